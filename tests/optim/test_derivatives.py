@@ -251,6 +251,7 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
     assert success.tolist() == [row != 4 for row in range(len(T_cw))]
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_inconsistent_batch_inputs_are_rejected_by_name(pose_scene, bundle_scene):
     scene = pose_scene()
     with pytest.raises(ValueError, match=r"pixels is torch.float32, but T_cw is torch.float64"):

@@ -120,6 +120,7 @@ def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
 
 
 @pytest.mark.parametrize("shape", [(2, 39), (2, 40, 2), (2, 40, 3, 3), (40,), (2, 41, 2, 2)])
+@pytest.mark.usefixtures("without_shape_checks")
 def test_wrong_shapes_are_named(pose_scene, bundle_scene, shape):
     scene = pose_scene()
     with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or \(B, N, 2, 2\), not"):

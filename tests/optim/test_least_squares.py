@@ -250,6 +250,7 @@ def test_dtype_and_device(dtype, device):
     assert solution.unknowns[0].device.type == device.type
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_inconsistent_inputs_are_rejected_by_name():
     x, y = normal(2, 9), normal(2, 9)
     start = torch.zeros(2, 2, dtype=torch.float64)

@@ -178,6 +178,7 @@ def run_graph(graph, start=0):
     )
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_a_run_graph_keeps_its_row_numbers(tmp_path):
     path = tmp_path / "graph.safetensors"
     graph = run_graph(replace(simulated()[1], submap=torch.full((10,), 3)), start=5)
@@ -298,6 +299,7 @@ def test_joined_run_graphs_keep_their_names():
     assert torch.equal(both.point_index[len(graph.pixels) :], graph.point_index + 50)
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_a_file_of_another_format_is_refused(tmp_path):
     path = tmp_path / "graph.safetensors"
     path.write_bytes(b"something else")

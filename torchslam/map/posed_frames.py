@@ -32,15 +32,15 @@ class RunGraph(ObservationGraph):
         keypoint_index: Row of each observation among the frame's features, to read its pixels anew from a front end.
     """
 
-    frame_ids: Int[Tensor, " F"]
-    sessions: Int[Tensor, " F"]
+    frame_ids: Int[Tensor, " K"]
+    sessions: Int[Tensor, " K"]
     point_ids: Int[Tensor, " N"]
     keypoint_index: Int[Tensor, " O"]
 
     _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
-        "frame_ids": ("F", (), int),
-        "sessions": ("F", (), int),
-        "point_ids": ("P", (), int),
+        "frame_ids": ("K", (), int),
+        "sessions": ("K", (), int),
+        "point_ids": ("N", (), int),
         "keypoint_index": ("O", (), int),
     }
 

@@ -2,7 +2,7 @@
 
 from torchslam.optim._core.implicit import Backward
 from torchslam.optim._core.levenberg_marquardt import Convergence, Progress
-from torchslam.optim._core.priors import CameraPrior, PosePrior
+from torchslam.optim._core.tangent import CameraPrior, PosePrior
 from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, minimize
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.bundle._schur import Marginals

@@ -8,15 +8,21 @@ from math import prod
 from typing import Literal, NamedTuple, get_args
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.func import grad, jvp, vmap
 
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.optim._core import tangent
-from torchslam.optim._core.batching import Tensors, index_tree, where_tree
-from torchslam.optim._core.implicit import Backward, Ndims, check_backward, find_minimum
-from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
+from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
+from torchslam.optim._core.levenberg_marquardt import (
+    Convergence,
+    index_tree,
+    minimize_batch,
+    select_models,
+    where_tree,
+)
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
 from torchslam.optim._core.residuals import Linearization, flat_along
 
@@ -101,7 +107,7 @@ class Product:
         )
 
     def pull_back(self, unknowns: Tensors, gradient: Tensors) -> Tensor:
-        """(B, n) the gradient in the step of a loss with this gradient in the unknowns."""
+        """The gradient (B, n) in the step of a loss with this gradient in the unknowns."""
         parts = [
             _MATRICES[name].pull_back(x, part) if name in _MATRICES else part
             for name, x, part in zip(self.manifolds, unknowns, gradient, strict=True)
@@ -124,15 +130,15 @@ class LeastSquaresSolution:
 
     Attributes:
         unknowns: the estimates, in the order and shapes of the start.
-        cost: (B,) half the sum of robustified squared whitened residuals, detached.
-        success: (B,) bool, the start and its residuals are finite, and all unknowns are determined. If False, the
+        cost: half the sum of robustified squared whitened residuals, detached.
+        success: the start and its residuals are finite, and all unknowns are determined. If False, the
             estimate is the best one found, but it has no gradient.
         convergence: iterations and convergence per element.
     """
 
     unknowns: Tensors
-    cost: Tensor
-    success: Tensor
+    cost: Float[Tensor, " B"]
+    success: Bool[Tensor, " B"]
     convergence: Convergence
 
 
@@ -142,10 +148,10 @@ def minimize(
     start: Tensor | Sequence[Tensor],
     inputs: Sequence[Tensor] = (),
     manifolds: Manifold | Sequence[Manifold] = "euclidean",
-    weights: Tensor | None = None,
-    mask: Tensor | None = None,
+    weights: Float[Tensor, "#B N"] | None = None,
+    mask: Bool[Tensor, "#B N"] | None = None,
     kernel: Kernel = "none",
-    scale: Tensor | float = 1.0,
+    scale: Float[Tensor, "*#scale"] | float = 1.0,
     backward: Backward = "implicit",
     iterations: int = 50,
     tolerance: float = 1e-10,
@@ -169,8 +175,8 @@ def minimize(
         start: one or several unknowns, all leading with B, together of few dimensions: their Hessian is dense.
         inputs: all tensors that differ between elements or require a gradient, leading with B.
         manifolds: manifold of each unknown, or one for all.
-        weights: (B, N) inverse variances, one if None.
-        mask: (B, N) bool, residuals that count, all if None; the others must be finite, with finite derivatives.
+        weights: inverse variances, one if None.
+        mask: residuals that count, all if None; the others must be finite, with finite derivatives.
         kernel: robust kernel.
         scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
         backward: how gradients reach inputs, weights and scale.
@@ -293,15 +299,15 @@ class _Problem:
         return self.product.retract(model.unknowns, -step), predicted_reduction
 
     def select(self, accept: Tensor, new: _Model, old: _Model) -> _Model:
-        return new if accept.all() else where_tree(accept, new, old)
+        return select_models(accept, new, old)
 
     def cost(self, unknowns: Tensors) -> Tensor:
-        """(B,)"""
+        """The costs (B,)."""
         r = self._residuals(unknowns)
         return self._weighed(r, r[..., None]).cost.sum(1)
 
     def slope(self, unknowns: Tensors, direction: Tensor) -> Tensor:
-        """(B,) the derivatives of the costs along directions (B, n)."""
+        """The derivatives (B,) of the costs along directions (B, n)."""
 
         def moved(step: Tensor) -> Tensor:
             return self._residuals(self.product.retract(unknowns, step))
@@ -320,7 +326,7 @@ class _Problem:
         return factorize(vmap(lambda step: jvp(gradient, (zero,), (step,))[1], out_dims=-1)(basis))
 
     def _residuals(self, unknowns: Tensors) -> Tensor:
-        """(B, N, D), zero where nothing counts."""
+        """Residuals (B, N, D), zero where nothing counts."""
         r = self.residual(*unknowns, *self.data.inputs)
         r = r[..., None] if r.ndim == 2 else r
         return torch.where(self.data.counted[..., None], r, 0.0)

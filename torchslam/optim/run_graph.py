@@ -15,6 +15,7 @@ from typing import Any, ClassVar, NamedTuple, Self, TypeVar
 
 import safetensors.torch
 import torch
+from jaxtyping import Bool, Float, Int
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
@@ -36,43 +37,41 @@ _MAX_BYTES = 1 << 34
 _MAX_SIZE_RATIO = 2.0
 
 Schema = dict[str, tuple[str, tuple[int, ...], type]]
-"""Per column: what it has a row for (F frames, P points or O observations), the shape of a row, the kind of numbers."""
+"""Per column: what it has a row for (K frames, N points or O observations), the shape of a row, the kind of numbers."""
 
 
 @dataclass(frozen=True)
 class ObservationGraph:
-    """O observations of P points by F frames, in any order.
+    """O observations of N points by K frames, in any order.
 
     Attributes:
-        timestamps: (F,) float64 seconds.
-        T_cw: (F, 4, 4) world to camera, as the run left them.
-        points_w: (P, 3)
-        frame_index: (O,) int64 rows of T_cw.
-        point_index: (O,) int64 rows of points_w.
-        pixels: (O, 2)
-        weights: (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances.
+        timestamps: seconds.
+        T_cw: world to camera, as the run left them.
+        frame_index: rows of T_cw.
+        point_index: rows of points_w.
+        weights: inverse variances in px^-2, or (O, 2, 2) inverse covariances.
         camera: one for all frames.
-        is_keyframe: (F,) bool. Keyframes and points are solved together, the other frames against the points.
-        submap: (F,) int64 submap of each frame, 0 if omitted. Submaps share nothing but the camera.
+        is_keyframe: Keyframes and points are solved together, the other frames against the points.
+        submap: submap of each frame, 0 if omitted. Submaps share nothing but the camera.
     """
 
-    timestamps: Tensor
-    T_cw: Tensor
-    points_w: Tensor
-    frame_index: Tensor
-    point_index: Tensor
-    pixels: Tensor
-    weights: Tensor
+    timestamps: Float[Tensor, " K"]
+    T_cw: Float[Tensor, "K 4 4"]
+    points_w: Float[Tensor, "N 3"]
+    frame_index: Int[Tensor, " O"]
+    point_index: Int[Tensor, " O"]
+    pixels: Float[Tensor, "O 2"]
+    weights: Float[Tensor, " O"] | Float[Tensor, "O 2 2"]
     camera: Camera
-    is_keyframe: Tensor
-    submap: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    is_keyframe: Bool[Tensor, " K"]
+    submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
 
     _SCHEMA: ClassVar[Schema] = {
-        "timestamps": ("F", (), float),
-        "T_cw": ("F", (4, 4), float),
-        "is_keyframe": ("F", (), bool),
-        "submap": ("F", (), int),
-        "points_w": ("P", (3,), float),
+        "timestamps": ("K", (), float),
+        "T_cw": ("K", (4, 4), float),
+        "is_keyframe": ("K", (), bool),
+        "submap": ("K", (), int),
+        "points_w": ("N", (3,), float),
         "frame_index": ("O", (), int),
         "point_index": ("O", (), int),
         "pixels": ("O", (2,), float),
@@ -90,7 +89,7 @@ class ObservationGraph:
             int(submap) for submap in torch.unique(self.submap)
         ]  # `tolist` fails in transforms of torch 2.5
 
-    def part(self, submap: int) -> tuple[Tensor, Tensor, Tensor]:
+    def part(self, submap: int) -> tuple[Int[Tensor, " n"], Int[Tensor, " m"], Int[Tensor, " p"]]:
         """Rows of the frames, the observations and the points of one submap; points without observations have none."""
         frames = (self.submap == submap).nonzero().squeeze(-1)
         rows = (self.submap[self.frame_index] == submap).nonzero().squeeze(-1)
@@ -135,7 +134,7 @@ class ObservationGraph:
 
     def _check(self) -> None:
         """Raises ValueError where a column does not fit the others, or names rows that there are not."""
-        rows = {"F": len(self.T_cw), "P": len(self.points_w), "O": len(self.pixels)}
+        rows = {"K": len(self.T_cw), "N": len(self.points_w), "O": len(self.pixels)}
         for name, (owner, shape, kind) in self._SCHEMA.items():
             column = getattr(self, name)
             if name == "weights" and column.ndim == 3:
@@ -147,7 +146,7 @@ class ObservationGraph:
                 raise ValueError(f"{name} is of type {column.dtype}")
             if not bool(column.isfinite().all()):
                 raise ValueError(f"{name} is not finite")
-        for name, owner in (("frame_index", "F"), ("point_index", "P")):
+        for name, owner in (("frame_index", "K"), ("point_index", "N")):
             index = getattr(self, name)
             if len(index) and not 0 <= int(index.min()) <= int(index.max()) < rows[owner]:
                 raise ValueError(f"{name} from {int(index.min())} to {int(index.max())} of {rows[owner]}")
@@ -172,27 +171,26 @@ class GraphSolution:
     """The minimum of a graph, differentiable with respect to its pixels, weights and camera.
 
     Attributes:
-        T_cw: (F, 4, 4) world to camera.
-        points_w: (P, 3)
+        T_cw: world to camera.
         camera: of all frames, with refined parameters where it was free.
-        success: (F,) bool. A frame that its observations do not determine stays at its start, without gradient. If the
+        success: A frame that its observations do not determine stays at its start, without gradient. If the
             keyframes of a submap together are not determined, none of them succeeds.
-        moved_points: (P,) bool. Points that too few keyframes see stay at their start; their observations do not count.
-        converged: (F,) bool, the search for a frame's pose, and before for its submap's keyframes and points, ended at
+        moved_points: Points that too few keyframes see stay at their start; their observations do not count.
+        converged: the search for a frame's pose, and before for its submap's keyframes and points, ended at
             a minimum. Elsewhere the poses are nearly right, but the gradient may be wrong by any factor.
-        submap: (F,) submap of each frame; different submaps share no coordinate frame.
+        submap: submap of each frame; different submaps share no coordinate frame.
         keyframes: the bundle adjustment of each submap, in the order of `ObservationGraph.submaps`, with its
             covariances; its rows are the submap's keyframes and the points that its frames see.
     """
 
-    timestamps: Tensor
-    T_cw: Tensor
-    points_w: Tensor
+    timestamps: Float[Tensor, " K"]
+    T_cw: Float[Tensor, "K 4 4"]
+    points_w: Float[Tensor, "N 3"]
     camera: Camera
-    success: Tensor
-    moved_points: Tensor
-    converged: Tensor
-    submap: Tensor
+    success: Bool[Tensor, " K"]
+    moved_points: Bool[Tensor, " N"]
+    converged: Bool[Tensor, " K"]
+    submap: Int[Tensor, " K"]
     keyframes: tuple[BundleSolution, ...]
 
     @property
@@ -212,8 +210,8 @@ class GraphSolution:
 def solve_graph(
     graph: ObservationGraph,
     kernel: Kernel = "huber",
-    scale: Tensor | float = 2.45,
-    free_camera: bool | Tensor = False,
+    scale: Float[Tensor, "*#scale"] | float = 2.45,
+    free_camera: bool | Float[Tensor, "P n"] = False,
     backward: Backward = "implicit",
     iterations: int = 30,
     tolerance: float = 1e-10,
@@ -251,7 +249,7 @@ def solve_graph(
     return _solve([graph], adjust, *options)[0]
 
 
-def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
+def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
     """The keyframes (k,) of one submap, its points (p,), and their bundle adjustment.
 
     Raises ValueError where there is no keyframe.
@@ -276,13 +274,13 @@ def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tens
     return keyframes, points, problem
 
 
-def bundle_converged(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
-    """(F,) whether the bundle adjustment of each frame's submap, in the order of `graph.submaps`, has converged."""
+def _bundle_converged(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
+    """Whether the bundle adjustment of the submap of each frame (K,) has converged; in the order of `graph.submaps`."""
     converged = torch.cat([bundle.convergence.converged for bundle in bundles])
     return converged[torch.unique(graph.submap, return_inverse=True)[1]]
 
 
-def pose_other_frames(
+def _pose_other_frames(
     graph: ObservationGraph,
     T_cw: Tensor,
     points_w: Tensor,
@@ -295,9 +293,10 @@ def pose_other_frames(
     iterations: int,
     tolerance: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The poses (F, 4, 4), with frames that are not keyframes refined against the points, `success` and `converged`.
+    """The poses (K, 4, 4), with frames that are not keyframes refined against the points, `success` and `converged`.
 
-    camera: one for all frames, or one for each, params (F, K)
+    Args:
+        camera: one for all frames, or one for each, params (K, P)
     """
     others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
@@ -358,7 +357,7 @@ class _GraphSubmap(NamedTuple):
 def solve_graphs(
     graphs: Sequence[ObservationGraph],
     kernel: Kernel = "huber",
-    scale: Tensor | float = 2.45,
+    scale: Float[Tensor, "*#scale"] | float = 2.45,
     backward: Backward = "implicit",
     iterations: int = 30,
     tolerance: float = 1e-10,
@@ -395,7 +394,7 @@ def _solve(
 ) -> tuple[GraphSolution, ...]:
     """Solve graphs with one camera model; `adjust` solves the bundle adjustments of all their submaps."""
     submaps = [
-        _GraphSubmap(number, *keyframe_problem(graph, submap))
+        _GraphSubmap(number, *_keyframe_problem(graph, submap))
         for number, graph in enumerate(graphs)
         for submap in graph.submaps
     ]
@@ -421,13 +420,13 @@ def _solve(
     camera = cameras[0]
     if len(cameras) > 1:
         camera = camera.with_params(torch.stack([each.params for each in cameras])[joined.submap])
-    T_cw, success, is_minimum = pose_other_frames(joined, T_cw, points_w, camera, moved, success, *options)
+    T_cw, success, is_minimum = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, *options)
     solutions = []
     for number, graph in enumerate(graphs):
         rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
         places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
         own = tuple(bundle for bundle, submap in zip(bundles, submaps, strict=True) if submap.graph == number)
-        converged = is_minimum[rows] & bundle_converged(graph, own)
+        converged = is_minimum[rows] & _bundle_converged(graph, own)
         found = T_cw[rows], points_w[places], cameras[number], success[rows], moved[places], converged
         solutions.append(GraphSolution(graph.timestamps, *found, graph.submap, own))
     return tuple(solutions)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchslam.optim._core.residuals import (
-    Observations,
+    ReprojectionData,
     exact_expansion,
     gauss_newton_expansion,
     linearize,
@@ -22,7 +22,7 @@ def make_observations(make_camera, generator):
         error = noise * torch.randn(count, 2, generator=generator, dtype=torch.float64)
         weights = torch.rand(count, generator=generator, dtype=torch.float64) + 0.5
         scale = torch.tensor(1.5, dtype=torch.float64)
-        return Observations(camera.project(points_c)[0] + error, weights, camera, kernel, scale), points_c
+        return ReprojectionData(camera.project(points_c)[0] + error, weights, camera, kernel, scale), points_c
 
     return make
 
@@ -86,7 +86,9 @@ def test_a_point_behind_the_camera_has_a_high_cost_without_gradient(make_observa
     camera = observations.camera.to(device).to(dtype)
     pixels, weights = observations.pixels.to(device, dtype), torch.ones(6, dtype=dtype, device=device)
     behind = points_c.to(device, dtype) * torch.tensor([1.0, 1.0, -1.0], dtype=dtype, device=device)
-    observations = Observations(pixels, weights, camera, "none", torch.ones((), dtype=dtype, device=device))
+    observations = ReprojectionData(
+        pixels, weights, camera, "none", torch.ones((), dtype=dtype, device=device)
+    )
     lin = linearize(observations, behind)
     torch.testing.assert_close(lin.cost, torch.full_like(lin.cost, 0.5 * (640**2 + 480**2)))
     assert (lin.gradient_wrt_residual == 0).all()

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.optim._core.residuals import Observations
+from torchslam.optim._core.residuals import ReprojectionData
 from torchslam.optim._core.tangent import retract
 from torchslam.optim.pose._refinement import PoseObservations
 
@@ -26,7 +26,7 @@ def scene(camera: Camera, generator: torch.Generator) -> tuple[Tensor, PoseObser
     pixels[:, :6] += 20
     weights = 0.5 + torch.rand(2, 30, generator=generator, dtype=torch.float64)
     scale = torch.tensor([2.0], dtype=torch.float64)
-    return T_cw, PoseObservations(points_w, Observations(pixels, weights, camera, "cauchy", scale))
+    return T_cw, PoseObservations(points_w, ReprojectionData(pixels, weights, camera, "cauchy", scale))
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
@@ -75,14 +75,14 @@ def test_second_order_curvature_is_added_on_request(generator: torch.Generator) 
 def test_the_pinhole_shortcut_equals_the_general_expansion(generator: torch.Generator) -> None:
     T_cw, short = scene(PINHOLE, generator)
     inputs = short.observations
-    straight = Observations(inputs.pixels, inputs.weights, STRAIGHT, inputs.kernel, inputs.scale)
+    straight = ReprojectionData(inputs.pixels, inputs.weights, STRAIGHT, inputs.kernel, inputs.scale)
     general = PoseObservations(short.points_w.mT, straight)
     moved = se3_exp(torch.tensor([0.05, 0, -0.1, 0.01, 0.02, 0.0], dtype=torch.float64)) @ T_cw
     for T in (T_cw, moved):
         torch.testing.assert_close(short.expand(T, ALL), general.expand(T, ALL))
     batch = Camera("pinhole", PINHOLE.params * torch.tensor([[1.0], [1.1]], dtype=torch.float64), (640, 480))
     pair = PoseObservations(
-        short.points_w.mT, Observations(inputs.pixels, inputs.weights, batch, inputs.kernel, inputs.scale)
+        short.points_w.mT, ReprojectionData(inputs.pixels, inputs.weights, batch, inputs.kernel, inputs.scale)
     )
     torch.testing.assert_close(pair.expand(T_cw, ALL).hessian[0], short.expand(T_cw, ALL).hessian[0])
     assert not torch.allclose(pair.expand(T_cw, ALL).hessian[1], short.expand(T_cw, ALL).hessian[1])

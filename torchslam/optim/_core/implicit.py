@@ -17,10 +17,9 @@ import torch
 from torch import Tensor
 from torch._C import _are_functorch_transforms_active
 from torch._C._functorch import TransformType, get_interpreter_stack
-from torch.func import grad, vjp
+from torch.func import grad, vjp, vmap
 
 from torchslam.geometry.precision import full_precision
-from torchslam.optim._core.batching import InDims, Tensors, leading, nested_vmap, vmap_by_fold, vmap_by_loop
 
 Backward = Literal["implicit", "unroll", "truncated", "detached"]
 """How gradients pass a minimization.
@@ -31,7 +30,10 @@ Backward = Literal["implicit", "unroll", "truncated", "detached"]
 "detached":  none
 """
 
+Tensors = tuple[Tensor, ...]
 Ndims = tuple[int, ...]
+InDims = Sequence[int | None]
+"""The mapped dimension of each tensor under `vmap`; None where all elements share the tensor."""
 
 
 def check_backward(backward: str) -> None:
@@ -146,9 +148,9 @@ class _Minimum(torch.autograd.Function):
             return _Minimum.apply(problem, *tensors)
 
         if problem.ndims is None:
-            found = vmap_by_loop(apply, info.batch_size, in_dims[1:], inputs)
+            found = _vmap_by_loop(apply, info.batch_size, in_dims[1:], inputs)
         else:
-            found = vmap_by_fold(
+            found = _vmap_by_fold(
                 apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], (0,) * len(inputs)
             )
         return found, (0,) * len(found)
@@ -161,7 +163,7 @@ class _Solve(torch.autograd.Function):
     @full_precision
     def forward(problem: Minimization, many: int, num_found: int, *tensors: Tensor) -> Tensors:
         right, found, inputs = _parts(problem, num_found, tensors)
-        return tuple(nested_vmap(problem.factorized(found, inputs), many)(right))
+        return tuple(_nested_vmap(problem.factorized(found, inputs), many)(right))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensors) -> None:
@@ -179,7 +181,7 @@ class _Solve(torch.autograd.Function):
 
         def curvature(tensors: Tensors) -> Tensor:
             at = _split(tensors, len(found))
-            return -nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
+            return -_nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
                 (direction, adjoint)
             ).sum()
 
@@ -196,7 +198,7 @@ class _Solve(torch.autograd.Function):
         def change_of_curvature(probe: Tensors) -> Tensor:
             def curvature(tensors: Tensors) -> Tensor:
                 at = _split(tensors, len(found))
-                return nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
+                return _nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
                     (direction, probe)
                 ).sum()
 
@@ -216,16 +218,16 @@ class _Solve(torch.autograd.Function):
         dims, count = in_dims[3:], problem.num_vectors
         if all(dim is None for dim in dims[count:]):
             right, found, inputs = _parts(problem, num_found, tensors)
-            right = tuple(leading(x, dim, info.batch_size) for x, dim in zip(right, dims, strict=False))
+            right = tuple(_leading(x, dim, info.batch_size) for x, dim in zip(right, dims, strict=False))
             return _solve(problem, right, found, inputs, many + 1), (0,) * count
 
         def apply(*tensors: Tensor) -> Tensors:
             return _Solve.apply(problem, many, num_found, *tensors)
 
         if problem.ndims is None:
-            return vmap_by_loop(apply, info.batch_size, dims, tensors), (0,) * count
+            return _vmap_by_loop(apply, info.batch_size, dims, tensors), (0,) * count
         before = (many,) * count + (0,) * (len(tensors) - count)
-        solved = vmap_by_fold(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
+        solved = _vmap_by_fold(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
         return tuple(part.movedim(many, 0) for part in solved), (0,) * count
 
 
@@ -302,3 +304,57 @@ def _along(
         if slope is not None and change is not None
     ]
     return torch.stack(products).sum()
+
+
+def _nested_vmap(function: Callable[[Any], Any], many: int) -> Callable[[Any], Any]:
+    """Map a function over `many` additional leading dimensions of its tensors."""
+    for _ in range(many):
+        function = vmap(function)
+    return function
+
+
+def _leading(tensor: Tensor, dim: int | None, size: int) -> Tensor:
+    """Move the mapped dimension to the front, or expand a shared tensor."""
+    return tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
+
+
+def _vmap_by_loop(
+    function: Callable[..., Tensors], size: int, dims: InDims, tensors: Sequence[Tensor]
+) -> Tensors:
+    """Apply the function to one element after the other."""
+    elements = [
+        function(*(x if dim is None else x.select(dim, row) for x, dim in zip(tensors, dims, strict=True)))
+        for row in range(size)
+    ]
+    return tuple(torch.stack(parts) for parts in zip(*elements, strict=True))
+
+
+def _vmap_by_fold(
+    function: Callable[..., Tensors],
+    size: int,
+    dims: InDims,
+    tensors: Sequence[Tensor],
+    ndims: Sequence[int],
+    before: Sequence[int],
+) -> Tensors:
+    """Fold the mapped dimension into the batch dimension of the function, which follows `before` dimensions."""
+    batched = [
+        x.ndim - (dim is not None) > ndim + skip
+        for x, dim, ndim, skip in zip(tensors, dims, ndims, before, strict=True)
+    ]
+    batch = next(
+        x.shape[skip + (dim is not None and dim <= skip)]
+        for x, dim, skip, has in zip(tensors, dims, before, batched, strict=True)
+        if has
+    )
+    rows = []
+    for x, dim, skip, has in zip(tensors, dims, before, batched, strict=True):
+        if dim is None and not has:
+            rows.append(x)
+            continue
+        x = _leading(x, dim, size).movedim(0, skip)
+        if not has:
+            x = x.unsqueeze(skip + 1).expand(*x.shape[: skip + 1], batch, *x.shape[skip + 1 :])
+        rows.append(x.flatten(skip, skip + 1))
+    skip = before[0]
+    return tuple(part.unflatten(skip, (size, batch)) for part in function(*rows))

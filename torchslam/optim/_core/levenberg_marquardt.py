@@ -9,14 +9,14 @@ can be differentiated through ("unroll"). Sources: Levenberg, 1944; Marquardt, 1
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, Self, TypeVar, runtime_checkable
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
-
-from torchslam.optim._core.batching import concat_tree, index_tree
+from torch.utils._pytree import tree_map
 
 INITIAL_DAMPING = 1e-4
 DAMPING_DOWN, DAMPING_UP = 0.1, 10.0
@@ -32,7 +32,7 @@ class Model(Protocol):
     """A local quadratic model of a cost; `cost` is (B,)."""
 
     @property
-    def cost(self) -> Tensor: ...
+    def cost(self) -> Float[Tensor, " B"]: ...
 
 
 M = TypeVar("M", bound=Model)
@@ -43,23 +43,25 @@ class LeastSquares(Protocol[X, M]):
     """A problem with estimates X and local models M."""
 
     @property
-    def solvable(self) -> Tensor:
-        """(B,) bool, which elements to minimize; the others stay at their start."""
+    def solvable(self) -> Bool[Tensor, " B"]:
+        """Which elements to minimize; the others stay at their start."""
         ...
 
-    def evaluate(self, estimate: X, use_curvature: Tensor) -> M:
+    def evaluate(self, estimate: X, use_curvature: Bool[Tensor, " B"]) -> M:
         """The cost and its quadratic model at an estimate. use_curvature: (B,) bool, add the kernel's curvature."""
         ...
 
-    def step(self, model: M, damping: Tensor) -> tuple[X, Tensor]:
+    def step(self, model: M, damping: Float[Tensor, " B"]) -> tuple[X, Float[Tensor, " B"]]:
         """The estimate that minimizes the damped model, and the decrease (B,) of the cost that the model predicts.
 
-        damping: (B,), relative to the diagonal of the Hessian. The decrease is infinite where there is no solution.
+        Args:
+            damping: relative to the diagonal of the Hessian. The decrease is infinite where there is no
+                solution.
         """
         ...
 
-    def select(self, accept: Tensor, new: M, old: M) -> M:
-        """Per element, `new` where `accept` (B,) and `old` elsewhere."""
+    def select(self, accept: Bool[Tensor, " B"], new: M, old: M) -> M:
+        """Per element, `new` where `accept` (B,) and `old` elsewhere; `select_models` for trees."""
         ...
 
 
@@ -67,7 +69,7 @@ class LeastSquares(Protocol[X, M]):
 class Divisible(Protocol):
     """A problem whose models are named tuples of batched tensors: elements that have converged leave the batch."""
 
-    def part(self, rows: Tensor) -> Self:
+    def part(self, rows: Int[Tensor, " R"]) -> Self:
         """The problems of some elements."""
         ...
 
@@ -76,8 +78,8 @@ class Divisible(Protocol):
 class Rounded(Protocol):
     """A problem with known rounding errors: a cost below them cannot be reduced."""
 
-    def rounding(self) -> Tensor:
-        """(B,) the cost of exact data, from rounding alone."""
+    def rounding(self) -> Float[Tensor, " B"]:
+        """The cost of exact data, from rounding alone."""
         ...
 
 
@@ -86,21 +88,50 @@ class Convergence:
     """Convergence of a minimization, per element.
 
     Attributes:
-        iterations: (B,) int64 steps tried.
-        converged: (B,) bool, the predicted reduction of the last step was below the tolerance.
-        initial_cost: (B,) half the sum of robustified squared residuals at the start.
-        cost: (B,) the same at the end.
+        iterations: steps tried.
+        converged: the predicted reduction of the last step was below the tolerance.
+        initial_cost: half the sum of robustified squared residuals at the start.
+        cost: the same at the end.
     """
 
-    iterations: Tensor
-    converged: Tensor
-    initial_cost: Tensor
-    cost: Tensor
+    iterations: Int[Tensor, " B"]
+    converged: Bool[Tensor, " B"]
+    initial_cost: Float[Tensor, " B"]
+    cost: Float[Tensor, " B"]
 
     def of(self, row: int) -> Convergence:
         """Of one element."""
         one = slice(row, row + 1)
         return Convergence(self.iterations[one], self.converged[one], self.initial_cost[one], self.cost[one])
+
+
+Tree = TypeVar("Tree")
+"""Nested named tuples of batched tensors."""
+
+
+def index_tree(tree: Tree, rows: Int[Tensor, " R"]) -> Tree:
+    """Select elements of a batch by their rows (b,)."""
+    return tree_map(lambda tensor: tensor.index_select(0, rows), tree)
+
+
+def where_tree(first: Bool[Tensor, " B"], one: Tree, other: Tree) -> Tree:
+    """Select per element: `one` where `first` (B,) is true, `other` elsewhere."""
+
+    def choose(a: Tensor, b: Tensor) -> Tensor:
+        return torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b)
+
+    return tree_map(choose, one, other)
+
+
+def select_models(accept: Bool[Tensor, " B"], new: Tree, old: Tree) -> Tree:
+    """`LeastSquares.select` for models that are trees."""
+    return new if accept.all() else where_tree(accept, new, old)
+
+
+def concat_tree(trees: Sequence[Tree], rows: Sequence[Tensor]) -> Tree:
+    """Merge trees into one batch; each has the elements of its rows (b,)."""
+    order = torch.argsort(torch.cat(list(rows)))
+    return tree_map(lambda *parts: torch.cat(parts).index_select(0, order), *trees)
 
 
 def minimize_batch(

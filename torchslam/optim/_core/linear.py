@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 LOWER_3X3 = ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2))
@@ -28,31 +29,33 @@ def smallest_pivot(dtype: torch.dtype) -> float:
 class DefiniteFactor:
     """Cholesky factors of symmetric matrices that were scaled to a unit diagonal.
 
-    scale:    (..., D) such that scale * matrix * scale has a unit diagonal
-    factor:   (..., D, D) lower triangular
-    definite: (...) bool, the matrix is positive definite, whatever its units
+    Attributes:
+        scale: such that scale * matrix * scale has a unit diagonal
+        factor: lower triangular
+        definite: the matrix is positive definite, whatever its units
     """
 
-    scale: Tensor
-    factor: Tensor
-    definite: Tensor
+    scale: Float[Tensor, "*batch D"]
+    factor: Float[Tensor, "*batch D D"]
+    definite: Bool[Tensor, "*batch"]
 
-    def solve(self, right: Tensor) -> Tensor:
-        """matrix^-1 right, zero where the matrix is not definite. (..., D, K) -> (..., D, K)."""
+    def solve(self, right: Float[Tensor, "*#batch D n"]) -> Float[Tensor, "*#batch D n"]:
+        """matrix^-1 right, zero where the matrix is not definite."""
         scale = self.scale[..., None]
         solution = scale * torch.cholesky_solve(scale * right, self.factor)
         return torch.where(self.definite[..., None, None], solution, 0.0)
 
-    def inverse_root(self) -> Tensor:
-        """Q with Q^T Q = matrix^-1, zero where the matrix is not definite. -> (..., D, D)."""
+    def inverse_root(self) -> Float[Tensor, "*batch D D"]:
+        """Q with Q^T Q = matrix^-1, zero where the matrix is not definite."""
         root = torch.linalg.solve_triangular(self.factor, torch.diag_embed(self.scale), upper=False)
         return torch.where(self.definite[..., None, None], root, 0.0)
 
 
-def factorize(matrix: Tensor, strict: bool = True) -> DefiniteFactor:
+def factorize(matrix: Float[Tensor, "*batch D D"], strict: bool = True) -> DefiniteFactor:
     """Cholesky factorization of symmetric (..., D, D) matrices that never raises.
 
-    strict: count a matrix as definite only if it is clearly so, beyond rounding.
+    Args:
+        strict: count a matrix as definite only if it is clearly so, beyond rounding.
     """
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()

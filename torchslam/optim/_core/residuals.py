@@ -15,6 +15,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -23,21 +24,21 @@ from torchslam.geometry.robust import Kernel, robustify
 
 
 @dataclass(frozen=True)
-class Observations:
+class ReprojectionData:
     """Pixels that points were seen at, and how errors are weighed.
 
-    pixels:  (..., N, 2)
-    weights: (..., N) inverse variances, px^-2, or (..., N, 2, 2) inverse covariances; zero where the observation does
-             not count
-    camera:  parameters (P,) or (..., P)
-    scale:   scalar, or with the batch dimensions and a last one of size 1 or N
+    Attributes:
+        weights: inverse variances, px^-2, or (..., N, 2, 2) inverse covariances; zero where the
+            observation does not count
+        camera: parameters (P,) or (..., P)
+        scale: scalar, or with the batch dimensions and a last one of size 1 or N
     """
 
-    pixels: Tensor
-    weights: Tensor
+    pixels: Float[Tensor, "*batch N 2"]
+    weights: Float[Tensor, "*batch N"] | Float[Tensor, "*batch N 2 2"]
     camera: Camera
     kernel: Kernel
-    scale: Tensor
+    scale: Float[Tensor, "..."]
 
     @property
     def has_matrices(self) -> bool:
@@ -45,29 +46,32 @@ class Observations:
         return self.weights.ndim == self.pixels.ndim + 1
 
     @property
-    def factors(self) -> Tensor:
-        """(..., N) what squares of residuals are multiplied with: weights, or one where residuals are whitened."""
+    def factors(self) -> Float[Tensor, "*batch N"]:
+        """Factors of squared residuals: the weights, or one where residuals are whitened."""
         return has_weight(self.weights).to(self.weights.dtype) if self.has_matrices else self.weights
 
     def tensors(self) -> list[Tensor]:
         """All that gradients may flow to: pixels, weights, camera parameters, scale."""
         return [self.pixels, self.weights, self.camera.params, self.scale]
 
-    def replaced(self, tensors: Sequence[Tensor]) -> Observations:
+    def replaced(self, tensors: Sequence[Tensor]) -> ReprojectionData:
         """The same observations with other tensors, in the order of `tensors`."""
         pixels, weights, params, scale = tensors
-        return Observations(pixels, weights, self.camera.with_params(params), self.kernel, scale)
+        return ReprojectionData(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
 # Projecting a point ends in so many roundings of a pixel's coordinates, with room to spare.
 _ROUNDINGS = 16.0
 
 
-def rounding_cost(weights: Tensor, params: Tensor) -> Tensor:
-    """(B,) what exact observations cost because numbers are rounded: below it there is nothing to be gained.
+def rounding_cost(weights: Float[Tensor, "B ..."], params: Float[Tensor, "B C P"]) -> Float[Tensor, " B"]:
+    """The cost of exact observations from rounding alone, below which there is nothing to be gained.
 
-    weights: (B, ...) inverse variances, or the diagonals of inverse covariances, zero where nothing counts
-    params:  (B, C, K) of the cameras: focal lengths and principal points bound the terms of a pixel's coordinates
+    Args:
+        weights: inverse variances, or the diagonals of inverse covariances, zero where nothing
+            counts
+        params: of the cameras: focal lengths and principal points bound the terms of a pixel's
+            coordinates
     """
     pixels = params.detach()[..., :4].abs().amax((1, 2))
     rounding = _ROUNDINGS * torch.finfo(pixels.dtype).eps * pixels
@@ -77,44 +81,54 @@ def rounding_cost(weights: Tensor, params: Tensor) -> Tensor:
 class Linearization(NamedTuple):
     """Reprojection errors and their first derivatives.
 
-    residual:     (..., N, 2) projected minus observed, px; whitened where weights are matrices
-    J:            (..., N, 2, D) d residual / d points_c, followed by d residual / d camera.params where it is free
-    cost:         (..., N) the share in the objective, half of rho
-    weight:       (..., N) weights * rho', zero where the point cannot be projected
-    curvature_term: (..., N) c = 2 * weights^2 * rho''; weight * I + c r r^T is the Hessian of the cost in the residual
+    Attributes:
+        residual: projected minus observed, px; whitened where weights are matrices
+        J: d residual / d points_c, followed by d residual / d camera.params where it is free
+        cost: contribution to the objective, half of rho
+        weight: weights * rho', zero where the point cannot be projected
+        curvature_term: c = 2 * weights^2 * rho''; weight * I + c r r^T is the Hessian of the cost in
+            the residual
     """
 
-    residual: Tensor
-    J: Tensor
-    cost: Tensor
-    weight: Tensor
-    curvature_term: Tensor
+    residual: Float[Tensor, "*batch N R"]
+    J: Float[Tensor, "*batch N R D"]
+    cost: Float[Tensor, "*batch N"]
+    weight: Float[Tensor, "*batch N"]
+    curvature_term: Float[Tensor, "*batch N"]
 
     @property
-    def gradient_wrt_residual(self) -> Tensor:
-        """(..., N, 2) the gradient of the cost with respect to the residual."""
+    def gradient_wrt_residual(self) -> Float[Tensor, "*batch N R"]:
+        """The gradient of the cost with respect to the residual."""
         return self.weight[..., None] * self.residual
 
 
-def usable(pixels: Tensor, points_w: Tensor, weights: Tensor) -> Tensor:
-    """Whether all inputs of an observation are finite and its weight is not negative, or definite. -> (..., N)."""
+def usable(
+    pixels: Float[Tensor, "*batch N 2"],
+    points_w: Float[Tensor, "*batch N 3"],
+    weights: Float[Tensor, "*batch N"] | Float[Tensor, "*batch N 2 2"],
+) -> Bool[Tensor, "*batch N"]:
+    """Whether all inputs of an observation are finite and its weight is not negative, or definite."""
     finite = torch.isfinite(pixels).all(-1) & torch.isfinite(points_w).all(-1)
     if weights.ndim == pixels.ndim + 1:
         return finite & torch.isfinite(weights).flatten(-2).all(-1) & is_definite(weights)
     return finite & torch.isfinite(weights) & (weights >= 0)
 
 
-def only(use: Tensor, weights: Tensor) -> Tensor:
+def only(
+    use: Bool[Tensor, "*batch"], weights: Float[Tensor, "*batch"] | Float[Tensor, "*batch 2 2"]
+) -> Float[Tensor, "*batch"] | Float[Tensor, "*batch 2 2"]:
     """Weights (..., N) or (..., N, 2, 2), zero outside of `use` (..., N)."""
     return torch.where(use if weights.ndim == use.ndim else use[..., None, None], weights, 0.0)
 
 
-def has_weight(weights: Tensor) -> Tensor:
-    """(..., N) bool, which of the matrices (..., N, 2, 2) are not zero."""
+def has_weight(weights: Float[Tensor, "*batch 2 2"]) -> Bool[Tensor, "*batch"]:
+    """Which of the matrices are not zero."""
     return weights.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
 
 
-def linearize(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Linearization:
+def linearize(
+    observations: ReprojectionData, points_c: Float[Tensor, "*batch N 3"], free_camera: bool = False
+) -> Linearization:
     """Errors and Jacobians of finite points_c (..., N, 3)."""
     pixels, valid, J = _project(observations.camera, points_c, free_camera)
     residual = pixels - observations.pixels
@@ -124,7 +138,9 @@ def linearize(observations: Observations, points_c: Tensor, free_camera: bool = 
     return Linearization(residual, J, *weigh(observations, residual.square().sum(-1), valid))
 
 
-def linearize_each(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Linearization:
+def linearize_each(
+    observations: ReprojectionData, points_c: Float[Tensor, "N 3"], free_camera: bool = False
+) -> Linearization:
     """`linearize` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
     if observations.camera.params.ndim == 1:
         return linearize(observations, points_c, free_camera)
@@ -132,7 +148,7 @@ def linearize_each(observations: Observations, points_c: Tensor, free_camera: bo
     return Linearization(*(part.squeeze(1) for part in lin))
 
 
-def _apart(observations: Observations) -> Observations:
+def _apart(observations: ReprojectionData) -> ReprojectionData:
     """Observations (N,) as a batch of one each; their scale is a scalar or (N,)."""
     scale = observations.scale
     return replace(
@@ -146,12 +162,14 @@ def _apart(observations: Observations) -> Observations:
 class Weighed(NamedTuple):
     """`cost`, `weight` and `curvature_term` of a `Linearization`, all (..., N)."""
 
-    cost: Tensor
-    weight: Tensor
-    curvature_term: Tensor
+    cost: Float[Tensor, "*batch N"]
+    weight: Float[Tensor, "*batch N"]
+    curvature_term: Float[Tensor, "*batch N"]
 
 
-def weigh(observations: Observations, squared_px: Tensor, valid: Tensor) -> Weighed:
+def weigh(
+    observations: ReprojectionData, squared_px: Float[Tensor, "*batch N"], valid: Bool[Tensor, "*batch N"]
+) -> Weighed:
     """Costs and weights of squared errors (..., N), px or whitened; errors that are not valid have weight zero."""
     camera, weights = observations.camera, observations.factors
     diagonal: Tensor | float = float(camera.width**2 + camera.height**2)
@@ -187,7 +205,12 @@ def _project_pinhole(camera: Camera, points_c: Tensor) -> tuple[Tensor, Tensor, 
     return normalized * focal + center, valid[..., 0], J_points
 
 
-def flat_along(weight: Tensor, curvature_term: Tensor, squared: Tensor, use_curvature: Tensor) -> Tensor:
+def flat_along(
+    weight: Float[Tensor, "*batch"],
+    curvature_term: Float[Tensor, "*batch"],
+    squared: Float[Tensor, "*batch"],
+    use_curvature: Shaped[Tensor, "*#use"],
+) -> Float[Tensor, "*batch"]:
     """The curvature term (..., N) that `gauss_newton_expansion` takes for residuals of these squares, px^2."""
     flat = -weight / torch.where(squared > 0, squared, 1.0)
     return torch.maximum(curvature_term, flat) * use_curvature
@@ -196,19 +219,22 @@ def flat_along(weight: Tensor, curvature_term: Tensor, squared: Tensor, use_curv
 class Expansion(NamedTuple):
     """The second-order expansion of the cost in points_c and, where it is free, camera.params.
 
-    gradient: (..., N, D); hessian: (..., N, D, D) with D = 3, or 3 + P where the camera is free.
+    Attributes:
+        hessian: with D = 3, or 3 + P where the camera is free.
     """
 
-    gradient: Tensor
-    hessian: Tensor
+    gradient: Float[Tensor, "*batch N D"]
+    hessian: Float[Tensor, "*batch N D D"]
 
-    def along(self, columns: Tensor) -> Expansion:
+    def along(self, columns: Float[Tensor, "*#batch D n"]) -> Expansion:
         """The expansion in the coefficients of columns (..., D, n)."""
         gradient = (self.gradient[..., None, :] @ columns).squeeze(-2)
         return Expansion(gradient, columns.mT @ self.hessian @ columns)
 
 
-def gauss_newton_expansion(lin: Linearization, J: Tensor, use_curvature: Tensor) -> Expansion:
+def gauss_newton_expansion(
+    lin: Linearization, J: Float[Tensor, "2 D *batch"], use_curvature: Shaped[Tensor, "*#use"]
+) -> Expansion:
     """Gradient (D, ..., N) and Hessian (D, D, ..., N) of the cost, for pixels with Jacobians J (2, D, ..., N).
 
     The curvature of the projection is left out.
@@ -226,7 +252,9 @@ def gauss_newton_expansion(lin: Linearization, J: Tensor, use_curvature: Tensor)
     return Expansion(lin.weight * pulled, hessian.addcmul((curvature_term * pulled)[:, None], pulled))
 
 
-def exact_expansion(observations: Observations, points_c: Tensor, free_camera: bool = False) -> Expansion:
+def exact_expansion(
+    observations: ReprojectionData, points_c: Float[Tensor, "*batch N 3"], free_camera: bool = False
+) -> Expansion:
     """Exact gradient and Hessian of the cost per observation, with the curvature of kernel and projection.
 
     The projection's own second derivative is that of J^T g with the gradient g in the residual fixed: autograd of the
@@ -246,7 +274,7 @@ def exact_expansion(observations: Observations, points_c: Tensor, free_camera: b
 
 
 def exact_expansion_of_each(
-    observations: Observations, points_c: Tensor, free_camera: bool = False
+    observations: ReprojectionData, points_c: Float[Tensor, "N 3"], free_camera: bool = False
 ) -> Expansion:
     """`exact_expansion` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
     if observations.camera.params.ndim == 1:
@@ -256,9 +284,12 @@ def exact_expansion_of_each(
 
 
 def _projection_curvature(
-    camera: Camera, points_c: Tensor, gradient_wrt_residual: Tensor, free_camera: bool
-) -> Tensor:
-    """sum_k force_k * Hessian of pixel_k in (points_c, camera.params). (..., N, 2, 1) force -> (..., N, D, D)."""
+    camera: Camera,
+    points_c: Float[Tensor, "*batch N 3"],
+    gradient_wrt_residual: Float[Tensor, "*batch N 2 1"],
+    free_camera: bool,
+) -> Float[Tensor, "*batch N D D"]:
+    """sum_k force_k * Hessian of pixel_k in (points_c, camera.params)."""
     dims = 3 + (camera.params.shape[-1] if free_camera else 0)
     with torch.enable_grad():
         # One copy of every observation per row of the Hessian, each with its own camera where that is free.
@@ -277,9 +308,9 @@ def _projection_curvature(
 
 
 def variance_factor(
-    observations: Observations, linearization: Linearization, num_parameters: int | Tensor
-) -> Tensor:
-    """What to multiply the inverse reweighted normal matrix with to get the covariance of the estimate. -> (...).
+    observations: ReprojectionData, linearization: Linearization, num_parameters: int | Int[Tensor, "*batch"]
+) -> Float[Tensor, "*batch"]:
+    """What to multiply the inverse reweighted normal matrix with to get the covariance of the estimate.
 
     From the residuals at the minimum: mean psi^2 times mean weight over the squared mean slope of psi, psi = rho' r,
     with Huber's correction for small samples; for least squares this is the variance of unit weight. One where there is

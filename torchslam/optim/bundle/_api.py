@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
@@ -26,25 +27,24 @@ class BundleSolution:
     """The minimum of a bundle adjustment; for a batch, everything leads with B.
 
     Attributes:
-        T_cw: (F, 4, 4) world to camera.
-        points_w: (P, 3)
+        T_cw: world to camera.
         camera: the cameras of the problem, with refined parameters where they were free.
-        cost: () half the sum of robustified squared whitened residuals and priors, detached.
-        success: () bool, all observing frames start finite, and all free unknowns are determined, up to the gauge. If
+        cost: half the sum of robustified squared whitened residuals and priors, detached.
+        success: all observing frames start finite, and all free unknowns are determined, up to the gauge. If
             False, the estimate is the best one found, but it has no gradient.
-        moved_frames: (F,) bool. Fixed frames, and frames with fewer than three points and no prior, stayed at their
+        moved_frames: Fixed frames, and frames with fewer than three points and no prior, stayed at their
             start; observations of the latter did not count.
-        moved_points: (P,) bool. Fixed points, and points seen by fewer than two frames, likewise.
+        moved_points: Fixed points, and points seen by fewer than two frames, likewise.
         convergence: iterations and convergence per element of the batch.
     """
 
-    T_cw: Tensor
-    points_w: Tensor
+    T_cw: Float[Tensor, "*batch K 4 4"]
+    points_w: Float[Tensor, "*batch N 3"]
     camera: Camera
-    cost: Tensor
-    success: Tensor
-    moved_frames: Tensor
-    moved_points: Tensor
+    cost: Float[Tensor, "*batch"]
+    success: Bool[Tensor, "*batch"]
+    moved_frames: Bool[Tensor, "*batch K"]
+    moved_points: Bool[Tensor, "*batch N"]
     convergence: Convergence
     _marginals: Callable[[], Marginals] = field(repr=False)
 
@@ -53,7 +53,9 @@ class BundleSolution:
         return self._marginals()
 
     def covariance(
-        self, frames: Tensor | Sequence[int] | None = None, points: Tensor | Sequence[int] | None = None
+        self,
+        frames: Int[Tensor, " n"] | Sequence[int] | None = None,
+        points: Int[Tensor, " m"] | Sequence[int] | None = None,
     ) -> Marginals:
         """Marginal covariances, detached, zero for what did not move; computed on the first call.
 
@@ -64,8 +66,8 @@ class BundleSolution:
             points: indices (m,) of points, all if None.
 
         Returns:
-            Frames (n, 6, 6) of the left perturbation (translation, rotation), points (m, 3, 3), and camera (K, K), or
-            (C K, C K) of several cameras.
+            Frames (n, 6, 6) of the left perturbation (translation, rotation), points (m, 3, 3), and camera (P, P), or
+            (C P, C P) of several cameras.
         """
         marginals = self._covariance
         rows = [
@@ -102,8 +104,8 @@ class BundleSolution:
 def bundle_adjust(
     problem: BundleProblem,
     kernel: Kernel = "huber",
-    scale: Tensor | float = 1.0,
-    free_camera: bool | Tensor = False,
+    scale: Float[Tensor, "*#scale"] | float = 1.0,
+    free_camera: bool | Float[Tensor, "P n"] = False,
     backward: Backward = "implicit",
     iterations: int = 20,
     tolerance: float = 1e-8,
@@ -123,7 +125,7 @@ def bundle_adjust(
         problem: one bundle adjustment, or a batch.
         kernel: robust kernel.
         scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
-        free_camera: True frees all K parameters of every camera. A tensor (K, n) frees steps along its n columns, of
+        free_camera: True frees all P parameters of every camera. A tensor (P, n) frees steps along its n columns, of
             which the covariances then are. Every problem of a batch finds its own parameters.
         backward: how gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed poses and fixed
             points. Nothing flows to the start of free unknowns.

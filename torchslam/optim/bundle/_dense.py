@@ -12,17 +12,19 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.batching import Tensors, index_tree, where_tree
+from torchslam.optim._core.implicit import Tensors
+from torchslam.optim._core.levenberg_marquardt import index_tree, select_models
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize, inverse_root_3x3
 from torchslam.optim._core.residuals import (
     Expansion,
     Linearization,
-    Observations,
+    ReprojectionData,
     exact_expansion,
     gauss_newton_expansion,
     linearize,
@@ -51,32 +53,36 @@ _MAX_CELLS_PER_OBSERVATION = 8
 class DenseLayout(NamedTuple):
     """The discrete part of the problems; every tensor leads with the batch.
 
-    order:   (B, F) rows of T_cw, those that move first; rank: (B, F) its inverse
-    cells:   (B, O) place of each observation among the F * P cells of its grid, the one after them if it does not count
-    free:    (B, F') which of the first F' move, F' being the most of any problem
-    anchors: (B, F) which of the ordered frames stay and see something
-    free_points: (B, P); held_points: (B,) whether a point that is seen stays
+    Attributes:
+        order: rows of T_cw, those that move first
+        rank: its inverse
+        cells: place of each observation among the K * N cells of its grid, the one after them if it
+            does not count
+        free: which of the first K' move, K' being the most of any problem
+        anchors: which of the ordered frames stay and see something
+        held_points: whether a point that is seen stays
     """
 
-    order: Tensor
-    rank: Tensor
-    cells: Tensor
-    free: Tensor
-    anchors: Tensor
-    free_points: Tensor
-    held_points: Tensor
+    order: Int[Tensor, "B K"]
+    rank: Int[Tensor, "B K"]
+    cells: Int[Tensor, "B O"]
+    free: Bool[Tensor, "B F"]
+    anchors: Bool[Tensor, "B K"]
+    free_points: Bool[Tensor, "B N"]
+    held_points: Bool[Tensor, " B"]
 
 
 class DenseData(NamedTuple):
     """All that the problems are made of, in the layout's order.
 
-    inputs:    as `BundleInputs`, but pixels (B, F, 2, P) and weights (B, F, P), zero where nothing was seen
-    camera_of: (B, F) the camera of each frame
+    Attributes:
+        inputs: as `BundleInputs`, but pixels (B, K, 2, N) and weights (B, K, N), zero where nothing was seen
+        camera_of: the camera of each frame
     """
 
     layout: DenseLayout
     inputs: BundleInputs
-    camera_of: Tensor
+    camera_of: Int[Tensor, "B K"]
 
 
 def suits_dense(given: BundleData, moving: MovingParts) -> bool:
@@ -128,13 +134,13 @@ def dense_data(layout: DenseLayout, given: BundleData) -> DenseData:
 
 
 def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:
-    """Rows (B, N) of (B, F, ...)."""
+    """Rows (B, M) of (B, K, ...)."""
     index = rows.view(*rows.shape, *(1,) * (tensor.ndim - 2))
     return tensor.gather(1, index.expand(*rows.shape, *tensor.shape[2:]))
 
 
 def _spread(layout: DenseLayout, values: Tensor) -> Tensor:
-    """Values (B, D, O) of observations in their cells, (B, F, D, P)."""
+    """Values (B, D, O) of observations in their cells, (B, K, D, N)."""
     (batch, num_frames), num_points = layout.order.shape, layout.free_points.shape[1]
     grid = values.new_zeros(batch, values.shape[1], num_frames * num_points + 1)
     grid = grid.scatter(2, layout.cells[:, None].expand_as(values), values)[..., :-1]
@@ -147,38 +153,41 @@ _CROSS = torch.linalg.cross(_AXES[:, None].expand(3, 3, 3), _AXES.expand(3, 3, 3
 
 
 class DenseExpansion(NamedTuple):
-    """`residuals.Expansion` of every frame and point: gradient (B, F, D, P), hessian (B, F, D, D, P), D = 3 + K."""
+    """`residuals.Expansion` of every frame and point: gradient (B, K, D, N), hessian (B, K, D, D, N), D = 3 + P."""
 
-    gradient: Tensor
-    hessian: Tensor
+    gradient: Float[Tensor, "B K D N"]
+    hessian: Float[Tensor, "B K D D N"]
 
 
 class DenseEquations(NamedTuple):
-    """Gradient and Hessian over F free frames, which move along the axes of the world as in `_sparse`, and the
-    cameras, D = 6 F + K, and points.
-
-    gradient: (B, D), points_gradient: (B, 3, P), reduced: (B, D, D), points: (B, 3, 3, P), coupling: (B, D, 3, P)
+    """Gradient and Hessian over K free frames, which move along the axes of the world as in `_sparse`, and the
+    cameras, D = 6 K + P, and points.
     """
 
-    gradient: Tensor
-    points_gradient: Tensor
-    reduced: Tensor
-    points: Tensor
-    coupling: Tensor
+    gradient: Float[Tensor, "B D"]
+    points_gradient: Float[Tensor, "B 3 N"]
+    reduced: Float[Tensor, "B D D"]
+    points: Float[Tensor, "B 3 3 N"]
+    coupling: Float[Tensor, "B D 3 N"]
 
 
 def assemble_dense(
-    expansion: DenseExpansion, rays_w: Tensor, R_cw: Tensor, free: Tensor, exact: bool
+    expansion: DenseExpansion,
+    rays_w: Float[Tensor, "B K 3 N"],
+    R_cw: Float[Tensor, "B K 3 3"],
+    free: Bool[Tensor, "B F"],
+    exact: bool,
 ) -> DenseEquations:
-    """Normal equations over the first frames, of which those that are free (B, F') move, all points, and the cameras.
+    """Normal equations over the first frames, of which those that are free (B, K') move, all points, and the cameras.
 
-    expansion: in the points in the camera frames
-    rays_w:    (B, F, 3, P) from the cameras to the points, in the axes of the world; R_cw: (B, F, 3, 3)
-    exact:     include the second-order terms of the rotation
+    Args:
+        expansion: in the points in the camera frames
+        rays_w: from the cameras to the points, in the axes of the world
+        exact: include the second-order terms of the rotation
     """
     dims, leading, R_wc = expansion.gradient.shape[2], free.shape[1], R_cw.mT
     upper = expansion.hessian[:, :, :3]
-    curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, F, 3, 3, P): R^T C R
+    curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, K, 3, 3, N): R^T C R
     slope, across = R_wc @ expansion.gradient[:, :, :3], _times(R_wc, upper[:, :, :, 3:])
     points, points_gradient, points_camera = curve.sum(1), slope.sum(1), across.sum(1)
 
@@ -215,44 +224,46 @@ def assemble_dense(
 
 
 def _times(R: Tensor, columns: Tensor) -> Tensor:
-    """R (B, F, 3, 3) times columns (B, F, 3, n, P)."""
+    """R (B, K, 3, 3) times columns (B, K, 3, n, N)."""
     return (R @ columns.flatten(3)).view_as(columns)
 
 
 def _sum_by_frame(
     slope: Tensor, across: Tensor, coupling: Tensor, rays_w: Tensor, exact: bool
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """G^T q (B, F, 6), G^T C G (B, F, 6, 6) and G^T C_camera (B, F, 6, K) summed over the points, G = [I, -r^].
+    """G^T q (B, K, 6), G^T C G (B, K, 6, 6) and G^T C_camera (B, K, 6, P) summed over the points, G = [I, -r^].
 
-    They are sums of q, C_camera and G^T C (B, F, 6, 3, P) times 1 and r.
+    They are sums of q, C_camera and G^T C (B, K, 6, 3, N) times 1 and r.
     """
     num_camera, cross = across.shape[3], _CROSS.to(rays_w.dtype).to(rays_w.device)
     affine = torch.cat((torch.ones_like(rays_w[:, :, :1]), rays_w), dim=2).mT
-    pushed = slope @ affine  # (B, F, 3, 4)
+    pushed = slope @ affine  # (B, K, 3, 4)
     outer = pushed[..., 1:]
     torque = torch.einsum("bmj,xfjm->xfb", cross, outer)
-    moments = (coupling.flatten(2, 3) @ affine).unflatten(2, (6, 3))  # (B, F, 6, 3, 4)
+    moments = (coupling.flatten(2, 3) @ affine).unflatten(2, (6, 3))  # (B, K, 6, 3, 4)
     frames = torch.cat((moments[..., 0], torch.einsum("clk,xfakl->xfac", cross, moments[..., 1:])), dim=-1)
     if exact:
         eye = torch.eye(3, dtype=outer.dtype, device=outer.device)
         trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
         curvature_term = 0.5 * (outer + outer.mT) - trace * eye
         frames = frames + torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
-    sums = (across.flatten(2, 3) @ affine).unflatten(2, (3, num_camera))  # (B, F, 3, K, 4)
+    sums = (across.flatten(2, 3) @ affine).unflatten(2, (3, num_camera))  # (B, K, 3, P, 4)
     rotated = torch.einsum("bmj,xfjkm->xfbk", cross, sums[..., 1:])
     return torch.cat((pushed[..., 0], torque), dim=-1), frames, torch.cat((sums[..., 0], rotated), dim=-2)
 
 
 class FactorizedDense(NamedTuple):
-    """Equations ready to be solved for any right side: the inverse roots (B, 3, 3, P) of the points' blocks, zero for
-    points that do not move, the coupling times them (B, D, 3 P), and the reduced system of frames and cameras."""
+    """Equations ready to be solved for any right side: the inverse roots of the points' blocks, zero for points that
+    do not move, the coupling times them, and the reduced system of frames and cameras."""
 
-    root: Tensor
-    whitened: Tensor
+    root: Float[Tensor, "B 3 3 N"]
+    whitened: Float[Tensor, "B D N3"]
     reduced: DefiniteFactor
 
-    def solve(self, right: Tensor, points: Tensor) -> tuple[Tensor, Tensor]:
-        """H^-1 right, (B, D) and (B, 3, P); all zero where the reduced system is not definite."""
+    def solve(
+        self, right: Float[Tensor, "B D"], points: Float[Tensor, "B 3 N"]
+    ) -> tuple[Float[Tensor, "B D"], Float[Tensor, "B 3 N"]]:
+        """H^-1 right; all zero where the reduced system is not definite."""
         halves = (self.root * points[:, None]).sum(2)
         rest = right - (self.whitened @ halves.flatten(1)[..., None]).squeeze(-1)
         solution = self.reduced.solve(rest[..., None])
@@ -260,12 +271,12 @@ class FactorizedDense(NamedTuple):
         moved = (self.root * halves[:, :, None]).sum(1)
         return solution.squeeze(-1), torch.where(self.reduced.definite[:, None, None], moved, 0.0)
 
-    def marginals(self) -> tuple[Tensor, Tensor]:
-        """The inverse over frames and cameras (B, D, D), and the blocks (B, P, 3, 3) of the points."""
+    def marginals(self) -> tuple[Float[Tensor, "B D D"], Float[Tensor, "B N 3 3"]]:
+        """The inverse over frames and cameras, and the blocks of the points."""
         size = self.whitened.shape[1]
         eye = torch.eye(size, dtype=self.root.dtype, device=self.root.device)
         inverse = self.reduced.solve(eye.expand(len(self.root), size, size))
-        A = self.whitened.unflatten(-1, (3, -1)).permute(0, 3, 2, 1)  # (B, P, 3, D)
+        A = self.whitened.unflatten(-1, (3, -1)).permute(0, 3, 2, 1)  # (B, N, 3, D)
         root = self.root.permute(0, 3, 1, 2)
         inner = torch.eye(3, dtype=A.dtype, device=A.device) + (A @ inverse[:, None]) @ A.mT
         return inverse, root.mT @ inner @ root
@@ -273,16 +284,15 @@ class FactorizedDense(NamedTuple):
 
 def factorize_dense(
     equations: DenseEquations,
-    free: Tensor,
-    free_points: Tensor,
+    free: Bool[Tensor, "B K"],
+    free_points: Bool[Tensor, "B N"],
     num_camera: int,
-    damping: Tensor | None = None,
-    gauge: Tensor | None = None,
+    damping: Float[Tensor, " B"] | None = None,
+    gauge: Float[Tensor, "B R g"] | None = None,
 ) -> FactorizedDense:
     """Eliminate the points and factorize what is left, as `NormalEquations.factorized` does.
 
-    free: (B, F); free_points: (B, P); num_camera: rows at the end that are no frames'; damping: (B,)
-    gauge: (B, 6 F, g)
+    The last `num_camera` rows are those of the cameras.
     """
     root = _inverse_root(equations.points, free_points, damping)
     c0, c1, c2 = equations.coupling.unbind(2)
@@ -309,7 +319,7 @@ def factorize_dense(
 
 
 def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
-    """(B,) mean of the diagonal, without the rows that only fill up: each problem has the one that it has alone."""
+    """Mean (B,) of the diagonal, without the rows that only fill up: each problem has the one that it has alone."""
     diagonal = reduced.diagonal(dim1=-2, dim2=-1)
     if free.all():
         return diagonal.mean(-1)
@@ -318,7 +328,7 @@ def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
 
 
 def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tensor:
-    """`inverse_root_3x3` of blocks (B, 3, 3, P), with diagonals grown by the share `damping`, where they are free."""
+    """`inverse_root_3x3` of blocks (B, 3, 3, N), with diagonals grown by the share `damping`, where they are free."""
     diagonal = blocks.diagonal(dim1=1, dim2=2).mT
     if damping is not None:
         diagonal = diagonal * (1 + damping[:, None, None])
@@ -331,18 +341,18 @@ def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tenso
 
 
 class DenseEstimate(NamedTuple):
-    """Poses (B, F, 4, 4) in the layout's order, points (B, 3, P), camera parameters (B, C, K)."""
+    """Poses (B, K, 4, 4) in the layout's order, points (B, 3, N), camera parameters (B, C, P)."""
 
-    T_cw: Tensor
-    points_w: Tensor
-    params: Tensor
+    T_cw: Float[Tensor, "B K 4 4"]
+    points_w: Float[Tensor, "B 3 N"]
+    params: Float[Tensor, "B C P"]
 
 
 class DenseModel(NamedTuple):
     """The local models of the costs (B,) at an estimate."""
 
     estimate: DenseEstimate
-    cost: Tensor
+    cost: Float[Tensor, " B"]
     equations: DenseEquations
 
 
@@ -350,13 +360,14 @@ class DenseModel(NamedTuple):
 class DenseBundle:
     """A batch of bundle adjustments for `minimize_batch`, with their covariances and exact solvers.
 
-    directions: (K, n) in which the cameras' parameters move, None where they do not
+    Attributes:
+        directions: in which the cameras' parameters move, None where they do not
     """
 
     data: DenseData
     camera: Camera
     kernel: Kernel
-    directions: Tensor | None
+    directions: Float[Tensor, "P n"] | None
 
     @property
     def solvable(self) -> Tensor:
@@ -399,10 +410,10 @@ class DenseBundle:
         return DenseEstimate(T_cw, points_w - points, params), predicted_reduction
 
     def select(self, accept: Tensor, new: DenseModel, old: DenseModel) -> DenseModel:
-        return new if accept.all() else where_tree(accept, new, old)
+        return select_models(accept, new, old)
 
     def definite(self, model: DenseModel) -> Tensor:
-        """(B,) whether all that moves is determined, up to the gauge."""
+        """Whether (B,) all that moves is determined, up to the gauge."""
         return self._factorized(model.estimate, model.equations).reduced.definite
 
     def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
@@ -429,7 +440,7 @@ class DenseBundle:
         return solve
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
-        """Covariances (B, F, 6, 6), (B, P, 3, 3), (B, C n, C n) in the order of the problems, zero for what stays."""
+        """Covariances (B, K, 6, 6), (B, N, 3, 3), (B, C n, C n) in the order of the problems, zero for what stays."""
         layout, ordered = self.data.layout, self.ordered(estimate)
         points_c = self._points_c(ordered)
         lin = self._linearize(ordered, points_c)
@@ -464,28 +475,28 @@ class DenseBundle:
         return BundleEstimate(T_cw, estimate.points_w.mT, estimate.params)
 
     def _points_c(self, estimate: DenseEstimate) -> Tensor:
-        """(B, F, 3, P)"""
+        """Points in the camera frames, (B, K, 3, N)."""
         T_cw = estimate.T_cw
         return T_cw[..., :3, :3] @ estimate.points_w[:, None] + T_cw[..., :3, 3:]
 
-    def _observations(self, estimate: DenseEstimate) -> Observations:
+    def _observations(self, estimate: DenseEstimate) -> ReprojectionData:
         inputs = self.data.inputs
         params = estimate.params
         if params.shape[1] > 1:
             params = take_rows(params, self.data.camera_of)
         camera, scale = self.camera.with_params(params), inputs.scale[:, None, None]
-        return Observations(inputs.pixels.mT, inputs.weights, camera, self.kernel, scale)
+        return ReprojectionData(inputs.pixels.mT, inputs.weights, camera, self.kernel, scale)
 
     @property
     def _columns(self) -> Tensor:
-        """From points and directions to points and parameters, (3 + K, 3 + n) or (B, F, 1, 3 + K, 3 + C n)."""
+        """From points and directions to points and parameters, (3 + P, 3 + n) or (B, K, 1, 3 + P, 3 + C n)."""
         assert self.directions is not None
         num_cameras = self.data.inputs.params.shape[1]
         columns = camera_columns(self.directions, num_cameras)
         return columns[0] if num_cameras == 1 else columns[self.data.camera_of][:, :, None]
 
     def _linearize(self, estimate: DenseEstimate, points_c: Tensor) -> Linearization:
-        """Of every frame and point, (B, F, P, ...)."""
+        """Of every frame and point, (B, K, N, ...)."""
         lin = linearize(self._observations(estimate), points_c.mT, self.directions is not None)
         return lin if self.directions is None else lin._replace(J=lin.J @ self._columns)
 
@@ -528,7 +539,7 @@ class DenseBundle:
         return None if terms is None else terms.in_world(T_cw[..., :3, :3])
 
     def _split(self, vector: Tensor) -> tuple[Tensor, Tensor]:
-        """The parts of (B, D) that are of the free frames (B, F', 6) and of the cameras."""
+        """The parts of (B, D) that are of the free frames (B, K', 6) and of the cameras."""
         leading = self.data.layout.free.shape[1]
         return vector[:, : 6 * leading].unflatten(1, (leading, 6)), vector[:, 6 * leading :]
 
@@ -542,7 +553,7 @@ class DenseBundle:
         )
 
     def _gauge(self, estimate: DenseEstimate) -> Tensor | None:
-        """Gauge directions (B, 6 F', g) along the axes of the world, zero where the gauge is fixed; None if all are."""
+        """Gauge directions (B, 6 K', g) along the axes of the world, zero where the gauge is fixed; None if all are."""
         layout = self.data.layout
         free, anchors = layout.free, layout.anchors.sum(1)
         is_open = (anchors < 2) & ~layout.held_points & free.any(1)
@@ -577,12 +588,12 @@ def _expanded(lin: Linearization, use_curvature: Tensor) -> DenseExpansion:
 
 
 def _as_grid(expansion: Expansion) -> DenseExpansion:
-    """(B, F, P, D) and (B, F, P, D, D) with the points last."""
+    """The expansion of every frame and point, with the points last."""
     return DenseExpansion(expansion.gradient.mT.contiguous(), expansion.hessian.movedim(2, -1).contiguous())
 
 
 def camera_columns(directions: Tensor, num_cameras: int) -> Tensor:
-    """(C, 3 + K, 3 + C n) from a point and the steps of all cameras along n directions (K, n) to the point and the
+    """(C, 3 + P, 3 + C n) from a point and the steps of all cameras along n directions (P, n) to the point and the
     parameters of one of them."""
     eye = torch.eye(3, dtype=directions.dtype, device=directions.device)
     own = torch.eye(num_cameras, dtype=directions.dtype, device=directions.device)

@@ -10,10 +10,9 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.batching import Tensors
-from torchslam.optim._core.implicit import Ndims
+from torchslam.optim._core.implicit import Ndims, Tensors
 from torchslam.optim._core.levenberg_marquardt import LeastSquares, M, Progress, X, minimize_batch
-from torchslam.optim._core.residuals import Observations, linearize_each, only
+from torchslam.optim._core.residuals import ReprojectionData, linearize_each, only
 from torchslam.optim._core.tangent import move, pull_back, push, retract
 from torchslam.optim.bundle._dense import (
     DenseBundle,
@@ -38,7 +37,7 @@ _MAX_CELLS_CPU, _MAX_CELLS_GPU = 1 << 14, 1 << 20
 
 
 class BundleMinimum(NamedTuple):
-    """Estimates, moved frames (B, F) and points (B, P), counted observations (B, O), and convergence (B,)."""
+    """Estimates, moved frames (B, K) and points (B, N), counted observations (B, O), and convergence (B,)."""
 
     T_cw: Tensor
     points_w: Tensor
@@ -71,7 +70,7 @@ class BundleFormulation(LeastSquares[X, M], Protocol[X, M]):
     def start(self) -> X: ...
 
     def definite(self, model: M) -> Tensor:
-        """(B,) whether all that moves is determined, up to the gauge."""
+        """Whether (B,) all that moves is determined, up to the gauge."""
         ...
 
     def ordered(self, estimate: BundleEstimate) -> X:
@@ -94,7 +93,7 @@ class BundleFormulation(LeastSquares[X, M], Protocol[X, M]):
 class BundleMinimization:
     """Bundle adjustments of inputs `BundleData`.
 
-    Vectors are frames (B, F, 6), points (B, P, 3) and cameras (B, C n): along the directions (K, n) in which each may
+    Vectors are frames (B, K, 6), points (B, N, 3) and cameras (B, C n): along the directions (P, n) in which each may
     move, none where they are fixed.
     """
 
@@ -177,7 +176,7 @@ class BundleMinimization:
         cameras, in_cameras = self.camera.with_params(at.params.flatten(0, 1)), None
         if len(cameras.params) > 1:
             in_cameras = flat_rows(given.camera_of, at.params.shape[1])
-        observed = Observations(
+        observed = ReprojectionData(
             given.pixels.flatten(0, 1),
             only(found.used, given.weights).flatten(0, 1),
             cameras[0 if in_cameras is None else in_cameras],
@@ -218,14 +217,14 @@ class BundleMinimization:
         return pull_back(found[0], frames), points, camera.flatten(1)
 
     def _directions(self, params: Tensor) -> Tensor | None:
-        """(K, n) along which parameters (..., K) may move; None where they do not."""
+        """Directions (P, n) along which parameters (..., P) may move; None where they do not."""
         if isinstance(self.free_camera, Tensor):
             return self.free_camera
         size = params.shape[-1]
         return torch.eye(size, dtype=params.dtype, device=params.device) if self.free_camera else None
 
     def _along(self, step: Tensor, params: Tensor) -> Tensor:
-        """How a step (B, C n) changes the cameras' parameters (B, C, K)."""
+        """How a step (B, C n) changes the cameras' parameters (B, C, P)."""
         directions = self._directions(params)
         if directions is None:
             return torch.zeros_like(params)

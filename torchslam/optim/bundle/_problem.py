@@ -7,52 +7,52 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, transform
 from torchslam.geometry.precision import check_dtypes
-from torchslam.optim._core.priors import CameraPrior, PosePrior, prior_expansion, prior_hessian
 from torchslam.optim._core.residuals import only, usable
-from torchslam.optim._core.tangent import rotated
+from torchslam.optim._core.tangent import CameraPrior, PosePrior, prior_expansion, prior_hessian, rotated
+from torchslam.utils.indexing import row_mask
 
 
 @dataclass(frozen=True)
 class BundleProblem:
-    """O observations of P points by F frames; or a batch of B such problems.
+    """O observations of N points by K frames; or a batch of B such problems.
 
-    `T_cw` (B, F, 4, 4) makes it a batch. Everything else may lead with B, too; without, it is shared by all problems.
+    `T_cw` (B, K, 4, 4) makes it a batch. Everything else may lead with B, too; without, it is shared by all problems.
 
     Attributes:
-        T_cw: (F, 4, 4) world to camera, the start.
-        points_w: (P, 3) start.
-        frame_index: (O,) int64 rows of T_cw.
-        point_index: (O,) int64 rows of points_w.
-        pixels: (O, 2)
-        camera: one for all frames, params (K,); with `camera_index` C cameras of one model and size, (C, K).
-        weights: (O,) inverse variances in px^-2, or (O, 2, 2) inverse covariances, which count where they are positive
+        T_cw: world to camera, the start.
+        points_w: start.
+        frame_index: rows of T_cw.
+        point_index: rows of points_w.
+        camera: one for all frames, params (P,); with `camera_index` C cameras of one model and size, (C, P).
+        weights: inverse variances in px^-2, or (O, 2, 2) inverse covariances, which count where they are positive
             definite; one if None.
-        fixed_frames: rows of T_cw, or an (F,) bool mask. One fixed frame leaves the scale open, which then stays that
+        fixed_frames: rows of T_cw, or a (K,) bool mask. One fixed frame leaves the scale open, which then stays that
             of the start; without any, position and orientation stay as well.
-        fixed_points: rows of points_w, or a (P,) bool mask.
-        mask: (O,) bool, observations that count, all if None. Padding of smaller problems in a batch may hold any
+        fixed_points: rows of points_w, or a (N,) bool mask.
+        mask: observations that count, all if None. Padding of smaller problems in a batch may hold any
             values, with indices in range.
-        camera_index: (F,) int64 camera of each frame.
-        pose_prior: T_cw (F, 4, 4) and information (F, 6, 6), zero for frames without a prior.
+        camera_index: camera of each frame.
+        pose_prior: T_cw (K, 4, 4) and information (K, 6, 6), zero for frames without a prior.
         camera_prior: prior on the parameters of free cameras.
     """
 
-    T_cw: Tensor
-    points_w: Tensor
-    frame_index: Tensor
-    point_index: Tensor
-    pixels: Tensor
+    T_cw: Float[Tensor, "*#batch K 4 4"]
+    points_w: Float[Tensor, "*#batch N 3"]
+    frame_index: Int[Tensor, "*#batch O"]
+    point_index: Int[Tensor, "*#batch O"]
+    pixels: Float[Tensor, "*#batch O 2"]
     camera: Camera
-    weights: Tensor | None = None
-    fixed_frames: Tensor | Sequence[int] = (0,)
-    fixed_points: Tensor | Sequence[int] | None = None
-    mask: Tensor | None = None
-    camera_index: Tensor | None = None
+    weights: Float[Tensor, "*#batch O"] | Float[Tensor, "*#batch O 2 2"] | None = None
+    fixed_frames: Shaped[Tensor, "..."] | Sequence[int] = (0,)
+    fixed_points: Shaped[Tensor, "..."] | Sequence[int] | None = None
+    mask: Bool[Tensor, "*#batch O"] | None = None
+    camera_index: Int[Tensor, "*#batch K"] | None = None
     pose_prior: PosePrior | None = None
     camera_prior: CameraPrior | None = None
 
@@ -64,7 +64,7 @@ class BundleProblem:
 class BundleInputs(NamedTuple):
     """All that gradients may flow to, in the order of the problem; every tensor of a batch of B leads with it.
 
-    params (C, K), scale (); priors have no rows where there are none.
+    params (C, P), scale (); priors have no rows where there are none.
     """
 
     T_cw: Tensor
@@ -91,8 +91,8 @@ class BundleInputs(NamedTuple):
 
 class BundleData(NamedTuple):
     """All that bundle adjustments are made of, batched: the tensors of `BundleInputs`, which observations count (B, O),
-    whether all frames that anything counts of are finite (B,), the rows of `BundleProblem`, and what may move, (B, F)
-    and (B, P)."""
+    whether all frames that anything counts of are finite (B,), the rows of `BundleProblem`, and what may move, (B, K)
+    and (B, N)."""
 
     T_cw: Tensor
     points_w: Tensor
@@ -118,7 +118,7 @@ class BundleData(NamedTuple):
 
     @property
     def camera_of(self) -> Tensor:
-        """(B, O) the camera of each observation."""
+        """The camera (B, O) of each observation."""
         return self.camera_index.gather(1, self.frame_index)
 
     def part(self, rows: slice) -> BundleData:
@@ -127,11 +127,11 @@ class BundleData(NamedTuple):
 
 
 class BundleEstimate(NamedTuple):
-    """(F, 4, 4) poses, (P, 3) points in the layout's order, (C, K) camera parameters."""
+    """Poses, points and camera parameters, in the order of the problem or of a layout."""
 
-    T_cw: Tensor
-    points_w: Tensor
-    params: Tensor
+    T_cw: Float[Tensor, "*batch K 4 4"]
+    points_w: Float[Tensor, "*batch N 3"]
+    params: Float[Tensor, "*batch C P"]
 
 
 _MIN_POINTS_PER_FRAME = 3
@@ -139,11 +139,11 @@ _MIN_FRAMES_PER_POINT = 2
 
 
 class MovingParts(NamedTuple):
-    """(B, O) bool, the observations that count; (B, F), (B, P) bool, the frames and points that move."""
+    """Masks of the observations that count and of the frames and points that move."""
 
-    counted: Tensor
-    frames: Tensor
-    points: Tensor
+    counted: Bool[Tensor, "B O"]
+    frames: Bool[Tensor, "B K"]
+    points: Bool[Tensor, "B N"]
 
 
 def select_moving(given: BundleData) -> MovingParts:
@@ -160,12 +160,12 @@ def select_moving(given: BundleData) -> MovingParts:
 
 
 def _counts(index: Tensor, counted: Tensor, of: Tensor) -> Tensor:
-    """How many counted rows of index (B, O) there are of each of `of`. -> (B, N)."""
+    """How many counted rows of index (B, O) there are of each of `of`."""
     rows = flat_rows(index, of.shape[1])[counted.flatten()]
     return torch.bincount(rows, minlength=of.numel()).view(of.shape)
 
 
-def flat_rows(index: Tensor, size: int) -> Tensor:
+def flat_rows(index: Int[Tensor, "B O"], size: int) -> Int[Tensor, " R"]:
     """Rows (B * O,) of what was (B, size, ...) and is flattened to (B * size, ...), for index (B, O)."""
     return (index + size * torch.arange(len(index), device=index.device)[:, None]).flatten()
 
@@ -216,21 +216,21 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         frame_index,
         point_index,
         camera_index,
-        is_finite & ~as_mask(problem.fixed_frames, is_finite),
-        ~as_mask(problem.fixed_points, points_w[..., 0]),
+        is_finite & ~row_mask("fixed_frames", problem.fixed_frames, is_finite),
+        ~row_mask("fixed_points", problem.fixed_points, points_w[..., 0]),
     )
 
 
 def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points (B, P, 3), and of the observations pixels (B, O, 2), weights (B, O) and mask (B, O)."""
+    """Points (B, N, 3), and of the observations pixels (B, O, 2), weights (B, O) and mask (B, O)."""
     points_w, pixels = problem.points_w, problem.pixels
     if T_cw.shape[2:] != (4, 4) or points_w.shape[-1:] != (3,) or pixels.shape[-1:] != (2,):
         raise ValueError(
-            "T_cw, points_w and pixels must be (F, 4, 4), (P, 3) and (O, 2), not "
+            "T_cw, points_w and pixels must be (K, 4, 4), (N, 3) and (O, 2), not "
             f"{tuple(T_cw.shape[1:])}, {tuple(points_w.shape)} and {tuple(pixels.shape)}"
         )
     batch, count = T_cw.shape[0], pixels.shape[-2]
-    points_w = _over("points_w", "(P, 3)", points_w, (batch, points_w.shape[-2], 3))
+    points_w = _over("points_w", "(N, 3)", points_w, (batch, points_w.shape[-2], 3))
     pixels = _over("pixels", "(O, 2)", pixels, (batch, count, 2))
     weights = torch.ones_like(pixels[..., 0]) if problem.weights is None else problem.weights
     mask = torch.ones_like(pixels[..., 0], dtype=torch.bool) if problem.mask is None else problem.mask
@@ -244,17 +244,17 @@ def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor,
 
 
 def _cameras(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor]:
-    """Parameters (B, C, K) and the camera of each frame (B, F)."""
+    """Parameters (B, C, P) and the camera of each frame (B, K)."""
     params, index = problem.camera.params, problem.camera_index
     if index is None:
-        params = _over("camera.params", "(K,)", params, (len(T_cw), params.shape[-1]))
+        params = _over("camera.params", "(P,)", params, (len(T_cw), params.shape[-1]))
         return params[:, None], torch.zeros(T_cw.shape[:2], dtype=torch.int64, device=T_cw.device)
-    params = _over("camera.params", "(C, K)", params, (len(T_cw), *params.shape[-2:]))
+    params = _over("camera.params", "(C, P)", params, (len(T_cw), *params.shape[-2:]))
     return params, checked_rows("camera_index", index, T_cw.shape[:2], params.shape[1])
 
 
 def _priors(problem: BundleProblem, T_cw: Tensor, params: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Means and informations (B, F, 4, 4), (B, F, 6, 6), (B, C, K), (B, C, K, K), without rows where there are none."""
+    """Means and informations (B, K, 4, 4), (B, K, 6, 6), (B, C, P), (B, C, P, P), without rows where there are none."""
     (batch, num_frames), (_, num_cameras, size) = T_cw.shape[:2], params.shape
     poses, camera = problem.pose_prior, problem.camera_prior
     if poses is None:
@@ -267,8 +267,8 @@ def _priors(problem: BundleProblem, T_cw: Tensor, params: Tensor) -> tuple[Tenso
         camera = CameraPrior(camera.params[..., None, :], camera.information[..., None, :, :])
     shape, square = (batch, num_cameras, size), (batch, num_cameras, size, size)
     return (
-        _over("pose_prior.T_cw", "(F, 4, 4)", poses.T_cw, (batch, num_frames, 4, 4)),
-        _over("pose_prior.information", "(F, 6, 6)", poses.information, (batch, num_frames, 6, 6)),
+        _over("pose_prior.T_cw", "(K, 4, 4)", poses.T_cw, (batch, num_frames, 4, 4)),
+        _over("pose_prior.information", "(K, 6, 6)", poses.information, (batch, num_frames, 6, 6)),
         _over("camera_prior.params", "as those of the camera", camera.params, shape),
         _over("camera_prior.information", "a square matrix per camera", camera.information, square),
     )
@@ -282,7 +282,7 @@ def _over(name: str, described: str, tensor: Tensor, shape: tuple[int, ...]) -> 
 
 
 def checked_rows(name: str, index: Tensor, shape: tuple[int, ...], size: int) -> Tensor:
-    """Rows (B, N) that lie in 0 ... size - 1."""
+    """Rows (B, M) that lie in 0 ... size - 1."""
     if index.shape not in (shape, shape[1:]):
         each = "frame" if name == "camera_index" else "observation"
         raise ValueError(f"{name} must have one row per {each}, {shape[-1]}, not {tuple(index.shape)}")
@@ -291,21 +291,8 @@ def checked_rows(name: str, index: Tensor, shape: tuple[int, ...], size: int) ->
     return index.expand(shape)
 
 
-def as_mask(rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:
-    """A bool mask of the shape (B, N) of `like`, of rows given as one, or as indices."""
-    batch, count = like.shape
-    rows = torch.as_tensor(() if rows is None else rows, device=like.device)
-    if rows.dtype == torch.bool:
-        if rows.shape not in ((count,), (batch, count)):
-            raise ValueError(f"a mask of fixed rows must have shape ({count},), not {tuple(rows.shape)}")
-        return rows.expand(batch, count)
-    mask = torch.zeros(count, dtype=torch.bool, device=like.device)
-    mask[rows.long()] = True
-    return mask.expand(batch, count)
-
-
 class PriorTerms(NamedTuple):
-    """Cost (...), and gradients and Hessians over frames, (..., F, 6), (..., F, 6, 6), and the cameras' n free
+    """Cost (...), and gradients and Hessians over frames, (..., K, 6), (..., K, 6, 6), and the cameras' n free
     directions each, (..., C n), (..., C n, C n)."""
 
     cost: Tensor
@@ -315,7 +302,7 @@ class PriorTerms(NamedTuple):
     camera: Tensor
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
-        """The same for frames (..., F, 3, 3) that move along the axes of the world."""
+        """The same for frames (..., K, 3, 3) that move along the axes of the world."""
         frames = rotated(R_cw.mT, rotated(R_cw.mT, self.frames).mT)
         gradient = rotated(R_cw.mT, self.frames_gradient[..., None])[..., 0]
         return self._replace(frames_gradient=gradient, frames=frames)
@@ -324,10 +311,12 @@ class PriorTerms(NamedTuple):
 def prior_terms(
     inputs: BundleInputs, T_cw: Tensor, params: Tensor, moving: Tensor, directions: Tensor | None, exact: bool
 ) -> PriorTerms | None:
-    """The terms at poses (..., F, 4, 4) and parameters (..., C, K); None where there are no priors.
+    """The terms at poses (..., K, 4, 4) and parameters (..., C, P); None where there are no priors.
 
-    moving: (..., F) bool, of which frames the prior counts; directions: (K, n), none where the camera is fixed
-    exact:  the exact Hessian, not that of Gauss and Newton
+    Args:
+        moving: (..., K) bool, of which frames the prior counts
+        directions: (P, n), none where the camera is fixed
+        exact: the exact Hessian, not that of Gauss and Newton
     """
     poses, camera = inputs.pose_prior, inputs.camera_prior
     if poses is None and camera is None:
@@ -352,21 +341,23 @@ def prior_terms(
     return PriorTerms(cost, g_frames, H_frames, g_camera.flatten(-2), block_diagonal(H_camera))
 
 
-def block_diagonal(blocks: Tensor) -> Tensor:
-    """(..., N, D, D) -> (..., N D, N D)."""
+def block_diagonal(blocks: Float[Tensor, "*batch M D D"]) -> Float[Tensor, "*batch MD MD"]:
+    """The block-diagonal matrix of M blocks."""
     rows = torch.diag_embed(blocks.movedim(-3, -1), dim1=-4, dim2=-2)
     return rows.flatten(-2).flatten(-3, -2)
 
 
-def gauge_motions(T_cw: Tensor, origin_w: Tensor) -> Tensor:
-    """How frames (..., F, 4, 4) move along the axes of the world, (..., F, 6, 7): with the scale about a point
+def gauge_motions(T_cw: Float[Tensor, "*batch K 4 4"], origin_w: Tensor) -> Float[Tensor, "*batch K 6 7"]:
+    """How frames (..., K, 4, 4) move along the axes of the world, (..., K, 6, 7): with the scale about a point
     (..., 3) or (..., 1, 3), and with each of the six rigid motions of the world."""
     scaling = torch.nn.functional.pad(transform(T_cw, origin_w[..., None, :]).squeeze(-2), (0, 3))[..., None]
     return rotated(T_cw[..., :3, :3].mT, torch.cat((scaling, -se3_adjoint(T_cw)), dim=-1))
 
 
-def open_motions(motions: Tensor, H_frames: Tensor) -> Tensor:
-    """Of orthonormal motions (..., F, 6, g) of all frames those that priors (..., F, 6, 6) do not hinder; else zero."""
+def open_motions(
+    motions: Float[Tensor, "*batch K 6 g"], H_frames: Float[Tensor, "*batch K 6 6"]
+) -> Float[Tensor, "*batch K 6 g"]:
+    """Of orthonormal motions (..., K, 6, g) of all frames those that priors (..., K, 6, 6) do not hinder; else zero."""
     held = torch.einsum("...fag,...fab,...fbh->...gh", motions, H_frames, motions)
     stiffness, mixtures = torch.linalg.eigh(held)
     is_open = stiffness <= torch.finfo(held.dtype).eps ** 0.5 * stiffness[..., -1:]

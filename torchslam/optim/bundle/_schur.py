@@ -15,6 +15,7 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
@@ -29,33 +30,37 @@ _MANY_FRAMES = 64
 class Tile:
     """A run of points and the free frames that see any of them.
 
-    points: slice of the points; storage: slice of the coupling's rows
-    rows:   (6 n,) int64 rows of the reduced system that belong to the n frames
+    Attributes:
+        points: slice of the points
+        storage: slice of the coupling's rows
+        rows: rows of the reduced system that belong to the n frames
     """
 
     points: slice
     storage: slice
-    rows: Tensor
+    rows: Int[Tensor, " R"]
 
 
 @dataclass(frozen=True)
 class Structure:
     """Which observation joins which frame and which point; made once per problem.
 
-    Free frames have slots 0 ... F-1 in the reduced system. Observations are ordered by frame, those of free frames
+    Free frames have slots 0 ... K-1 in the reduced system. Observations are ordered by frame, those of free frames
     first; points by the first free frame that sees them.
 
-    frame_ends:  for every free frame, the end of its observations
-    by_point:    (O,) the observations ordered by point; point_counts: (P,) how many each point has
-    coupling:    (3 O_free,) storage row of each row of the observations' 3x6 blocks
+    Attributes:
+        frame_ends: for every free frame, the end of its observations
+        by_point: the observations ordered by point
+        point_counts: number of observations of each point
+        coupling: storage row of each row of the observations' 3x6 blocks
     """
 
     num_frames: int
     num_points: int
     frame_ends: list[int]
-    by_point: Tensor
-    point_counts: Tensor
-    coupling: Tensor
+    by_point: Int[Tensor, " O"]
+    point_counts: Int[Tensor, " N"]
+    coupling: Int[Tensor, " R"]
     storage_rows: int
     tiles: list[Tile]
 
@@ -64,22 +69,25 @@ class Structure:
         """How many observations are made by free frames."""
         return self.frame_ends[-1] if self.frame_ends else 0
 
-    def sum_by_point(self, values: Tensor) -> Tensor:
-        """Sums over each point's observations. (O, ...) -> (P, ...)."""
+    def sum_by_point(self, values: Float[Tensor, "O ..."]) -> Float[Tensor, "N ..."]:
+        """Sums over each point's observations. (O, ...) -> (N, ...)."""
         flat = values.flatten(1)[self.by_point]
         total = torch.segment_reduce(flat, "sum", lengths=self.point_counts, unsafe=True)
         return total.view(self.num_points, *values.shape[1:])
 
-    def sum_by_frame(self, values: Tensor) -> Tensor:
-        """Sums over each free frame's observations. (..., O) -> (F, ...)."""
+    def sum_by_frame(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "K ..."]:
+        """Sums over each free frame's observations. (..., O) -> (K, ...)."""
         sums = [values[..., begin:end].sum(-1) for begin, end in pairwise((0, *self.frame_ends))]
         return torch.stack(sums) if sums else values.new_zeros(0, *values.shape[:-1])
 
 
-def build_structure(frame_slots: Tensor, point_index: Tensor, num_frames: int, num_points: int) -> Structure:
+def build_structure(
+    frame_slots: Int[Tensor, " O"], point_index: Int[Tensor, " O"], num_frames: int, num_points: int
+) -> Structure:
     """The structure of observations (O,) in the order of `Structure`.
 
-    frame_slots: slot of the observing frame, `num_frames` for all fixed ones.
+    Args:
+        frame_slots: slot of the observing frame, `num_frames` for all fixed ones.
     """
     counts = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames]
     frame_ends = counts.cumsum(0).tolist()
@@ -124,11 +132,11 @@ def build_structure(frame_slots: Tensor, point_index: Tensor, num_frames: int, n
 
 
 class BundleTangent(NamedTuple):
-    """A vector over all unknowns: frames (F, 6), points (P, 3), camera (K,); K = 0 where the camera is fixed."""
+    """A vector over all unknowns: frames (K, 6), points (N, 3), camera (P,); P = 0 where the camera is fixed."""
 
-    frames: Tensor
-    points: Tensor
-    camera: Tensor
+    frames: Float[Tensor, "K 6"]
+    points: Float[Tensor, "N 3"]
+    camera: Float[Tensor, " P"]
 
     def dot(self, other: BundleTangent) -> Tensor:
         products = (mine * others for mine, others in zip(self, other, strict=True))
@@ -139,27 +147,31 @@ class BundleTangent(NamedTuple):
 class NormalEquations:
     """Gradient and block Hessian of a bundle adjustment's cost.
 
-    frames: (F, 6, 6), points: (P, 3, 3), camera: (K, K), frames_camera: (F, 6, K), points_camera: (P, 3, K),
-    coupling: (storage_rows, 6) the point-frame blocks as the tiles store them,
-    free_points: (P,) bool, the points that move
+    Attributes:
+        coupling: the point-frame blocks as the tiles store them
+        free_points: the points that move
     """
 
     structure: Structure
     gradient: BundleTangent
-    frames: Tensor
-    points: Tensor
-    camera: Tensor
-    frames_camera: Tensor
-    points_camera: Tensor
-    coupling: Tensor
-    free_points: Tensor
+    frames: Float[Tensor, "K 6 6"]
+    points: Float[Tensor, "N 3 3"]
+    camera: Float[Tensor, "P P"]
+    frames_camera: Float[Tensor, "K 6 P"]
+    points_camera: Float[Tensor, "N 3 P"]
+    coupling: Float[Tensor, "R 6"]
+    free_points: Bool[Tensor, " N"]
 
-    def factorized(self, damping: Tensor | None = None, gauge: Tensor | None = None) -> FactorizedEquations:
+    def factorized(
+        self, damping: Float[Tensor, "*#scale"] | None = None, gauge: Float[Tensor, "K 6 g"] | None = None
+    ) -> FactorizedEquations:
         """Eliminate the points and factorize what is left, after the diagonals grew by the share `damping`.
 
         Points that their observations do not determine are left out, as if fixed.
-        gauge: (F, 6, g) directions of the frames along which the solution is set to zero. If they span the null space
-        of the observations, solutions for right sides orthogonal to it do not change.
+
+        Args:
+            gauge: directions of the frames along which the solution is set to zero. If they span
+                the null space of the observations, solutions for right sides orthogonal to it do not change.
         """
         root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
         root = torch.where(self.free_points[:, None, None], root, 0.0)
@@ -174,7 +186,7 @@ class NormalEquations:
         return FactorizedEquations(self, root, whitened, factorize(reduced, strict=damping is None))
 
     def _frames_and_camera(self, damping: Tensor | None) -> Tensor:
-        """The reduced system before elimination, (6 F + K, 6 F + K)."""
+        """The reduced system before elimination, (6 K + P, 6 K + P)."""
         num_frames, num_camera = self.structure.num_frames, self.camera.shape[-1]
         size = 6 * num_frames + num_camera
         reduced = self.frames.new_zeros(size, size)
@@ -192,7 +204,7 @@ class NormalEquations:
         return reduced
 
     def _whitened(self, tile: Tile, root: Tensor) -> Tensor:
-        """A tile's coupling times the inverse root of its points' blocks, (3 p, 6 f + K)."""
+        """A tile's coupling times the inverse root of its points' blocks, (3 p, 6 f + P)."""
         count = tile.points.stop - tile.points.start
         coupling = self.coupling[tile.storage].view(count, 3, len(tile.rows))
         if self.camera.shape[-1]:
@@ -210,13 +222,14 @@ class NormalEquations:
 class FactorizedEquations:
     """Normal equations, ready to be solved for any right side.
 
-    points_root: (P, 3, 3) Q with Q^T Q the inverse of a point's block, zero for points that do not move
-    whitened:    per tile (3 p, 6 f + K)
-    reduced:     factor of the system over frames and camera
+    Attributes:
+        points_root: Q with Q^T Q the inverse of a point's block, zero for points that do not move
+        whitened: per tile (3 p, 6 f + P)
+        reduced: factor of the system over frames and camera
     """
 
     equations: NormalEquations
-    points_root: Tensor
+    points_root: Float[Tensor, "N 3 3"]
     whitened: list[Tensor]
     reduced: DefiniteFactor
 
@@ -264,14 +277,12 @@ class Marginals(NamedTuple):
     """Marginal covariances.
 
     Attributes:
-        frames: (F, 6, 6) of the left perturbations (translation, rotation).
-        points: (P, 3, 3)
-        camera: (K, K)
+        frames: of the left perturbations (translation, rotation).
     """
 
-    frames: Tensor
-    points: Tensor
-    camera: Tensor
+    frames: Float[Tensor, "*batch K 6 6"]
+    points: Float[Tensor, "*batch N 3 3"]
+    camera: Float[Tensor, "*batch P P"]
 
 
 def _damped(blocks: Tensor, damping: Tensor | None) -> Tensor:

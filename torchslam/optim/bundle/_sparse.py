@@ -14,16 +14,17 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.batching import Tensors
+from torchslam.optim._core.implicit import Tensors
 from torchslam.optim._core.residuals import (
     Expansion,
     Linearization,
-    Observations,
+    ReprojectionData,
     exact_expansion_of_each,
     gauss_newton_expansion,
     linearize_each,
@@ -52,26 +53,34 @@ from torchslam.optim.bundle._schur import (
 class SparseLayout:
     """The order in which one bundle adjustment is processed, and what of it moves.
 
-    observations: (O',) rows of the problem's observations that count, in the order of `Structure`
-    frame_index:  (O',) rows of T_cw; point_index: (O',) positions in point_order
-    point_order:  (P,) rows of points_w, in the order of `Structure`; point_rank: (P,) its inverse
-    free_frames:  (F',) rows of T_cw that move; free_points: (P,) bool, in point_order
+    Attributes:
+        observations: rows of the problem's observations that count, in the order of `Structure`
+        frame_index: rows of T_cw
+        point_index: positions in point_order
+        point_order: rows of points_w, in the order of `Structure`
+        point_rank: its inverse
+        free_frames: rows of T_cw that move
+        free_points: in point_order
     """
 
-    observations: Tensor
-    frame_index: Tensor
-    point_index: Tensor
-    point_order: Tensor
-    point_rank: Tensor
-    free_frames: Tensor
-    free_points: Tensor
+    observations: Int[Tensor, " O"]
+    frame_index: Int[Tensor, " O"]
+    point_index: Int[Tensor, " O"]
+    point_order: Int[Tensor, " N"]
+    point_rank: Int[Tensor, " N"]
+    free_frames: Int[Tensor, " K"]
+    free_points: Bool[Tensor, " N"]
     structure: Structure
 
 
 def build_sparse_layout(
-    frame_index: Tensor, point_index: Tensor, counted: Tensor, free_frames: Tensor, free_points: Tensor
+    frame_index: Int[Tensor, " O"],
+    point_index: Int[Tensor, " O"],
+    counted: Bool[Tensor, " O"],
+    free_frames: Bool[Tensor, " K"],
+    free_points: Bool[Tensor, " N"],
 ) -> SparseLayout:
-    """Order the observations (O,) that count; frames (F,) and points (P,) are free or fixed as in `MovingParts`."""
+    """Order the observations (O,) that count; frames (K,) and points (N,) are free or fixed as in `MovingParts`."""
     num_points = len(free_points)
     count = int(free_frames.sum())
     slots = torch.where(free_frames, free_frames.cumsum(0) - 1, count)
@@ -96,13 +105,18 @@ def build_sparse_layout(
 
 
 def assemble_sparse(
-    structure: Structure, expansion: Expansion, rays_w: Tensor, free_points: Tensor, exact: bool
+    structure: Structure,
+    expansion: Expansion,
+    rays_w: Float[Tensor, "3 O"],
+    free_points: Bool[Tensor, " N"],
+    exact: bool,
 ) -> NormalEquations:
     """Normal equations of observations in the order of `structure`, for frames that move along the world's axes.
 
-    expansion: gradient (3 + K, O) and Hessian (3 + K, 3 + K, O) in the points in the world and the camera
-    rays_w:    (3, O) from the observing camera to the point, in the axes of the world
-    exact:     include the second-order terms of the rotation, for the exact Hessian
+    Args:
+        expansion: gradient (3 + P, O) and Hessian (3 + P, 3 + P, O) in the points in the world and the camera
+        rays_w: from the observing camera to the point, in the axes of the world
+        exact: include the second-order terms of the rotation, for the exact Hessian
     """
     gradient, hessian = expansion
     slope, linked = gradient[:3], structure.num_linked
@@ -137,8 +151,8 @@ def assemble_sparse(
     )
 
 
-def product(A: Tensor, B: Tensor) -> Tensor:
-    """A B of matrices (m, 3, O) and (3, n, O). -> (m, n, O)."""
+def product(A: Float[Tensor, "m 3 O"], B: Float[Tensor, "3 n O"]) -> Float[Tensor, "m n O"]:
+    """A B of matrices whose last dimension runs along the observations."""
     first = A[:, 0, None] * B[0]
     return first.addcmul(A[:, 1, None], B[1]).addcmul(A[:, 2, None], B[2])
 
@@ -151,7 +165,7 @@ class SparseModel:
     """
 
     estimate: BundleEstimate
-    cost: Tensor
+    cost: Float[Tensor, " 1"]
     assembled: Callable[[], NormalEquations]
 
     @cached_property
@@ -180,7 +194,7 @@ class SparseBundle:
         directions: Tensor | None,
         camera_of: Tensor,
     ) -> None:
-        """directions: (K, n) in which the parameters move, None where they do not; camera_of: (O,)"""
+        """directions: (P, n) in which the parameters move, None where they do not; camera_of: (O,)"""
         self.layout, self.inputs, self.directions = layout, inputs, directions
         self.camera, self.kernel = camera, kernel
         self.camera_of: Tensor | None = None  # where there are several, of each observation
@@ -236,7 +250,7 @@ class SparseBundle:
         return new if bool(accept) else old
 
     def definite(self, model: SparseModel) -> Tensor:
-        """(1,) whether all that moves is determined, up to the gauge."""
+        """Whether (1,) all that moves is determined, up to the gauge."""
         return model.equations.factorized(gauge=self._gauge(model.estimate)).reduced.definite[None]
 
     def ordered(self, estimate: BundleEstimate) -> BundleEstimate:
@@ -250,7 +264,7 @@ class SparseBundle:
         return BundleEstimate(estimate.T_cw[None], points_w[None], estimate.params[None])
 
     def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
-        """Gauge directions (F', 6, g): the scale, or a similarity; None where the gauge is fixed.
+        """Gauge directions (K', 6, g): the scale, or a similarity; None where the gauge is fixed.
 
         In the axes of the world, as are all vectors of the equations.
         """
@@ -272,7 +286,7 @@ class SparseBundle:
             return motions if priors is None else open_motions(motions, priors.frames)
 
     def _priors(self, estimate: BundleEstimate, exact: bool = False) -> PriorTerms | None:
-        """What the priors on free frames (F') and the cameras add, in the axes of the world."""
+        """What the priors on free frames (K') and the cameras add, in the axes of the world."""
         frames, inputs = self.layout.free_frames, self.inputs
         poses = inputs.pose_prior
         if poses is None and inputs.camera_prior is None:
@@ -286,7 +300,7 @@ class SparseBundle:
         return None if terms is None else terms.in_world(T_cw[:, :3, :3])
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
-        """Covariances (1, F, 6, 6), (1, P, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
+        """Covariances (1, K, 6, 6), (1, N, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
         estimate = self.ordered(estimate)
         seen = self._seen(estimate)
         lin = self._linearize(estimate, seen)
@@ -333,7 +347,7 @@ class SparseBundle:
         return linearize_each(self._observations(estimate), seen.points_c, self.directions is not None)
 
     def _in_world(self, rows: Tensor, R_cw: Tensor) -> Tensor:
-        """Derivatives (m, 3 + K, O') in points_c and the camera, as such in points_w and what moves of all cameras."""
+        """Derivatives (m, 3 + P, O') in points_c and the camera, as such in points_w and what moves of all cameras."""
         points = product(rows[:, :3], R_cw)
         if self.directions is None:
             return points
@@ -343,12 +357,12 @@ class SparseBundle:
             camera = torch.where(self.camera_of == every[:, None, None], camera[:, None], 0.0).flatten(1, 2)
         return torch.cat((points, camera), dim=1)
 
-    def _observed(self, pixels: Tensor, weights: Tensor, params: Tensor) -> Observations:
+    def _observed(self, pixels: Tensor, weights: Tensor, params: Tensor) -> ReprojectionData:
         camera = self.camera.with_params(params)
         camera = camera[0] if self.camera_of is None else camera[self.camera_of]
-        return Observations(pixels, weights, camera, self.kernel, self.inputs.scale)
+        return ReprojectionData(pixels, weights, camera, self.kernel, self.inputs.scale)
 
-    def _observations(self, estimate: BundleEstimate) -> Observations:
+    def _observations(self, estimate: BundleEstimate) -> ReprojectionData:
         if self.directions is None:
             return self.observations
         return self._observed(self.observations.pixels, self.observations.weights, estimate.params)

@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints
@@ -34,14 +35,15 @@ from torchslam.optim._core.numpy_backend import (
     solve_symmetric,
     to_numpy,
 )
-from torchslam.optim.bundle._problem import BundleProblem, as_mask, checked_rows
+from torchslam.optim.bundle._problem import BundleProblem, checked_rows
+from torchslam.utils.indexing import row_mask
 
 
 class NumpyBundleSolution(NamedTuple):
-    """Poses (F, 4, 4) and points (P, 3) of minimal robust cost, and that cost."""
+    """Poses (K, 4, 4) and points (N, 3) of minimal robust cost, and that cost."""
 
-    T_cw: Tensor
-    points_w: Tensor
+    T_cw: Float[Tensor, "K 4 4"]
+    points_w: Float[Tensor, "N 3"]
     cost: float
 
 
@@ -65,7 +67,7 @@ def bundle_adjust_numpy(
 
 
 class _Estimate(NamedTuple):
-    """poses: (F, 3, 4) in order of slots; points: (3, P)"""
+    """poses: (K, 3, 4) in order of slots; points: (3, N)"""
 
     poses: Array
     points: Array
@@ -101,7 +103,7 @@ class _Bundle:
 
     @cached_property
     def cells(self) -> Array:
-        """(18 O',) flat position in the coupling (6 F', 3 P) of each entry of the observations' blocks (6, 3, O')."""
+        """Flat position (18 O',) in the coupling (6 K', 3 N) of each entry of the observations' blocks (6, 3, O')."""
         size, linked = self.start.points.shape[1], self.linked
         row = 6 * self.slot[:linked] + np.arange(6)[:, None]
         column = self.point[:linked] + size * np.arange(3)[:, None]
@@ -136,7 +138,7 @@ class _Bundle:
         return _Estimate(poses, estimate.points - step.points)
 
     def gauge(self, poses: Array) -> Array | None:
-        """(6 F', 1 or 7) gauge directions of the free frames, along the axes of the world: the scale where one frame is
+        """Gauge directions (6 K', 1 or 7) of the free frames, along the axes of the world: the scale where one frame is
         fixed, a similarity where none is; None where more frames are."""
         if len(self.anchors) > 1 or not self.num_free:
             return None
@@ -164,14 +166,14 @@ class _Bundle:
 
 
 def _rows_of(problem: BundleProblem) -> tuple[Array, Array, Array]:
-    """Frame and point of each observation, (O,) twice, and the mask (F,) of the fixed frames."""
+    """Frame and point of each observation, (O,) twice, and the mask (K,) of the fixed frames."""
     names = ("fixed_points", "mask", "camera_index", "pose_prior", "camera_prior")
     if problem.is_batch or any(getattr(problem, name) is not None for name in names):
         raise ValueError(f"the NumPy backend takes one problem without {', '.join(names)}: use bundle_adjust")
     shape = (1, len(problem.pixels))
     frame = checked_rows("frame_index", problem.frame_index, shape, len(problem.T_cw))
     point = checked_rows("point_index", problem.point_index, shape, len(problem.points_w))
-    fixed = as_mask(problem.fixed_frames, problem.T_cw[None, :, 0, 0])
+    fixed = row_mask("fixed_frames", problem.fixed_frames, problem.T_cw[None, :, 0, 0])
     return frame[0].cpu().numpy(), point[0].cpu().numpy(), fixed[0].cpu().numpy()
 
 
@@ -259,7 +261,7 @@ class _Model:
 
 
 class _Step(NamedTuple):
-    """Steps of the free frames (F', 6), along the axes of the world, and of the points (3, P)."""
+    """Steps of the free frames (K', 6), along the axes of the world, and of the points (3, N)."""
 
     frames: Array
     points: Array
@@ -270,7 +272,7 @@ class _Step(NamedTuple):
 class _Equations:
     """Normal equations of frames that move along the axes of the world, as in `bundle._sparse`, and of points.
 
-    frames: (F', 6, 6), frames_gradient: (F', 6); points: (6, P) as `LOWER_3X3`, points_gradient: (3, P)
+    frames: (K', 6, 6), frames_gradient: (K', 6); points: (6, N) as `LOWER_3X3`, points_gradient: (3, N)
     blocks: (6, 3, O') of observations by free frames, frame against point; point: (O',) of each
     cells:  (18 O',) as `_Bundle.cells`
     """
@@ -286,7 +288,7 @@ class _Equations:
     def step(self, damping: float, gauge: Array | None) -> _Step | None:
         """The step to the minimum of the damped model; None where there is none.
 
-        gauge: (6 F', g) directions of the frames along which the step is zero
+        gauge: (6 K', g) directions of the frames along which the step is zero
         """
         root = _damped_inverse_root(self.points, damping)
         halves = _lower_times(root, self.points_gradient)
@@ -314,7 +316,7 @@ class _Equations:
         return _Step(frames.reshape(-1, 6), points, predicted_reduction)
 
     def _coupling(self, root: Array) -> Array:
-        """(6 F', 3 P) the blocks of frames against points, times the inverse roots of the points' blocks."""
+        """Blocks (6 K', 3 N) of frames against points, times the inverse roots of the points' blocks."""
         q, blocks = root.take(self.point, axis=1), self.blocks
         whitened = np.empty(blocks.shape)
         whitened[:, 0] = q[0] * blocks[:, 0]
@@ -326,17 +328,17 @@ class _Equations:
 
 
 def _lower_times(q: Array, v: Array) -> Array:
-    """Q v of lower triangles (6, P) and vectors (3, P)."""
+    """Q v of lower triangles (6, N) and vectors (3, N)."""
     return np.stack((q[0] * v[0], q[1] * v[0] + q[2] * v[1], q[3] * v[0] + q[4] * v[1] + q[5] * v[2]))
 
 
 def _upper_times(q: Array, v: Array) -> Array:
-    """Q^T v of lower triangles (6, P) and vectors (3, P)."""
+    """Q^T v of lower triangles (6, N) and vectors (3, N)."""
     return np.stack((q[0] * v[0] + q[1] * v[1] + q[3] * v[2], q[2] * v[1] + q[4] * v[2], q[5] * v[2]))
 
 
 def _damped_inverse_root(blocks: Array, damping: float) -> Array:
-    """(6, P) -> (6, P), as `inverse_root_3x3` of blocks whose diagonals grew by the share `damping`."""
+    """`inverse_root_3x3` of blocks (6, N) whose diagonals grew by the share `damping`."""
     damped = blocks.copy()
     damped[[0, 2, 5]] *= 1 + damping
     return np.stack(inverse_root_3x3(damped))

@@ -12,19 +12,18 @@ from functools import cached_property
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.batching import Tensors
-from torchslam.optim._core.implicit import Backward, Ndims, check_backward, find_minimum
+from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
 from torchslam.optim._core.linear import diagonal_floor, factorize
-from torchslam.optim._core.priors import PosePrior, prior_expansion, prior_hessian
 from torchslam.optim._core.residuals import (
-    Observations,
+    ReprojectionData,
     Weighed,
     exact_expansion,
     linearize,
@@ -33,28 +32,38 @@ from torchslam.optim._core.residuals import (
     variance_factor,
     weigh,
 )
-from torchslam.optim._core.tangent import move, point_jacobian, pull_back, push, retract
+from torchslam.optim._core.tangent import (
+    PosePrior,
+    move,
+    point_jacobian,
+    prior_expansion,
+    prior_hessian,
+    pull_back,
+    push,
+    retract,
+)
 
 
 class PoseModel(NamedTuple):
     """The local model of the cost at poses T_cw (B, 4, 4): cost (B,), gradient (B, 6), hessian (B, 6, 6) in xi.
 
-    hessian: of iteratively reweighted least squares, positive semi-definite, descends from afar
-    curvature_term: (B, 6, 6) what the kernel's curvature adds to it near the optimum, never positive: the steps become
-             Newton's, several times as effective; zero elsewhere
+    Attributes:
+        hessian: of iteratively reweighted least squares, positive semi-definite, for steps far from the optimum
+        curvature_term: curvature of the kernel near the optimum, never positive: the steps become
+            Newton steps, several times as effective; zero elsewhere
     """
 
-    T_cw: Tensor
-    cost: Tensor
-    gradient: Tensor
-    hessian: Tensor
-    curvature_term: Tensor
+    T_cw: Float[Tensor, "B 4 4"]
+    cost: Float[Tensor, " B"]
+    gradient: Float[Tensor, "B 6"]
+    hessian: Float[Tensor, "B 6 6"]
+    curvature_term: Float[Tensor, "B 6 6"]
 
 
 class PoseObservations:
     """Observations (B, N) of known points, laid out for expansions at many poses."""
 
-    def __init__(self, points_w: Tensor, observations: Observations) -> None:
+    def __init__(self, points_w: Float[Tensor, "B N 3"], observations: ReprojectionData) -> None:
         """points_w: (B, N, 3)"""
         self.observations = observations
         camera = observations.camera
@@ -66,7 +75,7 @@ class PoseObservations:
             self.normalized = ((observations.pixels.mT - center) / focal).contiguous()
             self.metric = focal.square()  # (2, 1) or (B, 2, 1)
 
-    def expand(self, T_cw: Tensor, use_curvature: Tensor) -> PoseModel:
+    def expand(self, T_cw: Float[Tensor, "B 4 4"], use_curvature: Bool[Tensor, " B"]) -> PoseModel:
         """The model at T_cw (B, 4, 4); `use_curvature` (B,) says where to add the curvature term."""
         points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self.points_w)
         rows, (cost, weight, curvature_term) = (
@@ -123,7 +132,7 @@ class PoseInputs:
     """What a pose problem is made of: finite tensors, rows that do not count having weight zero."""
 
     points_w: Tensor
-    observations: Observations
+    observations: ReprojectionData
     prior: PosePrior | None
 
     @staticmethod
@@ -168,7 +177,7 @@ class PoseInputs:
         scale = torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device)
         if prior is not None:
             prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
-        observations = Observations(
+        observations = ReprojectionData(
             torch.where(rows, pixels, 0.0), only(use, weights), camera, kernel, scale[..., None]
         )
         return PoseInputs(torch.where(rows, points_w, 0.0), observations, prior)
@@ -227,7 +236,7 @@ class PoseProblem:
             torch.where(matrix, new.curvature_term, 0.0),
         )
 
-    def covariance(self, T_cw: Tensor) -> Tensor:
+    def covariance(self, T_cw: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 6 6"]:
         """Covariances (B, 6, 6) at minima, zero where the pose is not determined."""
         lin = linearize(self.observations, transform(T_cw, self.points_w))
         factor = variance_factor(self.observations, lin, num_parameters=6)[:, None, None]
@@ -236,7 +245,7 @@ class PoseProblem:
             information = information + factor * prior_expansion(self.prior, T_cw)[2]
         return factor * factorize(information).solve(self.eye.expand_as(information))
 
-    def hessian(self, T_cw: Tensor) -> Tensor:
+    def hessian(self, T_cw: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 6 6"]:
         """The exact Hessian (B, 6, 6) of the cost in xi."""
         points_c = transform(T_cw, self.points_w)
         gradient, hessian = exact_expansion(self.observations, points_c)
@@ -316,21 +325,21 @@ class RefinedPose:
     """Poses at the minimum of their robust reprojection error.
 
     Attributes:
-        T_cw: (B, 4, 4) world to camera; the start, without gradient, where `success` is False.
-        cost: (B,) half the sum of robustified squared whitened residuals, detached.
-        success: (B,) bool, the start is finite, and the usable points (at least three) or the prior determine the pose.
+        T_cw: world to camera; the start, without gradient, where `success` is False.
+        cost: half the sum of robustified squared whitened residuals, detached.
+        success: the start is finite, and the usable points (at least three) or the prior determine the pose.
         convergence: iterations and convergence per element.
     """
 
-    T_cw: Tensor
-    cost: Tensor
-    success: Tensor
+    T_cw: Float[Tensor, "B 4 4"]
+    cost: Float[Tensor, " B"]
+    success: Bool[Tensor, " B"]
     convergence: Convergence
     _inputs: PoseInputs = field(repr=False)
 
     @cached_property
-    def covariance(self) -> Tensor:
-        """(B, 6, 6) of the left perturbation (translation, rotation), detached; zero where `success` is False.
+    def covariance(self) -> Float[Tensor, "B 6 6"]:
+        """Covariance of the left perturbation (translation, rotation), detached; zero where `success` is False.
 
         Calibrated by the residuals themselves, so the weights need to be right only up to a factor.
         """
@@ -341,14 +350,14 @@ class RefinedPose:
 
 @full_precision
 def refine_pose(
-    T_cw: Tensor,
-    points_w: Tensor,
-    pixels: Tensor,
+    T_cw: Float[Tensor, "B 4 4"],
+    points_w: Float[Tensor, "#B N 3"],
+    pixels: Float[Tensor, "#B N 2"],
     camera: Camera,
-    weights: Tensor | None = None,
-    mask: Tensor | None = None,
+    weights: Float[Tensor, "#B N"] | Float[Tensor, "#B N 2 2"] | None = None,
+    mask: Bool[Tensor, "#B N"] | None = None,
     kernel: Kernel = "cauchy",
-    scale: Tensor | float = 1.0,
+    scale: Float[Tensor, "*#scale"] | float = 1.0,
     prior: PosePrior | None = None,
     backward: Backward = "implicit",
     iterations: int = 20,
@@ -357,13 +366,11 @@ def refine_pose(
     """Minimize robust reprojection errors over poses by Levenberg-Marquardt, many problems at once.
 
     Args:
-        T_cw: (B, 4, 4) world to camera, the start.
-        points_w: (B, N, 3) or (1, N, 3).
-        pixels: (B, N, 2) or (1, N, 2).
-        camera: of all problems, params (K,), or of one each, (B, K).
-        weights: (B, N) inverse variances in px^-2, or (B, N, 2, 2) inverse covariances, which count where they are
+        T_cw: world to camera, the start.
+        camera: of all problems, params (P,), or of one each, (B, P).
+        weights: inverse variances in px^-2, or (B, N, 2, 2) inverse covariances, which count where they are
             positive definite; one if None.
-        mask: (B, N) bool, the observations that count, all if None. Observations that are not finite never count.
+        mask: the observations that count, all if None. Observations that are not finite never count.
         kernel: robust kernel.
         scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
         prior: Gaussian prior on the poses, in the same units.

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints
@@ -40,31 +41,33 @@ _TOLERANCE = 1e-4  # relative to the cost: a smaller reduction moves the pose by
 class PoseLinearization:
     """The unweighted errors of a frame's points at a pose.
 
-    pose:   (3, 4) world to camera
-    rows:   (7, 2, N) derivatives of the whitened errors in the left perturbation of the pose, then the errors
-    squares, z: (N,) what `squared` and `depths` return
-    like:   type and device of the tensors that properties return
+    Attributes:
+        pose: world to camera
+        rows: derivatives of the whitened errors in the left perturbation of the pose, then the
+            errors
+        squares, z: (N,) what `squared` and `depths` return
+        like: type and device of the tensors that properties return
     """
 
-    pose: Array
-    rows: Array
-    squares: Array
-    z: Array
+    pose: Float[np.ndarray, "3 4"]
+    rows: Float[np.ndarray, "7 2 N"]
+    squares: Float[np.ndarray, " N"]
+    z: Float[np.ndarray, " N"]
     like: Tensor
 
     @property
-    def T_cw(self) -> Tensor:
-        """(4, 4)"""
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera."""
         return self._tensor(np.concatenate((self.pose, ((0.0, 0.0, 0.0, 1.0),))))
 
     @property
-    def squared(self) -> Tensor:
-        """(N,) squared errors in units of the noise; huge for points behind the camera."""
+    def squared(self) -> Float[Tensor, " N"]:
+        """Squared errors in units of the noise; huge for points behind the camera."""
         return self._tensor(self.squares)
 
     @property
-    def depths(self) -> Tensor:
-        """(N,)"""
+    def depths(self) -> Float[Tensor, " N"]:
+        """Depths of the points, in units of the map."""
         return self._tensor(self.z)
 
     def _tensor(self, values: Array) -> Tensor:
@@ -75,8 +78,9 @@ class PoseLinearization:
 class FramePose:
     """A pose of minimal robust cost.
 
-    linearization: at the pose
-    success:       the weighted points determine the pose; otherwise it is the start
+    Attributes:
+        linearization: at the pose
+        success: the weighted points determine the pose; otherwise it is the start
     """
 
     linearization: PoseLinearization
@@ -84,12 +88,12 @@ class FramePose:
     _model: _Model
 
     @property
-    def T_cw(self) -> Tensor:
-        """(4, 4)"""
+    def T_cw(self) -> Float[Tensor, "4 4"]:
+        """World to camera."""
         return self.linearization.T_cw
 
-    def covariance(self) -> Tensor:
-        """(6, 6) of the left perturbation (translation, rotation), as `RefinedPose.covariance`; zero on failure."""
+    def covariance(self) -> Float[Tensor, "6 6"]:
+        """Covariance of the left perturbation (translation, rotation), as `RefinedPose.covariance`; zero on failure."""
         like, model = self.linearization.like, self._model
         if not self.success:
             return like.new_zeros(6, 6)
@@ -100,28 +104,31 @@ class FramePose:
 class FrameProblem:
     """Known points and the keypoints at which one frame observes them."""
 
-    def __init__(self, points_w: Tensor, xy: Tensor, whitened: Tensor) -> None:
+    def __init__(
+        self, points_w: Float[Tensor, "N 3"], xy: Float[Tensor, "2 N"], whitened: Float[Tensor, "2 2 N"]
+    ) -> None:
         """Take the matches, all finite.
 
         Args:
-            points_w: (N, 3)
-            xy: (2, N) undistorted coordinates.
-            whitened: (2, 2, N) as returned by `UndistortedKeypoints.whitened`.
+            xy: undistorted coordinates.
+            whitened: as returned by `UndistortedKeypoints.whitened`.
         """
         self.points_w, self.like = np.ascontiguousarray(to_numpy(points_w).T), points_w.detach()
         self.xy = to_numpy(xy)
         self.along_x, self.along_y = np.ascontiguousarray(to_numpy(whitened))
 
-    def linearize(self, T_cw: Tensor) -> PoseLinearization:
+    def linearize(self, T_cw: Float[Tensor, "4 4"]) -> PoseLinearization:
         """The errors and their derivatives at a pose (4, 4)."""
         return self._linearize(to_numpy(T_cw[:3]))
 
-    def minimize(self, start: PoseLinearization, weights: Tensor, kernel: RobustKernel) -> FramePose:
+    def minimize(
+        self, start: PoseLinearization, weights: Float[Tensor, " N"], kernel: RobustKernel
+    ) -> FramePose:
         """Find the pose of minimal robust cost by Levenberg-Marquardt.
 
         Args:
             start: the linearization at the start.
-            weights: (N,) of the squared errors, not negative; zero where a point does not count.
+            weights: of the squared errors, not negative; zero where a point does not count.
             kernel: robust kernel, of scale `SCALE`.
         """
         counts = to_numpy(weights)
@@ -156,13 +163,16 @@ class FrameProblem:
 
 
 def nearby_pose(
-    expected_T_cw: Tensor, points_w: Tensor, undistorted: UndistortedKeypoints, threshold: float
-) -> Tensor | None:
+    expected_T_cw: Float[Tensor, "4 4"],
+    points_w: Float[Tensor, "N 3"],
+    undistorted: UndistortedKeypoints,
+    threshold: float,
+) -> Float[Tensor, "4 4"] | None:
     """Refine an expected pose without RANSAC, by all matches under a robust kernel, then by those that agree.
 
     Args:
-        expected_T_cw: (4, 4) start.
-        points_w: (N, 3) matched points.
+        expected_T_cw: start.
+        points_w: matched points.
         undistorted: their keypoints.
         threshold: maximum error of a match that agrees, px.
 

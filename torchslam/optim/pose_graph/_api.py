@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.lie import sim3_scale
@@ -14,6 +15,7 @@ from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence
 from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
+from torchslam.utils.indexing import row_mask
 
 # 95 % of the norms of seven standard normal numbers lie below.
 _SCALE = 3.75
@@ -24,23 +26,23 @@ class PoseGraph:
     """Nodes with measured relative similarities, or rigid poses; a batch shares the edges.
 
     Attributes:
-        S_cw: (B, K, 4, 4) or (K, 4, 4) similarities from the world to the nodes, the start.
-        edges: (E, 2) int64 nodes (i, j).
-        S_ji: (B, E, 4, 4) or (E, 4, 4) measurements, from node i to node j.
-        information: (B, E, D, D) or (E, D, D) inverse covariances of log(S_j S_i^-1 S_ji^-1), symmetric, with D = 7:
+        S_cw: similarities from the world to the nodes, the start.
+        edges: nodes (i, j).
+        S_ji: measurements, from node i to node j.
+        information: inverse covariances of log(S_j S_i^-1 S_ji^-1), symmetric, with D = 7:
             translation, rotation, log scale; D = 6 without scale. Or (B, E) or (E,) weights of the identity; one if
             None.
         fixed: rows of nodes, or a (B, K) or (K,) bool mask.
-        mask: (B, E) or (E,) bool, edges that count, all if None.
+        mask: edges that count, all if None.
         with_scale: free the scales of the nodes. If False, the log scale is not part of the error either.
     """
 
-    S_cw: Tensor
-    edges: Tensor
-    S_ji: Tensor
-    information: Tensor | None = None
-    fixed: Tensor | Sequence[int] = (0,)
-    mask: Tensor | None = None
+    S_cw: Float[Tensor, "*#batch K 4 4"]
+    edges: Int[Tensor, "E 2"]
+    S_ji: Float[Tensor, "*#batch E 4 4"]
+    information: Float[Tensor, "*#batch E D D"] | Float[Tensor, "*#batch E"] | None = None
+    fixed: Shaped[Tensor, "..."] | Sequence[int] = (0,)
+    mask: Bool[Tensor, "*#batch E"] | None = None
     with_scale: bool = True
 
 
@@ -49,19 +51,18 @@ class PoseGraphSolution:
     """The minimum of a pose graph; without the B where the graph had none.
 
     Attributes:
-        S_cw: (B, K, 4, 4)
-        cost: (B,) half the sum of robustified squared whitened errors, detached.
-        success: (B,) bool, some node is free, and all free nodes are determined. If False, the estimate is the best
+        cost: half the sum of robustified squared whitened errors, detached.
+        success: some node is free, and all free nodes are determined. If False, the estimate is the best
             one found, but it has no gradient.
-        moved: (B, K) bool. Nodes that are fixed, not finite, or not connected with a fixed node by counted edges stayed
+        moved: Nodes that are fixed, not finite, or not connected with a fixed node by counted edges stayed
             at their start (the identity where that is not a similarity), with a gradient to that start only.
         convergence: iterations and convergence per element of the batch.
     """
 
-    S_cw: Tensor
-    cost: Tensor
-    success: Tensor
-    moved: Tensor
+    S_cw: Float[Tensor, "*batch K 4 4"]
+    cost: Float[Tensor, "*batch"]
+    success: Bool[Tensor, "*batch"]
+    moved: Bool[Tensor, "*batch K"]
     convergence: Convergence
 
 
@@ -69,7 +70,7 @@ class PoseGraphSolution:
 def pose_graph_optimize(
     graph: PoseGraph,
     kernel: Kernel = "huber",
-    scale: Tensor | float = _SCALE,
+    scale: Float[Tensor, "*#scale"] | float = _SCALE,
     backward: Backward = "implicit",
     iterations: int = 30,
     tolerance: float = 1e-8,
@@ -145,7 +146,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
     counted = measured & weighted & nodes[:, edges[:, 0]] & nodes[:, edges[:, 1]]
     if graph.mask is not None:
         counted = counted & graph.mask
-    fixed = (_as_mask(graph.fixed, num_nodes, S_cw.device) & nodes).expand(batch, num_nodes)
+    fixed = row_mask("fixed", graph.fixed, nodes) & nodes
     eye = torch.eye(4, dtype=S_cw.dtype, device=S_cw.device)
     scale = torch.as_tensor(scale, dtype=S_cw.dtype, device=S_cw.device)
     rows = counted[..., None, None]
@@ -176,18 +177,6 @@ def _information(graph: PoseGraph, S_cw: Tensor, batch: int, num_edges: int) -> 
     return (0.5 * (given + given.mT)).expand(batch, num_edges, dims, dims)
 
 
-def _is_similarity(S: Tensor) -> Tensor:
-    """Whether matrices are finite and have a scale. (..., 4, 4) -> (...)."""
+def _is_similarity(S: Float[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
+    """Whether matrices are finite and have a scale."""
     return torch.isfinite(S).flatten(-2).all(-1) & (sim3_scale(S.detach()) > 0)
-
-
-def _as_mask(rows: Tensor | Sequence[int], count: int, device: torch.device) -> Tensor:
-    """A bool mask (count,) of rows, or the mask (B, count) or (count,) that was given."""
-    rows = torch.as_tensor(rows, device=device)
-    if rows.dtype == torch.bool:
-        if rows.shape[-1:] != (count,):
-            raise ValueError(f"a mask of fixed nodes must end in {count}, not have shape {tuple(rows.shape)}")
-        return rows
-    mask = torch.zeros(count, dtype=torch.bool, device=device)
-    mask[rows.long()] = True
-    return mask

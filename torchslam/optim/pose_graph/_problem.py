@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.lie import (
@@ -23,9 +24,8 @@ from torchslam.geometry.lie import (
     skew,
 )
 from torchslam.geometry.robust import Kernel, Robustified, robustify
-from torchslam.optim._core.batching import Tensors
-from torchslam.optim._core.implicit import Ndims
-from torchslam.optim._core.levenberg_marquardt import minimize_batch
+from torchslam.optim._core.implicit import Ndims, Tensors
+from torchslam.optim._core.levenberg_marquardt import minimize_batch, select_models
 from torchslam.optim._core.linear import diagonal_floor
 from torchslam.optim._core.tangent import pull_back_sim3, push_sim3, retract_sim3
 from torchslam.optim.pose_graph._sparse_cholesky import (
@@ -47,8 +47,8 @@ class Groups:
     def of(index: Tensor, count: int) -> Groups:
         return Groups(torch.argsort(index, stable=True), torch.bincount(index, minlength=count))
 
-    def sum(self, values: Tensor) -> Tensor:
-        """(B, N, ...) -> (B, groups, ...)."""
+    def sum(self, values: Float[Tensor, "B N ..."]) -> Float[Tensor, "B G ..."]:
+        """Sums over the rows of each of G groups."""
         shape = (len(self.counts), values.shape[0], *values.shape[2:])
         flat = values.transpose(0, 1).index_select(0, self.order).flatten(1)
         total = torch.segment_reduce(flat, "sum", lengths=self.counts, unsafe=True)
@@ -59,25 +59,29 @@ class Groups:
 class PoseGraphLayout:
     """The discrete part of a pose graph: counted edges, moving nodes, and the order of elimination.
 
-    i, j:     (E,) int64 nodes of the edges
-    counted:  (B, E) bool; moving: (B, K) bool, nodes that counted edges join with a fixed one
-    linking:  (L,) edges that, in some element, join two moving nodes; turned: (L,) bool, whether the block of the pair
-              of nodes is the transpose of the edge's; by_pair: the edges of each pair; by_node: the edges' ends, first
-              all i, then all j, of each node
+    Attributes:
+        i, j: (E,) int64 nodes of the edges
+        moving: nodes that counted edges join with a fixed one
+        linking: edges that, in some element, join two moving nodes; transposed: (L,) bool, whether the block
+            of the pair of nodes is the transpose of the edge's
+        by_pair: the edges of each pair
+        by_node: the edges' ends, first all i, then all j, of each node
     """
 
-    i: Tensor
-    j: Tensor
-    counted: Tensor
-    moving: Tensor
-    linking: Tensor
-    transposed: Tensor
+    i: Int[Tensor, " E"]
+    j: Int[Tensor, " E"]
+    counted: Bool[Tensor, "B E"]
+    moving: Bool[Tensor, "B K"]
+    linking: Int[Tensor, " L"]
+    transposed: Bool[Tensor, " L"]
     by_pair: Groups
     by_node: Groups
     structure: BlockStructure
 
 
-def build_pose_graph_layout(edges: Tensor, counted: Tensor, fixed: Tensor, dims: int) -> PoseGraphLayout:
+def build_pose_graph_layout(
+    edges: Int[Tensor, "E 2"], counted: Bool[Tensor, "B E"], fixed: Bool[Tensor, "B K"], dims: int
+) -> PoseGraphLayout:
     """Find the moving nodes and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
     i, j = edges.unbind(-1)
     num_nodes = fixed.shape[1]
@@ -129,47 +133,50 @@ _DAMPING_SHARE = 1e-4
 class PoseGraphInputs(NamedTuple):
     """All that gradients may flow to: S_cw (B, K, 4, 4), S_ji (B, E, 4, 4), information (B, E, D, D), scale."""
 
-    S_cw: Tensor
-    S_ji: Tensor
-    information: Tensor
+    S_cw: Float[Tensor, "B K 4 4"]
+    S_ji: Float[Tensor, "B E 4 4"]
+    information: Float[Tensor, "B E D D"]
     scale: Tensor
 
 
 class EdgeLinearization(NamedTuple):
     """Errors of the edges and how they change.
 
-    error:   (B, E, D); J: (B, E, D, D) d error / d eta; carry: (B, E, D, D) Ad(X), so that eta = xi_j - carry xi_i
-    weighted_residual: (B, E, D) information @ error; squared: (B, E) error^T information error
-    kernel:  rho and its derivatives (B, E); zero where the edge does not count
-    sigma:   (B, E) the error in log scale, a constant where the scale is fixed
+    Attributes:
+        J: d error / d eta
+        carry: Ad(X), so that eta = xi_j - carry xi_i
+        weighted_residual: information @ error
+        squared: error^T information error
+        kernel: rho and its derivatives (B, E); zero where the edge does not count
+        sigma: the error in log scale, a constant where the scale is fixed
     """
 
-    error: Tensor
-    J: Tensor
-    carry: Tensor
-    weighted_residual: Tensor
-    squared: Tensor
+    error: Float[Tensor, "B E D"]
+    J: Float[Tensor, "B E D D"]
+    carry: Float[Tensor, "B E D D"]
+    weighted_residual: Float[Tensor, "B E D"]
+    squared: Float[Tensor, "B E"]
     kernel: Robustified
-    sigma: Tensor
+    sigma: Float[Tensor, "B E"]
 
     @property
-    def gradient_wrt_eta(self) -> Tensor:
-        """(B, E, D) the gradient of the cost in eta."""
+    def gradient_wrt_eta(self) -> Float[Tensor, "B E D"]:
+        """The gradient of the cost in eta."""
         return (self.J.mT @ (self.kernel.weight[..., None] * self.weighted_residual)[..., None]).squeeze(-1)
 
 
-@dataclass(frozen=True)
-class PoseGraphModel:
+class PoseGraphModel(NamedTuple):
     """The local model of the cost (B,) at nodes S_cw (B, K, 4, 4).
 
-    gradient: (B, K, D); diagonal: (B, K, D, D), across: (B, P, D, D) the Hessian, the identity where nothing moves
+    Attributes:
+        across: the Hessian, the identity where nothing moves
     """
 
-    S_cw: Tensor
-    cost: Tensor
-    gradient: Tensor
-    diagonal: Tensor
-    across: Tensor
+    S_cw: Float[Tensor, "B K 4 4"]
+    cost: Float[Tensor, " B"]
+    gradient: Float[Tensor, "B K D"]
+    diagonal: Float[Tensor, "B K D D"]
+    across: Float[Tensor, "B L D D"]
 
 
 class PoseGraphProblem:
@@ -201,11 +208,7 @@ class PoseGraphProblem:
         return moved, torch.where(factor.definite, predicted_reduction, torch.inf)
 
     def select(self, accept: Tensor, new: PoseGraphModel, old: PoseGraphModel) -> PoseGraphModel:
-        if accept.all():
-            return new
-        names = PoseGraphModel.__dataclass_fields__
-        pairs = ((getattr(new, name), getattr(old, name)) for name in names)
-        return PoseGraphModel(*(torch.where(accept.view(-1, *(1,) * (x.ndim - 1)), x, y) for x, y in pairs))
+        return select_models(accept, new, old)
 
     def factorized(self, model: PoseGraphModel) -> SparseFactor:
         """The undamped equations of a model at a minimum, ready to be solved."""
@@ -271,7 +274,12 @@ class PoseGraphProblem:
 
 
 def linearize_edges(
-    S_cw: Tensor, i: Tensor, j: Tensor, counted: Tensor, inputs: PoseGraphInputs, kernel: Kernel
+    S_cw: Float[Tensor, "B K 4 4"],
+    i: Int[Tensor, " E"],
+    j: Int[Tensor, " E"],
+    counted: Bool[Tensor, "B E"],
+    inputs: PoseGraphInputs,
+    kernel: Kernel,
 ) -> EdgeLinearization:
     """Errors of the edges from nodes i to j, (E,) each, and how they change; counted: (B, E)."""
     dims = inputs.information.shape[-1]
@@ -287,8 +295,8 @@ def linearize_edges(
     return EdgeLinearization(error, J, carry, weighted_residual, squared, robust, sigma)
 
 
-def _bracket(gradient_wrt_eta: Tensor) -> Tensor:
-    """Half of force . [a, b] as a bilinear form a^T M b of tangent vectors. (..., D) -> (..., D, D)."""
+def _bracket(gradient_wrt_eta: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D D"]:
+    """Half of force . [a, b] as a bilinear form a^T M b of tangent vectors."""
     v, omega = skew(gradient_wrt_eta[..., :3]), skew(gradient_wrt_eta[..., 3:6])
     M = torch.cat((torch.cat((torch.zeros_like(v), -v), -1), torch.cat((-v, -omega), -1)), dim=-2)
     if gradient_wrt_eta.shape[-1] == 7:

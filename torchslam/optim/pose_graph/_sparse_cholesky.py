@@ -16,6 +16,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.optim._core.linear import smallest_pivot
@@ -121,16 +122,18 @@ def _separator(levels: list[list[int]]) -> tuple[list[int], tuple[list[int], lis
 class Front:
     """A dense matrix over some nodes: those eliminated, then those joined with them.
 
-    size:    (eliminated, all) scalar rows of the front
-    rows:    (size[1],) int64 rows of the whole system
-    entries: (m,) int64 blocks of the system that first appear here, at block row and column `places` (2, m)
-    parent:  the front that takes what remains, at its scalar rows `parent_rows`; -1 where nothing remains
+    Attributes:
+        size: (eliminated, all) scalar rows of the front
+        rows: rows of the whole system
+        entries: blocks of the system that first appear here, at block row and column `places` (2,
+            m)
+        parent: the front that takes what remains, at its scalar rows `parent_rows`; -1 where nothing remains
     """
 
     size: tuple[int, int]
-    rows: Tensor
-    entries: Tensor
-    places: Tensor
+    rows: Int[Tensor, " n"]
+    entries: Int[Tensor, " m"]
+    places: Int[Tensor, "2 m"]
     parent: int
     parent_rows: Tensor
 
@@ -139,16 +142,17 @@ class Front:
 class BlockStructure:
     """Which nodes are joined, and the order of elimination; made once per problem.
 
-    pairs: (P, 2) int64, every joined pair once
+    Attributes:
+        pairs: every joined pair once
     """
 
     num_nodes: int
     dims: int
-    pairs: Tensor
+    pairs: Int[Tensor, "L 2"]
     fronts: list[Front]
 
 
-def build_block_structure(num_nodes: int, dims: int, pairs: Tensor) -> BlockStructure:
+def build_block_structure(num_nodes: int, dims: int, pairs: Int[Tensor, "L 2"]) -> BlockStructure:
     """The structure of a system with (dims, dims) blocks for `num_nodes` nodes and the pairs (P, 2) of them."""
     device, listed = pairs.device, pairs.tolist()
     ordered = dissect(num_nodes, listed)
@@ -188,18 +192,20 @@ def build_block_structure(num_nodes: int, dims: int, pairs: Tensor) -> BlockStru
 class SparseFactor:
     """Cholesky factors of systems that were scaled to a unit diagonal.
 
-    scale:    (B, K * D) such that scale * matrix * scale has a unit diagonal
-    factors:  per front the lower triangle (B, n, n) of the eliminated nodes, and the rows below it (B, m, n)
-    definite: (B,) bool, the matrix is positive definite, whatever its units
+    Attributes:
+        scale: such that scale * matrix * scale has a unit diagonal
+        factors: per front the lower triangle (B, n, n) of the eliminated nodes, and the rows below it (B, m,
+            n)
+        definite: the matrix is positive definite, whatever its units
     """
 
     structure: BlockStructure
-    scale: Tensor
+    scale: Float[Tensor, "B KD"]
     factors: list[tuple[Tensor, Tensor]]
-    definite: Tensor
+    definite: Bool[Tensor, " B"]
 
-    def solve(self, right: Tensor) -> Tensor:
-        """matrix^-1 right, zero where the matrix is not definite. (B, K, D) -> (B, K, D)."""
+    def solve(self, right: Float[Tensor, "B K D"]) -> Float[Tensor, "B K D"]:
+        """matrix^-1 right, zero where the matrix is not definite."""
         x = (self.scale * right.flatten(1))[..., None]
         halves = []
         for front, (lower, below) in zip(self.structure.fronts, self.factors, strict=True):
@@ -220,16 +226,18 @@ class SparseFactor:
 
 def factorize_sparse(
     structure: BlockStructure,
-    diagonal: Tensor,
-    across: Tensor,
-    damping: Tensor | None = None,
+    diagonal: Float[Tensor, "B K D D"],
+    across: Float[Tensor, "B L D D"],
+    damping: Float[Tensor, " B"] | None = None,
     strict: bool = True,
 ) -> SparseFactor:
     """Cholesky factorization of symmetric block systems that never raises.
 
-    diagonal: (B, K, D, D) blocks of the nodes; across: (B, P, D, D) blocks at (pairs[p, 0], pairs[p, 1])
-    damping:  (B,) share by which the diagonal grows
-    strict:   count a matrix as definite only if it is clearly so, beyond rounding
+    Args:
+        diagonal: blocks of the nodes
+        across: blocks at (pairs[p, 0], pairs[p, 1])
+        damping: relative increase of the diagonal
+        strict: count a matrix as definite only if it is clearly so, beyond rounding
     """
     d = diagonal.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(d > 0, d, 1.0).rsqrt()
