@@ -218,7 +218,7 @@ def test_scale_consistency() -> None:
     T_2w[2, 3] = -2.0  # two meters ahead: the point appears twice as large
     scales = torch.tensor([2.0, 1.0, 4.0], dtype=torch.float64)
     consistent = has_consistent_scale(
-        points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, (scales[1], 2 * scales[2])
+        points_w, T_1w, T_2w, torch.ones(3, dtype=torch.float64), scales, (scales[1:2], 2 * scales[2:])
     )
     assert consistent.tolist() == [True, False, False]
 

@@ -17,7 +17,7 @@ from torchslam.system.front_end import Simulated
 from torchslam.system.local_mapping import TentativeMapping
 from torchslam.tracking import backward_tracking as backwards
 from torchslam.tracking import pose_validation
-from torchslam.tracking.non_static import NOTHING
+from torchslam.tracking.non_static import NO_MOVEMENT
 from torchslam.types import Reason, Rejection
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
@@ -112,11 +112,11 @@ def test_a_pose_that_disagrees_with_its_matches_is_not_mapped(
     )
     if judge == "detect_independent_motion":
         monkeypatch.setattr(following, "check_map_agreement", lambda *_: None)
-        moving = replace(NOTHING, rejection=ODD)
+        moving = replace(NO_MOVEMENT, rejection=ODD)
         monkeypatch.setattr(
             slam.non_static_filter,
             "detect_independent_motion",
-            lambda _: moving if slam.last_frame and slam.last_frame[0] in DOUBTED else NOTHING,
+            lambda _: moving if slam.last_frame and slam.last_frame[0] in DOUBTED else NO_MOVEMENT,
         )
     grown: list[int] = []
     states = shown(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.config import KeyframesConfig
@@ -18,15 +19,16 @@ from torchslam.map.atlas import Submap
 from torchslam.map.compaction import RowRemap, remove_keyframes
 from torchslam.map.map import Map
 
-MIN_COVERED_RATIO, MIN_OBSERVERS = (
-    0.9,
-    3,
-)  # ratio of a keyframe's points that so many other keyframes must observe
-MAX_SCALE_RATIO = 1.25  # one pyramid level (a factor of 1.2) coarser is accepted
-NUM_NEWEST_KEPT = (
-    8  # keyframes that are never culled: their points are recent, and tracking continues from them
-)
-NUM_COVISIBLE = 20  # keyframes that are checked around each new one
+MIN_COVERED_RATIO = 0.9
+"""Ratio of a keyframe's points that other keyframes must observe."""
+MIN_OBSERVERS = 3
+"""Number of other keyframes that must observe each of these points."""
+MAX_SCALE_RATIO = 1.25
+"""Ratio of scales up to which an observation counts: one pyramid level (a factor of 1.2) coarser is accepted."""
+NUM_NEWEST_KEPT = 8
+"""Newest keyframes, which are never culled: their points are recent, and tracking continues from them."""
+NUM_COVISIBLE = 20
+"""Keyframes that are checked around each new one."""
 # Culling runs after this many new keyframes, or a sixteenth of the map: copying rows then costs O(1) per keyframe.
 _LEAST_BATCH, _BATCH_SHARE = 8, 16
 
@@ -45,8 +47,8 @@ def cull_keyframes(submap: Submap, settings: KeyframesConfig) -> RowRemap | None
     return renumbering
 
 
-def cull_candidates(submap: Submap) -> Tensor:
-    """Return keyframes (k,) covisible with those inserted since the last culling, the newest first."""
+def cull_candidates(submap: Submap) -> Int[Tensor, " R"]:
+    """Return keyframes covisible with those inserted since the last culling, the newest first."""
     slam_map = submap.map
     candidates = slam_map.covisibility_union(
         slam_map.index_tensor(*range(submap.num_cull_checked, slam_map.num_keyframes)), NUM_COVISIBLE
@@ -55,8 +57,10 @@ def cull_candidates(submap: Submap) -> Tensor:
     return candidates[may_go & (candidates != submap.tracking.reference)].flip(0)
 
 
-def redundant_keyframes(submap: Submap, candidates: Tensor, settings: KeyframesConfig) -> Tensor:
-    """Return (K,) bool: which candidates (k,) are redundant, decided one after the other."""
+def redundant_keyframes(
+    submap: Submap, candidates: Int[Tensor, " R"], settings: KeyframesConfig
+) -> Bool[Tensor, " K"]:
+    """Return which keyframes, of the candidates, are redundant, decided one after the other."""
     removed = torch.zeros(submap.map.num_keyframes, dtype=torch.bool, device=candidates.device)
     for keyframe in candidates.tolist():
         removed[keyframe] = is_covered(submap.map, keyframe, removed) and has_keyframe_nearby(
@@ -65,7 +69,7 @@ def redundant_keyframes(submap: Submap, candidates: Tensor, settings: KeyframesC
     return removed
 
 
-def is_covered(slam_map: Map, keyframe: int, removed: Tensor) -> bool:
+def is_covered(slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"]) -> bool:
     """Whether enough remaining keyframes observe the points of a keyframe at a similar or finer scale."""
     seen = slam_map.observations(slam_map.index_tensor(keyframe))
     observers, scales = slam_map.observers_and_scales(seen.point_index)
@@ -78,7 +82,9 @@ def is_covered(slam_map: Map, keyframe: int, removed: Tensor) -> bool:
     return float((counts.sum(1) >= MIN_OBSERVERS).double().mean()) >= MIN_COVERED_RATIO if len(seen) else True
 
 
-def has_keyframe_nearby(slam_map: Map, keyframe: int, removed: Tensor, settings: KeyframesConfig) -> bool:
+def has_keyframe_nearby(
+    slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"], settings: KeyframesConfig
+) -> bool:
     """Whether a remaining keyframe is so close that a frame at this pose would not become a keyframe."""
     covisible = slam_map.covisible_keyframes(keyframe, NUM_COVISIBLE)
     covisible = covisible[~removed[covisible]]
@@ -89,13 +95,10 @@ def has_keyframe_nearby(slam_map: Map, keyframe: int, removed: Tensor, settings:
     return bool(((translation <= settings.max_translation) & (rotation <= settings.max_rotation_deg)).any())
 
 
-def remove_masked_observations(submap: Submap, is_masked: Callable[[Tensor], Tensor]) -> None:
-    """Remove observations of the local keyframes at masked pixels.
-
-    Args:
-        submap: The submap that is tracked.
-        is_masked: Maps pixels (n, 2) to (n,) bool.
-    """
+def remove_masked_observations(
+    submap: Submap, is_masked: Callable[[Float[Tensor, "N 2"]], Bool[Tensor, " N"]]
+) -> None:
+    """Remove observations of the local keyframes at pixels for which `is_masked` is true."""
     slam_map = submap.map
     seen = slam_map.observations(torch.sort(submap.tracking.local_keyframes).values)
     slam_map.remove_masked_observations(seen, is_masked(seen.pixels))

@@ -14,6 +14,7 @@ from enum import Enum
 from typing import Protocol
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import BundleAdjustmentConfig
@@ -34,24 +35,24 @@ class BundleWindow:
     """A part of the map that is adjusted at once.
 
     Attributes:
-        keyframes: (k,) rows, ascending
-        point_ids: (p,) rows
-        seen: observations of the points by the keyframes
-        problem: the same, as a bundle adjustment problem
+        keyframes: rows, ascending.
+        point_ids: rows, ascending.
+        seen: observations of the points by the keyframes.
+        problem: the same, as a bundle adjustment problem.
     """
 
-    keyframes: Tensor
-    point_ids: Tensor
+    keyframes: Int[Tensor, " K"]
+    point_ids: Int[Tensor, " N"]
     seen: Observations
     problem: BundleProblem
 
 
 @dataclass(frozen=True)
 class BundleResult:
-    """The solution of a window: T_cw (k, 4, 4), points_w (p, 3), and covariances if requested."""
+    """The solution of a window, with covariances if requested."""
 
-    T_cw: Tensor
-    points_w: Tensor
+    T_cw: Float[Tensor, "K 4 4"]
+    points_w: Float[Tensor, "N 3"]
     marginals: Marginals | None
 
 
@@ -111,21 +112,23 @@ def adjust_all(
 
 def adjust_keyframes(
     slam_map: Map,
-    free: Tensor,
-    fixed: Tensor,
+    free: Int[Tensor, " K"],
+    fixed: Int[Tensor, " R"],
     camera: Camera,
     iterations: int,
     covariances: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Minimize the reprojection error over the free keyframes (k,) and their points, then remove outliers."""
+    """Minimize the reprojection error over the free keyframes and their points, then remove outliers."""
     window = build_window(slam_map, free, fixed, camera)
     if window is not None:
         apply_result(slam_map, window, solve(window.problem, iterations, covariances, progress), camera)
 
 
-def build_window(slam_map: Map, free: Tensor, fixed: Tensor, camera: Camera) -> BundleWindow | None:
-    """Build the problem of free keyframes (k,), their points and the fixed keyframes; None if nothing is observed."""
+def build_window(
+    slam_map: Map, free: Int[Tensor, " K"], fixed: Int[Tensor, " R"], camera: Camera
+) -> BundleWindow | None:
+    """Build the problem of free keyframes, their points and the fixed keyframes; None if nothing is observed."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
     seen = slam_map.observations(keyframes)
     rows = true_indices(is_among(seen.point_index, slam_map.observed_points(free)))
@@ -187,7 +190,7 @@ def remove_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
     slam_map.remove_masked_observations(seen, wrong)
 
 
-def select(seen: Observations, rows: Tensor) -> Observations:
+def select(seen: Observations, rows: Int[Tensor, " R"]) -> Observations:
     """Select observations by index."""
     columns = (getattr(seen, name) for name in Observations.__dataclass_fields__)
     return Observations(*(column.index_select(0, rows) for column in columns))
@@ -221,7 +224,10 @@ class AdjustmentRequest:
     """A requested adjustment: applied after frame `due`, or before the next frame if `due` is None.
 
     Attributes:
-        version: `Map.version` at the time of the request
+        due: index of a frame, or None.
+        slam_map: the map.
+        keyframe: row of the keyframe around which to adjust.
+        version: `Map.version` at the time of the request.
     """
 
     due: int | None
@@ -232,7 +238,7 @@ class AdjustmentRequest:
 
 @dataclass(frozen=True)
 class RunningAdjustment:
-    """A started adjustment; both None if there is nothing to adjust."""
+    """A started adjustment and its pending result; both None if there is nothing to adjust."""
 
     window: BundleWindow | None
     result: PendingResult | None

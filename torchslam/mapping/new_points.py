@@ -12,6 +12,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
@@ -31,24 +32,27 @@ from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_line
 from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchPrior
 
+RADIUS_PX = 3.0
+"""Search radius around the projection in fusion, at the finest pyramid level."""
+
 
 def triangulate_against(
     slam_map: Map,
     keyframe: int,
-    neighbors: Tensor,
+    neighbors: Int[Tensor, " K"],
     camera: Camera,
     config: Config,
     matcher: Matcher | None = None,
     normalize: Callable[[Tensor], Tensor] | None = None,
 ) -> None:
-    """Add new points that a keyframe and neighbors (k,) observe with enough parallax.
+    """Add new points that a keyframe and its neighbors observe with enough parallax.
 
     If a keypoint makes points with several neighbors, the first one counts.
 
     Args:
         slam_map: The map.
         keyframe: Row of the new keyframe.
-        neighbors: (k,) rows of the keyframes to triangulate against.
+        neighbors: Rows of the keyframes to triangulate against.
         camera: The camera of all keyframes.
         config: The configuration.
         matcher: A custom matcher; by default descriptors along epipolar lines.
@@ -66,14 +70,15 @@ def triangulate_against(
 
 
 class NewPointMatches(NamedTuple):
-    """Matches (m,) of a keyframe: index of the neighbor, rows of free keypoints of both, and weights."""
+    """Matches of a keyframe: index of the neighbor, rows of free keypoints of both, and weights."""
 
-    which: Tensor
-    at_1: Tensor
-    at_2: Tensor
-    weights: Tensor | None
+    which: Int[Tensor, " M"]
+    at_1: Int[Tensor, " M"]
+    at_2: Int[Tensor, " M"]
+    weights: Float[Tensor, " M"] | None
 
-    def select(self, rows: Tensor) -> NewPointMatches:
+    def select(self, rows: Int[Tensor, " R"]) -> NewPointMatches:
+        """Some of the matches, by index."""
         weights = None if self.weights is None else self.weights[rows]
         return NewPointMatches(self.which[rows], self.at_1[rows], self.at_2[rows], weights)
 
@@ -147,9 +152,13 @@ def _triangulate(
 
 
 def _observe(
-    slam_map: Map, keyframes: int | Tensor, rows: Tensor, ids: Tensor, weights: Tensor | None
+    slam_map: Map,
+    keyframes: int | Int[Tensor, " N"],
+    rows: Int[Tensor, " N"],
+    ids: Int[Tensor, " N"],
+    weights: Float[Tensor, " N"] | None,
 ) -> None:
-    """Add observations of points (n,) by keypoints (n,) of keyframes, one or (n,), with optional weights (n,)."""
+    """Add observations of points by keypoints of one keyframe or of one each, with optional weights."""
     slam_map.add_observations(keyframes, rows, ids)
     if weights is not None:
         slam_map.scale_information(keyframes, rows, weights)
@@ -167,8 +176,8 @@ def match_each(
     here: FreeKeypoints,
     there: FreeKeypoints,
     priors: list[MatchPrior],
-) -> tuple[Tensor, Tensor, Tensor, Tensor | None]:
-    """Match the first view with each of the others, like `match_along_epipolar_lines`; return weights (m,) as well."""
+) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"], Int[Tensor, " M"], Float[Tensor, " M"] | None]:
+    """Match the first view with each of the others, like `match_along_epipolar_lines`; return weights as well."""
     parts, weights = [], []
     for row, (view, prior) in enumerate(zip(views[1:], priors, strict=True)):
         pairs = run_matcher(matcher, views[0], view, prior)
@@ -180,14 +189,16 @@ def match_each(
     return which, at_1, at_2, torch.cat(weights) if len(weights) == len(parts) else None
 
 
-def slots_among(rows: Tensor) -> Tensor:
-    """Return (N,) the position of each of N keypoints among rows (n,), arbitrary for missing ones."""
+def slots_among(rows: Int[Tensor, " N"]) -> Int[Tensor, " R"]:
+    """Return the position of each keypoint among rows, arbitrary for missing ones."""
     found = torch.zeros(int(rows.max()) + 1 if len(rows) else 1, dtype=torch.int64, device=rows.device)
     return found.index_put((rows.flip(0),), torch.arange(len(rows), device=rows.device).flip(0))
 
 
-def has_baseline(slam_map: Map, keyframe: int, neighbors: Tensor, least: float) -> Tensor:
-    """Return (k,) bool: whether the baseline to neighbors (k,) is at least a ratio of the neighbor's median depth."""
+def has_baseline(
+    slam_map: Map, keyframe: int, neighbors: Int[Tensor, " K"], least: float
+) -> Bool[Tensor, " K"]:
+    """Return whether the baseline to neighbors is at least a ratio of the neighbor's median depth."""
     T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbors]
     seen = slam_map.keyframes["point_ids"][neighbors]
     depths = transform(T_2w, slam_map.positions_w[seen])[..., 2]
@@ -197,17 +208,24 @@ def has_baseline(slam_map: Map, keyframe: int, neighbors: Tensor, least: float) 
 
 
 def has_consistent_scale(
-    points_w: Tensor,
-    T_1w: Tensor,
-    T_2w: Tensor,
-    scale_1: Tensor,
-    scale_2: Tensor,
-    scale_range: tuple[Tensor, ...],
+    points_w: Float[Tensor, "*#batch N 3"],
+    T_1w: Float[Tensor, "*#batch 4 4"],
+    T_2w: Float[Tensor, "*#batch 4 4"],
+    scale_1: Float[Tensor, "*#batch N"],
+    scale_2: Float[Tensor, "*#batch N"],
+    scale_range: tuple[Float[Tensor, "*#batch #N"], ...],
     factor: float = 1.8,
-) -> Tensor:
-    """Return (..., n) bool: whether the scales in two images agree with the distances of the point.
+) -> Bool[Tensor, "*#batch N"]:
+    """Return whether the scales in two images agree with the distances of the point.
 
-    points_w: (..., n, 3); scale_1, scale_2: (..., n); scale_range: the finest and the coarsest of the second image
+    Args:
+        points_w: points.
+        T_1w: pose of the first image.
+        T_2w: pose of the second image.
+        scale_1: scale of the keypoint in the first image, pixels.
+        scale_2: scale of the keypoint in the second image, pixels.
+        scale_range: the finest and the coarsest scale of the second image.
+        factor: by which the scales may differ from the expected ratio.
     """
     distance_1 = torch.linalg.vector_norm(transform(T_1w, points_w), dim=-1)
     distance_2 = torch.linalg.vector_norm(transform(T_2w, points_w), dim=-1)
@@ -215,10 +233,7 @@ def has_consistent_scale(
     return (scale_2 < factor * expected) & (scale_2 * factor > expected)
 
 
-RADIUS_PX = 3.0  # around the projection, at the finest pyramid level
-
-
-def fuse(slam_map: Map, keyframe: int, neighbors: Tensor, camera: Camera, config: Config) -> None:
+def fuse(slam_map: Map, keyframe: int, neighbors: Int[Tensor, " K"], camera: Camera, config: Config) -> None:
     """Match the points of a keyframe in its covisible keyframes and theirs in it, and merge duplicates."""
     here = slam_map.index_tensor(keyframe)
     own = slam_map.observed_points(here)
@@ -229,11 +244,15 @@ def fuse(slam_map: Map, keyframe: int, neighbors: Tensor, camera: Camera, config
 
 
 def match_in_keyframes(
-    slam_map: Map, keyframes: Tensor, point_ids: Tensor, camera: Camera, config: Config
-) -> tuple[Tensor, Tensor]:
-    """Match points (n,) by projection into keyframes (k,) that do not observe them yet.
+    slam_map: Map,
+    keyframes: Int[Tensor, " K"],
+    point_ids: Int[Tensor, " N"],
+    camera: Camera,
+    config: Config,
+) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
+    """Match points by projection into keyframes that do not observe them yet.
 
-    Matches with free keypoints become observations. Returns the other matches as pairs (m,), (m,) of duplicate points:
+    Matches with free keypoints become observations. Returns the other matches as pairs of duplicate points:
     the matched point and the one that the keypoint already observes.
     """
     if len(keyframes) == 0 or len(point_ids) == 0:
@@ -269,8 +288,8 @@ def match_in_keyframes(
     return ids[~is_free], taken[~is_free]
 
 
-def merge_points(slam_map: Map, found: Tensor, there: Tensor) -> None:
-    """Merge pairs of points (m,), (m,); of each group of duplicates the point with most observations stays."""
+def merge_points(slam_map: Map, found: Int[Tensor, " M"], there: Int[Tensor, " M"]) -> None:
+    """Merge pairs of points; of each group of duplicates the point with most observations stays."""
     pairs = torch.stack([found, there], dim=1)
     counts = slam_map.points["times_observed"][pairs]
     observed = dict(zip(pairs.flatten().tolist(), counts.flatten().tolist(), strict=True))

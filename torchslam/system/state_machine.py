@@ -17,7 +17,7 @@ from torchslam.mapping.mapper import MapInitializer
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, TentativeMapping
 from torchslam.system.session import SystemContext
 from torchslam.tracking.initialization import Initializer, ProvisionalMap
-from torchslam.tracking.non_static import NOTHING
+from torchslam.tracking.non_static import NO_MOVEMENT
 from torchslam.tracking.pose_validation import check_map_agreement, check_pose_quality
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
@@ -30,7 +30,7 @@ class FrameOutcome:
     Attributes:
         reasons: why the frame has no pose, an uncertain one, or became a keyframe.
         submap: the submap in which it has a pose; None without a pose.
-        estimate: pose and inliers; None if the frame was not tracked.
+        estimate: pose and inliers; None without a pose, and for a frame that initialized the submap.
         is_keyframe: True if it became a keyframe.
     """
 
@@ -43,7 +43,8 @@ class FrameOutcome:
 class InitializationState:
     """Creates submaps from two views.
 
-    provisional: the active submap, until enough frames were tracked in it to confirm it
+    Attributes:
+        provisional: the active submap, until enough frames were tracked in it to confirm it.
     """
 
     def __init__(self, context: SystemContext, backward: BackwardTracking) -> None:
@@ -274,14 +275,16 @@ class StateMachine:
             estimate = context.tracker.track(submap, view, is_sure=is_sure)
         if estimate is None:
             return self._on_lost(view)
-        bad_quality = check_pose_quality(estimate, expected, context.config.pose_validation)
-        doubt = bad_quality or check_map_agreement(estimate, submap.tracking, context.config.pose_validation)
-        motion = NOTHING if doubt else context.non_static_filter.detect_independent_motion(estimate)
-        if not (doubt or motion.rejection or context.confirmation.is_holding):
-            return self._on_confident(view, estimate, motion.note)
-        if not bad_quality and not motion.rejection and self._maps_tentatively(doubt):
+        quality_rejection = check_pose_quality(estimate, expected, context.config.pose_validation)
+        rejection = quality_rejection or check_map_agreement(
+            estimate, submap.tracking, context.config.pose_validation
+        )
+        motion = NO_MOVEMENT if rejection else context.non_static_filter.detect_independent_motion(estimate)
+        if not (rejection or motion.rejection or context.confirmation.is_holding):
+            return self._on_certain(view, estimate, motion.note)
+        if not quality_rejection and not motion.rejection and self._may_map_tentatively(rejection):
             self.tentative.add_keyframe(submap, view, estimate)
-        return self._on_uncertain(view, estimate, doubt or motion.rejection)
+        return self._on_uncertain(view, estimate, rejection or motion.rejection)
 
     def finalize(self) -> None:
         """End the session: frames that are held back keep their poses, uncertain as they are."""
@@ -297,7 +300,7 @@ class StateMachine:
             self.mapping.apply_adjustment(self.active_map.current)
         self.initialization.confirm_map()
 
-    def _on_confident(
+    def _on_certain(
         self, view: FrameFeatures, estimate: PoseEstimate, motion: Explanation | None
     ) -> FrameOutcome:
         """Map the frame, close loops, remove static overlays, confirm a provisional map.
@@ -341,21 +344,22 @@ class StateMachine:
             return ApplyAt.BEFORE_NEXT_FRAME
         return ApplyAt.AFTER_DELAY
 
-    def _maps_tentatively(self, doubt: Rejection | None) -> bool:
-        """Whether to map frames that are held back: not a relocalized camera whose pose is not in doubt."""
-        return bool(doubt or self.tentative.has_keyframes) and not self.context.confirmation.is_relocalized
+    def _may_map_tentatively(self, rejection: Rejection | None) -> bool:
+        """Whether a frame that is held back may become a tentative keyframe; never after a relocalization."""
+        is_doubtful = rejection is not None or self.tentative.has_keyframes
+        return is_doubtful and not self.context.confirmation.is_relocalized
 
     def _on_uncertain(
-        self, view: FrameFeatures, estimate: PoseEstimate, doubt: Rejection | None
+        self, view: FrameFeatures, estimate: PoseEstimate, rejection: Rejection | None
     ) -> FrameOutcome:
-        """Hold the frame back; enough frames in a row without doubt confirm all that are held back."""
+        """Hold the frame back; enough frames in a row without a rejection confirm all that are held back."""
         submap, confirmation = self.active_map.current, self.context.confirmation
-        confirmation.push(view, estimate, submap.tracking, doubt, self.tentative.has_keyframes)
+        confirmation.push(view, estimate, submap.tracking, rejection, self.tentative.has_keyframes)
         if confirmation.is_holding:
             if confirmation.is_full:
                 self._keep_uncertain()
             self.active_map.set_state(State.UNCERTAIN)
-            return FrameOutcome([doubt or confirmation.reason], submap, estimate)
+            return FrameOutcome([rejection or confirmation.reason], submap, estimate)
         self.tentative.commit(submap)
         was_relocalized, frames = confirmation.is_relocalized, confirmation.confirm()
         self.mapping.add_pending_frames(submap, frames)

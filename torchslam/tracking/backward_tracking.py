@@ -75,7 +75,11 @@ def track_back(
     certain frames follow or the earliest frame is reached. Tracking ends after `MAX_CONSECUTIVE_FAILURES`.
 
     Args:
-        views: from the latest to the earliest
+        tracker: poses the frames.
+        submap: the map, with the tracking state to start from.
+        views: from the latest to the earliest.
+        config: thresholds of the pose validation and confirmation.
+        builder: receives the posed frames.
 
     Returns:
         The frames that got a pose.

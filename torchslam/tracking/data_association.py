@@ -9,6 +9,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.config import MatchingConfig
@@ -19,34 +20,47 @@ from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matc
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, MatchPrior
 from torchslam.utils.indexing import is_among
 
+GRID = (8, 6)  # columns and rows of the image cells
+MAX_MATCHES_PER_CELL = 5  # that RANSAC samples from
+MAX_CELL_WEIGHT = 8  # sum of the weights of the matches in a cell, at most
+MIN_COVERAGE_CELLS = 5  # cells with mature points for which a coverage ratio is computed
+MATURE_OBSERVATIONS = 10  # frames with certain poses that found a point, from which on it is mature
+
 
 @dataclass(frozen=True)
 class Projected:
-    """Map points predicted to be visible: ids (n,), pixels (n, 2), predicted scales (n,), last observed angles (n,)."""
+    """Map points predicted to be visible.
 
-    ids: Tensor
-    pixels: Tensor
-    scales: Tensor
-    angles: Tensor
+    Attributes:
+        ids: rows of the points.
+        pixels: predicted projections.
+        scales: predicted scales, pixels.
+        angles: angles in the last observation, radians.
+    """
+
+    ids: Int[Tensor, " N"]
+    pixels: Float[Tensor, "N 2"]
+    scales: Float[Tensor, " N"]
+    angles: Float[Tensor, " N"]
 
 
 def match_views(
     view_1: FrameFeatures, view_2: FrameFeatures, settings: MatchingConfig
-) -> tuple[Tensor, Tensor]:
-    """(m,), (m,) keypoints of two views that match by their descriptors: mutual, by ratio, one to one."""
+) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
+    """Keypoints of two views that match by their descriptors: mutual, by ratio, one to one."""
     pairs = run_matcher(DescriptorMatcher(settings), view_1, view_2)
     return pairs.first, pairs.second
 
 
 def project_points(
     slam_map: Map,
-    ids: Tensor,
-    T_cw: Tensor,
+    ids: Int[Tensor, " M"],
+    T_cw: Float[Tensor, "4 4"],
     camera: Camera,
     max_view_angle_deg: float,
     scale_range: tuple[float, float],
 ) -> Projected:
-    """The valid points of ids (n,) in front of the camera, in the image and seen from a similar direction as before.
+    """The valid points in front of the camera, in the image and seen from a similar direction as before.
 
     Predicted scales are clamped to `scale_range`, the scales of the detector.
     """
@@ -60,17 +74,13 @@ def project_points(
 
 def predict_observations(
     slam_map: Map,
-    ids: Tensor,
-    T_cw: Tensor,
+    ids: Int[Tensor, " N"],
+    T_cw: Float[Tensor, "*batch 4 4"],
     camera: Camera,
     max_view_angle_deg: float,
-    scale_range: tuple[float, float] | tuple[Tensor, Tensor],
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Predicted pixels (..., n, 2), scales (..., n) and visibility (..., n) of points (n,) in cameras (..., 4, 4).
-
-    Args:
-        scale_range: as in `project_points`, numbers or (..., 1)
-    """
+    scale_range: tuple[float, float] | tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1"]],
+) -> tuple[Float[Tensor, "*batch N 2"], Float[Tensor, "*batch N"], Bool[Tensor, "*batch N"]]:
+    """Predicted pixels, scales and visibility of points in cameras; `scale_range` as in `project_points`."""
     points = slam_map.points
     positions_w = points["positions_w"][ids]
     pixels, valid = camera.project(transform(T_cw, positions_w))
@@ -116,7 +126,9 @@ def expected_view(slam_map: Map, projected: Projected, view: FrameFeatures) -> F
     )
 
 
-def match_points(slam_map: Map, ids: Tensor, view: FrameFeatures, settings: MatchingConfig) -> MatchIndices:
+def match_points(
+    slam_map: Map, ids: Int[Tensor, " N"], view: FrameFeatures, settings: MatchingConfig
+) -> MatchIndices:
     """Point ids and keypoints that match by descriptor alone, in the whole image."""
     if len(ids) == 0:
         return MatchIndices(ids, ids)
@@ -139,28 +151,18 @@ def match_keyframe(slam_map: Map, keyframe: int, view: FrameFeatures, matcher: M
     return replace(pairs, first=point_ids[pairs.first])
 
 
-GRID = (8, 6)  # columns and rows of the image cells
-MAX_MATCHES_PER_CELL = 5  # that RANSAC samples from
-MAX_CELL_WEIGHT = 8  # sum of the weights of the matches in a cell, at most
-MIN_COVERAGE_CELLS = 5  # cells with mature points for which a coverage ratio is computed
-MATURE_OBSERVATIONS = 10  # frames with certain poses that found a point, from which on it is mature
-
-
 def image_cells(
-    pixels: Tensor,
+    pixels: Float[Tensor, "N 2"],
     size: tuple[float, float],
     grid: tuple[int, int] = GRID,
     shape: tuple[int, int] | None = None,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
     """Columns and rows of the image cells that contain pixels.
 
     Args:
-        pixels: (n, 2)
-        size: width and height that are divided into `grid` columns and rows of cells
-        shape: columns and rows to which the result is clamped; those of `grid` if None
-
-    Returns:
-        Two int64 tensors (n,).
+        pixels: in the image.
+        size: width and height that are divided into `grid` columns and rows of cells.
+        shape: columns and rows to which the result is clamped; those of `grid` if None.
     """
     column, row = (
         (at / extent * count).clamp_(0, limit - 1).long()
@@ -169,20 +171,20 @@ def image_cells(
     return column, row
 
 
-def cell_numbers(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """(n,) int64 numbers of the cells of `GRID` that contain pixels (n, 2)."""
+def cell_numbers(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Int[Tensor, " N"]:
+    """Numbers of the cells of `GRID` that contain pixels."""
     column, row = image_cells(pixels, size)
     return row * GRID[0] + column
 
 
-def select_mature(times_found: Tensor, least: int) -> Tensor:
-    """(m,) rows of the matches (n,) with mature points; all rows if these are fewer than `least`."""
+def select_mature(times_found: Int[Tensor, " N"], least: int) -> Int[Tensor, " M"]:
+    """Rows of the matches with mature points; all rows if these are fewer than `least`."""
     old = torch.nonzero(times_found >= MATURE_OBSERVATIONS)[:, 0]
     return old if len(old) >= least else torch.arange(len(times_found), device=times_found.device)
 
 
-def subsample_per_cell(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """(m,) ascending rows of pixels (n, 2), at most `MAX_MATCHES_PER_CELL` of each image cell."""
+def subsample_per_cell(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Int[Tensor, " M"]:
+    """Ascending rows of pixels, at most `MAX_MATCHES_PER_CELL` of each image cell."""
     cell = cell_numbers(pixels, size)
     order = torch.argsort(cell, stable=True)
     ordered = cell[order]
@@ -191,27 +193,31 @@ def subsample_per_cell(pixels: Tensor, size: tuple[int, int]) -> Tensor:
     return torch.sort(order[rank < MAX_MATCHES_PER_CELL]).values
 
 
-def grid_weights(pixels: Tensor, size: tuple[int, int]) -> Tensor:
-    """(n,) weights of matches at pixels (n, 2) that limit the total weight of a crowded image cell."""
+def grid_weights(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, " N"]:
+    """Weights of matches that limit the total weight of a crowded image cell."""
     cell = cell_numbers(pixels, size)
     crowd = torch.bincount(cell, minlength=GRID[0] * GRID[1])[cell]
     return (MAX_CELL_WEIGHT / crowd).clamp(max=1.0)
 
 
-def explained_ratio(view: FrameFeatures, keypoints: Tensor, size: tuple[int, int]) -> float:
-    """Ratio of the image cells with several keypoints that contain at least one of `keypoints` (m,), the inliers."""
+def explained_ratio(view: FrameFeatures, keypoints: Int[Tensor, " M"], size: tuple[int, int]) -> float:
+    """Ratio of the image cells with several keypoints that contain at least one of `keypoints`, the inliers."""
     count = GRID[0] * GRID[1]
     occupied = torch.bincount(cell_numbers(view.keypoints[view.mask], size), minlength=count) >= 2
     used = torch.bincount(cell_numbers(view.keypoints[keypoints], size), minlength=count) > 0
     return float(used[occupied].double().mean()) if bool(occupied.any()) else 1.0
 
 
-def coverage_ratio(slam_map: Map, expected: Projected, seen: Tensor, size: tuple[int, int]) -> float:
+def coverage_ratio(
+    slam_map: Map, expected: Projected, seen: Int[Tensor, " M"], size: tuple[int, int]
+) -> float:
     """Ratio of the image cells with several expected mature points in which at least a fifth of them are inliers.
 
     Args:
-        expected: points predicted to be in the image
-        seen: (m,) ids of the inliers
+        slam_map: the map.
+        expected: points predicted to be in the image.
+        seen: ids of the inliers.
+        size: width and height of the image.
 
     Returns:
         The ratio; 1 if there are fewer than `MIN_COVERAGE_CELLS` such cells.

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import pad
 
@@ -18,23 +19,25 @@ from torchslam.types import Features, FrameFeatures
 
 @dataclass(frozen=True)
 class FreeKeypoints:
-    """The keypoints of k keyframes that see no point yet; where one has fewer than others, rows are masked out.
+    """The keypoints of keyframes that observe no point yet; where one has fewer than others, rows are masked out.
 
     Attributes:
-        features: (k, n, ...)
-        rows: (k, n) of the keyframes' keypoints
-        normalized: (k, n, 2) undistorted
-        noise: (k, n)
+        features: of the keypoints, a batch of K.
+        rows: of the keyframes' keypoints.
+        normalized: undistorted coordinates.
+        noise: of the keypoints.
     """
 
     features: Features
-    rows: Tensor
-    normalized: Tensor
+    rows: Int[Tensor, "K N"]
+    normalized: Float[Tensor, "K N 2"]
     noise: KeypointNoise
 
     @classmethod
-    def of(cls, slam_map: Map, keyframes: Tensor, normalize: Callable[[Tensor], Tensor]) -> FreeKeypoints:
-        """Those of keyframes (k,). normalize: pixels (k, n, 2) to undistorted coordinates."""
+    def of(
+        cls, slam_map: Map, keyframes: Int[Tensor, " K"], normalize: Callable[[Tensor], Tensor]
+    ) -> FreeKeypoints:
+        """Those of keyframes; `normalize` maps pixels to undistorted coordinates."""
         table = slam_map.keyframes
         free = table["mask"][keyframes] & (table["point_ids"][keyframes] == NO_POINT)
         free, rows = torch.sort(free, dim=1, descending=True, stable=True)
@@ -48,21 +51,26 @@ class FreeKeypoints:
 def match_along_epipolar_lines(
     here: FreeKeypoints,
     there: FreeKeypoints,
-    T_21: Tensor,
+    T_21: Float[Tensor, "K 4 4"],
     camera: Camera,
     epipolar_px: float,
     max_distance: float,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Keypoints of one keyframe and of k others that are each other's best on the epipolar line.
+) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"], Int[Tensor, " M"]]:
+    """Keypoints of one keyframe and of K others that are each other's best on the epipolar line.
 
     The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it. All these planes
     contain the baseline, so that a plane is an angle around it.
 
     Args:
-        T_21: (k, 4, 4) from the one camera to the others
+        here: keypoints of the one keyframe.
+        there: keypoints of the others.
+        T_21: from the one camera to the others.
+        camera: of all keyframes.
+        epipolar_px: largest distance from the epipolar line, pixels.
+        max_distance: of descriptors.
 
     Returns:
-        per match (m,) the row of the other view, and the rows in `here` and `there`, ordered by these three
+        Per match the row of the other view, and the rows in `here` and `there`, ordered by these three
     """
     rays_1 = pad(here.normalized, (0, 1), value=1.0) @ T_21[:, :3, :3].mT
     (angles_1, _), (angles_2, sines) = (
@@ -95,8 +103,10 @@ def match_along_epipolar_lines(
     return row // count, row % count, column % others
 
 
-def angle_around_axis(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
-    """(k, n), (k, n) angles of rays (k, n, 3) around axes (k, 3), radians, and the sines of their angles to these."""
+def angle_around_axis(
+    axes: Float[Tensor, "K 3"], rays: Float[Tensor, "K N 3"]
+) -> tuple[Float[Tensor, "K N"], Float[Tensor, "K N"]]:
+    """Angles of rays around axes, radians, and the sines of their angles to these."""
     least = torch.nn.functional.one_hot(axes.abs().argmin(-1), 3).to(axes.dtype)
     across = torch.nn.functional.normalize(torch.linalg.cross(axes, least), dim=-1)
     other = torch.linalg.cross(torch.nn.functional.normalize(axes, dim=-1), across)
@@ -107,12 +117,12 @@ def angle_around_axis(axes: Tensor, rays: Tensor) -> tuple[Tensor, Tensor]:
 def match_free(
     view_1: FrameFeatures,
     view_2: FrameFeatures,
-    T_21: Tensor,
+    T_21: Float[Tensor, "4 4"],
     camera: Camera,
     epipolar_px: float,
     max_distance: float,
-) -> tuple[Tensor, Tensor]:
-    """(m,), (m,) keypoints of two views, of those of their masks, that `match_along_epipolar_lines` finds."""
+) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
+    """Keypoints of two views, of those of their masks, that `match_along_epipolar_lines` finds."""
     one, two = (_of_view(view, camera) for view in (view_1, view_2))
     _, at_1, at_2 = match_along_epipolar_lines(one, two, T_21[None], camera, epipolar_px, max_distance)
     return one.rows[0, at_1], two.rows[0, at_2]

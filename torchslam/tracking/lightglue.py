@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from jaxtyping import Shaped
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
@@ -24,7 +25,7 @@ class LightGlue(nn.Module):
     """Matches float descriptors of the front end that its weights were trained for; weights are its confidences.
 
     Args:
-        weights: safetensors or .pt/.pth file; the shapes determine the variant
+        weights: safetensors or .pt/.pth file; the shapes determine the variant.
 
     Raises:
         ConfigError: if the file cannot be read or holds another network.
@@ -68,7 +69,11 @@ class LightGlue(nn.Module):
     def forward(
         self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None = None
     ) -> Matches:
-        """By descriptors and places alone: the prior is left alone. Raises ConfigError for other descriptors."""
+        """Match by descriptors and keypoints; the prior is ignored.
+
+        Raises:
+            ConfigError: if the weights are for other descriptors.
+        """
         rows = [torch.nonzero(view.mask)[:, 0] for view in (view_1, view_2)]
         if min(map(len, rows)) == 0:
             none = rows[0][:0][None]
@@ -102,8 +107,8 @@ class LightGlue(nn.Module):
         return data
 
 
-def renamed(state: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors under the names of today: published files have older ones."""
+def renamed(state: dict[str, Shaped[Tensor, "..."]]) -> dict[str, Shaped[Tensor, "..."]]:
+    """The tensors under the current names: published files have older ones."""
     names = {}
     for name in state:
         new = name.removeprefix("matcher.")

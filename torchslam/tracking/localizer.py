@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
@@ -56,15 +57,17 @@ class Localizer:
         slam_map: Map,
         view: FrameFeatures,
         candidates: Iterator[MatchIndices],
-        local_points: Tensor,
-        expected_T_cw: Tensor | None = None,
+        local_points: Int[Tensor, " N"],
+        expected_T_cw: Float[Tensor, "4 4"] | None = None,
     ) -> PoseEstimate | None:
         """Estimate the pose of a frame by PnP, then refine it against the local points.
 
         Args:
-            candidates: sets of matches, tried in turn until enough of their matches are inliers
-            local_points: (n,) ids, ascending
-            expected_T_cw: (4, 4) predicted pose, tried before RANSAC; None without a prediction
+            slam_map: the map.
+            view: the frame.
+            candidates: sets of matches, tried in turn until enough of their matches are inliers.
+            local_points: ids, ascending.
+            expected_T_cw: predicted pose, tried before RANSAC; None without a prediction.
 
         Returns:
             The estimate with the most inliers; None if no set gives a pose.
@@ -127,13 +130,16 @@ class Localizer:
 
     def _start(
         self, points_w: Tensor, seen: UndistortedKeypoints, expected_T_cw: Tensor | None
-    ) -> Tensor | None:
-        """(4, 4) initial pose: the one near the expected pose, or else by RANSAC."""
+    ) -> Float[Tensor, "4 4"] | None:
+        """Initial pose: the one near the expected pose, or else by RANSAC."""
         threshold = self.settings.threshold_px
         T_cw = None if expected_T_cw is None else nearby_pose(expected_T_cw, points_w, seen, threshold)
         return start_pose(points_w, seen, self.camera.size, threshold, self.seed) if T_cw is None else T_cw
 
-    def project(self, slam_map: Map, point_ids: Tensor, T_cw: Tensor, view: FrameFeatures) -> Projected:
+    def project(
+        self, slam_map: Map, point_ids: Int[Tensor, " N"], T_cw: Float[Tensor, "4 4"], view: FrameFeatures
+    ) -> Projected:
+        """The points that a view at a pose should observe, see `project_points`."""
         max_angle = self.settings.max_view_angle_deg
         return project_points(slam_map, point_ids, T_cw, self.camera, max_angle, view.scale_range)
 
@@ -144,8 +150,8 @@ class Localizer:
         keyframe = int(slam_map.count_observed(point_ids).argmax())
         return slam_map.observed_points(self.local_keyframes(slam_map, keyframe))
 
-    def local_keyframes(self, slam_map: Map, keyframe: int) -> Tensor:
-        """(k,) a keyframe and those that share most points with it."""
+    def local_keyframes(self, slam_map: Map, keyframe: int) -> Int[Tensor, " K"]:
+        """A keyframe and those that share most points with it."""
         covisible = slam_map.covisible_keyframes(keyframe, self.settings.local_keyframes)
         return torch.cat([covisible.new_tensor([keyframe]), covisible])
 
@@ -157,8 +163,8 @@ class Localizer:
         pixels: Tensor,
         undistorted: UndistortedKeypoints,
         noise: KeypointNoise,
-    ) -> tuple[FramePose, Tensor, Tensor]:
-        """The pose, the squared errors (n,) in units of the noise, and (n,) the inliers.
+    ) -> tuple[FramePose, Float[Tensor, " N"], Bool[Tensor, " N"]]:
+        """The pose, the squared errors in units of the noise, and the inliers.
 
         First by the matches within the widened gate around T_cw, mature points alone if there are enough of them, then
         by the inliers of that pose.
@@ -186,18 +192,23 @@ class Localizer:
     def agrees(
         self,
         slam_map: Map,
-        T_cw: Tensor,
-        ids: Tensor,
-        pixels: Tensor,
+        T_cw: Float[Tensor, "4 4"],
+        ids: Int[Tensor, " N"],
+        pixels: Float[Tensor, "N 2"],
         noise: KeypointNoise,
-        errors: Tensor | None = None,
-    ) -> Tensor:
-        """(n,) inliers of a pose by the configured gate.
+        errors: Float[Tensor, " N"] | None = None,
+    ) -> Bool[Tensor, " N"]:
+        """Inliers of a pose by the configured gate.
 
         The pose was fitted to these pixels, so its own uncertainty does not widen the gate.
 
         Args:
-            errors: (n,) squared, in units of the noise, if they are known
+            slam_map: the map.
+            T_cw: the pose.
+            ids: matched points.
+            pixels: of the matched keypoints.
+            noise: of the matched keypoints.
+            errors: squared, in units of the noise, if they are known.
         """
         chi_square, points = self.measurement.max_chi_square, slam_map.points
         by_noise = self.measurement.gate == "chi_square"
@@ -213,8 +224,8 @@ class Localizer:
         return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
 
 
-def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Tensor | None:
-    """(n,) weights of guided matches: the matcher's where it found the same pair, else their median; None without."""
+def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Float[Tensor, " M"] | None:
+    """Weights of guided matches: the matcher's where it found the same pair, else their median; None without."""
     if pairs.weights is None:
         return None
     points = torch.full((keypoints,), -1, device=pairs.first.device).index_put((pairs.second,), pairs.first)
@@ -223,7 +234,7 @@ def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Ten
     return torch.where(is_same, weights[guided.second], pairs.weights.median())
 
 
-def _are_among(ids: Tensor, ascending: Tensor) -> bool:
-    """Whether all ids (n,) are among others (m,), which are sorted and not empty."""
+def _are_among(ids: Int[Tensor, " N"], ascending: Int[Tensor, " M"]) -> bool:
+    """Whether all ids are among others, which are sorted and not empty."""
     at = torch.searchsorted(ascending, ids).clamp_(max=len(ascending) - 1)
     return bool((ascending.index_select(0, at) == ids).all())

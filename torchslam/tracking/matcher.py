@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.config import MatchingConfig
@@ -17,7 +18,10 @@ from torchslam.types import Frame, FrameFeatures, Matcher, Matches, MatchIndices
 
 
 class DescriptorMatcher:
-    """Matches mutual nearest descriptors with the ratio test; with a prior, near a prediction or an epipolar line."""
+    """Matches mutual nearest descriptors with the ratio test; with a prior, near a prediction or an epipolar line.
+
+    See `types.Matcher`; a prior needs a radius, or a pose and a camera.
+    """
 
     def __init__(self, settings: MatchingConfig) -> None:
         self.settings = settings
@@ -51,18 +55,22 @@ class DescriptorMatcher:
         return Matches(rows[None], columns[None], *_all_alike(rows))
 
 
-def _all_alike(rows: Tensor) -> tuple[Tensor, Tensor]:
-    """Distances and mask of pairs (n,) that all match; the distances are not used."""
+def _all_alike(rows: Int[Tensor, " M"]) -> tuple[Float[Tensor, "1 M"], Bool[Tensor, "1 M"]]:
+    """Distances and mask of pairs that all match; the distances are not used."""
     return rows.new_zeros(1, len(rows), dtype=torch.float32), torch.ones_like(rows, dtype=torch.bool)[None]
 
 
-def max_distance(descriptors: Tensor, settings: MatchingConfig) -> float:
+def max_distance(descriptors: Shaped[Tensor, "*batch N D"], settings: MatchingConfig) -> float:
     """The threshold for this kind of descriptor: bits, or 1 - cosine."""
     return settings.max_hamming_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
 
 
 def make_matcher(settings: MatchingConfig, matcher: Matcher | None = None) -> Matcher:
-    """The given matcher, or else the configured one. Raises ConfigError if its name is unknown."""
+    """The given matcher, or else the configured one.
+
+    Raises:
+        ConfigError: if the name of the configured one is unknown.
+    """
     if matcher is None and settings.matcher == "lightglue":
         from torchslam.tracking.lightglue import LightGlue
 
@@ -84,7 +92,11 @@ def prepare_view(view: FrameFeatures, frame: Frame, matcher: Matcher) -> FrameFe
 def run_matcher(
     matcher: Matcher, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None = None
 ) -> MatchIndices:
-    """Run a matcher. Raises ConfigError if its result is malformed."""
+    """Run a matcher.
+
+    Raises:
+        ConfigError: if its result is malformed.
+    """
     found = matcher(view_1, view_2, prior)
     if not isinstance(matcher, DescriptorMatcher):
         check_matches(found, view_1, view_2, matcher)
@@ -96,7 +108,11 @@ def run_matcher(
 
 
 def check_matches(found: Any, view_1: FrameFeatures, view_2: FrameFeatures, matcher: object) -> None:
-    """Raise ConfigError unless `found` is `Matches` of two views that use each keypoint of the second once."""
+    """Check that `found` is `Matches` of two views that use each keypoint of the second once.
+
+    Raises:
+        ConfigError: otherwise.
+    """
     name = getattr(matcher, "__name__", type(matcher).__name__)
 
     def refuse(what: str) -> None:
@@ -125,14 +141,18 @@ def check_matches(found: Any, view_1: FrameFeatures, view_2: FrameFeatures, matc
             refuse(f"weights must be positive floats {shape}")
 
 
-def nearest_keypoints(pixels: Tensor, rows: Tensor, view: FrameFeatures, radius_px: float = 1.5) -> Matches:
+def nearest_keypoints(
+    pixels: Float[Tensor, "N 2"], rows: Int[Tensor, " N"], view: FrameFeatures, radius_px: float = 1.5
+) -> Matches:
     """Convert the result of a dense matcher or optical flow to matches of keypoints.
 
     Each pixel is matched with the view's nearest keypoint within the radius, each keypoint with its nearest pixel.
 
     Args:
-        pixels: (n, 2) in `view`, where keypoints of another view appear
-        rows: (n,) of these keypoints
+        pixels: in `view`, where keypoints of another view appear.
+        rows: of these keypoints.
+        view: the view with the keypoints.
+        radius_px: largest distance between a pixel and its keypoint.
     """
     distances = torch.cdist(pixels.to(view.keypoints), view.keypoints).masked_fill(~view.mask, torch.inf)
     nearest, column = distances.min(1)

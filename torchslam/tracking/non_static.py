@@ -15,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.config import Config, IndependentMotionConfig, MatchingConfig, StaticOverlayConfig
@@ -28,22 +29,33 @@ _OVERLAY_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth, the poss
 _OVERLAY_STRIDE = 8  # stride of the keypoints in the first test whether the camera moved far enough
 _OVERLAY_PAUSE = 4  # frames without a comparison after one that found no overlay
 
+_MOTION_DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
+_NUM_NEIGHBORS = 3  # that vote on whether a keypoint belongs to the object
+_MOVING_PATIENCE = 10  # comparisons in which a keypoint that was seen to move may agree with the map
+_NEARBY_PATIENCE = 3  # the same, for a keypoint that is only near those
+_MAX_DISTANCE_RATIO = 0.06  # of the image's width, from a keypoint of the object to the nearest other one
+
 
 @dataclass(frozen=True)
 class _OverlayReference:
     """A posed frame to compare later ones with.
 
-    pixels:   (n, 2) of its keypoints
-    points_c: (d, n, 3) their points at the possible depths
+    Attributes:
+        view: the frame, with all its keypoints.
+        T_wc: its pose.
+        pixels: of its keypoints.
+        points_c: their points at the possible depths.
     """
 
     view: FrameFeatures
-    T_wc: Tensor
-    pixels: Tensor
-    points_c: Tensor
+    T_wc: Float[Tensor, "4 4"]
+    pixels: Float[Tensor, "N 2"]
+    points_c: Float[Tensor, "D N 3"]
 
     @classmethod
-    def of(cls, view: FrameFeatures, T_cw: Tensor, depth: float, camera: Camera) -> _OverlayReference:
+    def of(
+        cls, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float, camera: Camera
+    ) -> _OverlayReference:
         pixels = view.keypoints[view.mask]
         rays = camera.unproject(pixels)
         depths = depth * rays.new_tensor(_OVERLAY_DEPTHS)
@@ -69,18 +81,18 @@ class StaticOverlayDetector:
             return view
         return replace(view, mask=view.mask & ~self.covers(view.keypoints))
 
-    def covers(self, pixels: Tensor) -> Tensor:
-        """(n,) bool, which pixels (n, 2) belong to a known overlay."""
+    def covers(self, pixels: Float[Tensor, "N 2"]) -> Bool[Tensor, " N"]:
+        """Which pixels belong to a known overlay."""
         row, column = self._cells(pixels)
         return self.evidence[row, column] >= self.settings.min_evidence
 
-    def observe(self, view: FrameFeatures, T_cw: Tensor, depth: float) -> int:
+    def observe(self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float) -> int:
         """Compare a posed frame with an earlier one.
 
         Args:
-            view: with all its keypoints
-            T_cw: (4, 4)
-            depth: median depth of the scene
+            view: the frame, with all its keypoints.
+            T_cw: its pose.
+            depth: median depth of the scene.
 
         Returns:
             The number of cells that became known overlays.
@@ -107,22 +119,12 @@ class StaticOverlayDetector:
         self._add(stayed)
         return int((self.evidence >= self.settings.min_evidence).sum()) - before
 
-    def add(self, pixels: Tensor) -> None:
-        """Add evidence from another source: pixels (m, 2) that stayed in place while the scene moved."""
+    def add(self, pixels: Float[Tensor, "M 2"]) -> None:
+        """Add evidence from another source: pixels that stayed in place while the scene moved."""
         if self.settings.enabled and len(pixels) >= self.settings.min_keypoints:
             self._add(pixels)
 
-    def _must_move(self, last: _OverlayReference, T_cw: Tensor, step: int = 1) -> Tensor:
-        """(n,) whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
-        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
-        distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
-        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
-
-    def _is_far(self, must_move: Tensor) -> bool:
-        """Whether the camera moved far enough for a comparison: enough of the keypoints (n,) had to move."""
-        return int(must_move.sum()) >= self.settings.min_moving_ratio * len(must_move)
-
-    def restore(self, evidence: Tensor) -> None:
+    def restore(self, evidence: Int[Tensor, "R C"]) -> None:
         """Continue from the evidence of a checkpoint."""
         self.evidence.copy_(evidence)
 
@@ -130,8 +132,22 @@ class StaticOverlayDetector:
         """Compare the next frame with no earlier one: its pose is in another submap."""
         self._last = None
 
-    def _stayed(self, earlier: FrameFeatures, view: FrameFeatures, candidates: Tensor) -> Tensor:
-        """(m, 2) pixels in `view` of candidates (N,), keypoints of an earlier view matched at their old pixel."""
+    def _must_move(
+        self, last: _OverlayReference, T_cw: Float[Tensor, "4 4"], step: int = 1
+    ) -> Bool[Tensor, " N"]:
+        """Whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
+        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
+        distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
+        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
+
+    def _is_far(self, must_move: Bool[Tensor, " N"]) -> bool:
+        """Whether the camera moved far enough for a comparison: enough of the keypoints had to move."""
+        return int(must_move.sum()) >= self.settings.min_moving_ratio * len(must_move)
+
+    def _stayed(
+        self, earlier: FrameFeatures, view: FrameFeatures, candidates: Bool[Tensor, " N"]
+    ) -> Float[Tensor, "M 2"]:
+        """Pixels in `view` of candidates, keypoints of an earlier view matched at their old pixel."""
         rows = torch.nonzero(candidates)[:, 0]
         matches = match_by_projection(
             earlier.descriptors[rows][None],
@@ -144,8 +160,8 @@ class StaticOverlayDetector:
         )
         return view.keypoints[matches.indices_2[0][matches.mask[0]]]
 
-    def _add(self, pixels: Tensor) -> None:
-        """Increment the evidence of the cells of pixels (m, 2) and of their neighbors, each cell once."""
+    def _add(self, pixels: Float[Tensor, "M 2"]) -> None:
+        """Increment the evidence of the cells of pixels and of their neighbors, each cell once."""
         row, column = self._cells(pixels)
         hit = torch.zeros_like(self.evidence)
         for down in (-1, 0, 1):
@@ -153,61 +169,63 @@ class StaticOverlayDetector:
                 hit[(row + down).clamp(0, hit.shape[0] - 1), (column + right).clamp(0, hit.shape[1] - 1)] = 1
         self.evidence += hit
 
-    def _cells(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
-        """Rows and columns (n,) of `evidence` for pixels (n, 2)."""
+    def _cells(self, pixels: Float[Tensor, "N 2"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
+        """Rows and columns of `evidence` for pixels."""
         rows, columns = self.evidence.shape
         size = (self.settings.cell_px, self.settings.cell_px)
         column, row = image_cells(pixels, size, grid=(1, 1), shape=(columns, rows))
         return row, column
 
 
-def distances_to_segments(points: Tensor, starts: Tensor, ends: Tensor) -> Tensor:
-    """(...) distances of points (..., 2) from the segments between starts and ends (..., 2)."""
+def distances_to_segments(
+    points: Float[Tensor, "*#batch 2"], starts: Float[Tensor, "*#batch 2"], ends: Float[Tensor, "*#batch 2"]
+) -> Float[Tensor, "*#batch"]:
+    """Distances of points from the segments between starts and ends."""
     along = ends - starts
     length = (along * along).sum(-1).clamp(min=1e-12)
     share = (((points - starts) * along).sum(-1) / length).clamp(0, 1)
     return torch.linalg.vector_norm(points - starts - share[..., None] * along, dim=-1)
 
 
-_MOTION_DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
-_NUM_NEIGHBORS = 3  # that vote on whether a keypoint belongs to the object
-_MOVING_PATIENCE = 10  # comparisons in which a keypoint that was seen to move may agree with the map
-_NEARBY_PATIENCE = 3  # the same, for a keypoint that is only near those
-_MAX_DISTANCE_RATIO = 0.06  # of the image's width, from a keypoint of the object to the nearest other one
-
-
 @dataclass(frozen=True)
 class _Observation:
     """A frame to compare later ones with.
 
-    T_cw:     (4, 4); None if it has no pose
-    depth:    median depth of the scene
-    patience: (N,) int64 comparisons for which a keypoint still belongs to the moving object
+    Attributes:
+        view: the frame.
+        T_cw: its pose; None if it has none.
+        depth: median depth of the scene.
+        patience: comparisons for which a keypoint still belongs to the moving object.
     """
 
     view: FrameFeatures
-    T_cw: Tensor | None
+    T_cw: Float[Tensor, "4 4"] | None
     depth: float
-    patience: Tensor
+    patience: Int[Tensor, " N"]
 
 
 @dataclass(frozen=True)
 class _Mover:
     """The moving object in the last frame.
 
-    belongs: (N,) bool, which of the frame's keypoints are on the object
-    pixels: (m, 2); descriptors: (m, D); scales: (m,); rest: (n, 2) pixels; motion: (2,) pixels a frame
+    Attributes:
+        belongs: which of the frame's keypoints are on the object.
+        pixels: of these keypoints.
+        descriptors: of these keypoints.
+        scales: of these keypoints.
+        rest: pixels of the other keypoints.
+        motion: of the object, pixels a frame.
     """
 
-    belongs: Tensor
-    pixels: Tensor
-    descriptors: Tensor
-    scales: Tensor
-    rest: Tensor
-    motion: Tensor
+    belongs: Bool[Tensor, " N"]
+    pixels: Float[Tensor, "M 2"]
+    descriptors: Shaped[Tensor, "M D"]
+    scales: Float[Tensor, " M"]
+    rest: Float[Tensor, "R 2"]
+    motion: Float[Tensor, " 2"]
 
     @classmethod
-    def of(cls, view: FrameFeatures, belongs: Tensor, motion: Tensor) -> _Mover:
+    def of(cls, view: FrameFeatures, belongs: Bool[Tensor, " N"], motion: Float[Tensor, " 2"]) -> _Mover:
         rows = torch.nonzero(view.mask & belongs)[:, 0]
         rest = view.keypoints[view.mask & ~belongs]
         return cls(belongs, view.keypoints[rows], view.descriptors[rows], view.scales[rows], rest, motion)
@@ -226,7 +244,7 @@ class Movement:
     note: Explanation | None = None
 
 
-NOTHING = Movement()
+NO_MOVEMENT = Movement()
 
 
 class IndependentMotion:
@@ -259,17 +277,13 @@ class IndependentMotion:
         return replace(view, mask=view.mask & ~self._mover.belongs)
 
     def observe(self, view: FrameFeatures, estimate: PoseEstimate) -> Movement:
-        """Compare a posed frame with one some frames earlier.
-
-        Args:
-            view: with all its keypoints
-        """
+        """Compare a posed frame, with all its keypoints, with one some frames earlier."""
         mover, seen = self._mover, view.keypoints[estimate.keypoints]
         if mover is not None and self._area(mover.pixels) > self.settings.max_area_ratio * self._area(seen):
             return Movement(Rejection.of(Reason.MOVING_MAJORITY))
         if self._last is None or self._frames_since_comparison >= self.settings.frame_interval:
             return self._compare(view, estimate.T_cw, estimate.depth)
-        return NOTHING
+        return NO_MOVEMENT
 
     def _followed(self, mover: _Mover, view: FrameFeatures) -> _Mover | None:
         """The object in the next frame, matched by descriptors; None if it is gone or has not moved for long."""
@@ -291,14 +305,14 @@ class IndependentMotion:
         return _Mover.of(view, self._is_near_group(view.keypoints, mover.pixels + motion, mover.rest), motion)
 
     def _compare(self, view: FrameFeatures, T_cw: Tensor | None, depth: float) -> Movement:
-        """Compare with the last look: find what moves against the scene, and what of the object moves rigidly."""
+        """Compare with the last observation: what moves against the scene, and what of the object moves rigidly."""
         last = self._last
         none = torch.zeros_like(view.mask, dtype=torch.int64)
         guess = none if self._mover is None else _NEARBY_PATIENCE * self._mover.belongs
         look = _Observation(view, T_cw, depth, guess)
         self._last, self._frames_since_comparison = look, 0
         if last is None or view.session != last.view.session:
-            return NOTHING
+            return NO_MOVEMENT
         frames = view.index - last.view.index
         first, second = match_views(last.view, view, self.matching)
         strays = self._errors(last, look, first, second) > self.settings.min_error_px
@@ -308,7 +322,7 @@ class IndependentMotion:
         group = torch.cat([moving, self._rigid_group(last.view, view, first, second, known)])
         if len(group) == 0:
             self._mover, self._last = None, replace(look, patience=none)
-            return NOTHING
+            return NO_MOVEMENT
         to, fro = view.keypoints[second], last.view.keypoints[first]
         if len(moving) and self._is_pose_on_object(to, moving, strays, last.patience[first] > 0):
             return Movement(Rejection.of(Reason.MOVING_REMAINDER, count=len(moving)))
@@ -322,22 +336,28 @@ class IndependentMotion:
         self._mover = _Mover.of(view, belongs, (to - fro)[group].median(0).values / frames)
         self._last = replace(look, patience=patience)
         if len(moving) == 0:
-            return NOTHING
+            return NO_MOVEMENT
         self._frames_since_motion = 0
         count = int((belongs & view.mask).sum())
         return Movement(note=Explanation.of(Reason.INDEPENDENT_MOTION, count=count))
 
-    def _is_pose_on_object(self, pixels: Tensor, group: Tensor, strays: Tensor, known: Tensor) -> bool:
+    def _is_pose_on_object(
+        self,
+        pixels: Float[Tensor, "N 2"],
+        group: Int[Tensor, " M"],
+        strays: Bool[Tensor, " N"],
+        known: Bool[Tensor, " N"],
+    ) -> bool:
         """Whether the pose may follow the moving object, so that the group is the static scene.
 
         So it is if what was known to move agrees with the map now, or else if the group covers more of the image than
         what agrees.
 
         Args:
-            pixels: (n, 2) of all matches
-            group: (m,) rows of the matches that move
-            strays: (n,) bool, matches that disagree with the map
-            known: (n,) bool, matches of the known object
+            pixels: of all matches.
+            group: rows of the matches that move.
+            strays: matches that disagree with the map.
+            known: matches of the known object.
         """
         if bool(known[group].double().mean() >= 0.5):
             return False
@@ -345,12 +365,14 @@ class IndependentMotion:
             return 2 * int(strays[known].sum()) < int(known.sum())
         return self._area(pixels[group]) > self._area(pixels[~strays])
 
-    def _area(self, pixels: Tensor) -> int:
-        """Number of image cells that contain pixels (n, 2)."""
+    def _area(self, pixels: Float[Tensor, "N 2"]) -> int:
+        """Number of image cells that contain pixels."""
         return len(torch.unique(cell_numbers(pixels, self.camera.size)))
 
-    def _errors(self, last: _Observation, look: _Observation, first: Tensor, second: Tensor) -> Tensor:
-        """(n,) distances of matches from where a point of the scene can be, in units of the keypoints' noise.
+    def _errors(
+        self, last: _Observation, look: _Observation, first: Int[Tensor, " M"], second: Int[Tensor, " M"]
+    ) -> Float[Tensor, " M"]:
+        """Distances of matches from where a point of the scene can be, in units of the keypoints' noise.
 
         Zero if a pose is unknown.
         """
@@ -366,9 +388,14 @@ class IndependentMotion:
         return errors / torch.maximum(seen.noise.gate_sigma[first], view.noise.gate_sigma[second])
 
     def _rigid_group(
-        self, earlier: FrameFeatures, view: FrameFeatures, first: Tensor, second: Tensor, among: Tensor
-    ) -> Tensor:
-        """(m,) rows of those matches `among` (n,) bool that one rigid motion explains; none if these are too few."""
+        self,
+        earlier: FrameFeatures,
+        view: FrameFeatures,
+        first: Int[Tensor, " M"],
+        second: Int[Tensor, " M"],
+        among: Bool[Tensor, " M"],
+    ) -> Int[Tensor, " R"]:
+        """Rows of those matches `among` that one rigid motion explains; none if these are too few."""
         rows = torch.nonzero(among)[:, 0]
         if len(rows) < self.settings.min_matches:
             return rows[:0]
@@ -385,8 +412,10 @@ class IndependentMotion:
         enough = max(self.settings.min_matches, self.settings.min_outlier_ratio * len(rows))
         return group if len(group) >= enough else rows[:0]
 
-    def _is_near_group(self, pixels: Tensor, group: Tensor, rest: Tensor) -> Tensor:
-        """(n,) bool, which pixels (n, 2) belong to a group (g, 2), not to the rest (r, 2).
+    def _is_near_group(
+        self, pixels: Float[Tensor, "N 2"], group: Float[Tensor, "M 2"], rest: Float[Tensor, "R 2"]
+    ) -> Bool[Tensor, " N"]:
+        """Which pixels belong to a group, not to the rest.
 
         Most of their nearest neighbors, and one within reach, are of the group.
         """
@@ -415,11 +444,11 @@ class NonStaticFilter:
     def detect_independent_motion(self, estimate: PoseEstimate) -> Movement:
         """Detect keypoints of the newest view that move against the scene, given the view's pose."""
         if not self.config.independent_motion.enabled:
-            return NOTHING
+            return NO_MOVEMENT
         return self.independent_motion.observe(self._without_overlays, estimate)
 
-    def update_overlay(self, T_cw: Tensor, depth: float) -> bool:
-        """Update the overlays with the newest view and its pose (4, 4); return whether there are new ones."""
+    def update_overlay(self, T_cw: Float[Tensor, "4 4"], depth: float) -> bool:
+        """Update the overlays with the newest view and its pose; return whether there are new ones."""
         if not self.config.static_overlay.enabled:
             return False
         return self.static_overlay.observe(self._view, T_cw, depth) > 0

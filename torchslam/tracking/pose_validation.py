@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import Config, PoseValidationConfig
@@ -19,22 +20,24 @@ from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Re
 
 def validate_pose(
     estimate: PoseEstimate,
-    predicted_T_cw: Tensor | None,
+    predicted_T_cw: Float[Tensor, "4 4"] | None,
     tracking: TrackingState,
     settings: PoseValidationConfig,
 ) -> Rejection | None:
     """Why the map must not be extended from a pose; None if it may.
 
     Args:
-        predicted_T_cw: (4, 4) pose that the motion model predicts; None without a prediction
-        tracking: state with the averages over the frames up to this one
+        estimate: the pose.
+        predicted_T_cw: pose that the motion model predicts; None without a prediction.
+        tracking: state with the averages over the frames up to this one.
+        settings: thresholds.
     """
     quality = check_pose_quality(estimate, predicted_T_cw, settings)
     return quality or check_map_agreement(estimate, tracking, settings)
 
 
 def check_pose_quality(
-    estimate: PoseEstimate, predicted_T_cw: Tensor | None, settings: PoseValidationConfig
+    estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"] | None, settings: PoseValidationConfig
 ) -> Rejection | None:
     """Why a pose is wrong by its own matches, its covariance or its motion; None if it is plausible."""
     ratio = estimate.inliers / max(estimate.matches, 1)
@@ -73,15 +76,15 @@ def deviations(estimate: PoseEstimate) -> tuple[float, float]:
     return position, math.degrees(max(sum(variances[3:]), 0.0) ** 0.5)
 
 
-def jump(estimate: PoseEstimate, predicted_T_cw: Tensor) -> tuple[float, float]:
+def jump(estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"]) -> tuple[float, float]:
     """Distance of a pose from the predicted one, as a ratio of the scene's depth and in degrees."""
     motion = estimate.T_cw @ se3_inverse(predicted_T_cw)
     moved = float(torch.linalg.vector_norm(motion[:3, 3])) / max(estimate.depth, 1e-12)
     return moved, math.degrees(float(rotation_angle(motion[:3, :3])))
 
 
-PendingFrame = tuple[FrameFeatures, PoseEstimate, Tensor, int]
-"""A frame, its pose estimate, its pose T_cr (4, 4) relative to a keyframe, and the row of that keyframe."""
+PendingFrame = tuple[FrameFeatures, PoseEstimate, Float[Tensor, "4 4"], int]
+"""A frame, its pose estimate, its pose T_cr relative to a keyframe, and the row of that keyframe."""
 
 MAX_PENDING_FRAMES = 1000
 """Frames that are held back at most."""
@@ -126,9 +129,12 @@ class PoseConfirmation:
         """Hold a frame back; one without a rejection counts as a confirmation.
 
         Args:
-            rejection: result of the pose validation
-            is_mapped: there are tentative keyframes, which agree with frames by construction: as many certain frames
-                are needed as there were rejected ones
+            view: the frame.
+            estimate: its pose.
+            tracking: the tracking state after it.
+            rejection: result of the pose validation.
+            is_mapped: True if there are tentative keyframes, which agree with frames by construction: as many certain
+                frames are needed as there were rejected ones.
         """
         self._pending.append((view, estimate, tracking.T_cr, tracking.reference))
         if rejection is None:

@@ -6,13 +6,11 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 import torch
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import (
-    Camera,
-    se3_inverse,
-)
+from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
@@ -56,8 +54,8 @@ class Tracker:
             explained_ratio=submap.tracking.explained_ratio,
         )
 
-    def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Tensor) -> TrackingState:
-        """The tracking state of a frame at T_cw (4, 4) with this reference keyframe and its local map."""
+    def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Float[Tensor, "4 4"]) -> TrackingState:
+        """The tracking state of a frame with this pose and reference keyframe, and its local map."""
         local_keyframes = self.localizer.local_keyframes(slam_map, keyframe)
         recent = self.settings.recent_frames if self.counts else 0
         if recent:
@@ -77,8 +75,8 @@ class Tracker:
             local_points=local_points,
         )
 
-    def predict(self, submap: Submap) -> Tensor:
-        """(4, 4) predicted pose of the next frame, by constant velocity."""
+    def predict(self, submap: Submap) -> Float[Tensor, "4 4"]:
+        """Predicted pose of the next frame, by constant velocity."""
         if submap.tracking.velocity is None or not self.settings.motion_model:
             return submap.T_cw
         return reorthonormalized(submap.tracking.velocity @ submap.T_cw)
@@ -89,7 +87,9 @@ class Tracker:
         """Estimate the pose of the next frame and update the tracking state; None if it cannot be found.
 
         Args:
-            is_sure: the last poses are certain, so that a pose near the predicted one is tried first
+            submap: the submap with the tracking state.
+            view: the frame.
+            is_sure: True if the last poses are certain: a pose near the predicted one is tried first.
         """
         expected = self.predict(submap)
         candidates = self._candidates(submap, view, expected)
@@ -167,7 +167,7 @@ class Tracker:
             slam_map.points["last_seen_frame"][estimate.point_ids] = view.index
 
 
-def well_observed(slam_map: Map, keyframe: int, local_keyframes: Tensor) -> int:
+def well_observed(slam_map: Map, keyframe: int, local_keyframes: Int[Tensor, " K"]) -> int:
     """Number of points of a keyframe that at least three local keyframes observe."""
     table = slam_map.keyframes["point_ids"]
     local = table[local_keyframes].flatten()
