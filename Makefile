@@ -39,7 +39,7 @@ demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a
 	$(BIN)/torchslam demo --output results/demo
 
 test: lint  ## lint, then the tests
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile $(PYTEST_ARGS)
 
 test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## execute the code blocks of the documentation, all tutorials included
 	$(BIN)/python -m pytest tests/docs -m 'slow or not slow' $(PYTEST_ARGS)
