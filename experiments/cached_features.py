@@ -32,10 +32,10 @@ class Cached(nn.Module):
         self.front_end = extractor(self.kind, num_keypoints, weights)
         self.key = repr((self.kind, num_keypoints, Path(weights or "").name)).encode()
 
-    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
+    def forward(self, images: Tensor, mask: Tensor | None = None) -> Features:
         """(B, 1, H, W) to features; with a mask nothing is cached."""
-        if wanted is not None:
-            return self.front_end(images, wanted)
+        if mask is not None:
+            return self.front_end(images, mask)
         return Features.cat([self._of(image[None]) for image in images])
 
     def _of(self, image: Tensor) -> Features:

@@ -112,6 +112,7 @@ def test_noise_and_blank_images(kind: type[nn.Module]) -> None:
 @pytest.mark.parametrize(
     "images", [torch.rand(1, 3, 64, 64), torch.rand(64, 64), torch.zeros(1, 1, 64, 64).byte()]
 )
+@pytest.mark.usefixtures("without_shape_checks")
 def test_unsupported_images_are_refused(kind: type[nn.Module], images: Tensor) -> None:
     with pytest.raises(ValueError, match="images must be"):
         kind()(images)

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 
 from torchslam.features.corners import (
     _falling,
-    best_of_cells,
+    best_per_cell,
     plan_grid,
     prefilter_candidates,
     ranks_within,
@@ -26,7 +26,7 @@ def test_ranks_count_within_groups(groups: list[int]) -> None:
 def test_best_of_cells_are_the_highest() -> None:
     cells = torch.tensor([1, 0, 1, 1, 0])
     scores = torch.tensor([5, 9, 7, 200, 9], dtype=torch.uint8)
-    assert best_of_cells(cells, scores, 3).tolist() == [False, True, False, True, True]
+    assert best_per_cell(cells, scores, 3).tolist() == [False, True, False, True, True]
 
 
 def test_atlas_levels_do_not_overlap() -> None:
@@ -99,12 +99,12 @@ def test_non_candidates_are_not_selected(seed: int, count: int, corners: int, ba
     fast = torch.randint(8, 8 + most, (corners,), generator=draw).to(torch.uint8)
     strengths = fast + torch.randint(0, 4, (corners,), generator=draw) / 8
     strong = fast > 20
-    best = best_of_cells(images * num_cells + cells, fast, batch * num_cells)
+    best = best_per_cell(images * num_cells + cells, fast, batch * num_cells)
 
-    offered = strong | best
-    fewer = best | (strong & prefilter_candidates(fast, offered, cells, images, grid, batch, count))
+    candidates = strong | best
+    fewer = best | (strong & prefilter_candidates(fast, candidates, cells, images, grid, batch, count))
     results = []
-    for rows in (offered.nonzero().squeeze(1), fewer.nonzero().squeeze(1)):
+    for rows in (candidates.nonzero().squeeze(1), fewer.nonzero().squeeze(1)):
         chosen, places = select_evenly(
             *(x[rows] for x in (strengths, strong, cells, images)), grid, batch, count
         )
@@ -116,5 +116,5 @@ def test_candidates_are_bounded_where_many_scores_are_equal() -> None:
     grid = plan_grid(plan_pyramid(480, 640, 1.2, 8), 500, 8, 19, 7, CPU)
     cells = torch.randint(0, grid.levels.shape[0], (20_000,), generator=torch.Generator().manual_seed(0))
     fast = (torch.arange(20_000) % 200 + 30).to(torch.uint8)
-    offered, images = fast > 0, torch.zeros(20_000, dtype=torch.int64)
-    assert 500 <= int(prefilter_candidates(fast, offered, cells, images, grid, 1, 500).sum()) < 1500
+    candidates, images = fast > 0, torch.zeros(20_000, dtype=torch.int64)
+    assert 500 <= int(prefilter_candidates(fast, candidates, cells, images, grid, 1, 500).sum()) < 1500

@@ -44,7 +44,7 @@ def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None =
         weights: file of weights for "xfeat" and "aliked", unused by the others.
 
     Returns:
-        A module from images (B, 1, H, W) to Features.
+        A module from images (B, 1, H, W) and optionally a mask to `Features`.
 
     Raises:
         ConfigError: The name is unknown, or the weights are missing or unreadable.

@@ -6,6 +6,7 @@ import math
 from functools import lru_cache
 
 import torch
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.features.corners import array_module, chunks, gather_patches, to_numpy
@@ -85,41 +86,43 @@ ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle 
 
 
 @lru_cache(maxsize=8)
-def _moment_weights(device: torch.device) -> Tensor:
-    """(2, side^2) int8: x and y of each pixel of the patch within the disk of RADIUS, else 0; they sum to 0."""
+def _moment_weights(device: torch.device) -> Int[Tensor, "2 S"]:
+    """x and y (int8) of each pixel of the flattened patch within the disk of RADIUS, else 0; they sum to 0."""
     axis = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32)
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     disk = (x * x + y * y <= (RADIUS + 0.5) ** 2).float()
     return torch.stack([x * disk, y * disk]).flatten(1).to(device, torch.int8)
 
 
-def orientations(pixels: Tensor, positions: Tensor, stride: int) -> Tensor:
-    """Angle from each keypoint to the intensity centroid of the disk around it.
+def orientations(
+    pixels: UInt8[Tensor, " A"], positions: Int[Tensor, " N"], stride: int
+) -> Float[Tensor, " N"]:
+    """Compute the angle from each keypoint to the intensity centroid of the disk around it.
+
+    The moments are whole numbers below 2^24, hence exact.
 
     Args:
-        pixels: (P,) uint8 flattened atlas
-        positions: (N,) int64 into it.
+        pixels: flattened packed pyramids.
+        positions: of the keypoints in the pixels.
+        stride: length of a row of pixels.
 
     Returns:
-        (N,) float32 radians in [-pi, pi], from x towards y; 0 on a uniform patch. The moments are whole
-            numbers below 2^24, hence exact.
+        Radians in [-pi, pi], from x towards y; 0 on a uniform patch.
     """
     patches = gather_patches(pixels, positions, stride, RADIUS).flatten(1)
-    # As int8: what is subtracted is the same everywhere, and has no moment. The other order of factors is slower.
+    # As int8: subtracting a constant changes no moment. The other order of factors is slower.
     x, y = int8_product(_moment_weights(pixels.device), (patches ^ 128).view(torch.int8).mT)
     # In float64, as vectorized float32 may differ in the last bit from one position in memory to another.
     return torch.atan2(y.double(), x.double()).float()
 
 
-def blur(pixels: Tensor, stride: int) -> Tensor:
+def blur(pixels: UInt8[Tensor, " A"], stride: int) -> Int[Tensor, " R"]:
     """Smooth a flattened image by a 7x7 near-Gaussian of sigma 1.6 px, in whole numbers.
 
-    Args:
-        pixels: (P,) uint8.
+    Per direction two boxes of width 4, each the sum of two shifted sums.
 
     Returns:
-        (P - 6 stride - 6,) int16, 256 times the blurred value less 2^15: entry i belongs to pixel i +
-            BLUR_RADIUS * (stride + 1). Per direction two boxes of width 4, each the sum of two shifted sums.
+        int16, 256 times the blurred value less 2^15, without the first and the last BLUR_RADIUS * (stride + 1) pixels.
     """
     margin = 2 * BLUR_RADIUS * (stride + 1)
     blurred = pixels.new_empty(max(0, pixels.shape[0] - margin), dtype=torch.int16)
@@ -135,8 +138,10 @@ def blur(pixels: Tensor, stride: int) -> Tensor:
 
 
 @lru_cache(maxsize=16)
-def rotated_offsets(points: tuple[tuple[int, int], ...], stride: int, device: torch.device) -> Tensor:
-    """(ANGLE_BINS, K) int32: flat offsets of K points (x, y) around a keypoint, turned by every angle and rounded."""
+def rotated_offsets(
+    points: tuple[tuple[int, int], ...], stride: int, device: torch.device
+) -> Int[Tensor, "256 S"]:
+    """Compute flat offsets of points (x, y) around a keypoint, rotated by every angle and rounded."""
     angles = torch.arange(ANGLE_BINS, dtype=torch.float64) * (2 * math.pi / ANGLE_BINS)
     cos, sin = angles.cos()[:, None], angles.sin()[:, None]
     x, y = torch.tensor(points, dtype=torch.float64).unbind(-1)
@@ -145,18 +150,20 @@ def rotated_offsets(points: tuple[tuple[int, int], ...], stride: int, device: to
 
 
 def sample_rotated(
-    blurred: Tensor, positions: Tensor, angles: Tensor, stride: int, points: tuple[tuple[int, int], ...]
-) -> Tensor:
-    """Values of a blurred image at points around each keypoint, turned by its angle.
+    blurred: Int[Tensor, " R"],
+    positions: Int[Tensor, " N"],
+    angles: Float[Tensor, " N"],
+    stride: int,
+    points: tuple[tuple[int, int], ...],
+) -> Int[Tensor, "N S"]:
+    """Sample a blurred image at points around each keypoint, rotated by its angle.
 
     Args:
-        blurred: from `blur`
-        positions: (N,) int64 into the image before blurring
-        angles: (N,) radians
-        points: K times (x, y) in pixels of the level.
-
-    Returns:
-        (N, K) int16.
+        blurred: from `blur`.
+        positions: of the keypoints in the image before blurring.
+        angles: radians.
+        stride: length of a row of pixels.
+        points: (x, y) of the samples, in pixels of the level.
     """
     bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
     origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)
@@ -168,8 +175,10 @@ def sample_rotated(
 _ENDS = tuple((test[2 * end], test[2 * end + 1]) for end in (0, 1) for test in PATTERN)
 
 
-def describe(blurred: Tensor, positions: Tensor, angles: Tensor, stride: int) -> Tensor:
-    """256 brightness comparisons around each keypoint, turned by its angle: (N, 32) uint8, arguments as above.
+def describe(
+    blurred: Int[Tensor, " R"], positions: Int[Tensor, " N"], angles: Float[Tensor, " N"], stride: int
+) -> UInt8[Tensor, "N 32"]:
+    """Describe keypoints by 256 brightness comparisons, rotated by their angles; arguments as for `sample_rotated`.
 
     Keypoints must lie RADIUS + BLUR_RADIUS inside their level.
     """

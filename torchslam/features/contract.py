@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import torch
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
 from torchslam.errors import ConfigError
@@ -19,23 +20,31 @@ COLUMNS: dict[str, tuple[int, ...]] = {
     "angles": (),
     "mask": (),
 }
-"""The shape of one keypoint's row."""
-BYTES = 32
-"""Bytes of a binary descriptor: matching and the keyframe database count 256 bits."""
+"""Shape of a keypoint's row in each column."""
+BINARY_BYTES = 32
+"""Bytes of a binary descriptor, 256 bits."""
 
 LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 NORMALIZE = "torch.nn.functional.normalize(descriptors, dim=-1) makes them so"
 
 
-def are_comparable(descriptors: Tensor) -> Tensor:
-    """(..., N) bool, which rows of floats (..., N, D) the cosine compares: finite, of unit length, or zero as those of
-    no keypoint."""
+def are_unit_or_zero(descriptors: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*batch"]:
+    """Whether float descriptors are finite and of unit length, or zero as those of no keypoint."""
     lengths = torch.linalg.vector_norm(descriptors.detach().float(), dim=-1)
     return ((lengths - 1).abs() <= LENGTH_TOLERANCE) | (lengths == 0)
 
 
-def check_features(found: object, images: Tensor, name: str) -> None:
-    """Raises ConfigError where a front end's answer to images (B, 1, H, W) is not `Features` of B images."""
+def check_features(found: object, images: Shaped[Tensor, "B 1 H W"], name: str) -> None:
+    """Check that what a front end returned for a batch of images keeps the contract of `Features`.
+
+    Args:
+        found: what the front end returned.
+        images: its input.
+        name: of the front end, for messages.
+
+    Raises:
+        ConfigError: A field has a wrong shape, type or value.
+    """
 
     def refuse(what: str) -> None:
         raise ConfigError(f"front end {name}: {what}")
@@ -57,8 +66,10 @@ def check_features(found: object, images: Tensor, name: str) -> None:
         refuse(f"descriptors must be {rows} + (D,), not {_described(described)}")
     if described.dtype != torch.uint8 and not described.is_floating_point():
         refuse(f"descriptors must be uint8, bits, or floats, not {described.dtype}")
-    if described.dtype == torch.uint8 and described.shape[-1] != BYTES:
-        refuse(f"descriptors of bits must be {(*rows, BYTES)}, {8 * BYTES} bits, not {_described(described)}")
+    if described.dtype == torch.uint8 and described.shape[-1] != BINARY_BYTES:
+        refuse(
+            f"descriptors of bits must be {(*rows, BINARY_BYTES)}, {8 * BINARY_BYTES} bits, not {_described(described)}"
+        )
     if described.is_floating_point():
         _check_lengths(described, refuse)
     for column in ("keypoints", "scales"):
@@ -70,8 +81,9 @@ def check_features(found: object, images: Tensor, name: str) -> None:
         _check_information(found.information, found.mask, rows, refuse)
 
 
-def _check_lengths(descriptors: Tensor, refuse: Callable[[str], None]) -> None:
-    wrong = ~are_comparable(descriptors)
+def _check_lengths(descriptors: Float[Tensor, "B N D"], refuse: Callable[[str], None]) -> None:
+    """Check that float descriptors have unit length."""
+    wrong = ~are_unit_or_zero(descriptors)
     if bool(wrong.any()):
         lengths = descriptors.detach().float().norm(dim=-1)[wrong]
         refuse(
@@ -81,8 +93,9 @@ def _check_lengths(descriptors: Tensor, refuse: Callable[[str], None]) -> None:
 
 
 def _check_information(
-    information: object, mask: Tensor, rows: tuple[int, int], refuse: Callable[[str], None]
+    information: object, mask: Bool[Tensor, "B N"], rows: tuple[int, int], refuse: Callable[[str], None]
 ) -> None:
+    """Check the shape and type of the information, and that it is positive (definite)."""
     shapes = (rows, (*rows, 2, 2))
     if not isinstance(information, Tensor) or tuple(information.shape) not in shapes:
         refuse(f"information must be {shapes[0]} or {shapes[1]}, not {_described(information)}")
@@ -95,16 +108,16 @@ def _check_information(
 
 
 def _described(values: object) -> str:
+    """Shape of a tensor, or type of another value, for messages."""
     return f"{tuple(values.shape)}" if isinstance(values, Tensor) else type(values).__name__
 
 
-def only_where(features: Features, wanted: Tensor) -> Features:
-    """Features without the keypoints whose nearest pixel is not wanted; pixels beyond the image count as its edge.
+def apply_mask(features: Features, mask: Bool[Tensor, "B 1 H W"]) -> Features:
+    """Mask the keypoints whose nearest pixel is not in the mask of an image.
 
-    Args:
-        wanted: (B, 1, H, W) bool.
+    Pixels beyond the image count as those of its edge.
     """
-    height, width = wanted.shape[-2:]
+    height, width = mask.shape[-2:]
     x, y = features.keypoints.detach().round().to(torch.int64).unbind(-1)
-    inside = wanted[:, 0].flatten(1).gather(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1))
+    inside = mask[:, 0].flatten(1).gather(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1))
     return replace(features, mask=features.mask & inside)

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
 from torchslam.features.pyramid import PackedPyramid
@@ -47,9 +48,10 @@ def to_tensor(pixels: Any) -> Tensor:
 
 
 def chunks(pixels: Any, start: int, stop: int) -> list[tuple[int, int]]:
-    """(start, count) of chunks of nearly equal size from `start` to before `stop`; a single one on a GPU.
+    """Split the pixels of `to_numpy` from `start` to before `stop` into chunks of nearly equal size; one on a GPU.
 
-    pixels: of `to_numpy`
+    Returns:
+        (start, count) of each chunk.
     """
     count = max(0, stop - start)
     number = max(1, -(-count // CHUNK_PIXELS)) if isinstance(pixels, np.ndarray) else 1
@@ -71,12 +73,17 @@ Opposites = Callable[[Extremum, int, int], tuple[Any, Any]]
 """(extremum, i, j) -> the extremum of neighbors i and j on the circle, and that of those opposite, i + 8 and j + 8."""
 
 
-def fast_scores(pixels: Tensor, stride: int, bands: Bands | None = None) -> Tensor:
-    """Score of every pixel: the largest t at which it is brighter or darker by t than nine neighbors in a row.
+def fast_scores(pixels: UInt8[Tensor, " A"], stride: int, bands: Bands | None = None) -> UInt8[Tensor, " A"]:
+    """Score every pixel by the largest t at which it is brighter or darker by t than nine neighbors in a row.
 
-    pixels: (P,) uint8, a flattened image of row length `stride`; bands: the pixels whose scores are used, others are
-    undefined; None: all. Returns (P,) uint8; 0 where there is no such arc and in the first and last rows,
-    which the circle leaves. A pixel is a FAST-9 corner of threshold t where its score exceeds t.
+    Args:
+        pixels: a flattened image.
+        stride: length of a row of pixels.
+        bands: the pixels whose scores are used, others are undefined; None: all.
+
+    Returns:
+        Scores; 0 where there is no such arc and in the first and last rows, which the circle leaves. A pixel is a
+        FAST-9 corner of threshold t where its score exceeds t.
     """
     margin, values = 3 * stride + 3, to_numpy(pixels)
     parts = _chunks_of(bands, values, margin)
@@ -115,8 +122,8 @@ def _chunk_scores(pixels: Any, stride: int, start: int, count: int) -> Any:
     return _scores(opposites, pixels[start : start + count], array_module(pixels))
 
 
-def patch_scores(patches: Tensor) -> Tensor:
-    """FAST scores wherever the circle fits into a patch, differentiable: (N, S, S) floats -> (N, S - 6, S - 6)."""
+def patch_scores(patches: Float[Tensor, "N S S"]) -> Float[Tensor, "N S-6 S-6"]:
+    """Compute FAST scores wherever the circle fits into a patch, differentiable."""
     inner = patches.shape[-1] - 6
     ring = [patches[:, 3 + dy :, 3 + dx :][:, :inner, :inner] for dx, dy in FAST_CIRCLE]
 
@@ -159,12 +166,19 @@ def _in_place(values: Any, function: Callable[..., Any], others: Any) -> Any:
     return function(values, others, out=values if values.itemsize == 1 else None)
 
 
-def find_peaks(scores: Tensor, floor: Tensor, stride: int, bands: Bands | None = None) -> Tensor:
-    """Positions (K,) int64, ascending, of scores that exceed their floor and their eight neighbors; of equal ones the
-    first wins.
+def find_peaks(
+    scores: UInt8[Tensor, " A"], floor: UInt8[Tensor, " A"], stride: int, bands: Bands | None = None
+) -> Int[Tensor, " R"]:
+    """Find scores that exceed their floor and their eight neighbors; of equal neighbors the first wins.
 
-    scores, floor: (P,) uint8, flattened with row length `stride`; bands: pixels beyond which
-    no score exceeds its floor; None: all except a margin.
+    Args:
+        scores: of a flattened image.
+        floor: what each score must exceed.
+        stride: length of a row of pixels.
+        bands: pixels beyond which no score exceeds its floor; None: all except a margin.
+
+    Returns:
+        Positions of the peaks, ascending.
     """
     values, floors = to_numpy(scores), to_numpy(floor)
     parts = _chunks_of(bands, values, stride + 1)
@@ -191,8 +205,10 @@ HARRIS_WINDOW = 7
 HARRIS_K = 0.04
 
 
-def gather_patches(pixels: Tensor, positions: Tensor, stride: int, radius: int) -> Tensor:
-    """Square neighborhoods out of a flattened image: (P,), (N,) int64 -> (N, side, side), side = 2 radius + 1.
+def gather_patches(
+    pixels: Shaped[Tensor, " A"], positions: Int[Tensor, " N"], stride: int, radius: int
+) -> Shaped[Tensor, "N S S"]:
+    """Gather square neighborhoods out of a flattened image, of side 2 radius + 1.
 
     Whole rows are copied at once, which is ten times faster than an index per pixel.
     """
@@ -226,11 +242,10 @@ def _window_sums(inner: int, device: torch.device, dtype: torch.dtype) -> Tensor
     return matrix.view(inner * inner, -1).to(device=device, dtype=dtype)
 
 
-def harris_responses(patches: Tensor) -> Tensor:
-    """Harris corner response wherever its 7x7 window of Sobel derivatives fits (Harris, Stephens, 1988).
+def harris_responses(patches: Float[Tensor, "N S S"]) -> Float[Tensor, "N S-8 S-8"]:
+    """Compute Harris responses wherever the 7x7 window of Sobel derivatives fits (Harris, Stephens, 1988).
 
-    patches: (N, S, S) floats, S >= 9. Returns (N, S - 8, S - 8). For whole-number pixels below 256 the sums are
-    whole numbers too, so they do not depend on the order of summation.
+    For whole-number pixels below 256 the sums are whole numbers too, so they do not depend on the order of summation.
     """
     side = patches.shape[-1]
     gradients = patches.flatten(1) @ _sobel(side, patches.device, patches.dtype)
@@ -243,8 +258,8 @@ def harris_responses(patches: Tensor) -> Tensor:
 
 
 @lru_cache(maxsize=8)
-def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Tensor:
-    """(9, 5): 3x3 values to the least-squares paraboloid's gx, gy, gxx, gyy, gxy at the center."""
+def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "9 5"]:
+    """3x3 values to the least-squares paraboloid's gx, gy, gxx, gyy, gxy at the center."""
     slope, curve, ones = torch.tensor([-1.0, 0.0, 1.0]), torch.tensor([1.0, -2.0, 1.0]), torch.ones(3)
     fits = [
         torch.outer(ones, slope) / 6,
@@ -256,10 +271,11 @@ def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Tensor:
     return torch.stack(fits, dim=-1).view(9, 5).to(device=device, dtype=dtype)
 
 
-def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
-    """Offset (x, y) of the maximum of the paraboloid fitted to 3x3 responses, in pixels from the center.
+def quadratic_peak(responses: Float[Tensor, "N 3 3"], limit: float = 0.5) -> Float[Tensor, "N 2"]:
+    """Locate the maximum of the paraboloid fitted to 3x3 responses.
 
-    responses: (N, 3, 3). Returns (N, 2), within +-limit; zero where the fit has no maximum.
+    Returns:
+        Offset (x, y) from the center in pixels, within +-limit; zero where the fit has no maximum.
     """
     fit = responses.flatten(1) @ _paraboloid_fit(responses.device, responses.dtype)
     gx, gy, gxx, gyy, gxy = fit.unbind(-1)
@@ -270,11 +286,15 @@ def quadratic_peak(responses: Tensor, limit: float = 0.5) -> Tensor:
     return torch.where(peaked[:, None], offset, torch.zeros_like(offset)).clamp(-limit, limit)
 
 
-def soft_peak(responses: Tensor, temperature: float = 0.2) -> Tensor:
-    """Soft arg-max over a neighborhood: offset (x, y) of its maximum from its center, differentiable.
+def soft_peak(responses: Float[Tensor, "N S S"], temperature: float = 0.2) -> Float[Tensor, "N 2"]:
+    """Locate the maximum of a neighborhood by a soft arg-max, differentiable.
 
-    responses: (N, S, S), S odd. They are divided by the largest magnitude of their neighborhood, so that
-    `temperature` has no unit. Returns (N, 2) pixels.
+    Args:
+        responses: neighborhoods of odd side; each is divided by its largest magnitude.
+        temperature: of the softmax, without unit.
+
+    Returns:
+        Offset (x, y) from the center in pixels.
     """
     side = responses.shape[-1]
     scale = responses.abs().amax(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(responses.dtype).tiny)
@@ -288,18 +308,19 @@ def soft_peak(responses: Tensor, temperature: float = 0.2) -> Tensor:
 class Grid:
     """Cells over every level of a pyramid, less a border where no keypoint may lie.
 
-    table:   (rows * stride,) int32, the cell of each atlas pixel, -1 on the border and between levels
-    floor:   (rows * stride,) uint8, the FAST score that a corner must exceed there; 255 where none may lie
-    rows:    of the pyramid, runs (first, last + 1) of those in which there are cells
-    levels:  (cells,) int64, the level of each cell
-    budgets: (levels,) int64, how many keypoints each level may give
+    Attributes:
+        table: the cell of each pixel of the packed pyramid, -1 on the border and between levels.
+        floor: the FAST score that a corner must exceed there; 255 where none may lie.
+        rows: of the pyramid, runs (first, last + 1) of those in which there are cells.
+        levels: the level of each cell.
+        budgets: largest number of keypoints of each level.
     """
 
-    table: Tensor
-    floor: Tensor
+    table: Int[Tensor, " A"]
+    floor: UInt8[Tensor, " A"]
     rows: tuple[tuple[int, int], ...]
-    levels: Tensor
-    budgets: Tensor
+    levels: Int[Tensor, " N"]
+    budgets: Int[Tensor, " L"]
 
 
 @lru_cache(maxsize=8)
@@ -311,9 +332,15 @@ def plan_grid(
     threshold: int,
     device: torch.device,
 ) -> Grid:
-    """Budgets per level and square cells whose part of the budget is about `per_cell` keypoints.
+    """Divide the levels into square cells, and the keypoints between the levels.
 
-    threshold: the FAST score that a corner must exceed.
+    Args:
+        pyramid: layout of the levels.
+        num_keypoints: budget of all levels.
+        per_cell: approximate number of keypoints in a cell.
+        border: pixels at the edges of every level without keypoints.
+        threshold: the FAST score that a corner must exceed.
+        device: of the grid.
     """
     table = torch.full((pyramid.rows, pyramid.stride), -1, dtype=torch.int32)
     budgets = _level_budgets(num_keypoints, pyramid, border)
@@ -339,8 +366,8 @@ def plan_grid(
     )
 
 
-def _runs(flags: Tensor) -> tuple[tuple[int, int], ...]:
-    """(start, stop) of all runs of true ones in flags (n,)."""
+def _runs(flags: Bool[Tensor, " N"]) -> tuple[tuple[int, int], ...]:
+    """(start, stop) of all runs of true flags."""
     edges = F.pad(flags.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
     return tuple(zip(edges[::2], edges[1::2], strict=True))
 
@@ -358,8 +385,8 @@ def _level_budgets(num_keypoints: int, pyramid: PackedPyramid, border: int) -> l
     return [after - before for before, after in pairwise(edges)]
 
 
-def ranks_within(groups: Tensor, num_groups: int) -> Tensor:
-    """Place of each row among the rows of its group, from 0, in the order in which they come: (N,) int64 -> (N,)."""
+def ranks_within(groups: Int[Tensor, " N"], num_groups: int) -> Int[Tensor, " N"]:
+    """Number the rows of each group from 0, in the order of the rows."""
     order = torch.argsort(groups, stable=True)
     sizes = torch.bincount(groups, minlength=num_groups)
     starts = sizes.cumsum(0) - sizes
@@ -369,25 +396,36 @@ def ranks_within(groups: Tensor, num_groups: int) -> Tensor:
     return ranks
 
 
-def best_of_cells(cells: Tensor, scores: Tensor, num_cells: int) -> Tensor:
-    """Test whether a row has the highest score of its cell: (N,) int64, (N,) -> (N,) bool."""
+def best_per_cell(
+    cells: Int[Tensor, " N"], scores: Shaped[Tensor, " N"], num_cells: int
+) -> Bool[Tensor, " N"]:
+    """Test whether a row has the highest score of its cell."""
     best = scores.new_zeros(num_cells).scatter_reduce(0, cells, scores, "amax")
     return scores == best.index_select(0, cells)
 
 
 def prefilter_candidates(
-    scores: Tensor, offered: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
-) -> Tensor:
-    """Corners that `select_evenly` may choose besides the best of the cells: far fewer than all, without a sort.
+    scores: UInt8[Tensor, " N"],
+    candidates: Bool[Tensor, " N"],
+    cells: Int[Tensor, " N"],
+    images: Int[Tensor, " N"],
+    grid: Grid,
+    num_images: int,
+    count: int,
+) -> Bool[Tensor, " N"]:
+    """Find corners that `select_evenly` may choose besides the best of the cells: far fewer than all, without a sort.
 
-    scores: (N,) uint8, whole parts of the scores to be; offered: (N,) bool, what is to be spread; others as there.
-    A level takes its budget and at most all that is left of others': who has as many stronger ones cannot be chosen.
-    Returns (N,) bool.
+    A level takes at most its budget and all that other levels leave: a corner with as many stronger ones on its level
+    is never chosen. Arguments as for `select_evenly`, and:
+
+    Args:
+        scores: whole parts of the scores of `select_evenly`.
+        candidates: rows that compete.
     """
     num_levels = grid.budgets.shape[0]
     group = images * num_levels + grid.levels.index_select(0, cells)
     values = group * 256 + scores
-    weights = offered.to(torch.float32)
+    weights = candidates.to(torch.float32)
     histogram = torch.bincount(values, weights, minlength=num_images * num_levels * 256).view(
         -1, num_levels, 256
     )
@@ -398,14 +436,29 @@ def prefilter_candidates(
 
 
 def select_evenly(
-    scores: Tensor, strong: Tensor, cells: Tensor, images: Tensor, grid: Grid, num_images: int, count: int
-) -> tuple[Tensor, Tensor]:
+    scores: Float[Tensor, " N"],
+    strong: Bool[Tensor, " N"],
+    cells: Int[Tensor, " N"],
+    images: Int[Tensor, " N"],
+    grid: Grid,
+    num_images: int,
+    count: int,
+) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Choose up to `count` corners per image: the best of every cell first, then the strongest elsewhere.
 
-    scores: (N,) higher is better; strong: (N,) bool, whether a corner may be chosen besides the best of its cell;
-    cells: (N,) cell within its image; images: (N,) its image. Every level first takes its budget; what levels leave
-    unused goes to the best remaining corners of any level.
-    Returns the chosen rows (K,) and the place (K,) of each in its image's list, 0 ... count - 1, by falling score.
+    Every level first takes its budget; what levels leave unused goes to the best remaining corners of any level.
+
+    Args:
+        scores: higher is better.
+        strong: whether a corner may be chosen besides the best of its cell.
+        cells: of the corners, within their images.
+        images: of the corners.
+        grid: cells and budgets.
+        num_images: number of images.
+        count: largest number of corners per image.
+
+    Returns:
+        The chosen rows, and the place of each in its image's list, 0 ... count - 1, by falling score.
     """
     num_cells, num_levels = grid.levels.shape[0], grid.budgets.shape[0]
     rows = _falling(scores)  # every rank below follows this order
@@ -422,8 +475,8 @@ def select_evenly(
     return rows.index_select(0, chosen), ranks_within(images.index_select(0, chosen), num_images)
 
 
-def _falling(scores: Tensor) -> Tensor:
-    """Rows of scores (N,) from the highest down, equal ones in the order in which they come."""
+def _falling(scores: Float[Tensor, " N"]) -> Int[Tensor, " N"]:
+    """Rows of scores from the highest down, equal ones in the order of the rows."""
     if scores.dtype != torch.float32:
         return torch.argsort(scores, descending=True, stable=True)
     # The bits of floats are in the order of whole numbers, which are sorted several times as fast.
@@ -431,8 +484,8 @@ def _falling(scores: Tensor) -> Tensor:
     return torch.argsort(~torch.where(bits < 0, bits ^ 0x7FFFFFFF, bits), stable=True)
 
 
-def _is_first(groups: Tensor, num_groups: int) -> Tensor:
-    """Test whether a row is the first of its group: (N,) int64 -> (N,) bool."""
+def _is_first(groups: Int[Tensor, " N"], num_groups: int) -> Bool[Tensor, " N"]:
+    """Test whether a row is the first of its group."""
     rows = torch.arange(groups.shape[0], device=groups.device)
     first = rows.new_full((num_groups,), groups.shape[0]).scatter_reduce(0, groups, rows, "amin")
     return rows == first.index_select(0, groups)

@@ -1,8 +1,7 @@
 """Learned features behind the same interface as `ORB`, with weights from a local file; nothing is ever downloaded.
 
-The networks are kornia's. Descriptors are floats of unit length, angles are 0. The networks have a single scale, 2
-pixels, which is what searches take for the size of a keypoint. What is known of its error is its information, with the
-noise as measured on real sequences (`experiments/front_ends/noise.py`).
+The networks are kornia's. Descriptors are floats of unit length, angles are 0. All keypoints have the scale 2 pixels,
+and their information is that of the noise measured on real sequences (`experiments/front_ends/noise.py`).
 Keypoints, scores and descriptors carry gradients to the weights.
 """
 
@@ -12,12 +11,13 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.features.contract import only_where
+from torchslam.features.contract import apply_mask
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
 from torchslam.types import Features
@@ -26,8 +26,8 @@ from torchslam.utils.files import check_regular
 MAX_BYTES = 1 << 30  # of a file of weights
 _SCALE = 2.0
 XFEAT_NOISE, ALIKED_NOISE = 1.0, 0.7
-"""Pixels of the image that the network sees, by what whole runs on real sequences leave of its errors: XFeat has 1.03
-to 1.35, of which the least is taken (with 1.2 the start is refused on a short sequence), ALIKED 0.5 to 0.8."""
+"""Standard deviations of keypoints, in pixels of the network's input, measured in whole runs on real sequences: XFeat
+has 1.03 to 1.35 (with 1.2, a short sequence is not initialized), ALIKED 0.5 to 0.8."""
 
 
 class XFeat(nn.Module):
@@ -43,7 +43,7 @@ class XFeat(nn.Module):
     """
 
     def __init__(self, weights: str | Path, num_keypoints: int = 1000, threshold: float = 0.05) -> None:
-        import kornia  # here: whoever has no use for the networks need not wait for it
+        import kornia  # here, as the import is slow and only the networks need it
 
         super().__init__()
         self.num_keypoints = num_keypoints
@@ -53,20 +53,24 @@ class XFeat(nn.Module):
         _load(model, _read(weights), weights, optional="net.fine_matcher.")
         self.network = model.net.eval()
 
-    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
-        """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
-
-        Rows are in order of falling score, masked ones last.
+    def forward(
+        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
+    ) -> Features:
+        """Detect and describe keypoints.
 
         Args:
-            wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
+            images: gray, in [0, 1].
+            mask: where keypoints may lie; None: everywhere.
+
+        Returns:
+            Features with N = num_keypoints rows, in order of falling score, masked ones last.
 
         Raises:
-            ValueError: for another shape or type
+            ValueError: The images or the mask have another shape or type.
         """
         from kornia.geometry.subpix import nms2d
 
-        check_images(images, wanted)
+        check_images(images, mask)
         height, width = images.shape[-2:]
         # The network halves its input five times.
         inner = (max(32, height // 32 * 32), max(32, width // 32 * 32))
@@ -76,11 +80,11 @@ class XFeat(nn.Module):
         heat = F.pixel_shuffle(logits.softmax(1)[:, :64], 8)
         scores = heat * F.interpolate(reliability, inner, mode="bilinear", align_corners=False)
         peaks = nms2d(heat.detach(), (5, 5), mask_only=True) & (heat > self.threshold)
-        if wanted is not None:
-            peaks &= F.interpolate(wanted.float(), inner, mode="nearest-exact") > 0
+        if mask is not None:
+            peaks &= F.interpolate(mask.float(), inner, mode="nearest-exact") > 0
         ranked = torch.where(peaks, scores, 0).flatten(1)
         best = ranked.detach().topk(min(self.num_keypoints, ranked.shape[1]))
-        mask = best.values > 0
+        found = best.values > 0
         x, y = best.indices % inner[1], best.indices // inner[1]
 
         windows = F.pad(heat[:, 0], (2, 2, 2, 2)).unfold(1, 5, 1).unfold(2, 5, 1)
@@ -100,7 +104,7 @@ class XFeat(nn.Module):
         ratio = positions.new_tensor([width / inner[1], height / inner[0]])
         keypoints = (positions + 0.5) * ratio - 0.5
         scores = ranked.gather(1, best.indices)
-        return _features(keypoints, scores, descriptors, mask, self.num_keypoints, XFEAT_NOISE)
+        return _features(keypoints, scores, descriptors, found, self.num_keypoints, XFEAT_NOISE)
 
 
 class ALIKED(nn.Module):
@@ -129,19 +133,23 @@ class ALIKED(nn.Module):
         _load(self.network, state, weights, optional="dkd.")  # the detector's grid of pixels is no weight
         self.network.eval()
 
-    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
-        """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
-
-        Rows are in order of falling score, masked ones last.
+    def forward(
+        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
+    ) -> Features:
+        """Detect and describe keypoints.
 
         Args:
-            wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere. The detector of the network has
-                no mask, so keypoints elsewhere are dropped, not replaced
+            images: gray, in [0, 1].
+            mask: where keypoints may lie; None: everywhere. The detector of the network has no mask, so keypoints
+                elsewhere are dropped, not replaced.
+
+        Returns:
+            Features with N = num_keypoints rows, in order of falling score, masked ones last.
 
         Raises:
-            ValueError: for another shape or type
+            ValueError: The images or the mask have another shape or type.
         """
-        check_images(images, wanted)
+        check_images(images, mask)
         found = self.network(images.float())
         rows = [
             _features(
@@ -155,11 +163,16 @@ class ALIKED(nn.Module):
             for one in found
         ]
         features = Features.cat(rows)
-        return features if wanted is None else only_where(features, wanted)
+        return features if mask is None else apply_mask(features, mask)
 
 
 def _features(
-    keypoints: Tensor, scores: Tensor, descriptors: Tensor, mask: Tensor, count: int, noise_px: float
+    keypoints: Float[Tensor, "B R 2"],
+    scores: Float[Tensor, "B R"],
+    descriptors: Float[Tensor, "B R D"],
+    mask: Bool[Tensor, "B R"],
+    count: int,
+    noise_px: float,
 ) -> Features:
     """Features padded to `count` rows, zero where masked, with one scale, angle 0 and one noise."""
     missing = count - mask.shape[1]

@@ -13,13 +13,14 @@ import cv2
 import numpy as np
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from torchslam.features.brief import blur, describe, orientations
 from torchslam.features.corners import (
     Bands,
     Grid,
-    best_of_cells,
+    best_per_cell,
     fast_scores,
     find_peaks,
     gather_patches,
@@ -54,27 +55,31 @@ KEYPOINTS_PER_CELL = 8  # keypoints of a cell if they were spread evenly
 
 @dataclass(frozen=True)
 class Corners:
-    """The chosen corners of a batch of images, K in all, and the pyramid they were found in.
+    """The chosen corners of a batch of images, N in all, and the pyramid they were found in.
 
-    levels:    (B, 1, h, w) floats per level, gray values of 0 to 255 plus a half
-    pixels:    (B * rows * stride,) uint8, the flattened packed pyramids
-    positions: (K,) int64 into pixels
-    slots:     (K,) int64, row in the flattened (B, num_keypoints) table
-    strengths: (K,) float32, by which they were ranked
-    fast:      (K, 3, 3) uint8, FAST scores around each
-    image, level: (K,) int64; xy: (K, 2) int64, pixels of the level
+    Attributes:
+        levels: from `build_levels`.
+        pixels: the flattened packed pyramids.
+        pyramid: their layout.
+        positions: of the corners in the pixels.
+        slots: rows in the flattened (B, num_keypoints) table.
+        strengths: by which the corners were ranked.
+        fast: FAST scores around each corner.
+        image: of each corner.
+        level: of each corner.
+        xy: pixels of the level.
     """
 
-    levels: list[Tensor]
-    pixels: Tensor
+    levels: list[Float[Tensor, "B 1 _ _"]]
+    pixels: UInt8[Tensor, " A"]
     pyramid: PackedPyramid
-    positions: Tensor
-    slots: Tensor
-    strengths: Tensor
-    fast: Tensor
-    image: Tensor
-    level: Tensor
-    xy: Tensor
+    positions: Int[Tensor, " N"]
+    slots: Int[Tensor, " N"]
+    strengths: Float[Tensor, " N"]
+    fast: UInt8[Tensor, "N 3 3"]
+    image: Int[Tensor, " N"]
+    level: Int[Tensor, " N"]
+    xy: Int[Tensor, "N 2"]
 
 
 class ORB(nn.Module):
@@ -118,12 +123,14 @@ class ORB(nn.Module):
         self.ranking = ranking
         self.differentiable = differentiable
 
-    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
+    def forward(
+        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
+    ) -> Features:
         """Detect and describe keypoints.
 
         Args:
-            images: (B, 1, H, W) floats in [0, 1].
-            wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere.
+            images: gray, in [0, 1].
+            mask: where keypoints may lie; None: everywhere.
 
         Returns:
             Features with N = num_keypoints rows, in order of falling score, masked ones last.
@@ -131,7 +138,7 @@ class ORB(nn.Module):
         Raises:
             ValueError: The images or the mask have another shape or type.
         """
-        corners = self.detect(images, wanted)
+        corners = self.detect(images, mask)
         stride, dtype = corners.pyramid.stride, images.dtype
         angles = orientations(corners.pixels, corners.positions, stride)
         descriptors = describe(blur(corners.pixels, stride), corners.positions, angles, stride)
@@ -153,14 +160,16 @@ class ORB(nn.Module):
             table(torch.ones_like(corners.slots, dtype=torch.bool)),
         )
 
-    def detect(self, images: Tensor, wanted: Tensor | None = None) -> Corners:
+    def detect(
+        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
+    ) -> Corners:
         """Choose the corners of a batch of images, without sub-pixel positions and descriptors.
 
         Args:
-            images: (B, 1, H, W) floats in [0, 1].
-            wanted: (B, 1, H, W) bool, where corners may lie, which get the whole budget; None: everywhere.
+            images: gray, in [0, 1].
+            mask: where corners may lie, which get the whole budget; None: everywhere.
         """
-        check_images(images, wanted)
+        check_images(images, mask)
         pyramid = plan_pyramid(*images.shape[-2:], self.scale_factor, self.num_levels)
         grid = plan_grid(
             pyramid, self.num_keypoints, KEYPOINTS_PER_CELL, BORDER, self.low_threshold, images.device
@@ -172,8 +181,8 @@ class ORB(nn.Module):
             # Peaks lie in cells, and the scores next to them are needed as well.
             scores = fast_scores(pixels, pyramid.stride, _bands(grid, pyramid, len(images), margin=1))
             floor = grid.floor.expand(len(images), -1).reshape(-1)
-            if wanted is not None:
-                floor = torch.where(_packed_mask(wanted, pyramid), floor, MAX_SCORE)
+            if mask is not None:
+                floor = torch.where(_packed_mask(mask, pyramid), floor, MAX_SCORE)
             bands = _bands(grid, pyramid, len(images))
             positions = self._peaks(scores, floor, len(images), pyramid.stride, bands)
             positions, slots, strengths = self._choose(pixels, scores, positions, grid, pyramid.stride)
@@ -185,8 +194,15 @@ class ORB(nn.Module):
             xy = torch.stack([inside % pyramid.stride - left, inside // pyramid.stride - top], dim=-1)
         return Corners(levels, pixels, pyramid, positions, slots, strengths, fast, image, level, xy)
 
-    def _peaks(self, scores: Tensor, floor: Tensor, batch: int, stride: int, bands: Bands) -> Tensor:
-        """(K,) where corners are: peaks of the scores above a floor, which is lower in images that offer few."""
+    def _peaks(
+        self,
+        scores: UInt8[Tensor, " A"],
+        floor: UInt8[Tensor, " A"],
+        batch: int,
+        stride: int,
+        bands: Bands,
+    ) -> Int[Tensor, " R"]:
+        """Positions of corners: peaks of the scores above a floor, which is lower in images with few of them."""
         positions = find_peaks(scores, floor, stride, bands)
         images = _images_of(positions, len(scores), batch)
         faint = self._are_few(torch.ones_like(positions, dtype=torch.bool), images, batch)
@@ -197,22 +213,29 @@ class ORB(nn.Module):
         )
         return find_peaks(scores, lower.flatten(), stride, bands)
 
-    def _are_few(self, corners: Tensor, images: Tensor, batch: int) -> Tensor:
-        """(batch,) whether an image has few of some corners, a mask (K,), given the image (K,) of each."""
+    def _are_few(
+        self, corners: Bool[Tensor, " N"], images: Int[Tensor, " N"], batch: int
+    ) -> Bool[Tensor, "{batch}"]:
+        """Whether an image has few of the masked corners, given the image of each corner."""
         count = corners.sum()[None] if batch == 1 else torch.bincount(images[corners], minlength=batch)
         return count < WEAK_TEXTURE_RATIO * self.num_keypoints
 
     def _choose(
-        self, pixels: Tensor, scores: Tensor, positions: Tensor, grid: Grid, stride: int
-    ) -> tuple[Tensor, Tensor, Tensor]:
-        """Out of all corners those to keep: positions, rows of the flattened (B, num_keypoints) table, strengths."""
+        self,
+        pixels: UInt8[Tensor, " A"],
+        scores: UInt8[Tensor, " A"],
+        positions: Int[Tensor, " N"],
+        grid: Grid,
+        stride: int,
+    ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"], Float[Tensor, " R"]]:
+        """Choose corners: their positions, rows of the flattened (B, num_keypoints) table, and strengths."""
         area, num_cells = grid.table.shape[0], grid.levels.shape[0]
         batch = pixels.shape[0] // area
         image = _images_of(positions, len(scores), batch)
         cell = grid.table.index_select(0, positions - image * area).to(torch.int64)
         fast = scores.index_select(0, positions)
         strong = fast > self.threshold
-        best = best_of_cells(image * num_cells + cell, fast, batch * num_cells)
+        best = best_per_cell(image * num_cells + cell, fast, batch * num_cells)
         strong |= self._are_few(strong | best, image, batch).index_select(0, image)
         if self.ranking == "fast":  # the whole part of what they compete by
             needed = best | (
@@ -231,10 +254,10 @@ class ORB(nn.Module):
         rows, places = select_evenly(strengths, strong, cell, image, grid, batch, self.num_keypoints)
         return positions[rows], image[rows] * self.num_keypoints + places, strengths[rows]
 
-    def _refine(self, corners: Corners) -> tuple[Tensor, Tensor]:
-        """Sub-pixel offsets (K, 2) in pixels of the level, and scores (K,).
+    def _refine(self, corners: Corners) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
+        """Sub-pixel offsets in pixels of the level, and scores.
 
-        Corners sit where the FAST score peaks; the maximum of the Harris response lies further inside the corner and
+        Corners are where the FAST score peaks; the maximum of the Harris response lies further inside the corner and
         repeats less precisely.
         """
         if not self.differentiable:
@@ -259,31 +282,30 @@ def _bands(grid: Grid, pyramid: PackedPyramid, batch: int, margin: int = 0) -> B
     )
 
 
-def _images_of(positions: Tensor, pixels: int, batch: int) -> Tensor:
-    """(K,) the image of each position (K,) in `batch` flattened pyramids of `pixels` pixels together."""
+def _images_of(positions: Int[Tensor, " N"], pixels: int, batch: int) -> Int[Tensor, " N"]:
+    """The image of each position in `batch` flattened pyramids of `pixels` pixels together."""
     return torch.zeros_like(positions) if batch == 1 else positions // (pixels // batch)
 
 
-def _contrast_score(fast: Tensor) -> Tensor:
-    """The FAST score, and below its unit, to settle ties, by how much it exceeds the mean around it.
-
-    fast: (K, 3, 3) scores, below 256. Returns (K,).
-    """
+def _contrast_score(fast: Float[Tensor, "N 3 3"]) -> Float[Tensor, " N"]:
+    """The FAST score (below 256), with ties settled below its unit by how much it exceeds the mean around it."""
     return fast[:, 1, 1] + (fast[:, 1, 1] - fast.flatten(1).mean(1)) / 256
 
 
-def _packed_mask(wanted: Tensor, pyramid: PackedPyramid) -> Tensor:
-    """Masks (B, 1, H, W) bool at the pixels of the packed pyramids, by nearest neighbor: (B * rows * stride,) bool."""
-    levels = [F.interpolate(wanted.float(), size=size, mode="nearest-exact") for size in pyramid.sizes]
+def _packed_mask(mask: Bool[Tensor, "B 1 H W"], pyramid: PackedPyramid) -> Bool[Tensor, " A"]:
+    """Masks of images at the pixels of the flattened packed pyramids, by nearest neighbor."""
+    levels = [F.interpolate(mask.float(), size=size, mode="nearest-exact") for size in pyramid.sizes]
     return pack_levels(levels, pyramid).flatten() > 0
 
 
-def check_images(images: Tensor, wanted: Tensor | None = None) -> None:
-    """Raise ValueError unless the images are (B, 1, H, W) floats, and where keypoints are wanted, (B, 1, H, W) bool."""
-    if wanted is not None and (wanted.shape != images.shape or wanted.dtype != torch.bool):
-        raise ValueError(
-            f"a mask must be bool {tuple(images.shape)}, got {wanted.dtype} {tuple(wanted.shape)}"
-        )
+def check_images(images: Tensor, mask: Tensor | None = None) -> None:
+    """Check the input of an extractor.
+
+    Raises:
+        ValueError: The images are not (B, 1, H, W) floats, or the mask is not (B, 1, H, W) bool.
+    """
+    if mask is not None and (mask.shape != images.shape or mask.dtype != torch.bool):
+        raise ValueError(f"a mask must be bool {tuple(images.shape)}, got {mask.dtype} {tuple(mask.shape)}")
     if images.dim() != 4 or images.shape[1] != 1 or 0 in images.shape:
         raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
     if not images.is_floating_point():
@@ -310,15 +332,12 @@ class OpenCVORB(nn.Module):
             nfeatures=num_keypoints, scaleFactor=scale_factor, nlevels=num_levels, fastThreshold=threshold
         )
 
-    def forward(self, images: Tensor, wanted: Tensor | None = None) -> Features:
-        """Detect and describe: (B, 1, H, W) floats in [0, 1] -> Features with N = num_keypoints rows.
-
-        wanted: (B, 1, H, W) bool, where keypoints may lie; None: everywhere
-
-        Raises ValueError for another shape or type.
-        """
-        check_images(images, wanted)
-        masks = [None] * len(images) if wanted is None else list(wanted[:, 0].to(torch.uint8).cpu().numpy())
+    def forward(
+        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
+    ) -> Features:
+        """Detect and describe keypoints; arguments, result and errors as for `ORB.forward`."""
+        check_images(images, mask)
+        masks = [None] * len(images) if mask is None else list(mask[:, 0].to(torch.uint8).cpu().numpy())
         arrays = images.detach().mul(255).add(0.5).clamp(0, 255).to(torch.uint8)[:, 0].cpu()
         batch = [self._extract(*each, images.dtype) for each in zip(arrays, masks, strict=True)]
         fields = (torch.stack(column) for column in zip(*batch, strict=True))

@@ -12,6 +12,7 @@ from functools import lru_cache
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 MIN_SIDE = 40  # of a packed pyramid, so that every neighborhood fits whatever the image
@@ -22,9 +23,11 @@ class PackedPyramid:
     """Layout of the levels of a pyramid in one rectangle, in pixels of that rectangle.
 
     Attributes:
-        sizes: (height, width) of each level
-        corners: (top, left) of each level
-        scales: full-resolution pixels (x, y) per pixel of the level
+        sizes: (height, width) of each level.
+        corners: (top, left) of each level.
+        scales: full-resolution pixels (x, y) per pixel of each level.
+        rows: height of the rectangle.
+        stride: width of the rectangle.
     """
 
     sizes: tuple[tuple[int, int], ...]
@@ -36,7 +39,7 @@ class PackedPyramid:
 
 @lru_cache(maxsize=32)
 def plan_pyramid(height: int, width: int, scale_factor: float, num_levels: int) -> PackedPyramid:
-    """Sizes of the levels and their places: each level goes on the first shelf with room, or opens a new one."""
+    """Compute sizes and places of the levels: each goes on the first shelf with room, or opens a new one."""
     sizes = [
         (max(1, round(height / scale_factor**k)), max(1, round(width / scale_factor**k)))
         for k in range(num_levels)
@@ -56,14 +59,11 @@ def plan_pyramid(height: int, width: int, scale_factor: float, num_levels: int) 
     return PackedPyramid(tuple(sizes), tuple(corners), scales, max(bottom, MIN_SIDE), max(width, MIN_SIDE))
 
 
-def build_levels(images: Tensor, pyramid: PackedPyramid) -> list[Tensor]:
-    """The pyramid in gray values of 0 to 255, plus a half: each level is resized bilinearly from the one before.
-
-    Args:
-        images: (B, 1, H, W) in [0, 1]
+def build_levels(images: Float[Tensor, "B 1 H W"], pyramid: PackedPyramid) -> list[Float[Tensor, "B 1 _ _"]]:
+    """Build the pyramid of images in [0, 1]: each level is resized bilinearly from the one before.
 
     Returns:
-        one (B, 1, h, w) per level; truncating the values rounds them to the nearest gray value
+        Gray values of 0 to 255, plus a half, so that truncation rounds.
     """
     levels = [(images * 255).add_(0.5)]
     for size in pyramid.sizes[1:]:
@@ -71,8 +71,10 @@ def build_levels(images: Tensor, pyramid: PackedPyramid) -> list[Tensor]:
     return levels
 
 
-def pack_levels(levels: list[Tensor], pyramid: PackedPyramid) -> Tensor:
-    """Levels rounded to bytes at their places: (B, rows, stride) uint8."""
+def pack_levels(
+    levels: list[Float[Tensor, "B 1 _ _"]], pyramid: PackedPyramid
+) -> UInt8[Tensor, "B {pyramid.rows} {pyramid.stride}"]:
+    """Truncate levels to bytes and put them at their places."""
     filled = torch.zeros(
         levels[0].shape[0], pyramid.rows, pyramid.stride, dtype=torch.uint8, device=levels[0].device
     )
@@ -83,16 +85,20 @@ def pack_levels(levels: list[Tensor], pyramid: PackedPyramid) -> Tensor:
 
 
 def gather_level_patches(
-    levels: list[Tensor], images: Tensor, level: Tensor, xy: Tensor, radius: int
-) -> Tensor:
-    """Patches around keypoints on their own levels, with gradients to the levels.
+    levels: list[Float[Tensor, "B 1 _ _"]],
+    images: Int[Tensor, " N"],
+    level: Int[Tensor, " N"],
+    xy: Int[Tensor, "N 2"],
+    radius: int,
+) -> Float[Tensor, "N S S"]:
+    """Gather patches around keypoints on their own levels, with gradients to the levels.
 
     Args:
-        images, level: (N,) int64, image and level of each patch
-        xy: (N, 2) int64, pixels of the level, at least `radius` inside
-
-    Returns:
-        (N, side, side)
+        levels: from `build_levels`.
+        images: the image of each keypoint.
+        level: the level of each keypoint.
+        xy: pixels of the level, at least `radius` inside.
+        radius: of the patches; their side is 2 radius + 1 pixels.
     """
     device = xy.device
     heights, widths = (torch.tensor([lv.shape[d] for lv in levels], device=device) for d in (-2, -1))

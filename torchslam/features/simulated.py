@@ -1,16 +1,17 @@
-"""Simulated features: 3-D points projected through the true poses. They prove the geometry apart from the images."""
+"""Simulated features: 3-D points projected through the true poses, to test the geometry without images."""
 
 from __future__ import annotations
 
 import math
 
 import torch
+from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
 
+from torchslam.features.contract import BINARY_BYTES
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.types import Features
 
-DESCRIPTOR_BYTES = 32
 LEVELS, FACTOR = 8, 1.2  # the pyramid of the scales, as that of ORB
 
 
@@ -23,18 +24,24 @@ class SimulatedFeatures:
     the CPU, whose generator draws the same everywhere; features are on the device of the frame's pose.
 
     Args:
-        T_cw: (F, 4, 4) true poses.
+        T_cw: true poses.
+        camera: of all frames.
+        num_keypoints: number of rows of the features; the strongest points are used.
+        points_per_view: number of points to place in each view.
+        depth_near: smallest depth, in units of the extent.
+        depth_far: largest depth, in units of the extent.
         noise_px: standard deviation of the keypoints.
         outliers: fraction of the keypoints that are at a uniformly random place of the image.
         dropout: fraction of the visible points that a frame misses.
         scales: whether points have a size and a direction. Then a keypoint has the scale at which its point appears
-            from that depth, in steps of the pyramid's factor, and is seen within the pyramid alone; its noise grows
-            with its scale, and its angle turns with the camera. Without it all scales are one.
+            from that depth, in steps of the pyramid's factor, and is visible only at scales of the pyramid; its noise
+            grows with its scale, and its angle turns with the camera. Without it all scales are one.
+        seed: of all random numbers.
     """
 
     def __init__(
         self,
-        T_cw: Tensor,
+        T_cw: Float[Tensor, "K 4 4"],
         camera: Camera,
         *,
         num_keypoints: int = 1000,
@@ -55,18 +62,18 @@ class SimulatedFeatures:
         extent = float(torch.linalg.vector_norm(centers - centers.mean(0), dim=-1).max()) or 1.0
         self.depth_range = (depth_near * extent, depth_far * extent)
         generator = torch.Generator().manual_seed(seed)
-        self.sizes = T_cw.new_zeros(0)  # (P,) metres
+        self.sizes = T_cw.new_zeros(0)  # (P,) meters
         self.directions_w = T_cw.new_zeros(0, 3)  # (P, 3) unit vectors along their texture
         self.points_w = T_cw.new_zeros(0, 3)
         self._scatter(T_wc, points_per_view, generator)
         # Where more are visible than a frame may have keypoints, the same ones win in every frame.
         self.strengths = torch.rand(len(self.points_w), generator=generator)
         self.descriptors = torch.randint(
-            0, 256, (len(self.points_w), DESCRIPTOR_BYTES), generator=generator, dtype=torch.uint8
+            0, 256, (len(self.points_w), BINARY_BYTES), generator=generator, dtype=torch.uint8
         )
 
     def _scatter(self, T_wc: Tensor, per_view: int, generator: torch.Generator) -> None:
-        """Points such that every view holds about `per_view`: views are filled up in the order of the frames."""
+        """Add points so that every view has about `per_view`, in the order of the frames."""
         width, height = self.camera.size
         near, far = self.depth_range
         for pose in T_wc:
@@ -82,8 +89,10 @@ class SimulatedFeatures:
             if self.scales:
                 self._shape(pose, depth[:, 0], generator)
 
-    def _shape(self, T_wc: Tensor, depth: Tensor, generator: torch.Generator) -> None:
-        """Give new points at a depth (n,) sizes, seen from T_wc (4, 4) at any level, and directions in its image."""
+    def _shape(
+        self, T_wc: Float[Tensor, "4 4"], depth: Float[Tensor, " N"], generator: torch.Generator
+    ) -> None:
+        """Give new points at these depths in the view T_wc sizes, of any level, and directions in its image."""
         draw = torch.rand(2, len(depth), generator=generator, dtype=depth.dtype)
         sizes = FACTOR ** ((LEVELS - 1) * draw[0]) * depth / self.camera.focal
         angle = 2 * torch.pi * draw[1]
@@ -91,8 +100,10 @@ class SimulatedFeatures:
         self.sizes = torch.cat([self.sizes, sizes])
         self.directions_w = torch.cat([self.directions_w, directions_c @ T_wc[:3, :3].mT])
 
-    def _visible(self, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """(P, 2) pixels, (P,) whether a point is seen, (P,) its level in the pyramid, (P,) its angle."""
+    def _visible(
+        self, T_cw: Float[Tensor, "4 4"]
+    ) -> tuple[Float[Tensor, "N 2"], Bool[Tensor, " N"], Float[Tensor, " N"], Float[Tensor, " N"]]:
+        """Pixels of all points, whether each is visible, its level in the pyramid, and its angle."""
         points_c = transform(T_cw, self.points_w)
         pixels, valid = self.camera.project(points_c)
         # Far points stay visible for a while after the trajectory has moved on; very near ones do not.
@@ -109,8 +120,8 @@ class SimulatedFeatures:
         angle = torch.atan2(image[:, 1], image[:, 0])
         return pixels, visible & (level >= 0) & (level < LEVELS), level, angle
 
-    def __call__(self, T_cw: Tensor, frame_index: int) -> Features:
-        """Features (batch of one) of the frame with this true pose (4, 4)."""
+    def __call__(self, T_cw: Float[Tensor, "4 4"], frame_index: int) -> Features:
+        """Return the features (a batch of one) of the frame with this true pose."""
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + frame_index) % 2**63)
         device, T_cw = T_cw.device, T_cw.cpu()
         width, height = self.camera.size
@@ -127,7 +138,14 @@ class SimulatedFeatures:
         keypoints = torch.where(is_outlier, anywhere * pixels.new_tensor([width - 1, height - 1]), keypoints)
         return self._padded(keypoints, scales, angle[ids], self.descriptors[ids]).to(device)
 
-    def _padded(self, keypoints: Tensor, scales: Tensor, angles: Tensor, descriptors: Tensor) -> Features:
+    def _padded(
+        self,
+        keypoints: Float[Tensor, "M 2"],
+        scales: Float[Tensor, " M"],
+        angles: Float[Tensor, " M"],
+        descriptors: Shaped[Tensor, "M 32"],
+    ) -> Features:
+        """Features of `num_keypoints` rows, those beyond the keypoints masked."""
         n, N = len(keypoints), self.num_keypoints
         mask = torch.arange(N) < n
         ones = torch.ones(1, N, dtype=keypoints.dtype)
@@ -136,6 +154,6 @@ class SimulatedFeatures:
             ones,
             torch.cat([scales, scales.new_ones(N - n)])[None],
             torch.cat([angles, angles.new_zeros(N - n)])[None],
-            torch.cat([descriptors, descriptors.new_zeros(N - n, DESCRIPTOR_BYTES)])[None],
+            torch.cat([descriptors, descriptors.new_zeros(N - n, BINARY_BYTES)])[None],
             mask[None],
         )

@@ -140,6 +140,7 @@ def test_a_lone_candidate_passes_the_ratio_test() -> None:
     assert pairs(match(first, first)) == {0: 0}
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_match_refuses_descriptors_of_two_kinds() -> None:
     with pytest.raises(ValueError, match="descriptors"):
         match(features(1, 4), features(1, 4, floats=32))

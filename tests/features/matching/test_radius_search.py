@@ -12,7 +12,7 @@ from tests.accelerator import simulated_accelerator
 from tests.conftest import HAS_SIMULATED_ACCELERATOR
 from tests.features.matching.random_features import features
 from torchslam.features import expand_runs
-from torchslam.features.matching.by_projection import nearest_of_pairs, pairs_within_radius
+from torchslam.features.matching.by_projection import nearest_per_row, pairs_within_radius
 
 
 @given(
@@ -68,7 +68,7 @@ def test_the_nearest_of_the_pairs_is_found(seed: int, ratio: float | None, pairs
     with simulated_accelerator() if HAS_SIMULATED_ACCELERATOR else nullcontext(torch.device("cpu")) as other:
         for where in (torch.device("cpu"), other):
             inputs = (tensor.to(where) for tensor in (row, column, distance))
-            found = [x.tolist() for x in nearest_of_pairs(*inputs, 30, scales.to(where), ratio, 9)]
+            found = [x.tolist() for x in nearest_per_row(*inputs, 30, scales.to(where), ratio, 9)]
             assert list(zip(*found, strict=True)) == expected
 
 

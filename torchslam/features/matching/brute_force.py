@@ -1,4 +1,4 @@
-"""Matching of descriptors, every row against every row or among given pairs, and what all matching shares.
+"""Matching of descriptors, all against all or among given pairs, and helpers of all matching.
 
 Binary descriptors (uint8) are compared by exact Hamming distance, float descriptors by 1 - cosine. Of equal distances
 the lower index wins, so results do not depend on the device.
@@ -7,9 +7,10 @@ the lower index wins, so results do not depend on the device.
 from __future__ import annotations
 
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchslam.features.contract import NORMALIZE, are_comparable
+from torchslam.features.contract import NORMALIZE, are_unit_or_zero
 from torchslam.features.matching.hamming import (
     dual_softmax,
     hamming,
@@ -33,7 +34,7 @@ def match(
     mutual: bool = True,
     max_distance: float | None = 64,
     temperature: float | None = None,
-    allowed: Tensor | None = None,
+    allowed: Bool[Tensor, "B N1 N2"] | None = None,
 ) -> Matches:
     """Match two sets of features by nearest descriptors, all against all.
 
@@ -41,14 +42,14 @@ def match(
     float descriptors carry gradients.
 
     Args:
-        features_1: batch of B sets of N1 keypoints; rows outside their mask never match.
-        features_2: batch of B sets of N2 keypoints.
+        features_1: batch of sets of N1 keypoints; rows outside their mask never match.
+        features_2: batch of sets of N2 keypoints.
         ratio: the nearest must be closer than `ratio` times the second nearest; None: no ratio test.
         mutual: require that the row is a nearest neighbor of its match in turn.
         max_distance: Hamming bits, or 1 - cosine for floats; None: no limit.
         temperature: if given, `weights` are the dual softmax of -distance / temperature at the matches, with gradients
             to float descriptors (Sun et al.: LoFTR, 2021, eq. 2).
-        allowed: (B, N1, N2) bool, pairs that may match; None: all.
+        allowed: pairs that may match; None: all.
 
     Returns:
         Matches with M = N1 rows; row i is keypoint i of the first set.
@@ -60,7 +61,7 @@ def match(
     check_descriptors(descriptors_1, descriptors_2)
     batch, rows, columns = len(descriptors_1), descriptors_1.shape[1], descriptors_2.shape[1]
     if rows == 0 or columns == 0:
-        return no_matches(batch, rows, descriptors_1.device)
+        return empty_matches(batch, rows, descriptors_1.device)
     similarity, masks = None, (features_1.mask, features_2.mask, allowed)
     if descriptors_1.dtype == torch.uint8:
         nearest = nearest_by_hamming(descriptors_1, descriptors_2, *masks, with_second=ratio is not None)
@@ -85,19 +86,23 @@ def match(
 
 @full_precision
 def match_pairs(
-    descriptors_1: Tensor, descriptors_2: Tensor, rows: Tensor, columns: Tensor, max_distance: float
-) -> tuple[Tensor, Tensor]:
+    descriptors_1: Shaped[Tensor, "N1 D"],
+    descriptors_2: Shaped[Tensor, "N2 D"],
+    rows: Int[Tensor, " M"],
+    columns: Int[Tensor, " M"],
+    max_distance: float,
+) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Match mutual nearest descriptors among given pairs.
 
     Args:
-        descriptors_1: (N1, 32) uint8 or (N1, D) unit-length floats.
-        descriptors_2: (N2, 32) uint8 or (N2, D) unit-length floats.
-        rows: (P,) int64 rows of the pairs that may match.
-        columns: (P,) int64 columns of the pairs that may match.
+        descriptors_1: 32 uint8 or unit-length floats.
+        descriptors_2: as `descriptors_1`.
+        rows: rows of the pairs that may match.
+        columns: columns of the pairs that may match.
         max_distance: Hamming bits, or 1 - cosine for floats.
 
     Returns:
-        Rows (m,), ascending, and columns (m,) of the matches.
+        Rows, ascending, and columns of the matches.
 
     Raises:
         ValueError: The descriptors differ in type or length, or are not of unit length.
@@ -105,48 +110,74 @@ def match_pairs(
     check_descriptors(descriptors_1[None], descriptors_2[None])
     distances = pair_distances(descriptors_1, rows, descriptors_2, columns)
     near = torch.nonzero(distances <= max_distance).squeeze(1)
-    rows, columns, distances = take_rows(rows, near), take_rows(columns, near), take_rows(distances, near)
-    column, found, _ = best_of_pairs(rows, columns, distances, None, len(descriptors_1), None)
-    row, _, _ = best_of_pairs(columns, rows, distances, None, len(descriptors_2), None)
+    rows, columns, distances = (
+        select_rows(rows, near),
+        select_rows(columns, near),
+        select_rows(distances, near),
+    )
+    column, found, _ = best_per_row(rows, columns, distances, None, len(descriptors_1), None)
+    row, _, _ = best_per_row(columns, rows, distances, None, len(descriptors_2), None)
     kept = torch.nonzero(found).squeeze(1)
     kept = kept[row[column[kept]] == kept]
     return kept, column[kept]
 
 
-def take_rows(values: Tensor, rows: Tensor) -> Tensor:
-    """values[rows], several times faster on the CPU."""
+def select_rows(values: Shaped[Tensor, "N *batch"], rows: Int[Tensor, " M"]) -> Shaped[Tensor, "M *batch"]:
+    """Select rows, several times faster on the CPU than values[rows]."""
     return values.index_select(0, rows)
 
 
-def where_rows(mask: Tensor, first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
-    """The masked rows of two columns."""
+def masked_rows(
+    mask: Bool[Tensor, " N"], first: Shaped[Tensor, " N"], second: Shaped[Tensor, " N"]
+) -> tuple[Shaped[Tensor, " R"], Shaped[Tensor, " R"]]:
+    """Select the masked rows of two columns."""
     rows = true_indices(mask)
-    return take_rows(first, rows), take_rows(second, rows)
+    return select_rows(first, rows), select_rows(second, rows)
 
 
-def pair_distances(descriptors_1: Tensor, rows: Tensor, descriptors_2: Tensor, columns: Tensor) -> Tensor:
-    """Distances of pairs (P,), (P,) of rows of (N1, D) and (N2, D): float32 for bits, with gradients for floats."""
+def pair_distances(
+    descriptors_1: Shaped[Tensor, "N1 D"],
+    rows: Int[Tensor, " M"],
+    descriptors_2: Shaped[Tensor, "N2 D"],
+    columns: Int[Tensor, " M"],
+) -> Float[Tensor, " M"]:
+    """Compute distances of pairs of rows of two tables, with gradients for floats."""
     if descriptors_1.dtype != torch.uint8:
-        return 1 - (take_rows(descriptors_1, rows) * take_rows(descriptors_2, columns)).sum(-1)
+        return 1 - (select_rows(descriptors_1, rows) * select_rows(descriptors_2, columns)).sum(-1)
     return hamming_between(descriptors_1, rows, descriptors_2, columns).float()
 
 
-def best_of_pairs(
-    row: Tensor, column: Tensor, distances: Tensor, scales: Tensor | None, rows: int, ratio: float | None
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The nearest column of each row, whether it passes the ratio test, and its distance (with its graph): (rows,).
+def best_per_row(
+    row: Int[Tensor, " M"],
+    column: Int[Tensor, " M"],
+    distances: Float[Tensor, " M"],
+    scales: Float[Tensor, " N"] | None,
+    rows: int,
+    ratio: float | None,
+) -> tuple[Int[Tensor, "{rows}"], Bool[Tensor, "{rows}"], Float[Tensor, "{rows}"]]:
+    """Find the nearest column of each row among candidate pairs.
 
-    The ratio is taken to the nearest other column of the same scale. Rows without pairs get column 0, not accepted.
+    Args:
+        row: rows of the pairs.
+        column: columns of the pairs.
+        distances: of the pairs.
+        scales: of the columns, with `ratio`.
+        rows: number of rows.
+        ratio: the nearest must be closer than `ratio` times the nearest other column of its scale; None: no test.
+
+    Returns:
+        The column of each row, whether it passes the ratio test, and its distance (with its graph). Rows without pairs
+        get column 0, not accepted.
     """
     values = distances.detach()
     nearest = _lowest(row, values, rows)
     pair = torch.arange(row.shape[0], device=row.device)
-    winner = values == take_rows(nearest, row)
+    winner = values == select_rows(nearest, row)
     # Lowest column among equals, then the pair that holds it.
     unset = torch.iinfo(torch.int64).max
-    winner_row, winner_column = where_rows(winner, row, column)
+    winner_row, winner_column = masked_rows(winner, row, column)
     best = row.new_full((rows,), unset).scatter_reduce(0, winner_row, winner_column, "amin")
-    chosen = column == take_rows(best, row)
+    chosen = column == select_rows(best, row)
     best_pair = row.new_zeros(rows).scatter(0, row[chosen], pair[chosen])
     found = best != unset
     best = torch.where(found, best, 0)
@@ -154,20 +185,24 @@ def best_of_pairs(
     if distances.requires_grad:
         distance = torch.where(found, distances[best_pair], torch.inf)
     if ratio is not None and scales is not None:
-        same = (take_rows(scales, column) / take_rows(scales[best], row) - 1).abs() < SAME_SCALE
-        rival_row, rival_value = where_rows(same & ~chosen, row, values)
+        same = (select_rows(scales, column) / select_rows(scales[best], row) - 1).abs() < SAME_SCALE
+        rival_row, rival_value = masked_rows(same & ~chosen, row, values)
         second = _lowest(rival_row, rival_value, rows)
         found = found & (nearest < ratio * second)
     return best, found, distance
 
 
-def _lowest(groups: Tensor, values: Tensor, num_groups: int) -> Tensor:
-    """The lowest value of each group: (P,) int64, (P,) -> (num_groups,), infinity for empty groups."""
+def _lowest(
+    groups: Int[Tensor, " N"], values: Float[Tensor, " N"], num_groups: int
+) -> Float[Tensor, "{num_groups}"]:
+    """The lowest value of each group, infinity for empty groups."""
     return values.new_full((num_groups,), torch.inf).scatter_reduce(0, groups, values, "amin")
 
 
-def one_to_one(column: Tensor, distances: Tensor, mask: Tensor, columns: int) -> Tensor:
-    """Keep of the masked rows that share a column the one of lowest distance, then of lowest index: (B, M) each."""
+def one_to_one(
+    column: Int[Tensor, "B M"], distances: Float[Tensor, "B M"], mask: Bool[Tensor, "B M"], columns: int
+) -> Bool[Tensor, "B M"]:
+    """Keep of the masked rows that share a column the one of lowest distance, then of lowest index."""
     batch, rows = column.shape
     offset = torch.arange(batch, device=column.device)[:, None] * columns
     target = (column + offset).flatten()
@@ -179,8 +214,13 @@ def one_to_one(column: Tensor, distances: Tensor, mask: Tensor, columns: int) ->
     return (winner & (first[target] == row)).view(batch, rows)
 
 
-def to_matches(column: Tensor, distances: Tensor, mask: Tensor, weights: Tensor | None = None) -> Matches:
-    """Matches of row i with column[i] where the mask is set; index and distance 0 elsewhere."""
+def to_matches(
+    column: Int[Tensor, "B M"],
+    distances: Float[Tensor, "B M"],
+    mask: Bool[Tensor, "B M"],
+    weights: Float[Tensor, "B M"] | None = None,
+) -> Matches:
+    """Build matches of row i with column[i] where the mask is set; index and distance are 0 elsewhere."""
     row = torch.arange(column.shape[1], device=column.device).expand_as(column)
     zero = torch.zeros_like(distances)
     return Matches(
@@ -192,12 +232,18 @@ def to_matches(column: Tensor, distances: Tensor, mask: Tensor, weights: Tensor 
     )
 
 
-def no_matches(batch: int, rows: int, device: torch.device) -> Matches:
+def empty_matches(batch: int, rows: int, device: torch.device) -> Matches:
+    """Build matches of which no row is valid."""
     index = torch.zeros(batch, rows, dtype=torch.int64, device=device)
     return Matches(index, index, index.float(), index.bool())
 
 
 def check_descriptors(descriptors_1: Tensor, descriptors_2: Tensor) -> None:
+    """Check that descriptors are two (B, N, D) of one type.
+
+    Raises:
+        ValueError: The descriptors differ in type or length, or are not of unit length.
+    """
     same = descriptors_1.dtype == descriptors_2.dtype and descriptors_1.shape[-1] == descriptors_2.shape[-1]
     if (
         descriptors_1.dim() != 3
@@ -210,7 +256,7 @@ def check_descriptors(descriptors_1: Tensor, descriptors_2: Tensor) -> None:
             f"and {tuple(descriptors_2.shape)} {descriptors_2.dtype}"
         )
     for descriptors in (descriptors_1, descriptors_2) if descriptors_1.is_floating_point() else ():
-        if not bool(are_comparable(descriptors).all()):
+        if not bool(are_unit_or_zero(descriptors).all()):
             raise ValueError(
                 f"descriptors must be finite and have unit length, or be zero where there is no keypoint; {NORMALIZE}"
             )

@@ -10,19 +10,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int, Shaped
 from numpy.typing import NDArray
 from torch import Tensor
 
 from torchslam.features.matching.brute_force import (
     SAME_SCALE,
-    best_of_pairs,
+    best_per_row,
     check_descriptors,
-    no_matches,
+    empty_matches,
+    masked_rows,
     one_to_one,
     pair_distances,
-    take_rows,
+    select_rows,
     to_matches,
-    where_rows,
 )
 from torchslam.features.matching.hamming import hamming_between
 from torchslam.geometry.precision import full_precision
@@ -42,16 +43,20 @@ _MAX_COLUMNS, _MAX_ROWS = 256, 64  # of cells: those of larger images are larger
 
 
 def pairs_within_radius(
-    pixels: Tensor, radius: Tensor, mask: Tensor, keypoints: Tensor, keypoint_mask: Tensor
-) -> tuple[Tensor, Tensor]:
+    pixels: Float[Tensor, "B M 2"],
+    radius: Float[Tensor, "B M"],
+    mask: Bool[Tensor, "B M"],
+    keypoints: Float[Tensor, "B N 2"],
+    keypoint_mask: Bool[Tensor, "B N"],
+) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Find all pairs of a predicted pixel and a keypoint within its radius.
 
     Args:
-        pixels: (B, M, 2) finite predicted pixels, at least one.
-        radius: (B, M) pixels.
-        mask: (B, M) predictions in use.
-        keypoints: (B, N, 2) pixels.
-        keypoint_mask: (B, N) keypoints in use.
+        pixels: finite predicted pixels, at least one.
+        radius: pixels.
+        mask: predictions in use.
+        keypoints: pixels.
+        keypoint_mask: keypoints in use.
 
     Returns:
         Flat rows b * M + i, ascending, and flat columns b * N + j; the columns of a row are in no particular order.
@@ -83,15 +88,17 @@ def pairs_within_radius(
     return row.index_select(0, near), column.index_select(0, near)
 
 
-def expand_runs(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
+def expand_runs(
+    starts: Int[Tensor, " N"], ends: Int[Tensor, " N"]
+) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Expand the runs starts[k], ..., ends[k] - 1 into one list.
 
     Args:
-        starts: (n,) int64 first numbers.
-        ends: (n,) int64 numbers after the last ones.
+        starts: first numbers.
+        ends: numbers after the last ones.
 
     Returns:
-        The run (m,) of each number, ascending, and the numbers (m,).
+        The run of each number, ascending, and the numbers.
     """
     if starts.is_cpu:
         found = _expand_runs_numpy(starts.numpy(), ends.numpy())
@@ -102,30 +109,30 @@ def expand_runs(starts: Tensor, ends: Tensor) -> tuple[Tensor, Tensor]:
     return run, torch.arange(run.shape[0], device=run.device) + shift.index_select(0, run)
 
 
-def nearest_of_pairs(
-    row: Tensor,
-    column: Tensor,
-    distance: Tensor,
+def nearest_per_row(
+    row: Int[Tensor, " M"],
+    column: Int[Tensor, " M"],
+    distance: Int[Tensor, " M"],
     rows: int,
-    scales: Tensor,
+    scales: Float[Tensor, " N"],
     ratio: float | None,
     limit: int | float,
-) -> tuple[Tensor, Tensor, Tensor]:
+) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"], Float[Tensor, " R"]]:
     """Choose one column for each row among candidate pairs, each column at most once.
 
     Of equal distances the lower column wins; of rows that share a column the nearest, then the lowest.
 
     Args:
-        row: (P,) rows of the pairs, ascending.
-        column: (P,) columns of the pairs.
-        distance: (P,) int64 distances.
+        row: rows of the pairs, ascending.
+        column: columns of the pairs.
+        distance: of the pairs.
         rows: number of rows.
-        scales: (N,) of the columns.
+        scales: of the columns.
         ratio: the nearest must be closer than `ratio` times the nearest other column of its scale; None: no test.
         limit: largest distance, finite.
 
     Returns:
-        Rows (m,), ascending, their columns (m,) and their distances (m,).
+        Rows, ascending, their columns and their distances.
     """
     if row.is_cpu:
         pairs = row.numpy(), column.numpy(), distance.numpy()
@@ -239,7 +246,7 @@ def _nearest_of_pairs_numpy(
     ratio: float | None,
     limit: int | float,
 ) -> tuple[Array, Array, Array]:
-    """`nearest_of_pairs` on the CPU."""
+    """`nearest_per_row` on the CPU."""
     if len(row) == 0:
         return row, column, distance
     is_first = np.empty(len(row), dtype=bool)
@@ -273,13 +280,13 @@ _MAX_PIXEL = 1e6  # points projected farther outside of the image do not match
 
 @full_precision
 def match_by_projection(
-    descriptors: Tensor,
-    pixels: Tensor,
-    radius: Tensor | float,
+    descriptors: Shaped[Tensor, "B M D"],
+    pixels: Float[Tensor, "B M 2"],
+    radius: Float[Tensor, "B M"] | float,
     features: Features,
-    mask: Tensor | None = None,
-    scales: Tensor | None = None,
-    angles: Tensor | None = None,
+    mask: Bool[Tensor, "B M"] | None = None,
+    scales: Float[Tensor, "B M"] | None = None,
+    angles: Float[Tensor, "B M"] | None = None,
     ratio: float | None = 0.9,
     max_distance: float | None = 64,
     scale_tolerance: float = SCALE_TOLERANCE,
@@ -290,13 +297,13 @@ def match_by_projection(
     Every keypoint is used at most once, by the point of lowest distance, then of lowest index.
 
     Args:
-        descriptors: (B, M, 32) uint8 or (B, M, D) unit-length floats, of the points.
-        pixels: (B, M, 2) predicted pixels.
-        radius: (B, M) or one number, pixels.
-        features: keypoints to match, (B, N, ...).
-        mask: (B, M) points that take part; None: all.
-        scales: (B, M) predicted `Features.scales`; a keypoint's may differ by the factor `scale_tolerance`.
-        angles: (B, M) predicted angles in radians; a keypoint's may differ by `angle_tolerance`.
+        descriptors: of the points, 32 uint8 or unit-length floats.
+        pixels: predicted pixels.
+        radius: of the search around the predicted pixels, pixels.
+        features: keypoints to match.
+        mask: points that may match; None: all.
+        scales: predicted `Features.scales`; a keypoint's may differ by the factor `scale_tolerance`.
+        angles: predicted angles in radians; a keypoint's may differ by `angle_tolerance`.
         ratio: the nearest must be closer than `ratio` times the nearest other keypoint of its scale in the window
             (keypoints of other levels mostly see the same corner); None: no ratio test.
         max_distance: Hamming bits, or 1 - cosine for floats; None: no limit.
@@ -312,7 +319,7 @@ def match_by_projection(
     check_descriptors(descriptors, features.descriptors)
     batch, rows, columns = len(pixels), pixels.shape[1], features.keypoints.shape[1]
     if rows == 0 or columns == 0:
-        return no_matches(batch, rows, pixels.device)
+        return empty_matches(batch, rows, pixels.device)
     radius = torch.as_tensor(radius, dtype=pixels.dtype, device=pixels.device).expand(batch, rows)
     is_near = pixels.detach().abs().amax(-1) < _MAX_PIXEL  # false for NaN as well
     mask = is_near if mask is None else mask & is_near
@@ -322,23 +329,23 @@ def match_by_projection(
 
     keypoint_scales = features.scales.detach().flatten()
     if scales is not None:
-        factor = take_rows(keypoint_scales, column) / take_rows(scales.detach().flatten(), row)
-        row, column = where_rows((factor <= scale_tolerance) & (factor * scale_tolerance >= 1), row, column)
+        factor = select_rows(keypoint_scales, column) / select_rows(scales.detach().flatten(), row)
+        row, column = masked_rows((factor <= scale_tolerance) & (factor * scale_tolerance >= 1), row, column)
     if angles is not None:
-        turn = take_rows(features.angles.detach().flatten(), column) - take_rows(
+        turn = select_rows(features.angles.detach().flatten(), column) - select_rows(
             angles.detach().flatten(), row
         )
-        row, column = where_rows(torch.cos(turn) >= math.cos(angle_tolerance), row, column)
+        row, column = masked_rows(torch.cos(turn) >= math.cos(angle_tolerance), row, column)
 
     pairs = descriptors.flatten(0, 1), row, features.descriptors.flatten(0, 1), column
     if descriptors.dtype == torch.uint8:
         bits = 8 * descriptors.shape[-1]
         limit = bits if max_distance is None else min(max_distance, bits)
         distances = hamming_between(*pairs)
-        found = nearest_of_pairs(row, column, distances, batch * rows, keypoint_scales, ratio, limit)
+        found = nearest_per_row(row, column, distances, batch * rows, keypoint_scales, ratio, limit)
         return _scattered(*found, batch, rows, columns)
     distances = pair_distances(*pairs)
-    best, accepted, distance = best_of_pairs(row, column, distances, keypoint_scales, batch * rows, ratio)
+    best, accepted, distance = best_per_row(row, column, distances, keypoint_scales, batch * rows, ratio)
     if max_distance is not None:
         accepted = accepted & (distance <= max_distance)
     local = (best % columns).view(batch, rows)
@@ -347,9 +354,14 @@ def match_by_projection(
 
 
 def _scattered(
-    first: Tensor, second: Tensor, distance: Tensor, batch: int, rows: int, columns: int
+    first: Int[Tensor, " R"],
+    second: Int[Tensor, " R"],
+    distance: Float[Tensor, " R"],
+    batch: int,
+    rows: int,
+    columns: int,
 ) -> Matches:
-    """Matches of flat rows b * M + i (m,) with flat columns b * N + j (m,)."""
+    """Matches of flat rows b * M + i with flat columns b * N + j."""
     mask = torch.zeros(batch * rows, dtype=torch.bool, device=first.device).index_fill_(0, first, True)
     column = first.new_zeros(batch * rows).index_copy_(0, first, second % columns)
     distances = distance.new_zeros(batch * rows).index_copy_(0, first, distance)

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from jaxtyping import Bool, Float, Int, Num, Shaped, UInt8
 from torch import Tensor
 
 # Product with this word moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
@@ -19,8 +20,8 @@ _CHUNK = 1 << 13  # pairs whose bits are counted at once: their words stay in th
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
 
-def pack_bits(bits: Tensor) -> Tensor:
-    """Pack booleans into bytes, least significant bit first: (..., 8 D) bool -> (..., D) uint8.
+def pack_bits(bits: Shaped[Tensor, "*batch D"]) -> UInt8[Tensor, "*batch D//8"]:
+    """Pack booleans into bytes, least significant bit first.
 
     Raises:
         ValueError: The last dimension is not a multiple of eight.
@@ -31,28 +32,30 @@ def pack_bits(bits: Tensor) -> Tensor:
     return ((words * _GATHER_BITS) >> 56).to(torch.uint8).view(*bits.shape[:-1], bits.shape[-1] // 8)
 
 
-def unpack_bits(descriptors: Tensor) -> Tensor:
-    """Unpack descriptors to bits, the inverse of `pack_bits`: (..., D) uint8 -> (..., 8 D) bool."""
+def unpack_bits(descriptors: UInt8[Tensor, "*batch D"]) -> Bool[Tensor, "*batch 8*D"]:
+    """Unpack descriptors to bits, the inverse of `pack_bits`."""
     return bit_table(0, 1, descriptors.device)[descriptors.long()].flatten(-2).to(torch.bool)
 
 
 @lru_cache(maxsize=16)
-def bit_table(zero: int, one: int, device: torch.device) -> Tensor:
-    """(256, 8) int8: the bits of every byte, least significant first, with `zero` and `one` in place of 0 and 1."""
+def bit_table(zero: int, one: int, device: torch.device) -> Int[Tensor, "256 8"]:
+    """The bits of every byte (int8), least significant first, with `zero` and `one` in place of 0 and 1."""
     shifts = torch.arange(8, device=device)
     bits = (torch.arange(256, device=device)[:, None] >> shifts) & 1
     return torch.where(bits.bool(), one, zero).to(torch.int8)
 
 
-def spread_bits(descriptors: Tensor, amplitude: int) -> Tensor:
-    """Bits as -amplitude and +amplitude: (..., D) uint8 -> (..., 8 D) int8, one table row (a word) per byte."""
+def spread_bits(descriptors: UInt8[Tensor, "*batch D"], amplitude: int) -> Int[Tensor, "*batch 8*D"]:
+    """Spread bits to int8 of -amplitude and +amplitude, one table row (a word) per byte."""
     words = bit_table(-amplitude, amplitude, descriptors.device).view(torch.int64).view(-1)
     rows = words.index_select(0, descriptors.reshape(-1).to(torch.int32))
     return rows.view(torch.int8).view(*descriptors.shape[:-1], 8 * descriptors.shape[-1])
 
 
-def hamming_pairs(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
-    """Hamming distance row by row: (..., D) uint8 twice, D a multiple of 8 up to 248 -> (...) int64.
+def hamming_pairs(
+    descriptors_1: UInt8[Tensor, "*batch D"], descriptors_2: UInt8[Tensor, "*batch D"]
+) -> Int[Tensor, "*batch"]:
+    """Compute Hamming distances row by row; D must be a multiple of 8 up to 248.
 
     Counts set bits by summing neighboring bit fields of whole words (Warren: Hacker's Delight, 2002).
     """
@@ -66,8 +69,13 @@ def hamming_pairs(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
     return ((in_pairs * 0x0001000100010001) >> 48) & 0xFFFF
 
 
-def hamming_between(descriptors_1: Tensor, rows: Tensor, descriptors_2: Tensor, columns: Tensor) -> Tensor:
-    """Hamming distances of pairs (P,), (P,) of rows of (N1, D) and (N2, D) uint8, D as for `hamming_pairs`: (P,) int64.
+def hamming_between(
+    descriptors_1: UInt8[Tensor, "N1 D"],
+    rows: Int[Tensor, " M"],
+    descriptors_2: UInt8[Tensor, "N2 D"],
+    columns: Int[Tensor, " M"],
+) -> Int[Tensor, " M"]:
+    """Compute Hamming distances of pairs of rows of two tables, D as for `hamming_pairs`.
 
     On the CPU by NumPy, which gathers words and counts bits several times as fast, in versions from 2 on.
     """
@@ -94,40 +102,39 @@ def _sum_of_bytes(counts: Any) -> Any:
     return ((pairs + (pairs >> 16)) & 0xFFFF).astype(np.int64)
 
 
-def hamming(descriptors_1: Tensor, descriptors_2: Tensor) -> Tensor:
-    """Compute all exact Hamming distances between two batches of packed descriptors.
-
-    Args:
-        descriptors_1: (..., N1, D) uint8.
-        descriptors_2: (..., N2, D) uint8.
-
-    Returns:
-        (..., N1, N2) int32 distances in bits.
-    """
+def hamming(
+    descriptors_1: UInt8[Tensor, "*batch N1 D"], descriptors_2: UInt8[Tensor, "*batch N2 D"]
+) -> Int[Tensor, "*batch N1 N2"]:
+    """Compute all exact Hamming distances (bits) between two batches of packed descriptors."""
     bits = 8 * descriptors_1.shape[-1]
     return (bits - sign_products(descriptors_1, descriptors_2, 1).to(torch.int32)) >> 1
 
 
-def sign_products(descriptors_1: Tensor, descriptors_2: Tensor, amplitude: int) -> Tensor:
-    """Inner products of the bits as +-amplitude: amplitude^2 (bits - 2 distance).
+def sign_products(
+    descriptors_1: UInt8[Tensor, "*batch N1 D"], descriptors_2: UInt8[Tensor, "*batch N2 D"], amplitude: int
+) -> Num[Tensor, "*batch N1 N2"]:
+    """Compute inner products of the bits as +-amplitude: amplitude^2 (bits - 2 distance).
 
     Args:
-        descriptors_1: (..., N1, D) uint8
-        descriptors_2: (..., N2, D) uint8
-        amplitude: at most 64
+        descriptors_1: packed bits.
+        descriptors_2: packed bits.
+        amplitude: at most 64.
 
     Returns:
-        (..., N1, N2), int32 if the processor multiplies int8 matrices quickly, else float32. Both are exact,
-            because the sums stay below 2^24.
+        int32 if the processor multiplies int8 matrices quickly, else float32. Both are exact, because the sums stay
+        below 2^24.
     """
     signs_1, signs_2 = spread_bits(descriptors_1, amplitude), spread_bits(descriptors_2, amplitude)
     return int8_product(signs_1, signs_2.mT)
 
 
-def int8_product(left: Tensor, right: Tensor) -> Tensor:
-    """left @ right of int8 matrices (..., M, K) and (..., K, N).
+def int8_product(
+    left: Int[Tensor, "*batch M K"], right: Int[Tensor, "*batch K N"]
+) -> Num[Tensor, "*batch M N"]:
+    """Multiply int8 matrices.
 
-    int32 where the processor multiplies these quickly, else float32, which is exact while no sum exceeds 2^24.
+    Returns:
+        int32 where the processor multiplies these quickly, else float32, which is exact while no sum exceeds 2^24.
     """
     if not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
         return left.float() @ right.float()
@@ -148,39 +155,41 @@ def _fast_int8(device: torch.device) -> bool:
     )
 
 
-class Nearest(NamedTuple):
+class NearestNeighbors(NamedTuple):
     """Nearest columns of N1 rows.
 
     Attributes:
-        column: (B, N1) the nearest column
-        distance: (B, N1) distance to it
-        found: (B, N1) bool, some column may match
-        mutual: (B, N1) bool, no other row is nearer to that column
-        second: (B, N1) distance of the second nearest column, if requested
+        column: the nearest column.
+        distance: distance to it.
+        found: whether any column may match.
+        mutual: whether no other row is nearer to that column.
+        second: distance of the second nearest column; None if not requested.
     """
 
-    column: Tensor
-    distance: Tensor
-    found: Tensor
-    mutual: Tensor
-    second: Tensor | None
+    column: Int[Tensor, "B N1"]
+    distance: Float[Tensor, "B N1"]
+    found: Bool[Tensor, "B N1"]
+    mutual: Bool[Tensor, "B N1"]
+    second: Float[Tensor, "B N1"] | None
 
 
-def _possible(mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None) -> Tensor:
-    """(B, N1, N2) bool, the pairs that may match."""
+def _possible(
+    mask_1: Bool[Tensor, "B N1"], mask_2: Bool[Tensor, "B N2"], allowed: Bool[Tensor, "B N1 N2"] | None
+) -> Bool[Tensor, "B N1 N2"]:
+    """The pairs that may match."""
     possible = mask_1[:, :, None] & mask_2[:, None, :]
     return possible if allowed is None else possible & allowed
 
 
 def nearest_by_hamming(
-    descriptors_1: Tensor,
-    descriptors_2: Tensor,
-    mask_1: Tensor,
-    mask_2: Tensor,
-    allowed: Tensor | None,
+    descriptors_1: UInt8[Tensor, "B N1 D"],
+    descriptors_2: UInt8[Tensor, "B N2 D"],
+    mask_1: Bool[Tensor, "B N1"],
+    mask_2: Bool[Tensor, "B N2"],
+    allowed: Bool[Tensor, "B N1 N2"] | None,
     with_second: bool,
-) -> Nearest:
-    """Exact nearest neighbors by Hamming distance; needs two maxima over the matrix and one more for the second."""
+) -> NearestNeighbors:
+    """Find exact nearest neighbors by Hamming distance, by two maxima over the matrix and one more for the second."""
     keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
     bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
     columns = keys.shape[2]
@@ -205,25 +214,33 @@ def nearest_by_hamming(
         second = distance(keys.amax(2))
         second = torch.where(second > bits, torch.inf, second)
     mutual = nearest <= distance(column_best).gather(1, column)
-    return Nearest(column, nearest, nearest <= bits, mutual, second)
+    return NearestNeighbors(column, nearest, nearest <= bits, mutual, second)
 
 
 def nearest_by_cosine(
-    similarity: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None, with_second: bool
-) -> Nearest:
-    """Nearest neighbors by cosine similarity (B, N1, N2); distances keep their graph."""
+    similarity: Float[Tensor, "B N1 N2"],
+    mask_1: Bool[Tensor, "B N1"],
+    mask_2: Bool[Tensor, "B N2"],
+    allowed: Bool[Tensor, "B N1 N2"] | None,
+    with_second: bool,
+) -> NearestNeighbors:
+    """Find nearest neighbors by cosine similarity; distances keep their graph."""
     values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
     best, column = values.max(2)
     mutual = best >= values.amax(1).gather(1, column)
     second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2) if with_second else None
     nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
-    return Nearest(column, nearest, best > -torch.inf, mutual, second)
+    return NearestNeighbors(column, nearest, best > -torch.inf, mutual, second)
 
 
 def dual_softmax(
-    logits: Tensor, column: Tensor, mask_1: Tensor, mask_2: Tensor, allowed: Tensor | None
-) -> Tensor:
-    """Product of the softmax over columns and over rows at (row, column[row]): (B, N1, N2), (B, N1) -> (B, N1)."""
+    logits: Float[Tensor, "B N1 N2"],
+    column: Int[Tensor, "B N1"],
+    mask_1: Bool[Tensor, "B N1"],
+    mask_2: Bool[Tensor, "B N2"],
+    allowed: Bool[Tensor, "B N1 N2"] | None,
+) -> Float[Tensor, "B N1"]:
+    """Compute the product of the softmax over columns and over rows at (row, column[row])."""
     low = torch.finfo(logits.dtype).min / 2
     logits = logits.masked_fill(~_possible(mask_1, mask_2, allowed), low)
     both = logits.softmax(2) * logits.softmax(1)
