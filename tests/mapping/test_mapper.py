@@ -14,7 +14,7 @@ from torchslam.errors import ConfigError
 from torchslam.geometry import transform, triangulation_covariance
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.mapping.mapper import YOUNG, Mapper, initial_scale
+from torchslam.mapping.mapper import RECENT_KEYFRAMES, Mapper, initial_scale
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import TwoViewMap
 from torchslam.utils.timing import Stopwatch
@@ -149,15 +149,15 @@ def test_fusion_culling_and_adjustment_can_be_disabled() -> None:
         table = submap.map.keyframes["point_ids"]
         at = torch.nonzero(table[0] >= 0)[:10, 0]
         originals = table[0, at].clone()
-        submap.map.forget(torch.zeros_like(at), at)
+        submap.map.remove_observations(torch.zeros_like(at), at)
         twins = submap.map.add_points(
             submap.map.positions_w[originals],
             submap.map.points["descriptors"][originals],
             0,
             from_initialization=True,
         )
-        submap.map.observe(0, at, twins)
-        submap.map.refresh(torch.arange(2))
+        submap.map.add_observations(0, at, twins)
+        submap.map.update_appearance(torch.arange(2))
         Tracker(CAMERA, Config()).reset_to_keyframe(submap, 1)
         inserted(
             mapper("bundle_adjustment.local=false", "mapping.cull=false", f"mapping.fuse={fuse}"),
@@ -205,9 +205,9 @@ def young_map(
 def test_new_points_must_be_found_where_they_are_visible() -> None:
     assert young_map(1, found=5, visible=20)
     assert not young_map(1, found=4, visible=20)
-    assert not young_map(YOUNG, found=4, visible=20)
-    assert young_map(YOUNG + 1, found=4, visible=20)
-    assert YOUNG == 3
+    assert not young_map(RECENT_KEYFRAMES, found=4, visible=20)
+    assert young_map(RECENT_KEYFRAMES + 1, found=4, visible=20)
+    assert RECENT_KEYFRAMES == 3
 
 
 def test_new_points_must_be_observed_by_a_third_keyframe_in_time() -> None:

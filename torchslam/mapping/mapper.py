@@ -22,8 +22,9 @@ from torchslam.tracking.tracker import Tracker
 from torchslam.types import Explanation, FrameFeatures, Matcher, PoseEstimate, Reason, Rejection, TwoViewMap
 from torchslam.utils.timing import Stopwatch
 
-YOUNG = 3  # keyframes after its own for which a point may be culled
-ENOUGH_OVERLAP = 0.4
+RECENT_KEYFRAMES = 3
+"""Number of keyframes after its first one for which a point may be culled."""
+LIVE_MIN_OVERLAP = 0.4
 """Overlap above which keyframes wait for as many frames as a live camera is ahead, since late frames are dropped.
 
 Half of the default `min_overlap`, so that tracking stays safe."""
@@ -135,7 +136,7 @@ class Mapper:
     def cull_recent_points(self, slam_map: Map, keyframe: int) -> None:
         """Remove recent points that are rarely found where visible, or that too few keyframes observe."""
         points = slam_map.points
-        recent = torch.nonzero(points["first_keyframe"] >= keyframe - YOUNG)[:, 0]
+        recent = torch.nonzero(points["first_keyframe"] >= keyframe - RECENT_KEYFRAMES)[:, 0]
         recent = recent[points["is_valid"][recent]]
         age = keyframe - points["first_keyframe"][recent]
         least = self.config.mapping.min_found_ratio
@@ -154,7 +155,7 @@ def initial_scale(start: TwoViewMap, kind: str) -> float:
         kind: "unit": the median depth in the first camera is one; "groundtruth": the baseline has its true length.
 
     Raises:
-        ConfigError: The true poses are needed and not known.
+        ConfigError: If the true poses are needed and not known.
     """
     if kind == "unit":
         return 1.0 / float(start.points_w[:, 2].median())
@@ -210,7 +211,7 @@ def keyframe_reason(
     newest = slam_map.num_keyframes - 1
     age = abs(view.index - int(slam_map.keyframes["frame_index"][newest]))
     overlap = estimate.inliers / max(tracking.reference_size, 1)
-    if age < max(1, settings.min_interval) or (age < view.backlog and overlap > ENOUGH_OVERLAP):
+    if age < max(1, settings.min_interval) or (age < view.backlog and overlap > LIVE_MIN_OVERLAP):
         return None
     around = torch.cat([tracking.local_keyframes, tracking.local_keyframes.new_tensor([newest])])
     translation, rotation = pose_distance(estimate.T_cw, slam_map.T_cw[around], estimate.depth)

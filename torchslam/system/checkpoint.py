@@ -35,7 +35,11 @@ UNKNOWN = "not a whole checkpoint"
 
 
 def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
-    """Write the state after a frame, atomically. Raises ValueError unless `SLAM.can_checkpoint`."""
+    """Write the state after a frame, atomically.
+
+    Raises:
+        ValueError: unless `SLAM.can_checkpoint`.
+    """
     submap = slam.submap
     if submap is None or not slam.can_checkpoint:
         raise ValueError("a checkpoint needs a submap that is followed and nothing that is held back")
@@ -75,8 +79,9 @@ def read_checkpoint(
 ) -> tuple[SLAM, RunProgress]:
     """Read the system and the progress of its run from a checkpoint.
 
-    Raises ResultsError for a file that is missing or damaged, or of a run over another sequence or with another
-    configuration.
+    Raises:
+        ResultsError: if the file is missing or damaged, or belongs to a run over another sequence or with another
+            configuration.
     """
     tensors, about = read_tensors(path)
     run = about.pop("run", None)
@@ -150,7 +155,7 @@ def _restore(
 
 
 def _check_tracking(tracking: TrackingState) -> None:
-    """Raises ValueError, or TypeError for what is no tensor, where it is not the way of a camera."""
+    """Check the types and shapes of a tracking state; raise ValueError or TypeError if they are wrong."""
     for T in (tracking.T_cr, tracking.velocity):
         if T is not None and (T.shape != (4, 4) or not T.is_floating_point() or not bool(T.isfinite().all())):
             raise ValueError("where the camera was is no pose")

@@ -9,6 +9,7 @@ from inspect import signature
 
 import torch
 import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchslam.config import Config
@@ -76,7 +77,9 @@ def _takes_two(front_end: FrontEnd) -> bool:
     return True
 
 
-def reduced(image: Tensor, mask: Tensor | None, factor: float) -> tuple[Tensor, Tensor | None]:
+def reduced(
+    image: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None, factor: float
+) -> tuple[Float[Tensor, "B 1 h w"], Bool[Tensor, "B 1 h w"] | None]:
     """Reduce an image and its mask by a factor."""
     height, width = image.shape[-2:]
     size = max(1, round(height / factor)), max(1, round(width / factor))
@@ -99,7 +102,11 @@ def _enlarged(features: Features, ratio: tuple[float, float], factor: float) -> 
 
 
 def check_size(frame: Frame, camera: Camera) -> None:
-    """Raise FrameError if the image has another size than the camera."""
+    """Check that image and mask have the size of the camera.
+
+    Raises:
+        FrameError: otherwise.
+    """
     height, width = frame.image.shape[-2:]
     if (width, height) != camera.size:
         raise FrameError(
@@ -110,7 +117,11 @@ def check_size(frame: Frame, camera: Camera) -> None:
 
 
 def check_order(frame: Frame, last: tuple[int, float] | None) -> None:
-    """Raise FrameError if a frame does not come after the last one, by index and timestamp, or has no finite time."""
+    """Check that a frame comes after the last one, by index and timestamp.
+
+    Raises:
+        FrameError: otherwise, or if the timestamp is not finite.
+    """
     if not math.isfinite(frame.timestamp):
         raise FrameError(f"{_name(frame)} has the time {frame.timestamp}")
     if last is not None and (frame.index <= last[0] or frame.timestamp <= last[1]):
@@ -128,10 +139,12 @@ class Simulated:
     """Simulated features of a random scene around the true trajectory.
 
     Args:
-        T_cw_groundtruth: (F, 4, 4) true poses, around which the scene is generated
+        config: seed, number of keypoints and the scene.
+        camera: the camera.
+        T_cw_groundtruth: true poses, around which the scene is generated
     """
 
-    def __init__(self, config: Config, camera: Camera, T_cw_groundtruth: Tensor) -> None:
+    def __init__(self, config: Config, camera: Camera, T_cw_groundtruth: Float[Tensor, "K 4 4"]) -> None:
         settings = config.simulated
         self._scene = SimulatedFeatures(
             T_cw_groundtruth,
@@ -148,7 +161,11 @@ class Simulated:
         )
 
     def __call__(self, frame: Frame) -> Features:
-        """The features of a frame. Raises ConfigError if its true pose is unknown."""
+        """The features of a frame.
+
+        Raises:
+            ConfigError: if its true pose is unknown.
+        """
         if frame.T_cw_groundtruth is None:
             raise ConfigError(f"simulated features need the true pose of every frame; {frame.name} has none")
         return self._scene(frame.T_cw_groundtruth, frame.index)
@@ -171,9 +188,11 @@ class WithFeatures(Transformed):
 
     @property
     def brings_features(self) -> bool:
+        """True: every frame has features."""
         return True
 
     def features(self, index: int) -> Features | None:
+        """The features of the frame of an index."""
         return self._extract(self._whole[index])
 
     def __getitem__(self, index: int) -> Frame:
@@ -195,8 +214,12 @@ def source(sequence: Sequence, config: Config, camera: Camera) -> Sequence:
     return Simulated(config, camera, true_poses(sequence)).of(sequence)
 
 
-def true_poses(sequence: Sequence) -> Tensor:
-    """(F, 4, 4) the true poses, world to camera, of the frames that have one. Raises ConfigError where none has."""
+def true_poses(sequence: Sequence) -> Float[Tensor, "K 4 4"]:
+    """The true poses, world to camera, of the frames that have one.
+
+    Raises:
+        ConfigError: if no frame has one.
+    """
     frames = len(sequence) if sequence.groundtruth is not None else 0
     known = (sequence.pose(index) for index in range(frames))
     poses = [pose for pose in known if pose is not None]

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
+from jaxtyping import Int
+from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Sequence
@@ -36,15 +38,18 @@ class System(Protocol):
     loop_closer: LoopCloser
     last_frame: tuple[int, float] | None
 
-    def step(self, frame: Frame) -> StepResult: ...
+    def step(self, frame: Frame) -> StepResult:
+        """Process one frame."""
 
-    def finalize(self) -> None: ...
+    def finalize(self) -> None:
+        """End the session."""
 
 
 class Frames(Protocol):
     """The frames of a run, each read once and in order: a sequence or a `FeaturePrefetcher`."""
 
-    def __getitem__(self, index: int) -> Frame: ...
+    def __getitem__(self, index: int) -> Frame:
+        """The frame of an index."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +57,16 @@ class Run:
     """The result of a run.
 
     Attributes:
-        submaps: submaps in the order of their creation; usually one
-        results: one result per processed frame
-        skipped: messages about the frames that could not be read
-        interrupted: True if the user stopped the run
-        failure: reason why no frame has a pose; empty if some have one
-        loop_closures: closed loops and merges of submaps
-        session: number of the run among those over the same map; frames and trajectories are those of this
-            session
-        sessions: number of sessions of the map, without those that only localized
+        submaps: submaps in the order of their creation; usually one.
+        camera: the camera.
+        config: the configuration.
+        results: one result per processed frame.
+        skipped: messages about the frames that could not be read.
+        interrupted: True if the user stopped the run.
+        failure: message that says why no frame has a pose; empty if some have one.
+        loop_closures: closed loops and merges of submaps.
+        session: number of the run among those over the same map; frames and trajectories are those of this session.
+        sessions: number of sessions of the map, without those that only localized.
     """
 
     submaps: tuple[Submap, ...]
@@ -133,7 +139,8 @@ class Run:
 
         Where there are several submaps, `graph.submap` says whose poses can be compared with each other.
 
-        Raises InitializationError where there is no map.
+        Raises:
+            InitializationError: if there is no map.
         """
         if not self.submaps:
             raise InitializationError(self.failure)
@@ -147,9 +154,9 @@ class RunProgress:
     """How far a run has come.
 
     Attributes:
-        next: index of the next frame
-        results: one result per processed frame
-        skipped: messages about the frames that could not be read
+        next: index of the next frame.
+        results: one result per processed frame.
+        skipped: messages about the frames that could not be read.
     """
 
     next: int = 0
@@ -171,12 +178,15 @@ def run_sequence(
     counted; an interrupt ends the run, or its final adjustment, and keeps what there is.
 
     Args:
-        so_far: progress to resume from; it is updated after every frame
-        adjusting: called before each iteration of the final adjustments with its number and the maximum
-        frames: source of the frames; None: the sequence
+        slam: the system.
+        sequence: the sequence.
+        progress: called after every frame.
+        so_far: progress to resume from; it is updated after every frame.
+        adjusting: called before each iteration of the final adjustments with its number and the maximum.
+        frames: source of the frames; None: the sequence.
 
     Raises:
-        TorchslamError: if the system has processed frames that are missing in `so_far`
+        TorchslamError: if the system has processed frames that are missing in `so_far`.
     """
     if slam.last_frame is not None and (so_far is None or not so_far.next):
         raise TorchslamError(
@@ -245,8 +255,8 @@ def finish(
     )
 
 
-def keyframe_rows(slam_map: Map, session: int) -> torch.Tensor:
-    """(k,) the keyframes of one session, in order of time."""
+def keyframe_rows(slam_map: Map, session: int) -> Int[Tensor, " K"]:
+    """Rows of the keyframes of one session, in order of time."""
     if slam_map.num_keyframes == 0:
         return torch.zeros(0, dtype=torch.int64)
     rows = torch.nonzero(slam_map.keyframes["session"] == session)[:, 0]
@@ -262,7 +272,7 @@ def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
 
 
 def failure_message(slam: System, results: list[StepResult], skipped: list[str]) -> str:
-    """Why no frame of the session has a pose, in one sentence; empty where some have."""
+    """Message that says why no frame of the session has a pose; empty if some have one."""
     if len(slam.session.atlas) == 0:
         return no_map_message(results, skipped)
     if any(submap.posed_frames.count(slam.session.number) for submap in slam.session.atlas):
@@ -271,7 +281,7 @@ def failure_message(slam: System, results: list[StepResult], skipped: list[str])
 
 
 def no_map_message(results: list[StepResult], skipped: list[str]) -> str:
-    """One sentence for the user: how many frames were tried, what kept them from starting a map, the last attempt."""
+    """Message that says how many frames were tried, and the most frequent reason for which no map was initialized."""
     if not results:
         return (
             f"no frame could be read; {len(skipped)} were skipped, the first because {skipped[0]}"

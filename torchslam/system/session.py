@@ -44,7 +44,13 @@ class Session:
     def load(cls, path: str | Path, mapping: bool = True, device: torch.device | str = "cpu") -> Session:
         """Create the next session over the atlas of a map file.
 
-        Raises ResultsError for a file that is missing, damaged, or has no submap to localize in.
+        Args:
+            path: the map file.
+            mapping: False to localize frames only.
+            device: device of the map.
+
+        Raises:
+            ResultsError: if the file is missing, damaged, or has no submap to localize in.
         """
         saved = read_atlas(path, device)
         if not mapping and len(saved.atlas) == 0:

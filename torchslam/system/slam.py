@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from jaxtyping import Shaped
 
 from torchslam.config import Config
 from torchslam.data.formats.image_file import image_tensor
@@ -182,11 +183,13 @@ class SLAM:
                 outcome = self._state_machine.relocalize_or_initialize(view)
         return self._result(view, outcome)
 
-    def step_image(self, image: np.ndarray, timestamp: float, channels: str = "rgb") -> StepResult:
+    def step_image(
+        self, image: Shaped[np.ndarray, "H W *channels"], timestamp: float, channels: str = "rgb"
+    ) -> StepResult:
         """Process an image as the frame after the last one.
 
         Args:
-            image: (H, W) or (H, W, C), uint8, or floats in [0, 1].
+            image: uint8, or floats in [0, 1].
             timestamp: Seconds.
             channels: Order of the channels, one of `channel_orders`.
 
@@ -277,12 +280,12 @@ class SLAM:
         view = prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
         self.last_features = view = replace(view, session=self.session.number)
         if self.last_frame is None:
-            self._check_kind(view)
+            self._check_feature_kind(view)
         self.last_frame = frame.index, frame.timestamp
         return view
 
-    def _check_kind(self, view: FrameFeatures) -> None:
-        """Raises ConfigError if the submaps were made with another front end."""
+    def _check_feature_kind(self, view: FrameFeatures) -> None:
+        """Raise ConfigError if the submaps were made with another front end."""
         for submap in self.atlas:
             wrong = feature_mismatch(submap.map, view, to_map=self.mapping)
             if wrong:

@@ -46,10 +46,10 @@ class Localizer:
     def __init__(self, camera: Camera, config: Config) -> None:
         self.camera = camera
         self.undistorted = Undistortion(camera)
-        self.own = DescriptorMatcher(config.matching)  # for what is guided to a few pixels
+        self.guided_matcher = DescriptorMatcher(config.matching)
         self.settings = config.tracking
         self.measurement = config.measurement
-        self.least_share = config.pose_validation.min_inlier_ratio
+        self.min_inlier_ratio = config.pose_validation.min_inlier_ratio
         self.seed = config.seed
 
     def locate(
@@ -77,7 +77,7 @@ class Localizer:
             estimate = self._locate(slam_map, view, pairs, local_points, expected_T_cw)
             if estimate is not None and (best is None or estimate.inliers > best.inliers):
                 best = estimate
-            if best is not None and best.inliers >= self.least_share * best.matches:
+            if best is not None and best.inliers >= self.min_inlier_ratio * best.matches:
                 break
         return best
 
@@ -96,13 +96,15 @@ class Localizer:
         chosen = select_mature(slam_map.points["times_found"][point_ids], settings.min_matches)
         chosen = chosen[subsample_per_cell(view.keypoints[keypoints[chosen]], self.camera.size)]
         undistorted = self.undistorted(view.keypoints)
-        points_w, heard = slam_map.positions_w[point_ids[chosen]], undistorted[keypoints[chosen]]
-        T_cw = self._start(points_w, heard, expected_T_cw)
+        points_w = slam_map.positions_w[point_ids[chosen]]
+        T_cw = self._start(points_w, undistorted[keypoints[chosen]], expected_T_cw)
         if T_cw is None:
             return None
         candidates = self._local_points_with(slam_map, point_ids, local_points)
         near = self.project(slam_map, candidates, T_cw, view)
-        guided = match_projected_points(slam_map, near, view, settings.refine_radius_px, self.own, ratio=0.9)
+        guided = match_projected_points(
+            slam_map, near, view, settings.refine_radius_px, self.guided_matcher, ratio=0.9
+        )
         ids, at, noise = guided.first, guided.second, view.noise[guided.second]
         if len(ids) < settings.min_inliers:
             return None
