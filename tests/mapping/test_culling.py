@@ -40,12 +40,12 @@ def world_of(T_cw: Tensor, scales: list[float] | None = None) -> Submap:
         keyframe = slam_map.add_keyframe(view, pose)
         if index == 0:
             slam_map.add_points(cloud(), view.descriptors, 0)
-        slam_map.observe(keyframe, everyone, everyone)
+        slam_map.add_observations(keyframe, everyone, everyone)
         seen = estimate_at(pose, everyone, everyone)
         submap.posed_frames.add(view, seen, pose @ se3_inverse(pose), keyframe)
     last = len(T_cw) - 1
     eye = torch.eye(4, dtype=torch.float64)
-    submap.tracking = TrackingState(eye, last, POINTS, None, everyone, slam_map.ids(last), everyone)
+    submap.tracking = TrackingState(eye, last, POINTS, None, everyone, slam_map.index_tensor(last), everyone)
     return submap
 
 
@@ -72,7 +72,7 @@ def test_coarser_observations_do_not_replace_finer_ones() -> None:
 
 
 def forget(slam_map: Map, keyframe: int, count: int) -> None:
-    slam_map.forget(torch.full((count,), keyframe), torch.arange(count))
+    slam_map.remove_observations(torch.full((count,), keyframe), torch.arange(count))
 
 
 @pytest.mark.parametrize(("missing", "covered"), [(2, True), (3, False)])
@@ -115,7 +115,9 @@ def test_a_mapper_culls_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(compaction, "_MAX_REWRITTEN", 1000)
     submap = world_of(standing(30))
     descriptors = submap.map.points["descriptors"][:1].repeat(40, 1)
-    submap.map.invalidate(submap.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:])
+    submap.map.remove_points(
+        submap.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:]
+    )
     before, left = submap.map.keyframes["frame_index"].clone(), submap.map.positions_w[:21].clone()
     went = Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap)
     assert went is not None

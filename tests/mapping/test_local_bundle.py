@@ -87,7 +87,7 @@ def weighted(coarse: float) -> float:
     slam_map = row(T_cw)
     slam_map.keyframes["keypoints"][2:, :, 1] += 2.0  # across the way, which no depth explains
     slam_map.keyframes["scales"][:2], slam_map.keyframes["scales"][2:] = 1.0, coarse
-    seen = slam_map.points_seen_by(torch.arange(4))
+    seen = slam_map.observed_points(torch.arange(4))
     before = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
     adjust_keyframes(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA, 30, covariances=False)
     after = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
@@ -147,7 +147,7 @@ def test_adjusted_points_are_refreshed_from_their_observations() -> None:
     slam_map = row(sideways(4))
     slam_map.points["scale_distance"][:] = 0
     adjust_local(slam_map, 3, CAMERA, bundle(local_window=2))
-    seen = slam_map.points_seen_by(torch.tensor([3]))
+    seen = slam_map.observed_points(torch.tensor([3]))
     size = SCENE.sizes[torch.argsort(ROWS)[seen]] * 200.0
     torch.testing.assert_close(slam_map.points["scale_distance"][seen], size)
 
@@ -169,7 +169,7 @@ def test_covariances_are_stored_on_request() -> None:
         adjust_local(slam_map, 3, CAMERA, bundle(local_window=2), covariances=requested)
         known = slam_map.keyframes["covariances"].diagonal(dim1=-2, dim2=-1).sum(-1) > 0
         assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if requested else [])
-        seen = slam_map.points_seen_by(torch.tensor([2, 3]))
+        seen = slam_map.observed_points(torch.tensor([2, 3]))
         seen = seen[slam_map.points["times_observed"][seen] >= 2]
         trace = slam_map.points["covariances_w"][seen].diagonal(dim1=-2, dim2=-1).sum(-1)
         assert bool((trace > 0).all()) is requested
@@ -188,7 +188,7 @@ def test_covariances_do_not_change_the_adjustment() -> None:
 
 def test_an_empty_window_changes_nothing() -> None:
     slam_map = row(sideways(2))
-    slam_map.invalidate(slam_map.valid_points())
+    slam_map.remove_points(slam_map.valid_points())
     before = slam_map.T_cw.clone()
     adjust_keyframes(slam_map, torch.tensor([1]), torch.tensor([0]), CAMERA, 5, covariances=True)
     assert torch.equal(slam_map.T_cw, before)

@@ -85,7 +85,7 @@ def test_new_points_have_covariances() -> None:
     new = triangulated(slam_map)
     scales = []
     for keyframe in (1, 0):
-        view = slam_map.view(keyframe)
+        view = slam_map.frame_features(keyframe)
         scales.append(view.scales[SCENE.at(view.index)[shown(slam_map, keyframe, new)]])
     wanted = triangulation_covariance(
         slam_map.T_cw[1], slam_map.T_cw[0], slam_map.positions_w[new], *scales, CAMERA, CAMERA
@@ -145,7 +145,7 @@ def test_points_with_inconsistent_scales_are_rejected() -> None:
 
 def test_the_baseline_must_be_a_fraction_of_the_depth() -> None:
     slam_map = half_known(sideways(2, step=0.4))
-    seen = slam_map.points_seen_by(torch.tensor([0]))
+    seen = slam_map.observed_points(torch.tensor([0]))
     share = 0.4 / float(slam_map.positions_w[seen, 2].median())
     assert has_baseline(slam_map, 1, torch.tensor([0, 1]), 0.99 * share).tolist() == [True, False]
     assert not has_baseline(slam_map, 1, torch.tensor([0]), 1.01 * share)
@@ -156,7 +156,7 @@ def test_the_baseline_must_be_a_fraction_of_the_depth() -> None:
 def test_the_median_depth_is_that_of_the_neighbor() -> None:
     T_cw = torch.stack([pose(0, 0, 2.0), pose(0.5, 0, 0)])  # the first stands two meters back
     slam_map = half_known(T_cw)
-    seen = slam_map.points_seen_by(torch.tensor([0]))
+    seen = slam_map.observed_points(torch.tensor([0]))
     share = math.hypot(0.5, 2.0) / float(slam_map.positions_w[seen, 2].median() + 2.0)
     assert has_baseline(slam_map, 1, torch.tensor([0]), 0.99 * share)
     assert not has_baseline(slam_map, 1, torch.tensor([0]), 1.01 * share)
@@ -293,7 +293,9 @@ def test_keypoints_with_a_point_are_not_matched_again() -> None:
     slam_map = half_known(sideways(3, step=0.3))
     table = slam_map.keyframes["point_ids"]
     known = torch.nonzero(table[0] >= 0)[:40, 0]
-    slam_map.forget(torch.zeros_like(known), known)  # the first keyframe has 40 free keypoints more
+    slam_map.remove_observations(
+        torch.zeros_like(known), known
+    )  # the first keyframe has 40 free keypoints more
     before = table.clone()
     free = FreeKeypoints.of(slam_map, torch.tensor([0, 1]), CAMERA.normalize)
     for row in range(2):

@@ -198,7 +198,7 @@ def test_a_contradicting_initialization_replaces_a_provisional_map(
     """No support is enough here: whatever start the first and the last frame make is a rival."""
     few = ("initialization.min_matches=30", "initialization.min_points=20")
     walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
-    monkeypatch.setattr("torchslam.tracking.provisional_map.MIN_SUPPORT_RATIO", 2.0)
+    monkeypatch.setattr("torchslam.tracking.initialization.MIN_SUPPORT_RATIO", 2.0)
     found, founded = MapInitializer.build, []
 
     def counted(

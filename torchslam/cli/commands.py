@@ -31,11 +31,11 @@ def add_arguments_demo(parser: argparse.ArgumentParser) -> None:
 
 def execute_demo(options: argparse.Namespace) -> int:
     """Run SLAM on a rendered room, evaluate and plot it: the whole system without any data."""
-    from torchslam.cli.run import Plan, run
+    from torchslam.cli.run import RunPlan, run
     from torchslam.data import open_sequence
 
     # The results can be reproduced, so overwriting loses nothing.
-    plan = Plan(DEMO_SEQUENCE, options.output, options.device, overwrite=True)
+    plan = RunPlan(DEMO_SEQUENCE, options.output, options.device, overwrite=True)
     return run(open_sequence(DEMO_SEQUENCE), arguments.config(options), plan)
 
 

@@ -35,7 +35,15 @@ from torchslam.io.export.colmap import colmap_camera, write_colmap
 from torchslam.io.export.nerfstudio import IMAGES, write_nerfstudio
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.export.recording import import_rerun, write_recording
-from torchslam.io.export.scene import WITHOUT, Images, Scene, open_images, scene_of, undistorted, write_images
+from torchslam.io.export.scene import (
+    WITHOUT,
+    ExportedScene,
+    Images,
+    open_images,
+    scene_of,
+    undistorted,
+    write_images,
+)
 from torchslam.io.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
@@ -78,7 +86,7 @@ class Job:
         """Rotation from the map frame to the upright one, the same for every format."""
         return upright_rotation(se3_inverse(self.submap.map.T_cw).double())
 
-    def scene(self) -> tuple[Scene, Images | None]:
+    def scene(self) -> tuple[ExportedScene, Images | None]:
         """The exported scene and its images, if requested. Raises ResultsError if they cannot be read."""
         scene = scene_of(self.submap, self.camera, self.session, self.keyframes_alone)
         images = None
@@ -214,7 +222,7 @@ def _rerun(job: Job) -> dict[str, str]:
     return _describe_scene(job, scene)
 
 
-def _describe_scene(job: Job, scene: Scene) -> dict[str, str]:
+def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
     error = float(scene.point_errors().mean()) if len(scene.points_w) else 0.0
     frames = f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes"
     if job.keyframes_alone:

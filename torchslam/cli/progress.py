@@ -22,7 +22,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}  # 128 + the signal's number, as shells have it
 
 
-class Stopping:
+class StopSignals:
     """Signal handling of a run: the first signal makes `check` raise, the second one exits at once."""
 
     def __init__(self) -> None:
@@ -52,7 +52,7 @@ class Stopping:
             self._is_wanted = False
             raise KeyboardInterrupt
 
-    def __enter__(self) -> Stopping:
+    def __enter__(self) -> StopSignals:
         self._before = {number: signal.getsignal(number) for number in SIGNALS}
         return self
 
@@ -89,10 +89,10 @@ class ProgressBar:
     """
 
     def __init__(
-        self, frames: int | None, count_points: Callable[[], int], stopping: Stopping, done: int = 0
+        self, frames: int | None, count_points: Callable[[], int], stop_signals: StopSignals, done: int = 0
     ) -> None:
         self._count_points = count_points
-        self._stopping = stopping
+        self._stopping = stop_signals
         self._bar = tqdm(
             total=frames,
             initial=done,

@@ -43,7 +43,7 @@ REFINED = "refined"  # folder in the results
 
 
 @dataclass(frozen=True)
-class Plan:
+class RefinePlan:
     """source, fps: what the sequence was opened from; choice, radial: as in `refine`"""
 
     source: str
@@ -91,7 +91,7 @@ def execute(options: argparse.Namespace) -> int:
     sequence = _with_camera(arguments.sequence(options), given, options.camera)
     is_guess = sequence.calibrated is Calibrated.GUESSED
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.IF_CONTRADICTED
-    plan = Plan(
+    plan = RefinePlan(
         options.path,
         options.fps,
         options.output,
@@ -103,7 +103,7 @@ def execute(options: argparse.Namespace) -> int:
     return run(sequence, given, arguments.config(options), plan)
 
 
-def run(sequence: Sequence, given: GivenPoses, config: Config, plan: Plan) -> int:
+def run(sequence: Sequence, given: GivenPoses, config: Config, plan: RefinePlan) -> int:
     """Refine, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, resume=False)
     check_replaceable(plan.output / CALIBRATION)
@@ -141,7 +141,7 @@ def _with_camera(sequence: Sequence, given: GivenPoses, camera: str | None) -> S
     return sequence
 
 
-def _write(refined: RefinementResult, sequence: Sequence, plan: Plan) -> dict[str, Any]:
+def _write(refined: RefinementResult, sequence: Sequence, plan: RefinePlan) -> dict[str, Any]:
     """Evaluate and write the refined run; returns the metrics."""
     finished = refined.run
     before = Trajectory.empty() if finished.failure else finished.online

@@ -19,7 +19,7 @@ import torch
 
 from torchslam.calibration.find_camera import RADIAL, find_camera
 from torchslam.cli import arguments
-from torchslam.cli.progress import ProgressBar, Stopping
+from torchslam.cli.progress import ProgressBar, StopSignals
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import is_found
@@ -50,7 +50,7 @@ GROWTH = 0.05
 
 
 @dataclass(frozen=True)
-class Plan:
+class RunPlan:
     """Inputs, outputs and options of a run.
 
     Attributes:
@@ -165,7 +165,7 @@ def execute(options: argparse.Namespace) -> int:
         own = saved / CONFIG
         options.config = options.config or (own if own.is_file() else None)
         saved = saved / MAP
-    plan = Plan(
+    plan = RunPlan(
         source=options.path,
         output=options.output,
         device=options.device,
@@ -196,7 +196,7 @@ def _sequence(options: argparse.Namespace) -> Sequence:
     return found.with_camera(unknown_camera(found.size), Calibrated.GUESSED)
 
 
-def run(sequence: Sequence, config: Config, plan: Plan) -> int:
+def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, plan.resume)
     sequence, found = _with_camera(sequence, config, plan)
@@ -206,16 +206,16 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     processes = (
         1 if plan.view or plan.video else plan.processes
     )  # the viewers need the images in this process
-    with Stopping() as stopping, _watching(slam, sequence, plan) as watching:
+    with StopSignals() as stop_signals, _watching(slam, sequence, plan) as watching:
         is_live = not len(sequence.timestamps)
         latencies: list[float] = []  # of a live source, in milliseconds from capture to pose
-        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stopping, so_far.next)
+        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
         with bar as progress:
 
             def after_frame(result: StepResult) -> None:
                 if is_live:
                     latencies.append(1e3 * (time.time() - result.timestamp))
-                checkpoints.offer(at_once=stopping.is_wanted)
+                checkpoints.offer(at_once=stop_signals.is_wanted)
                 watching.show(result)
                 progress.update(result)
 
@@ -223,7 +223,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
                 finished = run_sequence(
                     slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
                 )
-        stopping.begin("when the results are written")
+        stop_signals.begin("when the results are written")
         metrics = _write(finished, sequence, plan, found, latencies)
         watching.end(finished)
     written = {"results": plan.output, "view": plan.output / VIEW}
@@ -234,7 +234,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
         print(f"torchslam: warning: {warning}", file=sys.stderr)
     if finished.interrupted:
         print("torchslam: interrupted; the results so far were written", file=sys.stderr)
-        return stopping.status
+        return stop_signals.status
     checkpoints.remove()
     if finished.failure:
         print(f"torchslam: {finished.failure}", file=sys.stderr)
@@ -242,7 +242,7 @@ def run(sequence: Sequence, config: Config, plan: Plan) -> int:
     return DONE
 
 
-def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequence, str]:
+def _with_camera(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[Sequence, str]:
     """Return the sequence with the camera of the run, and a remark on the camera if it was estimated."""
     is_guess = sequence.calibrated is Calibrated.GUESSED and sequence.known_length is not None
     if plan.map is not None or not (plan.refine or is_guess):
@@ -262,7 +262,7 @@ def _with_camera(sequence: Sequence, config: Config, plan: Plan) -> tuple[Sequen
     )
 
 
-def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, RunProgress]:
+def _begin(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[SLAM, RunProgress]:
     """Return a new system, or one restored from a checkpoint or a saved map, with its progress."""
     checkpoint = plan.output / CHECKPOINT
     if plan.resume and checkpoint.exists():
@@ -287,7 +287,7 @@ def _begin(sequence: Sequence, config: Config, plan: Plan) -> tuple[SLAM, RunPro
     return slam, RunProgress()
 
 
-def _watching(slam: SLAM, sequence: Sequence, plan: Plan) -> FrameViewers:
+def _watching(slam: SLAM, sequence: Sequence, plan: RunPlan) -> FrameViewers:
     """Return the viewers of the run; delete the video of an earlier run."""
     (plan.output / VIDEO).unlink(missing_ok=True)
     screens: list[FrameViewer] = [LiveView.spawn(slam)] if plan.view else []
@@ -302,7 +302,7 @@ def _describe(camera: Camera) -> str:
 
 
 def _write(
-    finished: Run, sequence: Sequence, plan: Plan, camera: str, latencies: list[float]
+    finished: Run, sequence: Sequence, plan: RunPlan, camera: str, latencies: list[float]
 ) -> dict[str, object]:
     """Evaluate and write the run; returns the metrics.
 

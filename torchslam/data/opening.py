@@ -25,7 +25,7 @@ from torchslam.data.readers.rgbd import ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
 from torchslam.data.readers.video import VIDEO
 from torchslam.data.sequence import Reader, Sequence
 from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
-from torchslam.data.transforms import Masked, cut, resize, thin
+from torchslam.data.transforms import Masked, cut, reduce_rate, resize
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
 from torchslam.geometry.camera import Camera
 
@@ -77,7 +77,7 @@ def open_sequence(
         raise SequenceError(f"{cause.filename or path}: cannot be read: {cause.strerror or cause}") from cause
     sequence = cut(sequence, start, stop)
     if fps is not None:
-        sequence = thin(sequence, fps)
+        sequence = reduce_rate(sequence, fps)
     if limit is not None or stride != 1:
         sequence = sequence.part(stop=None if limit is None else limit * stride, stride=stride)
     return sequence if resize_to is None else resize(sequence, resize_to)

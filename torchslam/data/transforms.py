@@ -36,7 +36,7 @@ def cut(sequence: Sequence, start: str | int = 0, stop: str | int | None = None)
     return sequence if first == 0 and last is None else sequence.part(first, last)
 
 
-def thin(sequence: Sequence, rate: float) -> Sequence:
+def reduce_rate(sequence: Sequence, rate: float) -> Sequence:
     """Select at most `rate` frames per second by their timestamps."""
     _check_known(sequence, "--fps")
     elapsed = (sequence.timestamps - sequence.timestamps[:1]).tolist()

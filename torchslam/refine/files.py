@@ -19,7 +19,7 @@ from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import opengl
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import nerfstudio_camera
-from torchslam.io.export.scene import Scene, scene_of
+from torchslam.io.export.scene import ExportedScene, scene_of
 from torchslam.refine.pose_refinement import RefinementResult
 from torchslam.types import Trajectory
 from torchslam.utils.files import JSON_BYTES, parse_json
@@ -33,7 +33,7 @@ CAMERA_KEYS = (
 
 
 @dataclass(frozen=True)
-class NamedScene(Scene):
+class NamedScene(ExportedScene):
     """A scene with the image names of another program.
 
     Attributes:
@@ -103,7 +103,7 @@ def _write_colmap(folder: Path, refined: RefinementResult) -> None:
     assert refined.run.main is not None
     scene = scene_of(refined.run.main, refined.run.camera, refined.run.session, keyframes_alone=False)
     names = {frame: _name(refined, frame) for frame in scene.frame_ids.tolist()}
-    columns: dict[str, Any] = {column.name: getattr(scene, column.name) for column in fields(Scene)}
+    columns: dict[str, Any] = {column.name: getattr(scene, column.name) for column in fields(ExportedScene)}
     write_colmap(folder, NamedScene(names=names, **columns))
 
 

@@ -17,7 +17,7 @@ from torchslam.data import EndOfSequence, open_sequence
 from torchslam.data.camera_argument import parse_calibration
 from torchslam.data.readers import live
 from torchslam.data.readers.live import CaptureClock, LiveSequence
-from torchslam.data.transforms import Resized, cut, thin
+from torchslam.data.transforms import Resized, cut, reduce_rate
 from torchslam.errors import FrameError, SequenceError
 
 RATE = 50.0
@@ -130,7 +130,7 @@ def test_the_last_frame_can_be_chosen(clip: Path) -> None:
     assert (len(part), part.known_length) == (4, 4)
     with pytest.raises(SequenceError, match="only the end can be chosen"):
         part.part(start=2)
-    for wrong in (lambda: thin(part, 5.0), lambda: cut(part, 0, "10s")):
+    for wrong in (lambda: reduce_rate(part, 5.0), lambda: cut(part, 0, "10s")):
         with pytest.raises(SequenceError, match="a live source does not have"):
             wrong()
     assert cut(part, 0, 2).known_length == 2

@@ -8,7 +8,7 @@ import torch
 from tests.sample_run import camera as camera
 from tests.sample_run import results, run, slam_map, submap, trajectory
 from torchslam.geometry import Camera, rigid, so3_exp, transform
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import ExportedScene
 
 __all__ = ["results", "run", "slam_map", "submap", "trajectory"]
 
@@ -30,7 +30,7 @@ def lens(request: pytest.FixtureRequest) -> Camera:
 
 
 @pytest.fixture
-def scene(lens: Camera, generator: torch.Generator) -> Scene:
+def scene(lens: Camera, generator: torch.Generator) -> ExportedScene:
     """Thirty points before four cameras, all of which see all of them but one; pixels are noisy."""
     frames, points = 4, 30
     noise = {"generator": generator, "dtype": torch.float64}
@@ -41,7 +41,7 @@ def scene(lens: Camera, generator: torch.Generator) -> Scene:
     pixels, valid = lens.project(transform(T_cw, points_w.expand(frames, -1, -1)))
     assert valid.all()
     pixels = pixels.flatten(0, 1)[1:]
-    return Scene(
+    return ExportedScene(
         camera=lens,
         frame_ids=torch.tensor((3, 5, 6, 90)),
         timestamps=torch.tensor((0.3, 0.5, 0.6, 9.0), dtype=torch.float64),
@@ -55,7 +55,7 @@ def scene(lens: Camera, generator: torch.Generator) -> Scene:
     )
 
 
-def reprojection_error(scene: Scene) -> float:
+def reprojection_error(scene: ExportedScene) -> float:
     """Mean over the points of their mean error, point by point: what exports are compared with."""
     errors = []
     for point in range(len(scene.points_w)):

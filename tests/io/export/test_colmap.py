@@ -12,7 +12,7 @@ import torch
 from tests.io.export.conftest import reprojection_error
 from torchslam.geometry import transform
 from torchslam.io.export.colmap import colmap_camera, write_colmap
-from torchslam.io.export.scene import Scene, undistorted
+from torchslam.io.export.scene import ExportedScene, undistorted
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 
@@ -29,7 +29,7 @@ def read(folder: Path, reader: str) -> pycolmap.Reconstruction:
     return made
 
 
-def test_colmap_computes_our_reprojection_error(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_colmap_computes_our_reprojection_error(scene: ExportedScene, tmp_path: Path, reader: str) -> None:
     write_colmap(tmp_path, scene)
     made, ours = read(tmp_path, reader), reprojection_error(scene)
     assert made.compute_mean_reprojection_error() == pytest.approx(ours, abs=1e-9)  # as written
@@ -37,7 +37,7 @@ def test_colmap_computes_our_reprojection_error(scene: Scene, tmp_path: Path, re
     assert made.compute_mean_reprojection_error() == pytest.approx(ours, abs=1e-6)  # by its own projection
 
 
-def test_points_tracks_and_images_round_trip(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_points_tracks_and_images_round_trip(scene: ExportedScene, tmp_path: Path, reader: str) -> None:
     write_colmap(tmp_path, scene)
     made = read(tmp_path, reader)
     assert [made.image(number).name for number in (1, 2, 3, 4)] == scene.image_names
@@ -58,7 +58,7 @@ def test_points_tracks_and_images_round_trip(scene: Scene, tmp_path: Path, reade
     assert seen == len(scene.pixels)
 
 
-def test_the_colmap_camera_projects_like_ours(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_the_colmap_camera_projects_like_ours(scene: ExportedScene, tmp_path: Path, reader: str) -> None:
     write_colmap(tmp_path, scene)
     made = read(tmp_path, reader)
     points_c = transform(scene.T_cw[0], scene.points_w)
@@ -68,7 +68,7 @@ def test_the_colmap_camera_projects_like_ours(scene: Scene, tmp_path: Path, read
     assert (made.camera(1).width, made.camera(1).height) == scene.camera.size
 
 
-def test_every_camera_model_has_a_colmap_name(scene: Scene) -> None:
+def test_every_camera_model_has_a_colmap_name(scene: ExportedScene) -> None:
     model, params = colmap_camera(scene.camera)
     k3 = scene.camera.params.tolist()[8:9]
     expected = {"pinhole": "PINHOLE", "fisheye": "OPENCV_FISHEYE"}.get(scene.camera.model)
@@ -76,7 +76,7 @@ def test_every_camera_model_has_a_colmap_name(scene: Scene) -> None:
     assert len(params) == {"PINHOLE": 4, "OPENCV": 8, "OPENCV_FISHEYE": 8, "FULL_OPENCV": 12}[model]
 
 
-def test_without_distortion_the_error_is_that_of_the_new_pixels(scene: Scene, tmp_path: Path) -> None:
+def test_without_distortion_the_error_is_that_of_the_new_pixels(scene: ExportedScene, tmp_path: Path) -> None:
     flat = undistorted(scene)
     write_colmap(tmp_path, flat)
     made = read(tmp_path, "read_binary")
@@ -85,7 +85,7 @@ def test_without_distortion_the_error_is_that_of_the_new_pixels(scene: Scene, tm
     assert made.compute_mean_reprojection_error() == pytest.approx(reprojection_error(flat), abs=1e-6)
 
 
-def test_an_image_without_observations_is_written(scene: Scene, tmp_path: Path, reader: str) -> None:
+def test_an_image_without_observations_is_written(scene: ExportedScene, tmp_path: Path, reader: str) -> None:
     seen = scene.frame_index != 1
     blind = replace(
         scene,

@@ -11,7 +11,7 @@ import torch
 from torchslam.data import open_sequence
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.export.scene import Scene, Undistorter, open_images, write_images
+from torchslam.io.export.scene import ExportedScene, Undistorter, open_images, write_images
 
 FRAMES = 7
 
@@ -23,7 +23,7 @@ def picture(index: int, camera: Camera) -> np.ndarray:
 
 
 @pytest.fixture
-def seen(scene: Scene) -> Scene:
+def seen(scene: ExportedScene) -> ExportedScene:
     """The scene with its frames at 10 Hz within a short sequence."""
     ids = torch.tensor((0, 2, 3, 6))
     return replace(scene, frame_ids=ids, timestamps=torch.arange(FRAMES).double()[ids] / 10.0)
@@ -41,7 +41,7 @@ def folder(tmp_path: Path, lens: Camera) -> Path:
     return tmp_path
 
 
-def test_every_frame_gets_its_own_image(seen: Scene, folder: Path, tmp_path: Path) -> None:
+def test_every_frame_gets_its_own_image(seen: ExportedScene, folder: Path, tmp_path: Path) -> None:
     images = open_images(str(folder), seen)
     (tmp_path / "out").mkdir()
     stale, unrelated = tmp_path / "out" / "000001.png", tmp_path / "out" / "holiday.png"
@@ -54,20 +54,20 @@ def test_every_frame_gets_its_own_image(seen: Scene, folder: Path, tmp_path: Pat
     assert unrelated.exists()
 
 
-def test_without_distortion(seen: Scene, folder: Path) -> None:
+def test_without_distortion(seen: ExportedScene, folder: Path) -> None:
     plain, flat = open_images(str(folder), seen), open_images(str(folder), seen, undistort=True)
     expected = Undistorter(seen.camera)(plain.bgr(3)) if seen.camera.model != "pinhole" else plain.bgr(3)
     np.testing.assert_array_equal(flat.bgr(3), expected)
     assert (seen.camera.model == "pinhole") == np.array_equal(flat.bgr(3), plain.bgr(3))
 
 
-def test_another_sequence_is_refused(seen: Scene, folder: Path) -> None:
+def test_another_sequence_is_refused(seen: ExportedScene, folder: Path) -> None:
     later = replace(seen, timestamps=seen.frame_ids.double() / 10 + 0.01)
     with pytest.raises(ResultsError, match=r"not the sequence of this run.*--sequence"):
         open_images(str(folder), later)
 
 
-def test_images_without_times_have_the_rate_of_the_run(seen: Scene, folder: Path) -> None:
+def test_images_without_times_have_the_rate_of_the_run(seen: ExportedScene, folder: Path) -> None:
     images = str(folder / "rgb" / "*.png")
     np.testing.assert_array_equal(open_images(images, seen, fps=10.0).bgr(3), picture(3, seen.camera))
     with pytest.raises(ResultsError, match=r"other times"):
@@ -76,25 +76,25 @@ def test_images_without_times_have_the_rate_of_the_run(seen: Scene, folder: Path
     np.testing.assert_array_equal(open_images(str(folder), seen, fps=3.0).bgr(3), picture(3, seen.camera))
 
 
-def test_frames_are_found_by_their_times(seen: Scene, folder: Path) -> None:
+def test_frames_are_found_by_their_times(seen: ExportedScene, folder: Path) -> None:
     """The run may have begun later in the sequence."""
     part = replace(seen, frame_ids=seen.frame_ids - 2)
     np.testing.assert_array_equal(open_images(str(folder), part).bgr(1), picture(3, seen.camera))
 
 
-def test_images_have_the_size_that_the_run_saw(seen: Scene, folder: Path) -> None:
+def test_images_have_the_size_that_the_run_saw(seen: ExportedScene, folder: Path) -> None:
     half = Camera("pinhole", torch.tensor([100.0, 100, 40, 30]).double(), (seen.camera.width // 2, 60))
     image = open_images(str(folder), replace(seen, camera=half)).bgr(3)
     assert image.shape == (60, seen.camera.width // 2, 3)
     assert np.abs(image.mean((0, 1)) - picture(3, seen.camera).mean((0, 1))).max() < 1
 
 
-def test_a_missing_sequence_is_named(seen: Scene, tmp_path: Path) -> None:
+def test_a_missing_sequence_is_named(seen: ExportedScene, tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match=r"nowhere: does not exist; use --sequence.*--no-images"):
         open_images(str(tmp_path / "nowhere"), seen)
 
 
-def test_a_video_has_colors_at_every_frame(seen: Scene, tmp_path: Path) -> None:
+def test_a_video_has_colors_at_every_frame(seen: ExportedScene, tmp_path: Path) -> None:
     path = str(tmp_path / "film.avi")
     video = cv2.VideoWriter(path, cv2.VideoWriter.fourcc(*"MJPG"), 10.0, seen.camera.size)
     for index in range(FRAMES):
@@ -112,7 +112,7 @@ def test_a_rendered_sequence_has_three_equal_channels() -> None:
     assert sequence.color(0).unique().tolist() == [128]
 
 
-def test_a_damaged_image_is_a_frame_error(seen: Scene, folder: Path) -> None:
+def test_a_damaged_image_is_a_frame_error(seen: ExportedScene, folder: Path) -> None:
     sequence = open_sequence(folder, seen.camera)
     (folder / "rgb" / "3.png").write_bytes(b"not an image")
     with pytest.raises(FrameError, match=r"rgb\.txt:4"):

@@ -8,18 +8,18 @@ import torch
 from tests.io.export.conftest import reprojection_error
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, so3_exp
-from torchslam.io.export.scene import Scene, scene_of
+from torchslam.io.export.scene import ExportedScene, scene_of
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.types import PoseEstimate
 
 
-def test_errors_are_those_of_the_points(scene: Scene) -> None:
+def test_errors_are_those_of_the_points(scene: ExportedScene) -> None:
     assert float(scene.point_errors().mean()) == pytest.approx(reprojection_error(scene), abs=1e-9)
     assert 0.4 < float(scene.errors().mean()) < 0.9  # 0.63 expected of the noise
 
 
-def test_rotating_the_map_changes_no_pixel(scene: Scene) -> None:
+def test_rotating_the_map_changes_no_pixel(scene: ExportedScene) -> None:
     R = so3_exp(torch.tensor((0.3, 2.0, -0.7), dtype=torch.float64))
     turned = scene.turned(R)
     torch.testing.assert_close(turned.errors(), scene.errors())

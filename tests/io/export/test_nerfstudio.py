@@ -13,7 +13,7 @@ from tests.io.export.conftest import reprojection_error
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import VERTEX
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import ExportedScene
 
 
 def distort(about: dict, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -33,12 +33,12 @@ def read_cloud(path: Path) -> np.ndarray:
 
 
 @pytest.fixture
-def folder(scene: Scene, tmp_path: Path) -> Path:
+def folder(scene: ExportedScene, tmp_path: Path) -> Path:
     write_nerfstudio(tmp_path, scene, upright_rotation(scene.T_wc))
     return tmp_path
 
 
-def test_points_fall_on_their_keypoints(scene: Scene, folder: Path) -> None:
+def test_points_fall_on_their_keypoints(scene: ExportedScene, folder: Path) -> None:
     about = json.loads((folder / "transforms.json").read_text())
     cloud = read_cloud(folder / about["ply_file_path"])
     points = np.stack([cloud[name] for name in "xyz"], axis=1).astype(float)
@@ -56,7 +56,7 @@ def test_points_fall_on_their_keypoints(scene: Scene, folder: Path) -> None:
     assert np.mean(total / count) == pytest.approx(reprojection_error(scene), abs=1e-4)  # floats in the cloud
 
 
-def test_the_map_is_upright_and_the_transform_is_written(scene: Scene, folder: Path) -> None:
+def test_the_map_is_upright_and_the_transform_is_written(scene: ExportedScene, folder: Path) -> None:
     about = json.loads((folder / "transforms.json").read_text())
     up = np.mean([np.array(frame["transform_matrix"])[:3, 1] for frame in about["frames"]], axis=0)
     np.testing.assert_allclose(up / np.linalg.norm(up), (0, 0, 1), atol=1e-9)
@@ -65,7 +65,7 @@ def test_the_map_is_upright_and_the_transform_is_written(scene: Scene, folder: P
     assert "applied_transform" not in about  # versions of nerfstudio differ in what they apply it to
 
 
-def test_the_cloud_has_the_colors_and_the_frames_their_images(scene: Scene, folder: Path) -> None:
+def test_the_cloud_has_the_colors_and_the_frames_their_images(scene: ExportedScene, folder: Path) -> None:
     about = json.loads((folder / "transforms.json").read_text())
     cloud = read_cloud(folder / "sparse_pc.ply")
     colors = np.stack([cloud[name] for name in ("red", "green", "blue")], axis=1)

@@ -16,7 +16,7 @@ from tests.walks import Walk, arc
 from torchslam.errors import ResultsError
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import import_rerun, write_recording
-from torchslam.io.export.scene import Images, Scene, undistorted
+from torchslam.io.export.scene import ExportedScene, Images, undistorted
 
 chunks = pytest.importorskip("rerun.chunk", reason="rerun is not installed: pip install 'torchslam[rerun]'")
 
@@ -24,12 +24,12 @@ Rows = dict[tuple[str, str], list[tuple[int | None, Any]]]
 
 
 @pytest.fixture
-def flat(scene: Scene) -> Scene:
+def flat(scene: ExportedScene) -> ExportedScene:
     return undistorted(scene)
 
 
 @pytest.fixture
-def recorded(flat: Scene, tmp_path: Path) -> Rows:
+def recorded(flat: ExportedScene, tmp_path: Path) -> Rows:
     sequence = Walk(arc(91))  # one image per frame
     images = Images(sequence, {index: index for index in range(91)}, flat.camera)
     write_recording(tmp_path / "it.rrd", flat, upright_rotation(flat.T_wc), images)
@@ -57,7 +57,7 @@ def only(rows: Rows, entity: str, component: str) -> np.ndarray:
     return np.array(value)
 
 
-def test_points_fall_on_their_keypoints(flat: Scene, recorded: Rows) -> None:
+def test_points_fall_on_their_keypoints(flat: ExportedScene, recorded: Rows) -> None:
     points = only(recorded, "/world/points", "Points3D:positions")
     K = only(recorded, "/world/keyframe", "Pinhole:image_from_camera").reshape(3, 3).T  # by columns
     rotations = dict(recorded["/world/keyframe", "Transform3D:mat3x3"])
@@ -79,7 +79,7 @@ def test_points_fall_on_their_keypoints(flat: Scene, recorded: Rows) -> None:
     assert np.mean(total / count) == pytest.approx(expected, abs=1e-3)
 
 
-def only_keyframes(scene: Scene) -> Scene:
+def only_keyframes(scene: ExportedScene) -> ExportedScene:
     kept = scene.is_keyframe[scene.frame_index]
     return replace(
         scene,
@@ -89,14 +89,14 @@ def only_keyframes(scene: Scene) -> Scene:
     )
 
 
-def test_keypoints_have_the_colors_of_their_points(flat: Scene, recorded: Rows) -> None:
+def test_keypoints_have_the_colors_of_their_points(flat: ExportedScene, recorded: Rows) -> None:
     frame, colors = recorded["/world/keyframe/keypoints", "Points2D:colors"][-1]
     ids = flat.point_index[flat.frame_index == flat.frame_ids.tolist().index(frame)]
     red = np.array(colors, dtype=np.uint32) >> 24  # red, green, blue, opacity
     np.testing.assert_array_equal(red, flat.colors[ids, 0])
 
 
-def test_every_frame_has_a_pose_and_a_time(flat: Scene, recorded: Rows) -> None:
+def test_every_frame_has_a_pose_and_a_time(flat: ExportedScene, recorded: Rows) -> None:
     frames = [frame for frame, _ in recorded["/world/camera", "Transform3D:translation"]]
     assert frames == flat.frame_ids.tolist()
     positions = np.array([value for _, value in recorded["/world/camera", "Transform3D:translation"]])
@@ -104,12 +104,12 @@ def test_every_frame_has_a_pose_and_a_time(flat: Scene, recorded: Rows) -> None:
     np.testing.assert_allclose(positions.reshape(-1, 3), upright, atol=1e-6)
 
 
-def test_the_path_is_broken_where_frames_are_missing(flat: Scene, recorded: Rows) -> None:
+def test_the_path_is_broken_where_frames_are_missing(flat: ExportedScene, recorded: Rows) -> None:
     ((_, strips),) = recorded["/world/path", "LineStrips3D:strips"]
     assert [len(strip) for strip in strips] == [3, 1]  # frame 90 comes long after frame 6
 
 
-def test_keyframes_have_their_image(flat: Scene, recorded: Rows) -> None:
+def test_keyframes_have_their_image(flat: ExportedScene, recorded: Rows) -> None:
     logged = recorded["/world/keyframe", "EncodedImage:blob"]
     assert [frame for frame, _ in logged] == flat.frame_ids[flat.is_keyframe].tolist()
     content = np.array(logged[0][1], dtype=np.uint8).reshape(-1)

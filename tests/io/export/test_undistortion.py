@@ -7,7 +7,7 @@ import torch
 
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.export.scene import Scene, Undistorter, pinhole_within, undistorted
+from torchslam.io.export.scene import ExportedScene, Undistorter, pinhole_within, undistorted
 
 
 def border(camera: Camera) -> torch.Tensor:
@@ -29,7 +29,7 @@ def test_the_undistorted_image_is_the_largest_valid_one(lens: Camera) -> None:
     assert torch.equal(pinhole.params[:2], lens.params[:2])
 
 
-def test_undistorted_keypoints_agree_with_opencv(scene: Scene) -> None:
+def test_undistorted_keypoints_agree_with_opencv(scene: ExportedScene) -> None:
     flat, (K, k) = undistorted(scene), (scene.camera.K.numpy(), scene.camera.params[4:].numpy())
     undistort = cv2.fisheye.undistortPoints if scene.camera.model == "fisheye" else cv2.undistortPoints
     if scene.camera.model == "pinhole":
@@ -51,14 +51,14 @@ def test_undistorted_images_agree_with_opencv(lens: Camera) -> None:
     assert difference.max() <= 2
 
 
-def test_a_point_keeps_its_ray(scene: Scene) -> None:
+def test_a_point_keeps_its_ray(scene: ExportedScene) -> None:
     flat = undistorted(scene)
     torch.testing.assert_close(
         flat.camera.unproject(flat.pixels), scene.camera.unproject(scene.pixels), atol=1e-9, rtol=0
     )
 
 
-def test_only_a_pinhole_camera_is_unchanged(scene: Scene) -> None:
+def test_only_a_pinhole_camera_is_unchanged(scene: ExportedScene) -> None:
     assert (undistorted(scene) is scene) == (scene.camera.model == "pinhole")
 
 

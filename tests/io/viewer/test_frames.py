@@ -20,10 +20,10 @@ from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.scene import pinhole_within
 from torchslam.io.viewer.frames import (
     BAR,
-    Film,
     FrameSnapshot,
     FrameViewers,
     LiveView,
+    VideoRecorder,
     film_of,
     tracked_pixels,
 )
@@ -65,7 +65,7 @@ class Kept:
         self.closed += 1
 
 
-def watched(slam: SLAM, walk: Walk, *screens: Kept | LiveView | Film) -> Run:
+def watched(slam: SLAM, walk: Walk, *screens: Kept | LiveView | VideoRecorder) -> Run:
     with FrameViewers(slam, walk, list(screens)) as watching:
         run = slam.run(watching.sequence, watching.show)
         watching.end(run)
@@ -197,7 +197,7 @@ def test_a_video_has_every_frame_and_marks_tracked_points(tmp_path: Path) -> Non
     gray = np.full((120, 1920), GRAY, np.uint8)
     result = StepResult(7, 0.0, State.TRACKING, None, inliers=1)
     snapshot = FrameSnapshot(result, gray, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
-    video = Film(tmp_path / "it.mp4", (1920, 120), 10.0)
+    video = VideoRecorder(tmp_path / "it.mp4", (1920, 120), 10.0)
     for shown in (snapshot, replace(snapshot, tracked=torch.zeros(0, 2))):
         video.show(shown)
     video.close()
@@ -224,4 +224,4 @@ def test_a_video_has_the_frame_rate_of_its_sequence(tmp_path: Path) -> None:
 
 def test_a_video_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match="cannot write it"):
-        Film(tmp_path / "nowhere" / "it.mp4", (64, 48), 10.0)
+        VideoRecorder(tmp_path / "nowhere" / "it.mp4", (64, 48), 10.0)

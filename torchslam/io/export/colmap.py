@@ -15,7 +15,7 @@ import numpy as np
 
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, corner_pixels, quaternion_wxyz
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import ExportedScene
 
 CAMERA_ID = 1
 MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
@@ -54,7 +54,7 @@ def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
     return "FULL_OPENCV", [*params, 0.0, 0.0, 0.0]  # k4, k5, k6 of a denominator
 
 
-def write_colmap(folder: Path, scene: Scene) -> None:
+def write_colmap(folder: Path, scene: ExportedScene) -> None:
     """Write the model, binary and text, into a folder that is made if need be."""
     folder.mkdir(parents=True, exist_ok=True)
     images, points = _images(scene), _points(scene)
@@ -71,7 +71,7 @@ def write_colmap(folder: Path, scene: Scene) -> None:
         (folder / name).write_text("".join(content), encoding="utf-8")
 
 
-def _images(scene: Scene) -> list[_Image]:
+def _images(scene: ExportedScene) -> list[_Image]:
     points = np.zeros(len(scene.pixels), POINT_IN_IMAGE)
     points["x"], points["y"] = corner_pixels(scene.pixels).numpy().T
     points["point"] = scene.point_index.numpy() + 1
@@ -82,7 +82,7 @@ def _images(scene: Scene) -> list[_Image]:
     return [_Image(*row) for row in zip(scene.image_names, poses, per_image, strict=True)]
 
 
-def _points(scene: Scene) -> list[_Point]:
+def _points(scene: ExportedScene) -> list[_Point]:
     frame, point = scene.frame_index.numpy(), scene.point_index.numpy()
     first = np.searchsorted(frame, np.arange(len(scene.T_cw)))
     tracks = np.zeros(len(frame), TRACK)

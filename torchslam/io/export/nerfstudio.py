@@ -17,7 +17,7 @@ from torch import Tensor
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, opengl
 from torchslam.io.export.ply import write_ply
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import ExportedScene
 
 TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"
@@ -39,7 +39,7 @@ def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
     return about | dict(zip(names, params, strict=True))
 
 
-def write_nerfstudio(folder: Path, scene: Scene, R_up: Float[Tensor, "3 3"]) -> None:
+def write_nerfstudio(folder: Path, scene: ExportedScene, R_up: Float[Tensor, "3 3"]) -> None:
     """Write transforms.json and the point cloud into a folder that is made if need be.
 
     Args:

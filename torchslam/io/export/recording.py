@@ -15,7 +15,7 @@ from torch import Tensor
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, corner_pixels
-from torchslam.io.export.scene import Images, Scene
+from torchslam.io.export.scene import ExportedScene, Images
 
 APPLICATION = "torchslam"
 JPEG_QUALITY = 90
@@ -105,7 +105,9 @@ class Recorder:
         self._recording.log(entity, content, static=static)
 
 
-def write_recording(path: Path, scene: Scene, R_up: Float[Tensor, "3 3"], images: Images | None) -> None:
+def write_recording(
+    path: Path, scene: ExportedScene, R_up: Float[Tensor, "3 3"], images: Images | None
+) -> None:
     """Write a .rrd file with the timelines `frame` and `time`, in a world whose z is up.
 
     `world/camera` has the pose of every frame, `world/keyframe` pose, image and observed keypoints of those that are

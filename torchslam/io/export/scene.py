@@ -26,7 +26,7 @@ MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees 
 
 
 @dataclass(frozen=True)
-class Scene:
+class ExportedScene:
     """Posed frames in order of time, points and observations, ordered by frame; on the CPU.
 
     Attributes:
@@ -59,7 +59,7 @@ class Scene:
         """Image file names of an export, in the order of the frames."""
         return [f"{index:06d}.png" for index in self.frame_ids.tolist()]
 
-    def turned(self, R: Float[Tensor, "3 3"]) -> Scene:
+    def turned(self, R: Float[Tensor, "3 3"]) -> ExportedScene:
         """Return the scene rotated by R: points p become R p."""
         T_cw = self.T_cw.clone()
         T_cw[:, :3, :3] = T_cw[:, :3, :3] @ R.mT
@@ -77,7 +77,7 @@ class Scene:
         return total.index_add(0, self.point_index, self.errors()) / count
 
 
-def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool) -> Scene:
+def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool) -> ExportedScene:
     """Build the scene of one session in a saved submap, from all frames or only from keyframes.
 
     Points outside of the domain of the camera model and points with fewer than two observations are omitted. Raises
@@ -101,7 +101,7 @@ def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool
     seen = torch.nonzero(is_kept)[:, 0]
     seen = seen[torch.argsort(slot[graph.frame_index[seen]], stable=True)]
     points, point_index = torch.unique(graph.point_index[seen], return_inverse=True)
-    return Scene(
+    return ExportedScene(
         camera=camera.to(torch.float64),
         frame_ids=graph.frame_ids[rows],
         timestamps=graph.timestamps[rows],
@@ -137,7 +137,7 @@ def pinhole_within(camera: Camera) -> Camera:
     return Camera("pinhole", params, (width, height))
 
 
-def undistorted(scene: Scene) -> Scene:
+def undistorted(scene: ExportedScene) -> ExportedScene:
     """Return the scene for `pinhole_within` of its camera; keypoints may lie outside of the new images."""
     if scene.camera.model == "pinhole":
         return scene
@@ -198,7 +198,9 @@ class Images:
         return image if self._undistort is None else self._undistort(image)
 
 
-def open_images(source: str, scene: Scene, undistort: bool = False, fps: float | None = None) -> Images:
+def open_images(
+    source: str, scene: ExportedScene, undistort: bool = False, fps: float | None = None
+) -> Images:
     """Open the images of a scene, in the size of the run.
 
     Images are matched by timestamp, since the run may have read a part of the sequence. Raises ResultsError if the
@@ -228,7 +230,7 @@ def open_images(source: str, scene: Scene, undistort: bool = False, fps: float |
     return Images(sequence, rows, scene.camera, undistort)
 
 
-def write_images(folder: Path, scene: Scene, images: Images) -> None:
+def write_images(folder: Path, scene: ExportedScene, images: Images) -> None:
     """Write the image of every frame as PNG; images of an earlier export are deleted."""
     folder.mkdir(parents=True, exist_ok=True)
     for old in folder.glob("[0-9]" * 6 + ".png"):

@@ -59,7 +59,7 @@ class FrameSnapshot:
 class FrameViewer(Protocol):
     """Interface of a viewer: shows frames one after the other."""
 
-    def show(self, glimpse: FrameSnapshot) -> None:
+    def show(self, snapshot: FrameSnapshot) -> None:
         """Show a processed frame."""
 
     def end(self, run: Run) -> None:
@@ -98,14 +98,14 @@ class FrameViewers:
         assert self._memory.last is not None  # the frame's own
         seen = self._slam.last_features
         assert seen is not None
-        glimpse = FrameSnapshot(
+        snapshot = FrameSnapshot(
             result,
             (self._memory.last[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy(),
             seen.keypoints[seen.mask],
             tracked_pixels(self._slam, result.index),
         )
         for screen in self._screens:
-            screen.show(glimpse)
+            screen.show(snapshot)
 
     def end(self, run: Run) -> None:
         """After the last frame, and all that was learned since."""
@@ -162,14 +162,14 @@ class LiveView:
             raise ResultsError(f"--view: the viewer of rerun does not start: {error}") from None
         return cls(slam, recording)
 
-    def show(self, glimpse: FrameSnapshot) -> None:
-        result, recorder = glimpse.result, self._recorder
+    def show(self, snapshot: FrameSnapshot) -> None:
+        result, recorder = snapshot.result, self._recorder
         self._start = result.timestamp if self._start is None else self._start
         recorder.at(result.index, result.timestamp - self._start)
         if result.T_cw is not None:
             recorder.pose(CAMERA, se3_inverse(result.T_cw))
-        recorder.image(CAMERA, glimpse.image if self._undistort is None else self._undistort(glimpse.image))
-        pixels = glimpse.tracked.cpu()
+        recorder.image(CAMERA, snapshot.image if self._undistort is None else self._undistort(snapshot.image))
+        pixels = snapshot.tracked.cpu()
         if self._undistort is not None:
             pixels = undistorted_pixels(pixels.to(self._camera.params), self._camera, self._pinhole)
         recorder.keypoints(CAMERA, pixels)
@@ -197,7 +197,7 @@ class LiveView:
         self._recorder.path(path.positions_w, gaps(path.timestamps))
 
 
-class Film:
+class VideoRecorder:
     """tracked.mp4: every frame with its keypoints, those that hold the pose in the color of the state."""
 
     def __init__(self, path: Path, size: tuple[int, int], rate: float) -> None:
@@ -211,14 +211,14 @@ class Film:
         if not self._writer.isOpened():
             raise ResultsError(f"{path}: this OpenCV cannot write it")
 
-    def show(self, glimpse: FrameSnapshot) -> None:
-        result = glimpse.result
+    def show(self, snapshot: FrameSnapshot) -> None:
+        result = snapshot.result
         image = cv2.cvtColor(
-            cv2.resize(glimpse.image, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
+            cv2.resize(snapshot.image, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
         )
         for pixels, color, radius in (
-            (glimpse.keypoints, UNMATCHED, 1),
-            (glimpse.tracked, COLORS[result.state], 3),
+            (snapshot.keypoints, UNMATCHED, 1),
+            (snapshot.tracked, COLORS[result.state], 3),
         ):
             for x, y in (pixels * self._scale).round().int().tolist():
                 cv2.circle(image, (x, y), radius, color, 1, cv2.LINE_AA)
@@ -235,7 +235,7 @@ class Film:
         self._writer.release()
 
 
-def film_of(sequence: Sequence, directory: Path) -> Film:
+def film_of(sequence: Sequence, directory: Path) -> VideoRecorder:
     """Create the video of a run in the results folder, at the frame rate of the sequence."""
     rate = sequence.frame_rate if sequence.known_length is not None and len(sequence.timestamps) > 1 else 0.0
-    return Film(directory / VIDEO, sequence.size, rate or USUAL_RATE)
+    return VideoRecorder(directory / VIDEO, sequence.size, rate or USUAL_RATE)
