@@ -17,7 +17,7 @@ from torchslam.errors import CalibrationError, TorchslamError, TrajectoryError
 from torchslam.geometry import Camera
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
-from torchslam.io.export.scene import Scene
+from torchslam.io.export.scene import ExportedScene
 
 __all__ = ["lens", "scene"]
 
@@ -44,7 +44,7 @@ def params_of(given: GivenPoses, camera: Camera) -> list[float]:
 
 
 @pytest.mark.parametrize("name", ["images.bin", "images.txt"])
-def test_colmap_poses_round_trip(scene: Scene, tmp_path: Path, name: str) -> None:
+def test_colmap_poses_round_trip(scene: ExportedScene, tmp_path: Path, name: str) -> None:
     """Binary and text, by folder and by file; of a folder with both the binary."""
     write_colmap(tmp_path, scene)
     (tmp_path / ("images.txt" if name == "images.bin" else "images.bin")).unlink()
@@ -55,7 +55,7 @@ def test_colmap_poses_round_trip(scene: Scene, tmp_path: Path, name: str) -> Non
         assert params_of(given, scene.camera) == pytest.approx(scene.camera.params.tolist())
 
 
-def test_nerfstudio_poses_round_trip(scene: Scene, tmp_path: Path) -> None:
+def test_nerfstudio_poses_round_trip(scene: ExportedScene, tmp_path: Path) -> None:
     """From the file or its folder; the axes of its cameras are turned."""
     write_nerfstudio(tmp_path, scene, torch.eye(3, dtype=torch.float64))
     for path in (tmp_path, tmp_path / "transforms.json"):
