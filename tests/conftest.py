@@ -18,6 +18,9 @@ torch.set_num_threads(1)
 # Before the first backward pass, at which torch counts its devices.
 HAS_SIMULATED_ACCELERATOR = accelerator.register()
 
+WHOLE_RUNS = ("batch", "cli", "docs", "experiments", "parallel")
+"""Folders of tests that run the whole system many times."""
+
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
@@ -49,6 +52,15 @@ def generator() -> torch.Generator:
 def without_shape_checks() -> Iterator[None]:
     """Turn off the check of shapes, for tests of the errors that a user gets for wrong ones."""
     jaxtyping.config.update("jaxtyping_disable", True)
+    yield
+    jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(autouse=True)
+def _check_shapes(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Check shapes in the tests of the parts, not in the whole runs of others: there it doubles the time."""
+    area = request.path.relative_to(Path(__file__).parent).parts[0]
+    jaxtyping.config.update("jaxtyping_disable", area in WHOLE_RUNS)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
 

@@ -141,6 +141,7 @@ rows = torch.ones(1, 20)
         ({"information": torch.nan * rows}, "information must be positive"),
     ],
 )
+@pytest.mark.usefixtures("without_shape_checks")
 def test_an_invalid_output_of_a_front_end_is_named(changes: dict[str, Any], words: str) -> None:
     Broken.changes = changes
     extract = image_extractor(load_config(None, [f"features.kind={HERE}:Broken"]))

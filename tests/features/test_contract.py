@@ -50,6 +50,7 @@ def test_a_mask_that_excludes_everything_gives_no_keypoints(image: torch.Tensor)
     assert not ORB(100)(image, torch.zeros_like(image, dtype=torch.bool)).mask.any()
 
 
+@pytest.mark.usefixtures("without_shape_checks")
 def test_front_end_passes_the_mask_on(image: torch.Tensor) -> None:
     frame = open_sequence("synthetic:room?frames=2")[0]
     mask = LEFT.expand(image.shape)

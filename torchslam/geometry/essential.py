@@ -250,8 +250,8 @@ def sampson_errors(
     E: Float[Tensor, "*#batch 3 3"],
     x_1: Float[Tensor, "*#batch N 2"],
     x_2: Float[Tensor, "*#batch N 2"],
-    variance_1: Float[Tensor, "*#batch N"] | float = 1.0,
-    variance_2: Float[Tensor, "*#batch N"] | float = 1.0,
+    variance_1: Float[Tensor, "*#batch #N"] | float = 1.0,
+    variance_2: Float[Tensor, "*#batch #N"] | float = 1.0,
 ) -> Float[Tensor, "*#batch N"]:
     """Compute signed Sampson distances to the epipolar constraint, zero at both epipoles.
 

@@ -140,7 +140,8 @@ def _submap(
     S = torch.eye(4, dtype=torch.float64) if evaluation is None else evaluation.S_groundtruth_estimate.clone()
     keyframes = keyframe_trajectory(submap.map, results.session)
     up = torch.eye(4, dtype=torch.float64)
-    up[:3, :3] = upright_rotation(aligned(Trajectory(path.timestamps, se3_inverse(submap.map.T_cw)), S).T_wc)
+    every_keyframe = Trajectory(submap.map.keyframes["timestamp"], se3_inverse(submap.map.T_cw))
+    up[:3, :3] = upright_rotation(aligned(every_keyframe, S).T_wc)
     S = up @ S
     points_w, colors = _points(submap)
     box = torch.from_numpy(
