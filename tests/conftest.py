@@ -18,7 +18,7 @@ torch.set_num_threads(1)
 # Before the first backward pass, at which torch counts its devices.
 HAS_SIMULATED_ACCELERATOR = accelerator.register()
 
-WHOLE_RUNS = ("batch", "cli", "docs", "experiments", "parallel")
+WHOLE_RUNS = ("batch", "calibration", "cli", "docs", "experiments", "io", "parallel", "refine", "system")
 """Folders of tests that run the whole system many times."""
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
