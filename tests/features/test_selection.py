@@ -4,7 +4,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.features.corners import (
+from torchslam.features.pyramid import plan_pyramid
+from torchslam.features.selection import (
     _falling,
     best_per_cell,
     plan_grid,
@@ -12,7 +13,6 @@ from torchslam.features.corners import (
     ranks_within,
     select_evenly,
 )
-from torchslam.features.pyramid import plan_pyramid
 
 CPU = torch.device("cpu")
 

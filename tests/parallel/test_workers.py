@@ -20,8 +20,8 @@ from torchslam.parallel.workers import (
     WORTH_AT_ONCE,
     BundleWorker,
     best_number,
+    prefetch_obstacle,
     processors,
-    why_alone,
     with_workers,
 )
 from torchslam.system.slam import SLAM
@@ -75,12 +75,12 @@ def test_without_prefetching_the_second_process_does_bundle_adjustment(
     here = type(sequence).__name__
     simulated = SLAM(sequence.camera, load_config(None, ["features.kind=simulated"]))
     assert who(sequence, simulated, 2) == (here, True)
-    assert "frames are read here: simulated features need no images" in capsys.readouterr().err
+    assert "frames are read in the main process: simulated features need no images" in capsys.readouterr().err
     slam = SLAM(sequence.camera)
     sequence.timestamps = sequence.timestamps[:0]
     monkeypatch.setattr("torchslam.parallel.workers.best_number", lambda *arguments: 3)
     assert who(sequence, slam, None) == ("LivePrefetcher", True)
-    assert why_alone(sequence, slam) == ""
+    assert prefetch_obstacle(sequence, slam) == ""
     assert capsys.readouterr().err == ""  # no message unless requested
 
 
@@ -91,7 +91,7 @@ def test_accelerators_use_no_workers(capsys: pytest.CaptureFixture[str]) -> None
     camera = sequence.camera
     slam.camera = Camera(camera.model, camera.params.to("meta"), camera.size)
     assert who(sequence, slam, 3) == (type(sequence).__name__, False)
-    assert "one process: the meta does it all" in capsys.readouterr().err
+    assert "one process is used, since the camera is on meta" in capsys.readouterr().err
 
 
 def test_the_default_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,7 +127,7 @@ def test_custom_components_stay_in_the_main_process() -> None:
     sequence = room(20)
     slam = SLAM(sequence.camera, CONFIG, extractor=OpenCVORB(300))
     assert who(sequence, slam, 3) == (type(sequence).__name__, True)
-    assert "of your own" in why_alone(sequence, slam)
+    assert "custom front end" in prefetch_obstacle(sequence, slam)
 
 
 def test_more_processes_give_the_same_run() -> None:

@@ -166,7 +166,7 @@ def test_a_checkpoint_of_another_run_is_refused(checkpoint: Path, tmp_path: Path
 DAMAGES: list[tuple[Callable[[dict[str, Any], dict[str, torch.Tensor]], object], str]] = [
     (lambda run, tensors: run.pop("next"), "'next'"),
     (lambda run, tensors: run.update(submap=5), "not enough values"),
-    (lambda run, tensors: run["tracking"].update(reference=1000), "names rows beyond"),
+    (lambda run, tensors: run["tracking"].update(reference=1000), "refers to rows outside"),
     (lambda run, tensors: run.update(last_frame=[3]), "not enough values"),
     (lambda run, tensors: run["reasons"].pop(), "out of range"),
     (lambda run, tensors: tensors.pop("run.T_cw"), r"run\.T_cw"),
@@ -186,8 +186,8 @@ def test_damaged_checkpoints_are_refused(
         read_checkpoint(tmp_path / "damaged", WALK, CONFIG)
 
 
-def test_a_checkpoint_needs_a_settled_system(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="held back"):
+def test_a_checkpoint_needs_a_confirmed_map(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="no pending frames"):
         write_checkpoint(tmp_path / "x", SLAM(WALK.camera, CONFIG), RunProgress(), WALK)
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways
 from torchslam.config import MatchingConfig, StaticOverlayConfig
-from torchslam.tracking.non_static import StaticOverlayDetector, distances_to_segments
+from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_segments
 from torchslam.types import FrameFeatures
 
 SCENE = Scene.of(200)

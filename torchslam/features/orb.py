@@ -19,17 +19,12 @@ from torch import Tensor, nn
 from torchslam.features.brief import blur, describe, orientations
 from torchslam.features.corners import (
     Bands,
-    Grid,
-    best_per_cell,
     fast_scores,
     find_peaks,
     gather_patches,
     harris_responses,
     patch_scores,
-    plan_grid,
-    prefilter_candidates,
     quadratic_peak,
-    select_evenly,
     soft_peak,
 )
 from torchslam.features.pyramid import (
@@ -39,6 +34,7 @@ from torchslam.features.pyramid import (
     pack_levels,
     plan_pyramid,
 )
+from torchslam.features.selection import Grid, best_per_cell, plan_grid, prefilter_candidates, select_evenly
 from torchslam.types import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding

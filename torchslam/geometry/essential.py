@@ -261,8 +261,8 @@ def sampson_errors(
         E: essential matrices.
         x_1: undistorted image coordinates in view 1.
         x_2: undistorted image coordinates in view 2.
-        variance_1: of the coordinates in view 1.
-        variance_2: of the coordinates in view 2.
+        variance_1: variances of the coordinates in view 1.
+        variance_2: variances of the coordinates in view 2.
 
     Returns:
         First-order distances over both images together, in standard deviations.

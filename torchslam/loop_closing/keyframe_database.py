@@ -1,8 +1,8 @@
 """Keyframe database: place recognition for relocalization and loop closing.
 
 The score of two images sums, over the visual words they share, the rarity of the word times the similarity of their
-codes. It is 1 for an image with itself and 0 for images without a common word. Recall and
-cost compared with alternatives: experiments/places.
+codes. It is 1 for an image with itself and 0 for images without a common word. Recall and cost compared with
+alternatives: experiments/places.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "
 """The fields of a problem that differ between problems of one run."""
 
 
-class System(Protocol):
+class _System(Protocol):
     """The part of `torchslam.system.slam.SLAM` that workers need."""
 
     camera: Camera
@@ -80,7 +80,9 @@ def best_number(sequence: Sequence, start: int) -> int:
 
 
 @contextmanager
-def with_workers(sequence: Sequence, slam: System, processes: int | None, start: int = 0) -> Iterator[Frames]:
+def with_workers(
+    sequence: Sequence, slam: _System, processes: int | None, start: int = 0
+) -> Iterator[Frames]:
     """The frames of a sequence from `start` on, for a run that uses workers while this is entered.
 
     Args:
@@ -92,7 +94,10 @@ def with_workers(sequence: Sequence, slam: System, processes: int | None, start:
     slam.warm_up()
     if slam.camera.params.device.type != "cpu":
         if processes is not None and processes > 1:
-            print(f"torchslam: one process: the {slam.camera.params.device} does it all", file=sys.stderr)
+            print(
+                f"torchslam: one process is used, since the camera is on {slam.camera.params.device}",
+                file=sys.stderr,
+            )
         wanted = 1
     with ExitStack() as others:
         frames: Frames = sequence
@@ -110,27 +115,27 @@ def with_workers(sequence: Sequence, slam: System, processes: int | None, start:
 
 
 def reader(
-    sequence: Sequence, slam: System, processes: int, is_asked_for: bool
+    sequence: Sequence, slam: _System, processes: int, is_asked_for: bool
 ) -> FeaturePrefetcher | LivePrefetcher | None:
     """The prefetcher of a sequence; None if frames cannot or should not be prefetched."""
-    alone = why_alone(sequence, slam)
-    if processes == 1 or alone:
+    obstacle = prefetch_obstacle(sequence, slam)
+    if processes == 1 or obstacle:
         if processes > 1 and is_asked_for:
-            print(f"torchslam: frames are read here: {alone}", file=sys.stderr)
+            print(f"torchslam: frames are read in the main process: {obstacle}", file=sys.stderr)
         return None
     if not len(sequence.timestamps):
         return LivePrefetcher(sequence, slam.camera, slam.config, slam.clock)
     return FeaturePrefetcher(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
 
 
-def why_alone(sequence: Sequence, slam: System) -> str:
-    """Why the frames of a sequence cannot be prefetched; empty if they can."""
+def prefetch_obstacle(sequence: Sequence, slam: _System) -> str:
+    """Message that says why the frames of a sequence cannot be prefetched; empty if they can."""
     if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"
     if slam.has_custom_components:
-        return "a front end or matcher of your own is here alone"
+        return "a custom front end or matcher is known only there"
     if slam.config.matching.matcher != "descriptors":
-        return "the matcher may want images"
+        return "the matcher may need images"
     return ""
 
 

@@ -42,7 +42,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
     """
     submap = slam.submap
     if submap is None or not slam.can_checkpoint:
-        raise ValueError("a checkpoint needs a submap that is followed and nothing that is held back")
+        raise ValueError("a checkpoint needs a confirmed active submap and no pending frames")
     tensors, about = pack_submaps(slam.atlas, slam.camera, slam.session.count, slam.atlas.num_created)
     whole = {column.name: getattr(submap.tracking, column.name) for column in fields(TrackingState)}
     tracking = {TRACKING + name: value for name, value in whole.items() if isinstance(value, Tensor)}
@@ -137,7 +137,7 @@ def _restore(
         (tracking.local_keyframes.new_tensor([tracking.reference]), submap.map.num_keyframes),
     ):
         if len(rows) and not 0 <= int(rows.min()) <= int(rows.max()) < count:
-            raise ValueError(f"where the camera was names rows beyond {count}")
+            raise ValueError(f"the tracking state refers to rows outside 0 to {count - 1}")
     for each, num_checked in zip(saved.atlas, run["num_cull_checked"], strict=True):
         each.num_cull_checked = int(num_checked)
     index, timestamp = run["last_frame"]
@@ -158,13 +158,13 @@ def _check_tracking(tracking: TrackingState) -> None:
     """Check the types and shapes of a tracking state; raise ValueError or TypeError if they are wrong."""
     for T in (tracking.T_cr, tracking.velocity):
         if T is not None and (T.shape != (4, 4) or not T.is_floating_point() or not bool(T.isfinite().all())):
-            raise ValueError("where the camera was is no pose")
+            raise ValueError("a pose of the tracking state is not a finite 4 x 4 matrix")
     for rows in (tracking.last_inlier_points, tracking.local_keyframes, tracking.local_points):
         if rows.ndim != 1 or rows.dtype != torch.int64:
-            raise ValueError("where the camera was does not name rows")
+            raise ValueError("the rows of the tracking state are not flat int64 tensors")
     counts, shares = (tracking.reference, tracking.reference_size), (tracking.error, tracking.explained_ratio)
     if not all(type(count) is int for count in counts) or not all(map(math.isfinite, shares)):
-        raise ValueError(f"where the camera was: {counts}, {shares}")
+        raise ValueError(f"the tracking state has invalid numbers: {counts}, {shares}")
 
 
 def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], list[str]]:

@@ -29,7 +29,7 @@ from torchslam.system.session import Session
 from torchslam.types import Frame, Reason, State, StepResult, Trajectory
 
 
-class System(Protocol):
+class _System(Protocol):
     """The part of `torchslam.system.slam.SLAM` that a run needs."""
 
     camera: Camera
@@ -165,7 +165,7 @@ class RunProgress:
 
 
 def run_sequence(
-    slam: System,
+    slam: _System,
     sequence: Sequence,
     progress: Callable[[StepResult], None] | None = None,
     so_far: RunProgress | None = None,
@@ -217,7 +217,7 @@ def run_sequence(
 
 
 def finish(
-    slam: System,
+    slam: _System,
     results: list[StepResult],
     skipped: list[str],
     interrupted: bool,
@@ -271,7 +271,7 @@ def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
     return Trajectory(slam_map.keyframes["timestamp"][rows], se3_inverse(slam_map.T_cw[rows]))
 
 
-def failure_message(slam: System, results: list[StepResult], skipped: list[str]) -> str:
+def failure_message(slam: _System, results: list[StepResult], skipped: list[str]) -> str:
     """Message that says why no frame of the session has a pose; empty if some have one."""
     if len(slam.session.atlas) == 0:
         return no_map_message(results, skipped)

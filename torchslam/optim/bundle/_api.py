@@ -32,9 +32,9 @@ class BundleSolution:
         cost: half the sum of robustified squared whitened residuals and priors, detached.
         success: all observing frames start finite, and all free unknowns are determined, up to the gauge. If
             False, the estimate is the best one found, but it has no gradient.
-        moved_frames: Fixed frames, and frames with fewer than three points and no prior, stayed at their
-            start; observations of the latter did not count.
-        moved_points: Fixed points, and points seen by fewer than two frames, likewise.
+        moved_frames: False for fixed frames, and for frames with fewer than three points and no prior, which stayed at
+            their start; observations of the latter did not count.
+        moved_points: False for fixed points, and for points seen by fewer than two frames.
         convergence: iterations and convergence per element of the batch.
     """
 

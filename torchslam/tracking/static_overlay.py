@@ -1,0 +1,171 @@
+"""Detection of static overlays: logos, subtitles, dirt on the lens, a part of the car.
+
+Evidence is a keypoint that stays at its pixel although the camera moved so far that every point of the scene would have
+moved. Pixels with evidence from two different camera motions are masked out from then on.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchslam.config import MatchingConfig, StaticOverlayConfig
+from torchslam.features import match_by_projection
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.tracking.data_association import image_cells
+from torchslam.tracking.matcher import max_distance
+from torchslam.types import FrameFeatures
+
+_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth, the possible depths of a keypoint
+_STRIDE = 8  # stride of the keypoints in the first test whether the camera moved far enough
+_PAUSE = 4  # frames without a comparison after one that found no overlay
+
+
+@dataclass(frozen=True)
+class _Reference:
+    """A posed frame to compare later ones with.
+
+    Attributes:
+        view: the frame, with all its keypoints.
+        T_wc: its pose.
+        pixels: of its keypoints.
+        points_c: their points at the possible depths.
+    """
+
+    view: FrameFeatures
+    T_wc: Float[Tensor, "4 4"]
+    pixels: Float[Tensor, "N 2"]
+    points_c: Float[Tensor, "D N 3"]
+
+    @classmethod
+    def of(cls, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float, camera: Camera) -> _Reference:
+        pixels = view.keypoints[view.mask]
+        rays = camera.unproject(pixels)
+        depths = depth * rays.new_tensor(_DEPTHS)
+        return cls(view, se3_inverse(T_cw), pixels, rays / rays[:, 2:] * depths[:, None, None])
+
+
+class StaticOverlayDetector:
+    """Collects evidence of static overlays in a grid of image cells."""
+
+    def __init__(self, camera: Camera, settings: StaticOverlayConfig, matching: MatchingConfig) -> None:
+        self.camera = camera
+        self.settings = settings
+        self.matching = matching
+        width, height = camera.size
+        shape = (int(height // settings.cell_px) + 1, int(width // settings.cell_px) + 1)
+        self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
+        self._last: _Reference | None = None
+        self._pause = 0
+
+    def mask_out(self, view: FrameFeatures) -> FrameFeatures:
+        """The view without the keypoints of known overlays."""
+        if not bool((self.evidence >= self.settings.min_evidence).any()):
+            return view
+        return replace(view, mask=view.mask & ~self.covers(view.keypoints))
+
+    def covers(self, pixels: Float[Tensor, "N 2"]) -> Bool[Tensor, " N"]:
+        """Which pixels belong to a known overlay."""
+        row, column = self._cells(pixels)
+        return self.evidence[row, column] >= self.settings.min_evidence
+
+    def observe(self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float) -> int:
+        """Compare a posed frame with an earlier one.
+
+        Args:
+            view: the frame, with all its keypoints.
+            T_cw: its pose.
+            depth: median depth of the scene.
+
+        Returns:
+            The number of cells that became known overlays.
+        """
+        last = self._last
+        if last is None or view.session != last.view.session:
+            self._last = _Reference.of(view, T_cw, depth, self.camera)
+            return 0
+        self._pause -= 1
+        if self._pause >= 0 or not self._is_far(self._must_move(last, T_cw, _STRIDE)):
+            return 0
+        moving = self._must_move(last, T_cw)
+        if not self._is_far(moving):
+            return 0
+        must_move = view.mask.new_zeros(len(last.view.mask))
+        must_move[last.view.mask] = moving
+        self._last = _Reference.of(view, T_cw, depth, self.camera)
+        stayed = self._stayed(last.view, view, must_move)
+        before = int((self.evidence >= self.settings.min_evidence).sum())
+        if len(stayed) < self.settings.min_keypoints:
+            self.evidence[self.evidence < self.settings.min_evidence] = 0
+            self._pause = _PAUSE
+            return 0
+        self._add(stayed)
+        return int((self.evidence >= self.settings.min_evidence).sum()) - before
+
+    def add(self, pixels: Float[Tensor, "M 2"]) -> None:
+        """Add evidence from another source: pixels that stayed in place while the scene moved."""
+        if self.settings.enabled and len(pixels) >= self.settings.min_keypoints:
+            self._add(pixels)
+
+    def restore(self, evidence: Int[Tensor, "R C"]) -> None:
+        """Continue from the evidence of a checkpoint."""
+        self.evidence.copy_(evidence)
+
+    def forget_last(self) -> None:
+        """Compare the next frame with no earlier one: its pose is in another submap."""
+        self._last = None
+
+    def _must_move(self, last: _Reference, T_cw: Float[Tensor, "4 4"], step: int = 1) -> Bool[Tensor, " N"]:
+        """Whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
+        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
+        distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
+        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
+
+    def _is_far(self, must_move: Bool[Tensor, " N"]) -> bool:
+        """Whether the camera moved far enough for a comparison: enough of the keypoints had to move."""
+        return int(must_move.sum()) >= self.settings.min_moving_ratio * len(must_move)
+
+    def _stayed(
+        self, earlier: FrameFeatures, view: FrameFeatures, candidates: Bool[Tensor, " N"]
+    ) -> Float[Tensor, "M 2"]:
+        """Pixels in `view` of candidates, keypoints of an earlier view matched at their old pixel."""
+        rows = torch.nonzero(candidates)[:, 0]
+        matches = match_by_projection(
+            earlier.descriptors[rows][None],
+            earlier.keypoints[rows][None],
+            self.settings.radius_px,
+            view.features,
+            scales=earlier.scales[rows][None],
+            max_distance=self.settings.max_distance_ratio * max_distance(view.descriptors, self.matching),
+            ratio=None,
+        )
+        return view.keypoints[matches.indices_2[0][matches.mask[0]]]
+
+    def _add(self, pixels: Float[Tensor, "M 2"]) -> None:
+        """Increment the evidence of the cells of pixels and of their neighbors, each cell once."""
+        row, column = self._cells(pixels)
+        hit = torch.zeros_like(self.evidence)
+        for down in (-1, 0, 1):
+            for right in (-1, 0, 1):
+                hit[(row + down).clamp(0, hit.shape[0] - 1), (column + right).clamp(0, hit.shape[1] - 1)] = 1
+        self.evidence += hit
+
+    def _cells(self, pixels: Float[Tensor, "N 2"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
+        """Rows and columns of `evidence` for pixels."""
+        rows, columns = self.evidence.shape
+        size = (self.settings.cell_px, self.settings.cell_px)
+        column, row = image_cells(pixels, size, grid=(1, 1), shape=(columns, rows))
+        return row, column
+
+
+def distances_to_segments(
+    points: Float[Tensor, "*#batch 2"], starts: Float[Tensor, "*#batch 2"], ends: Float[Tensor, "*#batch 2"]
+) -> Float[Tensor, "*#batch"]:
+    """Distances of points from the segments between starts and ends."""
+    along = ends - starts
+    length = (along * along).sum(-1).clamp(min=1e-12)
+    share = (((points - starts) * along).sum(-1) / length).clamp(0, 1)
+    return torch.linalg.vector_norm(points - starts - share[..., None] * along, dim=-1)
