@@ -44,7 +44,7 @@ def two_submaps(S_21: Tensor) -> tuple[Submap, Submap]:
     return submap_of_scene(SCENE, sideways(4)), submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
 
 
-# --- recognising ------------------------------------------------------------------------------------------------
+# --- detecting ------------------------------------------------------------------------------------------------
 
 
 def test_another_submap_of_the_same_place_is_detected(S_21: Tensor) -> None:

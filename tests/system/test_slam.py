@@ -382,7 +382,7 @@ def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
 
 
 def test_covariances_predict_the_errors_of_the_map() -> None:
-    """Errors of keyframes and points, squared and normalised, average to their degrees of freedom.
+    """Errors of keyframes and points, squared and normalized, average to their degrees of freedom.
 
     The map's scale is free; of all scales, the covariances belong to the one that least moves the keyframes.
     """
@@ -397,9 +397,9 @@ def test_covariances_predict_the_errors_of_the_map() -> None:
     truth[:, :3, 3] *= scale
 
     errors = se3_log(truth @ se3_inverse(T_cw))[1:]
-    keyframes = normalised(errors, slam_map.keyframes["covariances"][1:])
+    keyframes = normalized(errors, slam_map.keyframes["covariances"][1:])
     assert 0.4 < float(keyframes.mean()) / 6 < 2.0
-    points = normalised(
+    points = normalized(
         slam_map.positions_w[known] - scale * points_w, slam_map.points["covariances_w"][known]
     )
     assert len(points) > 200
@@ -423,7 +423,7 @@ def true_points(slam: SLAM, walk: Walk) -> tuple[torch.Tensor, torch.Tensor]:
     return scene.points_w[same.int().argmax(1)], ids
 
 
-def normalised(errors: torch.Tensor, covariances: torch.Tensor) -> torch.Tensor:
+def normalized(errors: torch.Tensor, covariances: torch.Tensor) -> torch.Tensor:
     return (errors * torch.linalg.solve(covariances, errors)).sum(-1)
 
 

@@ -188,10 +188,10 @@ def test_no_frames_are_kept_when_disabled() -> None:
 
 def test_a_provisional_map_counts_frames_from_its_initialization() -> None:
     submap = Atlas(CAMERA.params).create()
-    youth = ProvisionalMap(submap, views(0, 1))
-    assert youth.age == 0
+    provisional = ProvisionalMap(submap, views(0, 1))
+    assert provisional.age == 0
     for view in views(2, 3, 4):
-        youth.add_frame(view)
-    assert youth.age == 3
-    assert [view.index for view in youth.views] == [0, 1, 2, 3, 4]
-    assert youth.submap is submap
+        provisional.add_frame(view)
+    assert provisional.age == 3
+    assert [view.index for view in provisional.views] == [0, 1, 2, 3, 4]
+    assert provisional.submap is submap

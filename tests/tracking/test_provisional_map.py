@@ -38,10 +38,10 @@ def young(T_cw: Tensor, age: int = CHECK_INTERVAL) -> ProvisionalMap:
     submap = submap_of_scene(SCENE, torch.stack([pose(), SIDE]))
     own = pose(0.3, -0.2, 1.0, 0.5, 0.1, -0.4)
     submap.map.keyframes["T_cw"][:] = torch.stack([own, T_cw @ own])
-    youth = ProvisionalMap(submap, [SCENE.view(0, pose())])
-    youth.add_frame(SCENE.view(1, SIDE))
-    youth.age = age
-    return youth
+    provisional = ProvisionalMap(submap, [SCENE.view(0, pose())])
+    provisional.add_frame(SCENE.view(1, SIDE))
+    provisional.age = age
+    return provisional
 
 
 def two_views() -> TwoViewMap:
@@ -84,9 +84,9 @@ def test_every_few_frames_are_checked(age: int) -> None:
 
 
 def test_frames_without_initialization_contradict_nothing() -> None:
-    youth = young(swung(60))
-    youth.views[1] = SCENE.view(1, pose())
-    assert youth.find_contradicting_initialization(CAMERA, Config()) is None
+    provisional = young(swung(60))
+    provisional.views[1] = SCENE.view(1, pose())
+    assert provisional.find_contradicting_initialization(CAMERA, Config()) is None
 
 
 def test_a_map_with_less_than_half_of_the_support_is_contradicted() -> None:

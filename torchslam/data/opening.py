@@ -180,10 +180,10 @@ def _why_no_folder(folder: Path) -> str:
 
 def _around(path: Path) -> list[Path]:
     """Return the sequence to which a file or a part of a dataset belongs."""
-    beside = subfolder(path.parent)
+    sibling = subfolder(path.parent)
     if find_reader(str(path.parent)):
         return [path.parent]
-    return [beside] if beside is not None else []
+    return [sibling] if sibling is not None else []
 
 
 def _meant(proposals: list[Path]) -> str:

@@ -63,7 +63,7 @@ def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
     T_wc = trajectory.T_wc.detach().double().cpu()
     quaternions = quaternion_from_matrix(T_wc[:, :3, :3])
     table = torch.cat((T_wc[:, :3, 3], quaternions), dim=-1).tolist()
-    lines = [f"# {COLUMNS} (camera to world, seconds, metres)\n"]
+    lines = [f"# {COLUMNS} (camera to world, seconds, meters or map units)\n"]
     for timestamp, row in zip(trajectory.timestamps.tolist(), table, strict=True):
         # The shortest text that reads back as the same time: seconds since 1970 fill all digits of a double.
         lines.append(f"{round(timestamp, 9)!r} " + " ".join(f"{value:.9f}" for value in row) + "\n")

@@ -1,4 +1,4 @@
-"""Differentiable least squares: poses, maps and pose graphs refined, robust, batched, with right gradients."""
+"""Differentiable least squares for poses, maps and pose graphs: robust, batched, with implicit gradients."""
 
 from torchslam.optim._core.implicit import Backward
 from torchslam.optim._core.levenberg_marquardt import Convergence, Progress

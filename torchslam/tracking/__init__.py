@@ -1,1 +1,1 @@
-"""Where is the camera now? Initialise, predict, correspond, judge, relocalise."""
+"""Tracking: initialization, data association, pose estimation and validation, relocalization, backward tracking."""

@@ -240,15 +240,15 @@ def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
         proposals = " or ".join(f"'{path}?topic={topic}'" for topic in topics[:6])
         raise SequenceError(f"{path}: {len(topics)} topics of images; choose one: {proposals}")
     connection = _connection(reader, topics[0])
-    beside = topics[0].removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-    infos = [each for each in reader.connections if each.msgtype == CAMERA_INFO and each.topic == beside]
+    info_topic = topics[0].removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+    infos = [each for each in reader.connections if each.msgtype == CAMERA_INFO and each.topic == info_topic]
     calibration = None
     times: list[float] = []
     with _errors(path):
         for info, _, raw in reader.messages(infos) if infos else ():
             rectified = "rect" in topics[0].rpartition("/")[2] or "_rect" in topics[0]
             calibration = from_camera_info(
-                reader.deserialize(raw, info.msgtype), f"{path}{beside}", rectified
+                reader.deserialize(raw, info.msgtype), f"{path}{info_topic}", rectified
             )
             break
         for _, recorded, raw in reader.messages([connection]):
