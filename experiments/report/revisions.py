@@ -3,7 +3,8 @@
     python -m experiments.report.revisions v0.1.0 HEAD
     python -m experiments.report.revisions HEAD . shelf_bin kitti07 --rounds 3     # "." is the working tree
 
-Both revisions run in turn on this machine, one process and one thread each, with their default configuration.
+Both revisions run in turn on this machine, one process and one thread each, with their default configuration. Times are
+processor times: a frame's share of the run, the median and the 95th percentile of `SLAM.step`; medians of the rounds.
 """
 
 from __future__ import annotations
@@ -28,6 +29,13 @@ import hashlib, json, sys, time, torch
 torch.set_num_threads(1)
 from torchslam import SLAM, Config, evaluate, open_sequence
 sequence = open_sequence(sys.argv[1], limit=int(sys.argv[2]))
+step, steps = SLAM.step, []
+def timed_step(slam, frame):
+    start = time.process_time()
+    result = step(slam, frame)
+    steps.append(1e3 * (time.process_time() - start))
+    return result
+SLAM.step = timed_step
 start = time.process_time()
 run = SLAM(sequence.camera, Config()).run(sequence)
 spent = 1e3 * (time.process_time() - start) / len(sequence)
@@ -35,7 +43,9 @@ poses = run.trajectory
 truth = sequence.groundtruth
 ate = None if truth is None or len(poses) < 3 else evaluate(poses, truth).ate_m
 digest = hashlib.sha256(poses.T_wc.numpy().tobytes()).hexdigest()
-print(json.dumps({"posed": len(poses), "frames": len(sequence), "ate": ate, "ms": spent, "digest": digest}))
+steps.sort()
+print(json.dumps({"posed": len(poses), "frames": len(sequence), "ate": ate, "ms": spent, "digest": digest,
+    "median": steps[len(steps) // 2], "p95": steps[int(0.95 * len(steps))]}))
 """
 
 
@@ -59,7 +69,9 @@ def main() -> None:
                     compared(recording.name, [pair[0] for pair in pairs], [pair[1] for pair in pairs])
                 )
                 print(*rows[-1], sep="\t", flush=True)
-    header = "sequence | posed A, B | ATE A, m | ATE B, m | B / A | ms a frame A | B | B / A | poses"
+    header = (
+        "sequence | posed A, B | ATE A, m | ATE B, m | B / A | ms a frame B | B / A | median | 95 % | poses"
+    )
     print("\n" + table(header, rows))
 
 
@@ -88,7 +100,10 @@ def measure(recording: Recording, source: Path) -> dict[str, Any]:
 def compared(name: str, before: list[dict[str, Any]], after: list[dict[str, Any]]) -> list[str]:
     """A row of the table from the rounds of both revisions; poses are those of the first round."""
     a, b = before[0], after[0]
-    times = [statistics.median(run["ms"] for run in runs) for runs in (before, after)]
+    ratios = []
+    for figure in ("ms", "median", "p95"):
+        times = [statistics.median(run[figure] for run in runs) for runs in (before, after)]
+        ratios.append(times[1] / times[0])
     ates = [run["ate"] for run in (a, b)]
     has_ate = None not in ates
     return [
@@ -96,8 +111,8 @@ def compared(name: str, before: list[dict[str, Any]], after: list[dict[str, Any]
         f"{a['posed']}, {b['posed']} of {b['frames']}",
         *("" if ate is None else f"{ate:.4f}" for ate in ates),
         f"{ates[1] / ates[0]:.2f}" if has_ate else "",
-        *(f"{each:.0f}" for each in times),
-        f"{times[1] / times[0]:.2f}",
+        f"{statistics.median(run['ms'] for run in after):.0f}",
+        *(f"{ratio:.3f}" for ratio in ratios),
         "same bytes" if a["digest"] == b["digest"] else "different",
     ]
 
