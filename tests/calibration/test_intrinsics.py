@@ -11,8 +11,9 @@ import torch
 
 from torchslam.calibration import CalibrationResult, estimate_intrinsics
 from torchslam.calibration.find_camera import contradiction, describe_camera
-from torchslam.calibration.intrinsics import FOCAL, K1, adjust_with_camera, frames_of, problem_of
+from torchslam.calibration.intrinsics import adjust_with_camera, frames_of, problem_of
 from torchslam.geometry import Camera
+from torchslam.geometry.camera_measurement import FOCAL, K1
 from torchslam.optim.run_graph import ObservationGraph
 
 Make = Callable[..., ObservationGraph]

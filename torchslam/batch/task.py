@@ -24,7 +24,7 @@ from torchslam.batch.result_store import (
     run_or_reuse,
 )
 from torchslam.batch.rows import Row
-from torchslam.calibration.find_camera import RADIAL, find_camera
+from torchslam.calibration.find_camera import RADIAL, find_camera, with_stated_std
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.camera_argument import unknown_camera
@@ -172,6 +172,7 @@ def _run(task: Task, folder: Path) -> Columns:
         sequence = sequence.with_camera(unknown_camera(sequence.size), Calibrated.GUESSED)
     if sequence.calibrated is Calibrated.GUESSED:
         sequence, camera = find_camera(sequence, config, folder, device, RADIAL)
+    config = with_stated_std(config, sequence)
     finished = SLAM(sequence.camera.to(device), config).run(sequence)
     seconds = time.process_time() - start
     if finished.interrupted:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -12,13 +13,13 @@ import torch
 from torchslam.calibration import CalibrationRound, calibrate, estimate_intrinsics
 from torchslam.calibration.intrinsics import IntrinsicsEstimate
 from torchslam.calibration.rounds import CalibrationResult
-from torchslam.config import Config
+from torchslam.config import CameraConfig, Config
 from torchslam.data import Sequence
-from torchslam.data.calibration import check_replaceable, write_calibration
-from torchslam.data.camera_argument import parse_camera
+from torchslam.data.calibration import check_replaceable, read_numbers, write_calibration
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.io.results import CALIBRATION
 from torchslam.system.run import Run
 
@@ -54,8 +55,8 @@ def find_camera(
     path = output / CALIBRATION
     check_replaceable(path)
     if resume and path.exists():
-        found = parse_camera(str(path), sequence.size)
-        return sequence.with_camera(found), f"from {path}"
+        found = read_numbers(path)
+        return sequence.with_camera(found.camera(sequence.size), std=found.std), f"from {path}"
     with warnings.catch_warnings():  # the run itself reports unreadable frames
         warnings.simplefilter("ignore", UserWarning)
         calibrated = calibrate(
@@ -72,28 +73,50 @@ def find_camera(
         description,
         f"{len(calibrated.rounds)} runs, the last over {frames} of {len(sequence)} frames",
     ]
-    if calibrated.estimate is not None:
-        remarks.append(f"relative standard error of the focal length: {calibrated.estimate.focal_std:.2g}")
-    write_calibration(path, calibrated.camera, remarks)
+    std = 1.0 if calibrated.estimate is None else min(calibrated.estimate.focal_std, 1.0)
+    write_calibration(path, calibrated.camera, remarks, std)
     on_progress(description)
-    return sequence.with_camera(calibrated.camera.to("cpu")), description
+    return sequence.with_camera(calibrated.camera.to("cpu"), std=std), description
+
+
+def with_stated_std(config: Config, sequence: Sequence) -> Config:
+    """The configuration with the error of the camera that the sequence's calibration states, if it does."""
+    if sequence.camera_std is None:
+        return config
+    return replace(config, camera=CameraConfig(std=sequence.camera_std))
 
 
 def camera_remark(finished: Run, found: str) -> str:
-    """Describe the camera of a run: how it was found, and whether the run contradicts its focal length.
+    """Describe the camera of a run: how it was found, its error, and whether the run contradicts the given one.
 
-    Only a complete first session can contradict it.
+    Only a complete first session can contradict an exact one.
 
     Args:
         finished: The run.
         found: Description by `find_camera`, empty for a given camera.
     """
+    if finished.given is not None and finished.calibration is not None:
+        described = describe_calibration(finished.given, finished.calibration)
+        if found:
+            return f"{found}; over all frames {described}"
+        return f"{described} (given {float(finished.given.camera.focal):.1f} px)"
     against = ""
     if not (finished.failure or finished.interrupted or finished.session):
         against = contradiction(finished.camera, estimate_intrinsics(finished.graph))
     if found:
         return "; but over all frames ".join(filter(None, (found, against)))
     return f"{against}; --refine-camera looks for a better one" if against else ""
+
+
+def describe_calibration(given: CameraMeasurement, found: CameraMeasurement) -> str:
+    """Describe what a run made of a given camera, and whether it contradicts it."""
+    focal = float(found.camera.focal)
+    described = f"focal length {_with_error(focal, focal * found.focal_std)} px"
+    terms = zip(found.camera.params[4:6].tolist(), found.radial_std, ("k1", "k2"), strict=False)
+    described += "".join(f", {name} {k:.3f} ± {std:.3f}" for k, std, name in terms)
+    if given.departure(found.camera) > MIN_SIGMAS:
+        described += f"; the images contradict the given focal length, {CONSEQUENCE}: try --refine-camera"
+    return described
 
 
 def _describe_round(done: CalibrationRound) -> str:
@@ -160,5 +183,8 @@ def contradiction(given: Camera, estimate: IntrinsicsEstimate) -> str:
 
 def _focal(estimate: IntrinsicsEstimate, std: float) -> str:
     focal = float(estimate.camera.focal)
-    error = focal * std
-    return f"{focal:.0f} ± {error:.0f} px" if error >= 1 else f"{focal:.1f} ± {error:.1f} px"
+    return f"{_with_error(focal, focal * std)} px"
+
+
+def _with_error(value: float, std: float) -> str:
+    return f"{value:.0f} ± {std:.0f}" if std >= 1 else f"{value:.1f} ± {std:.1f}"

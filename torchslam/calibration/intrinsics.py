@@ -19,6 +19,16 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry import Camera
+from torchslam.geometry.camera_measurement import (
+    CX,
+    CY,
+    FOCAL,
+    K1,
+    K2,
+    intrinsics_directions,
+    simplify_model,
+    with_radial_terms,
+)
 from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.run_graph import ObservationGraph
 
@@ -152,7 +162,11 @@ def _propagate_held_parameters(
         move[n + k :] = (found - at.camera.params[2:4]) / at.camera.width
     move[:n] = follows @ move[n:]
     stds = (own + follows @ held @ follows.mT).diagonal().sqrt().tolist()
-    return at.camera.params + directions(at.camera, which) @ move, stds, math.sqrt(float(own[0, 0]))
+    return (
+        at.camera.params + intrinsics_directions(at.camera, which) @ move,
+        stds,
+        math.sqrt(float(own[0, 0])),
+    )
 
 
 def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
@@ -175,8 +189,6 @@ KERNEL_SCALE = 2.45  # as in `solve_graph`: ends the quadratic part at 95 % of a
 TOLERANCE = 1e-6
 ITERATIONS = 400  # 200 are needed if all depths change with a focal length that is far off
 MIN_FRAMES = 24  # frames of the problem, if available
-# Parameters of a camera that may be free: the logarithm of the focal length, k1, k2, and the principal point.
-FOCAL, K1, K2, CX, CY = range(5)
 
 
 def problem_of(graph: ObservationGraph) -> BundleProblem:
@@ -227,16 +239,6 @@ def frames_of(graph: ObservationGraph) -> Int[Tensor, " K"]:
     return frames[keyframes]
 
 
-def directions(camera: Camera, which: list[int]) -> Float[Tensor, "P D"]:
-    """Derivatives of the camera's parameters: log focal length, k1, k2, principal point in image widths."""
-    columns = camera.params.new_zeros(len(camera.params), 5)
-    columns[:2, FOCAL] = camera.params[:2]
-    columns[[2, 3], [CX, CY]] = float(camera.width)
-    if camera.model != "pinhole":
-        columns[[4, 5], [K1, K2]] = 1.0
-    return columns[:, which]
-
-
 def adjust_with_camera(
     problem: BundleProblem, which: list[int], iterations: int = ITERATIONS
 ) -> BundleSolution:
@@ -245,22 +247,8 @@ def adjust_with_camera(
         problem,
         "huber",
         KERNEL_SCALE,
-        directions(problem.camera, which),
+        intrinsics_directions(problem.camera, which),
         "detached",
         iterations,
         TOLERANCE,
     )
-
-
-def with_radial_terms(camera: Camera) -> Camera:
-    """The same camera in a model with distortion."""
-    if camera.model != "pinhole":
-        return camera
-    return Camera("radial_tangential", torch.cat([camera.params, camera.params.new_zeros(5)]), camera.size)
-
-
-def simplify_model(camera: Camera) -> Camera:
-    """The same camera, as a pinhole if it has no distortion."""
-    if camera.model != "radial_tangential" or bool(camera.params[4:].any()):
-        return camera
-    return Camera("pinhole", camera.params[:4], camera.size)

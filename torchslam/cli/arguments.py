@@ -110,6 +110,13 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="matcher (matching.matcher): descriptors, lightglue, a plugin, or PACKAGE:NAME",
     )
+    parser.add_argument(
+        "--camera-std",
+        type=float,
+        metavar="RATIO",
+        help="relative standard deviation of the given focal length (camera.std): 0.02 if neither this nor the "
+        "calibration file says otherwise; 0: the camera is exact",
+    )
     parser.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of the random number generators (seed)")
 
@@ -125,6 +132,7 @@ def overrides(options: argparse.Namespace) -> list[str]:
         "features.kind": options.features,
         "features.weights": options.weights,
         "matching.matcher": options.matcher,
+        "camera.std": options.camera_std,
         "scale": options.scale,
         "seed": options.seed,
     }

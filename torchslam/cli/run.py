@@ -17,12 +17,12 @@ from pathlib import Path
 
 import torch
 
-from torchslam.calibration.find_camera import RADIAL, find_camera
+from torchslam.calibration.find_camera import RADIAL, find_camera, with_stated_std
 from torchslam.cli import arguments
 from torchslam.cli.progress import ProgressBar, StopSignals
 from torchslam.config import Config
 from torchslam.data import Sequence
-from torchslam.data.calibration import is_found
+from torchslam.data.calibration import check_replaceable, is_found
 from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
@@ -61,6 +61,8 @@ class RunPlan:
         refine: refine the given camera from the images first; `distortion`: also its distortion.
         processes: number of processes; None: chosen automatically.
         view: show the run live in rerun; `video`: write a video of the tracked frames.
+        camera_std: stated relative standard deviation of the focal length; None: that of the calibration file, or of
+            the configuration.
     """
 
     source: str
@@ -77,6 +79,7 @@ class RunPlan:
     view: bool = False
     video: bool = False
     fps: float | None = None
+    camera_std: float | None = None
 
 
 class Checkpoints:
@@ -180,6 +183,7 @@ def execute(options: argparse.Namespace) -> int:
         view=options.view,
         video=options.video,
         fps=options.fps,
+        camera_std=options.camera_std,
     )
     return run(_sequence(options), arguments.config(options), plan)
 
@@ -199,7 +203,10 @@ def _sequence(options: argparse.Namespace) -> Sequence:
 def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, plan.resume)
+    check_replaceable(plan.output / CALIBRATION)
     sequence, found = _with_camera(sequence, config, plan)
+    if plan.camera_std is None:
+        config = with_stated_std(config, sequence)
     slam, so_far = _begin(sequence, config, plan)
     sequence = source(sequence, config, slam.camera)
     checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)

@@ -12,6 +12,7 @@ from pathlib import Path
 from torchslam.config.schema import Settings, choices, merge_settings, scale_pixel_settings, setting, to_toml
 from torchslam.config.sections import (
     BundleAdjustmentConfig,
+    CameraConfig,
     FeaturesConfig,
     IndependentMotionConfig,
     InitializationConfig,
@@ -31,6 +32,7 @@ from torchslam.errors import ConfigError
 __all__ = [
     "CHOICES",
     "BundleAdjustmentConfig",
+    "CameraConfig",
     "Config",
     "FeaturesConfig",
     "IndependentMotionConfig",
@@ -64,6 +66,7 @@ class Config(Settings):
         "Length unit of the map; unit: the median depth of the initial map is 1.",
         choices=("unit", "groundtruth"),
     )
+    camera: CameraConfig = field(default_factory=CameraConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     simulated: SimulatedConfig = field(default_factory=SimulatedConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)

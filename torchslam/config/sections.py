@@ -22,6 +22,18 @@ REDUCTION_TOLERANCE = 1.6
 
 
 @dataclass(frozen=True)
+class CameraConfig(Settings, section="camera"):
+    """The given camera, which the final bundle adjustment takes for a measurement."""
+
+    std: float = setting(
+        0.02,
+        "Relative standard deviation of the given focal length and radial distortion; 0: the camera is exact.",
+        low=0,
+        high=1,
+    )
+
+
+@dataclass(frozen=True)
 class FeaturesConfig(Settings, section="features"):
     """Keypoint detection and description."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -29,6 +30,7 @@ class Calibration:
         source: origin of the numbers, for messages.
         size: (width, height) of the images, if known.
         guessed: True if only approximate.
+        std: relative standard deviation of the focal length, if the source says so.
     """
 
     model: str
@@ -36,6 +38,7 @@ class Calibration:
     source: str
     size: Size | None = None
     guessed: bool = False
+    std: float | None = None
 
     @staticmethod
     def from_numbers(
@@ -138,7 +141,7 @@ def read_numbers(path: Path) -> Calibration:
     Raises CalibrationError naming file and line.
     """
     number, line = _first_line(path)
-    calibration = parse_numbers(line, f"{path}:{number}")
+    calibration = replace(parse_numbers(line, f"{path}:{number}"), std=_stated_std(path))
     distortion = path.with_name("distortion.txt")
     if len(calibration.params) > 4 or path == distortion or not distortion.is_file():
         return calibration
@@ -147,7 +150,16 @@ def read_numbers(path: Path) -> Calibration:
     numbers = parse_floats(line, where, CalibrationError)
     if len(numbers) not in (4, 5):
         raise CalibrationError(f"{where}: expected k1 k2 p1 p2 [k3], got {len(numbers)} numbers")
-    return Calibration.from_numbers([*calibration.params, *numbers], calibration.source)
+    whole = Calibration.from_numbers([*calibration.params, *numbers], calibration.source)
+    return replace(whole, std=calibration.std)
+
+
+def _stated_std(path: Path) -> float | None:
+    """The relative standard deviation that `write_calibration` wrote; None without one."""
+    if not is_found(path):
+        return None
+    found = re.search(rf"^# {FOCAL_STD}: ([0-9.e+-]+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    return None if found is None else float(found[1])
 
 
 def _first_line(path: Path) -> tuple[int, str]:
@@ -197,6 +209,7 @@ _CAMERAS: dict[str, tuple[Calibration, ...]] = {
 PRESETS = {name: Preset(name, cameras) for name, cameras in _CAMERAS.items()}
 
 ESTIMATED_HEADER = "# torchslam: camera estimated from the images"
+FOCAL_STD = "relative standard error of the focal length"
 PARAMETER_NAMES = {
     "pinhole": "fx fy cx cy",
     "radial_tangential": "fx fy cx cy k1 k2 p1 p2 k3",
@@ -215,13 +228,21 @@ def check_replaceable(path: Path) -> None:
         raise ResultsError(f"{path}: not replaced, since this calibration was not written by torchslam")
 
 
-def write_calibration(path: Path, camera: Camera, remarks: list[str]) -> None:
-    """Write an estimated camera as a calibration file, with remarks as comments."""
+def write_calibration(path: Path, camera: Camera, remarks: list[str], std: float | None = None) -> None:
+    """Write an estimated camera as a calibration file, with remarks as comments.
+
+    Args:
+        path: the file.
+        camera: the camera.
+        remarks: comments, one line each.
+        std: relative standard deviation of the focal length, if known.
+    """
+    stated = [] if std is None else [f"{FOCAL_STD}: {std:.2g}"]
     model = "" if camera.model != "fisheye" else "fisheye "
     numbers = " ".join(f"{number:.9g}" for number in camera.params.tolist())
     lines = [
         ESTIMATED_HEADER,
-        *(f"# {remark}" for remark in remarks),
+        *(f"# {remark}" for remark in (*remarks, *stated)),
         f"# {PARAMETER_NAMES[camera.model]}",
         model + numbers,
     ]

@@ -71,6 +71,8 @@ def open_sequence(
     given = parse_calibration(str(camera)) if isinstance(camera, str | Path) else camera
     try:
         sequence = _open(str(path), given, fps)
+        if isinstance(given, Calibration):
+            sequence.camera_std = given.std
         if mask is not None:
             sequence = Masked(sequence, mask)
     except OSError as cause:  # an unreadable folder, or a name that is too long

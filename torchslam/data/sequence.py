@@ -51,6 +51,7 @@ class Sequence(ABC):
         timestamps: (N,) float64 seconds, strictly increasing.
         groundtruth: the true trajectory at its own rate, or None.
         notes: remarks for the user on how it was read, one line each.
+        camera_std: relative standard deviation of the camera's focal length, if its calibration says so.
     """
 
     def __init__(
@@ -79,6 +80,7 @@ class Sequence(ABC):
         self.timestamps = timestamps
         self.groundtruth = groundtruth
         self.notes = tuple(notes)
+        self.camera_std: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
         self._T_cw: Tensor | None = None
         self._has_pose = torch.zeros(len(timestamps), dtype=torch.bool)
@@ -204,10 +206,15 @@ class Sequence(ABC):
             raise SequenceError(f"{self.name}: no frames left of {len(self)}")
         return Transformed(self, indices)
 
-    def with_camera(self, camera: Camera, calibrated: Calibrated = Calibrated.GIVEN) -> Sequence:
-        """Return the sequence with another camera. Raises CalibrationError for another image size."""
+    def with_camera(
+        self, camera: Camera, calibrated: Calibrated = Calibrated.GIVEN, std: float | None = None
+    ) -> Sequence:
+        """Return the sequence with another camera; `std`: relative standard deviation of its focal length, if known.
+
+        Raises CalibrationError for another image size.
+        """
         same = Transformed(self)
-        same.camera, same.calibrated = camera, calibrated
+        same.camera, same.calibrated, same.camera_std = camera, calibrated, std
         return same
 
     @property
@@ -276,6 +283,7 @@ class Transformed(Sequence):
             guessed=whole.calibrated is Calibrated.GUESSED,
             notes=(*whole.notes, *notes),
         )
+        self.camera_std = whole.camera_std
         self._whole = whole
         self._indices = indices
         self._same_pixels = camera is None and size in (None, whole.size)

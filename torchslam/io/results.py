@@ -17,6 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import to_toml
+from torchslam.data.calibration import write_calibration
 from torchslam.data.formats.image_file import read_gray
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import read_trajectory, write_trajectory
@@ -139,6 +140,9 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
     write_atlas(directory / MAP, run.submaps, run.camera, run.sessions)
     write_map_cloud(directory / POINT_CLOUD, run.map, run.session)
+    if run.calibration is not None and not run.session:
+        remark, std = str(metrics.get("camera", "")), run.calibration.focal_std
+        write_calibration(directory / CALIBRATION, run.camera, [remark] if remark else [], std)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     (directory / METRICS).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     write_frames(directory / FRAMES, run.results)

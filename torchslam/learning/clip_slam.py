@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor, nn
 
-from torchslam.config import Config
+from torchslam.config import CameraConfig, Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
 from torchslam.features.contract import check_features
@@ -294,7 +294,8 @@ class ClipSLAM(nn.Module):
         """The graph of one clip, or None and the reason why no map was initialized."""
         check_features(features, images, type(self.extractor).__name__)
         features = features.to(camera.params.device)
-        slam = SLAM(camera, self.config, self.extractor)
+        # The caller's camera is the one that poses are differentiated by.
+        slam = SLAM(camera, replace(self.config, camera=CameraConfig(std=0.0)), self.extractor)
         frames = [
             Frame(index, float(index), image[None], features=features[index : index + 1])
             for index, image in enumerate(images)

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, passes_gate, se3_inverse, transform
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, Schema
@@ -212,10 +213,22 @@ class PosedFrames:
         noise = KeypointNoise(seen["scales"], seen["information"])
         return passes_gate(noise.squared_reprojection(points_c, seen["pixels"], camera), _OUTLIER_CHI_SQUARE)
 
-    def graph(self, slam_map: Map, camera: Camera, submap: int = 0) -> RunGraph:
+    def graph(
+        self,
+        slam_map: Map,
+        camera: Camera,
+        submap: int = 0,
+        calibration: CameraMeasurement | None = None,
+    ) -> RunGraph:
         """Build the observation graph: keyframes first, then the frames between them.
 
         Keyframes contribute all their observations, other frames those of points that keyframes observe.
+
+        Args:
+            slam_map: the map.
+            camera: of all frames.
+            submap: number of the submap.
+            calibration: the given camera with its error; None: `camera` is exact.
         """
         seen = slam_map.observations()
         point_ids = torch.unique(seen.point_index)
@@ -244,6 +257,7 @@ class PosedFrames:
                 with_own(seen.scales, "scales"), with_own(seen.information, "information")
             ).weights,
             camera=camera,
+            calibration=calibration,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
             frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),

@@ -19,10 +19,12 @@ from torch import Tensor
 
 from torchslam.config import BundleAdjustmentConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, passes_gate, transform
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
 from torchslam.optim import BundleProblem, Marginals, Progress, bundle_adjust
 from torchslam.optim.bundle.dense_numpy import bundle_adjust_numpy
+from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
 from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
 
@@ -49,11 +51,12 @@ class BundleWindow:
 
 @dataclass(frozen=True)
 class BundleResult:
-    """The solution of a window, with covariances if requested."""
+    """The solution of a window, with covariances if requested, and the camera if it was free."""
 
     T_cw: Float[Tensor, "K 4 4"]
     points_w: Float[Tensor, "N 3"]
     marginals: Marginals | None
+    camera: Camera | None = None
 
 
 def adjust_local(
@@ -94,8 +97,12 @@ def solve_local(problem: BundleProblem, iterations: int, covariances: bool) -> B
 
 
 def adjust_all(
-    slam_map: Map, camera: Camera, settings: BundleAdjustmentConfig, progress: Progress | None = None
-) -> None:
+    slam_map: Map,
+    camera: Camera,
+    settings: BundleAdjustmentConfig,
+    progress: Progress | None = None,
+    calibration: CameraMeasurement | None = None,
+) -> Camera:
     """Run a global bundle adjustment with the first keyframe fixed.
 
     Args:
@@ -103,10 +110,20 @@ def adjust_all(
         camera: The camera of all keyframes.
         settings: Number of iterations.
         progress: Called before each iteration; if it raises, the map stays as it was.
+        calibration: The given camera with its error: the camera is adjusted as well; None: it is exact.
+
+    Returns:
+        The camera of the adjusted map.
     """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
-    adjust_keyframes(
-        slam_map, everyone[1:], everyone[:1], camera, settings.global_iterations, progress=progress
+    return adjust_keyframes(
+        slam_map,
+        everyone[1:],
+        everyone[:1],
+        camera,
+        settings.global_iterations,
+        progress=progress,
+        calibration=calibration,
     )
 
 
@@ -118,11 +135,18 @@ def adjust_keyframes(
     iterations: int,
     covariances: bool = False,
     progress: Progress | None = None,
-) -> None:
-    """Minimize the reprojection error over the free keyframes and their points, then remove outliers."""
+    calibration: CameraMeasurement | None = None,
+) -> Camera:
+    """Minimize the reprojection error over the free keyframes and their points, then remove outliers.
+
+    With a calibration the camera is free as well; returns it.
+    """
     window = build_window(slam_map, free, fixed, camera)
     if window is not None:
-        apply_result(slam_map, window, solve(window.problem, iterations, covariances, progress), camera)
+        result = solve(window.problem, iterations, covariances, progress, calibration)
+        camera = result.camera or camera
+        apply_result(slam_map, window, result, camera)
+    return camera
 
 
 def build_window(
@@ -156,18 +180,25 @@ def solve(
     iterations: int,
     covariances: bool = False,
     progress: Progress | None = None,
+    calibration: CameraMeasurement | None = None,
 ) -> BundleResult:
-    """Minimize the reprojection error of a window by `bundle_adjust`."""
+    """Minimize the reprojection error of a window by `bundle_adjust`, over the camera as well with a calibration."""
+    free: bool | Tensor = False
+    if calibration is not None:
+        problem, free = replace(problem, camera_prior=camera_prior(calibration)), calibration.directions
     solution = bundle_adjust(
         problem,
         kernel="huber",
         scale=HUBER,
+        free_camera=free,
         backward="detached",
         iterations=iterations,
         progress=progress,
         check=False,
     )
-    return BundleResult(solution.T_cw, solution.points_w, solution.covariance() if covariances else None)
+    marginals = solution.covariance() if covariances else None
+    found = None if calibration is None else solution.camera
+    return BundleResult(solution.T_cw, solution.points_w, marginals, found)
 
 
 def apply_result(slam_map: Map, window: BundleWindow, result: BundleResult, camera: Camera) -> None:

@@ -22,10 +22,12 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.camera_measurement import ERROR_FACTOR, CameraMeasurement
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward
 from torchslam.optim._core.levenberg_marquardt import Progress
+from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.pose._refinement import refine_pose
 from torchslam.types import Trajectory
@@ -35,6 +37,8 @@ _FRAMES_AT_ONCE = 64
 _MAX_BYTES = 1 << 34
 # Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
 _MAX_SIZE_RATIO = 2.0
+_CALIBRATION = "calibration.params", "calibration.directions"
+"""Tensors of a file that has them."""
 
 Schema = dict[str, tuple[str, tuple[int, ...], type]]
 """Per column: what it has a row for (K frames, N points or O observations), the shape of a row, the kind of numbers."""
@@ -53,6 +57,7 @@ class ObservationGraph:
         camera: one for all frames.
         is_keyframe: Keyframes and points are solved together, the other frames against the points.
         submap: submap of each frame, 0 if omitted. Submaps share nothing but the camera.
+        calibration: the given camera with its error, from which `camera` was found; None: `camera` is exact.
     """
 
     timestamps: Float[Tensor, " K"]
@@ -65,6 +70,7 @@ class ObservationGraph:
     camera: Camera
     is_keyframe: Bool[Tensor, " K"]
     submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    calibration: CameraMeasurement | None = None
 
     _SCHEMA: ClassVar[Schema] = {
         "timestamps": ("K", (), float),
@@ -99,6 +105,10 @@ class ObservationGraph:
         """Write to a safetensors file."""
         tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}
         tensors["camera"] = self.camera.params.detach().cpu().contiguous()
+        if self.calibration is not None:
+            given = self.calibration
+            parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
+            tensors |= {name: part.detach().cpu().contiguous() for name, part in parts}
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
         safetensors.torch.save_file(tensors, path, metadata)
@@ -115,10 +125,15 @@ class ObservationGraph:
             with safe_open(str(path), framework="pt") as file:
                 metadata, known = file.metadata() or {}, set(file.keys())
                 names = [name for name in cls.columns() if name in known or name != "submap"]
-                tensors = {name: file.get_tensor(name) for name in (*names, "camera")}
+                given = _CALIBRATION if set(_CALIBRATION) <= known else ()
+                tensors = {name: file.get_tensor(name) for name in (*names, "camera", *given)}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
-            graph = cls(camera=camera, **{name: tensors[name] for name in names})
+            calibration = None
+            if given:
+                params, directions = (tensors[name] for name in given)
+                calibration = CameraMeasurement(camera.with_params(params), directions)
+            graph = cls(camera=camera, calibration=calibration, **{name: tensors[name] for name in names})
             graph._check()
             return graph
         except (
@@ -153,14 +168,20 @@ class ObservationGraph:
         params = self.camera.params
         if params.ndim != 1 or not bool(params.isfinite().all()) or not bool((params[:2] > 0).all()):
             raise ValueError("the camera's parameters are none")
+        if self.calibration is not None:
+            given = self.calibration.camera.params, self.calibration.directions
+            if given[0].shape != params.shape or given[1].ndim != 2 or len(given[1]) != len(params):
+                raise ValueError("the calibration does not fit the camera")
+            if not all(bool(part.isfinite().all()) for part in given):
+                raise ValueError("the calibration is not finite")
         weights = self.weights.diagonal(dim1=1, dim2=2) if self.weights.ndim == 3 else self.weights
         if min(self.camera.size) < 1 or bool((weights < 0).any()):
             raise ValueError("an image without pixels, or a negative weight")
 
     @classmethod
     def columns(cls) -> list[str]:
-        """The names of all tensors but the camera's."""
-        return [column.name for column in fields(cls) if column.name != "camera"]
+        """The names of all tensors but those of the camera and its calibration."""
+        return [column.name for column in fields(cls) if column.name not in ("camera", "calibration")]
 
 
 Graph = TypeVar("Graph", bound=ObservationGraph)
@@ -211,7 +232,7 @@ def solve_graph(
     graph: ObservationGraph,
     kernel: Kernel = "huber",
     scale: Float[Tensor, "*#scale"] | float = 2.45,
-    free_camera: bool | Float[Tensor, "P n"] = False,
+    free_camera: bool | Float[Tensor, "P n"] | None = None,
     backward: Backward = "implicit",
     iterations: int = 30,
     tolerance: float = 1e-10,
@@ -220,14 +241,16 @@ def solve_graph(
     """Minimize the robust reprojection errors of a run's graph: keyframes and points, then the other frames.
 
     Every submap is solved on its own. Its first keyframe and its scale stay those of the start; a loss should not
-    depend on them (aligned trajectory errors do not).
+    depend on them (aligned trajectory errors do not). A camera that is free is found in the submap with most keyframes;
+    the others are solved with it.
 
     Args:
         graph: observation graph, as `Run.graph`.
         kernel: robust kernel.
         scale: of the kernel, in units of the whitened residual; the default is the 95 % quantile of a Gaussian.
-        free_camera: as in `bundle_adjust`; for a graph of one submap.
-        backward: how gradients reach pixels, weights and camera.
+        free_camera: as in `bundle_adjust`. None: along the directions of `graph.calibration`, with it as a prior; the
+            camera is fixed where there is none.
+        backward: how gradients reach pixels, weights and camera, or the calibration where that is a prior.
         iterations: maximum number of steps.
         tolerance: stop where the predicted reduction of the cost is below this share of it.
         progress: called before each iteration of a bundle adjustment.
@@ -236,17 +259,30 @@ def solve_graph(
         The minimum, differentiable with respect to pixels, weights and camera.
 
     Raises:
-        ValueError: a submap has no keyframe, two submaps see the same point, or the camera is free for several submaps.
+        ValueError: a submap has no keyframe, or two submaps see the same point.
     """
-    if free_camera is not False and len(graph.submaps) > 1:
-        raise ValueError("a free camera needs a graph of one submap")
     options = kernel, scale, backward, iterations, tolerance
+    free, prior = (False, None) if free_camera is None else (free_camera, None)
+    if free_camera is None and graph.calibration is not None:
+        free, prior = graph.calibration.directions, camera_prior(graph.calibration)
 
     def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
-        settings = kernel, scale, free_camera, backward, iterations, tolerance, progress
-        return [bundle_adjust(submap.problem, *settings) for submap in submaps]
+        def solved(problem: BundleProblem, free: bool | Tensor) -> BundleSolution:
+            return bundle_adjust(problem, kernel, scale, free, backward, iterations, tolerance, progress)
+
+        main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
+        first = solved(replace(submaps[main].problem, camera_prior=prior), free)
+        return [
+            first if row == main else solved(replace(submap.problem, camera=first.camera), False)
+            for row, submap in enumerate(submaps)
+        ]
 
     return _solve([graph], adjust, *options)[0]
+
+
+def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
+    """A calibration as the prior of a bundle adjustment, whose observations count as if they were independent."""
+    return CameraPrior(calibration.camera.params, ERROR_FACTOR**2 * calibration.information)
 
 
 def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
@@ -327,7 +363,7 @@ def _pose_other_frames(
 
 
 def concatenate_graphs(graphs: Sequence[Graph]) -> Graph:
-    """One graph of several with submaps of their own; the camera is that of the first."""
+    """One graph of several with submaps of their own; camera and calibration are those of the first."""
     frames, points = _starts([graph.T_cw for graph in graphs]), _starts([graph.points_w for graph in graphs])
     columns: dict[str, Any] = {}
     for name in graphs[0].columns():
@@ -364,8 +400,8 @@ def solve_graphs(
 ) -> tuple[GraphSolution, ...]:
     """The minimum of every graph as `solve_graph` finds it, up to rounding; options and errors as there.
 
-    Graphs may differ in size and camera. Those with the same camera model and the same kind of weights are solved
-    together. Converged problems leave the batch, and a failure does not affect the others.
+    Graphs may differ in size and camera. Those with an exact camera of one model, and the same kind of weights, are
+    solved together. Converged problems leave the batch, and a failure does not affect the others.
     """
     options = kernel, scale, backward, iterations, tolerance
 
@@ -374,13 +410,20 @@ def solve_graphs(
 
     alike: dict[tuple[object, ...], list[int]] = {}
     for row, graph in enumerate(graphs):
-        kind = (graph.camera.model, graph.camera.params.dtype, graph.camera.params.device, graph.weights.ndim)
+        kind: tuple[object, ...] = (
+            graph.camera.model,
+            graph.camera.params.dtype,
+            graph.camera.params.device,
+            graph.weights.ndim,
+        )
+        if graph.calibration is not None:
+            kind = (row,)  # directions of its own
         alike.setdefault(kind, []).append(row)
     solved: dict[int, GraphSolution] = {}
     found: Sequence[GraphSolution]
     for rows in alike.values():
         if len(rows) == 1:
-            found = (solve_graph(graphs[rows[0]], kernel, scale, False, backward, iterations, tolerance),)
+            found = (solve_graph(graphs[rows[0]], kernel, scale, None, backward, iterations, tolerance),)
         else:
             found = _solve([graphs[row] for row in rows], adjust, *options)
         solved.update(zip(rows, found, strict=True))

@@ -12,9 +12,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.calibration.intrinsics import FOCAL, directions
 from torchslam.config import Config
 from torchslam.geometry import Camera, KeypointNoise, passes_gate, so3_exp, so3_log, transform
+from torchslam.geometry.camera_measurement import FOCAL, intrinsics_directions
 from torchslam.geometry.robust import robustify
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
@@ -85,7 +85,7 @@ def adjust_coarse_to_fine(
             camera,
             weights=noise[rows].weights,
         )
-        free = directions(camera, [FOCAL]) if free_focal and width < KERNEL_WIDTHS[0] else False
+        free = intrinsics_directions(camera, [FOCAL]) if free_focal and width < KERNEL_WIDTHS[0] else False
         solution = bundle_adjust(problem, "cauchy", width, free, "detached", ITERATIONS, TOLERANCE)
         T_cw, camera = solution.T_cw, solution.camera
     points_w, good = triangulate_tracks(tracks, pixels, T_cw, camera, parallax)

@@ -16,9 +16,10 @@ from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import FrameError, InitializationError, TorchslamError
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
-from torchslam.map.atlas import Submap, main_submap
+from torchslam.map.atlas import Atlas, Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
 from torchslam.mapping.local_bundle import adjust_all
@@ -44,6 +45,9 @@ class _System(Protocol):
     def finalize(self) -> None:
         """End the session."""
 
+    def adopt_camera(self, camera: Camera) -> None:
+        """Save the maps with a camera that was found."""
+
 
 class Frames(Protocol):
     """The frames of a run, each read once and in order: a sequence or a `FeaturePrefetcher`."""
@@ -58,7 +62,7 @@ class Run:
 
     Attributes:
         submaps: submaps in the order of their creation; usually one.
-        camera: the camera.
+        camera: the camera that the final adjustment found; the given one without it, or where that is exact.
         config: the configuration.
         results: one result per processed frame.
         skipped: messages about the frames that could not be read.
@@ -67,6 +71,8 @@ class Run:
         loop_closures: closed loops and merges of submaps.
         session: number of the run among those over the same map; frames and trajectories are those of this session.
         sessions: number of sessions of the map, without those that only localized.
+        given: the given camera with its error, if the final adjustment changed it.
+        calibration: `camera` with its error after the final adjustment.
     """
 
     submaps: tuple[Submap, ...]
@@ -79,6 +85,8 @@ class Run:
     loop_closures: tuple[LoopClosureRecord, ...] = ()
     session: int = 0
     sessions: int = 1
+    given: CameraMeasurement | None = None
+    calibration: CameraMeasurement | None = None
 
     @property
     def main(self) -> Submap | None:
@@ -145,7 +153,10 @@ class Run:
         if not self.submaps:
             raise InitializationError(self.failure)
         return concatenate_graphs(
-            [submap.posed_frames.graph(submap.map, self.camera, submap.number) for submap in self.submaps]
+            [
+                submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given)
+                for submap in self.submaps
+            ]
         )
 
 
@@ -226,24 +237,16 @@ def finish(
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
     with torch.inference_mode():
         slam.finalize()
+    final = FinalAdjustment(slam.camera, slam.config)
     try:
-        for submap in slam.session.atlas:
-            if (
-                slam.session.mapping
-                and slam.config.bundle_adjustment.local
-                and slam.config.bundle_adjustment.global_at_end
-            ):
-                adjust_all(submap.map, slam.camera, slam.config.bundle_adjustment, adjusting)
-                submap.posed_frames.remove_outliers(submap.map, slam.camera)
-                graph = submap.posed_frames.graph(submap.map, slam.camera)
-                submap.posed_frames.apply_solution(
-                    solve_graph(graph, backward="detached", progress=adjusting), graph, submap.map
-                )
+        if slam.session.mapping:
+            final.adjust(slam.session.atlas, slam.session.number, adjusting)
     except KeyboardInterrupt:
         interrupted = True
+    slam.adopt_camera(final.camera)
     return Run(
         tuple(slam.session.atlas),
-        slam.camera,
+        final.camera,
         slam.config,
         results,
         skipped,
@@ -252,7 +255,54 @@ def finish(
         tuple(slam.loop_closer.loop_closures),
         slam.session.number,
         slam.session.count,
+        final.given,
+        final.calibration,
     )
+
+
+class FinalAdjustment:
+    """The adjustment of all maps at the end of a run, over keyframes, points, frames in between and the camera.
+
+    Attributes:
+        camera: the camera of the adjusted maps.
+        given: the given camera with its error; None until it is adjusted, and where it is exact.
+        calibration: `camera` with its error; None as `given`.
+    """
+
+    def __init__(self, camera: Camera, config: Config) -> None:
+        self.camera, self.settings, self._std = camera, config.bundle_adjustment, config.camera.std
+        self.given: CameraMeasurement | None = None
+        self.calibration: CameraMeasurement | None = None
+
+    def adjust(self, atlas: Atlas, session: int, progress: Progress | None = None) -> None:
+        """Adjust all submaps, if so configured. The main one determines the camera; the others follow.
+
+        Args:
+            atlas: the submaps.
+            session: the session whose main submap determines the camera.
+            progress: called before each iteration; if it raises, what was adjusted so far stays.
+        """
+        main = atlas.main(session)
+        if main is None or not (self.settings.local and self.settings.global_at_end):
+            return
+        given = CameraMeasurement.of(self.camera, self._std) if self._std else None
+        self._adjust(main, given, progress)
+        for submap in atlas:
+            if submap is not main:
+                self._adjust(submap, None, progress)
+
+    def _adjust(self, submap: Submap, given: CameraMeasurement | None, progress: Progress | None) -> None:
+        camera = self.camera if given is None else given.camera
+        camera = adjust_all(submap.map, camera, self.settings, progress, given)
+        self.camera, self.given = camera, given or self.given
+        submap.posed_frames.remove_outliers(submap.map, camera)
+        graph = submap.posed_frames.graph(submap.map, camera, calibration=given)
+        solution = solve_graph(graph, backward="detached", progress=progress)
+        submap.posed_frames.apply_solution(solution, graph, submap.map)
+        self.camera = solution.camera
+        if given is not None:
+            (bundle,) = solution.keyframes
+            self.calibration = given.updated(solution.camera, bundle.covariance().camera)
 
 
 def keyframe_rows(slam_map: Map, session: int) -> Int[Tensor, " K"]:

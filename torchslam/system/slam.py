@@ -242,6 +242,10 @@ class SLAM:
         """End the session: frames that are held back keep their poses, uncertain as they are."""
         self._state_machine.finalize()
 
+    def adopt_camera(self, camera: Camera) -> None:
+        """Save the maps with the camera that the final adjustment found; frames are tracked with the given one."""
+        self.session = replace(self.session, camera=camera)
+
     # --- results ---------------------------------------------------------------------------------------------
 
     def trajectory(self) -> Trajectory:

@@ -1,0 +1,116 @@
+"""A camera that is known with an error: a calibration is a measurement, and images say more about it.
+
+Published and printed calibrations are wrong by percents: the focal length depends on focus and temperature, and a
+distortion that is left out bends a map. `CameraMeasurement` has the given parameters, and directions in which they may
+be wrong; bundle adjustments take it as a prior and move the camera along these directions.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Self
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+
+# Parameters of a camera that may be free: the logarithm of the focal length, k1, k2, and the principal point in widths.
+FOCAL, K1, K2, CX, CY = range(5)
+
+ERROR_FACTOR = 3.0
+"""Standard errors of intrinsics are that many times those of independent observations.
+
+A point's errors in neighboring frames are alike: on real sequences, parts of a trajectory disagree by two to five
+formal standard errors (see `torchslam.calibration.intrinsics`)."""
+
+
+@dataclass(frozen=True)
+class CameraMeasurement:
+    """A Gaussian on the parameters of a camera.
+
+    Attributes:
+        camera: The mean.
+        directions: Columns along which the parameters may be wrong, each by one standard deviation.
+    """
+
+    camera: Camera
+    directions: Float[Tensor, "P n"]
+
+    @classmethod
+    def of(cls, camera: Camera, std: float) -> Self:
+        """A calibration whose focal length and radial distortion have a relative standard deviation.
+
+        The image of a point at a distance of one focal length from the center moves by `std` of that distance with
+        either of them. The principal point counts as exact.
+        """
+        camera = with_radial_terms(camera)
+        return cls(camera, std * intrinsics_directions(camera, [FOCAL, K1, K2]))
+
+    @property
+    def covariance(self) -> Float[Tensor, "P P"]:
+        """The covariance of the parameters."""
+        return self.directions @ self.directions.mT
+
+    @property
+    def information(self) -> Float[Tensor, "P P"]:
+        """The information of the parameters, zero across the directions."""
+        inverse = torch.linalg.pinv(self.directions)
+        return inverse.mT @ inverse
+
+    @property
+    def focal_std(self) -> float:
+        """Relative standard deviation of the focal length."""
+        relative = self.directions[:2].detach() / self.camera.params[:2, None].detach()
+        return float(relative.mean(0).norm())
+
+    @property
+    def radial_std(self) -> tuple[float, float]:
+        """Standard deviations of the first two radial coefficients; zero for a pinhole."""
+        if self.camera.model == "pinhole":
+            return 0.0, 0.0
+        k1, k2 = self.directions[4:6].detach().norm(dim=-1).tolist()
+        return k1, k2
+
+    def updated(self, camera: Camera, covariance: Float[Tensor, "n n"]) -> CameraMeasurement:
+        """The measurement after a bundle adjustment.
+
+        Args:
+            camera: The camera that was found.
+            covariance: Marginal covariance of the steps along the directions, of independent observations.
+        """
+        variances, axes = torch.linalg.eigh(covariance)
+        spread = axes * variances.clamp_min(0.0).sqrt() * ERROR_FACTOR
+        return CameraMeasurement(camera, self.directions @ spread)
+
+    def departure(self, camera: Camera) -> float:
+        """Distance of a camera's focal length from the mean, in standard deviations; 0 for an exact one."""
+        std = self.focal_std
+        off = abs(math.log(float(camera.focal) / float(self.camera.focal)))
+        return off / std if std > 0 else 0.0
+
+
+def intrinsics_directions(camera: Camera, which: list[int]) -> Float[Tensor, "P D"]:
+    """Derivatives of the camera's parameters: log focal length, k1, k2, principal point in image widths."""
+    columns = camera.params.new_zeros(len(camera.params), 5)
+    columns[:2, FOCAL] = camera.params[:2]
+    columns[[2, 3], [CX, CY]] = float(camera.width)
+    if camera.model != "pinhole":
+        columns[[4, 5], [K1, K2]] = 1.0
+    return columns[:, which]
+
+
+def with_radial_terms(camera: Camera) -> Camera:
+    """The same camera in a model with distortion."""
+    if camera.model != "pinhole":
+        return camera
+    return Camera("radial_tangential", torch.cat([camera.params, camera.params.new_zeros(5)]), camera.size)
+
+
+def simplify_model(camera: Camera) -> Camera:
+    """The same camera, as a pinhole if it has no distortion."""
+    if camera.model != "radial_tangential" or bool(camera.params[4:].any()):
+        return camera
+    return Camera("pinhole", camera.params[:4], camera.size)
