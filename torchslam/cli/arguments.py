@@ -103,7 +103,9 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         help=f"feature extractor (features.kind): {', '.join(CHOICES['features.kind'])}, a plugin, or PACKAGE:NAME",
     )
     parser.add_argument(
-        "--weights", metavar="FILE", help="weights of a learned feature extractor (features.weights)"
+        "--weights",
+        metavar="FILE|NAME",
+        help="weights of a learned feature extractor (features.weights); by default those of its own name",
     )
     parser.add_argument(
         "--matcher",

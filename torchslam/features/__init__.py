@@ -41,7 +41,8 @@ def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None =
     Args:
         name: one of `EXTRACTORS`.
         num_keypoints: largest number of keypoints per image.
-        weights: file of weights for "xfeat" and "aliked", unused by the others.
+        weights: file of weights for "xfeat" and "aliked", or their name, see `features.weights`; None: the published
+            ones of that name. Unused by the others.
 
     Returns:
         A module from images (B, 1, H, W) and optionally a mask to `Features`.
@@ -55,6 +56,6 @@ def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None =
         return OpenCVORB(num_keypoints)
     if name not in EXTRACTORS:
         raise ConfigError(f"unknown features {name!r}; there are {', '.join(EXTRACTORS)}")
-    if weights is None:
-        raise ConfigError(f"features {name!r} need a file of weights")
-    return XFeat(weights, num_keypoints) if name == "xfeat" else ALIKED(weights, num_keypoints)
+    if name == "xfeat":
+        return XFeat(weights or "xfeat", num_keypoints)
+    return ALIKED(weights or "aliked-n16", num_keypoints)

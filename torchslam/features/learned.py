@@ -1,4 +1,4 @@
-"""Learned features behind the same interface as `ORB`, with weights from a local file; nothing is ever downloaded.
+"""Learned features behind the same interface as `ORB`, with weights from a local file: see `features.weights`.
 
 The networks are kornia's. Descriptors are floats of unit length, angles are 0. All keypoints have the scale 2 pixels,
 and their information is that of the noise measured on real sequences (`experiments/front_ends/noise.py`).
@@ -7,24 +7,23 @@ Keypoints, scores and descriptors carry gradients to the weights.
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
 from torchslam.features.contract import apply_mask
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
+from torchslam.features.weights import read_weights
 from torchslam.types import Features
-from torchslam.utils.files import check_regular
 
-MAX_BYTES = 1 << 30  # of a file of weights
 _SCALE = 2.0
+_XFEAT_PREFIX = re.compile(r"^(extractor\.model\.)?(net\.)?")  # published files have none, one or both
 XFEAT_NOISE, ALIKED_NOISE = 1.0, 0.7
 """Standard deviations of keypoints, in pixels of the network's input, measured in whole runs on real sequences: XFeat
 has 1.03 to 1.35 (with 1.2, a short sequence is not initialized), ALIKED 0.5 to 0.8."""
@@ -34,7 +33,7 @@ class XFeat(nn.Module):
     """XFeat: 64 floats per keypoint (Potje et al., CVPR 2024).
 
     Args:
-        weights: safetensors file of the network.
+        weights: file of the network's weights, or their name.
         num_keypoints: largest number of keypoints per image; rows beyond what the image offers are masked.
         threshold: of the keypoint heat map, 0 to 1.
 
@@ -50,7 +49,9 @@ class XFeat(nn.Module):
         self.threshold = threshold
         model = kornia.feature.XFeat()
         # The file may leave out the fine matcher, which only dense matching needs.
-        _load(model, _read(weights), weights, optional="net.fine_matcher.")
+        state = {_XFEAT_PREFIX.sub("net.", name): tensor for name, tensor in read_weights(weights).items()}
+        state = {name: tensor for name, tensor in state.items() if not name.startswith("net.matcher.")}
+        _load(model, state, weights, optional="net.fine_matcher.")
         self.network = model.net.eval()
 
     def forward(
@@ -111,7 +112,7 @@ class ALIKED(nn.Module):
     """ALIKED: 64 (t16) or 128 (n16, n32) floats per keypoint (Zhao et al., IEEE TIM 2023).
 
     Args:
-        weights: safetensors file of the network; its shapes determine the variant.
+        weights: file of the network's weights, or their name; the shapes determine the variant.
         num_keypoints: largest number of keypoints per image; rows beyond what the image offers are masked.
 
     Raises:
@@ -123,7 +124,7 @@ class ALIKED(nn.Module):
 
         super().__init__()
         self.num_keypoints = num_keypoints
-        state = _read(weights)
+        state = read_weights(weights)
         variants = {(8, 16): "aliked-t16", (16, 16): "aliked-n16", (16, 32): "aliked-n32"}
         shape = tuple(len(state.get(name, ())) for name in ("block1.conv1.weight", "desc_head.agg_weights"))
         if shape not in variants:
@@ -183,15 +184,6 @@ def _features(
     )
     scales, information = torch.full_like(scores, _SCALE), torch.full_like(scores, noise_px**-2)
     return Features(keypoints, scores, scales, torch.zeros_like(scores), descriptors, mask, information)
-
-
-def _read(weights: str | Path) -> dict[str, Tensor]:
-    """The tensors of a safetensors file."""
-    try:
-        check_regular(weights, MAX_BYTES, "a file of weights")
-        return load_file(str(weights))
-    except (OSError, SafetensorError, ValueError, TypeError, AttributeError, RuntimeError) as error:
-        raise ConfigError(f"{weights}: cannot read the weights ({error})") from error
 
 
 def _load(network: nn.Module, state: dict[str, Tensor], weights: str | Path, optional: str) -> None:

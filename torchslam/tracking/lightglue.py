@@ -1,4 +1,4 @@
-"""LightGlue as a matcher, with weights from a local file; nothing is ever downloaded. The network is kornia's.
+"""LightGlue as a matcher, with weights from a local file: see `features.weights`. The network is kornia's.
 
 Source: Lindenberger, Sarlin and Pollefeys, "LightGlue: local feature matching at light speed", ICCV 2023.
 """
@@ -6,26 +6,22 @@ Source: Lindenberger, Sarlin and Pollefeys, "LightGlue: local feature matching a
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import torch
 from jaxtyping import Shaped
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
+from torchslam.features.weights import read_weights
 from torchslam.types import FrameFeatures, Matches, MatchPrior
-from torchslam.utils.files import check_regular
-
-MAX_BYTES = 1 << 30  # of a file of weights
 
 
 class LightGlue(nn.Module):
     """Matches float descriptors of the front end that its weights were trained for; weights are its confidences.
 
     Args:
-        weights: safetensors or .pt/.pth file; the shapes determine the variant.
+        weights: file of weights, or their name; the shapes determine the variant.
+        image_size: width and height of the images; None: as far as the keypoints of both views reach.
 
     Raises:
         ConfigError: if the file cannot be read or holds another network.
@@ -33,13 +29,12 @@ class LightGlue(nn.Module):
 
     weighs = True
 
-    def __init__(self, weights: str | Path | None = None) -> None:
+    def __init__(self, weights: str | Path, image_size: tuple[int, int] | None = None) -> None:
         from kornia.feature import LightGlue as Network
 
         super().__init__()
-        if weights is None:
-            raise ConfigError("matcher lightglue needs a file of weights: matching.weights")
-        state = renamed(_read(weights))
+        self.image_size = image_size
+        state = renamed(read_weights(weights))
         try:
             width, self.size_in = state["input_proj.weight"].shape
             layers = len({name.split(".")[1] for name in state if name.startswith("transformers.")})
@@ -79,6 +74,8 @@ class LightGlue(nn.Module):
             none = rows[0][:0][None]
             return Matches(none, none, none.float(), none.bool())
         size = torch.cat([view_1.keypoints[rows[0]], view_2.keypoints[rows[1]]]).amax(0) + 1
+        if self.image_size is not None:
+            size = size.new_tensor(self.image_size)
         data = {
             f"image{i}": self._data(view, at, size)
             for i, (view, at) in enumerate(zip((view_1, view_2), rows, strict=True))
@@ -97,8 +94,10 @@ class LightGlue(nn.Module):
                 f"matcher lightglue: its weights are for descriptors of {self.size_in} floats, "
                 f"these are {described.shape[-1]} x {described.dtype}"
             )
+        # Projected points may lie half a pixel outside of the image, where the network takes none.
+        inside = view.keypoints[rows].clamp_min(0.0).minimum(size)
         data = {
-            "keypoints": view.keypoints[rows].float()[None],
+            "keypoints": inside.float()[None],
             "descriptors": described.float()[None],
             "image_size": size.float()[None],
         }
@@ -119,17 +118,3 @@ def renamed(state: dict[str, Shaped[Tensor, "..."]]) -> dict[str, Shaped[Tensor,
                 new = f"transformers.{layer}.{part}.{rest}"
         names[name] = new
     return {new: state[name] for name, new in names.items()}
-
-
-def _read(weights: str | Path) -> dict[str, Tensor]:
-    """The tensors of a file."""
-    try:
-        check_regular(weights, MAX_BYTES, "a file of weights")
-        if Path(weights).suffix == ".safetensors":
-            return load_file(str(weights))
-        loaded: Any = torch.load(str(weights), map_location="cpu", weights_only=True)
-        return {name: tensor for name, tensor in loaded.items() if isinstance(tensor, Tensor)}
-    except (OSError, SafetensorError, ValueError, TypeError, AttributeError, RuntimeError, EOFError) as error:
-        raise ConfigError(f"{weights}: cannot read the weights ({error})") from error
-    except Exception as error:  # of unpickling
-        raise ConfigError(f"{weights}: cannot read the weights ({type(error).__name__})") from error

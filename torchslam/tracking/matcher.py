@@ -65,8 +65,10 @@ def max_distance(descriptors: Shaped[Tensor, "*batch N D"], settings: MatchingCo
     return settings.max_hamming_distance if descriptors.dtype == torch.uint8 else settings.max_cosine_distance
 
 
-def make_matcher(settings: MatchingConfig, matcher: Matcher | None = None) -> Matcher:
-    """The given matcher, or else the configured one.
+def make_matcher(
+    settings: MatchingConfig, matcher: Matcher | None = None, image_size: tuple[int, int] | None = None
+) -> Matcher:
+    """The given matcher, or else the configured one for images of a size (width, height).
 
     Raises:
         ConfigError: if the name of the configured one is unknown.
@@ -74,7 +76,7 @@ def make_matcher(settings: MatchingConfig, matcher: Matcher | None = None) -> Ma
     if matcher is None and settings.matcher == "lightglue":
         from torchslam.tracking.lightglue import LightGlue
 
-        return LightGlue(settings.weights or None)
+        return LightGlue(settings.weights or "xfeat-lighterglue", image_size)
     if matcher is None and settings.matcher != "descriptors":
         return load(MATCHERS, settings.matcher, weights=settings.weights or None)
     return DescriptorMatcher(settings) if matcher is None else matcher

