@@ -67,6 +67,7 @@ def test_run_writes_all_results(finished: Path) -> None:
         "groundtruth.txt",
         "map.safetensors",
         "map.ply",
+        "calibration.txt",
         "config.toml",
         "view.html",
     }

@@ -95,28 +95,30 @@ def camera_remark(finished: Run, found: str) -> str:
         finished: The run.
         found: Description by `find_camera`, empty for a given camera.
     """
-    if finished.given is not None and finished.calibration is not None:
-        described = describe_calibration(finished.given, finished.calibration)
+    given = finished.given
+    if given is not None and finished.calibration is not None:
+        described = describe_calibration(finished.calibration)
         if found:
             return f"{found}; over all frames {described}"
-        return f"{described} (given {float(finished.given.camera.focal):.1f} px)"
+        described += f" (given {float(given.camera.focal):.1f} px)"
+        freely = estimate_intrinsics(finished.graph)  # without the prior
+        if given.departure(freely.camera) > MIN_SIGMAS:
+            described += f"; {contradiction(given.camera, freely)}; {REMEDY}"
+        return described
     against = ""
     if not (finished.failure or finished.interrupted or finished.session):
         against = contradiction(finished.camera, estimate_intrinsics(finished.graph))
     if found:
         return "; but over all frames ".join(filter(None, (found, against)))
-    return f"{against}; --refine-camera looks for a better one" if against else ""
+    return f"{against}; {REMEDY}" if against else ""
 
 
-def describe_calibration(given: CameraMeasurement, found: CameraMeasurement) -> str:
-    """Describe what a run made of a given camera, and whether it contradicts it."""
+def describe_calibration(found: CameraMeasurement) -> str:
+    """Describe the camera that the final adjustment of a run found, with its errors."""
     focal = float(found.camera.focal)
     described = f"focal length {_with_error(focal, focal * found.focal_std)} px"
     terms = zip(found.camera.params[4:6].tolist(), found.radial_std, ("k1", "k2"), strict=False)
-    described += "".join(f", {name} {k:.3f} ± {std:.3f}" for k, std, name in terms)
-    if given.departure(found.camera) > MIN_SIGMAS:
-        described += f"; the images contradict the given focal length, {CONSEQUENCE}: try --refine-camera"
-    return described
+    return described + "".join(f", {name} {k:.3f} ± {std:.3f}" for k, std, name in terms)
 
 
 def _describe_round(done: CalibrationRound) -> str:
@@ -133,6 +135,7 @@ def _describe_round(done: CalibrationRound) -> str:
 # ratio with a relative cost decrease.
 MIN_SIGMAS, MIN_RATIO = 3.0, 0.01
 LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02
+REMEDY = "--refine-camera looks for a better one"
 CONSEQUENCE = "poses and map may be badly wrong with it"
 DEGENERATE = "pure rotation, straight motion and planes do not determine it"
 

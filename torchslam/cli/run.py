@@ -28,6 +28,7 @@ from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
+from torchslam.geometry.camera_measurement import may_be_same
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
 from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, prepare
@@ -281,13 +282,9 @@ def _begin(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[SLAM, Run
     if plan.map is None:
         return SLAM(sequence.camera.to(plan.device), config), RunProgress()
     slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
-    known, mine = slam.camera, sequence.camera.to(torch.float64)
-    same = known.params.shape == mine.params.shape  # to the nine digits of a calibration file
-    same = same and torch.allclose(known.params.cpu(), mine.params, rtol=1e-8, atol=0)
-    if known.size != mine.size or (
-        sequence.calibrated is Calibrated.GIVEN  # else the map's is the camera
-        and (known.model != mine.model or not same)
-    ):
+    known, mine = slam.camera.to("cpu"), sequence.camera.to(torch.float64)
+    is_given = sequence.calibrated is Calibrated.GIVEN  # else the map's is the camera
+    if known.size != mine.size or (is_given and not may_be_same(known, mine, config.camera.std)):
         raise ResultsError(
             f"{plan.map}: the map was built with the camera {_describe(known)}, but the sequence has {_describe(mine)}"
         )

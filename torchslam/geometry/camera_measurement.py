@@ -92,6 +92,23 @@ class CameraMeasurement:
         return off / std if std > 0 else 0.0
 
 
+MAX_DEPARTURE = 5.0
+"""Standard deviations by which a camera that was found may differ from the given one."""
+
+
+def may_be_same(found: Camera, given: Camera, std: float) -> bool:
+    """Whether a run may have found one camera where another one was given with a relative standard deviation.
+
+    What a run does not adjust must be equal, to the nine digits of a calibration file.
+    """
+    one, other = with_radial_terms(found), with_radial_terms(given)
+    if one.model != other.model:
+        return False
+    off = one.params - other.params
+    allowed = MAX_DEPARTURE * CameraMeasurement.of(given, std).directions.norm(dim=-1)
+    return bool((off.abs() <= allowed + 1e-8 * other.params.abs()).all())
+
+
 def intrinsics_directions(camera: Camera, which: list[int]) -> Float[Tensor, "P D"]:
     """Derivatives of the camera's parameters: log focal length, k1, k2, principal point in image widths."""
     columns = camera.params.new_zeros(len(camera.params), 5)
