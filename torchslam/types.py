@@ -365,6 +365,7 @@ class Reason(StrEnum):
     # keyframes
     MOVED = "moved by {ratio:.2f} of the depth of the scene"
     TURNED = "turned by {degrees:.1f} degrees"
+    FEW_POINTS = "sees only {count} points of the map"
     LOW_OVERLAP = "sees {ratio:.0%} of the points of its reference keyframe"
 
     # initialization

@@ -8,6 +8,7 @@ the schema and every row reference against the tables.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,6 +116,7 @@ def pack_submaps(
     Returns:
         The tensors by name, and the description.
     """
+    submaps = list(submaps)
     tensors, numbers = {CAMERA: camera.params}, []
     for submap in submaps:
         numbers.append(submap.number)
@@ -125,6 +127,7 @@ def pack_submaps(
         "format": FORMAT,
         "camera": {"model": camera.model, "size": list(camera.size)},
         "submaps": numbers,
+        "noise_variances": [submap.map.noise_variance for submap in submaps],
         "num_created": max(numbers, default=-1) + 1 if num_created is None else num_created,
         "sessions": sessions,
     }
@@ -165,11 +168,23 @@ def unpack_submaps(
             own = {name[len(start) :]: rows for name, rows in tensors.items() if name.startswith(start)}
             submaps.append(_submap(number, own, camera, sessions, device))
         _check_keys([submap.map for submap in submaps])
+        for submap, variance in zip(submaps, _noise_variances(about, len(submaps)), strict=True):
+            submap.map.noise_variance = variance
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
         what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ResultsError(f"{path}: not a whole torchslam map: {what}") from None
     like = camera.params.to(device)
     return SavedAtlas(Atlas(like, submaps, num_created), camera.with_params(like), sessions)
+
+
+def _noise_variances(about: dict[str, Any], count: int) -> list[float]:
+    """The noise of each map. Raises ValueError for something else."""
+    found = about["noise_variances"]
+    if not isinstance(found, list) or len(found) != count:
+        raise ValueError(f"noise_variances must have {count} numbers")
+    if not all(isinstance(each, float) and 1 <= each < math.inf for each in found):
+        raise ValueError("noise_variances must be finite numbers from 1")
+    return found
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Shaped[Tensor, "..."]], about: dict[str, Any]) -> None:

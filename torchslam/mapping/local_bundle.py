@@ -215,9 +215,14 @@ def apply_result(slam_map: Map, window: BundleWindow, result: BundleResult, came
 
 
 def remove_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
-    """Remove observations that fail the chi-square test, and points that fewer than two keyframes still observe."""
+    """Remove observations that fail the chi-square test, and points that fewer than two keyframes still observe.
+
+    Update the noise of the map before.
+    """
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
-    wrong = ~passes_gate(seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera))
+    squared = seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera)
+    slam_map.update_noise(squared)
+    wrong = ~passes_gate(squared)
     slam_map.remove_masked_observations(seen, wrong)
 
 

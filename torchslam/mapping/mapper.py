@@ -220,6 +220,8 @@ def keyframe_reason(
         if bool(has_moved.all()):
             return Explanation.of(Reason.MOVED, ratio=float(translation.min()))
         return Explanation.of(Reason.TURNED, degrees=float(rotation[~has_moved].min()))
+    if estimate.inliers < settings.min_points:
+        return Explanation.of(Reason.FEW_POINTS, count=estimate.inliers)
     if overlap < settings.min_overlap:
         return Explanation.of(Reason.LOW_OVERLAP, ratio=overlap)
     return None

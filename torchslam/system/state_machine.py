@@ -22,6 +22,9 @@ from torchslam.tracking.pose_validation import check_map_agreement, check_pose_q
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
 
+_FRAMES_PER_KEYFRAME = 2
+"""Frames that a keyframe is worth in the confirmation of a map: views far apart contradict a wrong one sooner."""
+
 
 @dataclass(frozen=True)
 class FrameOutcome:
@@ -93,13 +96,17 @@ class InitializationState:
 
     def on_lost(self) -> bool:
         """Discard a map that is still provisional when the camera is lost; return whether it was."""
-        is_discarded = (
-            self.provisional is not None and self.provisional.age < self.settings.provisional_frames
-        )
+        is_discarded = self.provisional is not None and self._is_young(self.provisional)
         if self.provisional is not None and is_discarded:
             self._discard(self.provisional)
         self.confirm_map()
         return is_discarded
+
+    def _is_young(self, provisional: ProvisionalMap) -> bool:
+        """Whether a map has too few frames to be kept when the camera is lost; keyframes are worth several."""
+        keyframes = provisional.submap.map.num_keyframes
+        frames = max(provisional.age, _FRAMES_PER_KEYFRAME * keyframes)
+        return frames < self.settings.provisional_frames
 
     def _create(self, start: TwoViewMap, views: list[FrameFeatures]) -> Rejection | None:
         """Create a submap from two views, and discard a provisional one; return why it is rejected, or None."""
@@ -177,10 +184,10 @@ class KeyframeActions:
 
     def detect_and_close(self) -> None:
         """Detect and close a loop at the newest keyframe; cull keyframes and compact the map."""
-        self._detect_loop()
+        self.detect_loop()
         self._cull_and_compact(self.active_map.current)
 
-    def _detect_loop(self) -> None:
+    def detect_loop(self) -> None:
         """Close a loop at the newest keyframe, or merge two submaps, if its place was seen before."""
         context, submap = self.context, self.active_map.current
         with context.clock("loops"):
@@ -279,10 +286,15 @@ class StateMachine:
         rejection = quality_rejection or check_map_agreement(
             estimate, submap.tracking, context.config.pose_validation
         )
-        motion = NO_MOVEMENT if rejection else context.non_static_filter.detect_independent_motion(estimate)
+        motion = NO_MOVEMENT
+        if rejection is None:
+            noise_variance = submap.map.noise_variance
+            motion = context.non_static_filter.detect_independent_motion(estimate, noise_variance)
         if not (rejection or motion.rejection or context.confirmation.is_holding):
             return self._on_certain(view, estimate, motion.note)
-        if not quality_rejection and not motion.rejection and self._may_map_tentatively(rejection):
+        # Where views are far apart, the motion model is wrong and not the pose.
+        is_plausible = quality_rejection is None or quality_rejection.reason is Reason.JUMP
+        if is_plausible and self._may_map_tentatively(rejection or motion.rejection):
             self.tentative.add_keyframe(submap, view, estimate)
         return self._on_uncertain(view, estimate, rejection or motion.rejection)
 
@@ -291,6 +303,7 @@ class StateMachine:
         if self.active_map.submap is not None:
             self._keep_uncertain()
             self.keyframe_actions.apply_pending_adjustment()
+            self.keyframe_actions.detect_loop()
         self.initialization.confirm_map()
 
     def confirm_map(self) -> None:
@@ -367,7 +380,8 @@ class StateMachine:
             first, first_estimate, _, _ = frames[0]
             self.backward.from_frame(submap, first, first_estimate)
         self.active_map.set_state(State.TRACKING)
-        return FrameOutcome([], submap, estimate)
+        self.keyframe_actions.detect_loop()
+        return FrameOutcome([], self.active_map.current, estimate)
 
     def _keep_uncertain(self) -> None:
         """Keep the poses of frames that are held back, and their tentative keyframes."""

@@ -123,7 +123,7 @@ class Localizer:
             matches=len(ids),
             covariance=refined.covariance(),
             depth=float(refined.linearization.depths[inliers].median()),
-            error=float(errors.median()),
+            error=float(errors.median()) / slam_map.noise_variance,
             coverage_ratio=coverage_ratio(slam_map, near, seen, self.camera.size),
             explained_ratio=explained_ratio(view, at[inliers], self.camera.size),
             weights=None if weights is None else weights[inliers],

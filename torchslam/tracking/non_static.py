@@ -118,13 +118,19 @@ class IndependentMotion:
             return view
         return replace(view, mask=view.mask & ~self._mover.belongs)
 
-    def observe(self, view: FrameFeatures, estimate: PoseEstimate) -> Movement:
-        """Compare a posed frame, with all its keypoints, with one some frames earlier."""
+    def observe(self, view: FrameFeatures, estimate: PoseEstimate, noise_variance: float = 1.0) -> Movement:
+        """Compare a posed frame, with all its keypoints, with one some frames earlier.
+
+        Args:
+            view: the frame.
+            estimate: its pose.
+            noise_variance: of its keypoints, in units of what the front end states.
+        """
         mover, seen = self._mover, view.keypoints[estimate.keypoints]
         if mover is not None and self._area(mover.pixels) > self.settings.max_area_ratio * self._area(seen):
             return Movement(Rejection.of(Reason.MOVING_MAJORITY))
         if self._last is None or self._frames_since_comparison >= self.settings.frame_interval:
-            return self._compare(view, estimate.T_cw, estimate.depth)
+            return self._compare(view, estimate.T_cw, estimate.depth, noise_variance)
         return NO_MOVEMENT
 
     def _followed(self, mover: _Mover, view: FrameFeatures) -> _Mover | None:
@@ -146,7 +152,9 @@ class IndependentMotion:
         motion = (view.keypoints[matches.indices_2[0][found]] - mover.pixels[found]).median(0).values
         return _Mover.of(view, self._is_near_group(view.keypoints, mover.pixels + motion, mover.rest), motion)
 
-    def _compare(self, view: FrameFeatures, T_cw: Tensor | None, depth: float) -> Movement:
+    def _compare(
+        self, view: FrameFeatures, T_cw: Tensor | None, depth: float, noise_variance: float = 1.0
+    ) -> Movement:
         """Compare with the last observation: what moves against the scene, and what of the object moves rigidly."""
         last = self._last
         none = torch.zeros_like(view.mask, dtype=torch.int64)
@@ -157,7 +165,7 @@ class IndependentMotion:
             return NO_MOVEMENT
         frames = view.index - last.view.index
         first, second = match_views(last.view, view, self.matching)
-        strays = self._errors(last, look, first, second) > self.settings.min_error_px
+        strays = self._errors(last, look, first, second) > self.settings.min_error_px * noise_variance**0.5
         patience = last.patience[first] - int(T_cw is not None and last.T_cw is not None)
         known = ~strays & (patience > 0)
         moving = self._rigid_group(last.view, view, first, second, strays)
@@ -283,11 +291,11 @@ class NonStaticFilter:
         self._without_overlays = self.static_overlay.mask_out(view)
         return self.independent_motion.mask_out(self._without_overlays)
 
-    def detect_independent_motion(self, estimate: PoseEstimate) -> Movement:
-        """Detect keypoints of the newest view that move against the scene, given the view's pose."""
+    def detect_independent_motion(self, estimate: PoseEstimate, noise_variance: float = 1.0) -> Movement:
+        """Detect keypoints of the newest view that move against the scene, given the view's pose and their noise."""
         if not self.config.independent_motion.enabled:
             return NO_MOVEMENT
-        return self.independent_motion.observe(self._without_overlays, estimate)
+        return self.independent_motion.observe(self._without_overlays, estimate, noise_variance)
 
     def update_overlay(self, T_cw: Float[Tensor, "4 4"], depth: float) -> bool:
         """Update the overlays with the newest view and its pose; return whether there are new ones."""
