@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
@@ -191,7 +192,7 @@ def view(dim: int, seed: int) -> FrameFeatures:
     return FrameFeatures(seed, 0.0, keypoints, ones, 0 * ones, described, torch.arange(30) < 25)
 
 
-def test_lightglue_works_as_a_matcher(tmp_path: Path) -> None:
+def test_lightglue_works_as_a_matcher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With weights of chance: what it says is nothing, how it says it is what is tested."""
     from torchslam.tracking.matcher import run_matcher
 
@@ -206,9 +207,13 @@ def test_lightglue_works_as_a_matcher(tmp_path: Path) -> None:
     assert len(pairs.first) > 0
     assert pairs.weights is not None
     assert bool((pairs.weights > 0).all())
+    at_the_border = replace(one, keypoints=one.keypoints - one.keypoints.amin(0) - 0.4)
+    assert len(run_matcher(matcher, at_the_border, one).first) > 0  # projections reach half a pixel further
     with pytest.raises(ConfigError, match="its weights are for descriptors of 64 floats, these are 32"):
         matcher(view(32, 1), view(32, 2), None)
-    with pytest.raises(ConfigError, match="needs a file of weights"):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.delenv("TORCHSLAM_WEIGHTS", raising=False)
+    with pytest.raises(ConfigError, match="torchslam download xfeat-lighterglue"):
         make_matcher(load_config(None, ["matching.matcher=lightglue"]).matching)
     (tmp_path / "other.pt").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match="cannot read the weights"):

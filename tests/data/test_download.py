@@ -247,7 +247,7 @@ def test_unknown_names(server: Server, tmp_path: Path) -> None:
     with pytest.raises(DownloadError, match="404"):
         download("eth3d/nothing", tmp_path, server.url, progress=False)
     for name in ("plant_1", "tum/desk", "eth3d/../up", "eth3d/"):
-        with pytest.raises(DownloadError, match="unknown sequence"):
+        with pytest.raises(DownloadError, match="unknown name"):
             download(name, tmp_path, server.url, progress=False)
 
 

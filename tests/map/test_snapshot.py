@@ -53,6 +53,15 @@ def test_a_snapshot_restores_the_map() -> None:
         assert list(slam_map.images) == [slam_map.key(0)]
 
 
+def test_a_snapshot_restores_the_noise() -> None:
+    slam_map = simulated_submap().map
+    slam_map.noise_variance = 1.5
+    snapshot = MapSnapshot.of(slam_map)
+    slam_map.noise_variance = 3.0
+    snapshot.restore(slam_map)
+    assert slam_map.noise_variance == 1.5
+
+
 def test_a_snapshot_is_a_copy() -> None:
     slam_map = simulated_submap().map
     snapshot = MapSnapshot.of(slam_map)

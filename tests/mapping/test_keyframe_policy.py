@@ -85,7 +85,18 @@ def test_a_reference_without_points_makes_no_keyframe() -> None:
     seen = submap.map.observed_points(torch.tensor([0]))[:1]
     submap.tracking.reference_size = 0
     estimate = estimate_at(pose(), seen, torch.arange(1))
-    assert keyframe_reason(SCENE.view(50, pose()), estimate, submap, SETTINGS) is None
+    settings = replace(SETTINGS, min_points=0)
+    assert keyframe_reason(SCENE.view(50, pose()), estimate, submap, settings) is None
+
+
+def test_a_frame_with_few_points_becomes_a_keyframe() -> None:
+    submap = submap_of_scene(SCENE, sideways(1))
+    seen = submap.map.observed_points(torch.tensor([0]))[:30]
+    submap.tracking.reference_size = 30
+    estimate = estimate_at(pose(), seen, torch.arange(30))
+    reason = keyframe_reason(SCENE.view(50, pose()), estimate, submap, replace(SETTINGS, min_points=31))
+    assert str(reason) == "sees only 30 points of the map"
+    assert keyframe_reason(SCENE.view(50, pose()), estimate, submap, replace(SETTINGS, min_points=30)) is None
 
 
 def test_keyframes_keep_their_interval_forwards_and_backwards() -> None:

@@ -8,8 +8,9 @@ from safetensors.torch import save_file
 from torchslam.errors import TorchslamError
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.posed_frames import RunGraph
-from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs, solve_graph
+from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs, solve_graph, solve_graphs
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -303,3 +304,82 @@ def test_a_file_of_another_format_is_refused(tmp_path):
     path.write_bytes(b"something else")
     with pytest.raises(TorchslamError, match=r"graph\.safetensors is not an observation graph"):
         ObservationGraph.load(path)
+
+
+def measured(graph, std=0.02, factor=1.02):
+    """The graph with a calibration whose focal length is off by a factor, as where its camera starts."""
+    params = graph.camera.params.clone()
+    params[:2] *= factor
+    given = CameraMeasurement.of(graph.camera.with_params(params), std)
+    return replace(graph, camera=given.camera, calibration=given)
+
+
+def test_a_calibration_with_an_error_is_corrected_by_the_images():
+    truth, graph = simulated(noise=0.1, points=200)
+    given = measured(graph, std=0.5)
+    solution, held = solve_graph(given), solve_graph(given, free_camera=False)
+    off = (solution.camera.params[:2] / graph.camera.params[:2] - 1).abs()
+    assert off.max() < 0.01
+    assert torch.equal(held.camera.params, given.camera.params)
+    assert solution.camera.params[2:4].tolist() == graph.camera.params[2:4].tolist()  # exact, as given
+    assert aligned_error(solution, truth) < aligned_error(held, truth)
+
+
+def test_a_certain_calibration_is_kept():
+    _, graph = simulated()
+    solution = solve_graph(measured(graph, std=1e-6))
+    torch.testing.assert_close(
+        solution.camera.params, 1.0 * measured(graph).camera.params, rtol=1e-5, atol=1e-6
+    )
+
+
+def test_the_gradient_reaches_the_calibration():
+    """It is that of central differences, and zero for the focal length from which the search starts."""
+    truth, graph = simulated()
+    given = measured(graph)
+
+    def loss(params):
+        calibration = replace(given.calibration, camera=given.camera.with_params(params))
+        return aligned_error(solve_graph(replace(given, calibration=calibration), **CONVERGED), truth)
+
+    params = given.calibration.camera.params.clone().requires_grad_()
+    loss(params).backward()
+    assert (params.grad[:2] != 0).all()
+    step = torch.zeros_like(params)
+    step[0] = 0.05
+    with torch.no_grad():
+        numeric = (loss(params + step) - loss(params - step)) / 0.1
+    torch.testing.assert_close(params.grad[0], numeric, rtol=1e-5, atol=0)
+    start = given.camera.params.clone().requires_grad_()
+    moved = replace(given, camera=given.camera.with_params(start))
+    aligned_error(solve_graph(moved, **CONVERGED), truth).backward()
+    assert start.grad[:2] @ given.calibration.directions[:2, 0] == pytest.approx(0.0, abs=1e-9)
+
+
+def test_the_main_submap_determines_the_camera_of_all():
+    _, (one, two), both = two_submaps()
+    given = measured(both)
+    solution, alone = solve_graph(given), solve_graph(measured(one))
+    torch.testing.assert_close(solution.camera.params, alone.camera.params, rtol=1e-9, atol=1e-9)
+    other = solve_graph(replace(two, camera=solution.camera))
+    torch.testing.assert_close(solution.trajectory_in(1).T_wc, other.trajectory.T_wc, rtol=0, atol=1e-9)
+
+
+def test_a_calibration_is_saved_with_the_graph(tmp_path):
+    _, graph = simulated()
+    given = measured(graph)
+    given.save(tmp_path / "graph.safetensors")
+    loaded = ObservationGraph.load(tmp_path / "graph.safetensors")
+    assert torch.equal(loaded.calibration.directions, given.calibration.directions)
+    assert torch.equal(loaded.calibration.camera.params, given.calibration.camera.params)
+    assert torch.equal(solve_graph(loaded).T_cw, solve_graph(given).T_cw)
+    graph.save(tmp_path / "exact.safetensors")
+    assert ObservationGraph.load(tmp_path / "exact.safetensors").calibration is None
+
+
+def test_graphs_with_calibrations_are_solved_as_alone():
+    _, graph = simulated()
+    given = measured(graph)
+    together = solve_graphs([given, graph, given])
+    for found, alone in zip(together, (given, graph, given), strict=True):
+        torch.testing.assert_close(found.T_cw, solve_graph(alone).T_cw, rtol=0, atol=1e-9)

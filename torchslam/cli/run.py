@@ -1,7 +1,11 @@
 """Run SLAM on a sequence and write trajectory, map, metrics and plots.
 
 Without a calibration, or with `--camera auto`, the intrinsics are estimated from the images and written to
-calibration.txt in the results.
+calibration.txt in the results. The final adjustment refines a given camera as well, which is a measurement with an
+error (--camera-std).
+
+If few frames get a pose with the default features, and the weights of XFeat are on this machine, the run is tried again
+with them, and the better run is kept; --features orb prevents it.
 
 Exit status: 0 done, 2 an error, 3 no map could be initialized or no frame could be localized; 130 and 143 ended by
 Ctrl-C and by SIGTERM (the results so far are written, and --resume continues from the last checkpoint).
@@ -12,7 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -27,6 +31,7 @@ from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
+from torchslam.features.weights import PUBLISHED, find_weights
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
 from torchslam.io.export.recording import import_rerun
@@ -45,6 +50,10 @@ from torchslam.utils.console import table
 
 DONE = 0
 NO_MAP = 3
+FEW_POSED = 0.9
+"""Ratio of posed frames below which another front end is tried."""
+LEARNED = "xfeat"
+"""The front end that is tried then."""
 CHECKPOINT_EVERY = 20  # keyframes
 GROWTH = 0.05
 """Minimum ratio of new keyframes between two checkpoints, so that all checkpoints together cost O(n)."""
@@ -64,6 +73,7 @@ class RunPlan:
         view: show the run live in rerun; `video`: write a video of the tracked frames.
         camera_std: stated relative standard deviation of the focal length; None: that of the calibration file, or of
             the configuration.
+        may_fall_back: try a learned front end if few frames are posed.
     """
 
     source: str
@@ -81,6 +91,7 @@ class RunPlan:
     video: bool = False
     fps: float | None = None
     camera_std: float | None = None
+    may_fall_back: bool = False
 
 
 class Checkpoints:
@@ -105,10 +116,6 @@ class Checkpoints:
         if at_once or keyframes - self._last >= max(self._every, GROWTH * keyframes):
             write_checkpoint(self._path, slam, so_far, sequence)
             self._last = keyframes
-
-    def remove(self) -> None:
-        """Delete the checkpoint of a finished run."""
-        self._path.unlink(missing_ok=True)
 
     def _keyframes(self) -> int:
         return sum(submap.map.num_keyframes for submap in self._run[0].atlas)
@@ -186,7 +193,11 @@ def execute(options: argparse.Namespace) -> int:
         fps=options.fps,
         camera_std=options.camera_std,
     )
-    return run(_sequence(options), arguments.config(options), plan)
+    opened, config = _sequence(options), arguments.config(options)
+    is_recorded = opened.known_length is not None and not (options.view or options.video)
+    is_default = config.features == Config().features and config.matching == Config().matching
+    is_default = is_default and options.features is None
+    return run(opened, config, replace(plan, may_fall_back=is_recorded and is_default and saved is None))
 
 
 def _sequence(options: argparse.Namespace) -> Sequence:
@@ -201,10 +212,58 @@ def _sequence(options: argparse.Namespace) -> Sequence:
     return found.with_camera(unknown_camera(found.size), Calibrated.GUESSED)
 
 
+@dataclass(frozen=True)
+class Attempt:
+    """A finished run, and what it was made with.
+
+    Attributes:
+        finished: the run.
+        sequence: with the camera of the run.
+        found: description of the camera, if it was estimated from the images.
+        latencies: milliseconds from capture to pose, of a live source.
+    """
+
+    finished: Run
+    sequence: Sequence
+    found: str
+    latencies: list[float]
+
+    @property
+    def posed_ratio(self) -> float:
+        """Ratio of the frames that have a pose in the main submap."""
+        return len(self.finished.trajectory) / max(len(self.finished.results), 1)
+
+
 def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, plan.resume)
     check_replaceable(plan.output / CALIBRATION)
+    with StopSignals() as stop_signals:
+        attempt = _attempt(sequence, config, plan, stop_signals)
+        hint = ""
+        if plan.may_fall_back and attempt.posed_ratio < FEW_POSED and not attempt.finished.interrupted:
+            attempt, hint = _fall_back(attempt, sequence, config, plan, stop_signals)
+        stop_signals.begin("when the results are written")
+        metrics = _write(attempt, plan)
+    finished = attempt.finished
+    written = {"results": plan.output, "view": plan.output / VIEW}
+    written |= {"video": plan.output / VIDEO} if plan.video else {}
+    words = summary(metrics) | {label: str(path) for label, path in written.items()}
+    print(f"\n{sequence.name}\n{table(words)}")
+    for warning in filter(None, [*result_warnings(metrics), hint]):
+        print(f"torchslam: warning: {warning}", file=sys.stderr)
+    if finished.interrupted:
+        print("torchslam: interrupted; the results so far were written", file=sys.stderr)
+        return stop_signals.status
+    (plan.output / CHECKPOINT).unlink(missing_ok=True)
+    if finished.failure:
+        print(f"torchslam: {finished.failure}", file=sys.stderr)
+        return NO_MAP
+    return DONE
+
+
+def _attempt(sequence: Sequence, config: Config, plan: RunPlan, stop_signals: StopSignals) -> Attempt:
+    """Find the camera, if it is not given, and run."""
     sequence, found = _with_camera(sequence, config, plan)
     if plan.camera_std is None:
         config = with_stated_std(config, sequence)
@@ -214,9 +273,9 @@ def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     processes = (
         1 if plan.view or plan.video else plan.processes
     )  # the viewers need the images in this process
-    with StopSignals() as stop_signals, _watching(slam, sequence, plan) as watching:
+    with _watching(slam, sequence, plan) as watching:
         is_live = not len(sequence.timestamps)
-        latencies: list[float] = []  # of a live source, in milliseconds from capture to pose
+        latencies: list[float] = []
         bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
         with bar as progress:
 
@@ -231,23 +290,40 @@ def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
                 finished = run_sequence(
                     slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
                 )
-        stop_signals.begin("when the results are written")
-        metrics = _write(finished, sequence, plan, found, latencies)
         watching.end(finished)
-    written = {"results": plan.output, "view": plan.output / VIEW}
-    written |= {"video": plan.output / VIDEO} if plan.video else {}
-    words = summary(metrics) | {label: str(path) for label, path in written.items()}
-    print(f"\n{sequence.name}\n{table(words)}")
-    for warning in result_warnings(metrics):
-        print(f"torchslam: warning: {warning}", file=sys.stderr)
-    if finished.interrupted:
-        print("torchslam: interrupted; the results so far were written", file=sys.stderr)
-        return stop_signals.status
-    checkpoints.remove()
-    if finished.failure:
-        print(f"torchslam: {finished.failure}", file=sys.stderr)
-        return NO_MAP
-    return DONE
+    return Attempt(finished, sequence, found, latencies)
+
+
+def _fall_back(
+    first: Attempt, sequence: Sequence, config: Config, plan: RunPlan, stop_signals: StopSignals
+) -> tuple[Attempt, str]:
+    """Try a learned front end where the classical one posed few frames; return the better run, and a hint.
+
+    Args:
+        first: run with the classical front end.
+        sequence, config, plan: as they were given.
+        stop_signals: of both runs.
+    """
+    few = f"{first.posed_ratio:.0%} of the frames are posed in one map"
+    if find_weights(LEARNED) is None:
+        published = PUBLISHED[LEARNED]
+        return first, (
+            f"{few}; a learned front end may pose more: `torchslam download {LEARNED}` fetches its weights "
+            f"({published.about}, {published.package.license}), and the next run will use them if it must"
+        )
+    print(f"torchslam: {few}: trying again with the features {LEARNED}", file=sys.stderr)
+    if first.finished.calibration is not None and first.found and not first.finished.failure:
+        std = first.finished.calibration.focal_std
+        sequence = sequence.with_camera(first.finished.camera.to("cpu"), std=std)
+    learned = replace(config, features=replace(config.features, kind=LEARNED))
+    second = _attempt(sequence, learned, replace(plan, checkpoint=0, resume=False), stop_signals)
+    is_better = len(second.finished.trajectory) > len(first.finished.trajectory)
+    kept = LEARNED if is_better else config.features.kind
+    print(
+        f"torchslam: {second.posed_ratio:.0%} of the frames are posed with {LEARNED}: keeping the run with {kept}",
+        file=sys.stderr,
+    )
+    return second if is_better else first, ""
 
 
 def _with_camera(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[Sequence, str]:
@@ -305,17 +381,14 @@ def _describe(camera: Camera) -> str:
     return f"{camera.model} {numbers} of {camera.width} x {camera.height} pixels"
 
 
-def _write(
-    finished: Run, sequence: Sequence, plan: RunPlan, camera: str, latencies: list[float]
-) -> dict[str, object]:
-    """Evaluate and write the run; returns the metrics.
-
-    Args:
-        camera: remark on the estimated camera.
-        latencies: milliseconds from capture to pose, of a live source.
-    """
+def _write(attempt: Attempt, plan: RunPlan) -> dict[str, object]:
+    """Evaluate and write the run; returns the metrics."""
+    finished, sequence, latencies = attempt.finished, attempt.sequence, attempt.latencies
     metrics = compute_metrics(
-        finished, sequence, camera, lambda words: print(f"torchslam: warning: {words}", file=sys.stderr)
+        finished,
+        sequence,
+        attempt.found,
+        lambda words: print(f"torchslam: warning: {words}", file=sys.stderr),
     )
     if latencies:
         median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()

@@ -82,7 +82,7 @@ def find_weights(name: str) -> Path | None:
     for folder in (*folders, downloads()):
         for suffix in SUFFIXES:
             path = folder / f"{name}{suffix}"
-            if path.is_file():
+            if os.path.isfile(path):
                 return path
     return None
 
@@ -93,7 +93,7 @@ def weights_file(weights: str | Path) -> Path:
     Raises:
         ConfigError: There is no such file, or the weights of that name are not on this machine.
     """
-    if Path(weights).is_file() or Path(weights).suffix:
+    if os.path.isfile(weights) or Path(weights).suffix:  # Path.is_file raises for a name that is too long
         return Path(weights)
     found = find_weights(str(weights))
     if found is not None:

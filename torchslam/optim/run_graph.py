@@ -108,7 +108,7 @@ class ObservationGraph:
         if self.calibration is not None:
             given = self.calibration
             parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
-            tensors |= {name: part.detach().cpu().contiguous() for name, part in parts}
+            tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
         safetensors.torch.save_file(tensors, path, metadata)

@@ -1,0 +1,78 @@
+"""Cameras with an error: what they say, what an adjustment makes of them, which two may be the same."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from torchslam.geometry import Camera
+from torchslam.geometry.camera_measurement import (
+    ERROR_FACTOR,
+    CameraMeasurement,
+    may_be_same,
+    simplify_model,
+    with_radial_terms,
+)
+
+PINHOLE = Camera.pinhole(500.0, 510.0, 320.0, 240.0, size=(640, 480))
+
+
+def test_a_given_camera_may_be_wrong_in_focal_length_and_radial_distortion() -> None:
+    given = CameraMeasurement.of(PINHOLE, 0.02)
+    assert given.camera.model == "radial_tangential"
+    std = given.covariance.diagonal().sqrt()
+    expected = torch.tensor([10.0, 10.2, 0, 0, 0.02, 0.02, 0, 0, 0], dtype=torch.float64)
+    torch.testing.assert_close(std, expected)
+    assert given.focal_std == pytest.approx(0.02)
+    assert given.radial_std == pytest.approx((0.02, 0.02))
+
+
+def test_the_information_is_the_inverse_along_the_directions() -> None:
+    given = CameraMeasurement.of(PINHOLE, 0.02)
+    step = given.directions @ torch.tensor([1.0, -2.0, 0.5], dtype=torch.float64)
+    assert float(step @ given.information @ step) == pytest.approx(1 + 4 + 0.25)
+
+
+def test_an_update_inflates_errors_of_independent_observations() -> None:
+    given = CameraMeasurement.of(PINHOLE, 0.02)
+    shrunk = torch.diag(torch.tensor([0.01, 0.04, 0.09], dtype=torch.float64))
+    moved = given.camera.with_params(given.camera.params * 1.01)
+    found = given.updated(moved, shrunk)
+    assert found.camera is moved
+    assert found.focal_std == pytest.approx(0.02 / 1.01 * 0.1 * ERROR_FACTOR)
+    assert found.radial_std == pytest.approx((0.02 * 0.2 * ERROR_FACTOR, 0.02 * 0.3 * ERROR_FACTOR))
+
+
+def test_departure_counts_standard_deviations_of_the_focal_length() -> None:
+    given = CameraMeasurement.of(PINHOLE, 0.02)
+    longer = PINHOLE.with_params(PINHOLE.params * torch.tensor([math.exp(0.06), math.exp(0.06), 1, 1]))
+    assert given.departure(longer) == pytest.approx(3.0)
+    assert CameraMeasurement.of(PINHOLE, 0.0).departure(longer) == 0.0
+
+
+@pytest.mark.parametrize(
+    ("factor", "shift", "std", "expected"),
+    [
+        (1.0, 0.0, 0.0, True),
+        (1.01, 0.0, 0.0, False),
+        (1.05, 0.0, 0.02, True),
+        (1.11, 0.0, 0.02, False),
+        (1.0, 0.01, 0.02, False),  # the principal point is never adjusted
+    ],
+)
+def test_a_found_camera_may_be_the_given_one(factor: float, shift: float, std: float, expected: bool) -> None:
+    fx, fy, cx, cy = PINHOLE.params.tolist()
+    found = Camera.pinhole(factor * fx, factor * fy, cx + shift, cy, size=PINHOLE.size)
+    assert may_be_same(with_radial_terms(found), PINHOLE, std) is expected
+
+
+def test_a_fisheye_is_not_a_pinhole() -> None:
+    fisheye = Camera.fisheye(500.0, 510.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0, size=(640, 480))
+    assert not may_be_same(fisheye, PINHOLE, 0.02)
+
+
+def test_a_pinhole_without_distortion_stays_one() -> None:
+    assert simplify_model(with_radial_terms(PINHOLE)).model == "pinhole"
+    assert with_radial_terms(PINHOLE).params[:4].tolist() == PINHOLE.params.tolist()
