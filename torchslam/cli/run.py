@@ -4,8 +4,8 @@ Without a calibration, or with `--camera auto`, the intrinsics are estimated fro
 calibration.txt in the results. The final adjustment refines a given camera as well, which is a measurement with an
 error (--camera-std).
 
-If few frames get a pose with the default features, and the weights of XFeat are on this machine, the run is tried again
-with them, and the better run is kept; --features orb prevents it.
+If few frames get a pose with the default features, and the weights of XFeat and LightGlue are on this machine, the run is
+tried again with them, and the better run is kept; --features orb prevents it.
 
 Exit status: 0 done, 2 an error, 3 no map could be initialized or no frame could be localized; 130 and 143 ended by
 Ctrl-C and by SIGTERM (the results so far are written, and --resume continues from the last checkpoint).
@@ -52,8 +52,8 @@ DONE = 0
 NO_MAP = 3
 FEW_POSED = 0.9
 """Ratio of posed frames below which another front end is tried."""
-LEARNED = "xfeat"
-"""The front end that is tried then."""
+LEARNED = "xfeat-lighterglue"
+"""Weights of the front end that is tried then: XFeat, matched by LightGlue."""
 CHECKPOINT_EVERY = 20  # keyframes
 GROWTH = 0.05
 """Minimum ratio of new keyframes between two checkpoints, so that all checkpoints together cost O(n)."""
@@ -308,14 +308,18 @@ def _fall_back(
     if find_weights(LEARNED) is None:
         published = PUBLISHED[LEARNED]
         return first, (
-            f"{few}; a learned front end may pose more: `torchslam download {LEARNED}` fetches its weights "
+            f"{few}; learned features may pose more: `torchslam download {LEARNED}` fetches their weights "
             f"({published.about}, {published.package.license}), and the next run will use them if it must"
         )
-    print(f"torchslam: {few}: trying again with the features {LEARNED}", file=sys.stderr)
+    print(f"torchslam: {few}: trying again with {LEARNED}", file=sys.stderr)
     if first.finished.calibration is not None and first.found and not first.finished.failure:
         std = first.finished.calibration.focal_std
         sequence = sequence.with_camera(first.finished.camera.to("cpu"), std=std)
-    learned = replace(config, features=replace(config.features, kind=LEARNED))
+    learned = replace(
+        config,
+        features=replace(config.features, kind="xfeat", weights=LEARNED),
+        matching=replace(config.matching, matcher="lightglue", weights=LEARNED),
+    )
     second = _attempt(sequence, learned, replace(plan, checkpoint=0, resume=False), stop_signals)
     is_better = len(second.finished.trajectory) > len(first.finished.trajectory)
     kept = LEARNED if is_better else config.features.kind

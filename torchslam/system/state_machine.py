@@ -22,6 +22,8 @@ from torchslam.tracking.pose_validation import check_map_agreement, check_pose_q
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
 
+_MANY_PENDING = 40
+"""Frames that are held back and kept when the camera is lost: a wrong pose does not last that long."""
 _FRAMES_PER_KEYFRAME = 2
 """Frames that a keyframe is worth in the confirmation of a map: views far apart contradict a wrong one sooner."""
 
@@ -391,8 +393,10 @@ class StateMachine:
             submap.posed_frames.add(*pending)
 
     def _on_lost(self, view: FrameFeatures) -> FrameOutcome:
-        """Frames that are held back are unposed again; a provisional map is discarded."""
+        """Frames that are held back are unposed again, unless they are many; a provisional map is discarded."""
         self.keyframe_actions.apply_pending_adjustment()
+        if len(self.context.confirmation.views()) >= _MANY_PENDING:
+            self._keep_uncertain()
         self.tentative.rollback(self.active_map.current)
         self.backward.unposed.add(*self.context.confirmation.views(), view)
         is_discarded = self.initialization.on_lost()

@@ -17,6 +17,9 @@ from torchslam.geometry.transforms import rotation_angle
 from torchslam.map.atlas import TrackingState
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
 
+SURE_INLIERS = 60
+"""Number of inliers with which a large turn is believed: where views are far apart, the motion model is no prediction."""
+
 
 def validate_pose(
     estimate: PoseEstimate,
@@ -51,7 +54,8 @@ def check_pose_quality(
     if predicted_T_cw is None:
         return None
     moved, turned = jump(estimate, predicted_T_cw)
-    if moved > settings.max_jump or turned > settings.max_turn_deg:
+    is_turn_odd = turned > settings.max_turn_deg and estimate.inliers < SURE_INLIERS
+    if moved > settings.max_jump or is_turn_odd:
         return Rejection.of(Reason.JUMP, translation=moved, degrees=turned)
     return None
 
