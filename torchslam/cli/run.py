@@ -4,8 +4,8 @@ Without a calibration, or with `--camera auto`, the intrinsics are estimated fro
 calibration.txt in the results. The final adjustment refines a given camera as well, which is a measurement with an
 error (--camera-std).
 
-If few frames get a pose with the default features, and the weights of XFeat and LightGlue are on this machine, the run is
-tried again with them, and the better run is kept; --features orb prevents it.
+If few frames get a pose with the default features, and the weights of XFeat and LightGlue are on this machine, the run
+is tried again with them, and the better run is kept; --features orb prevents it.
 
 Exit status: 0 done, 2 an error, 3 no map could be initialized or no frame could be localized; 130 and 143 ended by
 Ctrl-C and by SIGTERM (the results so far are written, and --resume continues from the last checkpoint).

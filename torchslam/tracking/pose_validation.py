@@ -18,7 +18,7 @@ from torchslam.map.atlas import TrackingState
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
 
 SURE_INLIERS = 60
-"""Number of inliers with which a large turn is believed: where views are far apart, the motion model is no prediction."""
+"""Number of inliers with which a large turn is believed: where views are far apart, the motion model fails."""
 
 
 def validate_pose(
