@@ -123,11 +123,16 @@ def test_a_pose_that_disagrees_with_its_matches_is_not_mapped(
     assert (len(set(grown[DOUBTED[0] - 1 : DOUBTED[-1] + 1])) > 1) is is_mapped
 
 
-def test_a_frame_with_independent_motion_is_mapped_tentatively(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without new points a moving camera would be lost before it is clear what moves."""
+@pytest.mark.parametrize(
+    ("rejection", "is_mapped"), [(Reason.MOVING_REMAINDER, True), (Reason.MOVING_MAJORITY, False)]
+)
+def test_a_frame_with_independent_motion_is_mapped_tentatively(
+    rejection: Reason, is_mapped: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without new points a moving camera would be lost before it is clear what moves; most of the image may not."""
     slam = doubting(monkeypatch, DOUBTED, "check_map_agreement")
     monkeypatch.setattr(following, "check_map_agreement", lambda *_: None)
-    moving = replace(NO_MOVEMENT, rejection=ODD)
+    moving = replace(NO_MOVEMENT, rejection=Rejection(rejection, {"count": 30}))
     monkeypatch.setattr(
         slam.non_static_filter,
         "detect_independent_motion",
@@ -136,7 +141,18 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(monkeypatch: pyte
     grown: list[int] = []
     states = shown(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
-    assert len(set(grown[DOUBTED[0] - 1 : DOUBTED[-1] + 1])) > 1
+    assert (len(set(grown[DOUBTED[0] - 1 : DOUBTED[-1] + 1])) > 1) is is_mapped
+
+
+def test_many_frames_that_are_held_back_are_kept_when_the_camera_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    leaves = 75
+    slam = doubting(monkeypatch, range(22, 200))
+    states = shown(slam, Leaving(arc(120)[: leaves + 3], leaves))
+    assert states[leaves - 1] is State.UNCERTAIN
+    assert states[leaves + 1] is State.LOST
+    assert len(slam.trajectory()) == leaves
 
 
 def test_tentative_frames_at_the_end_keep_their_poses(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,8 +24,8 @@ MIN_SHARED = 15  # points that two keyframes share, to count as covisible
 # Median of squared errors after an adjustment, in units of the stated noise, where that is right: points are fitted to
 # the pixels, and ORB is precise to half its scale. 0.05 to 0.26 with ORB on real sequences, 0.4 to 0.6 with XFeat,
 # blurred images or a rolling shutter.
-_ADJUSTED_SQUARED_ERROR = 0.1
-_MAX_NOISE_VARIANCE = 6.0  # beyond it, errors are not noise
+_ADJUSTED_SQUARED_ERROR = 0.2
+_MAX_NOISE_VARIANCE = 4.0  # beyond it, errors are not noise
 _PRIOR_ADJUSTMENTS, _REMEMBERED_ADJUSTMENTS = 3, 20
 SESSION_BITS = 40  # of a key, below the number of the session: more frames than a session has
 

@@ -290,13 +290,16 @@ class StateMachine:
         )
         motion = NO_MOVEMENT
         if rejection is None:
-            noise_variance = submap.map.noise_variance
-            motion = context.non_static_filter.detect_independent_motion(estimate, noise_variance)
+            motion = context.non_static_filter.detect_independent_motion(estimate)
         if not (rejection or motion.rejection or context.confirmation.is_holding):
             return self._on_certain(view, estimate, motion.note)
         # Where views are far apart, the motion model is wrong and not the pose.
         is_plausible = quality_rejection is None or quality_rejection.reason is Reason.JUMP
-        if is_plausible and self._may_map_tentatively(rejection or motion.rejection):
+        has_moving_majority = (
+            motion.rejection is not None and motion.rejection.reason is Reason.MOVING_MAJORITY
+        )
+        may_map = self._may_map_tentatively(rejection or motion.rejection)
+        if is_plausible and not has_moving_majority and may_map:
             self.tentative.add_keyframe(submap, view, estimate)
         return self._on_uncertain(view, estimate, rejection or motion.rejection)
 

@@ -118,19 +118,13 @@ class IndependentMotion:
             return view
         return replace(view, mask=view.mask & ~self._mover.belongs)
 
-    def observe(self, view: FrameFeatures, estimate: PoseEstimate, noise_variance: float = 1.0) -> Movement:
-        """Compare a posed frame, with all its keypoints, with one some frames earlier.
-
-        Args:
-            view: the frame.
-            estimate: its pose.
-            noise_variance: of its keypoints, in units of what the front end states.
-        """
+    def observe(self, view: FrameFeatures, estimate: PoseEstimate) -> Movement:
+        """Compare a posed frame, with all its keypoints, with one some frames earlier."""
         mover, seen = self._mover, view.keypoints[estimate.keypoints]
         if mover is not None and self._area(mover.pixels) > self.settings.max_area_ratio * self._area(seen):
             return Movement(Rejection.of(Reason.MOVING_MAJORITY))
         if self._last is None or self._frames_since_comparison >= self.settings.frame_interval:
-            return self._compare(view, estimate.T_cw, estimate.depth, noise_variance)
+            return self._compare(view, estimate.T_cw, estimate.depth)
         return NO_MOVEMENT
 
     def _followed(self, mover: _Mover, view: FrameFeatures) -> _Mover | None:
@@ -152,9 +146,7 @@ class IndependentMotion:
         motion = (view.keypoints[matches.indices_2[0][found]] - mover.pixels[found]).median(0).values
         return _Mover.of(view, self._is_near_group(view.keypoints, mover.pixels + motion, mover.rest), motion)
 
-    def _compare(
-        self, view: FrameFeatures, T_cw: Tensor | None, depth: float, noise_variance: float = 1.0
-    ) -> Movement:
+    def _compare(self, view: FrameFeatures, T_cw: Tensor | None, depth: float) -> Movement:
         """Compare with the last observation: what moves against the scene, and what of the object moves rigidly."""
         last = self._last
         none = torch.zeros_like(view.mask, dtype=torch.int64)
@@ -165,7 +157,7 @@ class IndependentMotion:
             return NO_MOVEMENT
         frames = view.index - last.view.index
         first, second = match_views(last.view, view, self.matching)
-        strays = self._errors(last, look, first, second) > self.settings.min_error_px * noise_variance**0.5
+        strays = self._errors(last, look, first, second) > self.settings.min_error_px
         patience = last.patience[first] - int(T_cw is not None and last.T_cw is not None)
         known = ~strays & (patience > 0)
         moving = self._rigid_group(last.view, view, first, second, strays)
@@ -291,11 +283,11 @@ class NonStaticFilter:
         self._without_overlays = self.static_overlay.mask_out(view)
         return self.independent_motion.mask_out(self._without_overlays)
 
-    def detect_independent_motion(self, estimate: PoseEstimate, noise_variance: float = 1.0) -> Movement:
-        """Detect keypoints of the newest view that move against the scene, given the view's pose and their noise."""
+    def detect_independent_motion(self, estimate: PoseEstimate) -> Movement:
+        """Detect keypoints of the newest view that move against the scene, given the view's pose."""
         if not self.config.independent_motion.enabled:
             return NO_MOVEMENT
-        return self.independent_motion.observe(self._without_overlays, estimate, noise_variance)
+        return self.independent_motion.observe(self._without_overlays, estimate)
 
     def update_overlay(self, T_cw: Float[Tensor, "4 4"], depth: float) -> bool:
         """Update the overlays with the newest view and its pose; return whether there are new ones."""
