@@ -302,9 +302,9 @@ def _broken(default: Any, allowed: Allowed) -> st.SearchStrategy[Any]:
     if isinstance(default, bool):
         return st.sampled_from([*other_types, 0, 1, 1.0, "true"])
     if isinstance(default, str):
-        words = (
-            st.text().filter(lambda word: word not in allowed.choices) if allowed.choices else st.nothing()
-        )
+        # A word with a colon may name a plugin, PACKAGE:NAME.
+        unknown = st.text().filter(lambda word: word not in allowed.choices and ":" not in word)
+        words = unknown if allowed.choices else st.nothing()
         return st.sampled_from([*other_types, 0, True]) | words
     numbers = st.integers(max_value=int(allowed.low) - 1)
     if isinstance(default, int):
