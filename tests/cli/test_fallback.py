@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
@@ -56,9 +57,11 @@ def test_the_run_with_more_poses_is_kept(
     """Of runs with equally many poses, the first one."""
     attempt, tried = command._attempt, list[Config]()
 
-    def attempted(sequence: Sequence, config: Config, plan: RunPlan, signals: StopSignals) -> Attempt:
+    def attempted(
+        sequence: Sequence, config: Config, plan: RunPlan, signals: StopSignals, viewers: ExitStack
+    ) -> Attempt:
         tried.append(config)
-        made = attempt(sequence, Config(), plan, signals)
+        made = attempt(sequence, Config(), plan, signals, viewers)
         if len(tried) - 1 != without_map:
             return made
         return replace(made, finished=replace(made.finished, submaps=()))

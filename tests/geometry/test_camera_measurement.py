@@ -22,7 +22,7 @@ PINHOLE = Camera.pinhole(500.0, 510.0, 320.0, 240.0, size=(640, 480))
 def test_a_given_camera_may_be_wrong_in_focal_length_and_radial_distortion() -> None:
     given = CameraMeasurement.of(PINHOLE, 0.02)
     assert given.camera.model == "radial_tangential"
-    std = given.covariance.diagonal().sqrt()
+    std = given.directions.norm(dim=-1)
     expected = torch.tensor([10.0, 10.2, 0, 0, 0.02, 0.02, 0, 0, 0], dtype=torch.float64)
     torch.testing.assert_close(std, expected)
     assert given.focal_std == pytest.approx(0.02)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -221,12 +222,14 @@ class Attempt:
         sequence: with the camera of the run.
         found: description of the camera, if it was estimated from the images.
         latencies: milliseconds from capture to pose, of a live source.
+        watching: the viewers, open until the results are written.
     """
 
     finished: Run
     sequence: Sequence
     found: str
     latencies: list[float]
+    watching: FrameViewers
 
     @property
     def posed_ratio(self) -> float:
@@ -238,13 +241,14 @@ def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
     prepare(plan.output, plan.overwrite, plan.resume)
     check_replaceable(plan.output / CALIBRATION)
-    with StopSignals() as stop_signals:
-        attempt = _attempt(sequence, config, plan, stop_signals)
+    with StopSignals() as stop_signals, ExitStack() as viewers:
+        attempt = _attempt(sequence, config, plan, stop_signals, viewers)
         hint = ""
         if plan.may_fall_back and attempt.posed_ratio < FEW_POSED and not attempt.finished.interrupted:
-            attempt, hint = _fall_back(attempt, sequence, config, plan, stop_signals)
+            attempt, hint = _fall_back(attempt, sequence, config, plan, stop_signals, viewers)
         stop_signals.begin("when the results are written")
         metrics = _write(attempt, plan)
+        attempt.watching.end(attempt.finished)
     finished = attempt.finished
     written = {"results": plan.output, "view": plan.output / VIEW}
     written |= {"video": plan.output / VIDEO} if plan.video else {}
@@ -262,7 +266,9 @@ def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     return DONE
 
 
-def _attempt(sequence: Sequence, config: Config, plan: RunPlan, stop_signals: StopSignals) -> Attempt:
+def _attempt(
+    sequence: Sequence, config: Config, plan: RunPlan, stop_signals: StopSignals, viewers: ExitStack
+) -> Attempt:
     """Find the camera, if it is not given, and run."""
     sequence, found = _with_camera(sequence, config, plan)
     if plan.camera_std is None:
@@ -273,36 +279,38 @@ def _attempt(sequence: Sequence, config: Config, plan: RunPlan, stop_signals: St
     processes = (
         1 if plan.view or plan.video else plan.processes
     )  # the viewers need the images in this process
-    with _watching(slam, sequence, plan) as watching:
-        is_live = not len(sequence.timestamps)
-        latencies: list[float] = []
-        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
-        with bar as progress:
+    watching = viewers.enter_context(_watching(slam, sequence, plan))
+    is_live = not len(sequence.timestamps)
+    latencies: list[float] = []
+    bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
+    with bar as progress:
 
-            def after_frame(result: StepResult) -> None:
-                if is_live:
-                    latencies.append(1e3 * (time.time() - result.timestamp))
-                checkpoints.offer(at_once=stop_signals.is_wanted)
-                watching.show(result)
-                progress.update(result)
+        def after_frame(result: StepResult) -> None:
+            if is_live:
+                latencies.append(1e3 * (time.time() - result.timestamp))
+            checkpoints.offer(at_once=stop_signals.is_wanted)
+            watching.show(result)
+            progress.update(result)
 
-            with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
-                finished = run_sequence(
-                    slam, watching.sequence, after_frame, so_far, progress.adjusting, frames
-                )
-        watching.end(finished)
-    return Attempt(finished, sequence, found, latencies)
+        with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
+            finished = run_sequence(slam, watching.sequence, after_frame, so_far, progress.adjusting, frames)
+    return Attempt(finished, sequence, found, latencies, watching)
 
 
 def _fall_back(
-    first: Attempt, sequence: Sequence, config: Config, plan: RunPlan, stop_signals: StopSignals
+    first: Attempt,
+    sequence: Sequence,
+    config: Config,
+    plan: RunPlan,
+    stop_signals: StopSignals,
+    viewers: ExitStack,
 ) -> tuple[Attempt, str]:
     """Try a learned front end where the classical one posed few frames; return the better run, and a hint.
 
     Args:
         first: run with the classical front end.
         sequence, config, plan: as they were given.
-        stop_signals: of both runs.
+        stop_signals, viewers: of both runs.
     """
     few = f"{first.posed_ratio:.0%} of the frames are posed in one map"
     if find_weights(LEARNED) is None:
@@ -320,7 +328,7 @@ def _fall_back(
         features=replace(config.features, kind="xfeat", weights=LEARNED),
         matching=replace(config.matching, matcher="lightglue", weights=LEARNED),
     )
-    second = _attempt(sequence, learned, replace(plan, checkpoint=0, resume=False), stop_signals)
+    second = _attempt(sequence, learned, replace(plan, checkpoint=0, resume=False), stop_signals, viewers)
     is_better = len(second.finished.trajectory) > len(first.finished.trajectory)
     kept = LEARNED if is_better else config.features.kind
     print(

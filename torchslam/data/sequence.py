@@ -110,7 +110,7 @@ class Sequence(ABC):
             raise CalibrationError(
                 f"{self.name}: a camera for images of {camera.size}, these are {self.size}"
             )
-        self._camera, self.calibrated = camera, Calibrated.GIVEN
+        self._camera, self.calibrated, self.camera_std = camera, Calibrated.GIVEN, None
 
     @property
     def known_length(self) -> int | None:

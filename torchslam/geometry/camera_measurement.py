@@ -50,11 +50,6 @@ class CameraMeasurement:
         return cls(camera, std * intrinsics_directions(camera, [FOCAL, K1, K2]))
 
     @property
-    def covariance(self) -> Float[Tensor, "P P"]:
-        """The covariance of the parameters."""
-        return self.directions @ self.directions.mT
-
-    @property
     def information(self) -> Float[Tensor, "P P"]:
         """The information of the parameters, zero across the directions."""
         inverse = torch.linalg.pinv(self.directions)

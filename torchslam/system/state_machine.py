@@ -306,9 +306,11 @@ class StateMachine:
     def finalize(self) -> None:
         """End the session: frames that are held back keep their poses, uncertain as they are."""
         if self.active_map.submap is not None:
+            has_new_keyframes = self.tentative.has_keyframes
             self._keep_uncertain()
             self.keyframe_actions.apply_pending_adjustment()
-            self.keyframe_actions.detect_loop()
+            if has_new_keyframes:
+                self.keyframe_actions.detect_loop()
         self.initialization.confirm_map()
 
     def confirm_map(self) -> None:
@@ -378,6 +380,7 @@ class StateMachine:
                 self._keep_uncertain()
             self.active_map.set_state(State.UNCERTAIN)
             return FrameOutcome([rejection or confirmation.reason], submap, estimate)
+        has_new_keyframes = self.tentative.has_keyframes  # whose adjustments are applied: none is pending
         self.tentative.commit(submap)
         was_relocalized, frames = confirmation.is_relocalized, confirmation.confirm()
         self.mapping.add_pending_frames(submap, frames)
@@ -385,7 +388,8 @@ class StateMachine:
             first, first_estimate, _, _ = frames[0]
             self.backward.from_frame(submap, first, first_estimate)
         self.active_map.set_state(State.TRACKING)
-        self.keyframe_actions.detect_loop()
+        if has_new_keyframes:
+            self.keyframe_actions.detect_loop()
         return FrameOutcome([], self.active_map.current, estimate)
 
     def _keep_uncertain(self) -> None:
