@@ -14,9 +14,9 @@ from torchslam.config.schema import scale_pixel_settings
 from torchslam.data import open_sequence
 from torchslam.data.transforms import resize
 from torchslam.features import match
-from torchslam.system.front_end import image_extractor
+from torchslam.system.front_end import WithFeatures, image_extractor
 from torchslam.system.run import Run
-from torchslam.types import Features
+from torchslam.types import Features, Frame
 
 WALK = "synthetic:room?frames=20"
 GROWING = {
@@ -116,3 +116,17 @@ def test_a_trajectory_is_the_same_at_another_image_size() -> None:
     assert max(keyframes) <= 1.3 * min(keyframes)
     assert large.camera.size == (1920, 1440)
     assert float(large.graph.pixels[:, 0].max()) > 1280
+
+
+def test_features_of_a_sequence_keep_no_activations() -> None:
+    gain = torch.ones((), requires_grad=True)
+
+    def extract(frame: Frame) -> Features:
+        features = image_extractor(Config())(frame)
+        return replace(features, descriptors=features.descriptors.float() * gain)
+
+    frames = WithFeatures(open_sequence(WALK), extract)
+    found, again = frames[0].features, frames.features(0)
+    assert found is not None and again is not None
+    assert found.mask.any() and not found.descriptors.requires_grad
+    assert torch.equal(found.descriptors, again.descriptors)

@@ -178,6 +178,8 @@ class Simulated:
 class WithFeatures(Transformed):
     """A sequence whose frames bring features, extracted when they are read.
 
+    The features have no gradient: who keeps them would keep all activations of a learned front end.
+
     Args:
         extract: function from a frame to its features
     """
@@ -193,8 +195,9 @@ class WithFeatures(Transformed):
 
     def features(self, index: int) -> Features | None:
         """The features of the frame of an index."""
-        return self._extract(self._whole[index])
+        return self[index].features
 
+    @torch.no_grad()
     def __getitem__(self, index: int) -> Frame:
         frame = self._whole[index]
         return replace(frame, features=self._extract(frame))
