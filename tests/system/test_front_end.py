@@ -127,6 +127,8 @@ def test_features_of_a_sequence_keep_no_activations() -> None:
 
     frames = WithFeatures(open_sequence(WALK), extract)
     found, again = frames[0].features, frames.features(0)
-    assert found is not None and again is not None
-    assert found.mask.any() and not found.descriptors.requires_grad
+    assert found is not None
+    assert again is not None
+    assert found.mask.any()
+    assert not found.descriptors.requires_grad
     assert torch.equal(found.descriptors, again.descriptors)

@@ -55,6 +55,8 @@ FEW_POSED = 0.9
 """Ratio of posed frames below which another front end is tried."""
 LEARNED = "xfeat-lighterglue"
 """Weights of the front end that is tried then: XFeat, matched by LightGlue."""
+LEARNED_WAIT = 3
+"""Frames after a loss before it starts another submap: views are far apart then, and its submaps are joined later."""
 CHECKPOINT_EVERY = 20  # keyframes
 GROWTH = 0.05
 """Minimum ratio of new keyframes between two checkpoints, so that all checkpoints together cost O(n)."""
@@ -327,6 +329,7 @@ def _fall_back(
         config,
         features=replace(config.features, kind="xfeat", weights=LEARNED),
         matching=replace(config.matching, matcher="lightglue", weights=LEARNED),
+        relocalization=replace(config.relocalization, frames_before_new_submap=LEARNED_WAIT),
     )
     second = _attempt(sequence, learned, replace(plan, checkpoint=0, resume=False), stop_signals, viewers)
     is_better = len(second.finished.trajectory) > len(first.finished.trajectory)

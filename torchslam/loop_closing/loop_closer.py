@@ -23,7 +23,7 @@ from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import match_in_keyframes, merge_points
 from torchslam.optim import PoseGraph, pose_graph_optimize
 from torchslam.tracking.relocalization import Candidate
-from torchslam.types import FrameFeatures
+from torchslam.types import FrameFeatures, Matcher
 
 MIN_ESSENTIAL_WEIGHT = 100  # shared points of two keyframes with an edge in addition to the spanning tree
 _MAX_STRONG_EDGES = 20  # of a keyframe
@@ -39,12 +39,12 @@ class LoopCloser:
         loop_precheck: key of the last keyframe of `precheck`, and whether a loop was detected.
     """
 
-    def __init__(self, camera: Camera, config: Config, atlas: Atlas) -> None:
+    def __init__(self, camera: Camera, config: Config, atlas: Atlas, matcher: Matcher | None = None) -> None:
         self.camera = camera
         self.config = config
         self.atlas = atlas
         self.keyframe_database = KeyframeDatabase()
-        self.loop_detector = LoopDetector(camera, config, atlas, self.keyframe_database)
+        self.loop_detector = LoopDetector(camera, config, atlas, self.keyframe_database, matcher)
         self.loop_closures: list[LoopClosureRecord] = []
         self.loop_precheck: tuple[int, bool] | None = None
         for submap in atlas:

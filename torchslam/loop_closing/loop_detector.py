@@ -21,6 +21,7 @@ from torchslam.loop_closing.relative_sim3 import (
 )
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
+from torchslam.types import Matcher
 
 _AROUND = 20  # keyframes that share most points with the new one: their places are known
 _NUM_VERIFYING = 5  # covisible keyframes that verify a candidate
@@ -79,12 +80,18 @@ class LoopDetector:
     """Detects whether a new keyframe shows a known place."""
 
     def __init__(
-        self, camera: Camera, config: Config, atlas: Atlas, keyframe_database: KeyframeDatabase
+        self,
+        camera: Camera,
+        config: Config,
+        atlas: Atlas,
+        keyframe_database: KeyframeDatabase,
+        matcher: Matcher | None = None,
     ) -> None:
         self.camera = camera
         self.config = config
         self.atlas = atlas
         self.keyframe_database = keyframe_database
+        self.matcher = matcher
 
     def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
         """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
@@ -118,7 +125,7 @@ class LoopDetector:
     ) -> RelativeSim3 | None:
         """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
         relation = estimate_relative_sim3(
-            submap.map, keyframe, other.map, matched_keyframe, self.camera, self.config
+            submap.map, keyframe, other.map, matched_keyframe, self.camera, self.config, self.matcher
         )
         if relation is None:
             return None

@@ -23,9 +23,9 @@ from torchslam.geometry import (
 from torchslam.geometry.ransac import samples_needed
 from torchslam.map.map import Map
 from torchslam.optim import refine_pose
-from torchslam.tracking.data_association import match_views
 from torchslam.tracking.localizer import match_projected_points, project_points
-from torchslam.tracking.matcher import DescriptorMatcher
+from torchslam.tracking.matcher import DescriptorMatcher, run_matcher
+from torchslam.types import Matcher
 
 _RADIUS_PX = 8.0  # around the projection by a first similarity
 _AROUND = 10  # keyframes whose points are searched for in the other map
@@ -53,13 +53,29 @@ class RelativeSim3:
 
 
 def estimate_relative_sim3(
-    map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
+    map_1: Map,
+    keyframe_1: int,
+    map_2: Map,
+    keyframe_2: int,
+    camera: Camera,
+    config: Config,
+    matcher: Matcher | None = None,
 ) -> RelativeSim3 | None:
     """Estimate the Sim(3) between two maps from a keyframe of each; None if it is not certain.
 
     Both may be the same map: then the Sim(3) is the drift between the two keyframes.
+
+    Args:
+        map_1: The first map.
+        keyframe_1: Row of its keyframe.
+        map_2: The second map.
+        keyframe_2: Row of its keyframe.
+        camera: Of both keyframes.
+        config: Thresholds, and the descriptor matcher of guided matching.
+        matcher: Of the two keyframes; by descriptors if None.
     """
-    T_12 = _first_guess(map_1, keyframe_1, map_2, keyframe_2, camera, config)
+    matcher = matcher or DescriptorMatcher(config.matching)
+    T_12 = _first_guess(map_1, keyframe_1, map_2, keyframe_2, camera, config, matcher)
     if T_12 is None:
         return None
     points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
@@ -162,17 +178,24 @@ def inlier_matches(
 
 
 def _first_guess(
-    map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int, camera: Camera, config: Config
+    map_1: Map,
+    keyframe_1: int,
+    map_2: Map,
+    keyframe_2: int,
+    camera: Camera,
+    config: Config,
+    matcher: Matcher,
 ) -> Float[Tensor, "4 4"] | None:
     """The pose of keyframe 1 in map 2, from points that both keyframes observe; None if none was found."""
     view_1, view_2 = map_1.frame_features(keyframe_1), map_2.frame_features(keyframe_2)
     points_1 = map_1.keyframes["point_ids"][keyframe_1]
     points_2 = map_2.keyframes["point_ids"][keyframe_2]
-    rows_1, rows_2 = match_views(
+    pairs = run_matcher(
+        matcher,
         replace(view_1, mask=view_1.mask & (points_1 >= 0)),
         replace(view_2, mask=view_2.mask & (points_2 >= 0)),
-        config.matching,
     )
+    rows_1, rows_2 = pairs.first, pairs.second
     if len(rows_1) < _NEEDED:
         return None
     T_1, T_2 = map_1.T_cw[keyframe_1], map_2.T_cw[keyframe_2]

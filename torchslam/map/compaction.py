@@ -49,14 +49,14 @@ def remove_keyframes(submap: Submap, keyframes: Int[Tensor, " R"]) -> RowRemap:
     keyframe that still observes them; those that fewer than two observe become invalid.
 
     Raises:
-        ValueError: The first keyframe, which fixes the gauge, or the reference keyframe of tracking is among them.
+        ValueError: The reference keyframe of tracking is among them.
     """
     slam_map, posed_frames = submap.map, submap.posed_frames
     count, device = slam_map.num_keyframes, slam_map.T_cw.device
     removed = torch.zeros(count, dtype=torch.bool, device=device)
     removed[keyframes] = True
-    if bool(removed[0]) or (submap.tracking.reference >= 0 and bool(removed[submap.tracking.reference])):
-        raise ValueError("the first keyframe and the reference keyframe of tracking cannot be removed")
+    if submap.tracking.reference >= 0 and bool(removed[submap.tracking.reference]):
+        raise ValueError("the reference keyframe of tracking cannot be removed")
     replacement = torch.arange(count, device=device)
     for keyframe in torch.nonzero(removed)[:, 0].tolist():
         replacement[keyframe] = replacement_keyframe(slam_map, keyframe, removed)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -109,6 +110,15 @@ class PosedFrames:
             T_cw, timestamps = T_cw[rows], timestamps[rows]
         order = torch.argsort(timestamps, stable=True)
         return Trajectory(timestamps[order].clone(), se3_inverse(T_cw[order]))
+
+    def remove(self, frames: Iterable[int]) -> None:
+        """Remove frames, by their indices, and their observations."""
+        gone = self.frames["frame_index"].new_tensor(sorted(frames))
+        kept = ~torch.isin(self.frames["frame_index"], gone)
+        rows = torch.cumsum(kept, 0) - 1
+        self.observations.keep(torch.nonzero(kept[self.observations["frame_row"]])[:, 0])
+        self.observations["frame_row"][:] = rows[self.observations["frame_row"]]
+        self.frames.keep(torch.nonzero(kept)[:, 0])
 
     def rescale(self, factors: Float[Tensor, " K"]) -> None:
         """Scale the translations relative to each keyframe by its factor."""

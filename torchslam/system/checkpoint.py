@@ -1,8 +1,9 @@
 """Checkpoints: the state of a run between two frames in one file, from which the run can be resumed.
 
 A checkpoint is a map file with more in it: results so far, tracking state, evidence of static overlays. Frames that
-wait for a pose are left out and stay without one, and so is the frame that the next one would be compared with. There
-is no provisional map and no held-back frame, since no checkpoint is written then (`SLAM.can_checkpoint`).
+wait for a pose are left out and stay without one, and so are the frame that the next one would be compared with and a
+pending check of a map's start, which is left as it is. There is no provisional map and no held-back frame, since no
+checkpoint is written then (`SLAM.can_checkpoint`).
 """
 
 from __future__ import annotations

@@ -121,7 +121,7 @@ class SLAM:
         self.last_features: FrameFeatures | None = None  # of the last frame, before masking
         self.tracker.set_counting(session.mapping)
         self.mapper.adjustment.drop()
-        self.loop_closer = LoopCloser(self.camera, self.scaled_config, self.atlas)
+        self.loop_closer = LoopCloser(self.camera, self.scaled_config, self.atlas, self.matcher)
         self.non_static_filter = NonStaticFilter(self.camera, self.scaled_config)
         state = State.LOST if len(self.atlas) else State.INITIALIZING
         self._active_map = ActiveMap(submap, state if submap is None else State.TRACKING)

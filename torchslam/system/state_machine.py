@@ -16,14 +16,18 @@ from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.mapping.mapper import MapInitializer
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, TentativeMapping
 from torchslam.system.session import SystemContext
+from torchslam.system.start_check import StartCheck
 from torchslam.tracking.initialization import Initializer, ProvisionalMap
 from torchslam.tracking.non_static import NO_MOVEMENT
-from torchslam.tracking.pose_validation import check_map_agreement, check_pose_quality
+from torchslam.tracking.pose_validation import (
+    SURE_INLIERS,
+    PendingFrame,
+    check_map_agreement,
+    check_pose_quality,
+)
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
 
-_MANY_PENDING = 40
-"""Frames that are held back and kept when the camera is lost: a wrong pose does not last that long."""
 _FRAMES_PER_KEYFRAME = 2
 """Frames that a keyframe is worth in the confirmation of a map: views far apart contradict a wrong one sooner."""
 
@@ -52,8 +56,8 @@ class InitializationState:
         provisional: the active submap, until enough frames were tracked in it to confirm it.
     """
 
-    def __init__(self, context: SystemContext, backward: BackwardTracking) -> None:
-        self.context, self.backward = context, backward
+    def __init__(self, context: SystemContext, backward: BackwardTracking, start_check: StartCheck) -> None:
+        self.context, self.backward, self.start_check = context, backward, start_check
         self.atlas, self.settings = context.session.atlas, context.config.initialization
         self.map_initializer = MapInitializer(
             context.tracker, context.mapper, self.settings.min_explained_ratio
@@ -72,6 +76,11 @@ class InitializationState:
             result = self.initializer.step(view)
             self.context.non_static_filter.static_overlay.add(self.initializer.static_pixels)
             return result if isinstance(result, Rejection) else self._create(result, self.initializer.views)
+
+    def add_confirmed(self, frames: Sequence[PendingFrame]) -> None:
+        """Note frames of a provisional map that were held back, and then confirmed."""
+        if self.provisional is not None:
+            self.provisional.views += [view for view, _, _, _ in frames]
 
     @property
     def is_almost_confirmed(self) -> bool:
@@ -93,8 +102,9 @@ class InitializationState:
         """Confirm the provisional map, and pose the frames from before its first keyframe."""
         if self.provisional is None:
             return
-        submap, self.provisional = self.provisional.submap, None
-        self.backward.from_first_keyframe(submap)
+        provisional, self.provisional = self.provisional, None
+        self.backward.from_first_keyframe(provisional.submap)
+        self.start_check.start(provisional.submap, provisional.views)
 
     def on_lost(self) -> bool:
         """Discard a map that is still provisional when the camera is lost; return whether it was."""
@@ -198,6 +208,7 @@ class KeyframeActions:
                 return
             if not found.is_loop:
                 self.initialization.confirm_map()
+                self.initialization.start_check.cancel()  # the other map agrees with this one
             submap, keyframe = context.loop_closer.close(found)
             self.active_map.replace(submap)
             context.tracker.reset_to_keyframe(submap, keyframe)
@@ -264,7 +275,8 @@ class StateMachine:
         self.mapping = LocalMapping(context)
         self.tentative = TentativeMapping(context, self.mapping)
         self.backward = BackwardTracking(context, self.mapping)
-        self.initialization = InitializationState(context, self.backward)
+        self.start_check = StartCheck(context, self.backward)
+        self.initialization = InitializationState(context, self.backward, self.start_check)
         self.keyframe_actions = KeyframeActions(context, self.mapping, self.initialization)
         self.lost = LostState(context, self.initialization, self.backward)
 
@@ -298,7 +310,7 @@ class StateMachine:
         has_moving_majority = (
             motion.rejection is not None and motion.rejection.reason is Reason.MOVING_MAJORITY
         )
-        may_map = self._may_map_tentatively(rejection or motion.rejection)
+        may_map = self._may_map_tentatively(estimate, rejection or motion.rejection)
         if is_plausible and not has_moving_majority and may_map:
             self.tentative.add_keyframe(submap, view, estimate)
         return self._on_uncertain(view, estimate, rejection or motion.rejection)
@@ -306,19 +318,21 @@ class StateMachine:
     def finalize(self) -> None:
         """End the session: frames that are held back keep their poses, uncertain as they are."""
         if self.active_map.submap is not None:
-            has_new_keyframes = self.tentative.has_keyframes
-            self._keep_uncertain()
+            has_new_keyframes = self._keep_uncertain()
             self.keyframe_actions.apply_pending_adjustment()
             if has_new_keyframes:
                 self.keyframe_actions.detect_loop()
         self.initialization.confirm_map()
+        if self.active_map.submap is not None:
+            self.start_check.step(self.active_map.submap, is_last=True)
 
     def confirm_map(self) -> None:
-        """Confirm a provisional map with its tentative keyframes: backward tracking adds to the same map."""
+        """Confirm a provisional map as it is, with its tentative keyframes: backward tracking adds to the same map."""
         if self.active_map.submap is not None and self.initialization.provisional is not None:
             self.tentative.commit(self.active_map.current)
             self.mapping.apply_adjustment(self.active_map.current)
         self.initialization.confirm_map()
+        self.start_check.cancel()
 
     def _on_certain(
         self, view: FrameFeatures, estimate: PoseEstimate, motion: Explanation | None
@@ -350,6 +364,8 @@ class StateMachine:
             actions.precheck_loop()
         if not is_keyframe:
             actions.apply_pending_adjustment(view.index)
+        if not mapping.adjustment.is_pending:
+            self.start_check.step(self.active_map.current)
         notes = [reason, Reason.STATIC_OVERLAY if has_new_overlay else None, motion]
         reasons = [note for note in notes if note is not None]
         return FrameOutcome(reasons, self.active_map.submap, estimate, is_keyframe)
@@ -364,10 +380,11 @@ class StateMachine:
             return ApplyAt.BEFORE_NEXT_FRAME
         return ApplyAt.AFTER_DELAY
 
-    def _may_map_tentatively(self, rejection: Rejection | None) -> bool:
-        """Whether a frame that is held back may become a tentative keyframe; never after a relocalization."""
-        is_doubtful = rejection is not None or self.tentative.has_keyframes
-        return is_doubtful and not self.context.confirmation.is_relocalized
+    def _may_map_tentatively(self, estimate: PoseEstimate, rejection: Rejection | None) -> bool:
+        """Whether a frame that is held back may become a tentative keyframe; after a relocalization only a sure one."""
+        if self.context.confirmation.is_relocalized:
+            return estimate.inliers >= SURE_INLIERS
+        return rejection is not None or self.tentative.has_keyframes
 
     def _on_uncertain(
         self, view: FrameFeatures, estimate: PoseEstimate, rejection: Rejection | None
@@ -376,14 +393,16 @@ class StateMachine:
         submap, confirmation = self.active_map.current, self.context.confirmation
         confirmation.push(view, estimate, submap.tracking, rejection, self.tentative.has_keyframes)
         if confirmation.is_holding:
-            if confirmation.is_full:
-                self._keep_uncertain()
+            reason = rejection or confirmation.reason
             self.active_map.set_state(State.UNCERTAIN)
-            return FrameOutcome([rejection or confirmation.reason], submap, estimate)
+            if confirmation.is_full and self._keep_uncertain():
+                self.keyframe_actions.detect_loop()
+            return FrameOutcome([reason], self.active_map.current, estimate)
         has_new_keyframes = self.tentative.has_keyframes  # whose adjustments are applied: none is pending
         self.tentative.commit(submap)
         was_relocalized, frames = confirmation.is_relocalized, confirmation.confirm()
         self.mapping.add_pending_frames(submap, frames)
+        self.initialization.add_confirmed(frames)
         if was_relocalized:
             first, first_estimate, _, _ = frames[0]
             self.backward.from_frame(submap, first, first_estimate)
@@ -392,17 +411,18 @@ class StateMachine:
             self.keyframe_actions.detect_loop()
         return FrameOutcome([], self.active_map.current, estimate)
 
-    def _keep_uncertain(self) -> None:
-        """Keep the poses of frames that are held back, and their tentative keyframes."""
-        submap = self.active_map.current
+    def _keep_uncertain(self) -> bool:
+        """Keep the poses of frames that are held back, and their tentative keyframes; return whether there are any."""
+        submap, has_keyframes = self.active_map.current, self.tentative.has_keyframes
         self.tentative.commit(submap)
         for pending in self.context.confirmation.pop_all():
             submap.posed_frames.add(*pending)
+        return has_keyframes
 
     def _on_lost(self, view: FrameFeatures) -> FrameOutcome:
         """Frames that are held back are unposed again, unless they are many; a provisional map is discarded."""
         self.keyframe_actions.apply_pending_adjustment()
-        if len(self.context.confirmation.views()) >= _MANY_PENDING:
+        if self.context.confirmation.is_long:
             self._keep_uncertain()
         self.tentative.rollback(self.active_map.current)
         self.backward.unposed.add(*self.context.confirmation.views(), view)

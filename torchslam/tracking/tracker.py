@@ -14,9 +14,9 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.tracking.data_association import match_points
+from torchslam.tracking.data_association import match_keyframe, match_points
 from torchslam.tracking.localizer import Localizer, match_projected_points
-from torchslam.tracking.matcher import make_matcher
+from torchslam.tracking.matcher import DescriptorMatcher, make_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
 
 EMA_RATE = 0.1
@@ -118,6 +118,10 @@ class Tracker:
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)
         yield match_points(slam_map, tracking.local_points, view, self.matching)
+        if not isinstance(self.matcher, DescriptorMatcher):  # it may know better, from whole images
+            newest = slam_map.num_keyframes - 1
+            for keyframe in dict.fromkeys((tracking.reference, newest)):
+                yield match_keyframe(slam_map, keyframe, view, self.matcher)
 
     def update(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Update the tracking state by a frame: velocity, averages, reference keyframe, `last_seen_frame`."""
