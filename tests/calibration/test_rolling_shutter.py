@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 import torch
@@ -11,15 +12,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
+from experiments.trials.edited import Edit, Edited, shots
+from experiments.trials.edits import rolling
 from torchslam.calibration.rolling_shutter import (
     RollingShutter,
     _Block,
     find_rolling_shutter,
     image_interval_velocities,
     project_out,
+    rolling_shutter_remark,
 )
+from torchslam.data import open_sequence
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.optim.run_graph import ObservationGraph, solve_graph
+from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs, solve_graph
+from torchslam.system.run import Run
+from torchslam.system.slam import SLAM
 
 CAMERA = Camera.radial_tangential(400.0, 400.0, 319.5, 239.5, -0.1, 0.02, 0.0, 0.0, size=(640, 480))
 NOISE_PX = 0.5
@@ -121,6 +128,33 @@ def test_a_wrong_focal_length_is_no_rolling_shutter() -> None:
     assert estimated(adjusted(replace(recording(0.0), camera=camera))).description() == ""
 
 
+def run_on(data_dir: Path, name: str, edit: Edit | None = None) -> Run:
+    whole = open_sequence(data_dir / name)
+    sequence = Edited(name, whole.camera, shots(whole, range(len(whole)), edit))
+    return SLAM(whole.camera).run(sequence)
+
+
+@pytest.mark.data
+@pytest.mark.parametrize("wave_px", [0.0, 6.0])
+def test_waves_in_real_images_are_named(data_dir: Path, wave_px: float) -> None:
+    """The images of shelf_bin have none; here a sine along the rows shifts them."""
+    said = rolling_shutter_remark(run_on(data_dir, "shelf_bin", rolling(wave_px)))
+    assert ("the camera shakes" in said) if wave_px else said == ""
+
+
+@pytest.mark.data
+def test_the_rolling_shutter_of_a_kinect_is_named(data_dir: Path) -> None:
+    """Its color camera reads an image in about 30 ms, of the 100 ms between two frames of this sequence."""
+    finished = run_on(data_dir, "fr2_desk_20")
+    found = find_rolling_shutter(finished.graph)
+    assert found is not None
+    assert found.is_read_out
+    assert 0.2 < found.readout < 0.4
+    assert not found.is_shaken
+    assert rolling_shutter_remark(finished) == found.description()
+    assert rolling_shutter_remark(replace(finished, interrupted=True)) == ""
+
+
 def test_a_camera_at_rest_tells_nothing() -> None:
     graph = recording(0.0)
     still = graph.T_cw[:1].expand_as(graph.T_cw).contiguous()
@@ -128,6 +162,16 @@ def test_a_camera_at_rest_tells_nothing() -> None:
     pixels = CAMERA.project(points_c)[0][:, 0] + NOISE_PX * torch.sin(torch.arange(2.0)[None] + graph.pixels)
     found = estimated(replace(graph, T_cw=still, pixels=pixels))
     assert (found.readout, found.readout_std, found.is_read_out) == (0.0, math.inf, False)
+
+
+def test_covariances_and_other_submaps_change_nothing() -> None:
+    graph = recording(0.5)
+    expected = estimated(graph)
+    matrices = graph.weights[:, None, None] * torch.eye(2, dtype=torch.float64)
+    assert vars(estimated(replace(graph, weights=matrices))) == pytest.approx(vars(expected), rel=1e-6)
+    other = replace(recording(0.0, 1, frames=20), submap=torch.ones(20, dtype=torch.int64))
+    both = concatenate_graphs([other, graph])
+    assert vars(estimated(both)) == pytest.approx(vars(expected), rel=1e-6)
 
 
 def test_too_few_frames_are_not_tested() -> None:
