@@ -18,7 +18,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -103,13 +102,14 @@ class RollingShutter:
         )
 
 
-class _Block(NamedTuple):
+@dataclass(frozen=True)
+class _Block:
     """Derivatives of whitened residuals (O, 2, n), orthonormal for each of the variables that rows belong to.
 
     Attributes:
         derivatives: of an observation.
         index: its variable.
-        count: of the variables.
+        count: number of variables.
     """
 
     derivatives: Float[Tensor, "O 2 n"]
@@ -118,6 +118,7 @@ class _Block(NamedTuple):
 
     @classmethod
     def of(cls, derivatives: Float[Tensor, "O 2 n"], index: Int[Tensor, " O"], count: int) -> _Block:
+        """Make the derivatives of each variable orthonormal; those that are zero stay zero."""
         size = derivatives.shape[-1]
         squares = derivatives.square().sum(1)
         norms = squares.new_zeros(count, size).index_add(0, index, squares).sqrt()
@@ -130,10 +131,12 @@ class _Block(NamedTuple):
         return cls(orthonormal, index, count)
 
     def gathered(self, values: Float[Tensor, "O 2 D"]) -> Float[Tensor, "V n D"]:
+        """The products of the columns with the derivatives, summed over the observations of each variable."""
         products = self.derivatives.mT @ values
         return products.new_zeros(self.count, *products.shape[1:]).index_add(0, self.index, products)
 
     def spread(self, steps: Float[Tensor, "V n D"]) -> Float[Tensor, "O 2 D"]:
+        """What steps of the variables change."""
         return self.derivatives @ steps[self.index]
 
 
