@@ -47,10 +47,10 @@ MIN_INFORMATION = 1.0
 MIN_SIGMAS = 5.0
 """A readout of columns in place of rows, which no camera has, reaches 4 standard errors on real sequences."""
 MIN_SHIFT = 0.05
-"""Shift by a readout worth naming, as a ratio of the residuals."""
+"""Median shift worth naming, as a ratio of the median residual: in fast turns it is several times as large."""
 MIN_MORE_EXPLAINED = 0.1
-"""Ratio of the squared residuals by which functions of the row must explain more than those of the column: it is 0.03
-or less on real sequences, 0.2 or more where the rows of their images are shifted by up to 6 px."""
+"""Ratio of the squared residuals by which functions of the row must explain more than those of the column: it is 0.04
+or less on real sequences, 0.16 or more where the rows of their images are shifted by up to 6 px."""
 
 
 @dataclass(frozen=True)
