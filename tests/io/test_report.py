@@ -63,6 +63,13 @@ def test_half_of_the_frames_being_keyframes_is_reported(
     ] * said
 
 
+def test_a_rolling_shutter_is_a_warning(run: Run) -> None:
+    figures = run_metrics(run) | {"rolling_shutter": "rows are exposed one after the other"}
+    assert result_warnings(figures) == ["rows are exposed one after the other"]
+    assert len(result_warnings(figures | {"keyframes": 12, "posed": 23})) == 2
+    assert result_warnings(figures | {"rolling_shutter": ""}) == []
+
+
 def test_counts_of_several_submaps_and_sessions(run: Run, submap: Submap) -> None:
     """Frames 10 to 14 uncertain in submap 0; from frame 22 in submap 3, which has as many frames of another session."""
     other = Submap(3, submap.tracking)

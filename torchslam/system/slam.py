@@ -72,7 +72,7 @@ class SLAM:
         )  # unknown to worker processes
         self.clock = Stopwatch()
         scaled = self.scaled_config = self.config.for_size(camera.size)
-        self.matcher = make_matcher(scaled.matching, matcher, camera.size)
+        self.matcher = make_matcher(scaled.matching, matcher, camera.size, scaled.features.kind)
         self.tracker = Tracker(self.camera, scaled, self.matcher)
         undistorted = self.tracker.localizer.undistorted
         self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher, undistorted)

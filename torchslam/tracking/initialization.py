@@ -55,7 +55,7 @@ class Initializer:
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
-        self.matcher = make_matcher(config.matching, matcher)
+        self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.config = config
         self.views: list[FrameFeatures] = []  # the reference and the frames after it
         # keypoints of the last view that do not belong to the scene
@@ -328,7 +328,9 @@ class ProvisionalMap:
         threshold_px = config.initialization.threshold_px
         T_1w, T_2w = self.submap.posed_frames.T_cw(self.submap.map)[0], self.submap.T_cw
         T_21 = T_2w @ se3_inverse(T_1w)
-        pairs = run_matcher(make_matcher(config.matching, matcher), first, last)
+        pairs = run_matcher(
+            make_matcher(config.matching, matcher, features=config.features.kind), first, last
+        )
         pixels = first.keypoints[pairs.first], last.keypoints[pairs.second]
         if support(*pixels, T_21, camera, threshold_px) >= MIN_SUPPORT_RATIO * len(pairs.first):
             return None  # no motion can have twice the support

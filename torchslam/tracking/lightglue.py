@@ -12,7 +12,7 @@ from jaxtyping import Shaped
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.features.weights import read_weights
+from torchslam.features.weights import MATCHER, read_weights
 from torchslam.types import FrameFeatures, Matches, MatchPrior
 
 
@@ -110,7 +110,7 @@ def renamed(state: dict[str, Shaped[Tensor, "..."]]) -> dict[str, Shaped[Tensor,
     """The tensors under the current names: published files have older ones."""
     names = {}
     for name in state:
-        new = name.removeprefix("matcher.")
+        new = name.removeprefix(MATCHER)
         for part in ("self_attn", "cross_attn"):
             head, dot, rest = new.partition(f"{part}.")
             if not head and dot:

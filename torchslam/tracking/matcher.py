@@ -12,6 +12,7 @@ from torch import Tensor
 from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
 from torchslam.features import match, match_by_projection
+from torchslam.features.weights import MATCHER_OF
 from torchslam.plugins import MATCHERS, load
 from torchslam.tracking.epipolar import match_free
 from torchslam.types import Frame, FrameFeatures, Matcher, Matches, MatchIndices, MatchPrior
@@ -66,9 +67,12 @@ def max_distance(descriptors: Shaped[Tensor, "*batch N D"], settings: MatchingCo
 
 
 def make_matcher(
-    settings: MatchingConfig, matcher: Matcher | None = None, image_size: tuple[int, int] | None = None
+    settings: MatchingConfig,
+    matcher: Matcher | None = None,
+    image_size: tuple[int, int] | None = None,
+    features: str = "",
 ) -> Matcher:
-    """The given matcher, or else the configured one for images of a size (width, height).
+    """The given matcher, or else the configured one for images of a size (width, height) and a kind of features.
 
     Raises:
         ConfigError: if the name of the configured one is unknown.
@@ -76,7 +80,7 @@ def make_matcher(
     if matcher is None and settings.matcher == "lightglue":
         from torchslam.tracking.lightglue import LightGlue
 
-        return LightGlue(settings.weights or "xfeat-lighterglue", image_size)
+        return LightGlue(settings.weights or MATCHER_OF.get(features, "xfeat-lighterglue"), image_size)
     if matcher is None and settings.matcher != "descriptors":
         return load(MATCHERS, settings.matcher, weights=settings.weights or None)
     return DescriptorMatcher(settings) if matcher is None else matcher

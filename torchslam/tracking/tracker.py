@@ -31,7 +31,7 @@ class Tracker:
 
     def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
         self.localizer = Localizer(camera, config)
-        self.matcher = make_matcher(config.matching, matcher)
+        self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.settings = config.tracking
         self.matching = config.matching
         self.counts = True

@@ -1,0 +1,296 @@
+"""Test whether the residuals of a run show a rolling shutter: rows of an image that are exposed one after the other.
+
+A row v of an image of height H is exposed later than the middle by readout * (v / H - 1/2) frame intervals, so its
+keypoints move on by as much of their image velocity, which the poses of the neighboring frames predict. The readout is
+the coefficient of a linear regression of the residuals on these shifts. Poses, points and the camera have absorbed
+a part of them, so the residuals and the shifts are first projected onto the complement of all their derivatives
+(Frisch and Waugh, 1933).
+
+A camera that shakes faster than frames follow each other moves within an image, but not visibly between images. Then
+what is left of the residuals of each frame is a smooth function of the row, a different one in every frame. As other
+errors depend on the row as well, the test is that the same functions of the column explain less.
+
+Source of the model: Hedborg et al., "Rolling shutter bundle adjustment", CVPR 2012.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
+
+from torchslam.geometry import se3_inverse, se3_log, transform
+from torchslam.geometry.gating import whitening
+from torchslam.geometry.lie import skew
+from torchslam.geometry.precision import full_precision
+from torchslam.geometry.robust import robustify
+from torchslam.optim.run_graph import ObservationGraph
+from torchslam.system.run import Run
+
+MIN_FRAMES, MAX_FRAMES = 12, 60
+"""Frames of a test, evenly distributed over a run; more would take longer than they tell."""
+MAX_GAP = 1.5
+"""Frame intervals between two frames whose poses still give a velocity."""
+KERNEL_SCALE = 2.45  # as in `solve_graph`
+PARTS, PART_FRAMES = 10, 5
+"""Stretches of a run whose disagreement gives the standard error, and the frames of one: errors of neighboring frames
+are alike."""
+ITERATIONS, TOLERANCE = 30, 1e-8
+"""Of the projection, and the ratio of the squared gradient at which it ends."""
+RIDGE = 1e-9  # of normalized derivatives, whose squares may be singular for a point seen along its ray
+MIN_INFORMATION = 1.0
+"""Of the readout: less is a formal standard error of more than one frame interval, as of a camera at rest."""
+MIN_SIGMAS = 5.0
+"""A readout of columns in place of rows, which no camera has, reaches 4 standard errors on real sequences."""
+MIN_SHIFT = 0.05
+"""Median shift worth naming, as a ratio of the median residual: in fast turns it is several times as large."""
+MIN_MORE_EXPLAINED = 0.1
+"""Ratio of the squared residuals by which functions of the row must explain more than those of the column: it is 0.04
+or less on real sequences, 0.16 or more where the rows of their images are shifted by up to 6 px."""
+
+
+@dataclass(frozen=True)
+class RollingShutter:
+    """What the residuals of a run say about the exposure of the rows.
+
+    Attributes:
+        readout: Time from the first to the last row, in frame intervals; negative from the last to the first.
+        readout_std: Standard error of it; infinite, and the readout zero, if the camera hardly moves.
+        shift: Median shift by the readout, as a ratio of the median residual.
+        by_row: Ratio of the squared residuals without the readout that smooth functions of the row explain, one for
+            each frame.
+        by_column: The same for the column.
+    """
+
+    readout: float
+    readout_std: float
+    shift: float
+    by_row: float
+    by_column: float
+
+    @property
+    def is_read_out(self) -> bool:
+        """Whether the motion of the camera shows a rolling shutter."""
+        return abs(self.readout) > MIN_SIGMAS * self.readout_std and self.shift > MIN_SHIFT
+
+    @property
+    def is_shaken(self) -> bool:
+        """Whether rows are shifted against each other in a way that the motion between frames does not show."""
+        return self.by_row - self.by_column > MIN_MORE_EXPLAINED
+
+    def description(self) -> str:
+        """Say that there is a rolling shutter, and how large it is; empty if none is seen."""
+        sizes = []
+        if self.is_read_out:
+            sizes.append(
+                f"{100 * abs(self.readout):.0f} ± {100 * self.readout_std:.0f} % of the frame interval"
+            )
+        if self.is_shaken:
+            sizes.append(
+                f"the camera shakes, and the row explains {self.by_row:.0%} of the squared errors, "
+                f"the column {self.by_column:.0%}"
+            )
+        if not sizes:
+            return ""
+        return (
+            f"the rows of an image seem to be exposed one after the other (rolling shutter: {'; '.join(sizes)}), "
+            "which is not modeled: poses in fast turns are less exact"
+        )
+
+
+@dataclass(frozen=True)
+class _Block:
+    """Derivatives of whitened residuals (O, 2, n), orthonormal for each of the variables that rows belong to.
+
+    Attributes:
+        derivatives: of an observation.
+        index: its variable.
+        count: number of variables.
+    """
+
+    derivatives: Float[Tensor, "O 2 n"]
+    index: Int[Tensor, " O"]
+    count: int
+
+    @classmethod
+    def of(cls, derivatives: Float[Tensor, "O 2 n"], index: Int[Tensor, " O"], count: int) -> _Block:
+        """Make the derivatives of each variable orthonormal; those that are zero stay zero."""
+        size = derivatives.shape[-1]
+        squares = derivatives.square().sum(1)
+        norms = squares.new_zeros(count, size).index_add(0, index, squares).sqrt()
+        inverse = torch.where(norms > 0, 1 / norms.masked_fill(norms == 0, 1.0), 0.0)
+        scaled = derivatives * inverse[index][:, None]
+        gram = scaled.new_zeros(count, size, size).index_add(0, index, scaled.mT @ scaled)
+        gram = gram + torch.diag_embed(torch.where(norms > 0, RIDGE, 1.0))
+        factor = torch.linalg.cholesky(gram)
+        orthonormal = torch.linalg.solve_triangular(factor[index], scaled.mT, upper=False).mT
+        return cls(orthonormal, index, count)
+
+    def gathered(self, values: Float[Tensor, "O 2 D"]) -> Float[Tensor, "V n D"]:
+        """The products of the columns with the derivatives, summed over the observations of each variable."""
+        products = self.derivatives.mT @ values
+        return products.new_zeros(self.count, *products.shape[1:]).index_add(0, self.index, products)
+
+    def spread(self, steps: Float[Tensor, "V n D"]) -> Float[Tensor, "O 2 D"]:
+        """What steps of the variables change."""
+        return self.derivatives @ steps[self.index]
+
+
+def project_out(values: Float[Tensor, "O 2 D"], blocks: Sequence[_Block]) -> Float[Tensor, "O 2 D"]:
+    """The part of each column that no step of the blocks' variables can produce, by conjugate gradients."""
+
+    def dot(one: list[Tensor], other: list[Tensor]) -> Tensor:
+        return torch.stack([(a * b).sum((0, 1)) for a, b in zip(one, other, strict=True)]).sum(0)
+
+    def ratio(one: Tensor, other: Tensor) -> Tensor:
+        return torch.where(other > 0, one / other.masked_fill(other <= 0, 1.0), 0.0)
+
+    gradient = [block.gathered(values) for block in blocks]
+    direction, squared = gradient, dot(gradient, gradient)
+    enough = TOLERANCE * squared
+    for _ in range(ITERATIONS):
+        if bool((squared <= enough).all()):
+            break
+        change = torch.stack([block.spread(d) for block, d in zip(blocks, direction, strict=True)]).sum(0)
+        values = values - ratio(squared, change.square().sum((0, 1))) * change
+        gradient = [block.gathered(values) for block in blocks]
+        before, squared = squared, dot(gradient, gradient)
+        slope = ratio(squared, before)
+        direction = [g + slope * d for g, d in zip(gradient, direction, strict=True)]
+    return values
+
+
+def rolling_shutter_remark(finished: Run) -> str:
+    """Say that the residuals of a run show a rolling shutter; empty if they do not, or if there is no complete run."""
+    if finished.failure or finished.interrupted or finished.session:
+        return ""
+    found = find_rolling_shutter(finished.posed_frames.graph(finished.map, finished.camera))
+    return "" if found is None else found.description()
+
+
+@full_precision
+@torch.no_grad()
+def find_rolling_shutter(graph: ObservationGraph) -> RollingShutter | None:
+    """Test the residuals of a run at its solution, in the submap with most frames.
+
+    Returns:
+        The result; None with too few frames, or too few observations of the same points.
+    """
+    velocities, known = image_interval_velocities(graph)
+    frames = known.nonzero()[:, 0]
+    if len(frames) < MIN_FRAMES:
+        return None
+    frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
+    count = min(len(frames), MAX_FRAMES)
+    frames = frames[torch.arange(count, device=frames.device) * len(frames) // count]
+    rank = torch.full_like(graph.submap, -1)
+    rank[frames] = torch.arange(count, device=rank.device)
+    rows = _shared_rows(graph, rank)
+    frame, (points, point) = (
+        rank[graph.frame_index[rows]],
+        torch.unique(graph.point_index[rows], return_inverse=True),
+    )
+    T_cw = graph.T_cw[graph.frame_index[rows]]
+    points_c = transform(T_cw, graph.points_w[graph.point_index[rows]][:, None])[:, 0]
+    pixels, valid, J_points, J_camera = graph.camera.project_with_jacobians(points_c)
+    if 2 * int(valid.sum()) <= 6 * count + 3 * len(points) + J_camera.shape[-1]:
+        return None
+    W = _robust_whitening(graph, rows, pixels, valid)
+    residuals = W @ (graph.pixels[rows] - pixels)[..., None]
+    J_points = W @ J_points
+    J_poses = torch.cat((J_points, -J_points @ skew(points_c)), dim=-1)
+    size = pixels.new_tensor(graph.camera.size)
+    column, row = ((graph.pixels[rows] + 0.5) / size - 0.5)[..., None, None].unbind(1)  # (O, 1, 1)
+    flow = J_poses @ velocities[frames][frame][..., None]
+    common = torch.cat((W @ J_camera, column * flow), dim=-1)
+    others = [
+        _Block.of(J_points @ T_cw[:, :3, :3], point, len(points)),
+        _Block.of(common, torch.zeros_like(point), 1),
+    ]
+    poses = _Block.of(J_poses, frame, count)
+    left, shift = project_out(torch.cat((residuals, row * flow), dim=-1), [poses, *others]).split(1, dim=-1)
+    readout, std = _regress(left[..., 0], shift[..., 0], frame, count)
+    left = left - readout * shift
+    ratios = []
+    for place in (row, column):
+        bends = [bend * J_poses[..., 3:5] for bend in _curves(place)]
+        bent = _Block.of(torch.cat((J_poses, *bends), dim=-1), frame, count)
+        remaining = project_out(left, [bent, *others]).square().sum() / left.square().sum()
+        ratios.append(1.0 - float(remaining))
+    typical = (row * flow)[..., 0].norm(dim=-1).median() / residuals[..., 0].norm(dim=-1).median()
+    return RollingShutter(readout, std, abs(readout) * float(typical), *ratios)
+
+
+def image_interval_velocities(graph: ObservationGraph) -> tuple[Float[Tensor, "K 6"], Bool[Tensor, " K"]]:
+    """The motion of each frame per frame interval, a left perturbation of its pose, from the frames before and after.
+
+    Returns:
+        Velocities, and in which frames of the largest submap they are known; zero elsewhere.
+    """
+    velocities, known = graph.T_cw.new_zeros(len(graph.T_cw), 6), torch.zeros_like(graph.is_keyframe)
+    frames = (graph.submap == torch.bincount(graph.submap).argmax()).nonzero()[:, 0]
+    if len(frames) < 3:
+        return velocities, known
+    frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
+    T_cw, times = graph.T_cw[frames], graph.timestamps[frames]
+    intervals = times.diff() / times.diff().median()
+    near = (intervals > 0) & (intervals < MAX_GAP)
+    steps = se3_log(T_cw[2:] @ se3_inverse(T_cw[:-2])) / (intervals[1:] + intervals[:-1])[:, None]
+    known[frames[1:-1]] = near[1:] & near[:-1]
+    velocities[frames[1:-1]] = steps
+    return torch.where(known[:, None], velocities, 0.0), known
+
+
+def _shared_rows(graph: ObservationGraph, rank: Int[Tensor, " K"]) -> Int[Tensor, " R"]:
+    """The observations by frames that have a rank, of points that two of these frames see."""
+    rows = (rank[graph.frame_index] >= 0).nonzero()[:, 0]
+    seen = torch.bincount(graph.point_index[rows], minlength=len(graph.points_w))
+    return rows[seen[graph.point_index[rows]] > 1]
+
+
+def _robust_whitening(
+    graph: ObservationGraph, rows: Int[Tensor, " R"], pixels: Float[Tensor, "R 2"], valid: Bool[Tensor, " R"]
+) -> Float[Tensor, "R 2 2"]:
+    """The square roots of the weights, smaller for large residuals as in the adjustment, zero where not `valid`."""
+    weights = graph.weights[rows]
+    if weights.ndim == 1:
+        weights = weights[:, None, None] * torch.eye(2, dtype=weights.dtype, device=weights.device)
+    W = whitening(weights)
+    squared = (W @ (graph.pixels[rows] - pixels)[..., None]).square().sum((1, 2))
+    factors = robustify(squared, "huber", squared.new_tensor(KERNEL_SCALE)).weight.sqrt()
+    return W * torch.where(valid, factors, 0.0)[:, None, None]
+
+
+def _curves(place: Float[Tensor, "*batch"]) -> list[Float[Tensor, "*batch"]]:
+    """Legendre polynomials of the second and third degree on -1/2 ... 1/2.
+
+    That of the first degree is left out: up to a rotation, a shift along x that grows with the row is a shift along y
+    that grows with the column.
+    """
+    return [6 * place**2 - 0.5, 20 * place**3 - 3 * place]
+
+
+def _regress(
+    left: Float[Tensor, "O 2"], shift: Float[Tensor, "O 2"], frame: Int[Tensor, " O"], frames: int
+) -> tuple[float, float]:
+    """The coefficient of residuals on shifts and its standard error, the larger of two.
+
+    Errors count as independent between frames, which are in order of time, and between stretches of the run.
+    """
+    information = shift.square().sum()
+    if not bool(information > MIN_INFORMATION):
+        return 0.0, math.inf
+    readout = (shift * left).sum() / information
+    scores = (shift * (left - readout * shift)).sum(-1)
+    parts = max(2, min(PARTS, frames // PART_FRAMES))
+    stds = [
+        scores.new_zeros(groups).index_add(0, frame * groups // frames, scores).norm()
+        * math.sqrt(groups / (groups - 1))
+        / information
+        for groups in (frames, parts)
+    ]
+    return float(readout), float(torch.stack(stds).max())
