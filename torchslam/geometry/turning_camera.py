@@ -16,10 +16,11 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.camera_measurement import FOCAL, K1, intrinsics_directions, with_radial_terms
 from torchslam.geometry.lie import cayley_rotation, generators
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.ransac import ModelState, levenberg_marquardt
+from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import robustify
 
-_ITERATIONS = 20
+_STARTS = 7  # focal lengths, over twice the standard deviation to both sides, of which the best is optimized
+_ITERATIONS = 8
 _KERNEL_SCALE = 2.0  # thresholds at which the Huber kernel becomes linear
 _BEHIND = 1e3  # squared thresholds: the cost of a match that turns behind the camera
 
@@ -31,13 +32,13 @@ class TurningCamera:
     Attributes:
         R_21: rotations from view 1 to view 2.
         camera: the B cameras, each of both views.
-        log_focal: logarithms of their focal lengths, relative to the given one.
+        departure: of the focal length or of k1, whichever is larger, from the given one, in standard deviations.
         errors_px: pixels between the matches in view 2 and where those of view 1 turn to; infinite behind the camera.
     """
 
     R_21: Float[Tensor, "B 3 3"]
     camera: Camera
-    log_focal: Float[Tensor, " B"]
+    departure: Float[Tensor, " B"]
     errors_px: Float[Tensor, "B N"]
 
 
@@ -53,7 +54,7 @@ def fit_turning_camera(
     """Fit a rotation, a focal length and k1 to the matches of two views, few of which may be wrong.
 
     Minimizes the Huber cost of the errors in view 2 and of the departure from the given camera, by Levenberg-Marquardt
-    from the rotation that the given camera measures. Not differentiable by design: it serves a decision.
+    from the best of some focal lengths. Not differentiable by design: it serves a decision.
 
     Args:
         pixels_1: matches in view 1.
@@ -67,23 +68,21 @@ def fit_turning_camera(
     axes = generators(given.params.dtype, given.params.device)
     directions = std * intrinsics_directions(given, [FOCAL, K1])
 
+    def factor(change: Float[Tensor, "B 2"]) -> Float[Tensor, "B 1"]:
+        return (std * change[:, :1]).exp()
+
     def changed(change: Float[Tensor, "B 2"]) -> Camera:
         """The camera after a change of the logarithm of its focal length and of k1, in standard deviations."""
-        factor, k1 = (std * change[:, :1]).exp(), directions[2:, 1] * change[:, 1:]
-        return given.with_params(torch.cat((given.params[:2] * factor, given.params[2:] + k1), dim=-1))
-
-    def turned(
-        R: Float[Tensor, "B 3 3"], at: Camera
-    ) -> tuple[Float[Tensor, "B N 3"], Float[Tensor, "B N 3"]]:
-        """The matches of view 1 as image points, and in view 2."""
-        h_1 = torch.nn.functional.pad(at.normalize(pixels_1), (0, 1), value=1.0)
-        return h_1, h_1 @ R.mT
+        focal, others = (
+            given.params[:2] * factor(change),
+            given.params[2:] + directions[2:, 1] * change[:, 1:],
+        )
+        return given.with_params(torch.cat((focal, others), dim=-1))
 
     def evaluate(R: Float[Tensor, "B 3 3"], change: Float[Tensor, "B 2"]) -> tuple[Tensor, Tensor]:
         at = changed(change)
-        h_1, h_2 = turned(R, at)
-        factor = torch.nn.functional.pad((std * change[:, :1]).exp(), (0, 1), value=1.0)
-        along = (directions * factor[:, None])[:, None]
+        h_1, h_2 = _turned(R, at, pixels_1)
+        along = (directions * torch.nn.functional.pad(factor(change), (0, 1), value=1.0)[:, None])[:, None]
         # The image points of fixed pixels move with the camera: 0 = J_point dx + J_params dparams.
         _, _, J_point, J_params = at.project_with_jacobians(h_1)
         moves = -torch.linalg.solve_ex(J_point[..., :2], J_params @ along)[0]
@@ -94,24 +93,54 @@ def fit_turning_camera(
         robust = robustify(residual.square().sum(-1), "huber", residual.new_tensor(_KERNEL_SCALE))
         weight = torch.where(valid & mask, robust.weight, 0.0).sqrt()[..., None, None]
         rows = torch.cat((torch.cat((J_turn, J_camera), dim=-1) / threshold, residual[..., None]), dim=-1)
-        rows = (weight * rows).flatten(1, 2)
         prior = torch.nn.functional.pad(torch.diag_embed(torch.ones_like(change)), (3, 0))
-        rows = torch.cat((rows, torch.cat((prior, change[..., None]), dim=-1)), dim=1)
+        rows = torch.cat(
+            ((weight * rows).flatten(1, 2), torch.cat((prior, change[..., None]), dim=-1)), dim=1
+        )
         cost = torch.where(mask, torch.where(valid, robust.rho, _BEHIND), 0.0).sum(-1)
         return rows.mT @ rows, cost + change.square().sum(-1)
 
     def retract(state: ModelState, step: Float[Tensor, "B 5"]) -> ModelState:
         return cayley_rotation(step[:, :3]) @ state[0], state[1] + step[:, 3:]
 
-    with torch.no_grad():
-        start = _rotation_of_rays(given.unproject(pixels_1), given.unproject(pixels_2), mask)
-        (R, change), _ = levenberg_marquardt(
-            (start, start.new_zeros(len(mask), 2)), evaluate, retract, _ITERATIONS
-        )
+    def start() -> ModelState:
+        """The best of some focal lengths, each with its best rotation."""
+        B, focal = len(mask), torch.linspace(-2.0, 2.0, _STARTS, dtype=axes.dtype, device=axes.device)
+        change = torch.nn.functional.pad(focal.repeat(B)[:, None], (0, 1))
+        first, second, used = (x.repeat_interleave(_STARTS, dim=0) for x in (pixels_1, pixels_2, mask))
         at = changed(change)
-        pixels, valid = at.project(turned(R, at)[1])
-        errors = torch.where(valid, (pixels - pixels_2).norm(dim=-1), torch.inf)
-    return TurningCamera(R, at, std * change[:, 0], errors)
+        R = _rotation_of_rays(at.unproject(first), at.unproject(second), used)
+        squared = (_errors(R, at, first, second) / threshold).square()
+        cost = robustify(squared, "huber", squared.new_tensor(_KERNEL_SCALE)).rho.clamp_max(_BEHIND)
+        cost = torch.where(used, cost, 0.0).sum(-1) + focal.square().repeat(B)
+        state, _ = best_of(
+            (R.unflatten(0, (B, -1)), change.unflatten(0, (B, -1))), cost.unflatten(0, (B, -1))
+        )
+        return state
+
+    with torch.no_grad():
+        (R, change), _ = levenberg_marquardt(start(), evaluate, retract, _ITERATIONS)
+        at = changed(change)
+        return TurningCamera(R, at, change.abs().amax(-1), _errors(R, at, pixels_1, pixels_2))
+
+
+def _turned(
+    R: Float[Tensor, "B 3 3"], camera: Camera, pixels_1: Float[Tensor, "B N 2"]
+) -> tuple[Float[Tensor, "B N 3"], Float[Tensor, "B N 3"]]:
+    """The image points of pixels, and where they turn to."""
+    h_1 = torch.nn.functional.pad(camera.normalize(pixels_1), (0, 1), value=1.0)
+    return h_1, h_1 @ R.mT
+
+
+def _errors(
+    R: Float[Tensor, "B 3 3"],
+    camera: Camera,
+    pixels_1: Float[Tensor, "B N 2"],
+    pixels_2: Float[Tensor, "B N 2"],
+) -> Float[Tensor, "B N"]:
+    """Errors in view 2, pixels; infinite behind the camera."""
+    pixels, valid = camera.project(_turned(R, camera, pixels_1)[1])
+    return torch.where(valid, (pixels - pixels_2).norm(dim=-1), torch.inf)
 
 
 def _rotation_of_rays(

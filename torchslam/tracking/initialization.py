@@ -174,7 +174,7 @@ class Initializer:
             threshold,
             relative.inliers,
         )
-        if float(turning.log_focal.abs()) > largest:
+        if float(turning.departure) > MAX_FOCAL_SIGMAS:
             return None
         off = turning.errors_px[relative.inliers] > math.sqrt(2) * threshold  # with the noise of both views
         if float(off.double().mean()) > MAX_CONTRADICTING_RATIO:
