@@ -19,8 +19,8 @@ from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import robustify
 
-_STARTS = 7  # focal lengths, over twice the standard deviation to both sides, of which the best is optimized
-_ITERATIONS = 8
+_STARTS = 3  # focal lengths, over twice the standard deviation to both sides; the best result counts
+_ITERATIONS = 10
 _KERNEL_SCALE = 2.0  # thresholds at which the Huber kernel becomes linear
 _BEHIND = 1e3  # squared thresholds: the cost of a match that turns behind the camera
 
@@ -54,7 +54,7 @@ def fit_turning_camera(
     """Fit a rotation, a focal length and k1 to the matches of two views, few of which may be wrong.
 
     Minimizes the Huber cost of the errors in view 2 and of the departure from the given camera, by Levenberg-Marquardt
-    from the best of some focal lengths. Not differentiable by design: it serves a decision.
+    from several focal lengths. Not differentiable by design: it serves a decision.
 
     Args:
         pixels_1: matches in view 1.
@@ -103,25 +103,18 @@ def fit_turning_camera(
     def retract(state: ModelState, step: Float[Tensor, "B 5"]) -> ModelState:
         return cayley_rotation(step[:, :3]) @ state[0], state[1] + step[:, 3:]
 
-    def start() -> ModelState:
-        """The best of some focal lengths, each with its best rotation."""
-        B, focal = len(mask), torch.linspace(-2.0, 2.0, _STARTS, dtype=axes.dtype, device=axes.device)
-        change = torch.nn.functional.pad(focal.repeat(B)[:, None], (0, 1))
-        first, second, used = (x.repeat_interleave(_STARTS, dim=0) for x in (pixels_1, pixels_2, mask))
-        at = changed(change)
-        R = _rotation_of_rays(at.unproject(first), at.unproject(second), used)
-        squared = (_errors(R, at, first, second) / threshold).square()
-        cost = robustify(squared, "huber", squared.new_tensor(_KERNEL_SCALE)).rho.clamp_max(_BEHIND)
-        cost = torch.where(used, cost, 0.0).sum(-1) + focal.square().repeat(B)
-        state, _ = best_of(
-            (R.unflatten(0, (B, -1)), change.unflatten(0, (B, -1))), cost.unflatten(0, (B, -1))
-        )
-        return state
-
     with torch.no_grad():
-        (R, change), _ = levenberg_marquardt(start(), evaluate, retract, _ITERATIONS)
+        B, focal = len(mask), torch.linspace(-2.0, 2.0, _STARTS, dtype=axes.dtype, device=axes.device)
+        pixels_1, pixels_2, mask = (x.repeat_interleave(_STARTS, dim=0) for x in (pixels_1, pixels_2, mask))
+        change = torch.nn.functional.pad(focal.repeat(B)[:, None], (0, 1))
         at = changed(change)
-        return TurningCamera(R, at, change.abs().amax(-1), _errors(R, at, pixels_1, pixels_2))
+        start = _rotation_of_rays(at.unproject(pixels_1), at.unproject(pixels_2), mask), change
+        found, cost = levenberg_marquardt(start, evaluate, retract, _ITERATIONS)
+        (R, change), _ = best_of(tuple(x.unflatten(0, (B, -1)) for x in found), cost.unflatten(0, (B, -1)))
+        at = changed(change)
+        pixels, valid = at.project(_turned(R, at, pixels_1[::_STARTS])[1])
+        errors = torch.where(valid, (pixels - pixels_2[::_STARTS]).norm(dim=-1), torch.inf)
+        return TurningCamera(R, at, change.abs().amax(-1), errors)
 
 
 def _turned(
@@ -130,17 +123,6 @@ def _turned(
     """The image points of pixels, and where they turn to."""
     h_1 = torch.nn.functional.pad(camera.normalize(pixels_1), (0, 1), value=1.0)
     return h_1, h_1 @ R.mT
-
-
-def _errors(
-    R: Float[Tensor, "B 3 3"],
-    camera: Camera,
-    pixels_1: Float[Tensor, "B N 2"],
-    pixels_2: Float[Tensor, "B N 2"],
-) -> Float[Tensor, "B N"]:
-    """Errors in view 2, pixels; infinite behind the camera."""
-    pixels, valid = camera.project(_turned(R, camera, pixels_1)[1])
-    return torch.where(valid, (pixels - pixels_2).norm(dim=-1), torch.inf)
 
 
 def _rotation_of_rays(
