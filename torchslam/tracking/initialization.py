@@ -26,6 +26,7 @@ from torchslam.geometry import (
     triangulate,
 )
 from torchslam.geometry.turning_camera import fit_turning_camera
+from torchslam.geometry.two_view import TRANSFER_WIDTH
 from torchslam.map.atlas import Submap
 from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.tracking.matcher import make_matcher, run_matcher
@@ -48,8 +49,8 @@ MAX_LOG_FOCAL = math.log(3.0)
 MAX_CONTRADICTING_RATIO = 0.05
 """Ratio of the matches that may contradict a rotation with another focal length.
 
-Of a rendered rotation it is 0.014 or less, with any focal length. Between frames of real sequences that no rotation
-explains it is 0.06 or more, and 0.2 or more where these determine a map.
+Of rendered rotations it is 0.01 or less, with any guess of the focal length and either ORB. Where two frames of real
+sequences determine a map, it is 0.13 or more.
 """
 
 CHECK_INTERVAL = 5
@@ -142,10 +143,10 @@ class Initializer:
             return Rejection.of(Reason.MOVING_OBJECT, model=model)
         if model == "rotation":
             return Rejection(Reason.PURE_ROTATION)
+        self.num_planar_views += model == "homography"
         rejection = self._turns_only(view, first, second, relative)
         if rejection:
             return rejection
-        self.num_planar_views += model == "homography"
         if model == "homography" and self.num_planar_views < settings.min_planar_frames:
             # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
             return Rejection(Reason.PLANAR_SCENE)
@@ -176,7 +177,10 @@ class Initializer:
         )
         if float(turning.departure) > MAX_FOCAL_SIGMAS:
             return None
-        off = turning.errors_px[relative.inliers] > math.sqrt(2) * threshold  # with the noise of both views
+        limit = (
+            math.sqrt(2) * TRANSFER_WIDTH * threshold
+        )  # of errors in two dimensions, with the noise of both views
+        off = turning.errors_px[relative.inliers] > limit
         if float(off.double().mean()) > MAX_CONTRADICTING_RATIO:
             return None
         return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(turning.camera.focal))
