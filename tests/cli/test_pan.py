@@ -1,4 +1,4 @@
-"""A folder of images of a camera that only turns, without a calibration: no map, and why."""
+"""Images of a camera that only turns, with a focal length that is uncertain and wrong: no map, and why."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import room
 from torchslam.geometry import rigid, se3_inverse, so3_exp
 
-SIZE, FOCAL, FRAMES = (480, 360), 264.0, 24  # 0.55 image widths; the guess of an unknown camera is 0.85
+SIZE, FOCAL, FRAMES = (480, 360), 264.0, 24  # 0.55 image widths
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500", "--processes", "1"]
 
 

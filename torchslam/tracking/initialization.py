@@ -177,9 +177,8 @@ class Initializer:
         )
         if float(turning.departure) > MAX_FOCAL_SIGMAS:
             return None
-        limit = (
-            math.sqrt(2) * TRANSFER_WIDTH * threshold
-        )  # of errors in two dimensions, with the noise of both views
+        # Errors in two dimensions, with the noise of both views.
+        limit = math.sqrt(2) * TRANSFER_WIDTH * threshold
         off = turning.errors_px[relative.inliers] > limit
         if float(off.double().mean()) > MAX_CONTRADICTING_RATIO:
             return None
