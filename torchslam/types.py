@@ -376,6 +376,10 @@ class Reason(StrEnum):
     STANDSTILL_IN_PART = "{ratio:.0%} of the image stands still, and of the rest: {rejection}"
     MOVING_OBJECT = "something may move before a camera that stands still: a {model} explains it"
     PURE_ROTATION = "the camera only turns: a rotation explains the matches"
+    PURE_ROTATION_OTHER_FOCAL = (
+        "the camera only turns: a rotation with a focal length of about {focal:.0f} px "
+        "explains the matches as well"
+    )
     PLANAR_SCENE = "the scene looks planar: a homography explains the matches"
     AMBIGUOUS_MOTION = "ambiguous motion: the {model} allows several"
     BEHIND_CAMERA = "matches behind a camera: only {ratio:.0%} lie in front of both"

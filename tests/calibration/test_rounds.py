@@ -9,8 +9,8 @@ import torch
 
 from tests.walks import Walk, arc, turn
 from torchslam.calibration import CalibrationResult, CalibrationRound, IntrinsicsEstimate, calibrate
-from torchslam.calibration.find_camera import contradiction, describe_camera
-from torchslam.config import Config, load_config
+from torchslam.calibration.find_camera import contradiction, describe_camera, with_stated_std
+from torchslam.config import CameraConfig, Config, load_config
 from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.geometry import Camera
 from torchslam.system.front_end import Simulated, true_poses
@@ -57,6 +57,23 @@ def test_a_rotating_camera_is_not_calibrated() -> None:
     assert not found.is_determined
     assert found.camera is unknown.camera or float(found.camera.focal) == float(unknown.camera.focal)
     assert "a guess, which may be wrong by a factor of two" in describe_camera(found)
+
+
+def test_no_round_makes_a_map_of_a_rotating_camera() -> None:
+    """Taken for right, all guesses but the second, which is nearly right, make a translation of it."""
+    unknown, config = walk(turn(20, 0.7))
+    early = replace(config.initialization, min_planar_frames=2, min_matches=40, min_points=20)
+    found = calibrate(unknown, replace(config, initialization=early))
+    assert [round(float(each.camera.focal)) for each in found.rounds] == [272, 192, 384, 544]
+    assert all(each.estimate is None for each in found.rounds)
+
+
+def test_a_guess_without_a_search_counts_as_one() -> None:
+    unknown, config = walk(turn(2))
+    assert with_stated_std(config, unknown).camera.guessed
+    assert not with_stated_std(config, unknown.with_camera(unknown.camera)).camera.guessed
+    stated = with_stated_std(config, unknown.with_camera(unknown.camera, std=0.1))
+    assert stated.camera == CameraConfig(std=0.1)
 
 
 def refinement(focal: float, std: float, drop: float = 0.0) -> IntrinsicsEstimate:

@@ -340,3 +340,47 @@ def test_points_that_disagree_with_both_views_are_flagged() -> None:
     assert not refined(ones, off)[2][:10].any()
     assert refined(ones, off)[2][10:].double().mean() > 0.95
     assert refined(torch.where(off[:, 1] > 0, 6.0, 1.0).double(), off)[2][:10].all()
+
+
+def turning(focal: float, *overrides: str, T_cw: Tensor | None = None) -> tuple[TwoViewMap | None, str]:
+    """The first map, or the last rejection, of a camera that turns, or of poses (F, 4, 4), with a focal length."""
+    if T_cw is None:
+        T_cw = torch.stack([pose(0, 0, 0, 0.02 * k, 0.06 * k, 0.02 * k) for k in range(7)])
+    camera = CAMERA.with_params(torch.cat((torch.full_like(CAMERA.params[:2], focal), CAMERA.params[2:])))
+    scene = Scene.of(600, width=14.0)
+    always = ["initialization.min_matches=60", "initialization.min_planar_frames=2"]
+    initializer = Initializer(camera, load_config(None, [*always, *overrides]))
+    start, reason = None, ""
+    for index, T in enumerate(T_cw):
+        start, reason = step(initializer, scene.view(index, T, noise=0.2))
+        if start is not None:
+            break
+    return start, reason
+
+
+@pytest.mark.parametrize("focal", [110.0, 350.0])
+def test_a_rotating_camera_gives_no_depth_with_a_guess_of_its_focal_length(focal: float) -> None:
+    assert turning(focal)[0] is not None  # with the 2 % of a given camera
+    start, reason = turning(focal, "camera.guessed=true")
+    assert start is None
+    assert reason.startswith("the camera only turns: a rotation with a focal length of about ")
+    assert float(reason.split("about ")[1].split(" px")[0]) == pytest.approx(200.0, rel=0.05)
+
+
+def test_the_error_of_the_camera_bounds_the_focal_length_of_a_rotation() -> None:
+    assert turning(350.0, "camera.std=0")[0] is not None
+    assert turning(350.0, "camera.std=0.1")[0] is not None  # log(350 / 200) is 5.6 of these
+    start, reason = turning(350.0, "camera.std=0.3")
+    assert start is None
+    assert "only turns: a rotation with a focal length" in reason
+
+
+@pytest.mark.parametrize("focal", [160.0, 200.0, 300.0])
+def test_a_guess_of_the_focal_length_does_not_hide_depth(focal: float) -> None:
+    T_cw = torch.stack([pose(-0.1 * k, 0.0, 0.02 * k, 0.01 * k, 0.03 * k, 0.0) for k in range(9)])
+    certain, reason = turning(focal, "camera.std=0", T_cw=T_cw)
+    assert certain is not None, reason
+    guessed, reason = turning(focal, "camera.guessed=true", T_cw=T_cw)
+    assert guessed is not None, reason
+    assert guessed.view.index == certain.view.index
+    assert torch.equal(guessed.T_cw, certain.T_cw)

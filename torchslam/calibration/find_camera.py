@@ -80,9 +80,10 @@ def find_camera(
 
 
 def with_stated_std(config: Config, sequence: Sequence) -> Config:
-    """The configuration with the error of the camera that the sequence's calibration states, if it does."""
+    """The configuration with the error of the camera that the sequence's calibration states, or that of a guess."""
     if sequence.camera_std is None:
-        return config
+        guessed = sequence.calibrated is Calibrated.GUESSED
+        return replace(config, camera=replace(config.camera, guessed=guessed)) if guessed else config
     return replace(config, camera=CameraConfig(std=sequence.camera_std))
 
 

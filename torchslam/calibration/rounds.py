@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -108,7 +108,8 @@ def calibrate(
         sequence: With the camera to start from.
         config: Of the runs.
         radial: Maximum number of distortion coefficients; each must lower the cost.
-        guess: Whether the camera is a guess: then other focal lengths are tried, and the principal point may move.
+        guess: Whether the camera is a guess: then other focal lengths are tried, the principal point may move, and no
+            map is made where one of them and a rotation explain the matches.
         device: Of torch.
         extractor: Front end; the configured one if None.
         on_progress: Receives every round.
@@ -116,6 +117,7 @@ def calibrate(
     Raises:
         KeyboardInterrupt: A run was interrupted.
     """
+    config = replace(config, camera=replace(config.camera, guessed=guess))
     cached = None
     if not sequence.brings_features:
         cached = CachedExtractor(image_extractor(config, device, extractor))

@@ -31,6 +31,10 @@ class CameraConfig(Settings, section="camera"):
         low=0,
         high=1,
     )
+    guessed: bool = setting(
+        False,
+        "The focal length is a guess: no map is made of what a rotation with another one explains as well.",
+    )
 
 
 @dataclass(frozen=True)

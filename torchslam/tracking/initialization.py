@@ -25,6 +25,8 @@ from torchslam.geometry import (
     transform,
     triangulate,
 )
+from torchslam.geometry.turning_camera import fit_turning_camera
+from torchslam.geometry.two_view import TRANSFER_WIDTH
 from torchslam.map.atlas import Submap
 from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.tracking.matcher import make_matcher, run_matcher
@@ -40,6 +42,16 @@ MIN_MATCHED_RATIO = 0.35
 """Minimum ratio of the keypoints that match if the camera stands still."""
 MIN_EXPLAINED_RATIO = 0.5
 """Ratio of the matches in place that the motion of the others must explain if they belong to the scene."""
+MAX_FOCAL_SIGMAS = 3.0
+"""Largest departure from the focal length of the camera with which a rotation may explain the matches."""
+MAX_LOG_FOCAL = math.log(3.0)
+"""The same for a guess, and for any camera, as a logarithm: about the ratio of the focal lengths of usual lenses."""
+MAX_CONTRADICTING_RATIO = 0.05
+"""Ratio of the matches that may contradict a rotation with another focal length.
+
+Of rendered rotations it is 0.01 or less, with any guess of the focal length and either ORB. Where two frames of real
+sequences determine a map, it is 0.13 or more.
+"""
 
 CHECK_INTERVAL = 5
 """Frames between two checks; a turning camera soon no longer sees what the first frame saw."""
@@ -132,6 +144,9 @@ class Initializer:
         if model == "rotation":
             return Rejection(Reason.PURE_ROTATION)
         self.num_planar_views += model == "homography"
+        rejection = self._turns_only(view, first, second, relative)
+        if rejection:
+            return rejection
         if model == "homography" and self.num_planar_views < settings.min_planar_frames:
             # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
             return Rejection(Reason.PLANAR_SCENE)
@@ -140,6 +155,34 @@ class Initializer:
         inliers = torch.nonzero(relative.inliers[0])[:, 0]
         min_good_ratio = settings.min_planar_ratio if model == "homography" else settings.min_good_ratio
         return self._triangulate(view, relative.T_21[0], first[inliers], second[inliers], min_good_ratio)
+
+    def _turns_only(
+        self, view: FrameFeatures, first: Int[Tensor, " M"], second: Int[Tensor, " M"], relative: RelativePose
+    ) -> Rejection | None:
+        """A rejection if a rotation with another focal length explains the inliers of a relative pose as well.
+
+        The focal length may be as wrong as the configuration says of the camera, not at all for an exact one.
+        """
+        camera, threshold = self.config.camera, self.config.initialization.threshold_px
+        largest = MAX_LOG_FOCAL if camera.guessed else min(MAX_FOCAL_SIGMAS * camera.std, MAX_LOG_FOCAL)
+        if largest == 0 or not bool(relative.inliers.any()):
+            return None
+        turning = fit_turning_camera(
+            self.reference.keypoints[first][None],
+            view.keypoints[second][None],
+            self.camera,
+            largest / MAX_FOCAL_SIGMAS,
+            threshold,
+            relative.inliers,
+        )
+        if float(turning.departure) > MAX_FOCAL_SIGMAS:
+            return None
+        # Errors in two dimensions, with the noise of both views.
+        limit = math.sqrt(2) * TRANSFER_WIDTH * threshold
+        off = turning.errors_px[relative.inliers] > limit
+        if float(off.double().mean()) > MAX_CONTRADICTING_RATIO:
+            return None
+        return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(turning.camera.focal))
 
     def _scene(
         self,
