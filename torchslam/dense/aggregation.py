@@ -87,10 +87,3 @@ def _shifted(path: Tensor, shift: int) -> Tensor:
         return path
     pad = (0, 0, 1, 0) if shift > 0 else (0, 0, 0, 1)
     return F.pad(path[..., :-1, :] if shift > 0 else path[..., 1:, :], pad)
-
-
-def box(cost: Float[Tensor, "*batch D H W"], image: Float[Tensor, "*batch H W"]) -> Float[Tensor, "*batch D H W"]:
-    """Aggregate over squares of 9 pixels: the simplest aggregation, to compare with."""
-    from torchslam.dense.cost_volume import box_sum
-
-    return box_sum(cost, 4) / box_sum(torch.ones_like(cost), 4)

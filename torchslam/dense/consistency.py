@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.dense.cost_volume import warp
 from torchslam.geometry import Camera, se3_inverse
 
 TOLERANCE = 0.02
-"""Largest relative difference of depths that agree."""
+"""Relative difference of depths at which one gives half a vote to another; from twice as much on, none."""
 
 
 class Merged(NamedTuple):
@@ -20,17 +20,17 @@ class Merged(NamedTuple):
 
     Attributes:
         inverse_depth: mean of the views that agree, 1 / map units; 0 where no view knows the depth.
-        support: how well the views agree, the view itself among them: 1 for each, less where they differ.
+        support: sum of the votes of the views, the view itself among them: the confidence of each where they agree.
         spread: relative standard deviation of the depths that agree.
-        conflicts: number of views that see a surface in front.
-        agrees: whether the view's own depth is among those that agree.
+        conflicts: sum of the confidence of views that see a surface in front.
+        agrees: 1 where the view's own depth is among those that agree, else 0.
     """
 
     inverse_depth: Float[Tensor, "H W"]
     support: Float[Tensor, "H W"]
     spread: Float[Tensor, "H W"]
     conflicts: Float[Tensor, "H W"]
-    agrees: Bool[Tensor, "H W"]
+    agrees: Float[Tensor, "H W"]
 
 
 def render(
@@ -112,7 +112,9 @@ def as_seen_by(
 
 def merge(
     inverse_depth: Float[Tensor, "H W"],
+    confidence: Float[Tensor, "H W"],
     others: Float[Tensor, "V H W"],
+    other_confidences: Float[Tensor, "V H W"],
     camera: Camera,
     T_sr: Float[Tensor, "V 4 4"],
     tolerance: float = TOLERANCE,
@@ -124,25 +126,29 @@ def merge(
 
     Args:
         inverse_depth: of the view, 1 / map units; 0 where unknown.
-        others: of its neighbors.
+        confidence: of its depth alone, 0 to 1: the weight of its votes.
+        others, other_confidences: of its neighbors.
         camera: the pinhole of all views.
         T_sr: poses, camera of the view to those of the neighbors.
         tolerance: relative difference of depths at which one gives half a vote to another.
     """
     rendered = render(others, camera, se3_inverse(T_sr))
     maps = torch.cat((inverse_depth[None], as_seen_by(rendered, others, camera, T_sr)))
+    sampled, _ = warp(other_confidences[:, None], camera, T_sr[:, None], rendered[:, None])
+    weights = torch.cat((confidence[None], sampled[:, 0, 0]))
     is_known = maps > 0
-    best = [torch.zeros_like(inverse_depth) for _ in range(5)]
+    best = Merged(*(torch.zeros_like(inverse_depth) for _ in Merged._fields))
     for candidate in maps.unbind(0):
         relative = maps / torch.where(candidate > 0, candidate, 1.0) - 1
-        votes = 1 / (1 + (relative / tolerance) ** 2)
-        votes = torch.where(is_known & (candidate > 0) & (relative.abs() <= 2 * tolerance), votes, 0.0)
+        is_comparable = is_known & (candidate > 0)
+        agree = is_comparable & (relative.abs() <= 2 * tolerance)
+        votes = torch.where(agree, weights / (1 + (relative / tolerance) ** 2), 0.0)
         support = votes.sum(0)
-        weight = support.clamp(min=torch.finfo(maps.dtype).eps)
-        mean = (votes * relative).sum(0) / weight
-        variance = (votes * (relative - mean).square()).sum(0) / weight
-        conflicts = (is_known & (relative > 2 * tolerance)).sum(0).to(maps.dtype)
-        found = (candidate * (1 + mean), support, variance.sqrt(), conflicts, (votes[0] > 0).to(maps.dtype))
-        is_better = support > best[1]
-        best = [torch.where(is_better, new, old) for new, old in zip(found, best, strict=True)]
-    return Merged(*best[:4], agrees=best[4] > 0)
+        total = support.clamp(min=torch.finfo(maps.dtype).eps)
+        mean = (votes * relative).sum(0) / total
+        spread = ((votes * (relative - mean).square()).sum(0) / total).sqrt()
+        conflicts = torch.where(is_comparable & (relative > 2 * tolerance), weights, 0.0).sum(0)
+        found = Merged(candidate * (1 + mean), support, spread, conflicts, agree[0].to(maps.dtype))
+        is_better = support > best.support
+        best = Merged(*(torch.where(is_better, new, old) for new, old in zip(found, best, strict=True)))
+    return best

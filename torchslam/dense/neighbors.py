@@ -41,7 +41,9 @@ def neighbor_scores(
     return torch.where(is_enough, torch.where(is_shared, weight, 0.0).sum(-1), 0.0)
 
 
-def choose_neighbors(scores: Float[Tensor, "*batch K"], count: int) -> tuple[Int[Tensor, "*batch V"], Bool[Tensor, "*batch V"]]:
+def choose_neighbors(
+    scores: Float[Tensor, "*batch K"], count: int
+) -> tuple[Int[Tensor, "*batch V"], Bool[Tensor, "*batch V"]]:
     """Choose the candidates of the highest scores, of equal ones the first.
 
     Returns:
