@@ -62,7 +62,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--every",
         type=arguments.positive,
         metavar="N",
-        help="a depth map for every N-th posed frame (default: for the keyframes)",
+        help="depth for every N-th posed frame (default: for the keyframes)",
     )
 
 

@@ -7,20 +7,25 @@ depth of a rendered room, of equal weight; `experiments/dense` fits them.
 from __future__ import annotations
 
 import torch
-from jaxtyping import Float
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.dense.consistency import Merged
 from torchslam.dense.estimate import Estimate
 
-ALONE = (-1.1, 6.4, -1.1, 2.0, 0.7)
+ALONE = (-1.67, 7.88, -1.03, 2.27, 0.97)
 """Weights of the cost and the margin at full size, of those at half size, and the constant."""
-TOGETHER = (2.4, -0.8, -0.3, 0.5, -1.0)
+TOGETHER = (1.15, -0.66, -0.45, 0.40, 0.68)
 """Weights of the logarithm of the support, of the relative spread in percent, of the conflicts and of the view's own
 log-odds where it agrees, and the constant."""
 LEAST_SUPPORT = 1e-3
 LEAST_ALONE = 1e-4
 """Below these, evidence does not count any further."""
+LEAST_KEPT = 0.7
+"""Least confidence of depth that is kept: then about nine in ten of all kept pixels are right."""
+SPECK = 2
+"""Radius of the neighborhood most of which must be kept, pixels."""
 
 
 def alone_features(found: Estimate) -> Float[Tensor, "B H W 4"]:
@@ -43,6 +48,13 @@ def together_features(merged: Merged, alone: Float[Tensor, "H W"]) -> Float[Tens
 def confidence_together(merged: Merged, alone: Float[Tensor, "H W"]) -> Float[Tensor, "H W"]:
     """Probability that merged depth is right; 0 where there is none."""
     return torch.where(merged.inverse_depth > 0, _logistic(together_features(merged, alone), TOGETHER), 0.0)
+
+
+def kept(confidence: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+    """Whether depth is kept: it is probable enough, and so is most of what is around it, which specks are not."""
+    is_probable = confidence >= LEAST_KEPT
+    share = F.avg_pool2d(is_probable.to(confidence.dtype)[None, None], 2 * SPECK + 1, 1, SPECK)[0, 0]
+    return is_probable & (share > 0.5)
 
 
 def _logistic(features: Tensor, weights: tuple[float, ...]) -> Tensor:

@@ -27,8 +27,6 @@ BEST_VIEWS = 3
 """Views that must match; the others may not see the surface."""
 HALF_RADIUS, FULL_RADIUS = 3, 3
 """Radii of the windows, pixels."""
-MIN_SIZE = 32
-"""Smallest side of an image, pixels: windows at half size are a fraction of it."""
 
 
 class Estimate(NamedTuple):
@@ -36,14 +34,11 @@ class Estimate(NamedTuple):
 
     Attributes:
         inverse_depth: 1 / map units, positive.
-        sigma: its standard deviation by the curvature of the cost, 1 / map units: how well the place of the minimum is
-            known if it is the right one.
         coarse: minimum of the cost at half size, of the pixels at full size; its position is in planes.
         fine: minimum at full size; its position is in steps.
     """
 
     inverse_depth: Float[Tensor, "B H W"]
-    sigma: Float[Tensor, "B H W"]
     coarse: Minimum
     fine: Minimum
 
@@ -60,8 +55,7 @@ def estimate_depth(
 ) -> Estimate:
     """Estimate the depth of every pixel of reference views.
 
-    Differentiable with respect to images, poses and camera through the cost around the minimum. Detached are the range
-    of depth, the surface found at half size, which only says where to look, and which hypothesis is the best one.
+    Gradients are those of `refine_depth`; detached are the range of depth and the surface found at half size.
 
     Args:
         reference: gray images in [0, 1], of even width and height.
@@ -72,31 +66,55 @@ def estimate_depth(
         aggregate: aggregation of the costs.
         planes: number of planes of the sweep.
     """
-    best = min(BEST_VIEWS, sources.shape[1])
-    inverse_depths = inverse_depth_planes(near.to(reference), far.to(reference), planes)
-    step = (inverse_depths[:, 1] - inverse_depths[:, 0])[:, None, None]
+    inverse_depths = inverse_depth_planes(near.to(reference), far.to(reference), planes).detach()
+    step = inverse_depths[:, 1] - inverse_depths[:, 0]
     with torch.no_grad():
         small, small_sources = F.avg_pool2d(reference[:, None], 2)[:, 0], F.avg_pool2d(sources, 2)
+        best = min(BEST_VIEWS, sources.shape[1])
         hypotheses = inverse_depths[..., None, None]
         cost = matching_cost(small, small_sources, halved(camera), T_sr, hypotheses, HALF_RADIUS, best)
         coarse = find_minimum(aggregate(cost, small))
-        surface = inverse_depths[:, :1, None] + step * coarse.position
-        surface = F.interpolate(surface[:, None], size=reference.shape[-2:], mode="bilinear")
+        surface = inverse_depths[:, :1, None] + step[:, None, None] * coarse.position
+        surface = F.interpolate(surface[:, None], size=reference.shape[-2:], mode="bilinear")[:, 0]
         coarse = Minimum(*(F.interpolate(each[:, None], scale_factor=2)[:, 0] for each in coarse))
-    step = REFINEMENT * step
+    inverse_depth, fine = refine_depth(
+        reference, sources, camera, T_sr, surface, REFINEMENT * step, 0.5 / far.to(reference), aggregate
+    )
+    return Estimate(inverse_depth, coarse, fine)
+
+
+def refine_depth(
+    reference: Float[Tensor, "B H W"],
+    sources: Float[Tensor, "B V H W"],
+    camera: Camera,
+    T_sr: Float[Tensor, "B V 4 4"],
+    surface: Float[Tensor, "B H W"],
+    step: Float[Tensor, " B"],
+    least: Float[Tensor, " B"],
+    aggregate: Aggregation = semi_global,
+) -> tuple[Float[Tensor, "B H W"], Minimum]:
+    """Find the inverse depth of the least cost near a surface.
+
+    Differentiable with respect to images, poses and camera, through the costs around the minimum. Which hypothesis is
+    the best one, which views match, and the penalties of the aggregation are decisions without a gradient.
+
+    Args:
+        reference, sources, camera, T_sr, aggregate: as for `estimate_depth`.
+        surface: inverse depth to look around.
+        step: between hypotheses, of which there are STEPS on either side.
+        least: inverse depth that no hypothesis lies below, positive.
+
+    Returns:
+        Inverse depth, and the minimum of the cost in steps.
+    """
+    step, least = step[:, None, None], least[:, None, None]
     offsets = torch.arange(-STEPS, STEPS + 1, dtype=surface.dtype, device=surface.device)[:, None, None]
-    # No hypothesis lies at infinity or beyond.
-    hypotheses = (surface + offsets * step[:, None]).clamp(min=0.5 / far.to(surface).amax())
-    cost = matching_cost(reference, sources, camera, T_sr, hypotheses, FULL_RADIUS, best)
-    fine = find_minimum(aggregate(cost, reference))
-    inverse_depth = (surface[:, 0] + (fine.position - STEPS) * step).clamp(min=0.5 / far.to(surface).amax())
-    return Estimate(inverse_depth, _sigma(fine, step), coarse, fine)
-
-
-def _sigma(found: Minimum, step: Tensor) -> Tensor:
-    """Standard deviation of the place of a minimum: a parabola of that curvature rises by the cost of the minimum."""
-    ratio = found.cost.clamp(min=0) / found.curvature.clamp(min=1e-3)
-    return step * ratio.clamp(max=STEPS**2).sqrt()
+    hypotheses = torch.maximum(surface[:, None] + offsets * step[:, None], least[:, None])
+    cost = matching_cost(
+        reference, sources, camera, T_sr, hypotheses, FULL_RADIUS, min(BEST_VIEWS, sources.shape[1])
+    )
+    found = find_minimum(aggregate(cost, reference))
+    return torch.maximum(surface + (found.position - STEPS) * step, least), found
 
 
 def halved(camera: Camera) -> Camera:

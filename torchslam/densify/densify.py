@@ -20,14 +20,14 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from torchslam.dense.cloud import PointCloud
-from torchslam.dense.confidence import confidence_alone, confidence_together
+from torchslam.dense.confidence import confidence_alone, confidence_together, kept
 from torchslam.dense.consistency import merge
 from torchslam.dense.depth_maps import DepthMaps, join, read_about
 from torchslam.dense.estimate import estimate_depth
 from torchslam.dense.fusion import CloudFusion
 from torchslam.dense.normals import normals
 from torchslam.densify.pictures import write_picture
-from torchslam.densify.views import CACHED, ViewImages, Views
+from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views
 from torchslam.errors import ResultsError
 from torchslam.utils.files import parse_json, read_text, write_whole
 
@@ -38,8 +38,6 @@ JOB = "job.json"
 MAX_JOB_BYTES = 1 << 16
 FORMAT = 1
 """Of the parts: those of another version are computed again."""
-KEPT = 0.6
-"""Least confidence of depth that is kept: less is more likely to be wrong than a hole is to be missed."""
 
 
 @dataclass(frozen=True)
@@ -125,12 +123,12 @@ def _merged_path(parts: Path, views: Views, view: int) -> Path:
 
 def _write_alone(path: Path, views: Views, images: ViewImages, view: int, device: torch.device) -> None:
     """First pass: inverse depth of a view and its confidence."""
-    sources = torch.stack([images.gray(other) for other in views.neighbors[view]])
+    sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
     found = estimate_depth(
         images.gray(view)[None].to(device),
         sources[None].to(device),
         views.camera.to(device),
-        views.T_sr(view)[None].to(device),
+        views.T_sr(view)[None, :SWEPT].to(device),
         views.near[view, None].to(device),
         views.far[view, None].to(device),
     )
@@ -157,7 +155,7 @@ def _write_merged(
     camera, T_sr = views.camera.to(device), views.T_sr(view).to(device)
     merged = merge(inverse_depth, confidence, others, other_confidences, camera, T_sr)
     probability = confidence_together(merged, confidence)
-    is_kept = probability >= KEPT
+    is_kept = kept(probability)
     depth = torch.where(is_kept, 1 / torch.where(is_kept, merged.inverse_depth, 1.0), 0.0)
     maps = DepthMaps(
         frame_index=views.frame_index[view, None],
@@ -184,10 +182,10 @@ def _draw(folder: Path, views: Views, images: ViewImages) -> None:
 
 def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"]) -> DenseSummary:
     """Fuse the maps of a file."""
-    kept, pixels, confidence, sizes = 0, 0, 0.0, []
+    known, pixels, confidence, sizes = 0, 0, 0.0, []
     for view, maps in enumerate(DepthMaps.blocks(path, 1)):
         depth = maps.depth[maps.depth > 0]
-        kept, pixels = kept + depth.numel(), pixels + maps.depth.numel()
+        known, pixels = known + depth.numel(), pixels + maps.depth.numel()
         confidence += float(maps.confidence.sum(dtype=torch.float64))
         if depth.numel():
             # A point is as uncertain as its depth, and no smaller than a pixel.
@@ -196,4 +194,4 @@ def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"]) -> Dense
     fusion = CloudFusion(voxel)
     for view, maps in enumerate(DepthMaps.blocks(path, 1)):
         fusion.add(maps, images.color(view)[None])
-    return DenseSummary(len(spreads), kept / pixels, confidence / max(kept, 1), voxel, fusion.cloud())
+    return DenseSummary(len(spreads), known / pixels, confidence / max(known, 1), voxel, fusion.cloud())

@@ -17,7 +17,10 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.scene import ExportedScene, Images, undistorted
 
-NEIGHBORS = 8
+NEIGHBORS = 12
+"""Views that a depth map is compared with."""
+SWEPT = 8
+"""The best of them, which depth is estimated from."""
 LEAST_NEIGHBORS = 2
 """With fewer a depth would not be confirmed."""
 LEAST_POINTS = 10
