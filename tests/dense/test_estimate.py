@@ -71,7 +71,7 @@ def test_samples_at_the_true_depth_are_the_reference(dtype: torch.dtype) -> None
 
 
 def test_behind_a_camera_nothing_is_seen() -> None:
-    reference, sources, camera, T_sr, _ = scene(WIDTH, HEIGHT, 1)
+    _, sources, camera, T_sr, _ = scene(WIDTH, HEIGHT, 1)
     behind = T_sr.clone()
     behind[:, 2, 3] = -10.0
     samples, is_seen = warp(sources, camera, behind, torch.full((1, HEIGHT, WIDTH), 0.5, dtype=torch.float64))

@@ -103,7 +103,7 @@ def densify_results(
             f"{directory / METRICS}: does not say where the images are; give them with --images"
         )
     scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=every is None)
-    opened = open_images(source, scene, undistort=True, fps=metrics.get("source_fps"))
+    opened = open_images(source, scene, True, metrics.get("source_fps"), "use --images for its new location")
     size = map_size(resolution, pinhole_within(scene.camera).size)
     views = views_of(scene, size, every)
     view_images = ViewImages(views, opened)

@@ -24,7 +24,7 @@ import torch
 
 from torchslam.calibration.find_camera import RADIAL, find_camera, with_stated_std
 from torchslam.cli import arguments
-from torchslam.cli.densify import add_options, densify_results
+from torchslam.cli.densify import add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StopSignals
 from torchslam.config import Config
 from torchslam.data import Sequence
@@ -204,6 +204,8 @@ def execute(options: argparse.Namespace) -> int:
         camera_std=options.camera_std,
     )
     opened, config = _sequence(options), arguments.config(options)
+    if options.dense:
+        map_size(options.resolution, opened.size)  # raises now rather than after the run
     is_recorded = opened.known_length is not None and not (options.view or options.video)
     is_default = config.features == Config().features and config.matching == Config().matching
     is_default = is_default and options.features is None
