@@ -18,7 +18,7 @@ from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.dense import DepthMaps
 from torchslam.dense.cost_volume import matching_cost
-from torchslam.densify import densify as passes
+from torchslam.densify import passes
 from torchslam.errors import ConfigError
 from torchslam.geometry import se3_inverse
 
@@ -162,7 +162,7 @@ def test_missing_images_are_reported(
     [
         (["--every", "20"], "dense depth needs 3"),
         (["--resolution", "big"], "expected 640x480 or 640, got `big`"),
-        (["--resolution", "2000x1000"], "at most the image's 640 x 480"),
+        (["--resolution", "2000x1000"], "at most the image's"),
         (["--resolution", "40"], "at least 64 each way"),
     ],
 )

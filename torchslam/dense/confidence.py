@@ -22,7 +22,7 @@ log-odds where it agrees, and the constant."""
 LEAST_SUPPORT = 1e-3
 LEAST_ALONE = 1e-4
 """Below these, evidence does not count any further."""
-LEAST_KEPT = 0.7
+LEAST_KEPT = 0.72
 """Least confidence of depth that is kept: then about nine in ten of all kept pixels are right."""
 SPECK = 2
 """Radius of the neighborhood most of which must be kept, pixels."""
