@@ -31,7 +31,8 @@ def truth_of(folder: Path, maps: DepthMaps, depth: Path | None) -> Tensor:
         sequence = open_sequence(read_metrics(folder)["source"])
         if not isinstance(sequence, SyntheticSequence):
             raise SystemExit("give the folder of the sensor's depth with --depth")
-        true = torch.stack([sequence.pose(index) for index in maps.frame_index.tolist()])
+        poses = [sequence.pose(index) for index in maps.frame_index.tolist()]
+        true = torch.stack([pose for pose in poses if pose is not None])  # a rendered frame has one
         lengths = [torch.pdist(se3_inverse(T_cw.double())[:, :3, 3]).sum() for T_cw in (true, maps.T_cw)]
         return rendered_depth(
             sequence, maps.frame_index.tolist(), maps.camera.size, float(lengths[0] / lengths[1])

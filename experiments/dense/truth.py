@@ -112,6 +112,7 @@ class Sensor:
 
     def _image(self, frame: int) -> Tensor:
         image = cv2.imread(str(self._folder / f"{frame:06d}.png"), cv2.IMREAD_UNCHANGED)
+        assert image is not None, frame
         depth = torch.from_numpy(image.astype(np.float64)) / 1000
         return torch.where((depth > RANGE_M[0]) & (depth < RANGE_M[1]), depth, 0.0)
 
