@@ -1,4 +1,4 @@
-"""The command line: `torchslam run | batch | refine | demo | eval | plot | export | info | config | download`.
+"""The command line: `torchslam COMMAND`, with the commands of `COMMANDS`.
 
 Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialized or no frame could be
 localized, 4 some sequences of a batch failed, 130 and 143 ended by Ctrl-C and by SIGTERM.
@@ -30,6 +30,10 @@ COMMANDS = {
     "refine": (
         "refine",
         "refine the poses of another program from the images and write them in their original format",
+    ),
+    "densify": (
+        "densify",
+        "compute dense depth of a run from its map and images: depth maps, a colored cloud and pictures",
     ),
     "demo": (
         "commands",

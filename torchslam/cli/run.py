@@ -24,6 +24,7 @@ import torch
 
 from torchslam.calibration.find_camera import RADIAL, find_camera, with_stated_std
 from torchslam.cli import arguments
+from torchslam.cli.densify import add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StopSignals
 from torchslam.config import Config
 from torchslam.data import Sequence
@@ -161,6 +162,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--video", action="store_true", help=f"write {VIDEO}: the frames with their tracked keypoints"
     )
+    parser.add_argument(
+        "--dense", action="store_true", help="compute dense depth after the run, as `torchslam densify` does"
+    )
+    add_options(parser)
     arguments.add_device(parser)
     arguments.add_processes(parser)
     arguments.add_config(parser)
@@ -172,6 +177,10 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError("--refine-camera cannot be combined with --map: a map keeps its camera")
     if options.localize and options.map is None:
         raise ConfigError("--localize requires --map")
+    if options.dense and options.localize:
+        raise ConfigError(
+            "--dense cannot be combined with --localize: a run that only localizes has no keyframes"
+        )
     if options.view:
         import_rerun()
     saved = options.map
@@ -197,10 +206,16 @@ def execute(options: argparse.Namespace) -> int:
         camera_std=options.camera_std,
     )
     opened, config = _sequence(options), arguments.config(options)
+    if options.dense:
+        map_size(options.resolution, opened.size)  # raises now rather than after the run
     is_recorded = opened.known_length is not None and not (options.view or options.video)
     is_default = config.features == Config().features and config.matching == Config().matching
     is_default = is_default and options.features is None
-    return run(opened, config, replace(plan, may_fall_back=is_recorded and is_default and saved is None))
+    status = run(opened, config, replace(plan, may_fall_back=is_recorded and is_default and saved is None))
+    if options.dense and status == DONE:
+        dense = densify_results(options.output, options.resolution, options.every, options.device)
+        print(f"\n{table(dense)}")
+    return status
 
 
 def _sequence(options: argparse.Namespace) -> Sequence:

@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -89,8 +89,8 @@ def _nul(path: str | Path) -> OSError:
     return OSError(errno.EINVAL, "file name contains a NUL character", str(path))
 
 
-def write_whole(path: str | Path, content: bytes) -> None:
-    """Write a file under a temporary name, sync it to disk, and rename it to `path`.
+def write_whole(path: str | Path, content: bytes | Iterable[bytes]) -> None:
+    """Write a file, or its pieces, under a temporary name, sync it to disk, and rename it to `path`.
 
     An existing file stays unchanged until then. Raises OSError.
     """
@@ -98,7 +98,8 @@ def write_whole(path: str | Path, content: bytes) -> None:
     part = path.with_name(path.name + PART)
     try:
         with part.open("wb") as file:
-            file.write(content)
+            for piece in [content] if isinstance(content, bytes) else content:
+                file.write(piece)
             file.flush()
             os.fsync(file.fileno())
         part.replace(path)

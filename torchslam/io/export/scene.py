@@ -199,7 +199,11 @@ class Images:
 
 
 def open_images(
-    source: str, scene: ExportedScene, undistort: bool = False, fps: float | None = None
+    source: str,
+    scene: ExportedScene,
+    undistort: bool = False,
+    fps: float | None = None,
+    otherwise: str = WITHOUT,
 ) -> Images:
     """Open the images of a scene, in the size of the run.
 
@@ -211,6 +215,7 @@ def open_images(
         scene: the exported frames.
         undistort: undistort the images.
         fps: frame rate with which the run read images without timestamps.
+        otherwise: what to do without them, for the error.
     """
     times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
     try:
@@ -220,11 +225,11 @@ def open_images(
         if sequence.size != scene.camera.size:
             sequence = resize(sequence, "{}x{}".format(*scene.camera.size))
     except SequenceError as error:
-        raise ResultsError(f"the sequence of this run cannot be read: {error}; {WITHOUT}") from None
+        raise ResultsError(f"the sequence of this run cannot be read: {error}; {otherwise}") from None
     row_at = {time: row for row, time in enumerate(sequence.timestamps.tolist())}
     if not all(time in row_at for time in times.values()):
         raise ResultsError(
-            f"{source}: not the sequence of this run, whose frames have other times; {WITHOUT}"
+            f"{source}: not the sequence of this run, whose frames have other times; {otherwise}"
         )
     rows = {frame_id: row_at[time] for frame_id, time in times.items()}
     return Images(sequence, rows, scene.camera, undistort)

@@ -1,0 +1,91 @@
+"""Fit the constants of `torchslam.dense.confidence` to depth that is known, recordings weighted equally.
+
+python -m experiments.dense.fit RESULTS[=FOLDER] ...    with the folder of the sensor's depth; without, it is rendered
+
+Depth maps of the results are needed: run `torchslam densify` first. Half of each recording's pixels are fitted.
+"""
+
+from __future__ import annotations
+
+import sys
+from functools import cache
+from pathlib import Path
+
+import torch
+from torch import Tensor
+
+from experiments.dense.run import truth_of
+from torchslam.dense import DepthMaps
+from torchslam.dense.confidence import alone_features, confidence_alone, together_features
+from torchslam.dense.consistency import merge
+from torchslam.dense.estimate import estimate_depth
+from torchslam.densify.passes import DEPTHS
+from torchslam.densify.views import SWEPT, ViewImages, views_of
+from torchslam.io.export.scene import open_images, scene_of
+from torchslam.io.results import MAP, read_metrics
+from torchslam.map.file import read_atlas
+
+RIGHT = 0.05
+SAMPLE = 9  # every so many pixels
+ITERATIONS = 30
+
+
+def samples(folder: Path, depth: Path | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Features of depth alone and whether it is right, and the same for depth merged with that of neighbors."""
+    maps = DepthMaps.load(folder / "dense" / DEPTHS)
+    truth, metrics, saved = truth_of(folder, maps, depth), read_metrics(folder), read_atlas(folder / MAP)
+    submap = saved.atlas.main()
+    assert submap is not None
+    scene = scene_of(submap, saved.camera, 0, keyframes_alone=True)
+    views = views_of(scene, maps.camera.size)
+    images = ViewImages(views, open_images(metrics["source"], scene, undistort=True))
+
+    @cache
+    @torch.no_grad()
+    def alone(view: int) -> tuple[Tensor, Tensor, Tensor]:
+        sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
+        poses, limits = views.T_sr(view)[None, :SWEPT], (views.near[view, None], views.far[view, None])
+        found = estimate_depth(images.gray(view)[None], sources[None], views.camera, poses, *limits)
+        return found.inverse_depth[0], confidence_alone(found)[0], alone_features(found)[0]
+
+    rows: list[list[Tensor]] = [[], [], [], []]
+    for view in range(len(views)):
+        others = [alone(other) for other in views.neighbors[view]]
+        inverse_depth, confidence, features = alone(view)
+        depths, confidences = (torch.stack([each[i] for each in others]) for i in (0, 1))
+        merged = merge(inverse_depth, confidence, depths, confidences, views.camera, views.T_sr(view))
+        place = torch.nonzero(truth[view].flatten() > 0)[::SAMPLE, 0]
+        for which, (q, each) in enumerate(
+            ((inverse_depth, features), (merged.inverse_depth, together_features(merged, confidence)))
+        ):
+            wrong = (1 / (q * truth[view])).flatten()[place] - 1
+            rows[2 * which].append(each.flatten(0, 1)[place])
+            rows[2 * which + 1].append((wrong.abs() < RIGHT).double())
+    a, b, c, d = (torch.cat(each) for each in rows)
+    return a, b, c, d
+
+
+def fit(features: list[Tensor], right: list[Tensor]) -> list[float]:
+    """Weights and constant of largest likelihood."""
+    x = torch.cat([torch.nn.functional.pad(each.double(), (0, 1), value=1.0) for each in features])
+    weight = torch.cat([torch.full_like(each, 1 / len(each)) for each in right])
+    target, found = torch.cat(right), torch.zeros(x.shape[1], dtype=torch.float64)
+    for _ in range(ITERATIONS):
+        p = torch.sigmoid(x @ found)
+        H = (x * (weight * p * (1 - p))[:, None]).mT @ x
+        found = found - torch.linalg.solve(H, x.mT @ (weight * (p - target)))
+    return [round(float(each), 2) for each in found]
+
+
+def main() -> None:
+    found = []
+    for text in sys.argv[1:]:
+        folder, _, depth = text.partition("=")
+        found.append(samples(Path(folder), Path(depth) if depth else None))
+    print("ALONE", fit([each[0][::2] for each in found], [each[1][::2] for each in found]))
+    print("TOGETHER", fit([each[2][::2] for each in found], [each[3][::2] for each in found]))
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main()

@@ -1,0 +1,194 @@
+"""`torchslam densify` on a run over a few rendered frames: as a user has it."""
+
+from __future__ import annotations
+
+import errno
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from torchslam.cli.densify import map_size
+from torchslam.cli.main import main
+from torchslam.data import open_sequence
+from torchslam.dense import DepthMaps
+from torchslam.dense.cost_volume import matching_cost
+from torchslam.densify import passes
+from torchslam.errors import ConfigError
+from torchslam.geometry import se3_inverse
+
+ROOM = "synthetic:room?frames=24"
+FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
+SMALL = ["--resolution", "96"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    assert main(["run", ROOM, "--output", str(directory), *FAST, "--dense", *SMALL, "--every", "3"]) == 0
+    return directory
+
+
+@pytest.fixture
+def results(run: Path, tmp_path: Path) -> Path:
+    """The run without dense depth."""
+    shutil.copytree(run, tmp_path / "run", ignore=shutil.ignore_patterns("dense", "plots"))
+    return tmp_path / "run"
+
+
+def densify(results: Path, *more: str) -> int:
+    return main(["densify", str(results), *SMALL, "--every", "3", *more])
+
+
+def test_a_run_with_dense_depth_has_all_its_results(run: Path) -> None:
+    maps = DepthMaps.load(run / "dense" / "depths.safetensors")
+    figures = json.loads((run / "metrics.json").read_text())["dense"]
+    assert maps.camera.size == (96, 72)
+    assert (maps.frame_index % 3 == 0).all()
+    assert figures["depth_maps"] == len(maps) == len(list((run / "dense" / "pictures").iterdir()))
+    assert figures["kept_ratio"] == pytest.approx(float((maps.depth > 0).double().mean()))
+    assert figures["kept_ratio"] > 0.5
+    assert b"element vertex %d\n" % figures["points"] in (run / "dense" / "dense.ply").read_bytes()[:200]
+    assert not (run / "dense" / "parts").exists()
+    picture = cv2.imread(str(run / "dense" / "pictures" / f"{int(maps.frame_index[0]):06d}.png"))
+    assert picture.shape == (72, 3 * 96, 3)
+
+
+def test_depth_matches_the_images_at_the_true_poses(run: Path) -> None:
+    maps, sequence = DepthMaps.load(run / "dense" / "depths.safetensors"), open_sequence(ROOM)
+    frames = maps.frame_index.tolist()
+    true = torch.stack([sequence.pose(index) for index in frames])
+    found, expected = se3_inverse(maps.T_cw)[:, :3, 3], se3_inverse(true)[:, :3, 3]
+    depth = maps.depth[0].double() * torch.pdist(expected).sum() / torch.pdist(found).sum()
+    grays = torch.cat([sequence.image(index) for index in frames])
+    grays = torch.nn.functional.interpolate(grays, size=(72, 96), mode="area")[:, 0].double()
+    inverse = 1 / depth.clamp(min=1e-3)
+    hypotheses = torch.stack((inverse, 1.2 * inverse, inverse / 1.2))
+    T_sr = true[1:] @ se3_inverse(true[0])
+    right, *wrong = matching_cost(grays[0], grays[1:], maps.camera, T_sr, hypotheses, 3, 1)[:, depth > 0]
+    assert all(float(right.median()) < 0.5 * float(each.median()) for each in wrong)
+
+
+def test_the_same_bytes_again_and_after_an_interruption(
+    run: Path, results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    computed: list[Path] = []
+    write = passes._write_alone
+
+    def write_three(path: Path, *arguments: Any) -> None:
+        if len(computed) == 3:
+            raise KeyboardInterrupt
+        computed.append(path)
+        write(path, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "_write_alone", write_three)
+        assert densify(results) == 130
+    assert not (results / "dense" / "depths.safetensors").exists()
+    times = {path: path.stat().st_mtime_ns for path in computed}
+    assert len(times) == 3
+    kept = []
+    monkeypatch.setattr(passes, "_write_alone", lambda path, *rest: (kept.append(path), write(path, *rest)))
+    assert densify(results) == 0
+    assert not set(kept) & set(computed)
+    for name in ("depths.safetensors", "dense.ply"):
+        assert (results / "dense" / name).read_bytes() == (run / "dense" / name).read_bytes()
+
+
+def test_other_settings_begin_anew(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "_write_merged", stop)
+        assert densify(results) == 130
+    before = sorted((results / "dense" / "parts").glob("*.alone.safetensors"))
+    assert main(["densify", str(results), "--resolution", "80x64", "--every", "3"]) == 0
+    assert before
+    assert DepthMaps.load(results / "dense" / "depths.safetensors").camera.size == (80, 64)
+
+
+def test_a_full_disk_is_one_line_and_loses_nothing(
+    results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def full(*arguments: Any) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device", "dense/depths.safetensors")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "join", full)
+        assert densify(results) == 2
+    assert "No space left on device" in capsys.readouterr().err.splitlines()[-1]
+    parts = list((results / "dense" / "parts").glob("*.merged.safetensors"))
+    assert parts
+    assert densify(results) == 0
+
+
+def test_a_damaged_part_is_named(
+    results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write = passes._write_alone
+
+    def damage(path: Path, *arguments: Any) -> None:
+        write(path, *arguments)
+        path.write_bytes(path.read_bytes()[:100])
+
+    monkeypatch.setattr(passes, "_write_alone", damage)
+    assert densify(results) == 2
+    assert "not a readable part of depth maps" in capsys.readouterr().err
+
+
+def test_missing_images_are_reported(
+    results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = results / "metrics.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"source": str(tmp_path / "moved.mp4")}))
+    assert densify(results) == 2
+    assert "moved.mp4: does not exist; use --images for its new location" in capsys.readouterr().err
+    assert densify(results, "--images", ROOM) == 0
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"source": None}))
+    assert densify(results) == 2
+    assert (
+        "metrics.json: does not say where the images are; give them with --images" in capsys.readouterr().err
+    )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--every", "20"], "dense depth needs 3"),
+        (["--resolution", "big"], "expected 640x480 or 640, got `big`"),
+        (["--resolution", "2000x1000"], "at most the image's"),
+        (["--resolution", "40"], "at least 64 each way"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(
+    options: list[str], message: str, results: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["densify", str(results), *SMALL, *options]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
+
+
+def test_a_folder_without_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert densify(tmp_path / "none") == 2
+    assert "none: no such results folder" in capsys.readouterr().err
+
+
+def test_sizes_are_even_and_no_larger_than_the_image() -> None:
+    assert map_size("320", (640, 481)) == (320, 240)
+    assert map_size("320", (481, 641)) == (240, 320)
+    assert map_size("1000", (641, 481)) == (640, 480)
+    assert map_size("100x80", (640, 480)) == (100, 80)
+    with pytest.raises(ConfigError):
+        map_size("", (640, 480))
+
+
+def test_the_file_has_the_tensors_of_the_class(run: Path) -> None:
+    names = {"frame_index", "depth", "normal", "confidence", "T_cw", "camera.params"}
+    assert load_file(run / "dense" / "depths.safetensors").keys() == names

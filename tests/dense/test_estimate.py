@@ -1,0 +1,334 @@
+"""Depth from views with known poses: a slanted plane of exact depth, gradients, batches and devices."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from torch import Tensor
+
+from tests.dense.slanted_plane import FAR, NEAR, NORMAL, a_camera, depth_of, poses, scene
+from torchslam.dense.aggregation import semi_global
+from torchslam.dense.confidence import confidence_alone, confidence_together, kept
+from torchslam.dense.consistency import as_seen_by, merge, render
+from torchslam.dense.cost_volume import (
+    box_sum,
+    correlation,
+    inverse_depth_planes,
+    matching_cost,
+    mean_of_best,
+    warp,
+)
+from torchslam.dense.estimate import estimate_depth, halved, refine_depth
+from torchslam.dense.minimum import find_minimum
+from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
+from torchslam.dense.normals import normals
+from torchslam.geometry import Camera, se3_inverse
+
+WIDTH, HEIGHT = 192, 144
+BORDER = 36
+
+
+def limits(count: int = 1, dtype: torch.dtype = torch.float32) -> tuple[Tensor, Tensor]:
+    return torch.full((count,), NEAR, dtype=dtype), torch.full((count,), FAR, dtype=dtype)
+
+
+def inside(values: Tensor) -> Tensor:
+    return values[..., BORDER:-BORDER, BORDER:-BORDER]
+
+
+def test_the_depth_of_a_slanted_plane(device: torch.device, dtype: torch.dtype) -> None:
+    reference, sources, camera, T_sr, depth = scene(WIDTH, HEIGHT)
+    near, far = limits(dtype=dtype)
+    found = estimate_depth(
+        reference[None].to(device, dtype),
+        sources[None].to(device, dtype),
+        camera.to(device),
+        T_sr[None].to(device),
+        near.to(device),
+        far.to(device),
+    )
+    assert found.inverse_depth.dtype == dtype
+    error = inside((1 / found.inverse_depth[0].cpu()) / depth - 1).abs()
+    assert float(error.median()) < 4e-3
+    assert float((error < 0.02).double().mean()) > 0.95
+    confidence = inside(confidence_alone(found).cpu())
+    assert float(confidence.median()) > 0.8
+
+
+def test_samples_at_the_true_depth_are_the_reference(dtype: torch.dtype) -> None:
+    reference, sources, camera, T_sr, depth = scene(WIDTH, HEIGHT)
+    samples, is_seen = warp(sources.to(dtype), camera, T_sr, (1 / depth[None]).to(dtype))
+    assert is_seen[:, 0].double().mean() > 0.7
+    wrong = (samples[:, 0] - reference)[is_seen[:, 0]].abs()
+    assert float(wrong.max()) < 0.03  # of linear interpolation
+    true, wrong = matching_cost(
+        reference, sources, camera, T_sr, torch.stack((1 / depth, 1.03 / depth)), 3, 2
+    )
+    assert float(inside(true).median()) < 0.02
+    assert float(inside(true < wrong).double().mean()) > 0.95
+
+
+def test_behind_a_camera_nothing_is_seen() -> None:
+    _, sources, camera, T_sr, _ = scene(WIDTH, HEIGHT, 1)
+    behind = T_sr.clone()
+    behind[:, 2, 3] = -10.0
+    samples, is_seen = warp(sources, camera, behind, torch.full((1, HEIGHT, WIDTH), 0.5, dtype=torch.float64))
+    assert not is_seen.any()
+    assert torch.isfinite(samples).all()
+
+
+def test_planes_are_even_in_inverse_depth() -> None:
+    found = inverse_depth_planes(torch.tensor(1.0), torch.tensor(4.0), 4)
+    torch.testing.assert_close(found, torch.tensor([0.25, 0.5, 0.75, 1.0]))
+
+
+@given(radius=st.integers(0, 3), height=st.integers(4, 9), width=st.integers(4, 9), seed=st.integers(0, 99))
+@settings(max_examples=25, deadline=None)
+def test_box_sums_are_those_of_a_convolution(radius: int, height: int, width: int, seed: int) -> None:
+    images = torch.rand(2, height, width, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    kernel = torch.ones(1, 1, 2 * radius + 1, 2 * radius + 1, dtype=torch.float64)
+    expected = torch.nn.functional.conv2d(images[:, None], kernel, padding=radius)[:, 0]
+    torch.testing.assert_close(box_sum(images, radius), expected)
+
+
+@given(gain=st.floats(0.5, 3), offset=st.floats(-1, 1))
+@settings(max_examples=20, deadline=None)
+def test_correlation_does_not_see_a_change_of_light(gain: float, offset: float) -> None:
+    image = torch.rand(12, 14, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    found = correlation(image, gain * image + offset, 2)
+    assert float(found.min()) > 0.99
+    assert float(found.max()) <= 1
+    assert float(correlation(image, -image, 2).max()) < -0.99
+
+
+def test_nothing_correlates_without_texture() -> None:
+    flat = torch.full((12, 14), 0.5, dtype=torch.float64)
+    assert float(correlation(flat, flat, 2).abs().max()) < 1e-6
+
+
+@given(scores=st.lists(st.floats(-1, 1), min_size=1, max_size=6), count=st.integers(1, 6))
+@settings(max_examples=40, deadline=None)
+def test_mean_of_the_best(scores: list[float], count: int) -> None:
+    count = min(count, len(scores))
+    found = mean_of_best(torch.tensor(scores, dtype=torch.float64)[:, None], count)
+    assert float(found) == pytest.approx(sum(sorted(scores)[-count:]) / count)
+
+
+@given(at=st.floats(1, 6), curvature=st.floats(0.1, 2))
+@settings(max_examples=30, deadline=None)
+def test_the_minimum_of_a_parabola_is_found_between_hypotheses(at: float, curvature: float) -> None:
+    position = torch.arange(8, dtype=torch.float64)[:, None, None]
+    found = find_minimum(0.5 * curvature * (position - at) ** 2)
+    assert float(found.position) == pytest.approx(at)
+    assert float(found.curvature) == pytest.approx(curvature)
+    assert float(found.margin) > 0
+
+
+def test_a_minimum_at_the_end_stays_there() -> None:
+    found = find_minimum(torch.arange(5.0)[:, None, None])
+    assert float(found.position) == 0
+    assert float(found.curvature) == 0
+
+
+def test_aggregation_fills_what_has_no_information() -> None:
+    """A surface at plane 5 with a patch without texture: the cost there is that of no correlation."""
+    cost = torch.ones(12, 20, 24)
+    cost[5] = 0.1
+    cost[:, 6:12, 8:14] = 1.0
+    image = torch.full((20, 24), 0.5)
+    assert (find_minimum(semi_global(cost, image)).position.round() == 5).all()
+
+
+def test_an_edge_of_the_image_lets_depth_jump() -> None:
+    cost = torch.ones(12, 20, 24)
+    cost[3, :, :12] = cost[9, :, 12:] = 0.5
+    image = torch.zeros(20, 24)
+    image[:, 12:] = 1.0
+    position = find_minimum(semi_global(cost, image)).position.round()
+    assert (position[:, :12] == 3).all()
+    assert (position[:, 12:] == 9).all()
+
+
+def test_aggregation_does_not_depend_on_the_direction() -> None:
+    cost = torch.rand(6, 9, 11, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    image = torch.rand(9, 11, dtype=torch.float64, generator=torch.Generator().manual_seed(1))
+    found = semi_global(cost, image)
+    for dims in ((-1,), (-2,), (-1, -2)):
+        torch.testing.assert_close(semi_global(cost.flip(dims), image.flip(dims)).flip(dims), found)
+    torch.testing.assert_close(semi_global(cost.mT, image.mT).mT, found, atol=0.2, rtol=0.2)
+
+
+def test_a_batch_is_a_loop() -> None:
+    reference, sources, camera, T_sr, _ = scene(48, 40, 3)
+    references = torch.stack((reference, reference.flip(0)))
+    others = torch.stack((sources, sources.flip(1)))
+    flip = torch.diag(torch.tensor([1.0, -1, 1, 1], dtype=torch.float64))
+    transforms = torch.stack((T_sr, flip @ T_sr @ flip))
+    near, far = torch.tensor([1.0, 1.2]).double(), torch.tensor([5.0, 6.0]).double()
+    found = estimate_depth(references, others, camera, transforms, near, far, planes=16)
+    for row in range(2):
+        one = slice(row, row + 1)
+        single = estimate_depth(
+            references[one], others[one], camera, transforms[one], near[one], far[one], planes=16
+        )
+        torch.testing.assert_close(found.inverse_depth[one], single.inverse_depth)
+        torch.testing.assert_close(found.fine.margin[one], single.fine.margin)
+
+
+def test_gradients_of_depth_to_images_poses_and_camera() -> None:
+    reference, sources, camera, T_sr, depth = scene(28, 24, 2)
+    step, least = torch.tensor([0.01]).double(), torch.tensor([0.1]).double()
+
+    def refined(reference: Tensor, sources: Tensor, T_sr: Tensor, params: Tensor) -> Tensor:
+        found, _ = refine_depth(
+            reference[None],
+            sources[None],
+            camera.with_params(params),
+            T_sr[None],
+            1.003 / depth[None],
+            step,
+            least,
+        )
+        return 1 / found[0, 8:16, 8:16]  # where nothing jumps
+
+    tensors = (reference, sources, T_sr, camera.params)
+    inputs = tuple(each.clone().requires_grad_() for each in tensors)
+    assert torch.autograd.gradcheck(refined, inputs, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
+    for gradient in torch.autograd.grad(refined(*inputs).sum(), inputs):
+        assert torch.isfinite(gradient).all()
+        assert gradient.abs().max() > 0
+
+
+def test_the_surface_found_at_half_size_has_no_gradient() -> None:
+    reference, sources, camera, T_sr, _ = scene(48, 40, 2)
+    near, far = (each.double().requires_grad_() for each in limits())
+    params = camera.params.clone().requires_grad_()
+    found = estimate_depth(
+        reference[None], sources[None], camera.with_params(params), T_sr[None], near, far, planes=16
+    )
+    found.inverse_depth.sum().backward()
+    assert params.grad is not None
+    assert torch.isfinite(params.grad).all()
+    assert not found.coarse.cost.requires_grad
+    assert near.grad is None
+
+
+def test_the_halved_camera_sees_the_same_rays() -> None:
+    camera = a_camera(WIDTH, HEIGHT)
+    # The middle of the pixels 2 and 3 is the pixel 1 of the smaller image.
+    wide = camera.normalize(torch.tensor([[2.5, 4.5]]).double())
+    small = halved(camera).normalize(torch.tensor([[1.0, 2.0]]).double())
+    torch.testing.assert_close(wide, small)
+
+
+def test_normals_of_a_plane(device: torch.device) -> None:
+    camera = a_camera(WIDTH, HEIGHT)
+    depth = depth_of(torch.eye(4, dtype=torch.float64)[None], camera)
+    depth[:, 20:30, 20:30] = 0
+    found = normals(depth.to(device), camera.to(device)).cpu()
+    expected = torch.nn.functional.normalize(torch.tensor(NORMAL, dtype=torch.float64), dim=0)
+    assert not found[:, :, 20:30, 20:30].any()
+    is_known = (found != 0).any(1)
+    assert is_known[depth > 0].all()
+    torch.testing.assert_close(found.movedim(1, -1)[is_known], expected.expand(int(is_known.sum()), 3))
+
+
+def test_normals_do_not_bend_at_an_edge() -> None:
+    camera = a_camera(WIDTH, HEIGHT)
+    depth = torch.full((1, HEIGHT, WIDTH), 1.0, dtype=torch.float64)
+    depth[..., WIDTH // 2 :] = 2.0
+    found = normals(depth, camera)
+    expected = torch.tensor([0.0, 0, -1], dtype=torch.float64)
+    torch.testing.assert_close(found.movedim(1, -1), expected.expand(1, HEIGHT, WIDTH, 3))
+
+
+def test_gradients_of_normals() -> None:
+    camera = a_camera(10, 9)
+    depth = depth_of(torch.eye(4, dtype=torch.float64)[None], camera)
+    noise = 1 + 1e-3 * torch.rand(depth.shape, dtype=depth.dtype, generator=torch.Generator().manual_seed(0))
+    inputs = ((depth * noise).requires_grad_(), camera.params.clone().requires_grad_())
+    assert torch.autograd.gradcheck(lambda d, p: normals(d, camera.with_params(p)), inputs, fast_mode=True)
+
+
+def test_rendered_depth_is_that_of_the_other_view(device: torch.device) -> None:
+    camera, T_sr = a_camera(WIDTH, HEIGHT), poses()
+    own = 1 / depth_of(torch.eye(4, dtype=torch.float64)[None], camera)
+    others = 1 / depth_of(T_sr, camera)
+    rendered = render(others.to(device), camera.to(device), se3_inverse(T_sr).to(device))
+    seen = as_seen_by(rendered, others.to(device), camera.to(device), T_sr.to(device)).cpu()
+    is_known = seen > 0
+    assert float(is_known.double().mean()) > 0.7
+    wrong = (seen / own - 1)[is_known].abs()
+    assert float(wrong.max()) < 5e-4
+    # Rendered depth is that of a place up to a pixel away.
+    assert float((rendered.cpu() / own - 1)[is_known].abs().max()) > 2e-3
+
+
+def one_plane() -> tuple[Tensor, Tensor, Camera, Tensor]:
+    camera, T_sr = a_camera(WIDTH, HEIGHT), poses()
+    return (
+        1 / depth_of(torch.eye(4, dtype=torch.float64)[None], camera)[0],
+        1 / depth_of(T_sr, camera),
+        camera,
+        T_sr,
+    )
+
+
+def test_views_that_agree_outvote_the_own_depth() -> None:
+    own, others, camera, T_sr = one_plane()
+    certain = torch.full_like(own, 0.9)
+    wrong = own.clone()
+    wrong[30:40, 40:50] *= 1.5
+    found = merge(wrong, certain, others, certain.expand(4, -1, -1), camera, T_sr)
+    assert float(inside(found.inverse_depth / own - 1).abs().max()) < 1e-3
+    assert not found.agrees[30:40, 40:50].any()
+    assert inside(found.agrees).mean() > 0.9
+    assert float(found.support[35, 45]) < float(found.support[35, 60])
+    probability = confidence_together(found, certain)
+    assert float(probability[35, 45]) < float(probability[35, 60])
+    assert kept(probability)[20:50, 20:70].all()
+
+
+def test_a_surface_in_front_is_a_conflict_and_one_behind_is_none() -> None:
+    own, others, camera, T_sr = one_plane()
+    certain, uncertain = torch.full_like(own, 0.9), torch.full((4, HEIGHT, WIDTH), 0.01, dtype=torch.float64)
+    for factor, least, most in ((1.5, 0.02, 0.05), (0.6, 0.0, 0.0)):
+        found = merge(own, certain, factor * others, uncertain, camera, T_sr)
+        assert least <= float(found.conflicts[36, 48]) <= most
+        torch.testing.assert_close(found.inverse_depth[36, 48], own[36, 48])
+
+
+def test_views_without_depth_give_none() -> None:
+    own, others, camera, T_sr = one_plane()
+    zero = torch.zeros_like(own)
+    found = merge(zero, zero, torch.zeros_like(others), torch.zeros_like(others), camera, T_sr)
+    assert not found.inverse_depth.any()
+    assert not confidence_together(found, zero).any()
+
+
+def test_specks_are_not_kept() -> None:
+    confidence = torch.zeros(20, 20)
+    confidence[3, 3] = 1.0
+    confidence[8:16, 8:16] = 1.0
+    found = kept(confidence)
+    assert not found[3, 3]
+    assert found[9:15, 9:15].all()
+
+
+def test_neighbors_share_points_and_have_parallax() -> None:
+    points_w = torch.tensor([0.0, 0, 10]).double() + torch.rand(
+        20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0)
+    )
+    shared = torch.ones(4, 20, dtype=torch.bool)
+    shared[3, 4:] = False
+    # The same place, a parallax of about 5 degrees, one of 45, and one of 5 that shares too few points.
+    centers_w = torch.tensor([[0.0, 0, 0], [0.9, 0, 0], [10, 0, 0], [0.9, 0, 0]]).double()
+    scores = neighbor_scores(points_w, shared, torch.zeros(3).double(), centers_w)
+    assert float(scores[1]) > 15
+    assert float(scores[[0, 2]].max()) < 0.1
+    assert float(scores[3]) == 0
+    order, is_there = choose_neighbors(torch.tensor([1.0, 3, 3, 0]), 4)
+    assert order.tolist() == [1, 2, 0, 3]
+    assert is_there.tolist() == [True, True, True, False]

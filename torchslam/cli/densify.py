@@ -1,0 +1,165 @@
+"""Compute dense depth of a run from its map and images: depth maps, a colored cloud and pictures.
+
+Each keyframe, or every N-th frame with --every, gets a depth map with normals and confidence. What is textureless,
+reflecting or moving stays unknown. The results are in the folder dense of the run: depths.safetensors, dense.ply and
+pictures. An interrupted computation goes on where it ended when it is started again with the same options.
+
+Exit status: 0 done, 2 an error; 130 ended by Ctrl-C.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import time
+from pathlib import Path
+from typing import Any
+
+import torch
+from tqdm import tqdm
+
+from torchslam.cli import arguments
+from torchslam.densify import DenseSummary, densify
+from torchslam.densify.views import ViewImages, views_of
+from torchslam.errors import ConfigError, ResultsError
+from torchslam.geometry import se3_inverse
+from torchslam.geometry.transforms import upright_rotation
+from torchslam.io.export.ply import write_ply
+from torchslam.io.export.scene import open_images, pinhole_within, scene_of
+from torchslam.io.results import MAP, METRICS, read_metrics
+from torchslam.map.file import read_atlas
+from torchslam.utils.console import table, tqdm_options
+from torchslam.utils.files import write_whole
+
+FOLDER = "dense"  # in the folder of results
+CLOUD = "dense.ply"
+LONG_SIDE = 320
+"""Default resolution: about a second per keyframe."""
+SMALLEST = 64
+"""Width and height of a depth map, pixels: windows at half size must be a small part of it."""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of `torchslam densify`."""
+    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+    add_options(parser)
+    parser.add_argument(
+        "--images", metavar="PATH", help="the images of the run, if they are not where the run read them"
+    )
+    arguments.add_device(parser)
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of dense depth that `torchslam run` has as well."""
+    parser.add_argument(
+        "--resolution",
+        default=str(LONG_SIDE),
+        metavar="WxH|LONG",
+        help="size of the depth maps: 640x480, or the longer side (default: %(default)s)",
+    )
+    parser.add_argument(
+        "--every",
+        type=arguments.positive,
+        metavar="N",
+        help="depth for every N-th posed frame (default: for the keyframes)",
+    )
+
+
+def execute(options: argparse.Namespace) -> int:
+    """Execute `torchslam densify`; returns the exit status."""
+    print(
+        table(
+            densify_results(
+                options.directory, options.resolution, options.every, options.device, options.images
+            )
+        )
+    )
+    return 0
+
+
+def densify_results(
+    directory: Path, resolution: str, every: int | None, device: torch.device | str, images: str | None = None
+) -> dict[str, str]:
+    """Compute dense depth of a results folder and add it to the folder; return rows for `table`.
+
+    Args:
+        directory: the results folder.
+        resolution: of the depth maps, `640x480` or the longer side.
+        every: every N-th posed frame; None: the keyframes.
+        device: to compute on.
+        images: where the images are; None: where the run read them.
+    """
+    started = time.process_time()
+    if not directory.is_dir():
+        raise ResultsError(f"{directory}: no such results folder")
+    metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
+    submap = next((each for each in saved.atlas if each.number == metrics["submap"]), None)
+    if submap is None:
+        raise ResultsError(f"{directory / MAP}: no map to get depth for")
+    source = images or metrics.get("source")
+    if source is None:
+        raise ResultsError(
+            f"{directory / METRICS}: does not say where the images are; give them with --images"
+        )
+    scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=every is None)
+    opened = open_images(source, scene, True, metrics.get("source_fps"), "use --images for its new location")
+    size = map_size(resolution, pinhole_within(scene.camera).size)
+    views = views_of(scene, size, every)
+    view_images = ViewImages(views, opened)
+    folder = directory / FOLDER
+    with tqdm(
+        total=2 * len(views),
+        **tqdm_options(),
+        bar_format="depth {n_fmt}/{total_fmt} |{bar:24}| {remaining} left",
+    ) as bar:
+        found = densify(
+            views, view_images, folder, torch.device(device), lambda done, _: bar.update(done - bar.n)
+        )
+    R_up = upright_rotation(se3_inverse(submap.map.T_cw).double()).to(found.cloud.points_w)
+    write_ply(
+        folder / CLOUD,
+        found.cloud.points_w @ R_up.mT,
+        found.cloud.colors,
+        torch.zeros(0, 3),
+        found.cloud.normals_w @ R_up.mT,
+    )
+    about = {"dense": _figures(found, size, time.process_time() - started)}
+    write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
+    return {
+        "depth maps": f"{found.views} of {size[0]} x {size[1]} pixels",
+        "kept": f"{found.kept:.0%} of the pixels, mean confidence {found.confidence:.2f}",
+        "points": f"{len(found.cloud)}, voxels of {found.voxel:.4g} map units",
+        "dense": str(folder),
+    }
+
+
+def _figures(found: DenseSummary, size: tuple[int, int], seconds: float) -> dict[str, Any]:
+    """The entry `dense` of metrics.json."""
+    return {
+        "depth_maps": found.views,
+        "size": list(size),
+        "kept_ratio": found.kept,
+        "confidence": found.confidence,
+        "points": len(found.cloud),
+        "voxel": found.voxel,
+        "cpu_s": seconds,
+    }
+
+
+def map_size(text: str, image: tuple[int, int]) -> tuple[int, int]:
+    """Size of depth maps: even, no larger than the image. Raises ConfigError."""
+    if both := re.fullmatch(r"(\d{1,5})x(\d{1,5})", text):
+        width, height = int(both[1]), int(both[2])
+    elif re.fullmatch(r"\d{1,5}", text):
+        scale = min(int(text) / max(image), 1.0)
+        width, height = round(image[0] * scale), round(image[1] * scale)
+    else:
+        raise ConfigError(f"--resolution: expected 640x480 or 640, got `{text}`")
+    width, height = width // 2 * 2, height // 2 * 2
+    if min(width, height) < SMALLEST or width > image[0] or height > image[1]:
+        raise ConfigError(
+            f"--resolution {text}: depth maps of {width} x {height} pixels; at least {SMALLEST} each way and at most "
+            f"the image's {image[0]} x {image[1]} are possible"
+        )
+    return width, height

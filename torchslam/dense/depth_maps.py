@@ -1,0 +1,250 @@
+"""Depth maps of keyframes, and their file: one safetensors file that is written and read in blocks.
+
+The file holds a tensor for each field of `DepthMaps`, so that any program reads it. Depth maps are large: `join` copies
+the files of single keyframes into one, and `DepthMaps.blocks` reads a few keyframes at a time.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchslam.errors import ResultsError
+from torchslam.geometry import Camera
+from torchslam.utils.files import check_regular, parse_json, write_whole
+
+FORMAT = 1
+MAX_BYTES = 1 << 40  # of depth maps of 170,000 keyframes of 640 x 480 pixels
+UNIT_TOLERANCE = 1e-3
+"""Largest difference of the length of a normal from 1."""
+FIELDS = {
+    "frame_index": torch.int64,
+    "depth": torch.float32,
+    "normal": torch.float32,
+    "confidence": torch.float32,
+    "T_cw": torch.float64,
+}
+"""Tensors of the file that have a row per keyframe, and their types."""
+CAMERA = "camera.params"
+_NAMES = {torch.int64: "I64", torch.float32: "F32", torch.float64: "F64"}  # of types, in a safetensors file
+
+
+@dataclass(frozen=True)
+class DepthMaps:
+    """Depth of keyframes, or of other frames with a pose.
+
+    Attributes:
+        frame_index: frames in the sequence, ascending.
+        depth: z in the camera frame, map units; 0 where unknown.
+        normal: unit normals in the camera frame, facing the camera; 0 where unknown.
+        confidence: probability, 0 to 1, that the depth is right within 5 %; 0 where unknown.
+        T_cw: poses.
+        camera: a pinhole of the size of the maps; undistorted images belong to it.
+    """
+
+    frame_index: Int[Tensor, " K"]
+    depth: Float[Tensor, "K H W"]
+    normal: Float[Tensor, "K 3 H W"]
+    confidence: Float[Tensor, "K H W"]
+    T_cw: Float[Tensor, "K 4 4"]
+    camera: Camera
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    def save(self, path: str | Path, about: dict[str, Any] | None = None) -> None:
+        """Write all maps to a file, atomically; equal maps give equal bytes.
+
+        Args:
+            path: the file.
+            about: what a program wants to know again (`read_about`), as JSON.
+        """
+        shapes = {name: tuple(getattr(self, name).shape) for name in FIELDS}
+        write_whole(
+            path, _content(shapes, lambda name: iter([getattr(self, name)]), self.camera, about or {})
+        )
+
+    @classmethod
+    def load(cls, path: str | Path) -> DepthMaps:
+        """Read and check all maps of a file. Raises ResultsError naming the file."""
+        return cls._read(path, slice(None))
+
+    @classmethod
+    def blocks(cls, path: str | Path, size: int = 8) -> Iterator[DepthMaps]:
+        """Read and check a file in blocks of keyframes, for files larger than memory. Raises ResultsError."""
+        count = read_shape(path)[0]
+        for start in range(0, count, size):
+            yield cls._read(path, slice(start, start + size))
+
+    @classmethod
+    def _read(cls, path: str | Path, rows: slice) -> DepthMaps:
+        """Read some rows of a file."""
+        with _opened(path) as (file, about):
+            width, height = about["camera"]["size"]
+            camera = Camera(about["camera"]["model"], file.get_tensor(CAMERA).clone(), (width, height))
+            # In memory of their own: the file may be replaced.
+            maps = cls(**{name: file.get_slice(name)[rows].clone() for name in FIELDS}, camera=camera)
+            _check_values(maps)
+        return maps
+
+
+def read_shape(path: str | Path) -> tuple[int, int, int]:
+    """Read the number of keyframes, height and width of a file. Raises ResultsError naming the file."""
+    with _opened(path) as (file, _):
+        count, height, width = file.get_slice("depth").get_shape()
+        return count, height, width
+
+
+def read_about(path: str | Path) -> dict[str, Any]:
+    """Read what was given to `DepthMaps.save` as `about`. Raises ResultsError naming the file."""
+    with _opened(path) as (_, about):
+        return dict(about["about"])
+
+
+def join(path: str | Path, parts: Sequence[str | Path], about: dict[str, Any] | None = None) -> None:
+    """Write the maps of several files, in their order, as one, reading them one at a time.
+
+    Args:
+        path: the file to write.
+        parts: files of `DepthMaps.save`, of one camera and size; at least one.
+        about: as for `save`.
+
+    Raises:
+        ResultsError: a part is missing or damaged, or has another camera.
+        OSError: the file cannot be written.
+    """
+    camera, count, shapes = None, 0, {}
+    for part in parts:
+        maps = DepthMaps.load(part)
+        camera = maps.camera if camera is None else camera
+        if maps.camera.size != camera.size or not torch.equal(maps.camera.params, camera.params):
+            raise ResultsError(f"{part}: depth maps of another camera than {parts[0]}")
+        count += len(maps)
+        shapes = {name: (count, *getattr(maps, name).shape[1:]) for name in FIELDS}
+    if camera is None:
+        raise ValueError("no depth maps to join")
+
+    def rows(name: str) -> Iterator[Tensor]:
+        for part in parts:
+            with _opened(part) as (file, _):
+                yield file.get_tensor(name)
+
+    write_whole(path, _content(shapes, rows, camera, about or {}))
+
+
+def _content(
+    shapes: dict[str, tuple[int, ...]],
+    rows: Callable[[str], Iterator[Tensor]],
+    camera: Camera,
+    about: dict[str, Any],
+) -> Iterator[bytes]:
+    """The bytes of a file, in pieces: a header that says where each tensor is, and the tensors.
+
+    Args:
+        shapes: of the tensors.
+        rows: the rows of a tensor, in blocks.
+        camera, about: the rest of the content.
+    """
+    description = {
+        "format": FORMAT,
+        "camera": {"model": camera.model, "size": list(camera.size)},
+        "about": about,
+    }
+    header: dict[str, Any] = {"__metadata__": {"torchslam": json.dumps(description, sort_keys=True)}}
+    end = 0
+    # Wide types first, so that every tensor begins at a multiple of its item size.
+    names = sorted(FIELDS, key=lambda name: -FIELDS[name].itemsize)
+    types = {CAMERA: torch.float64} | {name: FIELDS[name] for name in names}
+    for name, dtype in types.items():
+        shape = tuple(camera.params.shape) if name == CAMERA else shapes[name]
+        start, end = end, end + dtype.itemsize * torch.Size(shape).numel()
+        header[name] = {"dtype": _NAMES[dtype], "shape": list(shape), "data_offsets": [start, end]}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 8)
+    yield struct.pack("<Q", len(text)) + text
+    for name, dtype in types.items():
+        for block in iter([camera.params]) if name == CAMERA else rows(name):
+            yield block.detach().to("cpu", dtype).contiguous().numpy().tobytes()
+
+
+@contextmanager
+def _opened(path: str | Path) -> Iterator[tuple[Any, dict[str, Any]]]:
+    """A file with the tensors of depth maps, and its description. Raises ResultsError."""
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        check_regular(path, MAX_BYTES, "depth maps")
+        with safe_open(str(path), framework="pt") as file:
+            about = parse_json((file.metadata() or {}).get("torchslam", "null"))
+            if not isinstance(about, dict) or "format" not in about:
+                raise ResultsError(f"{path}: a safetensors file, but not depth maps of torchslam")
+            if about["format"] != FORMAT:
+                raise ResultsError(
+                    f"{path}: depth maps of format {about['format']}, this version reads format {FORMAT}: "
+                    "run again"
+                )
+            _check_shapes(
+                {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()},  # noqa: SIM118
+                {name: file.get_slice(name).get_dtype() for name in file.keys()},  # noqa: SIM118
+                about,
+            )
+            yield file, about
+    except FileNotFoundError:
+        raise ResultsError(f"{path}: no depth maps") from None
+    except OSError as error:
+        raise ResultsError(f"{path}: not readable depth maps: {error.strerror or error}") from None
+    except (SafetensorError, ValueError, TypeError, KeyError, RuntimeError) as error:
+        what = f"{error} is missing" if isinstance(error, KeyError) else error
+        raise ResultsError(f"{path}: not whole depth maps: {what}") from None
+
+
+def _check_shapes(shapes: dict[str, tuple[int, ...]], dtypes: dict[str, str], about: dict[str, Any]) -> None:
+    """Check names, shapes and types against each other and the camera. Raises ValueError."""
+    wrong = sorted(shapes.keys() ^ {*FIELDS, CAMERA})
+    if wrong:
+        raise ValueError(f"missing or unknown tensors: {', '.join(wrong[:3])}")
+    width, height = about["camera"]["size"]
+    if not all(type(side) is int and side > 0 for side in (width, height)):
+        raise ValueError(f"an image of {width} x {height} pixels")
+    if about["camera"]["model"] != "pinhole" or not isinstance(about["about"], dict):
+        raise ValueError(f"the camera is {about['camera']['model']}, not a pinhole")
+    count = shapes["frame_index"][0] if shapes["frame_index"] else 0
+    expected: dict[str, tuple[int, ...]] = {
+        "frame_index": (count,),
+        "depth": (count, height, width),
+        "normal": (count, 3, height, width),
+        "confidence": (count, height, width),
+        "T_cw": (count, 4, 4),
+        CAMERA: (4,),
+    }
+    for name, shape in expected.items():
+        dtype = _NAMES[FIELDS.get(name, torch.float64)]
+        if shapes[name] != shape or dtypes[name] != dtype:
+            raise ValueError(f"{name}: {dtypes[name]} {list(shapes[name])}, expected {dtype} {list(shape)}")
+
+
+def _check_values(maps: DepthMaps) -> None:
+    """Check the numbers of maps. Raises ValueError."""
+    for name in ("depth", "normal", "confidence", "T_cw"):
+        if not bool(torch.isfinite(getattr(maps, name)).all()):
+            raise ValueError(f"{name}: not finite")
+    if not bool(torch.isfinite(maps.camera.params).all() and (maps.camera.params[:2] > 0).all()):
+        raise ValueError(f"{CAMERA}: no focal lengths and principal point")
+    if bool((maps.frame_index < 0).any() or (maps.frame_index.diff() <= 0).any()):
+        raise ValueError("frame_index: not ascending from 0")
+    if bool((maps.depth < 0).any()):
+        raise ValueError("depth: negative")
+    if bool((maps.confidence < 0).any() or (maps.confidence > 1).any()):
+        raise ValueError("confidence: not between 0 and 1")
+    lengths = maps.normal.norm(dim=1)
+    if bool(((lengths - 1).abs().minimum(lengths) > UNIT_TOLERANCE).any()):
+        raise ValueError("normal: neither of unit length nor 0")

@@ -1,0 +1,124 @@
+"""Depth of a view from other views with known poses: planes are swept at half size, then depth is refined at full size.
+
+At half size every pixel chooses among all planes. At full size the hypotheses are a few steps around the surface found,
+so that windows follow its slant, and the aggregation holds on to its shape.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+import torch.nn.functional as F
+from jaxtyping import Float
+from torch import Tensor
+
+from torchslam.dense.aggregation import Aggregation, semi_global
+from torchslam.dense.cost_volume import inverse_depth_planes, matching_cost
+from torchslam.dense.minimum import Minimum, find_minimum
+from torchslam.geometry import Camera
+
+PLANES = 64
+STEPS = 4
+"""Hypotheses at full size on either side of the surface found at half size."""
+REFINEMENT = 0.5
+"""Step at full size, in steps at half size."""
+BEST_VIEWS = 3
+"""Views that must match; the others may not see the surface."""
+HALF_RADIUS, FULL_RADIUS = 3, 3
+"""Radii of the windows, pixels."""
+
+
+class Estimate(NamedTuple):
+    """Depth of views, and what tells how certain it is.
+
+    Attributes:
+        inverse_depth: 1 / map units, positive.
+        coarse: minimum of the cost at half size, of the pixels at full size; its position is in planes.
+        fine: minimum at full size; its position is in steps.
+    """
+
+    inverse_depth: Float[Tensor, "B H W"]
+    coarse: Minimum
+    fine: Minimum
+
+
+def estimate_depth(
+    reference: Float[Tensor, "B H W"],
+    sources: Float[Tensor, "B V H W"],
+    camera: Camera,
+    T_sr: Float[Tensor, "B V 4 4"],
+    near: Float[Tensor, " B"],
+    far: Float[Tensor, " B"],
+    aggregate: Aggregation = semi_global,
+    planes: int = PLANES,
+) -> Estimate:
+    """Estimate the depth of every pixel of reference views.
+
+    Gradients are those of `refine_depth`; detached are the range of depth and the surface found at half size.
+
+    Args:
+        reference: gray images in [0, 1], of even width and height.
+        sources: views to compare each with.
+        camera: the pinhole of all views.
+        T_sr: poses, reference camera to source camera.
+        near, far: range of depth, map units.
+        aggregate: aggregation of the costs.
+        planes: number of planes of the sweep.
+    """
+    inverse_depths = inverse_depth_planes(near.to(reference), far.to(reference), planes).detach()
+    step = inverse_depths[:, 1] - inverse_depths[:, 0]
+    with torch.no_grad():
+        small, small_sources = F.avg_pool2d(reference[:, None], 2)[:, 0], F.avg_pool2d(sources, 2)
+        best = min(BEST_VIEWS, sources.shape[1])
+        hypotheses = inverse_depths[..., None, None]
+        cost = matching_cost(small, small_sources, halved(camera), T_sr, hypotheses, HALF_RADIUS, best)
+        coarse = find_minimum(aggregate(cost, small))
+        surface = inverse_depths[:, :1, None] + step[:, None, None] * coarse.position
+        surface = F.interpolate(surface[:, None], size=reference.shape[-2:], mode="bilinear")[:, 0]
+        coarse = Minimum(*(F.interpolate(each[:, None], scale_factor=2)[:, 0] for each in coarse))
+    inverse_depth, fine = refine_depth(
+        reference, sources, camera, T_sr, surface, REFINEMENT * step, 0.5 / far.to(reference), aggregate
+    )
+    return Estimate(inverse_depth, coarse, fine)
+
+
+def refine_depth(
+    reference: Float[Tensor, "B H W"],
+    sources: Float[Tensor, "B V H W"],
+    camera: Camera,
+    T_sr: Float[Tensor, "B V 4 4"],
+    surface: Float[Tensor, "B H W"],
+    step: Float[Tensor, " B"],
+    least: Float[Tensor, " B"],
+    aggregate: Aggregation = semi_global,
+) -> tuple[Float[Tensor, "B H W"], Minimum]:
+    """Find the inverse depth of the least cost near a surface.
+
+    Differentiable with respect to images, poses and camera, through the costs around the minimum. Which hypothesis is
+    the best one, which views match, and the penalties of the aggregation are decisions without a gradient.
+
+    Args:
+        reference, sources, camera, T_sr, aggregate: as for `estimate_depth`.
+        surface: inverse depth to look around.
+        step: between hypotheses, of which there are STEPS on either side.
+        least: inverse depth that no hypothesis lies below, positive.
+
+    Returns:
+        Inverse depth, and the minimum of the cost in steps.
+    """
+    step, least = step[:, None, None], least[:, None, None]
+    offsets = torch.arange(-STEPS, STEPS + 1, dtype=surface.dtype, device=surface.device)[:, None, None]
+    hypotheses = torch.maximum(surface[:, None] + offsets * step[:, None], least[:, None])
+    cost = matching_cost(
+        reference, sources, camera, T_sr, hypotheses, FULL_RADIUS, min(BEST_VIEWS, sources.shape[1])
+    )
+    found = find_minimum(aggregate(cost, reference))
+    return torch.maximum(surface + (found.position - STEPS) * step, least), found
+
+
+def halved(camera: Camera) -> Camera:
+    """The pinhole for images of half the size, whose pixels are means of four."""
+    fx, fy, cx, cy = camera.params.unbind(-1)
+    params = torch.stack((fx / 2, fy / 2, (cx + 0.5) / 2 - 0.5, (cy + 0.5) / 2 - 0.5), dim=-1)
+    return Camera("pinhole", params, (camera.width // 2, camera.height // 2))

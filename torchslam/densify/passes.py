@@ -1,0 +1,197 @@
+"""Depth maps of all views of a run, one view at a time and resumable, and the cloud fused from them.
+
+Two passes: first the depth of every view alone, then every view is compared with its neighbors. Each writes a file per
+view into a folder of parts, so that memory is bounded and an interrupted computation goes on where it ended.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save
+from torch import Tensor
+
+from torchslam.dense.cloud import PointCloud
+from torchslam.dense.confidence import confidence_alone, confidence_together, kept
+from torchslam.dense.consistency import merge
+from torchslam.dense.depth_maps import DepthMaps, join, read_about
+from torchslam.dense.estimate import estimate_depth
+from torchslam.dense.fusion import CloudFusion
+from torchslam.dense.normals import normals
+from torchslam.densify.pictures import write_picture
+from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views
+from torchslam.errors import ResultsError
+from torchslam.utils.files import parse_json, read_text, write_whole
+
+DEPTHS = "depths.safetensors"
+PARTS = "parts"
+PICTURES = "pictures"
+JOB = "job.json"
+MAX_JOB_BYTES = 1 << 16
+FORMAT = 1
+"""Of the parts: those of another version are computed again."""
+
+
+@dataclass(frozen=True)
+class DenseSummary:
+    """What a dense reconstruction has.
+
+    Attributes:
+        views: number of depth maps.
+        kept: ratio of pixels with depth.
+        confidence: mean of the kept pixels.
+        voxel: edge of the voxels of the cloud, map units.
+        cloud: the cloud.
+    """
+
+    views: int
+    kept: float
+    confidence: float
+    voxel: float
+    cloud: PointCloud
+
+
+def densify(
+    views: Views,
+    images: ViewImages,
+    folder: Path,
+    device: torch.device,
+    on_progress: Callable[[int, int], None] = lambda done, total: None,
+) -> DenseSummary:
+    """Compute depth maps and cloud; depth maps and pictures are written.
+
+    Args:
+        views, images: of the run.
+        folder: for the results; its folder of parts is used again if it is of the same views, and deleted at the end.
+        device: to compute on.
+        on_progress: called after each view of both passes with the numbers done and in all.
+
+    Raises:
+        FrameError: an image cannot be read.
+        OSError: a file cannot be written; the parts stay.
+    """
+    parts = folder / PARTS
+    _prepare(parts, views)
+    total = 2 * len(views)
+    for view in range(len(views)):
+        path = _alone_path(parts, views, view)
+        if not path.exists():
+            _write_alone(path, views, images, view, device)
+        on_progress(view + 1, total)
+    alone = lru_cache(maxsize=CACHED)(lambda view: _read_alone(_alone_path(parts, views, view)))
+    for view in range(len(views)):
+        path = _merged_path(parts, views, view)
+        if not path.exists():
+            _write_merged(path, views, alone, view, device)
+        on_progress(len(views) + view + 1, total)
+    paths = [_merged_path(parts, views, view) for view in range(len(views))]
+    join(folder / DEPTHS, paths)
+    _draw(folder, views, images)
+    summary = _fuse(folder / DEPTHS, images, torch.tensor([read_about(path)["spread"] for path in paths]))
+    shutil.rmtree(parts)
+    return summary
+
+
+def _prepare(parts: Path, views: Views) -> None:
+    """Create the folder of parts; delete those of other views or of another version."""
+    job = {"format": FORMAT, "views": views.fingerprint()}
+    try:
+        is_same = parse_json(read_text(parts / JOB, MAX_JOB_BYTES, "a description of depth maps")) == job
+    except (OSError, ValueError):
+        is_same = False
+    if not is_same:
+        shutil.rmtree(parts, ignore_errors=True)
+    parts.mkdir(parents=True, exist_ok=True)
+    write_whole(parts / JOB, json.dumps(job).encode())
+
+
+def _alone_path(parts: Path, views: Views, view: int) -> Path:
+    return parts / f"{int(views.frame_index[view]):06d}.alone.safetensors"
+
+
+def _merged_path(parts: Path, views: Views, view: int) -> Path:
+    return parts / f"{int(views.frame_index[view]):06d}.merged.safetensors"
+
+
+def _write_alone(path: Path, views: Views, images: ViewImages, view: int, device: torch.device) -> None:
+    """First pass: inverse depth of a view and its confidence."""
+    sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
+    found = estimate_depth(
+        images.gray(view)[None].to(device),
+        sources[None].to(device),
+        views.camera.to(device),
+        views.T_sr(view)[None, :SWEPT].to(device),
+        views.near[view, None].to(device),
+        views.far[view, None].to(device),
+    )
+    tensors = {"inverse_depth": found.inverse_depth[0], "confidence": confidence_alone(found)[0]}
+    write_whole(path, save({name: rows.cpu().contiguous() for name, rows in tensors.items()}))
+
+
+def _read_alone(path: Path) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
+    """Inverse depth and confidence. Raises ResultsError."""
+    try:
+        tensors = load_file(path)
+        return tensors["inverse_depth"], tensors["confidence"]
+    except (OSError, KeyError, SafetensorError) as error:
+        raise ResultsError(f"{path}: not a readable part of depth maps: {error}; delete it") from None
+
+
+def _write_merged(
+    path: Path, views: Views, alone: Callable[[int], tuple[Tensor, Tensor]], view: int, device: torch.device
+) -> None:
+    """Second pass: the depth map of a view after the comparison with its neighbors."""
+    neighbors = [alone(other) for other in views.neighbors[view]]
+    others, other_confidences = (torch.stack([rows[i] for rows in neighbors]).to(device) for i in (0, 1))
+    inverse_depth, confidence = (rows.to(device) for rows in alone(view))
+    camera, T_sr = views.camera.to(device), views.T_sr(view).to(device)
+    merged = merge(inverse_depth, confidence, others, other_confidences, camera, T_sr)
+    probability = confidence_together(merged, confidence)
+    is_kept = kept(probability)
+    depth = torch.where(is_kept, 1 / torch.where(is_kept, merged.inverse_depth, 1.0), 0.0)
+    maps = DepthMaps(
+        frame_index=views.frame_index[view, None],
+        depth=depth[None],
+        normal=normals(depth[None], camera),
+        confidence=torch.where(is_kept, probability, 0.0)[None],
+        T_cw=views.T_cw[view, None],
+        camera=views.camera,
+    )
+    spread = float(merged.spread[is_kept].median()) if bool(is_kept.any()) else 0.0
+    maps.save(path, {"spread": spread})
+
+
+def _draw(folder: Path, views: Views, images: ViewImages) -> None:
+    """Draw a picture of each view; those of an earlier reconstruction are deleted."""
+    pictures = folder / PICTURES
+    pictures.mkdir(exist_ok=True)
+    for old in pictures.glob("[0-9]" * 6 + ".png"):
+        old.unlink()
+    for view, maps in enumerate(DepthMaps.blocks(folder / DEPTHS, 1)):
+        name = f"{int(views.frame_index[view]):06d}.png"
+        write_picture(pictures / name, maps.depth[0], maps.normal[0], images.color(view))
+
+
+def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"]) -> DenseSummary:
+    """Fuse the maps of a file."""
+    known, pixels, confidence, sizes = 0, 0, 0.0, []
+    for view, maps in enumerate(DepthMaps.blocks(path, 1)):
+        depth = maps.depth[maps.depth > 0]
+        known, pixels = known + depth.numel(), pixels + maps.depth.numel()
+        confidence += float(maps.confidence.sum(dtype=torch.float64))
+        if depth.numel():
+            # A point is as uncertain as its depth, and no smaller than a pixel.
+            sizes.append(depth.median() * max(float(spreads[view]), 1 / float(maps.camera.focal)))
+    voxel = float(torch.stack(sizes).median()) if sizes else 1.0
+    fusion = CloudFusion(voxel)
+    for view, maps in enumerate(DepthMaps.blocks(path, 1)):
+        fusion.add(maps, images.color(view)[None])
+    return DenseSummary(len(spreads), known / pixels, confidence / max(known, 1), voxel, fusion.cloud())

@@ -1,0 +1,170 @@
+"""The views of a run that get a depth map: poses, images at the resolution of the maps, range of depth, neighbors."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import torch
+from jaxtyping import Float, Int, UInt8
+from torch import Tensor
+
+from torchslam.data.transforms import scale_camera
+from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
+from torchslam.errors import ResultsError
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.io.export.scene import ExportedScene, Images, undistorted
+
+NEIGHBORS = 12
+"""Views that a depth map is compared with."""
+SWEPT = 8
+"""The best of them, which depth is estimated from."""
+LEAST_NEIGHBORS = 2
+"""With fewer a depth would not be confirmed."""
+LEAST_POINTS = 10
+"""Points of a view that its range of depth is taken from."""
+QUANTILES = (0.02, 0.98)
+NEARER, FARTHER = 0.75, 1.35
+"""The range of depth reaches that much beyond the quantiles of the view's points."""
+CACHED = 2 * NEIGHBORS
+"""Images that are kept: consecutive views have most neighbors in common."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """Views with neighbors, in order of time.
+
+    Attributes:
+        frame_index: frames in the sequence.
+        T_cw: poses.
+        camera: the pinhole of the images.
+        near, far: range of depth, map units.
+        neighbors: of each view, indices of views, best first.
+    """
+
+    frame_index: Int[Tensor, " K"]
+    T_cw: Float[Tensor, "K 4 4"]
+    camera: Camera
+    near: Float[Tensor, " K"]
+    far: Float[Tensor, " K"]
+    neighbors: tuple[tuple[int, ...], ...]
+
+    def __len__(self) -> int:
+        return len(self.frame_index)
+
+    def fingerprint(self) -> str:
+        """A digest of everything but the images."""
+        digest = hashlib.sha256(repr((self.camera.size, self.neighbors)).encode())
+        for rows in (self.frame_index, self.T_cw, self.camera.params, self.near, self.far):
+            digest.update(rows.contiguous().numpy().tobytes())
+        return digest.hexdigest()
+
+    def T_sr(self, view: int) -> Float[Tensor, "V 4 4"]:
+        """Poses from the camera of a view to those of its neighbors."""
+        return self.T_cw[list(self.neighbors[view])] @ se3_inverse(self.T_cw[view])
+
+
+class ViewImages:
+    """Images of views, undistorted and resized; the last few are kept."""
+
+    def __init__(self, views: Views, images: Images) -> None:
+        self._frames = views.frame_index.tolist()
+        self._size = views.camera.size
+        self._images = images
+        self.color = lru_cache(maxsize=CACHED)(self._color)
+
+    def gray(self, view: int) -> Float[Tensor, "H W"]:
+        """Gray image in [0, 1]. Raises FrameError if it cannot be read."""
+        color = self.color(view).numpy()
+        return torch.from_numpy(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)).float() / 255
+
+    def _color(self, view: int) -> UInt8[Tensor, "H W 3"]:
+        image = cv2.cvtColor(self._images.bgr(self._frames[view]), cv2.COLOR_BGR2RGB)
+        return torch.from_numpy(cv2.resize(image, self._size, interpolation=cv2.INTER_AREA))
+
+
+def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = None) -> Views:
+    """Choose the views, and for each its range of depth and its neighbors.
+
+    Views with few points, or without neighbors that see them from another direction, are left out.
+
+    Args:
+        scene: posed frames, with the observations of all of them.
+        size: width and height of the depth maps.
+        every: every N-th posed frame; None: the keyframes.
+
+    Raises:
+        ResultsError: fewer than three views are left.
+    """
+    scene = undistorted(scene)
+    chosen = scene.is_keyframe if every is None else torch.arange(len(scene.frame_ids)) % every == 0
+    frames = torch.nonzero(chosen)[:, 0]
+    if len(frames) <= LEAST_NEIGHBORS:
+        raise ResultsError(f"{len(frames)} views: dense depth needs {LEAST_NEIGHBORS + 1} or more")
+    T_cw = scene.T_cw[frames]
+    centers_w = se3_inverse(T_cw)[:, :3, 3]
+    seen = _seen(scene, frames)
+    kept: list[int] = []
+    ranges, neighbors = [], []
+    for view, points in enumerate(seen):
+        depth = transform(T_cw[view], scene.points_w[points])[:, 2]
+        if len(points) < LEAST_POINTS:
+            continue
+        shared = torch.stack([torch.isin(points, other) for other in seen])
+        shared[view] = False
+        scores = neighbor_scores(scene.points_w[points], shared, centers_w[view], centers_w)
+        order, is_there = choose_neighbors(scores, NEIGHBORS)
+        if int(is_there.sum()) < LEAST_NEIGHBORS:
+            continue
+        kept.append(view)
+        neighbors.append(order[is_there].tolist())
+        ranges.append(depth.quantile(torch.tensor(QUANTILES, dtype=depth.dtype)))
+    return _without_missing(scene, frames, size, kept, ranges, neighbors)
+
+
+def _seen(scene: ExportedScene, frames: Tensor) -> list[Tensor]:
+    """The points that each frame observes, ascending."""
+    order = torch.argsort(scene.frame_index, stable=True)
+    counts = torch.bincount(scene.frame_index, minlength=len(scene.frame_ids))
+    parts = scene.point_index[order].split(counts.tolist())
+    return [torch.unique(parts[frame]) for frame in frames.tolist()]
+
+
+def _without_missing(
+    scene: ExportedScene,
+    frames: Tensor,
+    size: tuple[int, int],
+    kept: list[int],
+    ranges: list[Tensor],
+    neighbors: list[list[int]],
+) -> Views:
+    """Views with neighbors among them. Raises ResultsError if too few are left."""
+    while True:  # a view that is left out is no neighbor of others
+        place = {view: index for index, view in enumerate(kept)}
+        neighbors = [[other for other in mine if other in place] for mine in neighbors]
+        enough = [len(mine) >= LEAST_NEIGHBORS for mine in neighbors]
+        if all(enough):
+            break
+        left = [row for row, fits in enumerate(enough) if fits]
+        kept, ranges, neighbors = (
+            [kept[i] for i in left],
+            [ranges[i] for i in left],
+            [neighbors[i] for i in left],
+        )
+    if len(kept) <= LEAST_NEIGHBORS:
+        raise ResultsError(
+            f"{len(kept)} of {len(frames)} views see enough points of others from another direction; dense depth needs "
+            f"{LEAST_NEIGHBORS + 1}: the camera must move sideways, or more frames be chosen"
+        )
+    rows = frames[kept]
+    limits = torch.stack(ranges)
+    return Views(
+        frame_index=scene.frame_ids[rows],
+        T_cw=scene.T_cw[rows],
+        camera=scale_camera(scene.camera, size),
+        near=limits[:, 0] * NEARER,
+        far=limits[:, 1] * FARTHER,
+        neighbors=tuple(tuple(place[other] for other in mine) for mine in neighbors),
+    )
