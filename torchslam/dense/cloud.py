@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from jaxtyping import Float, UInt8
+import torch
+from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
+
+THINNING_SEED = 0
 
 
 @dataclass(frozen=True)
@@ -26,3 +29,23 @@ class PointCloud:
 
     def __len__(self) -> int:
         return len(self.points_w)
+
+    def __getitem__(self, rows: Int[Tensor, " R"] | Bool[Tensor, " N"]) -> PointCloud:
+        """Return some of the points."""
+        return PointCloud(self.points_w[rows], self.normals_w[rows], self.colors[rows], self.confidence[rows])
+
+    def turned(self, R: Float[Tensor, "3 3"]) -> PointCloud:
+        """Return the cloud rotated by R: points p become R p."""
+        R = R.to(self.points_w)
+        return replace(self, points_w=self.points_w @ R.mT, normals_w=self.normals_w @ R.mT)
+
+    def thinned(self, limit: int) -> PointCloud:
+        """Return at most `limit` points, chosen at random with a fixed seed.
+
+        Neighboring rows are neighboring pixels, so that every n-th row would leave stripes.
+        """
+        if len(self) <= limit:
+            return self
+        generator = torch.Generator().manual_seed(THINNING_SEED)
+        rows = torch.randperm(len(self), generator=generator)[:limit].sort().values
+        return self[rows.to(self.points_w.device)]

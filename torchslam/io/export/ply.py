@@ -6,7 +6,6 @@ The sparse cloud of a map is only written. The dense one is read again, by `torc
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +32,11 @@ MAX_BYTES = 1 << 33  # of a cloud that is read: 270 million points
 UNIT_TOLERANCE = 1e-3  # of the length of a normal
 
 
+def upright_from_map(slam_map: Map) -> Float[Tensor, "3 3"]:
+    """Rotation from the world of a map to the upright one of all exports, float64."""
+    return upright_rotation(se3_inverse(slam_map.T_cw).double())
+
+
 def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
     """Write the points of a map in the colors of the images, and the keyframes of a session in red, z up."""
     if slam_map.num_keyframes == 0:
@@ -40,7 +44,7 @@ def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
         write_ply(path, nothing, nothing.byte(), nothing)
         return
     T_wc, points, alive = se3_inverse(slam_map.T_cw), slam_map.points, slam_map.valid_points()
-    R_up = upright_rotation(T_wc)
+    R_up = upright_from_map(slam_map).to(T_wc)
     write_ply(
         path,
         slam_map.positions_w[alive] @ R_up.mT,
@@ -89,9 +93,9 @@ def write_cloud(path: str | Path, cloud: PointCloud, R: Float[Tensor, "3 3"] | N
     Args:
         path: the file.
         cloud: points of the map's world.
-        R: rotation from the map's world to that of the file, as `upright_rotation`; None: the same.
+        R: rotation from the map's world to that of the file, as `upright_from_map`; None: the same.
     """
-    cloud = cloud if R is None else turned(cloud, R)
+    cloud = cloud if R is None else cloud.turned(R)
     vertices = np.zeros(len(cloud), DENSE_VERTEX)
     _fill(vertices, POSITION, cloud.points_w)
     _fill(vertices, NORMAL, cloud.normals_w)
@@ -120,13 +124,7 @@ def read_cloud(path: str | Path, R: Float[Tensor, "3 3"] | None = None) -> Point
         cloud = _cloud(_vertices(content))
     except ValueError as error:
         raise ResultsError(f"{path}: not a dense cloud of torchslam: {error}") from None
-    return cloud if R is None else turned(cloud, R.mT)
-
-
-def turned(cloud: PointCloud, R: Float[Tensor, "3 3"]) -> PointCloud:
-    """Return the cloud rotated by R: points p become R p."""
-    rotation = R.to(cloud.points_w)
-    return replace(cloud, points_w=cloud.points_w @ rotation.mT, normals_w=cloud.normals_w @ rotation.mT)
+    return cloud if R is None else cloud.turned(R.mT)
 
 
 def _vertices(content: bytes) -> np.ndarray:
