@@ -65,6 +65,8 @@ def _asset(name: str) -> str:
 MAX_POINTS = 150_000  # of all submaps together: 20 bytes each in the page
 MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
 DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
+SPACING_SAMPLE = 200  # points of the dense cloud whose distance to their neighbors is measured
+SPACING_RANK = 3  # the neighbor at that distance: on a surface, a circle of that radius holds as many points
 STEPS = 65535  # of a coordinate of the dense cloud, over the extent of the cloud
 MAX_FRAMES = 20_000  # 100 bytes each in the page
 MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
@@ -198,6 +200,7 @@ def _dense(cloud: PointCloud, S: Float[Tensor, "4 4"], box: Float[Tensor, "2 3"]
         low, step: (3,) lowest corner and length of a step
         points, colors: (P, 3)
         total: number of points before thinning
+        spacing: usual distance between neighbors
     """
     reach = DENSE_REACH * float((box[1] - box[0]).norm()) / 2
     near = (transform(S, cloud.points_w.double()).abs() <= reach).all(dim=-1)
@@ -211,7 +214,18 @@ def _dense(cloud: PointCloud, S: Float[Tensor, "4 4"], box: Float[Tensor, "2 3"]
         "points": encoded(((points - low) / step).round(), "uint16"),
         "colors": encoded(kept.colors, "uint8"),
         "total": len(cloud),
+        "spacing": _spacing(points),
     }
+
+
+def _spacing(points: Float[Tensor, "N 3"]) -> float:
+    """Return the median distance of points to their third neighbor; 0 for very few points."""
+    if len(points) <= SPACING_RANK:
+        return 0.0
+    points = points.float()
+    sample = points[torch.from_numpy(thin(len(points), SPACING_SAMPLE))]
+    nearest_first = torch.cdist(sample, points).topk(SPACING_RANK + 1, dim=1, largest=False).values
+    return float(nearest_first[:, SPACING_RANK].median())
 
 
 def _evaluation(path: Trajectory, results: Results) -> Evaluation | None:

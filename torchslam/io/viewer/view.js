@@ -10,6 +10,8 @@ const eye = createEye($("scene"), redraw, () => ($("follow").checked = false));
 const layers = {};
 const shown = { submap: null, frame: last, playing: false, clock: 0, pointSize: 1, waiting: false };
 
+const COVER = 1.5; // widths of a dense point, in distances between neighbors: surfaces are closed
+
 const number = (value) => value.toLocaleString("en");
 const tone = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const rgb = (name) => [1, 3, 5].map((i) => parseInt(tone(name).slice(i, i + 2), 16));
@@ -126,10 +128,10 @@ function draw() {
       limits: [shown.finest * scale * shown.pointSize, 7 * scale * shown.pointSize],
       lift: [...ink, 0.2],
     });
-  if (isOn("dense"))
+  if (submap.dense && isOn("dense"))
     painter.draw(layers.dense, {
       ...view,
-      size: shown.pointSize * 0.004 * submap.radius * canvas.height,
+      size: (shown.pointSize * COVER * submap.dense.spacing * canvas.height) / (2 * Math.tan(FIELD_OF_VIEW / 2)),
       limits: [1.2 * scale * shown.pointSize, 12 * scale * shown.pointSize],
       lift: [...ink, 0],
     });
