@@ -215,12 +215,6 @@ def test_a_mesh_has_the_colors_of_the_images(dense: Path, tmp_path: Path) -> Non
     assert np.asarray(mesh.vertex_colors).std() > 0.1
 
 
-def test_a_new_run_deletes_the_dense_results_of_the_old_one(dense: Path) -> None:
-    assert main(["run", ROOM, "--output", str(dense), "--overwrite", *FAST]) == 0
-    assert not (dense / "dense.ply").exists()
-    assert not (dense / "dense" / "depths.safetensors").exists()
-
-
 # --- what goes wrong -----------------------------------------------------------------------------------------
 
 

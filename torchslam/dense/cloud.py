@@ -9,6 +9,8 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 THINNING_SEED = 0
+SPACING_SAMPLE = 200  # points whose distance to their neighbors is measured
+SPACING_RANK = 3  # the neighbor at that distance: on a surface, a circle of that radius holds as many points
 
 
 @dataclass(frozen=True)
@@ -49,3 +51,12 @@ class PointCloud:
         generator = torch.Generator().manual_seed(THINNING_SEED)
         rows = torch.randperm(len(self), generator=generator)[:limit].sort().values
         return self[rows.to(self.points_w.device)]
+
+    def spacing(self) -> float:
+        """Return the median distance of points to their third neighbor; 0 for very few points."""
+        if len(self) <= SPACING_RANK:
+            return 0.0
+        points_w = self.points_w.float()
+        rows = torch.linspace(0, len(self) - 1, min(len(self), SPACING_SAMPLE)).long()
+        distances = torch.cdist(points_w[rows.to(points_w.device)], points_w)
+        return float(distances.topk(SPACING_RANK + 1, dim=1, largest=False).values[:, -1].median())

@@ -198,14 +198,6 @@ def test_a_large_dense_cloud_is_thinned(
     assert submap["dense"]["total"] == len(dense)
 
 
-def test_points_are_drawn_as_wide_as_they_are_apart() -> None:
-    grid = torch.stack(
-        torch.meshgrid(*(0.1 * torch.arange(30).double(),) * 2, indexing="ij"), dim=-1
-    ).flatten(0, 1)
-    assert view_data._spacing(torch.nn.functional.pad(grid, (0, 1))) == pytest.approx(0.1, rel=1e-4)
-    assert view_data._spacing(torch.zeros(3, 3)) == 0.0
-
-
 def test_without_a_dense_cloud_the_page_has_none(kept: Results) -> None:
     assert data_of(page(kept))["submaps"][0]["dense"] is None
 

@@ -19,7 +19,7 @@ from torchslam.data.trajectories import nearest
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
-from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry import Camera, se3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
@@ -65,8 +65,6 @@ def _asset(name: str) -> str:
 MAX_POINTS = 150_000  # of all submaps together: 20 bytes each in the page
 MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
 DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
-SPACING_SAMPLE = 200  # points of the dense cloud whose distance to their neighbors is measured
-SPACING_RANK = 3  # the neighbor at that distance: on a surface, a circle of that radius holds as many points
 STEPS = 65535  # of a coordinate of the dense cloud, over the extent of the cloud
 MAX_FRAMES = 20_000  # 100 bytes each in the page
 MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
@@ -214,18 +212,8 @@ def _dense(cloud: PointCloud, S: Float[Tensor, "4 4"], box: Float[Tensor, "2 3"]
         "points": encoded(((points - low) / step).round(), "uint16"),
         "colors": encoded(kept.colors, "uint8"),
         "total": len(cloud),
-        "spacing": _spacing(points),
+        "spacing": float(sim3_scale(S)) * kept.spacing(),
     }
-
-
-def _spacing(points: Float[Tensor, "N 3"]) -> float:
-    """Return the median distance of points to their third neighbor; 0 for very few points."""
-    if len(points) <= SPACING_RANK:
-        return 0.0
-    points = points.float()
-    sample = points[torch.from_numpy(thin(len(points), SPACING_SAMPLE))]
-    nearest_first = torch.cdist(sample, points).topk(SPACING_RANK + 1, dim=1, largest=False).values
-    return float(nearest_first[:, SPACING_RANK].median())
 
 
 def _evaluation(path: Trajectory, results: Results) -> Evaluation | None:
