@@ -85,9 +85,9 @@ def splat(
     """
     points_c = transform(T_cw, points_w.to(T_cw))
     front = points_c[:, 2] > near
-    points_c, colors = points_c[front], colors[front]
-    depth = points_c[:, 2]
-    pixels = camera.to(T_cw.dtype).project(points_c)[0].round().long()
+    pixels = camera.to(T_cw.dtype).project(points_c)[0].round()
+    seen = front & camera.in_image(pixels, border=-SAMPLES * MAX_POINT_PX)
+    pixels, colors, depth = pixels[seen].long(), colors[seen], points_c[seen, 2]
     half = (width / depth * float(camera.params[0]) / 2).round().clamp(0, SAMPLES * MAX_POINT_PX // 2).long()
     image = torch.tensor(GROUND, dtype=torch.uint8).expand(camera.height * camera.width, 3).clone()
     nearest = torch.full((len(image),), torch.inf, dtype=depth.dtype)

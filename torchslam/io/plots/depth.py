@@ -95,7 +95,7 @@ def _only(values: np.ndarray, known: np.ndarray) -> np.ndarray:
 
 
 def _frame(axes: Axes, name: str) -> None:
-    axes.set(xticks=[], yticks=[], facecolor=UNKNOWN)
+    axes.set(xticks=[], yticks=[], facecolor=UNKNOWN, anchor="N")  # some have a scale below
     axes.set_title(name)
     axes.grid(visible=False)
     for spine in axes.spines.values():
