@@ -73,9 +73,7 @@ class ExportedScene:
             raise ResultsError(f"frame {missing[0]} has no pose in this map")
         rows = torch.nonzero(torch.isin(self.frame_ids, frame_ids))[:, 0]
         slot = torch.full((len(self.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
-        is_kept = slot[self.frame_index] >= 0
-        tracks = torch.bincount(self.point_index[is_kept], minlength=len(self.points_w))
-        is_kept &= tracks[self.point_index] >= 2
+        is_kept = _of_tracks(slot[self.frame_index] >= 0, self.point_index, len(self.points_w))
         points, point_index = torch.unique(self.point_index[is_kept], return_inverse=True)
         return replace(
             self,
@@ -121,8 +119,7 @@ def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool
     slot = torch.full((len(graph.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])
     is_kept = (slot[graph.frame_index] >= 0) & camera.project(points_c[:, 0])[1]
-    tracks = torch.bincount(graph.point_index[is_kept], minlength=len(graph.points_w))
-    is_kept &= tracks[graph.point_index] >= 2
+    is_kept = _of_tracks(is_kept, graph.point_index, len(graph.points_w))
     seen = torch.nonzero(is_kept)[:, 0]
     seen = seen[torch.argsort(slot[graph.frame_index[seen]], stable=True)]
     points, point_index = torch.unique(graph.point_index[seen], return_inverse=True)
@@ -138,6 +135,14 @@ def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool
         point_index=point_index,
         pixels=graph.pixels[seen].double(),
     )
+
+
+def _of_tracks(
+    is_kept: Bool[Tensor, " O"], point_index: Int[Tensor, " O"], points: int
+) -> Bool[Tensor, " O"]:
+    """Return the kept observations without those of points that fewer than two of them see."""
+    tracks = torch.bincount(point_index[is_kept], minlength=points)
+    return is_kept & (tracks[point_index] >= 2)
 
 
 def pinhole_within(camera: Camera) -> Camera:
