@@ -89,6 +89,21 @@ def picture(figure: Figure) -> Image.Image:
     return Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3])
 
 
+def save_animation(pictures: list[Image.Image], path: Path, rate: float) -> None:
+    """Write pictures as an animation of `rate` pictures per second, and say how large it is."""
+    times = [round(1000 / rate)] * (len(pictures) - 1) + [1500]  # the last one stays longer
+    pictures[0].save(
+        path,
+        save_all=True,
+        append_images=pictures[1:],
+        duration=times,
+        loop=0,
+        quality=35,
+        method=6,
+    )
+    print(f"{path}: {len(pictures)} pictures, {path.stat().st_size / 1e3:.0f} kB")
+
+
 def main() -> None:
     parser = parser_of(__doc__)
     parser.add_argument("results", type=Path, help="results folder of a run")
@@ -100,17 +115,7 @@ def main() -> None:
     scene, sequence = RunScene(arguments.results), open_sequence(arguments.sequence)
     numbers = range(0, len(scene.frames), arguments.stride)
     pictures = [picture(draw_frame(scene, sequence, number)) for number in numbers]
-    times = [round(1000 / arguments.rate)] * (len(pictures) - 1) + [1500]  # the last one stays longer
-    pictures[0].save(
-        arguments.output,
-        save_all=True,
-        append_images=pictures[1:],
-        duration=times,
-        loop=0,
-        quality=35,
-        method=6,
-    )
-    print(f"{arguments.output}: {len(pictures)} pictures, {arguments.output.stat().st_size / 1e3:.0f} kB")
+    save_animation(pictures, arguments.output, arguments.rate)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
@@ -11,9 +12,13 @@ import numpy as np
 import pytest
 import torch
 
+from tests.box_room import box_cloud, box_depths
 from torchslam.cli.main import main
 from torchslam.data import read_trajectory
-from torchslam.geometry import squared_reprojection_errors, transform
+from torchslam.dense import DepthMaps
+from torchslam.geometry import Camera, squared_reprojection_errors, transform
+from torchslam.io.export.ply import read_cloud, upright_from_map, write_cloud
+from torchslam.io.export.scene import pinhole_within
 from torchslam.map.file import read_atlas, read_map, write_atlas
 
 ROOM = "synthetic:room?frames=16"
@@ -125,6 +130,89 @@ def test_frames_can_be_chosen(results: Path, tmp_path: Path) -> None:
         assert export(results, "nerfstudio", folder, "--frames", frames, "--no-images") == 0
         assert len(json.loads((folder / "transforms.json").read_text())["frames"]) == count
         assert not (folder / "images").exists()
+
+
+# --- depth maps and the dense cloud ---------------------------------------------------------------------------
+
+
+@pytest.fixture
+def dense(copy: Path) -> Path:
+    """Results with depth of half the size for all keyframes but the last one: of a room around the cameras."""
+    slam_map, camera = read_map(copy / "map.safetensors")
+    frames, order = slam_map.keyframes["frame_index"].sort()
+    pinhole = pinhole_within(camera)
+    (width, height), (fx, fy, cx, cy) = pinhole.size, pinhole.params.tolist()
+    half = Camera.pinhole(
+        fx / 2, fy / 2, (cx + 0.5) / 2 - 0.5, (cy + 0.5) / 2 - 0.5, size=(width // 2, height // 2)
+    )
+    maps = box_depths(slam_map.T_cw[order][:-1], frames[:-1], half)
+    (copy / "dense").mkdir()
+    maps.save(copy / "dense" / "depths.safetensors")
+    write_cloud(copy / "dense.ply", box_cloud(maps), upright_from_map(slam_map))
+    return copy
+
+
+def test_colmap_gets_the_workspace_and_the_start_of_a_splat(dense: Path, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    folder, maps = tmp_path / "model", DepthMaps.load(dense / "dense" / "depths.safetensors")
+    assert export(dense, "colmap", folder, "--undistort") == 0
+    made = pycolmap.Reconstruction(str(folder / "dense" / "sparse"))
+    assert made.num_images() == len(maps)
+    made.update_point_3d_errors()
+    assert made.compute_mean_reprojection_error() < 1.0
+    for image in made.images.values():
+        depth = pycolmap.DepthMap()
+        depth.read(str(folder / "dense" / "stereo" / "depth_maps" / f"{image.name}.geometric.bin"))
+        picture = cv2.imread(str(folder / "dense" / "images" / image.name))
+        assert picture.shape[:2] == (made.cameras[1].height, made.cameras[1].width) == depth.to_array().shape
+        large = cv2.imread(str(folder / "images" / image.name))
+        height, width = picture.shape[:2]
+        expected = cv2.resize(large[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+        assert np.abs(picture.astype(int) - expected).mean() < 0.1
+    cloud = read_cloud(dense / "dense.ply", upright_from_map(read_map(dense / "map.safetensors")[0]))
+    for name in ("sparse/0/points3D.ply", "dense/fused.ply"):
+        torch.testing.assert_close(
+            read_cloud(folder / name).points_w.mean(0), cloud.points_w.mean(0), atol=0.02, rtol=0
+        )
+    (dense / "dense.ply").unlink()
+    assert export(dense, "colmap", folder, "--overwrite") == 0
+    assert not (folder / "sparse" / "0" / "points3D.ply").exists()
+
+
+def test_nerfstudio_gets_depth_for_all_frames_or_none(dense: Path, tmp_path: Path) -> None:
+    assert export(dense, "nerfstudio", tmp_path / "keyframes") == 0
+    about = json.loads((tmp_path / "keyframes" / "transforms.json").read_text())
+    assert len(about["frames"]) == len(DepthMaps.load(dense / "dense" / "depths.safetensors"))
+    for frame in about["frames"]:
+        assert (tmp_path / "keyframes" / frame["depth_file_path"]).is_file()
+        image = cv2.imread(str(tmp_path / "keyframes" / frame["file_path"]))
+        assert image.shape[:2] == (about["h"], about["w"])
+    assert about["ply_file_path"] == "dense_pc.ply"
+    assert export(dense, "nerfstudio", tmp_path / "all", "--frames", "all", "--no-images") == 0
+    about = json.loads((tmp_path / "all" / "transforms.json").read_text())
+    assert not any("depth_file_path" in frame for frame in about["frames"])
+    assert about["ply_file_path"] == "dense_pc.ply"
+
+
+def test_a_mesh_needs_depth_maps_and_open3d(
+    dense: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("torchslam.cli.export.import_open3d", lambda: None)
+    (dense / "dense" / "depths.safetensors").unlink()
+    assert export(dense, "mesh", tmp_path / "mesh.ply") == 2
+    assert "no depth maps: `torchslam densify` writes them" in capsys.readouterr().err
+    monkeypatch.undo()
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    assert export(dense, "mesh", tmp_path / "mesh.ply") == 2
+    assert "pip install 'torchslam[mesh]'" in capsys.readouterr().err
+
+
+def test_a_mesh_has_the_colors_of_the_images(dense: Path, tmp_path: Path) -> None:
+    o3d = pytest.importorskip("open3d", reason="Open3D is not installed: pip install 'torchslam[mesh]'")
+    assert export(dense, "mesh", tmp_path / "mesh.ply") == 0
+    mesh = o3d.io.read_triangle_mesh(str(tmp_path / "mesh.ply"))
+    assert len(mesh.triangles) > 10_000
+    assert np.asarray(mesh.vertex_colors).std() > 0.1
 
 
 # --- what goes wrong -----------------------------------------------------------------------------------------

@@ -31,6 +31,7 @@ from torchslam.data.formats.image_file import read_color, read_gray
 from torchslam.data.sequence import Sequence
 from torchslam.errors import CalibrationError, ConfigError, FrameError
 from torchslam.features.learned import XFeat
+from torchslam.io.export.ply import read_cloud
 from torchslam.io.results import read_results
 from torchslam.io.viewer.page import page
 from torchslam.map.file import read_atlas, write_atlas
@@ -87,6 +88,9 @@ def readers() -> dict[str, Reader]:
         Reader("checkpoint", partial(_some, "checkpoint", "checkpoint.safetensors"), _checkpoint, 900),
         Reader("graph", lambda: sample_files()["graph"], _graph, 1200),
         Reader("results", lambda: sample_files()["results"], _results, 1700),
+        Reader(
+            "dense cloud", lambda: sample_files()["dense"], lambda root: read_cloud(root / "dense.ply"), 500
+        ),
         Reader("weights", lambda: {"w.safetensors": save(WEIGHTS)}, _weights, 200),
         Reader("toml", lambda: {"c.toml": to_toml(Config()).encode()}, _toml, 1200),
         Reader("--set", lambda: {"argument": b""}, _override, 800),

@@ -12,8 +12,10 @@ from tests.fuzz.mutators import Files
 from tests.fuzz.valid_inputs import content_of
 from tests.walks import Walk, arc
 from torchslam import SLAM, load_config
+from torchslam.dense.cloud import PointCloud
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
+from torchslam.io.export.ply import write_cloud
 from torchslam.io.export.scene import scene_of
 from torchslam.io.report import run_metrics
 from torchslam.io.results import write_results
@@ -36,7 +38,7 @@ WALK = Walk(arc(30)[:14])
 
 @cache
 def sample_files() -> dict[str, Files]:
-    """By kind: `results`, `checkpoint`, `graph`, `colmap`, `transforms`."""
+    """By kind: `results`, `checkpoint`, `graph`, `colmap`, `transforms`, `dense`."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         slam, so_far = SLAM(WALK.camera, CONFIG), RunProgress()
@@ -56,4 +58,8 @@ def sample_files() -> dict[str, Files]:
         write_colmap(root / "colmap", scene)
         (root / "transforms").mkdir()
         write_nerfstudio(root / "transforms", scene, torch.eye(3, dtype=torch.float64))
+        (root / "dense").mkdir()
+        ones = torch.ones(20, 3)
+        cloud = PointCloud(ones, ones / 3**0.5, ones.byte(), ones[:, 0])
+        write_cloud(root / "dense" / "dense.ply", cloud)
         return {kind.name: content_of(kind) for kind in root.iterdir()}

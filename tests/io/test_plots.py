@@ -226,3 +226,42 @@ def test_ellipses_of_points_are_of_true_size(trajectory: Trajectory, points_w: t
 
 def test_long_titles_wrap_in_narrow_pictures() -> None:
     assert max(map(len, _wrapped("words " * 40, 4.5).split("\n"))) <= 60
+
+
+# --- depth maps ----------------------------------------------------------------------------------------------
+
+
+def depth_figure(depth: torch.Tensor) -> Figure:
+    normal = torch.zeros(3, *depth.shape)
+    normal[2] = -1.0
+    image = torch.full((96, 128, 3), 90, dtype=torch.uint8)
+    return plots.plot_depth(image, depth, normal, 0.75 * torch.ones_like(depth), "Frame 7")
+
+
+def test_a_depth_map_is_drawn_next_to_its_image() -> None:
+    depth = torch.linspace(1.0, 4.0, 48 * 64).reshape(48, 64)
+    depth[:24] = 0.0
+    figure = depth_figure(depth)
+    image, drawn, normals, confidence = (axes.images[0].get_array() for axes in figure.axes[:4])
+    assert (image == 90).all()
+    assert drawn.mask[:24].all()
+    np.testing.assert_allclose(drawn[24:], depth[24:])
+    np.testing.assert_allclose(
+        normals[24:], np.broadcast_to((0.5, 0.5, 1.0, 1.0), (24, 64, 4))
+    )  # faces the camera
+    assert (normals[:24, :, 3] == 0).all()
+    assert confidence.mask[:24].all()
+    assert (confidence[24:] == 0.75).all()
+    titles = [axes.get_title(loc="left") for axes in figure.axes[:4]]
+    assert titles == ["Frame 7", "depth (map units), 50% known", "normals", "confidence"]
+
+
+@pytest.mark.parametrize("value", [0.0, 2.0])
+def test_depth_that_is_unknown_or_the_same_everywhere_is_drawn(value: float) -> None:
+    assert plots.png(depth_figure(torch.full((48, 64), value)))[:4] == b"\x89PNG"
+
+
+def test_the_picture_of_a_depth_map_is_written(tmp_path: Path) -> None:
+    maps = (torch.ones(6, 8), torch.zeros(3, 6, 8), torch.ones(6, 8))
+    plots.draw_depth(torch.zeros(6, 8, 3, dtype=torch.uint8), *maps, tmp_path / "new" / "a.png")
+    assert cv2.imread(str(tmp_path / "new" / "a.png")).shape[1] > 1000

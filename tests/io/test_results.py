@@ -7,11 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.box_room import box_cloud, box_depths
 from tests.walks import Walk, arc
 from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
+from torchslam.io.export.ply import upright_from_map, write_cloud
 from torchslam.io.report import run_metrics
-from torchslam.io.results import read_results, results_in, write_results
+from torchslam.io.results import DENSE_CLOUD, DEPTHS, read_results, results_in, write_results
 from torchslam.io.write_run import draw
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Submap
@@ -53,6 +55,26 @@ def test_results_round_trip(tmp_path: Path, run: Run) -> None:
     assert len(results.keyframes) == 6
     assert [frame.submap for frame in results.frames] == [result.submap for result in run.results]
     assert results.session == 0
+
+
+def test_the_dense_cloud_is_read_into_the_world_of_the_map(tmp_path: Path, run: Run) -> None:
+    write(run, tmp_path)
+    assert read_results(tmp_path).cloud is None
+    cloud = box_cloud(box_depths(run.map.T_cw[:1], torch.tensor([0]), run.camera))
+    write_cloud(tmp_path / DENSE_CLOUD, cloud, upright_from_map(run.map))
+    found = read_results(tmp_path).cloud
+    assert found is not None
+    torch.testing.assert_close(found.points_w, cloud.points_w, atol=1e-5, rtol=0)
+
+
+def test_a_new_run_deletes_the_dense_results_of_the_old_one(tmp_path: Path, run: Run) -> None:
+    write(run, tmp_path)
+    (tmp_path / DEPTHS).parent.mkdir()
+    for name in (DENSE_CLOUD, DEPTHS):
+        (tmp_path / name).write_bytes(b"")
+    write(run, tmp_path)
+    assert not (tmp_path / DENSE_CLOUD).exists()
+    assert not (tmp_path / DEPTHS).exists()
 
 
 def test_online_poses_have_a_file(tmp_path: Path, run: Run) -> None:

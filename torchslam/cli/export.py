@@ -6,6 +6,12 @@
   ply         colored points, keyframes in red, z up
   rerun       recording (.rrd): points, path and all cameras; undistorted images and keypoints of the keyframes; z up
   tum, kitti  all poses, camera to world: a file with timestamps; a folder with poses.txt and times.txt
+  mesh        triangles of the surfaces as PLY, z up, from depth maps: extra `mesh` (Open3D)
+
+Depth maps and the dense cloud, if the folder has them (`torchslam densify`), are part of the export. colmap: the
+workspace `dense/` for stereo_fusion and poisson_mesher, and sparse/0/points3D.ply, from which 3D Gaussian Splatting
+starts. nerfstudio: undistorted images with depth images, and dense_pc.ply, from which splatfacto starts. rerun: depth
+images and points.
 
 Lengths are in map units. Up is the mean up direction of the keyframes, since gravity is unknown. Images are read again
 from the sequence of the run.
@@ -24,27 +30,31 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from torchslam.cli import arguments
 from torchslam.data.trajectories import read_trajectory, write_kitti, write_trajectory
+from torchslam.dense.cloud import PointCloud
+from torchslam.dense.depth_maps import read_frames
 from torchslam.errors import ConfigError, ResultsError
-from torchslam.geometry import Camera, se3_inverse
-from torchslam.geometry.transforms import upright_rotation
+from torchslam.geometry import Camera
 from torchslam.io.export.colmap import colmap_camera, write_colmap
+from torchslam.io.export.depths import MAX_POINTS, enlarged, write_workspace
+from torchslam.io.export.mesh import import_open3d, write_mesh
 from torchslam.io.export.nerfstudio import IMAGES, write_nerfstudio
-from torchslam.io.export.ply import write_map_cloud
+from torchslam.io.export.ply import read_cloud, upright_from_map, write_cloud, write_map_cloud
 from torchslam.io.export.recording import import_rerun, write_recording
 from torchslam.io.export.scene import (
     WITHOUT,
     ExportedScene,
     Images,
     open_images,
+    pinhole_within,
     scene_of,
     undistorted,
     write_images,
 )
-from torchslam.io.results import MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
+from torchslam.io.results import DENSE_CLOUD, DEPTHS, MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
 from torchslam.system.run import keyframe_rows, keyframe_trajectory
@@ -53,6 +63,8 @@ from torchslam.utils.console import table
 
 FOLDER = "export"  # in the folder of results
 MODEL = Path("sparse") / "0"  # where COLMAP's programs and trainers of splats look for it
+WORKSPACE = "dense"  # for COLMAP's programs
+SPLAT_START = "points3D.ply"  # in MODEL: what 3D Gaussian Splatting reads instead of the points of the model
 
 
 @dataclass(frozen=True)
@@ -84,22 +96,49 @@ class Job:
     @property
     def R_up(self) -> Float[torch.Tensor, "3 3"]:
         """Rotation from the map frame to the upright one, the same for every format."""
-        return upright_rotation(se3_inverse(self.submap.map.T_cw).double())
+        return upright_from_map(self.submap.map)
 
-    def scene(self) -> tuple[ExportedScene, Images | None]:
-        """The exported scene and its images, if requested. Raises ResultsError if they cannot be read."""
-        scene = scene_of(self.submap, self.camera, self.session, self.keyframes_alone)
+    @property
+    def depths(self) -> Path | None:
+        """The file of the depth maps of the exported submap; None if there are none."""
+        path = self.directory / DEPTHS
+        return path if self.is_main and path.exists() else None
+
+    @property
+    def cloud(self) -> PointCloud | None:
+        """The dense cloud in the world of the exported submap; None if there is none."""
+        path = self.directory / DENSE_CLOUD
+        return read_cloud(path, self.R_up) if self.is_main and path.exists() else None
+
+    @property
+    def is_main(self) -> bool:
+        """Whether the exported submap is the main one."""
+        return bool(self.submap.number == self.metrics["submap"])
+
+    def scene(
+        self, pinhole: Camera | None = None, frame_ids: Int[torch.Tensor, " R"] | None = None
+    ) -> tuple[ExportedScene, Images | None]:
+        """The exported scene and its images, if requested. Raises ResultsError if they cannot be read.
+
+        Args:
+            pinhole: camera to undistort to; None: as requested.
+            frame_ids: the frames to export; None: as requested.
+        """
+        scene = scene_of(self.submap, self.camera, self.session, self.keyframes_alone and frame_ids is None)
+        if frame_ids is not None:
+            scene = scene.of_frames(frame_ids)
+        if pinhole is None and self.undistort:
+            pinhole = pinhole_within(scene.camera)
         images = None
         if self.source is not None:
-            images = open_images(self.source, scene, self.undistort, self.fps)
-        return (undistorted(scene) if self.undistort else scene), images
+            images = open_images(self.source, scene, pinhole, self.fps)
+        return (scene if pinhole is None else undistorted(scene, pinhole)), images
 
     def trajectory(self) -> Trajectory:
         """The poses of the run in the submap; those of all frames are read, since localization adds none to the map."""
         if self.keyframes_alone:
             return keyframe_trajectory(self.submap.map, self.session)
-        is_main = self.submap.number == self.metrics["submap"]
-        name = TRAJECTORY if is_main else OTHER_TRAJECTORY.format(self.submap.number)
+        name = TRAJECTORY if self.is_main else OTHER_TRAJECTORY.format(self.submap.number)
         return read_trajectory(self.directory / name)
 
 
@@ -154,6 +193,8 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError(f"--undistort: an export to {options.to} contains no images")
     if options.to == "rerun":
         import_rerun()
+    if options.to == "mesh":
+        import_open3d()
     job = _job(options, target)
     _make_way(job.output, options.overwrite)
     written = target.write(job)
@@ -205,21 +246,59 @@ def _colmap(job: Job) -> dict[str, str]:
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     write_colmap(job.output / MODEL, scene)
-    return {"camera": colmap_camera(scene.camera)[0]} | _describe_scene(job, scene)
+    about = {"camera": colmap_camera(scene.camera)[0]} | _describe_scene(job, scene)
+    cloud = job.cloud
+    (job.output / MODEL / SPLAT_START).unlink(missing_ok=True)
+    if cloud is not None:
+        write_cloud(job.output / MODEL / SPLAT_START, cloud.thinned(MAX_POINTS))
+    if job.depths is not None:
+        frame_ids, camera = read_frames(job.depths)
+        dense, small_images = job.scene(camera, frame_ids)
+        write_workspace(job.output / WORKSPACE, dense, job.depths, cloud, small_images)
+    return about | _describe_dense(job, cloud)
 
 
 def _nerfstudio(job: Job) -> dict[str, str]:
-    scene, images = job.scene()
+    depths = job.depths if job.keyframes_alone else None  # nerfstudio wants depth for all frames or none
+    if depths is None:
+        scene, images = job.scene()
+    else:
+        frame_ids, camera = read_frames(depths)
+        scene, images = job.scene(enlarged(camera, job.camera), frame_ids)
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
-    write_nerfstudio(job.output, scene, job.R_up)
-    return _describe_scene(job, scene)
+    cloud = job.cloud
+    write_nerfstudio(job.output, scene, job.R_up, cloud, depths)
+    return _describe_scene(job, scene) | _describe_dense(job, cloud)
 
 
 def _rerun(job: Job) -> dict[str, str]:
     scene, images = job.scene()
-    write_recording(job.output, scene, job.R_up, images)
-    return _describe_scene(job, scene)
+    cloud = job.cloud
+    write_recording(job.output, scene, job.R_up, images, cloud, job.depths)
+    return _describe_scene(job, scene) | _describe_dense(job, cloud)
+
+
+def _mesh(job: Job) -> dict[str, str]:
+    if job.depths is None:
+        raise ResultsError(f"{job.directory / DEPTHS}: no depth maps: `torchslam densify` writes them")
+    frame_ids, camera = read_frames(job.depths)
+    images = job.scene(camera, frame_ids)[1]
+    size = write_mesh(job.output, job.depths, job.R_up, images)
+    return {
+        "depth maps": str(len(frame_ids)),
+        "voxels": f"{size.voxel:.3g} map units wide",
+        "mesh": f"{size.triangles} triangles, {size.vertices} vertices",
+    }
+
+
+def _describe_dense(job: Job, cloud: PointCloud | None) -> dict[str, str]:
+    about = {}
+    if job.depths is not None:
+        about["depth maps"] = str(len(read_frames(job.depths)[0]))
+    if cloud is not None:
+        about["dense cloud"] = f"{len(cloud)} points"
+    return about
 
 
 def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
@@ -260,4 +339,5 @@ TARGETS = {
     "rerun": Target(_rerun, "recording.rrd", is_of_images=True, keyframes=False),
     "tum": Target(_tum, "trajectory.txt", is_of_images=False, keyframes=False),
     "kitti": Target(_kitti, "kitti", is_of_images=False, keyframes=False),
+    "mesh": Target(_mesh, "mesh.ply", is_of_images=True, keyframes=True),
 }

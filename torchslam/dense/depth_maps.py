@@ -89,10 +89,9 @@ class DepthMaps:
     def _read(cls, path: str | Path, rows: slice) -> DepthMaps:
         """Read some rows of a file."""
         with _opened(path) as (file, about):
-            width, height = about["camera"]["size"]
-            camera = Camera(about["camera"]["model"], file.get_tensor(CAMERA).clone(), (width, height))
             # In memory of their own: the file may be replaced.
-            maps = cls(**{name: file.get_slice(name)[rows].clone() for name in FIELDS}, camera=camera)
+            columns = {name: file.get_slice(name)[rows].clone() for name in FIELDS}
+            maps = cls(**columns, camera=_camera(file, about))
             _check_values(maps)
         return maps
 
@@ -102,6 +101,12 @@ def read_shape(path: str | Path) -> tuple[int, int, int]:
     with _opened(path) as (file, _):
         count, height, width = file.get_slice("depth").get_shape()
         return count, height, width
+
+
+def read_frames(path: str | Path) -> tuple[Int[Tensor, " K"], Camera]:
+    """Read which frames a file has maps of, and their camera, without the maps. Raises ResultsError."""
+    with _opened(path) as (file, about):
+        return file.get_tensor("frame_index").clone(), _camera(file, about)
 
 
 def read_about(path: str | Path) -> dict[str, Any]:
@@ -205,6 +210,11 @@ def _opened(path: str | Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     except (SafetensorError, ValueError, TypeError, KeyError, RuntimeError) as error:
         what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ResultsError(f"{path}: not whole depth maps: {what}") from None
+
+
+def _camera(file: Any, about: dict[str, Any]) -> Camera:
+    width, height = about["camera"]["size"]
+    return Camera(about["camera"]["model"], file.get_tensor(CAMERA).clone(), (width, height))
 
 
 def _check_shapes(shapes: dict[str, tuple[int, ...]], dtypes: dict[str, str], about: dict[str, Any]) -> None:

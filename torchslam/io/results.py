@@ -21,9 +21,10 @@ from torchslam.data.calibration import write_calibration
 from torchslam.data.formats.image_file import read_gray
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import read_trajectory, write_trajectory
+from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, rigid, transform
-from torchslam.io.export.ply import write_map_cloud
+from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
@@ -40,6 +41,8 @@ CALIBRATION = "calibration.txt"  # where the intrinsics were estimated from the 
 MAP = "map.safetensors"
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
 POINT_CLOUD = "map.ply"
+DENSE_CLOUD = "dense.ply"  # of the main submap, z up as in POINT_CLOUD
+DEPTHS = Path("dense") / "depths.safetensors"  # of keyframes of the main submap
 CONFIG = "config.toml"
 METRICS = "metrics.json"
 FRAMES = "frames.csv"
@@ -62,6 +65,7 @@ class Results:
         frames: one result per frame, without poses.
         metrics: the content of metrics.json.
         example_image: gray in [0, 1], of keyframe `example_keyframe(map, session)`, if readable.
+        cloud: the dense cloud in the world of the main submap, if there is one.
     """
 
     trajectory: Trajectory
@@ -74,6 +78,7 @@ class Results:
     frames: list[StepResult]
     metrics: dict[str, Any]
     example_image: Float[Tensor, "H W"] | None
+    cloud: PointCloud | None = None
 
     @property
     def session(self) -> int:
@@ -125,7 +130,7 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
         directory: the results folder, created if missing.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE)]
+    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, DENSE_CLOUD, DEPTHS)]
     for old in (*stale, *directory.glob(OTHER_TRAJECTORY.format("[0-9]*"))):
         old.unlink(missing_ok=True)
     write_trajectory(directory / TRAJECTORY, run.trajectory)
@@ -157,6 +162,7 @@ def read_results(directory: Path) -> Results:
     main = [submap.map for submap in saved.atlas if submap.number == metrics["submap"]]
     paths = {submap.number: directory / OTHER_TRAJECTORY.format(submap.number) for submap in saved.atlas}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
+    cloud = directory / DENSE_CLOUD
     return Results(
         trajectory=read_trajectory(directory / TRAJECTORY) if metrics["posed"] else Trajectory.empty(),
         keyframes=read_trajectory(directory / KEYFRAMES) if metrics["keyframes"] else Trajectory.empty(),
@@ -168,6 +174,7 @@ def read_results(directory: Path) -> Results:
         frames=read_frames(directory / FRAMES),
         metrics=metrics,
         example_image=read_gray(example, str(example))[0, 0] if example.exists() else None,
+        cloud=read_cloud(cloud, upright_from_map(main[0])) if main and cloud.exists() else None,
     )
 
 

@@ -11,7 +11,7 @@ import torch
 from torchslam.data import open_sequence
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.export.scene import ExportedScene, Undistorter, open_images, write_images
+from torchslam.io.export.scene import ExportedScene, Undistorter, open_images, pinhole_within, write_images
 
 FRAMES = 7
 
@@ -55,7 +55,7 @@ def test_every_frame_gets_its_own_image(seen: ExportedScene, folder: Path, tmp_p
 
 
 def test_without_distortion(seen: ExportedScene, folder: Path) -> None:
-    plain, flat = open_images(str(folder), seen), open_images(str(folder), seen, undistort=True)
+    plain, flat = open_images(str(folder), seen), open_images(str(folder), seen, pinhole_within(seen.camera))
     expected = Undistorter(seen.camera)(plain.bgr(3)) if seen.camera.model != "pinhole" else plain.bgr(3)
     np.testing.assert_array_equal(flat.bgr(3), expected)
     assert (seen.camera.model == "pinhole") == np.array_equal(flat.bgr(3), plain.bgr(3))

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
 
+from tests.box_room import HALF, box_cloud, box_depths
 from tests.io.export.conftest import reprojection_error
+from torchslam.geometry import Camera
 from torchslam.geometry.transforms import upright_rotation
+from torchslam.io.export.depths import enlarged
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import VERTEX
-from torchslam.io.export.scene import ExportedScene
+from torchslam.io.export.ply import read_cloud as read_dense
+from torchslam.io.export.scene import ExportedScene, undistorted
 
 
 def distort(about: dict, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -74,3 +79,31 @@ def test_the_cloud_has_the_colors_and_the_frames_their_images(scene: ExportedSce
         f"images/{name}" for name in scene.image_names
     ]
     assert (about["w"], about["h"]) == scene.camera.size
+
+
+def test_depth_images_give_the_surfaces(scene: ExportedScene, tmp_path: Path) -> None:
+    """As nerfstudio reads them: enlarged to the size of the images without interpolation, in thousandths."""
+    small = Camera.pinhole(50.0, 52.5, 39.5, 29.5, size=(80, 60))
+    maps = box_depths(scene.T_cw, scene.frame_ids, small)
+    maps.save(tmp_path / "depths.safetensors")
+    flat = undistorted(scene, enlarged(small, scene.camera).to(torch.float64))
+    R_up, cloud = upright_rotation(scene.T_wc), box_cloud(maps)
+    write_nerfstudio(tmp_path, flat, R_up, cloud, tmp_path / "depths.safetensors")
+    about = json.loads((tmp_path / "transforms.json").read_text())
+    assert (about["w"], about["h"]) == (320, 240)
+    assert len(about["frames"]) == 4
+    for frame in about["frames"]:
+        image = cv2.imread(str(tmp_path / frame["depth_file_path"]), cv2.IMREAD_UNCHANGED)
+        assert image.dtype == np.uint16
+        depth = cv2.resize(image * 1e-3, (320, 240), interpolation=cv2.INTER_NEAREST)
+        v, u = np.mgrid[:240, :320] + 0.5
+        ray = np.stack(
+            ((u - about["cx"]) / about["fl_x"], -(v - about["cy"]) / about["fl_y"], -np.ones_like(u)), -1
+        )
+        T_wc = np.array(frame["transform_matrix"])
+        points = ((ray * depth[..., None]) @ T_wc[:3, :3].T + T_wc[:3, 3]) @ R_up.numpy()  # of the map
+        far = np.abs(np.abs(points).max(axis=-1) - HALF)
+        assert np.median(far) < 2e-3
+        assert far.max() < 0.06  # in the other pixels of an enlarged one
+    dense = read_dense(tmp_path / about["ply_file_path"], R_up)
+    torch.testing.assert_close(dense.points_w, cloud.points_w)

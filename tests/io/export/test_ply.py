@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 import torch
 
+from torchslam.dense.cloud import PointCloud
+from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, se3_inverse, so3_exp
-from torchslam.io.export.ply import CAMERA_COLOR, VERTEX, write_map_cloud, write_ply
+from torchslam.io.export.ply import CAMERA_COLOR, VERTEX, read_cloud, write_cloud, write_map_cloud, write_ply
 from torchslam.map.map import Map
 
 
@@ -91,3 +93,91 @@ def test_the_upright_map_does_not_depend_on_the_map_frame(tmp_path: Path, slam_m
 def test_an_empty_map_has_a_header(tmp_path: Path) -> None:
     write_map_cloud(tmp_path / "map.ply", Map(), session=0)
     assert (tmp_path / "map.ply").read_bytes().endswith(b"end_header\n")
+
+
+# --- the dense cloud -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def cloud(generator: torch.Generator) -> PointCloud:
+    normals_w = torch.nn.functional.normalize(torch.randn(7, 3, generator=generator), dim=-1)
+    return PointCloud(
+        points_w=torch.randn(7, 3, generator=generator),
+        normals_w=normals_w,
+        colors=torch.randint(0, 256, (7, 3), generator=generator, dtype=torch.uint8),
+        confidence=torch.rand(7, generator=generator),
+    )
+
+
+def test_a_dense_cloud_round_trips(tmp_path: Path, cloud: PointCloud) -> None:
+    write_cloud(tmp_path / "dense.ply", cloud)
+    again = read_cloud(tmp_path / "dense.ply")
+    for name in ("points_w", "normals_w", "colors", "confidence"):
+        assert torch.equal(getattr(again, name), getattr(cloud, name)), name
+    write_cloud(tmp_path / "again.ply", again)
+    assert (tmp_path / "again.ply").read_bytes() == (tmp_path / "dense.ply").read_bytes()
+
+
+def test_a_dense_cloud_is_turned_and_turned_back(tmp_path: Path, cloud: PointCloud) -> None:
+    R = so3_exp(torch.tensor((0.4, 1.0, -2.0), dtype=torch.float64))
+    write_cloud(tmp_path / "dense.ply", cloud, R)
+    upright = read_cloud(tmp_path / "dense.ply")
+    for turned, before in ((upright.points_w, cloud.points_w), (upright.normals_w, cloud.normals_w)):
+        torch.testing.assert_close(turned, before @ R.float().mT)
+    torch.testing.assert_close(read_cloud(tmp_path / "dense.ply", R).points_w, cloud.points_w)
+
+
+def test_another_program_reads_the_dense_cloud(tmp_path: Path, cloud: PointCloud) -> None:
+    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    write_cloud(tmp_path / "dense.ply", cloud)
+    made = pycolmap.Reconstruction()
+    made.import_PLY(str(tmp_path / "dense.ply"))
+    assert len(made.points3D) == len(cloud)
+    for number, point in made.points3D.items():
+        np.testing.assert_array_equal(point.xyz, cloud.points_w[number - 1])
+        np.testing.assert_array_equal(point.color, cloud.colors[number - 1])
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "reason"),
+    [
+        (b"ply", b"pig", "no header"),
+        (b"vertex 7", b"vertex 70000000000000", "no header"),
+        (b"vertex 7", b"vertex 8", "8 points and a file of"),
+        (b"float confidence", b"float observations", "its properties are not x, y"),
+        (b"uchar red", b"float red", "its properties are not x, y"),
+    ],
+)
+def test_a_damaged_header_is_reported(
+    tmp_path: Path, cloud: PointCloud, old: bytes, new: bytes, reason: str
+) -> None:
+    path = tmp_path / "dense.ply"
+    write_cloud(path, cloud)
+    path.write_bytes(path.read_bytes().replace(old, new, 1))
+    with pytest.raises(ResultsError, match=f"dense.ply: .*{reason}"):
+        read_cloud(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "reason"),
+    [
+        ("points_w", torch.nan, "positions are not finite"),
+        ("normals_w", 3.0, "normals are not of unit length"),
+        ("confidence", 1.5, "confidence is not between 0 and 1"),
+        ("confidence", torch.nan, "confidence is not between 0 and 1"),
+    ],
+)
+def test_impossible_numbers_are_reported(
+    tmp_path: Path, cloud: PointCloud, name: str, value: float, reason: str
+) -> None:
+    getattr(cloud, name)[3] = value
+    write_cloud(tmp_path / "dense.ply", cloud)
+    with pytest.raises(ResultsError, match=reason):
+        read_cloud(tmp_path / "dense.ply")
+
+
+def test_a_missing_cloud_and_a_folder_are_reported(tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match="no dense cloud"):
+        read_cloud(tmp_path / "dense.ply")
+    with pytest.raises(ResultsError, match="cannot be read: Is a directory"):
+        read_cloud(tmp_path)

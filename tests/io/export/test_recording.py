@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.box_room import box_cloud, box_depths
 from tests.io.export.conftest import reprojection_error
 from tests.walks import Walk, arc
 from torchslam.errors import ResultsError
+from torchslam.geometry import Camera
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import import_rerun, write_recording
 from torchslam.io.export.scene import ExportedScene, Images, undistorted
@@ -120,3 +122,27 @@ def test_a_missing_rerun_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     with pytest.raises(ResultsError, match=r"pip install 'torchslam\[rerun\]'"):
         import_rerun()
+
+
+def test_depth_and_the_dense_cloud_are_recorded(flat: ExportedScene, tmp_path: Path) -> None:
+    maps = box_depths(
+        flat.T_cw[1:], flat.frame_ids[1:], Camera.pinhole(50.0, 52.5, 39.5, 29.5, size=(80, 60))
+    )
+    maps.save(tmp_path / "depths.safetensors")
+    R_up, cloud = upright_rotation(flat.T_wc), box_cloud(maps)
+    write_recording(tmp_path / "it.rrd", flat, R_up, None, cloud, tmp_path / "depths.safetensors")
+    rows = read(tmp_path / "it.rrd")
+    np.testing.assert_allclose(
+        only(rows, "/world/dense", "Points3D:positions"), cloud.points_w @ R_up.float().mT, atol=1e-5
+    )
+    assert only(rows, "/world/depth", "Pinhole:resolution").flatten().tolist() == [80, 60]
+    logged = rows["/world/depth", "EncodedDepthImage:blob"]
+    assert [frame for frame, _ in logged] == [5, 6, 90]
+    for depth, (_, blob) in zip(maps.depth, logged, strict=True):
+        image = cv2.imdecode(np.array(blob, np.uint8).reshape(-1), cv2.IMREAD_UNCHANGED)
+        np.testing.assert_allclose(image / 1000, depth, atol=5.1e-4)
+    assert {np.array(value).item() for _, value in rows["/world/depth", "EncodedDepthImage:meter"]} == {
+        1000.0
+    }
+    centers = np.array([value for _, value in rows["/world/depth", "Transform3D:translation"]]).reshape(-1, 3)
+    np.testing.assert_allclose(centers, flat.T_wc[1:, :3, 3] @ R_up.mT, atol=1e-6)

@@ -15,8 +15,10 @@ import numpy as np
 import pytest
 import torch
 
+from tests.box_room import box_cloud, box_depths
 from tests.io.test_results import two, write
-from torchslam.geometry import transform
+from torchslam.dense import PointCloud
+from torchslam.geometry import Camera, transform
 from torchslam.io.results import Results, read_results
 from torchslam.io.viewer import page as view_data
 from torchslam.io.viewer.page import decoded, encoded, page, write_view
@@ -26,7 +28,7 @@ from torchslam.types import State, Trajectory
 __all__ = ["two"]
 
 BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
-MAX_BYTES = 8 * 2**20
+MAX_BYTES = 15_000_000
 
 
 @pytest.fixture
@@ -36,6 +38,14 @@ def kept(tmp_path: Path, run: Run, generator: torch.Generator) -> Results:
     colors[:] = torch.randint(1, 256, colors.shape, generator=generator, dtype=torch.uint8)
     write(run, tmp_path)
     return read_results(tmp_path)
+
+
+@pytest.fixture
+def dense(kept: Results, camera: Camera) -> PointCloud:
+    """A room around the cameras, in green."""
+    cloud = box_cloud(box_depths(kept.map.T_cw[:2], torch.arange(2), camera))
+    cloud.colors[:] = torch.tensor([0, 255, 0], dtype=torch.uint8)
+    return cloud
 
 
 def data_of(text: str) -> dict[str, Any]:
@@ -155,7 +165,44 @@ def test_large_maps_and_long_runs_are_thinned(kept: Results, monkeypatch: pytest
     np.testing.assert_allclose(array(submap["poses"], 3, 4), poses, atol=1e-5)
 
 
-def test_the_size_of_a_page_is_bounded(kept: Results) -> None:
+def test_the_page_holds_the_dense_cloud(kept: Results, dense: PointCloud) -> None:
+    (submap,) = data_of(page(replace(kept, cloud=dense)))["submaps"]
+    packed = submap["dense"]
+    S = torch.tensor(submap["S_shown_map"], dtype=torch.float64)
+    shown = np.array(packed["low"]) + array(packed["points"], 3) * np.array(packed["step"])
+    assert array(packed["points"], 3).dtype == np.uint16
+    np.testing.assert_allclose(shown, transform(S, dense.points_w.double()), atol=1e-4)
+    np.testing.assert_array_equal(array(packed["colors"], 3), dense.colors)
+    assert packed["total"] == len(dense)
+
+
+def test_points_of_the_dense_cloud_that_are_far_off_are_not_shown(kept: Results, dense: PointCloud) -> None:
+    """They would leave few steps for the others."""
+    dense.points_w[7] = 1e6
+    (submap,) = data_of(page(replace(kept, cloud=dense)))["submaps"]
+    assert len(array(submap["dense"]["points"], 3)) == len(dense) - 1
+    assert max(submap["dense"]["step"]) < 1e-3
+    dense.points_w[:] = 1e6
+    (submap,) = data_of(page(replace(kept, cloud=dense)))["submaps"]
+    assert submap["dense"]["points"]["data"] == ""
+
+
+def test_a_large_dense_cloud_is_thinned(
+    kept: Results, dense: PointCloud, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(view_data, "MAX_DENSE_POINTS", 60)
+    text = page(replace(kept, cloud=dense))
+    assert page(replace(kept, cloud=dense)) == text
+    (submap,) = data_of(text)["submaps"]
+    assert len(array(submap["dense"]["points"], 3)) == len(array(submap["dense"]["colors"], 3)) == 60
+    assert submap["dense"]["total"] == len(dense)
+
+
+def test_without_a_dense_cloud_the_page_has_none(kept: Results) -> None:
+    assert data_of(page(kept))["submaps"][0]["dense"] is None
+
+
+def test_the_size_of_a_page_is_bounded(kept: Results, dense: PointCloud) -> None:
     """Any number of points and of frames fits."""
     count, frames = 200_000, 40_000
     many = kept.map.points
@@ -164,7 +211,8 @@ def test_the_size_of_a_page_is_bounded(kept: Results) -> None:
     times = torch.arange(frames, dtype=torch.float64) / 30
     path = Trajectory(times, kept.trajectory.T_wc[torch.arange(frames) % len(kept.trajectory)])
     steps = [replace(kept.frames[3], index=i, timestamp=i / 30) for i in range(frames)]
-    long = replace(kept, trajectory=path, groundtruth=path, frames=steps)
+    cloud = dense[torch.arange(view_data.MAX_DENSE_POINTS + 1000) % len(dense)]
+    long = replace(kept, trajectory=path, groundtruth=path, frames=steps, cloud=cloud)
     assert len(page(long).encode()) < MAX_BYTES
 
 
@@ -230,3 +278,18 @@ def test_a_browser_shows_the_reason_for_no_map(tmp_path: Path, run: Run) -> None
     write(replace(run, submaps=(), failure="the camera <i>stands</i> still"), tmp_path)
     dom = browse(write_view(read_results(tmp_path), tmp_path), "--dump-dom")
     assert 'role="alert">the camera &lt;i&gt;stands&lt;/i&gt; still<' in dom
+
+
+def test_a_browser_draws_the_dense_cloud_as_closed_surfaces(
+    tmp_path: Path, kept: Results, dense: PointCloud
+) -> None:
+    path = write_view(replace(kept, cloud=dense), tmp_path)
+    dom = browse(path, "--dump-dom")
+    assert f'id="count-dense">{len(dense):,}<' in dom
+    picture = tmp_path / "picture.png"
+    browse(path, f"--screenshot={picture}")
+    blue, green, red = cv2.imread(str(picture)).astype(int).transpose(2, 0, 1)
+    is_green = ((green > 180) & (red < 80) & (blue < 80)).astype(np.uint8)
+    closed = cv2.morphologyEx(is_green, cv2.MORPH_CLOSE, np.ones((5, 5), np.uint8))
+    assert is_green.sum() > 8_000
+    assert is_green.sum() > 0.85 * closed.sum(), "there are holes between the points"

@@ -2,6 +2,10 @@
 
 Poses and points are in the same upright frame. `applied_transform` is omitted, since versions of nerfstudio differ in
 whether they apply it to the point cloud (issues 2784 and 3101).
+
+Depth images have 16 bits and the unit that nerfstudio expects, a thousandth of a map unit. Its data parser takes them
+for all frames or for none, enlarges them to the size of the images, and has the unit as an option
+(`--depth-unit-scale-factor`), not in the file.
 """
 
 from __future__ import annotations
@@ -14,14 +18,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchslam.dense.cloud import PointCloud
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, opengl
-from torchslam.io.export.ply import write_ply
+from torchslam.io.export.depths import MAX_POINTS, depth_images, depth_png
+from torchslam.io.export.ply import write_cloud, write_ply
 from torchslam.io.export.scene import ExportedScene
 
 TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"
+DENSE_CLOUD = "dense_pc.ply"
 IMAGES = "images"
+DEPTHS = "depths"
 # The names of the parameters in the order of ours; nerfstudio's formulas are OpenCV's.
 MODELS = {
     "pinhole": ("PINHOLE", ()),
@@ -39,11 +47,19 @@ def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
     return about | dict(zip(names, params, strict=True))
 
 
-def write_nerfstudio(folder: Path, scene: ExportedScene, R_up: Float[Tensor, "3 3"]) -> None:
-    """Write transforms.json and the point cloud into a folder that is made if need be.
+def write_nerfstudio(
+    folder: Path,
+    scene: ExportedScene,
+    R_up: Float[Tensor, "3 3"],
+    cloud: PointCloud | None = None,
+    depths: Path | None = None,
+) -> None:
+    """Write transforms.json, the point cloud and depth images into a folder that is made if need be.
 
     Args:
         R_up: (3, 3) from the map's world to the upright one, see `geometry.transforms.upright_rotation`
+        cloud: a dense cloud in the map's world, to start from instead of the points
+        depths: the file of the depth maps of all frames, whose camera is that of the scene up to its size
     """
     folder.mkdir(parents=True, exist_ok=True)
     upright = scene.turned(R_up)
@@ -51,10 +67,23 @@ def write_nerfstudio(folder: Path, scene: ExportedScene, R_up: Float[Tensor, "3 
         {"file_path": f"{IMAGES}/{name}", "transform_matrix": T}
         for name, T in zip(upright.image_names, opengl(upright.T_wc).tolist(), strict=True)
     ]
+    if depths is not None:
+        for frame, name in zip(frames, upright.image_names, strict=True):
+            frame["depth_file_path"] = f"{DEPTHS}/{name}"
+        _write_depths(folder / DEPTHS, upright, depths)
     content = nerfstudio_camera(scene.camera) | {
-        "ply_file_path": POINT_CLOUD,
+        "ply_file_path": POINT_CLOUD if cloud is None else DENSE_CLOUD,
         "upright_from_map": R_up.tolist(),  # for the reader: nerfstudio does not know it
         "frames": frames,
     }
     (folder / TRANSFORMS).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     write_ply(folder / POINT_CLOUD, upright.points_w, upright.colors, centers_w=torch.zeros(0, 3))
+    if cloud is not None:
+        write_cloud(folder / DENSE_CLOUD, cloud.thinned(MAX_POINTS), R_up)
+
+
+def _write_depths(folder: Path, scene: ExportedScene, depths: Path) -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    names = dict(zip(scene.frame_ids.tolist(), scene.image_names, strict=True))
+    for maps in depth_images(depths):
+        (folder / names[int(maps.frame_index)]).write_bytes(depth_png(maps.depth[0]))

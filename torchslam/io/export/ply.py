@@ -1,7 +1,11 @@
-"""Point clouds: binary PLY, read by MeshLab, CloudCompare, Blender and Open3D."""
+"""Point clouds: binary PLY, read by MeshLab, CloudCompare, Blender and Open3D.
+
+The sparse cloud of a map is only written. The dense one is read again, by `torchslam plot` and `torchslam export`.
+"""
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,20 +13,28 @@ import torch
 from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
+from torchslam.dense.cloud import PointCloud
+from torchslam.errors import ResultsError
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.map.map import Map
 from torchslam.system.run import keyframe_rows
+from torchslam.utils.files import read_bytes, write_whole
 
-VERTEX = np.dtype(
-    [
-        *((name, "<f4") for name in ("x", "y", "z", "nx", "ny", "nz")),
-        *((name, "u1") for name in ("red", "green", "blue")),
-        ("observations", "<f4"),  # COLMAP refuses a file with integers of more than a byte
-    ]
-)
+POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
+COLORED = [*((name, "<f4") for name in POSITION + NORMAL), *((name, "u1") for name in COLOR)]
+# COLMAP refuses a file with integers of more than a byte.
+VERTEX = np.dtype([*COLORED, ("observations", "<f4")])
+DENSE_VERTEX = np.dtype([*COLORED, ("confidence", "<f4")])
 PROPERTY_TYPES = {"<f4": "float", "|u1": "uchar"}
 CAMERA_COLOR = (213, 73, 63)
+MAX_BYTES = 1 << 33  # of a cloud that is read: 270 million points
+UNIT_TOLERANCE = 1e-3  # of the length of a normal
+
+
+def upright_from_map(slam_map: Map) -> Float[Tensor, "3 3"]:
+    """Rotation from the world of a map to the upright one of all exports, float64."""
+    return upright_rotation(se3_inverse(slam_map.T_cw).double())
 
 
 def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
@@ -32,7 +44,7 @@ def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
         write_ply(path, nothing, nothing.byte(), nothing)
         return
     T_wc, points, alive = se3_inverse(slam_map.T_cw), slam_map.points, slam_map.valid_points()
-    R_up = upright_rotation(T_wc)
+    R_up = upright_from_map(slam_map).to(T_wc)
     write_ply(
         path,
         slam_map.positions_w[alive] @ R_up.mT,
@@ -63,23 +75,99 @@ def write_ply(
     """
     vertices = np.zeros(len(points_w) + len(centers_w), VERTEX)
     points, cameras = vertices[: len(points_w)], vertices[len(points_w) :]
-    for names, rows, values in (
-        (("x", "y", "z"), points, points_w),
-        (("red", "green", "blue"), points, colors),
-        (("nx", "ny", "nz"), points, normals_w),
-        (("x", "y", "z"), cameras, centers_w),
-    ):
-        if values is not None:
-            for name, column in zip(names, values.detach().cpu().numpy().T, strict=True):
-                rows[name] = column
+    _fill(points, POSITION, points_w)
+    _fill(points, COLOR, colors)
+    _fill(cameras, POSITION, centers_w)
+    if normals_w is not None:
+        _fill(points, NORMAL, normals_w)
     if observations is not None:
         points["observations"] = observations.detach().cpu().numpy()
-    for name, value in zip(("red", "green", "blue"), CAMERA_COLOR, strict=True):
+    for name, value in zip(COLOR, CAMERA_COLOR, strict=True):
         cameras[name] = value
-    Path(path).write_bytes(_header(len(vertices)) + vertices.tobytes())
+    write_whole(path, [_header(vertices.dtype, len(vertices)), vertices.tobytes()])
 
 
-def _header(count: int) -> bytes:
-    properties = [f"property {PROPERTY_TYPES[VERTEX[name].str]} {name}" for name in VERTEX.names or ()]
+def write_cloud(path: str | Path, cloud: PointCloud, R: Float[Tensor, "3 3"] | None = None) -> None:
+    """Write a dense cloud, atomically; equal clouds give equal bytes.
+
+    Args:
+        path: the file.
+        cloud: points of the map's world.
+        R: rotation from the map's world to that of the file, as `upright_from_map`; None: the same.
+    """
+    cloud = cloud if R is None else cloud.turned(R)
+    vertices = np.zeros(len(cloud), DENSE_VERTEX)
+    _fill(vertices, POSITION, cloud.points_w)
+    _fill(vertices, NORMAL, cloud.normals_w)
+    _fill(vertices, COLOR, cloud.colors)
+    vertices["confidence"] = cloud.confidence.detach().cpu().numpy()
+    write_whole(path, [_header(vertices.dtype, len(vertices)), vertices.tobytes()])
+
+
+def read_cloud(path: str | Path, R: Float[Tensor, "3 3"] | None = None) -> PointCloud:
+    """Read and check a file that `write_cloud` wrote.
+
+    Args:
+        path: the file.
+        R: the rotation that the file was written with.
+
+    Raises:
+        ResultsError: the file is missing, too large, damaged, or another kind of PLY file.
+    """
+    try:
+        content = read_bytes(path, MAX_BYTES, "a dense cloud")
+    except FileNotFoundError:
+        raise ResultsError(f"{path}: no dense cloud") from None
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
+    try:
+        cloud = _cloud(_vertices(content))
+    except ValueError as error:
+        raise ResultsError(f"{path}: not a dense cloud of torchslam: {error}") from None
+    return cloud if R is None else cloud.turned(R.mT)
+
+
+def _vertices(content: bytes) -> np.ndarray:
+    """The rows (N,) of DENSE_VERTEX of a file. Raises ValueError for any other content."""
+    found = re.match(rb"ply\nformat binary_little_endian 1\.0\nelement vertex (\d{1,10})\n", content)
+    if found is None:
+        raise ValueError("no header of a binary PLY file")
+    count = int(found[1])
+    header = _header(DENSE_VERTEX, count)
+    if not content.startswith(header):
+        raise ValueError(f"its properties are not {', '.join(DENSE_VERTEX.names or ())}")
+    if len(content) != len(header) + count * DENSE_VERTEX.itemsize:
+        raise ValueError(f"{count} points and a file of {len(content)} bytes")
+    return np.frombuffer(content, DENSE_VERTEX, offset=len(header))
+
+
+def _cloud(vertices: np.ndarray) -> PointCloud:
+    """The cloud of rows of DENSE_VERTEX. Raises ValueError for impossible numbers."""
+    cloud = PointCloud(
+        points_w=_columns(vertices, POSITION),
+        normals_w=_columns(vertices, NORMAL),
+        colors=_columns(vertices, COLOR),
+        confidence=torch.from_numpy(vertices["confidence"].copy()),
+    )
+    if not bool(torch.isfinite(cloud.points_w).all()):
+        raise ValueError("positions are not finite")
+    if not bool(((cloud.normals_w.norm(dim=-1) - 1).abs() < UNIT_TOLERANCE).all()):
+        raise ValueError("normals are not of unit length")
+    if not bool(((cloud.confidence >= 0) & (cloud.confidence <= 1)).all()):
+        raise ValueError("confidence is not between 0 and 1")
+    return cloud
+
+
+def _columns(vertices: np.ndarray, names: tuple[str, ...]) -> Tensor:
+    return torch.from_numpy(np.stack([vertices[name] for name in names], axis=1))
+
+
+def _fill(vertices: np.ndarray, names: tuple[str, ...], values: Tensor) -> None:
+    for name, column in zip(names, values.detach().cpu().numpy().T, strict=True):
+        vertices[name] = column
+
+
+def _header(types: np.dtype[np.void], count: int) -> bytes:
+    properties = [f"property {PROPERTY_TYPES[types[name].str]} {name}" for name in types.names or ()]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header"]
     return ("\n".join(lines) + "\n").encode("ascii")

@@ -1,4 +1,4 @@
-"""Recordings for the rerun viewer: map, camera path, and images and keypoints of the keyframes."""
+"""Recordings for the rerun viewer: map, camera path, images, keypoints and depth of the keyframes, the dense cloud."""
 
 from __future__ import annotations
 
@@ -12,15 +12,19 @@ import torch
 from jaxtyping import Float, Num, UInt8
 from torch import Tensor
 
+from torchslam.dense.cloud import PointCloud
+from torchslam.dense.depth_maps import read_frames
 from torchslam.errors import ResultsError
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import corner_camera, corner_pixels
+from torchslam.io.export.depths import MAX_POINTS, UNIT, depth_images, depth_png
 from torchslam.io.export.scene import ExportedScene, Images
 
 APPLICATION = "torchslam"
 JPEG_QUALITY = 90
 CAMERA = "world/camera"
 KEYFRAME = "world/keyframe"
+DEPTH = "world/depth"
 UNPAINTED = (125, 135, 148)  # points before images have colored them
 TRACKED = (87, 190, 65)  # keypoints
 GAP = 5  # usual intervals without a pose that break the line of the path
@@ -59,12 +63,17 @@ class Recorder:
         )
         self._log(entity, pinhole, static=True)
 
-    def points(self, points_w: Float[Tensor, "N 3"], colors: UInt8[Tensor, "N 3"] | None) -> None:
-        """Replace the points of the map, with or without colors."""
+    def points(
+        self,
+        points_w: Float[Tensor, "N 3"],
+        colors: UInt8[Tensor, "N 3"] | None,
+        entity: str = "world/points",
+    ) -> None:
+        """Replace the points of the map, or another cloud, with or without colors."""
         content = self._rr.Points3D(
             _numpy(points_w), colors=UNPAINTED if colors is None else colors.cpu().numpy()
         )
-        self._log("world/points", content, static=True)
+        self._log(entity, content, static=True)
 
     def path(self, positions_w: Float[Tensor, "K 3"], breaks: list[int]) -> None:
         """Replace the path, interrupted before some rows."""
@@ -97,6 +106,11 @@ class Recorder:
         _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
         self._log(entity, self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
 
+    def depth(self, entity: str, depth: Float[Tensor, "H W"]) -> None:
+        """Log the depth image of a camera, in map units; 0 where unknown."""
+        content = self._rr.EncodedDepthImage(depth_png(depth), media_type="image/png", meter=1 / UNIT)
+        self._log(entity, content)
+
     def text(self, entity: str, text: str) -> None:
         """Log a line of text."""
         self._log(entity, self._rr.TextLog(text))
@@ -106,16 +120,24 @@ class Recorder:
 
 
 def write_recording(
-    path: Path, scene: ExportedScene, R_up: Float[Tensor, "3 3"], images: Images | None
+    path: Path,
+    scene: ExportedScene,
+    R_up: Float[Tensor, "3 3"],
+    images: Images | None,
+    cloud: PointCloud | None = None,
+    depths: Path | None = None,
 ) -> None:
     """Write a .rrd file with the timelines `frame` and `time`, in a world whose z is up.
 
     `world/camera` has the pose of every frame, `world/keyframe` pose, image and observed keypoints of those that are
-    one; a pinhole camera is all that rerun knows, so the scene must be undistorted.
+    one, `world/depth` pose and depth image of frames with a depth map. A pinhole camera is all that rerun knows, so the
+    scene must be undistorted.
 
     Args:
         R_up: rotation from the map's world to the upright one
         images: undistorted images of the keyframes; None: no images
+        cloud: a dense cloud in the map's world
+        depths: the file of depth maps
     """
     upright = scene.turned(R_up)
     recording = import_rerun().RecordingStream(APPLICATION)
@@ -123,6 +145,9 @@ def write_recording(
     recorder = Recorder(recording)
     recorder.world("RIGHT_HAND_Z_UP")
     recorder.points(upright.points_w, scene.colors)
+    if cloud is not None:
+        dense = cloud.thinned(MAX_POINTS).turned(R_up)
+        recorder.points(dense.points_w, dense.colors, "world/dense")
     recorder.path(upright.T_wc[:, :3, 3], gaps(scene.frame_ids))
     for entity in (CAMERA, KEYFRAME):
         recorder.camera(entity, scene.camera)
@@ -135,8 +160,24 @@ def write_recording(
             recorder.keypoints(KEYFRAME, scene.pixels[seen], scene.colors[scene.point_index[seen]])
             if images is not None:
                 recorder.image(KEYFRAME, images.bgr(int(scene.frame_ids[row])))
+    if depths is not None:
+        _record_depths(recorder, scene, R_up, depths)
     recording.flush()
     recording.disconnect()
+
+
+def _record_depths(
+    recorder: Recorder, scene: ExportedScene, R_up: Float[Tensor, "3 3"], depths: Path
+) -> None:
+    frame_ids, camera = read_frames(depths)
+    seconds = scene.of_frames(frame_ids).timestamps - scene.timestamps[0]
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = R_up
+    recorder.camera(DEPTH, camera)
+    for maps, time in zip(depth_images(depths), seconds.tolist(), strict=True):
+        recorder.at(int(maps.frame_index), time)
+        recorder.pose(DEPTH, turn @ se3_inverse(maps.T_cw[0].double()))
+        recorder.depth(DEPTH, maps.depth[0])
 
 
 def _numpy(values: Tensor) -> np.ndarray:

@@ -22,6 +22,7 @@ from torchslam.errors import ResultsError, SequenceError
 from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
 from torchslam.map.atlas import Submap
 
+SAME_PX = 0.01
 MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees from the axis
 
 
@@ -65,6 +66,28 @@ class ExportedScene:
         T_cw[:, :3, :3] = T_cw[:, :3, :3] @ R.mT
         return replace(self, T_cw=T_cw, points_w=self.points_w @ R.mT)
 
+    def of_frames(self, frame_ids: Int[Tensor, " R"]) -> ExportedScene:
+        """Return the scene of some of the frames. Raises ResultsError if one of them is not in the scene."""
+        missing = frame_ids[~torch.isin(frame_ids, self.frame_ids)].tolist()
+        if missing:
+            raise ResultsError(f"frame {missing[0]} has no pose in this map")
+        rows = torch.nonzero(torch.isin(self.frame_ids, frame_ids))[:, 0]
+        slot = torch.full((len(self.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
+        is_kept = _of_tracks(slot[self.frame_index] >= 0, self.point_index, len(self.points_w))
+        points, point_index = torch.unique(self.point_index[is_kept], return_inverse=True)
+        return replace(
+            self,
+            frame_ids=self.frame_ids[rows],
+            timestamps=self.timestamps[rows],
+            is_keyframe=self.is_keyframe[rows],
+            T_cw=self.T_cw[rows],
+            points_w=self.points_w[points],
+            colors=self.colors[points],
+            frame_index=slot[self.frame_index[is_kept]],
+            point_index=point_index,
+            pixels=self.pixels[is_kept],
+        )
+
     def errors(self) -> Float[Tensor, " O"]:
         """Return the reprojection errors, in pixels."""
         points_c = transform(self.T_cw[self.frame_index], self.points_w[self.point_index][:, None])
@@ -96,8 +119,7 @@ def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool
     slot = torch.full((len(graph.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])
     is_kept = (slot[graph.frame_index] >= 0) & camera.project(points_c[:, 0])[1]
-    tracks = torch.bincount(graph.point_index[is_kept], minlength=len(graph.points_w))
-    is_kept &= tracks[graph.point_index] >= 2
+    is_kept = _of_tracks(is_kept, graph.point_index, len(graph.points_w))
     seen = torch.nonzero(is_kept)[:, 0]
     seen = seen[torch.argsort(slot[graph.frame_index[seen]], stable=True)]
     points, point_index = torch.unique(graph.point_index[seen], return_inverse=True)
@@ -113,6 +135,14 @@ def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool
         point_index=point_index,
         pixels=graph.pixels[seen].double(),
     )
+
+
+def _of_tracks(
+    is_kept: Bool[Tensor, " O"], point_index: Int[Tensor, " O"], points: int
+) -> Bool[Tensor, " O"]:
+    """Return the kept observations without those of points that fewer than two of them see."""
+    tracks = torch.bincount(point_index[is_kept], minlength=points)
+    return is_kept & (tracks[point_index] >= 2)
 
 
 def pinhole_within(camera: Camera) -> Camera:
@@ -137,35 +167,52 @@ def pinhole_within(camera: Camera) -> Camera:
     return Camera("pinhole", params, (width, height))
 
 
-def undistorted(scene: ExportedScene) -> ExportedScene:
-    """Return the scene for `pinhole_within` of its camera; keypoints may lie outside of the new images."""
-    if scene.camera.model == "pinhole":
+def undistorted(scene: ExportedScene, pinhole: Camera | None = None) -> ExportedScene:
+    """Return the scene for a pinhole camera, by default `pinhole_within`; keypoints may lie outside of the images."""
+    pinhole = pinhole_within(scene.camera) if pinhole is None else pinhole
+    if _is_same(scene.camera, pinhole):
         return scene
-    pinhole = pinhole_within(scene.camera)
     return replace(scene, camera=pinhole, pixels=undistorted_pixels(scene.pixels, scene.camera, pinhole))
 
 
 def undistorted_pixels(pixels: Float[Tensor, "N 2"], camera: Camera, pinhole: Camera) -> Float[Tensor, "N 2"]:
-    """Convert pixels of a camera to its `pinhole_within`."""
+    """Convert pixels of a camera to a pinhole camera."""
     return camera.normalize(pixels) * pinhole.params[:2] + pinhole.params[2:]
 
 
 class Undistorter:
-    """Converts images of a camera to its `pinhole_within`."""
+    """Converts images of a camera to a pinhole camera, by default `pinhole_within`.
 
-    def __init__(self, camera: Camera) -> None:
-        pinhole = pinhole_within(camera)
-        v, u = torch.meshgrid(*(torch.arange(size) for size in reversed(pinhole.size)), indexing="ij")
+    Smaller images are means over the pixels of the larger ones.
+    """
+
+    def __init__(self, camera: Camera, pinhole: Camera | None = None) -> None:
+        pinhole = pinhole_within(camera) if pinhole is None else pinhole
+        self._size = pinhole.size
+        factor = max(1, int(camera.params[0] / pinhole.params[0] + 1e-6))
+        u, v = ((torch.arange(factor * side).double() + 0.5) / factor - 0.5 for side in pinhole.size)
+        grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
         rays = torch.nn.functional.pad(
-            pinhole.normalize(torch.stack((u, v), -1).flatten(0, 1).double()), (0, 1), value=1.0
+            pinhole.to(torch.float64).normalize(grid.flatten(0, 1)), (0, 1), value=1.0
         )
-        pixels = camera.project(rays)[0].reshape(pinhole.height, pinhole.width, 2)
+        pixels = camera.project(rays)[0].reshape(grid.shape)
         self._x, self._y = (pixels[..., axis].float().numpy() for axis in (0, 1))
 
     def __call__(self, image: UInt8[np.ndarray, "H W *channels"]) -> UInt8[np.ndarray, "h w *channels"]:
         """Undistort an image; the result has the size of the pinhole camera."""
         # Border pixels may fall outside by a rounding error, so the border is replicated.
-        return cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        large = cv2.remap(image, self._x, self._y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        is_small = large.shape[1::-1] == self._size
+        return large if is_small else cv2.resize(large, self._size, interpolation=cv2.INTER_AREA)
+
+
+def _is_same(camera: Camera, other: Camera) -> bool:
+    """Whether two cameras have the same images, to within a hundredth of a pixel."""
+    return (
+        camera.model == other.model
+        and camera.size == other.size
+        and bool(((camera.params - other.params).abs() < SAME_PX).all())
+    )
 
 
 def _line(at: int, values: Tensor) -> Tensor:
@@ -181,14 +228,17 @@ class Images:
 
     Args:
         rows: index in the sequence of each frame of the run
+        camera: that of the sequence
+        pinhole: camera of the undistorted images; None: the images as they are
     """
 
     def __init__(
-        self, sequence: Sequence, rows: Mapping[int, int], camera: Camera, undistort: bool = False
+        self, sequence: Sequence, rows: Mapping[int, int], camera: Camera, pinhole: Camera | None = None
     ) -> None:
         self._sequence = sequence
         self._rows = rows
-        self._undistort = Undistorter(camera) if undistort and camera.model != "pinhole" else None
+        is_same = pinhole is None or _is_same(camera, pinhole)
+        self._undistort = None if is_same else Undistorter(camera, pinhole)
 
     def bgr(self, frame_id: int) -> UInt8[np.ndarray, "H W 3"]:
         """Return an image as OpenCV writes it: blue, green, red. Raises FrameError if it cannot be read."""
@@ -201,7 +251,7 @@ class Images:
 def open_images(
     source: str,
     scene: ExportedScene,
-    undistort: bool = False,
+    pinhole: Camera | None = None,
     fps: float | None = None,
     otherwise: str = WITHOUT,
 ) -> Images:
@@ -213,7 +263,7 @@ def open_images(
     Args:
         source: path of the sequence.
         scene: the exported frames.
-        undistort: undistort the images.
+        pinhole: camera of the undistorted images; None: the images as they are.
         fps: frame rate with which the run read images without timestamps.
         otherwise: what to do without them, for the error.
     """
@@ -232,7 +282,7 @@ def open_images(
             f"{source}: not the sequence of this run, whose frames have other times; {otherwise}"
         )
     rows = {frame_id: row_at[time] for frame_id, time in times.items()}
-    return Images(sequence, rows, scene.camera, undistort)
+    return Images(sequence, rows, scene.camera, pinhole)
 
 
 def write_images(folder: Path, scene: ExportedScene, images: Images) -> None:

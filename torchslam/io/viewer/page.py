@@ -16,9 +16,10 @@ from jaxtyping import Float, Int, Num, Shaped, UInt8
 from torch import Tensor
 
 from torchslam.data.trajectories import nearest
+from torchslam.dense.cloud import PointCloud
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
-from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry import Camera, se3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
@@ -62,6 +63,9 @@ def _asset(name: str) -> str:
 
 
 MAX_POINTS = 150_000  # of all submaps together: 20 bytes each in the page
+MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
+DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
+STEPS = 65535  # of a coordinate of the dense cloud, over the extent of the cloud
 MAX_FRAMES = 20_000  # 100 bytes each in the page
 MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
 FRUSTUM = 0.035  # its depth, in radii of the scene
@@ -133,9 +137,12 @@ def _submap(
         truth: (M, 3) true positions
         points, colors: (P, 3); points without an observed image have no color
         points_total: number of points before thinning
+        dense: the dense cloud, see `_dense`; None if there is none
         box: (2, 3) lowest and highest corner around the scene
         radius: half the diagonal of the box
     """
+    is_main = submap.number == results.metrics["submap"]
+    cloud = results.cloud if is_main else None
     evaluation = _evaluation(path, results)
     S = torch.eye(4, dtype=torch.float64) if evaluation is None else evaluation.S_groundtruth_estimate.clone()
     keyframes = keyframe_trajectory(submap.map, results.session)
@@ -163,7 +170,7 @@ def _submap(
     steps = shown[:, :3, 3].diff(dim=0).norm(dim=-1)
     steps[[row - 1 for row in breaks]] = 0.0
     return {
-        "name": f"{submap.number}" + (", the main one" if submap.number == results.metrics["submap"] else ""),
+        "name": f"{submap.number}" + (", the main one" if is_main else ""),
         "unit": "" if evaluation is None else "m",
         "S_shown_map": S.tolist(),
         "frame": encoded(frame, "int32"),
@@ -177,9 +184,35 @@ def _submap(
         "points": encoded(transform(S, points_w)[kept], "float32"),
         "colors": encoded(colors[kept] if bool(colors.any()) else colors[:0], "uint8"),
         "points_total": len(points_w),
+        "dense": None if cloud is None else _dense(cloud, S, box),
         "box": box.tolist(),
         "radius": float((box[1] - box[0]).norm()) / 2,
         "frustum": FRUSTUM * float((box[1] - box[0]).norm()) / 2,
+    }
+
+
+def _dense(cloud: PointCloud, S: Float[Tensor, "4 4"], box: Float[Tensor, "2 3"]) -> dict[str, Any]:
+    """Return the data of the dense cloud, whose points are whole numbers of steps from the lowest corner.
+
+    Returns:
+        low, step: (3,) lowest corner and length of a step
+        points, colors: (P, 3)
+        total: number of points before thinning
+        spacing: usual distance between neighbors
+    """
+    reach = DENSE_REACH * float((box[1] - box[0]).norm()) / 2
+    near = (transform(S, cloud.points_w.double()).abs() <= reach).all(dim=-1)
+    kept = cloud[near].thinned(MAX_DENSE_POINTS)
+    points = transform(S, kept.points_w.double())
+    low, high = (points.amin(0), points.amax(0)) if len(points) else (S[:3, 3], S[:3, 3])
+    step = (high - low).clamp(min=1e-9) / STEPS
+    return {
+        "low": low.tolist(),
+        "step": step.tolist(),
+        "points": encoded(((points - low) / step).round(), "uint16"),
+        "colors": encoded(kept.colors, "uint8"),
+        "total": len(cloud),
+        "spacing": float(sim3_scale(S)) * kept.spacing(),
     }
 
 

@@ -2,7 +2,7 @@
 
 const RAMP = [[42, 157, 143], [138, 190, 120], [233, 196, 106], [231, 140, 90], [209, 73, 91]]; // no error to the most
 const STATES = ["initializing", "tracking", "uncertain", "lost"];
-const TYPES = { float64: Float64Array, float32: Float32Array, int32: Int32Array, uint8: Uint8Array };
+const TYPES = { float64: Float64Array, float32: Float32Array, int32: Int32Array, uint16: Uint16Array, uint8: Uint8Array };
 
 /** The numbers of an array that was written as base64. */
 function decode({ type, data }) {
@@ -56,6 +56,11 @@ function frustumLines(pose, corners, depth) {
 /** Positions (3 a row) of poses (12 a row). */
 function positionsOf(poses) {
   return Float32Array.from({ length: poses.length / 4 }, (_, i) => poses[12 * Math.floor(i / 3) + 4 * (i % 3) + 3]);
+}
+
+/** Positions (3 a row) of a dense cloud, whose points are whole numbers of steps from its lowest corner. */
+function densePositions({ low, step, points }) {
+  return Float32Array.from(points, (value, i) => low[i % 3] + value * step[i % 3]);
 }
 
 /** A grid on the floor below everything: ends, and how long the side of a square is. */

@@ -10,6 +10,8 @@ const eye = createEye($("scene"), redraw, () => ($("follow").checked = false));
 const layers = {};
 const shown = { submap: null, frame: last, playing: false, clock: 0, pointSize: 1, waiting: false };
 
+const COVER = 1.5; // widths of a dense point, in distances between neighbors: surfaces are closed
+
 const number = (value) => value.toLocaleString("en");
 const tone = (name) => getComputedStyle(document.documentElement).getPropertyValue(`--${name}`).trim();
 const rgb = (name) => [1, 3, 5].map((i) => parseInt(tone(name).slice(i, i + 2), 16));
@@ -32,8 +34,12 @@ function showSubmap(submap) {
     $("color-choice").hidden = !hasErrors;
     $("color").value = hasErrors ? "error" : "state";
     document.querySelector("[data-for=truth]").hidden = submap.truth.length === 0;
-    const all = submap.points.length / 3;
-    $("count-points").textContent = number(all) + (all < submap.points_total ? ` of ${number(submap.points_total)}` : "");
+    const counted = (shown, total) => number(shown) + (shown < total ? ` of ${number(total)}` : "");
+    $("count-points").textContent = counted(submap.points.length / 3, submap.points_total);
+    const { dense } = submap;
+    document.querySelector("[data-for=dense]").hidden = !dense;
+    document.querySelector("[data-layer=points]").checked = !dense; // which has them all, and more
+    if (dense) $("count-dense").textContent = counted(dense.points.length / 3, dense.total);
     $("count-path").textContent = length(submap.path_length, submap.unit);
     $("count-keyframes").textContent = number(submap.keyframe.length);
     build();
@@ -48,8 +54,10 @@ function build() {
   const submap = shown.submap;
   if (!submap || !painter) return;
   Object.values(layers).forEach(painter.remove);
+  layers.dense = null;
   const points = submap.colors.length ? submap.colors : new Uint8Array(submap.points.length).map((_, i) => rgb("unpainted")[i % 3]);
   layers.points = painter.points(submap.points, points);
+  if (submap.dense) layers.dense = painter.points(densePositions(submap.dense), submap.dense.colors);
   shown.finest = submap.points.length > 3e5 ? 1.3 : 2.6; // pixels: few points would hardly be seen
   const path = pathLines(submap.positions, (row) => submap.breaks.includes(row));
   shown.pathFrames = path.rows.map((row) => submap.frame[row]);
@@ -119,6 +127,13 @@ function draw() {
       size: shown.pointSize * 0.006 * submap.radius * canvas.height,
       limits: [shown.finest * scale * shown.pointSize, 7 * scale * shown.pointSize],
       lift: [...ink, 0.2],
+    });
+  if (submap.dense && isOn("dense"))
+    painter.draw(layers.dense, {
+      ...view,
+      size: (shown.pointSize * COVER * submap.dense.spacing * canvas.height) / (2 * Math.tan(FIELD_OF_VIEW / 2)),
+      limits: [1.2 * scale * shown.pointSize, 12 * scale * shown.pointSize],
+      lift: [...ink, 0],
     });
   if (isOn("truth")) painter.draw(layers.truth, { ...view, width: 1.4 * scale });
   if (isOn("keyframes"))
@@ -240,6 +255,7 @@ const KEYS = {
   "=": () => eye.zoom(0.9),
   "-": () => eye.zoom(1 / 0.9),
   p: () => toggle("points"),
+  c: () => toggle("dense"),
   k: () => toggle("keyframes"),
   g: () => toggle("grid"),
   "[": () => resizePoints(0.8),
