@@ -19,10 +19,9 @@ from torchslam.dense import DepthMaps
 from torchslam.dense.confidence import alone_features, confidence_alone, together_features
 from torchslam.dense.consistency import merge
 from torchslam.dense.estimate import estimate_depth
-from torchslam.densify.passes import DEPTHS
 from torchslam.densify.views import SWEPT, ViewImages, views_of
 from torchslam.io.export.scene import open_images, scene_of
-from torchslam.io.results import MAP, read_metrics
+from torchslam.io.results import DEPTHS, MAP, read_metrics
 from torchslam.map.file import read_atlas
 
 RIGHT = 0.05
@@ -32,13 +31,13 @@ ITERATIONS = 30
 
 def samples(folder: Path, depth: Path | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Features of depth alone and whether it is right, and the same for depth merged with that of neighbors."""
-    maps = DepthMaps.load(folder / "dense" / DEPTHS)
+    maps = DepthMaps.load(folder / DEPTHS)
     truth, metrics, saved = truth_of(folder, maps, depth), read_metrics(folder), read_atlas(folder / MAP)
     submap = saved.atlas.main()
     assert submap is not None
     scene = scene_of(submap, saved.camera, 0, keyframes_alone=True)
     views = views_of(scene, maps.camera.size)
-    images = ViewImages(views, open_images(metrics["source"], scene, undistort=True))
+    images = ViewImages(views, open_images(metrics["source"], scene, views.camera))
 
     @cache
     @torch.no_grad()

@@ -16,9 +16,8 @@ from experiments.dense.truth import Sensor, rendered_depth
 from torchslam.data import open_sequence
 from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.dense import DepthMaps
-from torchslam.densify.passes import DEPTHS
 from torchslam.geometry import se3_inverse
-from torchslam.io.results import MAP, read_metrics
+from torchslam.io.results import DEPTHS, MAP, read_metrics
 from torchslam.map.file import read_atlas
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
@@ -56,7 +55,7 @@ def main() -> None:
         "--depth", type=Path, help="folder of the sensor's depth images; else the scene is rendered"
     )
     options = parser.parse_args()
-    maps = DepthMaps.load(options.results / "dense" / DEPTHS)
+    maps = DepthMaps.load(options.results / DEPTHS)
     truth = truth_of(options.results, maps, options.depth)
     known, kept = truth > 0, maps.depth > 0
     error = (maps.depth / torch.where(known, truth, 1.0) - 1).abs()

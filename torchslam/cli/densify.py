@@ -23,17 +23,14 @@ from torchslam.cli import arguments
 from torchslam.densify import DenseSummary, densify
 from torchslam.densify.views import ViewImages, views_of
 from torchslam.errors import ConfigError, ResultsError
-from torchslam.geometry import se3_inverse
-from torchslam.geometry.transforms import upright_rotation
-from torchslam.io.export.ply import write_ply
+from torchslam.io.export.ply import upright_from_map, write_cloud
 from torchslam.io.export.scene import open_images, pinhole_within, scene_of
-from torchslam.io.results import MAP, METRICS, read_metrics
+from torchslam.io.results import DENSE_CLOUD, DEPTHS, MAP, METRICS, read_metrics, read_results
+from torchslam.io.viewer.page import VIEW, write_view
 from torchslam.map.file import read_atlas
 from torchslam.utils.console import table, tqdm_options
 from torchslam.utils.files import write_whole
 
-FOLDER = "dense"  # in the folder of results
-CLOUD = "dense.ply"
 LONG_SIDE = 320
 """Default resolution: about a second per keyframe."""
 SMALLEST = 64
@@ -103,11 +100,12 @@ def densify_results(
             f"{directory / METRICS}: does not say where the images are; give them with --images"
         )
     scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=every is None)
-    opened = open_images(source, scene, True, metrics.get("source_fps"), "use --images for its new location")
     size = map_size(resolution, pinhole_within(scene.camera).size)
     views = views_of(scene, size, every)
+    elsewhere = "use --images for its new location"
+    opened = open_images(source, scene, views.camera, metrics.get("source_fps"), elsewhere)
     view_images = ViewImages(views, opened)
-    folder = directory / FOLDER
+    folder = directory / DEPTHS.parent
     with tqdm(
         total=2 * len(views),
         **tqdm_options(),
@@ -116,21 +114,16 @@ def densify_results(
         found = densify(
             views, view_images, folder, torch.device(device), lambda done, _: bar.update(done - bar.n)
         )
-    R_up = upright_rotation(se3_inverse(submap.map.T_cw).double()).to(found.cloud.points_w)
-    write_ply(
-        folder / CLOUD,
-        found.cloud.points_w @ R_up.mT,
-        found.cloud.colors,
-        torch.zeros(0, 3),
-        found.cloud.normals_w @ R_up.mT,
-    )
+    write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map))
     about = {"dense": _figures(found, size, time.process_time() - started)}
     write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
+    if (directory / VIEW).exists():
+        write_view(read_results(directory), directory)
     return {
         "depth maps": f"{found.views} of {size[0]} x {size[1]} pixels",
         "kept": f"{found.kept:.0%} of the pixels, mean confidence {found.confidence:.2f}",
         "points": f"{len(found.cloud)}, voxels of {found.voxel:.4g} map units",
-        "dense": str(folder),
+        "dense": f"{directory / DENSE_CLOUD}, {folder}",
     }
 
 

@@ -29,9 +29,9 @@ from torchslam.dense.normals import normals
 from torchslam.densify.pictures import write_picture
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views
 from torchslam.errors import ResultsError
+from torchslam.io.results import DEPTHS
 from torchslam.utils.files import parse_json, read_text, write_whole
 
-DEPTHS = "depths.safetensors"
 PARTS = "parts"
 PICTURES = "pictures"
 JOB = "job.json"
@@ -93,9 +93,11 @@ def densify(
             _write_merged(path, views, alone, view, device)
         on_progress(len(views) + view + 1, total)
     paths = [_merged_path(parts, views, view) for view in range(len(views))]
-    join(folder / DEPTHS, paths)
+    join(folder / DEPTHS.name, paths)
     _draw(folder, views, images)
-    summary = _fuse(folder / DEPTHS, images, torch.tensor([read_about(path)["spread"] for path in paths]))
+    summary = _fuse(
+        folder / DEPTHS.name, images, torch.tensor([read_about(path)["spread"] for path in paths])
+    )
     shutil.rmtree(parts)
     return summary
 
@@ -175,7 +177,7 @@ def _draw(folder: Path, views: Views, images: ViewImages) -> None:
     pictures.mkdir(exist_ok=True)
     for old in pictures.glob("[0-9]" * 6 + ".png"):
         old.unlink()
-    for view, maps in enumerate(DepthMaps.blocks(folder / DEPTHS, 1)):
+    for view, maps in enumerate(DepthMaps.blocks(folder / DEPTHS.name, 1)):
         name = f"{int(views.frame_index[view]):06d}.png"
         write_picture(pictures / name, maps.depth[0], maps.normal[0], images.color(view))
 

@@ -67,11 +67,10 @@ class Views:
 
 
 class ViewImages:
-    """Images of views, undistorted and resized; the last few are kept."""
+    """Images of views, opened with the camera of the views; the last few are kept."""
 
     def __init__(self, views: Views, images: Images) -> None:
         self._frames = views.frame_index.tolist()
-        self._size = views.camera.size
         self._images = images
         self.color = lru_cache(maxsize=CACHED)(self._color)
 
@@ -81,8 +80,7 @@ class ViewImages:
         return torch.from_numpy(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)).float() / 255
 
     def _color(self, view: int) -> UInt8[Tensor, "H W 3"]:
-        image = cv2.cvtColor(self._images.bgr(self._frames[view]), cv2.COLOR_BGR2RGB)
-        return torch.from_numpy(cv2.resize(image, self._size, interpolation=cv2.INTER_AREA))
+        return torch.from_numpy(cv2.cvtColor(self._images.bgr(self._frames[view]), cv2.COLOR_BGR2RGB))
 
 
 def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = None) -> Views:
