@@ -105,12 +105,14 @@ class TentativeMapping:
         keyframe = context.mapper.insert(submap.map, view, estimate)
         context.tracker.reset_to_keyframe(submap, keyframe)
 
-    def commit(self, submap: Submap) -> None:
-        """Keep the tentative keyframes and add them to the keyframe database."""
-        if self._before is not None:
-            (before, _), self._before = self._before, None
-            for keyframe in range(before.num_keyframes, submap.map.num_keyframes):
-                self.context.loop_closer.add(submap.map, keyframe)
+    def commit(self, submap: Submap) -> int:
+        """Keep the tentative keyframes and add them to the keyframe database; return their number."""
+        if self._before is None:
+            return 0
+        (before, _), self._before = self._before, None
+        for keyframe in range(before.num_keyframes, submap.map.num_keyframes):
+            self.context.loop_closer.add(submap.map, keyframe)
+        return submap.map.num_keyframes - before.num_keyframes
 
     def rollback(self, submap: Submap) -> None:
         """Restore map and tracking state from before the first tentative keyframe."""

@@ -172,6 +172,7 @@ class PoseConfirmation:
         return self.pop_all()
 
     def pop_all(self) -> list[PendingFrame]:
-        """Remove and return the pending frames; the countdown goes on."""
+        """Remove and return the pending frames; those that follow need no more confirmation than others."""
         pending, self._pending = self._pending, []
+        self._num_rejected, self._needed = 0, min(self._needed, self._needed_after_rejection)
         return pending
