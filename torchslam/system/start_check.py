@@ -170,7 +170,8 @@ class StartCheck:
     ) -> bool:
         """Track the start anew from the later keyframes; return whether that is better, and undo it otherwise."""
         context, backward = self.context, self.backward
-        before = deepcopy(submap)
+        with torch.inference_mode(False):  # the run goes on outside of it
+            before = deepcopy(submap)
         frames = submap.map.keyframes["frame_index"].clone()
         start = torch.nonzero(frames <= views[-1].index)[:, 0]
         context.loop_closer.remove(submap.map.keys[start])

@@ -105,8 +105,8 @@ class InitializationState:
         if self.provisional is None:
             return
         provisional, self.provisional = self.provisional, None
-        self.backward.from_first_keyframe(provisional.submap)
-        self.start_check.start(provisional.submap, provisional.views)
+        earlier = self.backward.from_first_keyframe(provisional.submap)
+        self.start_check.start(provisional.submap, earlier + provisional.views)
 
     def on_lost(self) -> bool:
         """Discard a map that is still provisional when the camera is lost; return whether it was."""
