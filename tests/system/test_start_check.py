@@ -48,12 +48,12 @@ def shown(is_bent: bool, is_checked: bool) -> tuple[Tensor, float, int]:
         return create(self, bent(start, self.context.camera) if count[0] == 1 and is_bent else start, views)
 
     def counted(
-        self: StartCheck, submap: Submap, views: list[FrameFeatures], pairs: list[KeyframePair], by_map: float
+        self: StartCheck, submap: Submap, views: list[FrameFeatures], pairs: list[KeyframePair], needed: float
     ) -> bool:
         if not is_checked:
             return False
         count[1] += 1
-        return pose_anew(self, submap, views, pairs, by_map)
+        return pose_anew(self, submap, views, pairs, needed)
 
     with pytest.MonkeyPatch.context() as monkeypatch:
         monkeypatch.setattr(InitializationState, "_create", create_bent)

@@ -103,9 +103,8 @@ def camera_remark(finished: Run, found: str) -> str:
             return f"{found}; over all frames {described}"
         described += f" (given {float(given.camera.focal):.1f} px)"
         freely = estimate_intrinsics(finished.graph)  # without the prior
-        if given.departure(freely.camera) > MIN_SIGMAS:
-            described += f"; {contradiction(given.camera, freely)}; {REMEDY}"
-        return described
+        words = contradiction(given.camera, freely) if given.departure(freely.camera) > MIN_SIGMAS else ""
+        return f"{described}; {words}; {REMEDY}" if words else described
     against = ""
     if not (finished.failure or finished.interrupted or finished.session):
         against = contradiction(finished.camera, estimate_intrinsics(finished.graph))

@@ -347,6 +347,7 @@ def _fall_back(
         relocalization=replace(config.relocalization, frames_before_new_submap=LEARNED_WAIT),
     )
     second = _attempt(sequence, learned, replace(plan, checkpoint=0, resume=False), stop_signals, viewers)
+    second = replace(second, found=second.found or first.found)  # the camera was found by the first run
     is_better = len(second.finished.trajectory) > len(first.finished.trajectory)
     kept = LEARNED if is_better else config.features.kind
     print(

@@ -105,12 +105,14 @@ class TentativeMapping:
         keyframe = context.mapper.insert(submap.map, view, estimate)
         context.tracker.reset_to_keyframe(submap, keyframe)
 
-    def commit(self, submap: Submap) -> None:
-        """Keep the tentative keyframes and add them to the keyframe database."""
-        if self._before is not None:
-            (before, _), self._before = self._before, None
-            for keyframe in range(before.num_keyframes, submap.map.num_keyframes):
-                self.context.loop_closer.add(submap.map, keyframe)
+    def commit(self, submap: Submap) -> int:
+        """Keep the tentative keyframes and add them to the keyframe database; return their number."""
+        if self._before is None:
+            return 0
+        (before, _), self._before = self._before, None
+        for keyframe in range(before.num_keyframes, submap.map.num_keyframes):
+            self.context.loop_closer.add(submap.map, keyframe)
+        return submap.map.num_keyframes - before.num_keyframes
 
     def rollback(self, submap: Submap) -> None:
         """Restore map and tracking state from before the first tentative keyframe."""
@@ -127,11 +129,11 @@ class BackwardTracking:
         self.tentative = TentativeMapping(context, mapping)
         self.unposed = UnposedFrames(context.config.initialization.max_unposed_frames)
 
-    def from_first_keyframe(self, submap: Submap) -> None:
-        """Pose the frames from before the first keyframe of a submap."""
+    def from_first_keyframe(self, submap: Submap) -> list[FrameFeatures]:
+        """Pose the frames from before the first keyframe of a submap; return those that got a pose."""
         backward = submap.fork()
         self.context.tracker.reset_to_keyframe(backward, 0)
-        self._track(backward, before=int(submap.map.keyframes["frame_index"][0]))
+        return self._track(backward, before=int(submap.map.keyframes["frame_index"][0]))
 
     def from_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Pose the frames from before a relocalized frame."""
@@ -139,12 +141,13 @@ class BackwardTracking:
         self.context.tracker.start_at_estimate(backward, view, estimate)
         self._track(backward, before=view.index)
 
-    def _track(self, backward: Submap, before: int) -> None:
+    def _track(self, backward: Submap, before: int) -> list[FrameFeatures]:
         context = self.context
         with context.clock("backwards"):
             earlier = [view for view in self.unposed if view.index < before]
             posed = track_back(context.tracker, backward, reversed(earlier), context.config, self)
         self.unposed.remove(posed)
+        return posed
 
     def add_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Add a frame with a confirmed pose."""

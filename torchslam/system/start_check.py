@@ -2,7 +2,7 @@
 
 A map that was initialized from too little parallax can be bent: the frames of its start agree with its points, and both
 are wrong. The map that grows from it is right once it consists of points of later keyframes. Then the start is taken
-away and tracked anew, backward in time, and the better one of both is kept.
+away and tracked anew, backward in time; that is undone if it does not agree with the matches either.
 """
 
 from __future__ import annotations
@@ -113,10 +113,10 @@ class StartCheck:
         self.cancel()
         with self.context.clock("initialization"):
             pairs = self._pairs(submap.map, views[-1].index, later)
-            by_map, own = self._support(submap, pairs), sum(pair.support for pair in pairs)
-            if by_map >= MIN_SUPPORT_RATIO * own:
+            needed = MIN_SUPPORT_RATIO * sum(pair.support for pair in pairs)
+            if self._support(submap, pairs) >= needed:
                 return False
-        return self._pose_anew(submap, views, pairs, by_map)
+        return self._pose_anew(submap, views, pairs, needed)
 
     def _pairs(self, slam_map: Map, last: int, later: list[int]) -> list[KeyframePair]:
         """Matches between the keyframes of the start and the first later ones that give a motion on their own."""
@@ -166,11 +166,12 @@ class StartCheck:
         return support(pixels_1, pixels_2, found.T_21[0], camera, threshold)
 
     def _pose_anew(
-        self, submap: Submap, views: list[FrameFeatures], pairs: list[KeyframePair], by_map: float
+        self, submap: Submap, views: list[FrameFeatures], pairs: list[KeyframePair], needed: float
     ) -> bool:
-        """Track the start anew from the later keyframes; return whether that is better, and undo it otherwise."""
+        """Track the start anew, and undo that if matches contradict it still; return whether it stays."""
         context, backward = self.context, self.backward
-        before = deepcopy(submap)
+        with torch.inference_mode(False):  # the run goes on outside of it
+            before = deepcopy(submap)
         frames = submap.map.keyframes["frame_index"].clone()
         start = torch.nonzero(frames <= views[-1].index)[:, 0]
         context.loop_closer.remove(submap.map.keys[start])
@@ -180,7 +181,7 @@ class StartCheck:
         backward.unposed.add(*views)
         backward.from_first_keyframe(submap)
         known = set(submap.posed_frames.frames["frame_index"].tolist())
-        if all(view.index in known for view in views) and self._support(submap, pairs) > by_map:
+        if all(view.index in known for view in views) and self._support(submap, pairs) >= needed:
             return True
         backward.unposed.remove(views)
         context.loop_closer.remove(submap.map.keys[kept:])

@@ -28,6 +28,8 @@ from torchslam.tracking.pose_validation import (
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection, State, TwoViewMap
 
+_LOOP_STRIDE = 4
+"""Of the keyframes that are confirmed together, every so many are checked for a loop: their views overlap."""
 _FRAMES_PER_KEYFRAME = 2
 """Frames that a keyframe is worth in the confirmation of a map: views far apart contradict a wrong one sooner."""
 
@@ -103,8 +105,8 @@ class InitializationState:
         if self.provisional is None:
             return
         provisional, self.provisional = self.provisional, None
-        self.backward.from_first_keyframe(provisional.submap)
-        self.start_check.start(provisional.submap, provisional.views)
+        earlier = self.backward.from_first_keyframe(provisional.submap)
+        self.start_check.start(provisional.submap, earlier + provisional.views)
 
     def on_lost(self) -> bool:
         """Discard a map that is still provisional when the camera is lost; return whether it was."""
@@ -199,19 +201,27 @@ class KeyframeActions:
         self.detect_loop()
         self._cull_and_compact(self.active_map.current)
 
-    def detect_loop(self) -> None:
-        """Close a loop at the newest keyframe, or merge two submaps, if its place was seen before."""
+    def detect_loop(self, count: int = 1) -> None:
+        """Close a loop at one of the newest keyframes, or merge two submaps, if its place was seen before.
+
+        Args:
+            count: Number of the newest keyframes, of which every `_LOOP_STRIDE`-th is checked until one closes a loop.
+        """
         context, submap = self.context, self.active_map.current
+        newest = submap.map.num_keyframes - 1
         with context.clock("loops"):
-            found = context.loop_closer.detect(submap, submap.map.num_keyframes - 1)
+            keyframes = range(newest, newest - count, -_LOOP_STRIDE)
+            detected = (context.loop_closer.detect(submap, keyframe) for keyframe in keyframes)
+            found = next((candidate for candidate in detected if candidate is not None), None)
             if found is None:
                 return
             if not found.is_loop:
                 self.initialization.confirm_map()
                 self.initialization.start_check.cancel()  # the other map agrees with this one
+            since = newest - found.keyframe
             submap, keyframe = context.loop_closer.close(found)
             self.active_map.replace(submap)
-            context.tracker.reset_to_keyframe(submap, keyframe)
+            context.tracker.reset_to_keyframe(submap, keyframe + since)
             context.non_static_filter.forget_last()  # its pose was one of the map before
 
     def _cull_and_compact(self, submap: Submap) -> None:
@@ -318,10 +328,9 @@ class StateMachine:
     def finalize(self) -> None:
         """End the session: frames that are held back keep their poses, uncertain as they are."""
         if self.active_map.submap is not None:
-            has_new_keyframes = self._keep_uncertain()
+            num_new = self._keep_uncertain()
             self.keyframe_actions.apply_pending_adjustment()
-            if has_new_keyframes:
-                self.keyframe_actions.detect_loop()
+            self.keyframe_actions.detect_loop(num_new)
         self.initialization.confirm_map()
         if self.active_map.submap is not None:
             self.start_check.step(self.active_map.submap, is_last=True)
@@ -395,11 +404,10 @@ class StateMachine:
         if confirmation.is_holding:
             reason = rejection or confirmation.reason
             self.active_map.set_state(State.UNCERTAIN)
-            if confirmation.is_full and self._keep_uncertain():
-                self.keyframe_actions.detect_loop()
+            if confirmation.is_full:
+                self.keyframe_actions.detect_loop(self._keep_uncertain())
             return FrameOutcome([reason], self.active_map.current, estimate)
-        has_new_keyframes = self.tentative.has_keyframes  # whose adjustments are applied: none is pending
-        self.tentative.commit(submap)
+        num_new = self.tentative.commit(submap)  # whose adjustments are applied: none is pending
         was_relocalized, frames = confirmation.is_relocalized, confirmation.confirm()
         self.mapping.add_pending_frames(submap, frames)
         self.initialization.add_confirmed(frames)
@@ -407,17 +415,16 @@ class StateMachine:
             first, first_estimate, _, _ = frames[0]
             self.backward.from_frame(submap, first, first_estimate)
         self.active_map.set_state(State.TRACKING)
-        if has_new_keyframes:
-            self.keyframe_actions.detect_loop()
+        self.keyframe_actions.detect_loop(num_new)
         return FrameOutcome([], self.active_map.current, estimate)
 
-    def _keep_uncertain(self) -> bool:
-        """Keep the poses of frames that are held back, and their tentative keyframes; return whether there are any."""
-        submap, has_keyframes = self.active_map.current, self.tentative.has_keyframes
-        self.tentative.commit(submap)
+    def _keep_uncertain(self) -> int:
+        """Keep the poses of frames that are held back, and their tentative keyframes; return the number of these."""
+        submap = self.active_map.current
+        num_new = self.tentative.commit(submap)
         for pending in self.context.confirmation.pop_all():
             submap.posed_frames.add(*pending)
-        return has_keyframes
+        return num_new
 
     def _on_lost(self, view: FrameFeatures) -> FrameOutcome:
         """Frames that are held back are unposed again, unless they are many; a provisional map is discarded."""

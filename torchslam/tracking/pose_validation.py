@@ -90,8 +90,10 @@ def jump(estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"]) -> tuple[
 PendingFrame = tuple[FrameFeatures, PoseEstimate, Float[Tensor, "4 4"], int]
 """A frame, its pose estimate, its pose T_cr relative to a keyframe, and the row of that keyframe."""
 
-MAX_PENDING_FRAMES = 40
-"""Frames that are held back at most, and then kept with uncertain poses: a wrong pose does not last that long."""
+MAX_PENDING_FRAMES = 1000
+"""Frames that are held back at most."""
+MANY_PENDING_FRAMES = 40
+"""Frames that are held back and kept when the camera is lost: a wrong pose does not last that long."""
 
 
 class PoseConfirmation:
@@ -102,7 +104,7 @@ class PoseConfirmation:
         self._needed_after_relocalization = config.relocalization.num_confirming_frames
         self._pending: list[PendingFrame] = []
         self._needed = 0
-        self._num_held, self._num_rejected = 0, 0  # since the last confirmation
+        self._num_rejected = 0  # since the last confirmation
         self.is_relocalized = False
 
     @property
@@ -119,7 +121,7 @@ class PoseConfirmation:
         self, view: FrameFeatures, estimate: PoseEstimate, tracking: TrackingState
     ) -> None:
         """Start again with a relocalized frame."""
-        self._pending, self._num_held = [(view, estimate, tracking.T_cr, tracking.reference)], 1
+        self._pending = [(view, estimate, tracking.T_cr, tracking.reference)]
         self._needed, self.is_relocalized = self._needed_after_relocalization, True
 
     def push(
@@ -141,7 +143,6 @@ class PoseConfirmation:
                 frames are needed as there were rejected ones.
         """
         self._pending.append((view, estimate, tracking.T_cr, tracking.reference))
-        self._num_held += 1
         if rejection is None:
             self._needed -= 1
             return
@@ -160,7 +161,7 @@ class PoseConfirmation:
     @property
     def is_long(self) -> bool:
         """Whether frames are held back for so long that their poses are kept even if the camera is lost."""
-        return self._num_held >= MAX_PENDING_FRAMES
+        return len(self._pending) >= MANY_PENDING_FRAMES
 
     def views(self) -> list[FrameFeatures]:
         """The pending frames, in order."""
@@ -168,7 +169,7 @@ class PoseConfirmation:
 
     def confirm(self) -> list[PendingFrame]:
         """Remove and return the pending frames, and reset the countdown."""
-        self._needed, self._num_held, self._num_rejected, self.is_relocalized = 0, 0, 0, False
+        self._needed, self._num_rejected, self.is_relocalized = 0, 0, False
         return self.pop_all()
 
     def pop_all(self) -> list[PendingFrame]:
