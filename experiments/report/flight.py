@@ -1,6 +1,8 @@
 """Draw a flight through the dense cloud of a run as an animation: behind the camera, along its smoothed path.
 
-python -m experiments.report.flight results/demo docs/images/flight.webp
+torchslam run ../shared/data/fr2_desk_20 -o results/fr2_desk_20
+torchslam densify results/fr2_desk_20 --every 2 --resolution 480
+python -m experiments.report.flight results/fr2_desk_20 docs/images/flight.webp --pictures 48
 """
 
 from __future__ import annotations
@@ -25,7 +27,7 @@ from torchslam.types import Trajectory
 
 SIZE = (640, 400)
 SAMPLES = 2  # pixels to a side that are drawn for each pixel: edges are smooth
-FIELD_OF_VIEW_DEG = 75.0  # from left to right
+FIELD_OF_VIEW_DEG = 60.0  # from left to right
 GROUND = (246, 245, 241)
 SMOOTHING = 0.06  # width of the window over the path, in lengths of the path
 BACK = 0.25  # the eye is behind the camera by this, in median distances of the cloud from the path
@@ -41,21 +43,22 @@ def draw_flight(cloud: PointCloud, trajectory: Trajectory, pictures: int) -> lis
     Args:
         cloud: points in the world of the trajectory.
         trajectory: camera to world.
-        pictures: their number, evenly over the trajectory.
+        pictures: their number, evenly over the trajectory, also between its poses.
     """
     T_wc = smoothed(trajectory.T_wc, max(1, round(SMOOTHING * len(trajectory))))
     reach = float(_distances(cloud, trajectory).median())
-    rows = thin(len(T_wc), pictures)
     eye = torch.eye(4, dtype=T_wc.dtype)
     eye[2, 3] = -BACK * reach
     width, height = (SAMPLES * side for side in SIZE)
     focal = width / 2 / float(np.tan(np.radians(FIELD_OF_VIEW_DEG / 2)))
     camera = Camera.pinhole(focal, focal, (width - 1) / 2, (height - 1) / 2, size=(width, height))
     width_of_points = COVER * cloud.spacing()
-    return [
-        _picture(cloud, width_of_points, T_wc[int(row) :, :3, 3], se3_inverse(T_wc[row] @ eye), camera, reach)
-        for row in rows
-    ]
+    made = []
+    for place in torch.linspace(0, len(T_wc) - 1, pictures, dtype=T_wc.dtype).tolist():
+        T_wc_now = between(T_wc, place)
+        path_w = torch.cat((T_wc_now[None], T_wc[int(place) + 1 :]))[:, :3, 3]
+        made.append(_picture(cloud, width_of_points, path_w, se3_inverse(T_wc_now @ eye), camera, reach))
+    return made
 
 
 def smoothed(T_wc: Float[Tensor, "K 4 4"], window: int) -> Float[Tensor, "K 4 4"]:
@@ -63,8 +66,20 @@ def smoothed(T_wc: Float[Tensor, "K 4 4"], window: int) -> Float[Tensor, "K 4 4"
     means = torch.stack(
         [T_wc[max(0, row - window) : row + window + 1].mean(dim=0) for row in range(len(T_wc))]
     )
-    U, _, Vh = torch.linalg.svd(means[:, :3, :3])
-    return rigid(U @ Vh, means[:, :3, 3])
+    return _nearest_pose(means)
+
+
+def between(T_wc: Float[Tensor, "K 4 4"], place: float) -> Float[Tensor, "4 4"]:
+    """The pose at a place in a path: 1.5 is in the middle between the second pose and the third."""
+    before = int(place)
+    after = min(before + 1, len(T_wc) - 1)
+    return _nearest_pose(torch.lerp(T_wc[before], T_wc[after], place - before))
+
+
+def _nearest_pose(means: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
+    """Means of poses, whose rotations are none, with the nearest rotations."""
+    U, _, Vh = torch.linalg.svd(means[..., :3, :3])
+    return rigid(U @ Vh, means[..., :3, 3])
 
 
 def splat(

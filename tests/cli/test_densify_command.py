@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import shutil
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +19,11 @@ from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.dense import DepthMaps
 from torchslam.dense.cost_volume import matching_cost
-from torchslam.densify import passes
-from torchslam.errors import ConfigError
-from torchslam.geometry import se3_inverse
-from torchslam.io.results import DENSE_CLOUD, DEPTHS
+from torchslam.densify import Views, passes
+from torchslam.errors import ConfigError, FrameError
+from torchslam.geometry import Camera, se3_inverse
+from torchslam.io.export.scene import Images
+from torchslam.io.results import DENSE_CLOUD, DEPTHS, MESH
 
 ROOM = "synthetic:room?frames=24"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
@@ -158,10 +160,94 @@ def test_missing_images_are_reported(
     )
 
 
+def test_an_image_that_cannot_be_read_is_skipped_and_counted(
+    run: Path, results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = int(DepthMaps.load(run / DEPTHS).frame_index[3])
+    read = Images.bgr
+
+    def damaged(images: Images, frame_id: int) -> Any:
+        if frame_id == broken:
+            raise FrameError("b.png is not an image, or a damaged one")
+        return read(images, frame_id)
+
+    monkeypatch.setattr(Images, "bgr", damaged)
+    assert densify(results) == 0
+    error = capsys.readouterr().err
+    assert error.count("torchslam: warning: skipped a view: b.png is not an image, or a damaged one\n") == 1
+    maps, figures = (
+        DepthMaps.load(results / DEPTHS),
+        json.loads((results / "metrics.json").read_text())["dense"],
+    )
+    assert broken not in maps.frame_index
+    assert figures["skipped"] == 1
+    assert figures["depth_maps"] == len(maps) == len(DepthMaps.load(run / DEPTHS)) - 1
+
+
+def test_without_any_readable_image_there_is_no_depth(
+    results: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def damaged(images: Images, frame_id: int) -> Any:
+        raise FrameError(f"{frame_id}.png is not an image, or a damaged one")
+
+    monkeypatch.setattr(Images, "bgr", damaged)
+    assert densify(results) == 2
+    assert "images cannot be read, the first one: 0.png is not an image" in capsys.readouterr().err
+    assert not (results / DEPTHS).exists()
+
+
+def test_a_view_without_neighbors_goes_with_them() -> None:
+    neighbors = ((1, 2), (0, 2), (0, 1, 3), (2, 4), (3, 2))
+    T_cw = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    T_cw[:, 0, 3] = torch.arange(5)
+    ones = torch.ones(5)
+    views = Views(
+        10 * torch.arange(5), T_cw, Camera.pinhole(9.0, 9.0, 4.5, 3.5, (10, 8)), ones, 2 * ones, neighbors
+    )
+    assert views.without(()).neighbors == neighbors
+    left = views.without({4})  # 3 has one neighbor without it
+    assert left.frame_index.tolist() == [0, 10, 20]
+    assert left.neighbors == ((1, 2), (0, 2), (0, 1))
+    assert left.T_sr(0)[:, 0, 3].tolist() == [1.0, 2.0]
+    assert len(views.without({2})) == 0
+
+
+def test_a_mesh_needs_its_extra_before_anything_is_computed(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    assert densify(results, "--mesh") == 2
+    assert main(["run", ROOM, "--output", str(tmp_path / "new"), "--dense", "--mesh"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 2
+    assert all("Open3D is required for a mesh: pip install 'torchslam[mesh]'" in line for line in lines)
+    assert not (results / "dense").exists()
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_mesh_is_that_of_the_depth_maps(results: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    pytest.importorskip("open3d", reason="Open3D is not installed: pip install 'torchslam[mesh]'")
+    assert densify(results, "--mesh") == 0
+    assert "triangles" in capsys.readouterr().out
+    assert main(["export", str(results), "--to", "mesh"]) == 0
+    assert (results / MESH).read_bytes() == (results / "export" / "mesh.ply").read_bytes()
+    assert densify(results) == 0
+    assert not (results / MESH).exists()
+
+
+@pytest.mark.parametrize("option", [["--every", "5"], ["--resolution", "96"], ["--mesh"]])
+def test_options_of_dense_depth_require_it(
+    option: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", ROOM, "--output", str(tmp_path / "new"), *option]) == 2
+    assert "--resolution, --every and --mesh require --dense" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--every", "20"], "dense depth needs 3"),
+        (["--every", "20"], "dense depth needs 3 views or more, and there are 2 frames"),
+        (["--resolution", "999999999x80"], "at most the image's"),
         (["--resolution", "big"], "expected 640x480 or 640, got `big`"),
         (["--resolution", "2000x1000"], "at most the image's"),
         (["--resolution", "40"], "at least 64 each way"),

@@ -29,6 +29,7 @@ from torchslam.data import open_sequence, parse_camera, read_calibration, read_t
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_color, read_gray
 from torchslam.data.sequence import Sequence
+from torchslam.dense import DepthMaps
 from torchslam.errors import CalibrationError, ConfigError, FrameError
 from torchslam.features.learned import XFeat
 from torchslam.io.export.ply import read_cloud
@@ -91,6 +92,7 @@ def readers() -> dict[str, Reader]:
         Reader(
             "dense cloud", lambda: sample_files()["dense"], lambda root: read_cloud(root / "dense.ply"), 500
         ),
+        Reader("depth maps", lambda: sample_files()["depths"], _depths, 600),
         Reader("weights", lambda: {"w.safetensors": save(WEIGHTS)}, _weights, 200),
         Reader("toml", lambda: {"c.toml": to_toml(Config()).encode()}, _toml, 1200),
         Reader("--set", lambda: {"argument": b""}, _override, 800),
@@ -231,6 +233,14 @@ def _graph(root: Path) -> object:
 
 def _results(root: Path) -> str:
     return page(read_results(root))
+
+
+def _depths(root: Path) -> None:
+    path = root / "depths.safetensors"
+    maps, blocks = DepthMaps.load(path), list(DepthMaps.blocks(path, 2))
+    assert torch.equal(torch.cat([block.depth for block in blocks]), maps.depth) if blocks else not len(maps)
+    maps.save(root / "again")
+    assert torch.equal(DepthMaps.load(root / "again").normal, maps.normal)
 
 
 def _weights(root: Path) -> object:

@@ -8,11 +8,13 @@ from pathlib import Path
 
 import torch
 
+from tests.box_room import box_depths
 from tests.fuzz.mutators import Files
 from tests.fuzz.valid_inputs import content_of
 from tests.walks import Walk, arc
 from torchslam import SLAM, load_config
 from torchslam.dense.cloud import PointCloud
+from torchslam.geometry import Camera
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import write_cloud
@@ -34,11 +36,12 @@ CONFIG = load_config(
     ],
 )
 WALK = Walk(arc(30)[:14])
+SMALL_CAMERA = Camera.pinhole(8.0, 8.0, 5.5, 3.5, size=(12, 8))
 
 
 @cache
 def sample_files() -> dict[str, Files]:
-    """By kind: `results`, `checkpoint`, `graph`, `colmap`, `transforms`, `dense`."""
+    """By kind: `results`, `checkpoint`, `graph`, `colmap`, `transforms`, `dense`, `depths`."""
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         slam, so_far = SLAM(WALK.camera, CONFIG), RunProgress()
@@ -62,4 +65,7 @@ def sample_files() -> dict[str, Files]:
         ones = torch.ones(20, 3)
         cloud = PointCloud(ones, ones / 3**0.5, ones.byte(), ones[:, 0])
         write_cloud(root / "dense" / "dense.ply", cloud)
+        (root / "depths").mkdir()
+        eyes = torch.eye(4, dtype=torch.float64).expand(3, 4, 4)
+        box_depths(eyes, torch.tensor([0, 4, 9]), SMALL_CAMERA).save(root / "depths" / "depths.safetensors")
         return {kind.name: content_of(kind) for kind in root.iterdir()}

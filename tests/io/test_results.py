@@ -13,7 +13,7 @@ from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
 from torchslam.io.export.ply import upright_from_map, write_cloud
 from torchslam.io.report import run_metrics
-from torchslam.io.results import DENSE_CLOUD, DEPTHS, read_results, results_in, write_results
+from torchslam.io.results import DENSE_CLOUD, DEPTHS, MESH, PICTURES, read_results, results_in, write_results
 from torchslam.io.write_run import draw
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Submap
@@ -69,12 +69,14 @@ def test_the_dense_cloud_is_read_into_the_world_of_the_map(tmp_path: Path, run: 
 
 def test_a_new_run_deletes_the_dense_results_of_the_old_one(tmp_path: Path, run: Run) -> None:
     write(run, tmp_path)
-    (tmp_path / DEPTHS).parent.mkdir()
-    for name in (DENSE_CLOUD, DEPTHS):
-        (tmp_path / name).write_bytes(b"")
+    (tmp_path / PICTURES).mkdir(parents=True)
+    stale = [tmp_path / name for name in (DENSE_CLOUD, DEPTHS, MESH, PICTURES / "000012.png")]
+    mine = tmp_path / PICTURES / "mine.png"
+    for path in (*stale, mine):
+        path.write_bytes(b"")
     write(run, tmp_path)
-    assert not (tmp_path / DENSE_CLOUD).exists()
-    assert not (tmp_path / DEPTHS).exists()
+    assert not any(path.exists() for path in stale)
+    assert mine.exists()
 
 
 def test_online_poses_have_a_file(tmp_path: Path, run: Run) -> None:

@@ -1,8 +1,9 @@
 """Compute dense depth of a run from its map and images: depth maps, a colored cloud and pictures.
 
 Each keyframe, or every N-th frame with --every, gets a depth map with normals and confidence. What is textureless,
-reflecting or moving stays unknown. The results are in the folder dense of the run: depths.safetensors, dense.ply and
-pictures. An interrupted computation goes on where it ended when it is started again with the same options.
+reflecting or moving stays unknown. dense.ply is the cloud; the folder dense has depths.safetensors and pictures.
+--mesh also writes mesh.ply (extra `mesh`). Images that cannot be read are skipped. An interrupted computation goes on
+where it ended when it is started again with the same options.
 
 Exit status: 0 done, 2 an error; 130 ended by Ctrl-C.
 """
@@ -20,12 +21,14 @@ import torch
 from tqdm import tqdm
 
 from torchslam.cli import arguments
+from torchslam.cli.progress import shown_warnings
 from torchslam.densify import DenseSummary, densify
-from torchslam.densify.views import ViewImages, views_of
+from torchslam.densify.views import views_of
 from torchslam.errors import ConfigError, ResultsError
+from torchslam.io.export.mesh import import_open3d, write_mesh
 from torchslam.io.export.ply import upright_from_map, write_cloud
 from torchslam.io.export.scene import open_images, pinhole_within, scene_of
-from torchslam.io.results import DENSE_CLOUD, DEPTHS, MAP, METRICS, read_metrics, read_results
+from torchslam.io.results import DENSE_CLOUD, DEPTHS, MAP, MESH, METRICS, read_metrics, read_results
 from torchslam.io.viewer.page import VIEW, write_view
 from torchslam.map.file import read_atlas
 from torchslam.utils.console import table, tqdm_options
@@ -61,6 +64,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="depth for every N-th posed frame (default: for the keyframes)",
     )
+    parser.add_argument(
+        "--mesh", action="store_true", help="also write the surfaces as triangles (extra `mesh`)"
+    )
 
 
 def execute(options: argparse.Namespace) -> int:
@@ -68,7 +74,12 @@ def execute(options: argparse.Namespace) -> int:
     print(
         table(
             densify_results(
-                options.directory, options.resolution, options.every, options.device, options.images
+                options.directory,
+                options.resolution,
+                options.every,
+                options.device,
+                options.images,
+                options.mesh,
             )
         )
     )
@@ -76,7 +87,12 @@ def execute(options: argparse.Namespace) -> int:
 
 
 def densify_results(
-    directory: Path, resolution: str, every: int | None, device: torch.device | str, images: str | None = None
+    directory: Path,
+    resolution: str,
+    every: int | None,
+    device: torch.device | str,
+    images: str | None = None,
+    mesh: bool = False,
 ) -> dict[str, str]:
     """Compute dense depth of a results folder and add it to the folder; return rows for `table`.
 
@@ -86,7 +102,10 @@ def densify_results(
         every: every N-th posed frame; None: the keyframes.
         device: to compute on.
         images: where the images are; None: where the run read them.
+        mesh: also write a mesh; one of other depth maps is deleted.
     """
+    if mesh:
+        import_open3d()
     started = time.process_time()
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
@@ -104,33 +123,42 @@ def densify_results(
     views = views_of(scene, size, every)
     elsewhere = "use --images for its new location"
     opened = open_images(source, scene, views.camera, metrics.get("source_fps"), elsewhere)
-    view_images = ViewImages(views, opened)
     folder = directory / DEPTHS.parent
     with tqdm(
         total=2 * len(views),
         **tqdm_options(),
         bar_format="depth {n_fmt}/{total_fmt} |{bar:24}| {remaining} left",
     ) as bar:
-        found = densify(
-            views, view_images, folder, torch.device(device), lambda done, _: bar.update(done - bar.n)
-        )
+
+        def on_progress(done: int, total: int) -> None:
+            bar.total = total  # less where images are skipped
+            bar.update(done - bar.n)
+
+        with shown_warnings():
+            found = densify(views, opened, folder, torch.device(device), on_progress)
     write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map))
     about = {"dense": _figures(found, size, time.process_time() - started)}
     write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
     if (directory / VIEW).exists():
         write_view(read_results(directory), directory)
-    return {
+    (directory / MESH).unlink(missing_ok=True)
+    rows = {
         "depth maps": f"{found.views} of {size[0]} x {size[1]} pixels",
         "kept": f"{found.kept:.0%} of the pixels, mean confidence {found.confidence:.2f}",
         "points": f"{len(found.cloud)}, voxels of {found.voxel:.4g} map units",
         "dense": f"{directory / DENSE_CLOUD}, {folder}",
     }
+    if mesh:
+        made = write_mesh(directory / MESH, directory / DEPTHS, upright_from_map(submap.map), opened)
+        rows["mesh"] = f"{directory / MESH}, {made.triangles} triangles, voxels of {made.voxel:.4g} map units"
+    return rows
 
 
 def _figures(found: DenseSummary, size: tuple[int, int], seconds: float) -> dict[str, Any]:
     """The entry `dense` of metrics.json."""
     return {
         "depth_maps": found.views,
+        "skipped": len(found.skipped),
         "size": list(size),
         "kept_ratio": found.kept,
         "confidence": found.confidence,
@@ -142,9 +170,9 @@ def _figures(found: DenseSummary, size: tuple[int, int], seconds: float) -> dict
 
 def map_size(text: str, image: tuple[int, int]) -> tuple[int, int]:
     """Size of depth maps: even, no larger than the image. Raises ConfigError."""
-    if both := re.fullmatch(r"(\d{1,5})x(\d{1,5})", text):
+    if both := re.fullmatch(r"(\d{1,9})x(\d{1,9})", text):
         width, height = int(both[1]), int(both[2])
-    elif re.fullmatch(r"\d{1,5}", text):
+    elif re.fullmatch(r"\d{1,9}", text):
         scale = min(int(text) / max(image), 1.0)
         width, height = round(image[0] * scale), round(image[1] * scale)
     else:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import signal
 import sys
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from types import FrameType, TracebackType
 from typing import Any
 
@@ -20,6 +21,19 @@ from torchslam.utils.console import tqdm_options
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 STATUS = {signal.SIGINT: 130, signal.SIGTERM: 143}  # 128 + the signal's number, as shells have it
+
+
+@contextmanager
+def shown_warnings() -> Iterator[None]:
+    """Show warnings as lines, above the progress bars."""
+
+    def show(message: Warning | str, *where: Any, **more: Any) -> None:
+        tqdm.write(f"torchslam: warning: {message}", file=sys.stderr)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = show
+        yield
 
 
 class StopSignals:
@@ -103,7 +117,7 @@ class ProgressBar:
             else "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
         )
         self._adjusting: tqdm | None = None
-        self._warnings = warnings.catch_warnings()
+        self._warnings = shown_warnings()
 
     def update(self, result: StepResult) -> None:
         """Advance to the frame of a result. Raises KeyboardInterrupt after a signal."""
@@ -127,8 +141,6 @@ class ProgressBar:
 
     def __enter__(self) -> ProgressBar:
         self._warnings.__enter__()
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = self._show
         self._stopping.begin("after this frame")
         return self
 
@@ -139,6 +151,3 @@ class ProgressBar:
         self._bar.close()
         if self._adjusting is not None:
             self._adjusting.close()
-
-    def _show(self, message: Warning | str, *where: Any, **more: Any) -> None:
-        tqdm.write(f"torchslam: warning: {message}", file=sys.stderr)

@@ -24,7 +24,7 @@ import torch
 
 from torchslam.calibration.find_camera import RADIAL, find_camera, with_stated_std
 from torchslam.cli import arguments
-from torchslam.cli.densify import add_options, densify_results, map_size
+from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StopSignals
 from torchslam.config import Config
 from torchslam.data import Sequence
@@ -36,6 +36,7 @@ from torchslam.errors import ConfigError, ResultsError
 from torchslam.features.weights import PUBLISHED, find_weights
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
+from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
 from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, prepare
@@ -181,6 +182,10 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError(
             "--dense cannot be combined with --localize: a run that only localizes has no keyframes"
         )
+    if not options.dense and (options.mesh or options.every or options.resolution != str(LONG_SIDE)):
+        raise ConfigError("--resolution, --every and --mesh require --dense")
+    if options.mesh:
+        import_open3d()
     if options.view:
         import_rerun()
     saved = options.map
@@ -213,7 +218,9 @@ def execute(options: argparse.Namespace) -> int:
     is_default = is_default and options.features is None
     status = run(opened, config, replace(plan, may_fall_back=is_recorded and is_default and saved is None))
     if options.dense and status == DONE:
-        dense = densify_results(options.output, options.resolution, options.every, options.device)
+        dense = densify_results(
+            options.output, options.resolution, options.every, options.device, mesh=options.mesh
+        )
         print(f"\n{table(dense)}")
     return status
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -27,13 +28,13 @@ from torchslam.dense.estimate import estimate_depth
 from torchslam.dense.fusion import CloudFusion
 from torchslam.dense.normals import normals
 from torchslam.densify.pictures import write_picture
-from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views
+from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
 from torchslam.errors import ResultsError
-from torchslam.io.results import DEPTHS
+from torchslam.io.export.scene import Images
+from torchslam.io.results import DEPTHS, PICTURE_NAMES, PICTURES
 from torchslam.utils.files import parse_json, read_text, write_whole
 
 PARTS = "parts"
-PICTURES = "pictures"
 JOB = "job.json"
 MAX_JOB_BYTES = 1 << 16
 FORMAT = 1
@@ -50,6 +51,7 @@ class DenseSummary:
         confidence: mean of the kept pixels.
         voxel: edge of the voxels of the cloud, map units.
         cloud: the cloud.
+        skipped: messages about the images that could not be read.
     """
 
     views: int
@@ -57,34 +59,42 @@ class DenseSummary:
     confidence: float
     voxel: float
     cloud: PointCloud
+    skipped: list[str]
 
 
 def densify(
     views: Views,
-    images: ViewImages,
+    images: Images,
     folder: Path,
     device: torch.device,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> DenseSummary:
     """Compute depth maps and cloud; depth maps and pictures are written.
 
+    A view whose image cannot be read is left out with a warning.
+
     Args:
-        views, images: of the run.
+        views: of the run.
+        images: of their frames, with the camera of the views.
         folder: for the results; its folder of parts is used again if it is of the same views, and deleted at the end.
         device: to compute on.
         on_progress: called after each view of both passes with the numbers done and in all.
 
     Raises:
-        FrameError: an image cannot be read.
+        ResultsError: too few images can be read.
         OSError: a file cannot be written; the parts stay.
     """
+    views, skipped = readable(views, images)
+    for message in skipped:
+        warnings.warn(f"skipped a view: {message}", stacklevel=2)
     parts = folder / PARTS
     _prepare(parts, views)
+    opened = ViewImages(views, images)
     total = 2 * len(views)
     for view in range(len(views)):
         path = _alone_path(parts, views, view)
         if not path.exists():
-            _write_alone(path, views, images, view, device)
+            _write_alone(path, views, opened, view, device)
         on_progress(view + 1, total)
     alone = lru_cache(maxsize=CACHED)(lambda view: _read_alone(_alone_path(parts, views, view)))
     for view in range(len(views)):
@@ -94,10 +104,9 @@ def densify(
         on_progress(len(views) + view + 1, total)
     paths = [_merged_path(parts, views, view) for view in range(len(views))]
     join(folder / DEPTHS.name, paths)
-    _draw(folder, views, images)
-    summary = _fuse(
-        folder / DEPTHS.name, images, torch.tensor([read_about(path)["spread"] for path in paths])
-    )
+    _draw(folder, views, opened)
+    spreads = torch.tensor([read_about(path)["spread"] for path in paths])
+    summary = _fuse(folder / DEPTHS.name, opened, spreads, skipped)
     shutil.rmtree(parts)
     return summary
 
@@ -173,16 +182,16 @@ def _write_merged(
 
 def _draw(folder: Path, views: Views, images: ViewImages) -> None:
     """Draw a picture of each view; those of an earlier reconstruction are deleted."""
-    pictures = folder / PICTURES
+    pictures = folder / PICTURES.name
     pictures.mkdir(exist_ok=True)
-    for old in pictures.glob("[0-9]" * 6 + ".png"):
+    for old in pictures.glob(PICTURE_NAMES):
         old.unlink()
     for view, maps in enumerate(DepthMaps.blocks(folder / DEPTHS.name, 1)):
         name = f"{int(views.frame_index[view]):06d}.png"
         write_picture(pictures / name, maps.depth[0], maps.normal[0], images.color(view))
 
 
-def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"]) -> DenseSummary:
+def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"], skipped: list[str]) -> DenseSummary:
     """Fuse the maps of a file."""
     known, pixels, confidence, sizes = 0, 0, 0.0, []
     for view, maps in enumerate(DepthMaps.blocks(path, 1)):
@@ -196,4 +205,6 @@ def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"]) -> Dense
     fusion = CloudFusion(voxel)
     for view, maps in enumerate(DepthMaps.blocks(path, 1)):
         fusion.add(maps, images.color(view)[None])
-    return DenseSummary(len(spreads), known / pixels, confidence / max(known, 1), voxel, fusion.cloud())
+    return DenseSummary(
+        len(spreads), known / pixels, confidence / max(known, 1), voxel, fusion.cloud(), skipped
+    )

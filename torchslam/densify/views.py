@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -13,7 +14,7 @@ from torch import Tensor
 
 from torchslam.data.transforms import scale_camera
 from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
-from torchslam.errors import ResultsError
+from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.scene import ExportedScene, Images, undistorted
 
@@ -65,6 +66,49 @@ class Views:
         """Poses from the camera of a view to those of its neighbors."""
         return self.T_cw[list(self.neighbors[view])] @ se3_inverse(self.T_cw[view])
 
+    def without(self, left_out: Collection[int]) -> Views:
+        """The views without some of them, and without those that then have too few neighbors; possibly none."""
+        kept = [view for view in range(len(self)) if view not in left_out]
+        while True:  # a view that is left out is no neighbor of others
+            place = {view: row for row, view in enumerate(kept)}
+            neighbors = [
+                tuple(place[other] for other in self.neighbors[view] if other in place) for view in kept
+            ]
+            enough = [len(mine) >= LEAST_NEIGHBORS for mine in neighbors]
+            if all(enough):
+                break
+            kept = [view for view, fits in zip(kept, enough, strict=True) if fits]
+        return Views(
+            self.frame_index[kept],
+            self.T_cw[kept],
+            self.camera,
+            self.near[kept],
+            self.far[kept],
+            tuple(neighbors),
+        )
+
+
+def readable(views: Views, images: Images) -> tuple[Views, list[str]]:
+    """Leave out the views whose image cannot be read; also return what is wrong with each of these images.
+
+    Raises:
+        ResultsError: fewer than three views are left.
+    """
+    wrong: dict[int, str] = {}
+    for view, frame in enumerate(views.frame_index.tolist()):
+        try:
+            images.bgr(frame)
+        except FrameError as error:
+            wrong[view] = str(error)
+    left = views.without(wrong)
+    if len(left) <= LEAST_NEIGHBORS:
+        first = next(iter(wrong.values()))
+        raise ResultsError(
+            f"{len(wrong)} of {len(views)} images cannot be read, the first one: {first}; the views left are too few "
+            f"for dense depth, which needs {LEAST_NEIGHBORS + 1}"
+        )
+    return left, list(wrong.values())
+
 
 class ViewImages:
     """Images of views, opened with the camera of the views; the last few are kept."""
@@ -100,7 +144,11 @@ def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = No
     chosen = scene.is_keyframe if every is None else torch.arange(len(scene.frame_ids)) % every == 0
     frames = torch.nonzero(chosen)[:, 0]
     if len(frames) <= LEAST_NEIGHBORS:
-        raise ResultsError(f"{len(frames)} views: dense depth needs {LEAST_NEIGHBORS + 1} or more")
+        kind = "keyframes" if every is None else "frames"
+        raise ResultsError(
+            f"dense depth needs {LEAST_NEIGHBORS + 1} views or more, and there are {len(frames)} {kind}: choose more "
+            "posed frames (--every)"
+        )
     T_cw = scene.T_cw[frames]
     centers_w = se3_inverse(T_cw)[:, :3, 3]
     seen = _seen(scene, frames)
@@ -119,7 +167,23 @@ def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = No
         kept.append(view)
         neighbors.append(order[is_there].tolist())
         ranges.append(depth.quantile(torch.tensor(QUANTILES, dtype=depth.dtype)))
-    return _without_missing(scene, frames, size, kept, ranges, neighbors)
+    place = {view: row for row, view in enumerate(kept)}
+    limits = torch.stack(ranges) if ranges else torch.empty(0, len(QUANTILES))
+    rows = frames[kept]
+    views = Views(
+        frame_index=scene.frame_ids[rows],
+        T_cw=scene.T_cw[rows],
+        camera=scale_camera(scene.camera, size),
+        near=limits[:, 0] * NEARER,
+        far=limits[:, 1] * FARTHER,
+        neighbors=tuple(tuple(place[other] for other in mine if other in place) for mine in neighbors),
+    ).without(())
+    if len(views) <= LEAST_NEIGHBORS:
+        raise ResultsError(
+            f"{len(views)} of {len(frames)} views see enough points of others from another direction; dense depth "
+            f"needs {LEAST_NEIGHBORS + 1}: the camera must move sideways, or more frames be chosen (--every)"
+        )
+    return views
 
 
 def _seen(scene: ExportedScene, frames: Tensor) -> list[Tensor]:
@@ -128,41 +192,3 @@ def _seen(scene: ExportedScene, frames: Tensor) -> list[Tensor]:
     counts = torch.bincount(scene.frame_index, minlength=len(scene.frame_ids))
     parts = scene.point_index[order].split(counts.tolist())
     return [torch.unique(parts[frame]) for frame in frames.tolist()]
-
-
-def _without_missing(
-    scene: ExportedScene,
-    frames: Tensor,
-    size: tuple[int, int],
-    kept: list[int],
-    ranges: list[Tensor],
-    neighbors: list[list[int]],
-) -> Views:
-    """Views with neighbors among them. Raises ResultsError if too few are left."""
-    while True:  # a view that is left out is no neighbor of others
-        place = {view: index for index, view in enumerate(kept)}
-        neighbors = [[other for other in mine if other in place] for mine in neighbors]
-        enough = [len(mine) >= LEAST_NEIGHBORS for mine in neighbors]
-        if all(enough):
-            break
-        left = [row for row, fits in enumerate(enough) if fits]
-        kept, ranges, neighbors = (
-            [kept[i] for i in left],
-            [ranges[i] for i in left],
-            [neighbors[i] for i in left],
-        )
-    if len(kept) <= LEAST_NEIGHBORS:
-        raise ResultsError(
-            f"{len(kept)} of {len(frames)} views see enough points of others from another direction; dense depth needs "
-            f"{LEAST_NEIGHBORS + 1}: the camera must move sideways, or more frames be chosen"
-        )
-    rows = frames[kept]
-    limits = torch.stack(ranges)
-    return Views(
-        frame_index=scene.frame_ids[rows],
-        T_cw=scene.T_cw[rows],
-        camera=scale_camera(scene.camera, size),
-        near=limits[:, 0] * NEARER,
-        far=limits[:, 1] * FARTHER,
-        neighbors=tuple(tuple(place[other] for other in mine) for mine in neighbors),
-    )

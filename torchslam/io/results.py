@@ -42,7 +42,10 @@ MAP = "map.safetensors"
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
 POINT_CLOUD = "map.ply"
 DENSE_CLOUD = "dense.ply"  # of the main submap, z up as in POINT_CLOUD
+MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
 DEPTHS = Path("dense") / "depths.safetensors"  # of keyframes of the main submap
+PICTURES = Path("dense") / "pictures"
+PICTURE_NAMES = "[0-9]" * 6 + ".png"
 CONFIG = "config.toml"
 METRICS = "metrics.json"
 FRAMES = "frames.csv"
@@ -130,8 +133,9 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
         directory: the results folder, created if missing.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, DENSE_CLOUD, DEPTHS)]
-    for old in (*stale, *directory.glob(OTHER_TRAJECTORY.format("[0-9]*"))):
+    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, DENSE_CLOUD, DEPTHS, MESH)]
+    stale += [*directory.glob(OTHER_TRAJECTORY.format("[0-9]*")), *(directory / PICTURES).glob(PICTURE_NAMES)]
+    for old in stale:
         old.unlink(missing_ok=True)
     write_trajectory(directory / TRAJECTORY, run.trajectory)
     write_trajectory(directory / ONLINE, run.online)

@@ -10,6 +10,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import cv2
 import numpy as np
@@ -102,10 +103,27 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
     mesh.remove_unreferenced_vertices()
     if not mesh.triangles:
         raise ResultsError(f"{depths}: no surface that {weight} depth maps agree on")
+    mesh = _ordered(o3d, mesh)
     mesh.compute_vertex_normals()
     if not o3d.io.write_triangle_mesh(str(path), mesh):
         raise ResultsError(f"{path}: cannot be written")
     return MeshSize(voxel, len(mesh.vertices), len(mesh.triangles))
+
+
+def _ordered(o3d: ModuleType, mesh: Any) -> Any:
+    """The mesh with vertices and triangles in order: theirs depends on the threads of Open3D."""
+    vertices, colors = np.asarray(mesh.vertices), np.asarray(mesh.vertex_colors).clip(0, 1)
+    order = np.lexsort((*colors.T, *vertices.T))
+    triangles = np.argsort(order)[np.asarray(mesh.triangles)]
+    first = triangles.argmin(axis=1)[:, None]
+    triangles = np.take_along_axis(
+        triangles, (first + np.arange(3)) % 3, axis=1
+    )  # keeps the side that is outside
+    triangles = triangles[np.lexsort(triangles.T)]
+    vector = o3d.utility.Vector3dVector
+    ordered = o3d.geometry.TriangleMesh(vector(vertices[order]), o3d.utility.Vector3iVector(triangles))
+    ordered.vertex_colors = vector(colors[order])
+    return ordered
 
 
 def _sure_depth(maps: DepthMaps, middle: float = math.inf) -> Float[Tensor, "H W"]:
