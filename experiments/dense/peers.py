@@ -1,6 +1,6 @@
 """Dense depth beside OpenCV's StereoSGBM and a plane sweep of squared differences, on the same views.
 
-python -m experiments.dense.peers RESULTS [--depth FOLDER] [--every N]
+python -m experiments.dense.peers RESULTS [--depth FOLDER] [--first N]
 
 Poses, images, ranges of depth, neighbors and the comparison of the views are the same for all. A peer has no confidence
 of its own: that of its fused depth is a logistic model fitted to half of the truth that it is measured on, which favors
@@ -13,6 +13,7 @@ import argparse
 import time
 from collections.abc import Callable
 from functools import cache
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -224,15 +225,14 @@ def main() -> None:
     parser.add_argument(
         "--depth", type=Path, help="folder of the sensor's depth images; else the scene is rendered"
     )
-    parser.add_argument(
-        "--every", type=int, default=1, help="measure every so many views (default: %(default)s)"
-    )
+    parser.add_argument("--first", type=int, help="measure the first so many views (default: all)")
     options = parser.parse_args()
     maps = DepthMaps.load(options.results / DEPTHS)
     views, images = opened(options.results, maps)
-    rows = list(range(0, len(views), options.every))
-    truth = truth_of(options.results, maps, options.depth)[rows]
-    seconds = dict.fromkeys(("ours", "sgbm", "ssd"), 0.0)
+    rows = list(range(len(views)))[: options.first]
+    with torch.enable_grad():  # the sensor's pose is found by gradients
+        truth = truth_of(options.results, maps, options.depth)[rows]
+    seconds: dict[str, list[float]] = {"ours": [], "sgbm": [], "ssd": []}  # of each view alone
 
     def timed(
         name: str, alone: Callable[[int], tuple[Tensor, Tensor]]
@@ -243,7 +243,7 @@ def main() -> None:
                 images.color(each)
             started = time.process_time()
             found = alone(view)
-            seconds[name] += (time.process_time() - started) / len(views)
+            seconds[name].append(time.process_time() - started)
             return found
 
         return called
@@ -258,43 +258,41 @@ def main() -> None:
     def constant(depth: Tensor) -> tuple[Tensor, Tensor]:
         return depth, CONSTANT * (depth > 0).float()
 
-    def pairs(view: int) -> tuple[Tensor, Tensor]:
+    def pair_maps(view: int, count: int) -> list[Tensor]:
         found = (sgbm(views, images, view, other) for other in views.neighbors[view])
-        some = [each for each in found if each is not None][:PAIRS]
-        if len(some) < 2:
-            return constant(some[0] if some else torch.zeros(views.camera.size[::-1]))
-        all_pairs, same = torch.stack(some), torch.eye(4).expand(len(some) - 1, 4, 4)
-        weights = CONSTANT * (all_pairs > 0).float()
-        merged = merge(all_pairs[0], weights[0], all_pairs[1:], weights[1:], views.camera, same)
-        return constant(merged.inverse_depth)
+        unknown = torch.zeros(views.camera.size[::-1])
+        return list(islice((each for each in found if each is not None), count)) or [unknown]
 
-    def first_pair(view: int) -> Tensor:
-        found = (sgbm(views, images, view, other) for other in views.neighbors[view])
-        return next((each for each in found if each is not None), torch.zeros(views.camera.size[::-1]))
+    def pairs(view: int) -> tuple[Tensor, Tensor]:
+        depth = torch.stack(pair_maps(view, PAIRS))
+        weights, same = CONSTANT * (depth > 0).float(), torch.eye(4).expand(len(depth) - 1, 4, 4)
+        if len(depth) == 1:
+            return depth[0], weights[0]
+        return constant(merge(depth[0], weights[0], depth[1:], weights[1:], views.camera, same).inverse_depth)
 
     print(
         f"{len(rows)} of {len(views)} views, {views.camera.size[0]} x {views.camera.size[1]}; seconds are CPU"
     )
     print("| | kept | within 1 % | 2 % | 5 % | 10 % | s a map |\n|---|---|---|---|---|---|---|")
     started = time.process_time()
-    one = torch.stack([first_pair(view) for view in rows])
+    one = torch.cat([torch.stack(pair_maps(view, 1)) for view in rows])
     single = Depth(one, (one > 0).float(), None, time.process_time() - started)
     targets = {"SGBM, one pair": row_of("SGBM, one pair", single, one > 0, truth, single.seconds / len(rows))}
     found = {}
     for name, key, alone in (
         ("SGBM, fused", "sgbm", pairs),
+        ("torchslam", "ours", ours),
         (
             "squared differences, fused",
             "ssd",
             lambda view: constant(squared_differences(views, images, view)),
         ),
-        ("torchslam", "ours", ours),
     ):
         depth = fused(views, rows, timed(key, alone))
         depth = depth if key == "ours" else with_fitted_confidence(depth, truth)
         is_kept = torch.stack([kept(each) for each in depth.confidence])
         found[name] = depth
-        cost = seconds[key] + depth.seconds / len(rows)
+        cost = sum(seconds[key]) / len(seconds[key]) + depth.seconds / len(rows)
         targets[f"{name}"] = row_of(f"{name}, confidence at least {LEAST_KEPT}", depth, is_kept, truth, cost)
         if key != "ours":
             row_of(f"{name}, all", depth, depth.confidence > 0, truth, cost)
