@@ -14,15 +14,13 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.dense.run import truth_of
+from experiments.dense.run import opened, truth_of
 from torchslam.dense import DepthMaps
 from torchslam.dense.confidence import alone_features, confidence_alone, together_features
 from torchslam.dense.consistency import merge
 from torchslam.dense.estimate import estimate_depth
-from torchslam.densify.views import SWEPT, ViewImages, views_of
-from torchslam.io.export.scene import open_images, scene_of
-from torchslam.io.results import DEPTHS, MAP, read_metrics
-from torchslam.map.file import read_atlas
+from torchslam.densify.views import SWEPT
+from torchslam.io.results import DEPTHS
 
 RIGHT = 0.05
 SAMPLE = 9  # every so many pixels
@@ -32,12 +30,7 @@ ITERATIONS = 30
 def samples(folder: Path, depth: Path | None) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Features of depth alone and whether it is right, and the same for depth merged with that of neighbors."""
     maps = DepthMaps.load(folder / DEPTHS)
-    truth, metrics, saved = truth_of(folder, maps, depth), read_metrics(folder), read_atlas(folder / MAP)
-    submap = saved.atlas.main()
-    assert submap is not None
-    scene = scene_of(submap, saved.camera, 0, keyframes_alone=True)
-    views = views_of(scene, maps.camera.size)
-    images = ViewImages(views, open_images(metrics["source"], scene, views.camera))
+    truth, (views, images) = truth_of(folder, maps, depth), opened(folder, maps)
 
     @cache
     @torch.no_grad()

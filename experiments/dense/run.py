@@ -16,7 +16,9 @@ from experiments.dense.truth import Sensor, rendered_depth
 from torchslam.data import open_sequence
 from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.dense import DepthMaps
+from torchslam.densify.views import ViewImages, Views, views_of
 from torchslam.geometry import se3_inverse
+from torchslam.io.export.scene import open_images, scene_of
 from torchslam.io.results import DEPTHS, MAP, read_metrics
 from torchslam.map.file import read_atlas
 
@@ -46,6 +48,17 @@ def truth_of(folder: Path, maps: DepthMaps, depth: Path | None) -> Tensor:
     return torch.stack(
         [sensor.depth(i, T_cw, maps.camera, T_cs, meters) for i, T_cw in zip(frames, maps.T_cw, strict=True)]
     ).float()
+
+
+def opened(folder: Path, maps: DepthMaps) -> tuple[Views, ViewImages]:
+    """The views that depth maps were computed of, with the default options, and their images."""
+    metrics, saved = read_metrics(folder), read_atlas(folder / MAP)
+    submap = saved.atlas.main()
+    assert submap is not None
+    scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=True)
+    views = views_of(scene, maps.camera.size)
+    assert torch.equal(views.frame_index, maps.frame_index), "not the views of the depth maps"
+    return views, ViewImages(views, open_images(metrics["source"], scene, views.camera))
 
 
 def main() -> None:

@@ -131,7 +131,7 @@ def rendered_depth(
 ) -> Float[Tensor, "K H W"]:
     """Exact depth of a rendered sequence at another size, in map units of so many meters."""
     K = np.array(((FOCAL, 0, (SIZE[0] - 1) / 2), (0, FOCAL, (SIZE[1] - 1) / 2), (0, 0, 1)))
-    renderer = Renderer(SCENES[sequence.name].build(0), K, SIZE)
+    renderer = Renderer(SCENES[sequence.name].build(sequence._options.seed), K, SIZE)
     y, x = np.mgrid[0 : size[1], 0 : size[0]].astype(np.float64)
     x, y = (x + 0.5) * SIZE[0] / size[0] - 0.5, (y + 0.5) * SIZE[1] / size[1] - 0.5
     depths = []

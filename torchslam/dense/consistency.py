@@ -136,19 +136,27 @@ def merge(
     maps = torch.cat((inverse_depth[None], as_seen_by(rendered, others, camera, T_sr)))
     sampled, _ = warp(other_confidences[:, None], camera, T_sr[:, None], rendered[:, None])
     weights = torch.cat((confidence[None], sampled[:, 0, 0]))
-    is_known = maps > 0
-    best = Merged(*(torch.zeros_like(inverse_depth) for _ in Merged._fields))
-    for candidate in maps.unbind(0):
+    weights = torch.where(maps > 0, weights, 0.0)
+
+    def votes(candidate: Tensor) -> tuple[Tensor, Tensor]:
         relative = maps / torch.where(candidate > 0, candidate, 1.0) - 1
-        is_comparable = is_known & (candidate > 0)
-        agree = is_comparable & (relative.abs() <= 2 * tolerance)
-        votes = torch.where(agree, weights / (1 + (relative / tolerance) ** 2), 0.0)
-        support = votes.sum(0)
-        total = support.clamp(min=torch.finfo(maps.dtype).eps)
-        mean = (votes * relative).sum(0) / total
-        spread = ((votes * (relative - mean).square()).sum(0) / total).sqrt()
-        conflicts = torch.where(is_comparable & (relative > 2 * tolerance), weights, 0.0).sum(0)
-        found = Merged(candidate * (1 + mean), support, spread, conflicts, agree[0].to(maps.dtype))
-        is_better = support > best.support
-        best = Merged(*(torch.where(is_better, new, old) for new, old in zip(found, best, strict=True)))
-    return best
+        square = (relative / tolerance).square()
+        is_agreeing = (square <= 4) & (candidate > 0)
+        return relative, torch.where(is_agreeing, weights / (1 + square), 0.0)
+
+    best, support = torch.zeros_like(inverse_depth), torch.zeros_like(inverse_depth)
+    for candidate in maps.unbind(0):
+        found = votes(candidate)[1].sum(0)
+        best, support = torch.where(found > support, candidate, best), torch.maximum(support, found)
+    relative, given = votes(best)
+    total = support.clamp(min=torch.finfo(maps.dtype).eps)
+    mean = (given * relative).sum(0) / total
+    spread = ((given * (relative - mean).square()).sum(0) / total).sqrt()
+    is_in_front = (relative > 2 * tolerance) & (best > 0)
+    return Merged(
+        inverse_depth=best * (1 + mean),
+        support=support,
+        spread=spread,
+        conflicts=torch.where(is_in_front, weights, 0.0).sum(0),
+        agrees=(given[0] > 0).to(maps.dtype),
+    )

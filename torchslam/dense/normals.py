@@ -37,17 +37,16 @@ def normals(depth: Float[Tensor, "B H W"], camera: Camera, radius: int = RADIUS)
     around = windows(q)
     weight = ((around > 0) & ((around - q[:, None]).abs() <= EDGE * q[:, None])).to(q.dtype)
     offset = torch.arange(-radius, radius + 1, dtype=q.dtype, device=q.device)
-    y, x = (each.reshape(-1, 1, 1) for each in torch.meshgrid(offset, offset, indexing="ij"))
+    y, x = (each.flatten() for each in torch.meshgrid(offset, offset, indexing="ij"))
     # Least squares of q - q0 = a x + b y + c: the three moments of the window, centered.
-    total = weight.sum(1).clamp(min=1)
-    mean_x, mean_y = (weight * x).sum(1) / total, (weight * y).sum(1) / total
-    difference = around - q[:, None]
-    mean_q = (weight * difference).sum(1) / total
-    xx = (weight * x * x).sum(1) / total - mean_x**2
-    yy = (weight * y * y).sum(1) / total - mean_y**2
-    xy = (weight * x * y).sum(1) / total - mean_x * mean_y
-    xq = (weight * x * difference).sum(1) / total - mean_x * mean_q
-    yq = (weight * y * difference).sum(1) / total - mean_y * mean_q
+    moments = torch.stack((torch.ones_like(x), x, y, x * x, y * y, x * y))
+    sums = torch.einsum("mp,bphw->mbhw", moments, weight)
+    total = sums[0].clamp(min=1)
+    mean_x, mean_y, xx, yy, xy = sums[1:] / total
+    sums = torch.einsum("mp,bphw->mbhw", moments[:3], weight * (around - q[:, None]))
+    mean_q, xq, yq = sums / total
+    xx, yy, xy = xx - mean_x**2, yy - mean_y**2, xy - mean_x * mean_y
+    xq, yq = xq - mean_x * mean_q, yq - mean_y * mean_q
     determinant = xx * yy - xy * xy
     is_known = is_known & (total >= LEAST_SHARE * size**2) & (determinant > 0.1)
     safe = torch.where(is_known, determinant, 1.0)
