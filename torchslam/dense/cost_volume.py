@@ -69,7 +69,7 @@ def warp(
         at = torch.addcmul(fixed[..., None, :, :], q, moving) * inverse_z
         is_seen = is_seen & (at.abs() <= 1)
         grid.append(at)
-    flat = torch.stack(grid, dim=-1).clamp(-2, 2)
+    flat = torch.stack(grid, dim=-1)
     shape = flat.shape[:-1]
     samples = F.grid_sample(
         sources.reshape(-1, 1, height, width),
