@@ -73,6 +73,7 @@ class Initializer:
         # keypoints of the last view that do not belong to the scene
         self.static_pixels: Float[Tensor, "N 2"] = camera.params.new_zeros(0, 2)
         self.num_planar_views = 0  # whose matches with the reference a homography explained
+        self.planar_reason: Rejection | None = None  # of the last such view that was tested for a rotation
 
     @property
     def reference(self) -> FrameFeatures:
@@ -99,6 +100,7 @@ class Initializer:
         """Start again with another reference frame."""
         self.views = [view]
         self.num_planar_views = 0
+        self.planar_reason = None
 
     def _relate(self, view: FrameFeatures, first: Tensor, second: Tensor) -> TwoViewMap | Rejection:
         """Initialize from matches with the reference, unless the camera stands still."""
@@ -144,17 +146,19 @@ class Initializer:
         if model == "rotation":
             return Rejection(Reason.PURE_ROTATION)
         self.num_planar_views += model == "homography"
-        rejection = self._turns_only(view, first, second, relative)
-        if rejection:
-            return rejection
         if model == "homography" and self.num_planar_views < settings.min_planar_frames:
             # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
-            return Rejection(Reason.PLANAR_SCENE)
+            if self.num_planar_views.bit_count() == 1:  # the 1st, 2nd, 4th, ...: a test takes long
+                self.planar_reason = self._turns_only(view, first, second, relative)
+            return self.planar_reason or Rejection(Reason.PLANAR_SCENE)
         if not bool(relative.success[0]):
             return Rejection.of(Reason.AMBIGUOUS_MOTION, model=model)
         inliers = torch.nonzero(relative.inliers[0])[:, 0]
         min_good_ratio = settings.min_planar_ratio if model == "homography" else settings.min_good_ratio
-        return self._triangulate(view, relative.T_21[0], first[inliers], second[inliers], min_good_ratio)
+        found = self._triangulate(view, relative.T_21[0], first[inliers], second[inliers], min_good_ratio)
+        if isinstance(found, Rejection):
+            return found
+        return self._turns_only(view, first, second, relative) or found
 
     def _turns_only(
         self, view: FrameFeatures, first: Int[Tensor, " M"], second: Int[Tensor, " M"], relative: RelativePose
