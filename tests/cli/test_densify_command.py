@@ -44,8 +44,8 @@ def results(run: Path, tmp_path: Path) -> Path:
     return tmp_path / "run"
 
 
-def densify(results: Path, *more: str) -> int:
-    return main(["densify", str(results), *SMALL, "--every", "3", *more])
+def densify(results: Path, *more: str, processes: int = 1) -> int:
+    return main(["densify", str(results), *SMALL, "--every", "3", "--processes", str(processes), *more])
 
 
 def test_a_run_with_dense_depth_has_all_its_results(run: Path) -> None:
@@ -83,11 +83,11 @@ def test_the_same_bytes_again_and_after_an_interruption(
     computed: list[Path] = []
     write = passes._write_alone
 
-    def write_three(path: Path, *arguments: Any) -> None:
+    def write_three(job: passes.DenseJob, view: int) -> None:
         if len(computed) == 3:
             raise KeyboardInterrupt
-        computed.append(path)
-        write(path, *arguments)
+        computed.append(job.path(passes.Pass.ALONE, view))
+        write(job, view)
 
     with monkeypatch.context() as patch:
         patch.setattr(passes, "_write_alone", write_three)
@@ -96,9 +96,23 @@ def test_the_same_bytes_again_and_after_an_interruption(
     times = {path: path.stat().st_mtime_ns for path in computed}
     assert len(times) == 3
     kept = []
-    monkeypatch.setattr(passes, "_write_alone", lambda path, *rest: (kept.append(path), write(path, *rest)))
+
+    def noted(job: passes.DenseJob, view: int) -> None:
+        kept.append(job.path(passes.Pass.ALONE, view))
+        write(job, view)
+
+    monkeypatch.setattr(passes, "_write_alone", noted)
     assert densify(results) == 0
     assert not set(kept) & set(computed)
+    for name in (DEPTHS, DENSE_CLOUD):
+        assert (results / name).read_bytes() == (run / name).read_bytes()
+
+
+def test_the_same_bytes_with_any_number_of_processes(
+    run: Path, results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
+    assert densify(results, processes=3) == 0
     for name in (DEPTHS, DENSE_CLOUD):
         assert (results / name).read_bytes() == (run / name).read_bytes()
 
@@ -136,8 +150,9 @@ def test_a_damaged_part_is_named(
 ) -> None:
     write = passes._write_alone
 
-    def damage(path: Path, *arguments: Any) -> None:
-        write(path, *arguments)
+    def damage(job: passes.DenseJob, view: int) -> None:
+        write(job, view)
+        path = job.path(passes.Pass.ALONE, view)
         path.write_bytes(path.read_bytes()[:100])
 
     monkeypatch.setattr(passes, "_write_alone", damage)

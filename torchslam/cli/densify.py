@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import argparse
 import json
+import os
 import re
-import time
 from pathlib import Path
 from typing import Any
 
@@ -31,11 +31,14 @@ from torchslam.io.export.scene import open_images, pinhole_within, scene_of
 from torchslam.io.results import DENSE_CLOUD, DEPTHS, MAP, MESH, METRICS, read_metrics, read_results
 from torchslam.io.viewer.page import VIEW, write_view
 from torchslam.map.file import read_atlas
+from torchslam.parallel.workers import processors
 from torchslam.utils.console import table, tqdm_options
 from torchslam.utils.files import write_whole
 
 LONG_SIDE = 320
 """Default resolution: about a second per keyframe."""
+MAX_PROCESSES = 4
+"""Unless asked for: each takes as much memory, up to about 1 GB at 640 x 480."""
 SMALLEST = 64
 """Width and height of a depth map, pixels: windows at half size must be a small part of it."""
 
@@ -46,6 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_options(parser)
     parser.add_argument(
         "--images", metavar="PATH", help="the images of the run, if they are not where the run read them"
+    )
+    parser.add_argument(
+        "--processes",
+        type=arguments.positive,
+        metavar="N",
+        help="number of processes; results are identical (default: one per processor, at most "
+        f"{MAX_PROCESSES})",
     )
     arguments.add_device(parser)
 
@@ -80,6 +90,7 @@ def execute(options: argparse.Namespace) -> int:
                 options.device,
                 options.images,
                 options.mesh,
+                options.processes,
             )
         )
     )
@@ -93,6 +104,7 @@ def densify_results(
     device: torch.device | str,
     images: str | None = None,
     mesh: bool = False,
+    processes: int | None = None,
 ) -> dict[str, str]:
     """Compute dense depth of a results folder and add it to the folder; return rows for `table`.
 
@@ -103,10 +115,11 @@ def densify_results(
         device: to compute on.
         images: where the images are; None: where the run read them.
         mesh: also write a mesh; one of other depth maps is deleted.
+        processes: number of processes; None: one per processor, at most MAX_PROCESSES.
     """
     if mesh:
         import_open3d()
-    started = time.process_time()
+    started = _processor_time()
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
     metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
@@ -135,9 +148,10 @@ def densify_results(
             bar.update(done - bar.n)
 
         with shown_warnings():
-            found = densify(views, opened, folder, torch.device(device), on_progress)
+            count = min(processors(), MAX_PROCESSES) if processes is None else processes
+            found = densify(views, opened, folder, torch.device(device), on_progress, count)
     write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map))
-    about = {"dense": _figures(found, size, time.process_time() - started)}
+    about = {"dense": _figures(found, size, _processor_time() - started)}
     write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
     if (directory / VIEW).exists():
         write_view(read_results(directory), directory)
@@ -152,6 +166,11 @@ def densify_results(
         made = write_mesh(directory / MESH, directory / DEPTHS, upright_from_map(submap.map), opened)
         rows["mesh"] = f"{directory / MESH}, {made.triangles} triangles, voxels of {made.voxel:.4g} map units"
     return rows
+
+
+def _processor_time() -> float:
+    """Processor seconds of this process and of those that it has waited for."""
+    return sum(os.times()[:4])
 
 
 def _figures(found: DenseSummary, size: tuple[int, int], seconds: float) -> dict[str, Any]:

@@ -219,7 +219,12 @@ def execute(options: argparse.Namespace) -> int:
     status = run(opened, config, replace(plan, may_fall_back=is_recorded and is_default and saved is None))
     if options.dense and status == DONE:
         dense = densify_results(
-            options.output, options.resolution, options.every, options.device, mesh=options.mesh
+            options.output,
+            options.resolution,
+            options.every,
+            options.device,
+            mesh=options.mesh,
+            processes=options.processes,
         )
         print(f"\n{table(dense)}")
     return status

@@ -11,6 +11,7 @@ import shutil
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from enum import Enum
 from functools import lru_cache
 from pathlib import Path
 
@@ -32,6 +33,7 @@ from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
 from torchslam.errors import ResultsError
 from torchslam.io.export.scene import Images
 from torchslam.io.results import DEPTHS, PICTURE_NAMES, PICTURES
+from torchslam.parallel.tasks import SharedTasks
 from torchslam.utils.files import parse_json, read_text, write_whole
 
 PARTS = "parts"
@@ -68,6 +70,7 @@ def densify(
     folder: Path,
     device: torch.device,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    processes: int = 1,
 ) -> DenseSummary:
     """Compute depth maps and cloud; depth maps and pictures are written.
 
@@ -79,6 +82,7 @@ def densify(
         folder: for the results; its folder of parts is used again if it is of the same views, and deleted at the end.
         device: to compute on.
         on_progress: called after each view of both passes with the numbers done and in all.
+        processes: that compute views, this one included; the results are the same. On a GPU one is used.
 
     Raises:
         ResultsError: too few images can be read.
@@ -90,19 +94,17 @@ def densify(
     parts = folder / PARTS
     _prepare(parts, views)
     opened = ViewImages(views, images)
-    total = 2 * len(views)
-    for view in range(len(views)):
-        path = _alone_path(parts, views, view)
-        if not path.exists():
-            _write_alone(path, views, opened, view, device)
-        on_progress(view + 1, total)
-    alone = lru_cache(maxsize=CACHED)(lambda view: _read_alone(_alone_path(parts, views, view)))
-    for view in range(len(views)):
-        path = _merged_path(parts, views, view)
-        if not path.exists():
-            _write_merged(path, views, alone, view, device)
-        on_progress(len(views) + view + 1, total)
-    paths = [_merged_path(parts, views, view) for view in range(len(views))]
+    job = DenseJob(views, opened, parts, device)
+    with SharedTasks(_do, (job,), processes if device.type == "cpu" else 1) as shared:
+        done = 0
+        for each in Pass:
+            missing = [view for view in range(len(views)) if not job.path(each, view).exists()]
+            done += len(views) - len(missing)
+            on_progress(done, len(Pass) * len(views))
+            for _ in shared.run([(each, view) for view in missing]):
+                done += 1
+                on_progress(done, len(Pass) * len(views))
+    paths = [job.path(Pass.MERGED, view) for view in range(len(views))]
     join(folder / DEPTHS.name, paths)
     _draw(folder, views, opened)
     spreads = torch.tensor([read_about(path)["spread"] for path in paths])
@@ -124,19 +126,49 @@ def _prepare(parts: Path, views: Views) -> None:
     write_whole(parts / JOB, json.dumps(job).encode())
 
 
-def _alone_path(parts: Path, views: Views, view: int) -> Path:
-    return parts / f"{int(views.frame_index[view]):06d}.alone.safetensors"
+class Pass(Enum):
+    """What is computed of each view, in this order; the second needs the first one of the neighbors."""
+
+    ALONE = "alone"
+    MERGED = "merged"
 
 
-def _merged_path(parts: Path, views: Views, view: int) -> Path:
-    return parts / f"{int(views.frame_index[view]):06d}.merged.safetensors"
+class DenseJob:
+    """What the passes compute with, in each of the processes.
+
+    Args:
+        views: of the run.
+        images: theirs.
+        parts: folder of the results of views.
+        device: to compute on.
+    """
+
+    def __init__(self, views: Views, images: ViewImages, parts: Path, device: torch.device) -> None:
+        self.views, self.images, self.parts, self.device = views, images, parts, device
+        self.alone = lru_cache(maxsize=CACHED)(lambda view: _read_alone(self.path(Pass.ALONE, view)))
+
+    def __reduce__(self) -> tuple[type[DenseJob], tuple[object, ...]]:
+        return DenseJob, (self.views, self.images, self.parts, self.device)
+
+    def path(self, result: Pass, view: int) -> Path:
+        """The file of a view's result."""
+        return self.parts / f"{int(self.views.frame_index[view]):06d}.{result.value}.safetensors"
 
 
-def _write_alone(path: Path, views: Views, images: ViewImages, view: int, device: torch.device) -> None:
+def _do(job: DenseJob, result: Pass, view: int) -> None:
+    """Compute one view in one pass and write it."""
+    if result is Pass.ALONE:
+        _write_alone(job, view)
+    else:
+        _write_merged(job, view)
+
+
+def _write_alone(job: DenseJob, view: int) -> None:
     """First pass: inverse depth of a view and its confidence."""
-    sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
+    views, device = job.views, job.device
+    sources = torch.stack([job.images.gray(other) for other in views.neighbors[view][:SWEPT]])
     found = estimate_depth(
-        images.gray(view)[None].to(device),
+        job.images.gray(view)[None].to(device),
         sources[None].to(device),
         views.camera.to(device),
         views.T_sr(view)[None, :SWEPT].to(device),
@@ -144,7 +176,8 @@ def _write_alone(path: Path, views: Views, images: ViewImages, view: int, device
         views.far[view, None].to(device),
     )
     tensors = {"inverse_depth": found.inverse_depth[0], "confidence": confidence_alone(found)[0]}
-    write_whole(path, save({name: rows.cpu().contiguous() for name, rows in tensors.items()}))
+    content = save({name: rows.cpu().contiguous() for name, rows in tensors.items()})
+    write_whole(job.path(Pass.ALONE, view), content)
 
 
 def _read_alone(path: Path) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]:
@@ -156,13 +189,12 @@ def _read_alone(path: Path) -> tuple[Float[Tensor, "H W"], Float[Tensor, "H W"]]
         raise ResultsError(f"{path}: not a readable part of depth maps: {error}; delete it") from None
 
 
-def _write_merged(
-    path: Path, views: Views, alone: Callable[[int], tuple[Tensor, Tensor]], view: int, device: torch.device
-) -> None:
+def _write_merged(job: DenseJob, view: int) -> None:
     """Second pass: the depth map of a view after the comparison with its neighbors."""
-    neighbors = [alone(other) for other in views.neighbors[view]]
+    views, device = job.views, job.device
+    neighbors = [job.alone(other) for other in views.neighbors[view]]
     others, other_confidences = (torch.stack([rows[i] for rows in neighbors]).to(device) for i in (0, 1))
-    inverse_depth, confidence = (rows.to(device) for rows in alone(view))
+    inverse_depth, confidence = (rows.to(device) for rows in job.alone(view))
     camera, T_sr = views.camera.to(device), views.T_sr(view).to(device)
     merged = merge(inverse_depth, confidence, others, other_confidences, camera, T_sr)
     probability = confidence_together(merged, confidence)
@@ -177,7 +209,7 @@ def _write_merged(
         camera=views.camera,
     )
     spread = float(merged.spread[is_kept].median()) if bool(is_kept.any()) else 0.0
-    maps.save(path, {"spread": spread})
+    maps.save(job.path(Pass.MERGED, view), {"spread": spread})
 
 
 def _draw(folder: Path, views: Views, images: ViewImages) -> None:

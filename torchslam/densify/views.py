@@ -114,9 +114,12 @@ class ViewImages:
     """Images of views, opened with the camera of the views; the last few are kept."""
 
     def __init__(self, views: Views, images: Images) -> None:
+        self._views, self._images = views, images
         self._frames = views.frame_index.tolist()
-        self._images = images
         self.color = lru_cache(maxsize=CACHED)(self._color)
+
+    def __reduce__(self) -> tuple[type[ViewImages], tuple[object, ...]]:
+        return ViewImages, (self._views, self._images)
 
     def gray(self, view: int) -> Float[Tensor, "H W"]:
         """Gray image in [0, 1]. Raises FrameError if it cannot be read."""

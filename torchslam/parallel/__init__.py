@@ -1,1 +1,1 @@
-"""Worker processes: feature prefetching and bundle adjustment in the background."""
+"""Worker processes: feature prefetching, bundle adjustment in the background, and shared tasks."""

@@ -80,6 +80,13 @@ class Worker:
             self._lose()
         return self._is_there
 
+    def has_result(self) -> bool:
+        """Return True if `receive` need not wait: there is a result, or the process has ended."""
+        try:
+            return self._ours.poll()
+        except (EOFError, OSError):
+            return True
+
     def receive(self) -> Any:
         """Wait for the next result, unpickled; None if the process has ended."""
         try:

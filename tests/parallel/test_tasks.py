@@ -1,0 +1,76 @@
+"""Tasks shared between this process and workers: each is done once, whatever becomes of the workers."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import warnings
+from pathlib import Path
+
+import pytest
+
+from torchslam.errors import FrameError
+from torchslam.parallel.tasks import SharedTasks
+
+TASKS = [(number,) for number in range(12)]
+
+
+def note(folder: Path, number: int) -> None:
+    """Write the number of the process that did a task; each task may be done once."""
+    with (folder / str(number)).open("x") as file:
+        file.write(str(os.getpid()))
+    time.sleep(0.02)
+
+
+def die_elsewhere(folder: Path, main: int, number: int) -> None:
+    if os.getpid() != main:
+        os.kill(os.getpid(), signal.SIGKILL)
+    note(folder, number)
+
+
+def fail_elsewhere(folder: Path, main: int, number: int) -> None:
+    if os.getpid() != main:
+        raise FrameError(f"task {number}")
+    note(folder, number)
+
+
+@pytest.fixture(params=[True, False], ids=["copied", "spawned"])
+def starts(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: request.param)
+
+
+def wait_for_workers(shared: SharedTasks) -> None:
+    end = time.monotonic() + 120
+    while not all(worker.is_there() for worker in shared._pending):
+        assert time.monotonic() < end
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize("processes", [1, 2, 3])
+@pytest.mark.usefixtures("starts")
+def test_each_task_is_done_once_by_all_processes(tmp_path: Path, processes: int) -> None:
+    with SharedTasks(note, (tmp_path,), processes) as shared:
+        wait_for_workers(shared)
+        assert sum(1 for _ in shared.run(TASKS)) == len(TASKS)
+        assert list(shared.run([])) == []
+    by = {path.name: path.read_text() for path in tmp_path.iterdir()}
+    assert by.keys() == {str(number) for (number,) in TASKS}
+    assert len(set(by.values())) == processes
+    assert str(os.getpid()) in by.values()
+
+
+def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
+    with SharedTasks(die_elsewhere, (tmp_path, os.getpid()), 3) as shared:
+        wait_for_workers(shared)
+        with pytest.warns(UserWarning, match="going on without it"):
+            assert sum(1 for _ in shared.run(TASKS)) == len(TASKS)
+    assert {path.read_text() for path in tmp_path.iterdir()} == {str(os.getpid())}
+    assert len(list(tmp_path.iterdir())) == len(TASKS)
+
+
+def test_an_error_of_a_worker_is_raised_here(tmp_path: Path) -> None:
+    with SharedTasks(fail_elsewhere, (tmp_path, os.getpid()), 2) as shared:
+        wait_for_workers(shared)
+        with warnings.catch_warnings(), pytest.raises(FrameError, match="task"):
+            list(shared.run(TASKS))
