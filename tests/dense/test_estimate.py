@@ -21,7 +21,7 @@ from torchslam.dense.cost_volume import (
     warp,
 )
 from torchslam.dense.estimate import estimate_depth, halved, refine_depth
-from torchslam.dense.minimum import find_minimum
+from torchslam.dense.minimum import find_minimum, position_std
 from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
 from torchslam.dense.normals import normals
 from torchslam.geometry import Camera, se3_inverse
@@ -55,6 +55,23 @@ def test_the_depth_of_a_slanted_plane(device: torch.device, dtype: torch.dtype) 
     assert float((error < 0.02).double().mean()) > 0.95
     confidence = inside(confidence_alone(found).cpu())
     assert float(confidence.median()) > 0.8
+
+
+@pytest.mark.parametrize("noise", [0.01, 0.03])
+def test_the_standard_deviation_of_depth_grows_with_the_noise_of_the_images(noise: float) -> None:
+    reference, sources, camera, T_sr, depth = scene(WIDTH, HEIGHT)
+    generator = torch.Generator().manual_seed(0)
+    reference = reference + noise * torch.randn(reference.shape, generator=generator)
+    sources = sources + noise * torch.randn(sources.shape, generator=generator)
+    found = estimate_depth(reference[None].float(), sources[None].float(), camera, T_sr[None], *limits())
+    assert bool((found.std > 0).all())
+    ratio = inside((found.inverse_depth[0] - 1 / depth) / found.std[0]).abs()
+    assert 0.4 < float(ratio.median()) / 0.6745 < 1.6  # the median of a Gaussian's absolute value
+
+
+def test_a_flat_cost_has_no_position() -> None:
+    flat = find_minimum(torch.ones(5, 2, 2))
+    assert bool(torch.isinf(position_std(flat)).all())
 
 
 def test_samples_at_the_true_depth_are_the_reference(dtype: torch.dtype) -> None:

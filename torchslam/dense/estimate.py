@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchslam.dense.aggregation import Aggregation, semi_global
 from torchslam.dense.cost_volume import inverse_depth_planes, matching_cost
-from torchslam.dense.minimum import Minimum, find_minimum
+from torchslam.dense.minimum import Minimum, find_minimum, position_std
 from torchslam.geometry import Camera
 
 PLANES = 64
@@ -34,11 +34,13 @@ class Estimate(NamedTuple):
 
     Attributes:
         inverse_depth: 1 / map units, positive.
+        std: standard deviation of the inverse depth where it is right, 1 / map units; without a gradient.
         coarse: minimum of the cost at half size, of the pixels at full size; its position is in planes.
         fine: minimum at full size; its position is in steps.
     """
 
     inverse_depth: Float[Tensor, "B H W"]
+    std: Float[Tensor, "B H W"]
     coarse: Minimum
     fine: Minimum
 
@@ -80,7 +82,9 @@ def estimate_depth(
     inverse_depth, fine = refine_depth(
         reference, sources, camera, T_sr, surface, REFINEMENT * step, 0.5 / far.to(reference), aggregate
     )
-    return Estimate(inverse_depth, coarse, fine)
+    with torch.no_grad():
+        std = REFINEMENT * step[:, None, None] * position_std(fine)
+    return Estimate(inverse_depth, std, coarse, fine)
 
 
 def refine_depth(
