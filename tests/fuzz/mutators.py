@@ -322,7 +322,11 @@ def _changed(node: Any, rng: random.Random) -> Any:
 
 
 def change_png(content: bytes, rng: random.Random) -> bytes:
-    """Another header, with a checksum that fits."""
+    """Another header, with a checksum that fits; or another length of a chunk."""
+    chunks = [at - 4 for name in (b"IDAT", b"PLTE", b"IEND") if (at := content.find(name)) >= 4]
+    if chunks and rng.random() < 0.25:
+        at = rng.choice(chunks)
+        return content[:at] + struct.pack(">I", rng.choice(INTEGERS) & 0xFFFFFFFF) + content[at + 4 :]
     width, height, *rest = struct.unpack(">II5B", content[16:29])
     width, height = rng.choice((width, 0, 1, 30000, 2**31 - 1)), rng.choice((height, 0, 1, 2000, 2**31 - 1))
     rest = [rng.choice((value, rng.randrange(17))) if rng.random() < 0.5 else value for value in rest]

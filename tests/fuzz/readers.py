@@ -51,7 +51,7 @@ from torchslam.system.session import Session
 from torchslam.tracking.lightglue import LightGlue
 
 CAMERA = "60,61,31.5,23.5"
-IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "color.png", "color.jpg", "16.png")
+IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "color.png", "color.jpg", "1.png", "16.png")
 WEIGHTS = {"a.b": torch.zeros(3), "c": torch.ones(2, 2)}
 ALIKED_WEIGHTS = {"block1.conv1.weight": torch.ones(8, 1, 3, 3), "desc_head.agg_weights": torch.ones(16, 1)}
 MATCHER_WEIGHTS = {

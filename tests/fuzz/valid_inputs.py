@@ -59,6 +59,7 @@ def images() -> dict[str, Files]:
         "color.png": encoded(color),
         "color.jpg": encoded(color, ".jpg"),
     }
+    found["1.png"] = bytes(cv2.imencode(".png", picture(1) // 128 * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])[1])
     found["16.png"] = encoded(picture(1).astype(np.uint16) * 100)
     return {kind: {f"a.{kind}": content} for kind, content in found.items()}
 
