@@ -218,6 +218,15 @@ def test_wrong_recordings(tmp_path: Path) -> None:
         open_sequence(path)
 
 
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_calibration_that_is_not_finite_is_refused(tmp_path: Path, kind: str) -> None:
+    recording = Recording(tmp_path / ("r.bag" if kind == "ros1" else "r"), kind)
+    recording.camera_info("/camera_info", distortion=np.array([0.1, np.nan, 0.0, 0.0, 0.0]))
+    recording.image("/image", pictures()[0], STAMPS[0])
+    with pytest.raises(CalibrationError, match=r"the parameters must be finite, got \[60.*nan"):
+        open_sequence(recording.close())
+
+
 def test_a_definition_in_the_recording_is_not_followed(tmp_path: Path) -> None:
     """One of an array of 10^8 texts would be code of as many lines."""
     store = get_typestore(Stores.ROS1_NOETIC)
