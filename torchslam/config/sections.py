@@ -140,8 +140,8 @@ class MeasurementConfig(Settings, section="measurement"):
     gate: str = setting(
         "chi_square",
         "Unit of the errors; chi_square: the keypoint noise; "
-        "mahalanobis: in tracking, the keypoint noise combined with the uncertainty of the point, which the local bundle "
-        "adjustment then computes.",
+        "mahalanobis: in tracking, the keypoint noise combined with the uncertainty of the point, which the local "
+        "bundle adjustment then computes.",
         choices=("chi_square", "mahalanobis"),
     )
     max_chi_square: float = setting(
