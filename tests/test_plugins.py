@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 import torch
+from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from torchslam import ORB, SLAM, ClipSLAM, Config, Features, load_config, open_sequence, plugins
@@ -176,7 +177,6 @@ def test_information_is_scaled_with_reduced_images() -> None:
 
 def lightglue_file(path: Path) -> Path:
     from kornia.feature import LightGlue as Network
-    from safetensors.torch import save_file
 
     torch.manual_seed(0)
     network = Network(features=None, input_dim=64, descriptor_dim=96, n_layers=2, num_heads=1)
@@ -190,6 +190,22 @@ def view(dim: int, seed: int) -> FrameFeatures:
     keypoints = 100 * torch.rand(30, 2, generator=generator, dtype=torch.float64)
     ones = torch.ones(30, dtype=torch.float64)
     return FrameFeatures(seed, 0.0, keypoints, ones, 0 * ones, described, torch.arange(30) < 25)
+
+
+@pytest.mark.parametrize(
+    ("name", "tensor"),
+    [
+        ("posenc.Wr.weight", torch.tensor(1.0)),
+        ("posenc.Wr.weight", torch.ones(3)),
+        ("input_proj.weight", torch.tensor(1.0)),
+        ("input_proj.weight", torch.ones(200_000, 1)),  # of a network of 10^12 floats
+    ],
+)
+def test_weights_of_no_lightglue_are_refused(tmp_path: Path, name: str, tensor: torch.Tensor) -> None:
+    path = lightglue_file(tmp_path / "lightglue.safetensors")
+    save_file(load_file(path) | {f"matcher.{name}": tensor}, path)
+    with pytest.raises(ConfigError, match=r"lightglue\.safetensors: not the weights of a LightGlue network"):
+        LightGlue(path)
 
 
 def test_lightglue_works_as_a_matcher(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

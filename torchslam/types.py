@@ -369,7 +369,11 @@ class Reason(StrEnum):
     LOW_OVERLAP = "sees {ratio:.0%} of the points of its reference keyframe"
 
     # initialization
-    FEW_MATCHES = "too few matches with the reference frame: {count}, {needed} are needed"
+    FEW_KEYPOINTS = "too little texture: {count} keypoints, {needed} are needed"
+    FEW_MATCHES = (
+        "too few matches with the reference frame: {count}, {needed} are needed; "
+        "views may be too far apart, or blurred"
+    )
     STATIC_AMBIGUOUS = "some of the image stays in place, and it is not clear what moves"
     STATIC_REMAINDER = "what still matches stays in place, the rest has gone: took a new reference frame"
     STANDSTILL = "the camera stands still: the image moved by {pixels:.1f} px"

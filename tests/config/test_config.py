@@ -78,8 +78,11 @@ def test_an_integer_is_accepted_as_a_float() -> None:
             "--set bundle_adjustment.local_window=0: bundle_adjustment.local_window must be at least 2 "
             "and at most 1000000, not 0",
         ),
-        ("features.num_keypoints=0", "features.num_keypoints must be at least 1 and at most 100000, not 0"),
+        ("features.num_keypoints=0", "features.num_keypoints must be at least 1 and at most 8192, not 0"),
         ("features.max_image_pixels=1", "features.max_image_pixels must be 0 or at least 1024 and at most"),
+        ("static_overlay.cell_px=1e-300", "static_overlay.cell_px must be at least 1.0 and at most 10000"),
+        ("features.num_keypoints=100000", "features.num_keypoints must be at least 1 and at most 8192"),
+        ("bundle_adjustment.local_iterations=10000", "must be at least 1 and at most 1000, not 10000"),
         ("seed=18446744073709551616", "seed must be at least 0 and at most 9223372036854775807"),
         ("tracking.threshold_px=0", "tracking.threshold_px must be above 0 and at most 10000, not 0"),
         (

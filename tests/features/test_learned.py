@@ -86,6 +86,10 @@ def test_unusable_weights_are_rejected_by_name(kind: type, tmp_path: Path) -> No
     save_file({"block1.conv1.weight": torch.zeros(2, 2)}, tmp_path / "other.safetensors")
     with pytest.raises(ConfigError, match="other"):
         kind(tmp_path / "other.safetensors")
+    names = ("block1.conv1.weight", "desc_head.agg_weights", "net.norm.weight")
+    save_file({name: torch.tensor(1.0) for name in names}, tmp_path / "numbers.safetensors")
+    with pytest.raises(ConfigError, match="numbers"):
+        kind(tmp_path / "numbers.safetensors")
 
 
 @pytest.mark.parametrize("name", ["xfeat", "aliked"])

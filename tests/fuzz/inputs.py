@@ -48,6 +48,8 @@ def mutated(reader: Reader, number: int) -> Mutated:
     """Return the input of a number; it depends on the number alone."""
     rng = random.Random(f"{reader.name} {number}")
     files = dict(reader.files)
+    if reader.name == "settings of a run":
+        return {"argument": valid_inputs.absurd_setting(rng).encode()}
     if "argument" in files:
         examples = valid_inputs.OVERRIDES if reader.name == "--set" else valid_inputs.CAMERA_ARGUMENTS
         files["argument"] = rng.choice(examples).encode()

@@ -322,7 +322,11 @@ def _changed(node: Any, rng: random.Random) -> Any:
 
 
 def change_png(content: bytes, rng: random.Random) -> bytes:
-    """Another header, with a checksum that fits."""
+    """Another header, with a checksum that fits; or another length of a chunk."""
+    chunks = [at - 4 for name in (b"IDAT", b"PLTE", b"IEND") if (at := content.find(name)) >= 4]
+    if chunks and rng.random() < 0.25:
+        at = rng.choice(chunks)
+        return content[:at] + struct.pack(">I", rng.choice(INTEGERS) & 0xFFFFFFFF) + content[at + 4 :]
     width, height, *rest = struct.unpack(">II5B", content[16:29])
     width, height = rng.choice((width, 0, 1, 30000, 2**31 - 1)), rng.choice((height, 0, 1, 2000, 2**31 - 1))
     rest = [rng.choice((value, rng.randrange(17))) if rng.random() < 0.5 else value for value in rest]
@@ -448,8 +452,23 @@ def change_tensors(content: bytes, rng: random.Random) -> bytes:
             about = rng.choice((None, {"other": "1"}, {**about, "more": "1"}))
         return save(tensors, about)
     for _ in range(rng.choice((1, 1, 2))):
-        _change_column(tensors, rng)
+        if rng.random() < 0.15:
+            _change_table(tensors, rng)
+        else:
+            _change_column(tensors, rng)
     return save({name: values.contiguous() for name, values in tensors.items()}, about)
+
+
+def _change_table(tensors: dict[str, Any], rng: random.Random) -> None:
+    """All columns of a table (names up to the last dot) lose the same rows, or all of them."""
+    if not tensors:
+        return
+    table = rng.choice(sorted(tensors)).rpartition(".")[0]
+    columns = [name for name, values in tensors.items() if name.rpartition(".")[0] == table and values.ndim]
+    left = rng.choice((0, 1, min((len(tensors[name]) for name in columns), default=0) // 2))
+    for name in columns:
+        if rng.random() < 0.95:
+            tensors[name] = tensors[name][:left].clone()
 
 
 def _change_column(tensors: dict[str, Any], rng: random.Random) -> None:
@@ -459,8 +478,10 @@ def _change_column(tensors: dict[str, Any], rng: random.Random) -> None:
         return
     name = rng.choice(sorted(tensors))
     values = tensors[name]
-    kind = rng.randrange(9)
-    if kind == 0:
+    kind = rng.randrange(10)
+    if kind == 9:
+        tensors[name] = values.flatten()[0].clone() if values.numel() else values.new_zeros(())
+    elif kind == 0:
         del tensors[name]
     elif kind == 1:
         tensors[rng.choice(("x", name + ".x", "submaps.9.points.x", "\u2028"))] = values.clone()
@@ -485,7 +506,9 @@ def _change_column(tensors: dict[str, Any], rng: random.Random) -> None:
             else values.view(-1)[rng.randrange(values.numel()) :][:1]
         )
         target.fill_(
-            rng.choice((float("nan"), float("inf"), -1.0, 0.0, 1e30, -1e30, 1e-30))
+            rng.choice((float("nan"), float("inf"), -1.0, 0.0, 1e30, -1e30, 1e-30, 1e160, 1e300))
+            if values.dtype.itemsize > 4
+            else rng.choice((float("nan"), -1.0, 0.0, 1e30))
             if values.dtype.itemsize > 2
             else 0
         )

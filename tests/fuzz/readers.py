@@ -17,8 +17,9 @@ from safetensors.torch import save
 
 from tests.fuzz import valid_inputs
 from tests.fuzz.mutators import Files
-from tests.fuzz.sample_files import CONFIG, WALK, sample_files
+from tests.fuzz.sample_files import CONFIG, OVERRIDES, WALK, sample_files
 from tests.walks import T_cw
+from torchslam import SLAM
 from torchslam.batch import Row, Task, read_list
 from torchslam.batch.result_store import RUNS
 from torchslam.batch.results_table import collect_rows, read_times
@@ -30,20 +31,34 @@ from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_color, read_gray
 from torchslam.data.sequence import Sequence
 from torchslam.dense import DepthMaps
-from torchslam.errors import CalibrationError, ConfigError, FrameError
-from torchslam.features.learned import XFeat
-from torchslam.io.export.ply import read_cloud
+from torchslam.errors import CalibrationError, ConfigError, FrameError, InitializationError, ResultsError
+from torchslam.features.learned import ALIKED, XFeat
+from torchslam.geometry import Camera
+from torchslam.io.export.colmap import write_colmap
+from torchslam.io.export.nerfstudio import write_nerfstudio
+from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
+from torchslam.io.export.scene import scene_of, undistorted
 from torchslam.io.results import read_results
-from torchslam.io.viewer.page import page
+from torchslam.io.viewer.page import page, page_data
+from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.posed_frames import RunGraph
+from torchslam.optim.run_graph import solve_graph
 from torchslam.system.checkpoint import read_checkpoint
 from torchslam.system.front_end import Simulated
+from torchslam.system.run import run_sequence
 from torchslam.system.session import Session
+from torchslam.tracking.lightglue import LightGlue
 
 CAMERA = "60,61,31.5,23.5"
-IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "color.png", "color.jpg", "16.png")
+IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "color.png", "color.jpg", "1.png", "16.png")
 WEIGHTS = {"a.b": torch.zeros(3), "c": torch.ones(2, 2)}
+ALIKED_WEIGHTS = {"block1.conv1.weight": torch.ones(8, 1, 3, 3), "desc_head.agg_weights": torch.ones(16, 1)}
+MATCHER_WEIGHTS = {
+    "matcher.input_proj.weight": torch.ones(64, 32),
+    "matcher.posenc.Wr.weight": torch.ones(32, 2),
+    "matcher.self_attn.0.Wqkv.weight": torch.ones(192, 64),
+}
 RECORD_OF = "0123456789abcdef"
 FRAMES = 4
 """Frames of a sequence that are read."""
@@ -94,8 +109,11 @@ def readers() -> dict[str, Reader]:
         ),
         Reader("depth maps", lambda: sample_files()["depths"], _depths, 600),
         Reader("weights", lambda: {"w.safetensors": save(WEIGHTS)}, _weights, 200),
+        Reader("weights aliked", lambda: {"w.safetensors": save(ALIKED_WEIGHTS)}, _aliked, 200),
+        Reader("weights lightglue", lambda: {"w.safetensors": save(MATCHER_WEIGHTS)}, _lightglue, 300),
         Reader("toml", lambda: {"c.toml": to_toml(Config()).encode()}, _toml, 1200),
         Reader("--set", lambda: {"argument": b""}, _override, 800),
+        Reader("settings of a run", lambda: {"argument": b""}, _settings, 120),
         Reader("command line", valid_inputs.tum, _command, 300),
         Reader(
             "batch csv", lambda: {"l.csv": valid_inputs.BATCH_CSV.encode()}, partial(_list, name="l.csv"), 600
@@ -213,9 +231,32 @@ def _map(root: Path) -> None:
     for submap in saved.atlas:
         assert bool(submap.trajectory().T_wc.isfinite().all())
         submap.posed_frames.graph(submap.map, saved.camera)
+        with contextlib.suppress(ResultsError):  # of a submap without frames
+            _export(submap, saved.camera, root / "export")
     session = Session.load(root / "map.safetensors")
     write_atlas(root / "again", session.atlas, session.camera, session.number)
     read_atlas(root / "again")
+
+
+def _export(submap: Submap, camera: Camera, folder: Path) -> None:
+    """Write a submap for other programs, which read nothing but numbers."""
+    scene = scene_of(submap, camera, 0, keyframes_alone=False)
+    write_colmap(folder, scene)
+    read_poses(folder)
+    R_up = upright_from_map(submap.map)
+    write_nerfstudio(folder, scene, R_up)
+    strict_json((folder / "transforms.json").read_text())
+    write_map_cloud(folder / "map.ply", submap.map, 0)
+    undistorted(scene)
+
+
+def strict_json(text: str) -> object:
+    """JSON as a browser reads it: without NaN."""
+    return json.loads(text, parse_constant=_refuse)
+
+
+def _refuse(constant: str) -> None:
+    raise ValueError(f"{constant} in JSON")
 
 
 def _checkpoint(root: Path) -> None:
@@ -228,11 +269,13 @@ def _checkpoint(root: Path) -> None:
 
 def _graph(root: Path) -> object:
     graph = RunGraph.load(root / "graph.safetensors")
-    return [graph.part(submap) for submap in graph.submaps]
+    return solve_graph(graph, iterations=1)
 
 
 def _results(root: Path) -> str:
-    return page(read_results(root))
+    results = read_results(root)
+    strict_json(json.dumps(page_data(results)))
+    return page(results)
 
 
 def _depths(root: Path) -> None:
@@ -247,6 +290,14 @@ def _weights(root: Path) -> object:
     return XFeat(root / "w.safetensors")
 
 
+def _aliked(root: Path) -> object:
+    return ALIKED(root / "w.safetensors")
+
+
+def _lightglue(root: Path) -> object:
+    return LightGlue(root / "w.safetensors")
+
+
 def _toml(root: Path) -> None:
     _whole(load_config(root / "c.toml"))
 
@@ -255,6 +306,13 @@ def _override(root: Path) -> None:
     text = _argument(root)
     if "\0" not in text:
         _whole(load_config(None, [text]))
+
+
+def _settings(root: Path) -> None:
+    """A run ends whatever the numbers of its settings are."""
+    config = load_config(None, [*OVERRIDES, _argument(root)])
+    with contextlib.suppress(InitializationError):
+        run_sequence(SLAM(WALK.camera, config), WALK)
 
 
 def _whole(config: Config) -> None:

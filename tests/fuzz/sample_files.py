@@ -24,17 +24,11 @@ from torchslam.io.results import write_results
 from torchslam.system.checkpoint import write_checkpoint
 from torchslam.system.run import RunProgress, run_sequence
 
-CONFIG = load_config(
-    None,
-    [
-        *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
-        *(
-            "initialization.min_matches=40",
-            "initialization.min_points=30",
-            "initialization.provisional_frames=0",
-        ),
-    ],
+OVERRIDES = (
+    *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
+    *("initialization.min_matches=40", "initialization.min_points=30", "initialization.provisional_frames=0"),
 )
+CONFIG = load_config(None, OVERRIDES)
 WALK = Walk(arc(30)[:14])
 SMALL_CAMERA = Camera.pinhole(8.0, 8.0, 5.5, 3.5, size=(12, 8))
 

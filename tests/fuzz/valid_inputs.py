@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import random
 import tempfile
 import zipfile
 from functools import cache
@@ -17,6 +18,7 @@ from tests.data.readers.test_bag import STAMPS, Recording
 from tests.data.readers.test_euroc import SENSOR
 from tests.data.test_datasets import CAM_TO_CAM
 from tests.fuzz.mutators import Files
+from torchslam.config import Config, to_toml
 
 SIZE = (64, 48)
 VGA = (640, 480)
@@ -57,6 +59,7 @@ def images() -> dict[str, Files]:
         "color.png": encoded(color),
         "color.jpg": encoded(color, ".jpg"),
     }
+    found["1.png"] = bytes(cv2.imencode(".png", picture(1) // 128 * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])[1])
     found["16.png"] = encoded(picture(1).astype(np.uint16) * 100)
     return {kind: {f"a.{kind}": content} for kind, content in found.items()}
 
@@ -267,3 +270,20 @@ OVERRIDES = [
     "seed=7",
     'features.weights="a.safetensors"',
 ]
+
+
+ABSURD = [0, 1, 2, -1, 1e-300, 1e-9, 1e-3, 0.5, 1e3, 1e4, 1e6, 1e12, 1e300]
+
+
+def absurd_setting(rng: random.Random) -> str:
+    """A setting with a number that is finite, often allowed, and never meant."""
+    numbers = [line for line in to_toml(Config()).splitlines() if "=" in line or line.startswith("[")]
+    section, names = "", []
+    for line in numbers:
+        if line.startswith("["):
+            section = line.strip("[]") + "."
+        elif line.partition(" = ")[2][0] in "0123456789":
+            names.append(section + line.partition(" = ")[0])
+    name = rng.choice(names)
+    value = rng.choice(ABSURD)
+    return f"{name}={value!r}"

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
 from torchslam.config import BundleAdjustmentConfig, load_config
-from torchslam.geometry import se3_exp, transform
+from torchslam.geometry import Camera, se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.local_bundle import (
     HUBER,
@@ -175,10 +175,17 @@ def test_covariances_are_stored_on_request() -> None:
         assert bool((trace > 0).all()) is requested
 
 
-def test_covariances_do_not_change_the_adjustment() -> None:
+DISTORTED = Camera(
+    "radial_tangential", torch.cat([CAMERA.params, CAMERA.params.new_tensor([0.02, 0, 0, 0, 0])]), CAMERA.size
+)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
+def test_covariances_do_not_change_the_adjustment(camera: Camera) -> None:
+    """So that `measurement.gate = "mahalanobis"`, which needs them, has no other solver and no other residual."""
     plain, certain = (submap_of_scene(SCENE, sideways(4), noise=0.5).map for _ in range(2))
-    adjust_local(plain, 3, CAMERA, bundle(local_window=2))
-    adjust_local(certain, 3, CAMERA, bundle(local_window=2), covariances=True)
+    adjust_local(plain, 3, camera, bundle(local_window=2))
+    adjust_local(certain, 3, camera, bundle(local_window=2), covariances=True)
     for name in ("T_cw", "point_ids"):
         assert torch.equal(plain.keyframes[name], certain.keyframes[name])
     for name in ("positions_w", "is_valid"):

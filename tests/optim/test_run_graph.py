@@ -286,6 +286,34 @@ def test_submaps_that_cannot_be_solved_are_refused():
         solve_graph(replace(both, point_index=shared))
 
 
+def damaged(graph, name, change):
+    column = getattr(graph, name).clone()
+    return replace(graph, **{name: change(column)})
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "message"),
+    [
+        ("is_keyframe", torch.zeros_like, "the graph has no keyframe"),
+        (
+            "submap",
+            lambda submap: submap.index_fill(0, torch.tensor([4]), 9),
+            "a submap of the graph has no keyf",
+        ),
+        ("point_index", torch.zeros_like, "a point is seen in two submaps"),
+        ("points_w", torch.Tensor.float, "points_w is of type torch.float32, not torch.float64"),
+        ("T_cw", torch.Tensor.half, "T_cw is of type torch.float16, not torch.float64"),
+        ("weights", lambda weights: -weights, "a negative weight"),
+    ],
+)
+@pytest.mark.usefixtures("without_shape_checks")
+def test_a_file_that_cannot_be_solved_is_refused_when_it_is_read(tmp_path, name, change, message):
+    path = tmp_path / "graph.safetensors"
+    damaged(two_submaps()[2], name, change).save(path)
+    with pytest.raises(TorchslamError, match=rf"graph\.safetensors is not an observation graph: .*{message}"):
+        ObservationGraph.load(path)
+
+
 def test_joined_run_graphs_keep_their_names():
     _, graph = simulated()
     both = concatenate_graphs(

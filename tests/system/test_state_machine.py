@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -11,21 +12,40 @@ from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.system.run import no_map_message
 from torchslam.system.slam import SLAM
-from torchslam.types import Reason, State, StepResult
+from torchslam.types import Reason, Rejection, State, StepResult
 
 
 def result(index: int, reason: str) -> StepResult:
     return StepResult(index, float(index), State.INITIALIZING, None, None, None, False, 0, 0, reason)
 
 
-def test_a_video_without_texture_is_reported() -> None:
-    few = "too few matches with the reference frame: 12, 100 are needed"
+@pytest.mark.parametrize(
+    "rejection",
+    [
+        Rejection.of(Reason.FEW_KEYPOINTS, count=12, needed=100),
+        Rejection.of(Reason.FEW_MATCHES, count=12, needed=100),
+    ],
+)
+def test_the_reason_of_most_frames_is_reported(rejection: Rejection) -> None:
+    few = str(rejection)
     results = [result(0, Reason.NEW_REFERENCE), *(result(index, few) for index in range(1, 1000))]
     assert no_map_message(results, []) == f"no map was initialized in 1000 frames: {few}"
 
 
 def test_a_single_reference_frame_is_reported_as_too_few_frames() -> None:
     assert "1 frames are too few" in no_map_message([result(0, Reason.NEW_REFERENCE)], [])
+
+
+def test_a_video_without_texture_and_views_far_apart_are_told_apart() -> None:
+    room = open_sequence("synthetic:room?frames=400")
+    plain = [replace(room[index], image=torch.full_like(room[index].image, 0.5)) for index in range(5)]
+    for frames, message in (
+        (plain, "in 5 frames: too little texture: 0 keypoints, 100 are needed"),
+        ([room[index] for index in range(0, 400, 50)], r"in 8 frames: .*views may be too far apart"),
+    ):
+        slam = SLAM(room.camera, load_config(None, ["features.kind=opencv-orb"]))
+        said = no_map_message([slam.step(replace(frame, index=row)) for row, frame in enumerate(frames)], [])
+        assert re.search(message, said), said
 
 
 @pytest.fixture

@@ -12,6 +12,12 @@ MAX_COUNT = 1_000_000
 """Upper bound of every count: frames, keyframes, points or matches."""
 MAX_LENGTH_PX = 10_000
 """Upper bound of every length in the image; no image is larger."""
+MAX_KEYPOINTS = 1 << 13
+"""Upper bound of the keypoints of an image: the memory of comparing all with all grows with its square."""
+MAX_ITERATIONS = 1000
+"""Upper bound of the iterations of an adjustment; after a hundred nothing changes any more."""
+MIN_CELL_PX = 1.0
+"""Lower bound of the cells of a grid over the image, whose memory grows with their number."""
 MAX_FACTOR = 1_000_000
 """Upper bound of ratios and factors without a natural limit; far beyond the value that disables a test."""
 
@@ -47,7 +53,7 @@ class FeaturesConfig(Settings, section="features"):
         choices=("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
         group=FRONT_ENDS,
     )
-    num_keypoints: int = setting(1000, "Maximum number of keypoints per image.", low=1, high=100_000)
+    num_keypoints: int = setting(1000, "Maximum number of keypoints per image.", low=1, high=MAX_KEYPOINTS)
     max_image_pixels: int = setting(
         640 * 480,
         "Number of pixels to which much larger images are reduced before extraction; 0 disables the reduction.",
@@ -134,7 +140,8 @@ class MeasurementConfig(Settings, section="measurement"):
     gate: str = setting(
         "chi_square",
         "Unit of the errors; chi_square: the keypoint noise; "
-        "mahalanobis: in tracking, the keypoint noise combined with the uncertainty of the point.",
+        "mahalanobis: in tracking, the keypoint noise combined with the uncertainty of the point, which the local "
+        "bundle adjustment then computes.",
         choices=("chi_square", "mahalanobis"),
     )
     max_chi_square: float = setting(
@@ -388,7 +395,7 @@ class StaticOverlayConfig(Settings, section="static_overlay"):
     cell_px: float = setting(
         4.0,
         "Size, in pixels, of the cells that accumulate evidence; corners move slightly under noise.",
-        above=0,
+        low=MIN_CELL_PX,
         grows=True,
         high=MAX_LENGTH_PX,
     )
@@ -568,7 +575,7 @@ class BundleAdjustmentConfig(Settings, section="bundle_adjustment"):
         12, "Maximum number of fixed keyframes in the local bundle adjustment.", low=1, high=MAX_COUNT
     )
     local_iterations: int = setting(
-        6, "Maximum number of iterations of the local bundle adjustment.", low=1, high=10_000
+        6, "Maximum number of iterations of the local bundle adjustment.", low=1, high=MAX_ITERATIONS
     )
     delay_frames: int = setting(
         2,
@@ -579,5 +586,5 @@ class BundleAdjustmentConfig(Settings, section="bundle_adjustment"):
     )
     global_at_end: bool = setting(True, "Run a global bundle adjustment at the end of the run.")
     global_iterations: int = setting(
-        15, "Maximum number of iterations of a global bundle adjustment.", low=1, high=10_000
+        15, "Maximum number of iterations of a global bundle adjustment.", low=1, high=MAX_ITERATIONS
     )

@@ -46,11 +46,13 @@ class Calibration:
     ) -> Calibration:
         """Build a calibration from numbers; without `model`, their count determines it.
 
-        Raises CalibrationError for a wrong count or a focal length that is not positive.
+        Raises CalibrationError for a wrong count, a number that is not finite or a focal length that is not positive.
         """
         counts = COUNTS[model] if model else (4, 8, 9)
         if len(numbers) not in counts:
             raise CalibrationError(f"{source}: expected {NUMBERS}, got {len(numbers)} numbers")
+        if not all(map(math.isfinite, numbers)):
+            raise CalibrationError(f"{source}: the parameters must be finite, got {numbers[:9]}")
         if numbers[0] <= 0 or numbers[1] <= 0:
             raise CalibrationError(
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"

@@ -127,7 +127,12 @@ class ALIKED(nn.Module):
         state = {name.removeprefix(EXTRACTOR): tensor for name, tensor in read_weights(weights).items()}
         state = {name: tensor for name, tensor in state.items() if not name.startswith(MATCHER)}
         variants = {(8, 16): "aliked-t16", (16, 16): "aliked-n16", (16, 32): "aliked-n32"}
-        shape = tuple(len(state.get(name, ())) for name in ("block1.conv1.weight", "desc_head.agg_weights"))
+        sizes = [
+            state[name].shape[:1]
+            for name in ("block1.conv1.weight", "desc_head.agg_weights")
+            if name in state
+        ]
+        shape = tuple(length for size in sizes for length in size)
         if shape not in variants:
             raise ConfigError(f"{weights}: not the weights of an ALIKED network")
         # Without a threshold the network gives its strongest maxima.

@@ -35,22 +35,18 @@ TABLES: dict[str, Schema] = {
 CAMERA = "camera.params"
 MAX_NUMBER = 1 << 31  # of submaps and of sessions
 MAX_BYTES = 1 << 34  # of a map of 100,000 keyframes
+MAX_PIXELS = 1 << 26  # of the images; readers of images take no more
+MAX_LENGTH = (
+    1e12  # of a position in map units and of a pixel's coordinate: products of a few of them stay finite
+)
+MAX_SKEW = 1e-3  # of a rotation: largest entry of R^T R - I
 
 
 Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; none if a table is empty."""
 
-_FINITE = (
-    "T_cw",
-    "T_cr",
-    "positions_w",
-    "timestamp",
-    "keypoints",
-    "scales",
-    "pixels",
-    "scale_distance",
-    "information",
-)
+_POSES = "T_cw", "T_cr"
+_LENGTHS = "positions_w", "keypoints", "pixels", "scales", "scale_distance", "timestamp"
 
 
 @dataclass(frozen=True)
@@ -290,10 +286,12 @@ def _check_camera(about: dict[str, Any], params: Tensor | None) -> Camera:
     if params is None:
         raise ValueError("the camera's parameters are missing")
     width, height = about["size"]
-    if not all(isinstance(side, int) and side > 0 for side in (width, height)):
+    if not all(isinstance(side, int) and side > 0 for side in (width, height)) or width * height > MAX_PIXELS:
         raise ValueError(f"an image of {width} x {height} pixels")
-    if params.ndim != 1 or not params.is_floating_point() or not bool(torch.isfinite(params).all()):
-        raise ValueError("the camera's parameters are not a row of finite numbers")
+    if params.ndim != 1 or params.dtype not in (torch.float32, torch.float64):
+        raise ValueError("the camera's parameters are not a row of numbers")
+    if not bool((params.abs() < MAX_LENGTH).all()) or not bool((params[:2] > 0).all()):
+        raise ValueError("the camera's parameters are not finite numbers with a positive focal length")
     return Camera(about["model"], params, (width, height))
 
 
@@ -355,10 +353,24 @@ def _check_table(
             raise ValueError(f"{name}: {rows.dtype} but the camera is {dtype}")
         if column.kind == "descriptor":
             descriptors.add(rows.dtype)
-        if name in _FINITE and not bool(torch.isfinite(rows).all()):
-            raise ValueError(f"{name}: not finite")
+        if rows.is_floating_point():
+            _check_numbers(name, rows)
     if len(descriptors) > 1:
         raise ValueError("descriptors of several types")
+
+
+def _check_numbers(name: str, rows: Tensor) -> None:
+    """Check that the numbers of a column are finite, its lengths of a possible size and its poses rigid."""
+    if not bool(torch.isfinite(rows).all()):
+        raise ValueError(f"{name}: not finite")
+    if name in _POSES:
+        R, last = rows[:, :3, :3], rows.new_tensor([0.0, 0.0, 0.0, 1.0])
+        skew = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs()
+        if not bool((skew <= MAX_SKEW).all()) or not bool((rows[:, 3] == last).all()):
+            raise ValueError(f"{name}: not rigid transforms")
+    lengths = rows[:, :3, 3] if name in _POSES else rows
+    if name in (*_POSES, *_LENGTHS) and not bool((lengths.abs() <= MAX_LENGTH).all()):
+        raise ValueError(f"{name}: beyond {MAX_LENGTH:g}")
 
 
 def _check_rows(columns: Columns, sessions: int) -> None:

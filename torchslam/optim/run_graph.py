@@ -23,7 +23,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import ERROR_FACTOR, CameraMeasurement
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward
 from torchslam.optim._core.levenberg_marquardt import Progress
@@ -35,6 +35,7 @@ from torchslam.utils.files import check_regular
 
 _FRAMES_AT_ONCE = 64
 _MAX_BYTES = 1 << 34
+_MAX_SIDE = 1 << 26  # of an image, pixels
 # Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
 _MAX_SIZE_RATIO = 2.0
 _CALIBRATION = "calibration.params", "calibration.directions"
@@ -156,27 +157,31 @@ class ObservationGraph:
                 shape = (2, 2)
             if tuple(column.shape) != (rows[owner], *shape):
                 raise ValueError(f"{name} is {tuple(column.shape)}, not {(rows[owner], *shape)}")
-            is_float = kind is float and column.is_floating_point()
-            if not is_float and column.dtype != {int: torch.int64, bool: torch.bool}.get(kind):
-                raise ValueError(f"{name} is of type {column.dtype}")
+            if name != "timestamps" or not column.is_floating_point():
+                wanted = {int: torch.int64, bool: torch.bool}.get(kind, self.camera.params.dtype)
+                if column.dtype != wanted:
+                    raise ValueError(f"{name} is of type {column.dtype}, not {wanted}")
             if not bool(column.isfinite().all()):
                 raise ValueError(f"{name} is not finite")
         for name, owner in (("frame_index", "K"), ("point_index", "N")):
             index = getattr(self, name)
             if len(index) and not 0 <= int(index.min()) <= int(index.max()) < rows[owner]:
                 raise ValueError(f"{name} from {int(index.min())} to {int(index.max())} of {rows[owner]}")
+        _check_submaps(self)
         params = self.camera.params
+        check_dtypes(camera=params)
         if params.ndim != 1 or not bool(params.isfinite().all()) or not bool((params[:2] > 0).all()):
             raise ValueError("the camera's parameters are none")
         if self.calibration is not None:
             given = self.calibration.camera.params, self.calibration.directions
+            check_dtypes(camera=params, calibration=given[0], directions=given[1])
             if given[0].shape != params.shape or given[1].ndim != 2 or len(given[1]) != len(params):
                 raise ValueError("the calibration does not fit the camera")
             if not all(bool(part.isfinite().all()) for part in given):
                 raise ValueError("the calibration is not finite")
         weights = self.weights.diagonal(dim1=1, dim2=2) if self.weights.ndim == 3 else self.weights
-        if min(self.camera.size) < 1 or bool((weights < 0).any()):
-            raise ValueError("an image without pixels, or a negative weight")
+        if min(self.camera.size) < 1 or max(self.camera.size) > _MAX_SIDE or bool((weights < 0).any()):
+            raise ValueError("an image of an impossible size, or a negative weight")
 
     @classmethod
     def columns(cls) -> list[str]:
@@ -285,15 +290,24 @@ def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
     return CameraPrior(calibration.camera.params, ERROR_FACTOR**2 * calibration.information)
 
 
-def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
-    """The keyframes (k,) of one submap, its points (p,), and their bundle adjustment.
+def _check_submaps(graph: ObservationGraph) -> None:
+    """Raises ValueError where a submap has no keyframe, or a point is seen in two submaps."""
+    if not bool(graph.is_keyframe.any()):
+        raise ValueError("the graph has no keyframe")
+    submaps, number = torch.unique(graph.submap, return_inverse=True)
+    if len(torch.unique(number[graph.is_keyframe])) < len(submaps):
+        raise ValueError("a submap of the graph has no keyframe")
+    seen_in = number[graph.frame_index]
+    first = number.new_full((len(graph.points_w),), len(submaps))
+    first = first.scatter_reduce(0, graph.point_index, seen_in, "amin")
+    if bool((first[graph.point_index] != seen_in).any()):
+        raise ValueError("a point is seen in two submaps")
 
-    Raises ValueError where there is no keyframe.
-    """
+
+def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
+    """The keyframes (k,) of one submap, its points (p,), and their bundle adjustment."""
     frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
-    if len(keyframes) == 0:
-        raise ValueError("a submap of the graph has no keyframe")
     slots = torch.full_like(graph.submap, -1)
     slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
     rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
@@ -436,21 +450,19 @@ def _solve(
     *options: Any,
 ) -> tuple[GraphSolution, ...]:
     """Solve graphs with one camera model; `adjust` solves the bundle adjustments of all their submaps."""
+    for graph in graphs:
+        _check_submaps(graph)
     submaps = [
         _GraphSubmap(number, *_keyframe_problem(graph, submap))
         for number, graph in enumerate(graphs)
         for submap in graph.submaps
     ]
-    if not submaps:
-        raise ValueError("the graph has no keyframe")
     bundles = adjust(submaps)
     # Rows of all graphs, one after the other, as `concatenate_graphs` has them; `submap` tells the graphs apart.
     joined = concatenate_graphs([_plain(graph, number) for number, graph in enumerate(graphs)])
     frame_starts, point_starts = _starts([g.T_cw for g in graphs]), _starts([g.points_w for g in graphs])
     frames = torch.cat([submap.keyframes + frame_starts[submap.graph] for submap in submaps])
     points = torch.cat([submap.points + point_starts[submap.graph] for submap in submaps])
-    if len(torch.unique(points)) < len(points):
-        raise ValueError("a point is seen in two submaps")
     success, moved = torch.zeros_like(joined.is_keyframe), joined.points_w.new_zeros(len(joined.points_w))
     finite = joined.T_cw[frames].isfinite().flatten(1).all(-1)
     succeeded = torch.cat([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles])

@@ -93,6 +93,9 @@ class Initializer:
         least = self.config.initialization.min_matches
         if len(first) < least:
             self._refer_to(view)
+            keypoints = int(view.mask.sum())
+            if keypoints < least:
+                return Rejection.of(Reason.FEW_KEYPOINTS, count=keypoints, needed=least)
             return Rejection.of(Reason.FEW_MATCHES, count=len(first), needed=least)
         return self._relate(view, first, second)
 

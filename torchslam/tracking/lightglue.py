@@ -15,6 +15,9 @@ from torchslam.errors import ConfigError
 from torchslam.features.weights import MATCHER, read_weights
 from torchslam.types import FrameFeatures, Matches, MatchPrior
 
+MAX_WIDTH, MAX_LAYERS = 1024, 32
+"""Largest network that a file of weights may ask for; published ones have 9 layers of 256 floats."""
+
 
 class LightGlue(nn.Module):
     """Matches float descriptors of the front end that its weights were trained for; weights are its confidences.
@@ -38,9 +41,15 @@ class LightGlue(nn.Module):
         try:
             width, self.size_in = state["input_proj.weight"].shape
             layers = len({name.split(".")[1] for name in state if name.startswith("transformers.")})
-            self.with_angles = state["posenc.Wr.weight"].shape[1] == 4
+            _, positions = state["posenc.Wr.weight"].shape
         except (KeyError, ValueError):
             raise ConfigError(f"{weights}: not the weights of a LightGlue network") from None
+        if not 0 < width <= MAX_WIDTH or not 0 < self.size_in <= MAX_WIDTH or not 0 < layers <= MAX_LAYERS:
+            raise ConfigError(
+                f"{weights}: not the weights of a LightGlue network ({layers} layers of {width} floats for "
+                f"{self.size_in}; at most {MAX_LAYERS} of {MAX_WIDTH})"
+            )
+        self.with_angles = positions == 4
         self.network = Network(
             features=None,  # type: ignore[arg-type]  # a name would download
             input_dim=self.size_in,

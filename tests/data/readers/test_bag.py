@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pickle
+import time
 from pathlib import Path
 from typing import Any
 
@@ -215,6 +216,34 @@ def test_wrong_recordings(tmp_path: Path) -> None:
     path = recording.close()
     with pytest.raises(CalibrationError, match="distortion model `thin_prism` is not known"):
         open_sequence(path)
+
+
+@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+def test_a_calibration_that_is_not_finite_is_refused(tmp_path: Path, kind: str) -> None:
+    recording = Recording(tmp_path / ("r.bag" if kind == "ros1" else "r"), kind)
+    recording.camera_info("/camera_info", distortion=np.array([0.1, np.nan, 0.0, 0.0, 0.0]))
+    recording.image("/image", pictures()[0], STAMPS[0])
+    with pytest.raises(CalibrationError, match=r"the parameters must be finite, got \[60.*nan"):
+        open_sequence(recording.close())
+
+
+def test_a_definition_in_the_recording_is_not_followed(tmp_path: Path) -> None:
+    """One of an array of 10^8 texts would be code of as many lines."""
+    store = get_typestore(Stores.ROS1_NOETIC)
+    text, digest = store.generate_msgdef("sensor_msgs/msg/Image")
+    for name, changed, own in (("a", "string[100000000] more\n" + text, digest), ("b", text, "0" * 32)):
+        recording = Recording(tmp_path / f"{name}.bag", "ros1")
+        recording.connections["/image"] = recording.writer.add_connection(
+            "/image", "sensor_msgs/msg/Image", msgdef=changed, md5sum=own
+        )
+        for image, stamp in zip(pictures(), STAMPS, strict=True):
+            recording.image("/image", image, stamp)
+        recording.close()
+    started = time.process_time()
+    assert len(open_sequence(tmp_path / "a.bag")) == 3
+    assert time.process_time() - started < 5
+    with pytest.raises(SequenceError, match=r"b\.bag: .*sensor_msgs/msg/Image with another definition, 000"):
+        open_sequence(tmp_path / "b.bag")
 
 
 class Image:

@@ -37,6 +37,26 @@ def test_colmap_computes_our_reprojection_error(scene: ExportedScene, tmp_path: 
     assert made.compute_mean_reprojection_error() == pytest.approx(ours, abs=1e-6)  # by its own projection
 
 
+def test_a_scene_without_points_is_a_model_without_points(
+    scene: ExportedScene, tmp_path: Path, reader: str
+) -> None:
+    none = torch.zeros(0, dtype=torch.int64)
+    write_colmap(
+        tmp_path,
+        replace(
+            scene,
+            points_w=scene.points_w[:0],
+            colors=scene.colors[:0],
+            pixels=scene.pixels[:0],
+            frame_index=none,
+            point_index=none,
+        ),
+    )
+    made = read(tmp_path, reader)
+    assert len(made.images) == 4
+    assert len(made.points3D) == 0
+
+
 def test_points_tracks_and_images_round_trip(scene: ExportedScene, tmp_path: Path, reader: str) -> None:
     write_colmap(tmp_path, scene)
     made = read(tmp_path, reader)

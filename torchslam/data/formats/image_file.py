@@ -70,7 +70,7 @@ def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
 def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
     """An image file's bytes as (H, W) gray, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
     whole image."""
-    if not data or _declared_pixels(data) > MAX_PIXELS:
+    if not data or not _has_whole_chunks(data) or _declared_pixels(data) > MAX_PIXELS:
         return None
     if flags == AS_GRAY and (gray := decode_png_gray(data)) is not None:
         return gray
@@ -207,6 +207,8 @@ PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = (13).to_bytes(4, "big")
 PNG_CHUNK_FRAME = 12
 """Bytes of a chunk around its content: length, name, sum."""
+PNG_MAX_CHUNKS = 1 << 17
+"""Largest number of chunks of a file: libpng writes one for 8 kB of pixels, which are at most 1 GB."""
 PNG_PLAIN_CHUNKS = frozenset({b"IHDR", b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME"})
 """Chunks before the pixels that change none of them. Others (of gamma, transparency, animation) are left to OpenCV."""
 PNG_GRAY, PNG_COLOR = 0, 2  # color types
@@ -235,6 +237,19 @@ def decode_png_gray(data: bytes) -> Shaped[np.ndarray, "H W"] | None:
     except Exception:  # the decoder has no exception type
         return None
     return None
+
+
+def _has_whole_chunks(data: bytes) -> bool:
+    """Return False for a PNG file with a chunk that reaches beyond its end: OpenCV allocates what a chunk declares."""
+    if not data.startswith(PNG_SIGNATURE):
+        return True
+    position = len(PNG_SIGNATURE)
+    for _ in range(PNG_MAX_CHUNKS):
+        length, name = int.from_bytes(data[position : position + 4], "big"), data[position + 4 : position + 8]
+        position += PNG_CHUNK_FRAME + length
+        if name == b"IEND" or position > len(data):
+            return position <= len(data)
+    return False
 
 
 def _is_plain_png(data: bytes) -> bool:

@@ -28,7 +28,6 @@ from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.files import check_regular
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
@@ -78,7 +77,7 @@ class Topic:
 class BagSequence(Sequence):
     """Images of one topic, read in order; seeking backwards reads from the start again."""
 
-    def __init__(self, path: Path, reader: AnyReader, topic: Topic, camera: GivenCamera | None) -> None:
+    def __init__(self, path: Path, reader: Recording, topic: Topic, camera: GivenCamera | None) -> None:
         """Raises SequenceError if no image can be read, CalibrationError for a camera of another size."""
         self._path, self._reader, self._connection = path, reader, topic.connection
         # Messages may be recorded late: frames come in the order in which they were taken.
@@ -201,10 +200,51 @@ def _open_bag(path: str, camera: GivenCamera | None, rate: float | None) -> BagS
     return BagSequence(source, reader, _find_topic(reader, name, wanted), camera)
 
 
-def _open_reader(path: Path) -> AnyReader:
-    try:
-        from rosbags.highlevel import AnyReader
+class Recording:
+    """An open recording whose messages are read as ROS defines them.
+
+    Definitions in the recording itself are not followed: what a definition declares, such as an array of 10^9 texts,
+    would take any time and memory.
+    """
+
+    def __init__(self, path: Path) -> None:
+        from rosbags.rosbag1 import Reader as Reader1
+        from rosbags.rosbag2 import Reader as Reader2
         from rosbags.typesys import Stores, get_typestore
+
+        self._is_ros1 = path.suffix.lower() == ".bag"
+        self._types = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
+        self._reader: Reader1 | Reader2 = Reader1(path) if self._is_ros1 else Reader2(path)
+        self._reader.open()
+
+    @property
+    def connections(self) -> list[Connection]:
+        """The topics, each with the type of its messages."""
+        return self._reader.connections
+
+    def messages(self, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
+        """Yield connection, time of recording in nanoseconds and content of each message of some topics."""
+        return self._reader.messages(connections)
+
+    def deserialize(self, content: bytes, kind: str) -> Any:
+        """Return a message of a type."""
+        read = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
+        return read(content, kind)
+
+    def check_definition(self, connection: Connection) -> None:
+        """Raise ValueError if the messages of a topic are not as ROS defines them, by the digest of a definition."""
+        own = (
+            self._types.generate_msgdef(connection.msgtype)[1]
+            if self._is_ros1
+            else self._types.hash_rihs01(connection.msgtype)
+        )
+        if connection.digest and connection.digest != own:
+            raise ValueError(f"{connection.msgtype} with another definition, {connection.digest[:100]}")
+
+
+def _open_reader(path: Path) -> Recording:
+    try:
+        import rosbags.highlevel  # noqa: F401  # is there one?
     except ImportError:
         raise SequenceError(f"{path}: ROS bags need `pip install torchslam[bags]`") from None
     with _errors(str(path)):
@@ -212,20 +252,17 @@ def _open_reader(path: Path) -> AnyReader:
             if not file.is_dir():
                 limit = MAX_METADATA if file.name == "metadata.yaml" else MAX_RECORDING
                 check_regular(file, limit, "a file of a recording")
-        # A single ROS 2 file is part of a recording folder or a complete recording.
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-    return reader
+        return Recording(path)  # a single ROS 2 file is part of a recording folder or a complete recording
 
 
-def _connection(reader: AnyReader, topic: str) -> Connection:
+def _connection(reader: Recording, topic: str) -> Connection:
     """Return the connection of an image topic."""
     return next(
         each for each in reader.connections if each.topic == topic and each.msgtype in (IMAGE, COMPRESSED)
     )
 
 
-def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
+def _find_topic(reader: Recording, path: str, wanted: str | None) -> Topic:
     """Select the image topic. Raises SequenceError if there is none, or several without a choice."""
     if not all(isinstance(each.topic, str) for each in reader.connections):
         raise SequenceError(f"{path}: cannot be read: topics without a name")
@@ -245,6 +282,8 @@ def _find_topic(reader: AnyReader, path: str, wanted: str | None) -> Topic:
     calibration = None
     times: list[float] = []
     with _errors(path):
+        for each in (connection, *infos[:1]):
+            reader.check_definition(each)
         for info, _, raw in reader.messages(infos) if infos else ():
             rectified = "rect" in topics[0].rpartition("/")[2] or "_rect" in topics[0]
             calibration = from_camera_info(

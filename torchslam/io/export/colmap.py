@@ -76,7 +76,7 @@ def _images(scene: ExportedScene) -> list[_Image]:
     points["x"], points["y"] = corner_pixels(scene.pixels).numpy().T
     points["point"] = scene.point_index.numpy() + 1
     counts = np.bincount(scene.frame_index.numpy(), minlength=len(scene.T_cw))
-    per_image = np.split(points, counts.cumsum()[:-1])
+    per_image = np.split(points, counts.cumsum())[:-1]  # the rest is empty
     quaternions = quaternion_wxyz(scene.T_cw[:, :3, :3]).tolist()
     poses = [q + t for q, t in zip(quaternions, scene.T_cw[:, :3, 3].tolist(), strict=True)]
     return [_Image(*row) for row in zip(scene.image_names, poses, per_image, strict=True)]
@@ -88,7 +88,7 @@ def _points(scene: ExportedScene) -> list[_Point]:
     tracks = np.zeros(len(frame), TRACK)
     tracks["image"], tracks["index"] = frame + 1, np.arange(len(frame)) - first[frame]
     ends = np.bincount(point, minlength=len(scene.points_w)).cumsum()
-    per_point = np.split(tracks[np.argsort(point, kind="stable")], ends[:-1])
+    per_point = np.split(tracks[np.argsort(point, kind="stable")], ends)[:-1]
     columns = (scene.points_w.tolist(), scene.colors.tolist(), scene.point_errors().tolist(), per_point)
     return [_Point(*row) for row in zip(*columns, strict=True)]
 
