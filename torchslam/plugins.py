@@ -21,6 +21,8 @@ from torchslam.errors import ConfigError
 
 FRONT_ENDS = "torchslam.front_ends"
 MATCHERS = "torchslam.matchers"
+KORNIA, KORNIA_FEATURES = "kornia:", "kornia.feature:"
+"""kornia:DISK is kornia.feature.DISK."""
 
 
 @cache
@@ -35,8 +37,16 @@ def is_known(group: str, name: str) -> bool:
     return bool(colon and package and attribute) or name in registered(group)
 
 
-def load(group: str, name: str, **arguments: object) -> Callable[..., Any]:
+def load(
+    group: str, name: str, make: Callable[..., Any] | None = None, **arguments: object
+) -> Callable[..., Any]:
     """Load the plugin of a name; instantiate a class with those of the arguments that it takes and that are not None.
+
+    Args:
+        group: of entry points.
+        name: of the plugin.
+        make: instantiates a class instead, from it and all arguments.
+        **arguments: of a class.
 
     Raises:
         ConfigError: The package or the attribute does not exist or fails, or the plugin is not callable.
@@ -59,7 +69,7 @@ def load(group: str, name: str, **arguments: object) -> Callable[..., Any]:
         part = getattr(part, each)
     if isinstance(part, type):
         try:
-            part = part(**_taken(part, arguments))
+            part = part(**_taken(part, arguments)) if make is None else make(part, **arguments)
         except ConfigError:
             raise
         except Exception as error:
@@ -71,12 +81,20 @@ def load(group: str, name: str, **arguments: object) -> Callable[..., Any]:
 
 
 def load_front_end(name: str, num_keypoints: int, weights: str | None) -> Callable[..., Any]:
-    """Return the front end of a name: one of torchslam's own, or a plugin."""
+    """Return the front end of a name: one of torchslam's own, one of kornia's (`kornia:DISK`), or a plugin."""
     from torchslam.features import EXTRACTORS, extractor
+    from torchslam.features.kornia_modules import is_kornia_module, make_kornia_front_end
+
+    def make(kind: type, num_keypoints: int, weights: str | None) -> Callable[..., Any]:
+        if is_kornia_module(kind):
+            return make_kornia_front_end(kind, num_keypoints, weights)
+        made: Callable[..., Any] = kind(**_taken(kind, {"num_keypoints": num_keypoints, "weights": weights}))
+        return made
 
     if name in EXTRACTORS or not is_known(FRONT_ENDS, name):
         return extractor(name, num_keypoints, weights)
-    return load(FRONT_ENDS, name, num_keypoints=num_keypoints, weights=weights)
+    place = name.replace(KORNIA, KORNIA_FEATURES, 1) if name.startswith(KORNIA) else name
+    return load(FRONT_ENDS, place, make, num_keypoints=num_keypoints, weights=weights)
 
 
 def _taken(kind: type, arguments: dict[str, object]) -> dict[str, object]:

@@ -19,6 +19,7 @@ from torchslam.config import CameraConfig, Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
 from torchslam.features.contract import check_features
+from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera, KeypointNoise
 from torchslam.geometry.gating import times
 from torchslam.map.posed_frames import RunGraph
@@ -168,8 +169,8 @@ class ClipSLAM(nn.Module):
 
     Args:
         extractor: Module from images (T, 1, H, W) to Features with differentiable keypoints, such as
-            ORB(differentiable=True), XFeat or ALIKED. Networks come in evaluation mode; in `train` mode their
-            normalization statistics would follow the clip.
+            ORB(differentiable=True), XFeat, ALIKED or one of kornia's. Networks come in evaluation mode; in `train`
+            mode their normalization statistics would follow the clip.
         keypoint_weight: Module or function from Features to weights (T, N) >= 0 that multiply the information of each
             keypoint (for example its score); 1 if None.
         config: Of the system; its features section is not read.
@@ -183,7 +184,7 @@ class ClipSLAM(nn.Module):
     ) -> None:
         """Create a module with the parameters of the front end."""
         super().__init__()
-        self.extractor = extractor
+        self.extractor = KorniaFeatures(extractor) if is_kornia_module(extractor) else extractor
         self.keypoint_weight = keypoint_weight
         self.config = config or Config()
 

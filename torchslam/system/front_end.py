@@ -17,6 +17,7 @@ from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures
 from torchslam.features.contract import apply_mask, check_features
+from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera
 from torchslam.plugins import load_front_end
 from torchslam.types import Features, Frame
@@ -43,6 +44,9 @@ def image_extractor(
     settings = config.features
     if front_end is None:
         front_end = load_front_end(settings.kind, settings.num_keypoints, settings.weights or None)
+    if is_kornia_module(front_end):
+        assert isinstance(front_end, nn.Module)
+        front_end = KorniaFeatures(front_end, settings.num_keypoints)
     name = settings.kind if ":" in settings.kind else type(front_end).__name__
     if isinstance(front_end, nn.Module):
         front_end = front_end.to(device)
