@@ -16,6 +16,7 @@ from typing import Any
 import torchslam
 from torchslam.errors import TorchslamError
 from torchslam.utils.console import with_install_hint
+from torchslam.utils.text import printable, without_credentials
 
 ERROR = 2
 INTERRUPTED = 130
@@ -73,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _compute_in_one_thread()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
-        print(f"torchslam: error: {error}", file=sys.stderr)
+        print(f"torchslam: error: {printable(without_credentials(str(error)))}", file=sys.stderr)
         return ERROR
     except ModuleNotFoundError as error:
         if (reason := with_install_hint(error)) is error:

@@ -21,6 +21,7 @@ from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
+from torchslam.utils.text import without_credentials
 
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
 PATIENCE = 15.0
@@ -226,9 +227,14 @@ class CaptureClock:
         return self._last
 
 
+def is_address(path: str) -> bool:
+    """Return True for the address of a stream or of a file."""
+    return ADDRESS.fullmatch(path) is not None
+
+
 def is_live(path: str) -> bool:
     """Return True for an address, and for the number of a camera that is not a file."""
-    if ADDRESS.fullmatch(path):
+    if is_address(path):
         return (
             not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
         )  # a file does not drop frames
@@ -238,7 +244,7 @@ def is_live(path: str) -> bool:
 def _open_live(path: str, camera: GivenCamera | None, rate: float | None) -> LiveSequence:
     """A camera or a stream. Raises SequenceError where it cannot be opened."""
     number = path.isdecimal()
-    shown = re.sub(r"//[^/@]*@", "//", path)  # without a password
+    shown = without_credentials(path)
     capture = cv2.VideoCapture(int(path)) if number else cv2.VideoCapture(path)
     if not capture.isOpened():
         raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")
