@@ -118,6 +118,11 @@ class Sequence(ABC):
         """Number of frames; None for a live source, which has no end and no `len`."""
         return len(self)
 
+    @property
+    def is_live(self) -> bool:
+        """Whether each frame is there only once, when it comes, also where only so many are taken."""
+        return not len(self.timestamps)
+
     def indices(self, start: int = 0) -> Iterable[int]:
         """Return the frame indices from `start` on; endless for a live source."""
         length = self.known_length

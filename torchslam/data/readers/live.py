@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import re
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -30,6 +32,8 @@ BACKLOG = 10
 """Maximum number of queued frames; then the oldest one is dropped."""
 STEADY = 1.0
 """Maximum drift of the source's clock from ours in seconds, before it is ignored."""
+EXIT_PATIENCE = 2.0
+"""Seconds for which the interpreter waits for the threads of sources when it exits."""
 STALE = 0.5
 """Age in seconds above which the frame read on opening is discarded."""
 
@@ -79,6 +83,7 @@ class LiveSequence(Sequence):
         self._limit: int | None = None
         self._given, self._time = 0, 0.0
         self._is_watched = False
+        _SOURCES.add(self)
         self._thread = self._watch_until(lambda: bool(self._arrived))
         self._thread.join(patience)
         if not self._arrived:
@@ -161,6 +166,11 @@ class LiveSequence(Sequence):
         if not self._thread.is_alive():
             self._end()
 
+    def has_ended(self, patience: float) -> bool:
+        """Return whether the thread that watches has ended, after some seconds at most."""
+        self._thread.join(max(0.0, patience))
+        return not self._thread.is_alive()
+
     def _begin(self) -> None:
         """Watch from now on, without what was seen long ago."""
         self._is_watched = True
@@ -205,6 +215,23 @@ class LiveSequence(Sequence):
                 self._capture.release()
             self._ended = True
             self._fresh.notify_all()
+
+
+_SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()
+"""Those that there are; a thread keeps its source."""
+
+
+def close_sources(patience: float) -> bool:
+    """Close all sources, and return whether their threads have ended after some seconds at most."""
+    sources = list(_SOURCES)
+    end = time.monotonic() + patience
+    for source in sources:
+        source.close()
+    return all(source.has_ended(end - time.monotonic()) for source in sources)
+
+
+# Threads that end on their own before the interpreter does are not ended by it, in the middle of OpenCV.
+atexit.register(close_sources, EXIT_PATIENCE)
 
 
 class CaptureClock:
