@@ -1,7 +1,5 @@
 """`python -m torchslam` is the command `torchslam`, also where the scripts of an environment are not on the path."""
 
-import sys
+from torchslam.cli.main import console
 
-from torchslam.cli.main import main
-
-sys.exit(main())
+console()

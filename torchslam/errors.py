@@ -1,5 +1,7 @@
 """The errors that torchslam raises. A message says what is wrong, where, and what to do."""
 
+from torchslam.utils.text import printable, without_credentials
+
 LONGEST = 2000
 """Largest number of characters of a message; what it quotes from a file may be of any length."""
 
@@ -7,20 +9,16 @@ LONGEST = 2000
 class TorchslamError(Exception):
     """Base of every error that torchslam raises.
 
-    Its text is one printable line: control characters are escaped, and a long message is shortened in the middle.
+    Its text is one printable line: control characters are escaped, and a long message is shortened in the middle. The
+    credentials of addresses are left out.
     """
 
     def __str__(self) -> str:
-        text = _shortened(super().__str__())
-        return text if text.isprintable() else _shortened("".join(map(_shown, text)))
+        return _shortened(printable(_shortened(without_credentials(super().__str__()))))
 
 
 def _shortened(text: str) -> str:
     return text if len(text) <= LONGEST else f"{text[: LONGEST // 2]} [...] {text[-LONGEST // 2 :]}"
-
-
-def _shown(character: str) -> str:
-    return character if character.isprintable() else character.encode("unicode_escape").decode()
 
 
 class ConfigError(TorchslamError):

@@ -5,11 +5,14 @@
 
 Then use `--features mine`, or `--features my_package.features:MyFeatures` without registration. A class is instantiated
 with those of the configured arguments that it takes (num_keypoints, weights); any other callable is used as it is.
-Importing a plugin runs its code.
+Importing a plugin runs its code. So only the command line and Python may name PACKAGE:NAME; a file of settings or a
+list of a batch, which may be somebody else's, may do so for the packages in the environment variable
+TORCHSLAM_PLUGINS, separated by commas.
 """
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
@@ -23,6 +26,8 @@ FRONT_ENDS = "torchslam.front_ends"
 MATCHERS = "torchslam.matchers"
 KORNIA, KORNIA_FEATURES = "kornia:", "kornia.feature:"
 """kornia:DISK is kornia.feature.DISK."""
+ALLOWED = "TORCHSLAM_PLUGINS"
+"""Environment variable: packages that files may name, separated by commas."""
 
 
 @cache
@@ -35,6 +40,15 @@ def is_known(group: str, name: str) -> bool:
     """Test whether a name can be that of a plugin: registered, or of the form PACKAGE:NAME."""
     package, colon, attribute = name.partition(":")
     return bool(colon and package and attribute) or name in registered(group)
+
+
+def is_code_of_others(group: str, name: str) -> bool:
+    """Test whether a name imports a package that files may not ask for: neither registered nor in TORCHSLAM_PLUGINS."""
+    package, colon, attribute = name.partition(":")
+    if name.startswith(KORNIA) and "." not in attribute:  # torchslam itself imports kornia.feature
+        return False
+    allowed = os.environ.get(ALLOWED, "").split(",")
+    return bool(colon) and name not in registered(group) and package not in (each.strip() for each in allowed)
 
 
 def load(

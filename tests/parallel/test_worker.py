@@ -118,6 +118,73 @@ def test_a_killed_worker_is_reported_once_and_skipped(worker: Worker) -> None:
         assert worker.receive() is None
 
 
+@pytest.fixture
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.worker.SILENCE", 1.0)
+    monkeypatch.setattr("torchslam.parallel.worker.SILENCE_UNKNOWN", 1.0)
+    monkeypatch.setattr("torchslam.parallel.worker.LOOK", 0.05)
+    monkeypatch.setattr("torchslam.parallel.worker.END", 0.2)
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="processes cannot be stopped here")
+@pytest.mark.usefixtures("impatient")
+def test_a_stopped_worker_is_given_up(worker: Worker) -> None:
+    come(worker)
+    assert worker.send(pack_task(3))
+    assert worker.send(pickle.dumps(1))
+    assert worker.receive()[0] == 3
+    (process,) = helpers()
+    os.kill(process.pid, signal.SIGSTOP)
+    assert worker.send(pickle.dumps(2))
+    with pytest.warns(UserWarning, match="does not answer: going on without it"):
+        assert worker.receive() is None
+    assert worker.receive() is None  # nothing that it may have sent meanwhile
+    assert not worker.send(pickle.dumps(3))
+    assert not helpers()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="processes cannot be stopped here")
+@pytest.mark.usefixtures("impatient")
+def test_a_stopped_worker_takes_no_message_for_ever_and_can_be_ended(worker: Worker) -> None:
+    come(worker)
+    assert worker.send(pack_task(3))
+    (process,) = helpers()
+    os.kill(process.pid, signal.SIGSTOP)
+    with pytest.warns(UserWarning, match="does not answer: going on without it"):
+        assert not worker.send(bytes(100_000_000))
+    assert not helpers()
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="processes cannot be stopped here")
+@pytest.mark.usefixtures("impatient")
+def test_a_stopped_worker_can_be_ended(worker: Worker) -> None:
+    come(worker)
+    (process,) = helpers()
+    os.kill(process.pid, signal.SIGSTOP)
+    worker.end()
+    assert not helpers()
+
+
+def spin(connection: Connection, seconds: float) -> None:
+    for _ in requests(connection):
+        end = time.process_time() + seconds
+        while time.process_time() < end:
+            pass
+        send_result(connection, "done")
+
+
+@pytest.mark.usefixtures("impatient")
+def test_a_worker_that_works_is_waited_for() -> None:
+    worker = Worker(spin)
+    try:
+        come(worker)
+        assert worker.send(pack_task(2.0))
+        assert worker.send(pickle.dumps(0))
+        assert worker.receive() == "done"
+    finally:
+        worker.end()
+
+
 def test_nothing_is_sent_to_a_worker_before_it_is_ready() -> None:
     worker = Worker(multiply)
     try:

@@ -21,6 +21,7 @@ import torchslam
 from torchslam.data.synthetic import is_synthetic
 from torchslam.errors import ResultsError, SequenceError, TorchslamError
 from torchslam.utils.files import JSON_BYTES, parse_json, read_text, whole_folder, write_whole
+from torchslam.utils.text import printable, without_credentials
 
 RUNS = "runs"
 ERRORS = "errors"
@@ -128,10 +129,12 @@ def _write(path: Path, columns: Columns) -> None:
 
 def _describe(error: Exception) -> str:
     """One line; for an unexpected error with its type and location."""
-    if isinstance(error, TorchslamError | OSError):
+    if isinstance(error, TorchslamError):
         return str(error)
+    if isinstance(error, OSError):
+        return printable(without_credentials(str(error)))
     place = traceback.extract_tb(error.__traceback__)[-1]
-    text = " ".join(str(error).split())
+    text = printable(without_credentials(" ".join(str(error).split())))
     return f"{type(error).__name__}: {text[:1000]} ({Path(place.filename).name}:{place.lineno})"
 
 

@@ -18,6 +18,7 @@ from torchslam.batch.task import TIMES, Task, configuration
 from torchslam.errors import ResultsError, TorchslamError
 from torchslam.io import plots
 from torchslam.utils.files import JSON_BYTES, parse_json, read_text
+from torchslam.utils.text import without_credentials
 
 CSV = "table.csv"
 PARQUET = "table.parquet"
@@ -89,7 +90,7 @@ def collect_rows(tasks: Sequence[Task], configurations: Sequence[str], output: P
             record = read_stored(output, name, settings)
         except ResultsError as error:
             record = {"status": ERROR, "error": str(error)}
-        record |= {"name": name, "sequence": task.row.sequence}
+        record |= {"name": name, "sequence": without_credentials(task.row.sequence)}
         rows.append({column: _typed(record.get(column), kind) for column, kind in COLUMNS.items()})
     return rows
 

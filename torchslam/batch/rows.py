@@ -13,9 +13,12 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
+from torchslam.config import Config
+from torchslam.config.schema import check_override_in_file
 from torchslam.data.formats.text_file import MAX_LINE, numbered_lines, parse_count, read_text
 from torchslam.data.synthetic import is_synthetic
-from torchslam.errors import SequenceError
+from torchslam.errors import ConfigError, SequenceError
+from torchslam.utils.text import without_credentials
 
 MAX_BYTES = 1 << 26
 """Of a list: about half a million rows of a hundred characters."""
@@ -115,7 +118,7 @@ def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
 
 def short_name(sequence: str) -> str:
     """Derive a name from the path of a sequence: letters, digits, and `-` for anything else."""
-    text = sequence if is_synthetic(sequence) else Path(sequence).stem
+    text = sequence if is_synthetic(sequence) else Path(without_credentials(sequence)).stem
     text = re.sub(r"[^A-Za-z0-9_.+=]+", "-", text).strip("-.")
     return text[:MAX_NAME] or "sequence"
 
@@ -185,6 +188,11 @@ def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
         values["fps"] = _rate(values["fps"], where)
     settings = (setting.strip() for setting in values.get("overrides", "").split(SEPARATOR))
     values["overrides"] = tuple(setting for setting in settings if setting)
+    try:
+        for setting in values["overrides"]:
+            check_override_in_file(Config, setting, f"{where}: overrides")
+    except ConfigError as error:
+        raise SequenceError(str(error)) from None
     return Row(**values, folder=folder)
 
 

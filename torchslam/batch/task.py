@@ -38,6 +38,7 @@ from torchslam.io.report import compute_metrics
 from torchslam.io.write_run import write_run
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
+from torchslam.utils.text import without_credentials
 
 TIMES = "times.json"
 TIMED = ("fps", "ms_median", "ms_p95", "stage_ms")
@@ -183,7 +184,7 @@ def _run(task: Task, folder: Path) -> Columns:
     metrics |= {"source": full_name(row.resolve(row.sequence)), "source_fps": row.fps}
     write_run(_without_times(finished), sequence, metrics, folder, plots=task.plots, viewer=task.plots)
     return {
-        "sequence": row.sequence,
+        "sequence": without_credentials(row.sequence),
         "status": NO_MAP if finished.failure else DONE,
         "error": finished.failure,
         **_columns(metrics),

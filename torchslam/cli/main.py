@@ -11,14 +11,17 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import torchslam
 from torchslam.errors import TorchslamError
 from torchslam.utils.console import with_install_hint
+from torchslam.utils.text import printable, without_credentials
 
 ERROR = 2
 INTERRUPTED = 130
+EXIT_PATIENCE = 1.0
+"""Seconds to wait for the thread of a live source before the process exits."""
 
 # Module and first line of the description of each command; only the module of the requested command is imported.
 COMMANDS = {
@@ -62,6 +65,21 @@ COMMANDS = {
 WITHOUT_THREADS = ("config", "info")  # compute nothing and import torch only where a sequence is opened
 
 
+def console() -> NoReturn:
+    """Run the command of this process, and exit with its status.
+
+    A stream that has gone away may hold its thread in OpenCV for half a minute. Python's own way to exit would end that
+    thread from within, which aborts the process, so then nothing but the buffers is left to be done.
+    """
+    status = main()
+    live = sys.modules.get("torchslam.data.readers.live")  # imports torch
+    if live is not None and not live.close_sources(EXIT_PATIENCE):
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(status)
+    sys.exit(status)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Expected errors become one line on stderr."""
     # Before NumPy is imported: its idle threads would prevent forking.
@@ -73,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _compute_in_one_thread()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
-        print(f"torchslam: error: {error}", file=sys.stderr)
+        print(f"torchslam: error: {printable(without_credentials(str(error)))}", file=sys.stderr)
         return ERROR
     except ModuleNotFoundError as error:
         if (reason := with_install_hint(error)) is error:
@@ -94,11 +112,16 @@ class Version(argparse.Action):
 
 
 def _compute_in_one_thread() -> None:
-    """Use one thread unless OMP_NUM_THREADS is set: the tensors of a frame are too small for more."""
-    import torch  # after the arguments were checked
+    """Use one thread unless OMP_NUM_THREADS is set: the tensors of a frame are too small for more.
+
+    A thread of OpenCV would also keep the process from being forked, and would still run while it exits.
+    """
+    import cv2  # both after the arguments were checked
+    import torch
 
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
+        cv2.setNumThreads(1)
 
 
 def load_command(name: str) -> tuple[str, Callable[..., None], Callable[..., int]]:
@@ -136,4 +159,4 @@ def build_parser(chosen: str) -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    console()

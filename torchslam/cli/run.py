@@ -213,7 +213,7 @@ def execute(options: argparse.Namespace) -> int:
     opened, config = _sequence(options), arguments.config(options)
     if options.dense:
         map_size(options.resolution, opened.size)  # raises now rather than after the run
-    is_recorded = opened.known_length is not None and not (options.view or options.video)
+    is_recorded = not opened.is_live and not (options.view or options.video)
     is_default = config.features == Config().features and config.matching == Config().matching
     is_default = is_default and options.features is None
     status = run(opened, config, replace(plan, may_fall_back=is_recorded and is_default and saved is None))
@@ -233,7 +233,7 @@ def execute(options: argparse.Namespace) -> int:
 def _sequence(options: argparse.Namespace) -> Sequence:
     """Open the sequence, with an initial guess of the camera if it has no calibration."""
     found = arguments.sequence(options)
-    if found.calibrated is not Calibrated.MISSING or found.known_length is None:
+    if found.calibrated is not Calibrated.MISSING or found.is_live:
         return found
     print(
         "torchslam: no calibration found; estimating intrinsics from the images (--camera auto)",
@@ -309,13 +309,12 @@ def _attempt(
         1 if plan.view or plan.video else plan.processes
     )  # the viewers need the images in this process
     watching = viewers.enter_context(_watching(slam, sequence, plan))
-    is_live = not len(sequence.timestamps)
     latencies: list[float] = []
     bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
     with bar as progress:
 
         def after_frame(result: StepResult) -> None:
-            if is_live:
+            if sequence.is_live:
                 latencies.append(1e3 * (time.time() - result.timestamp))
             checkpoints.offer(at_once=stop_signals.is_wanted)
             watching.show(result)
@@ -371,7 +370,7 @@ def _fall_back(
 
 def _with_camera(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[Sequence, str]:
     """Return the sequence with the camera of the run, and a remark on the camera if it was estimated."""
-    is_guess = sequence.calibrated is Calibrated.GUESSED and sequence.known_length is not None
+    is_guess = sequence.calibrated is Calibrated.GUESSED and not sequence.is_live
     if plan.map is not None or not (plan.refine or is_guess):
         if not plan.resume and is_found(plan.output / CALIBRATION):
             (plan.output / CALIBRATION).unlink()

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
 from torchslam.errors import ConfigError
-from torchslam.plugins import is_known, registered
+from torchslam.plugins import ALLOWED, is_code_of_others, is_known, registered
 from torchslam.utils.files import read_text
 
 Value = TypeVar("Value", bool, int, float, str)
@@ -118,14 +118,57 @@ def choices(kind: type[Settings]) -> dict[str, tuple[str, ...]]:
 def merge_settings(config: Section, path: Path | str | None = None, overrides: Iterable[str] = ()) -> Section:
     """Return the configuration changed by a TOML file, then by overrides of the form `section.key=value`.
 
+    A file may not name a plugin as PACKAGE:NAME, unless an override names that setting as well: see `plugins`.
+
     Raises:
-        ConfigError: for a missing or malformed file, an unknown key, or a value that is not allowed.
+        ConfigError: for a missing or malformed file, an unknown key, a value that is not allowed, or code to import.
     """
+    changes = [(_parse_override(override), f"--set {_short(override)}") for override in overrides]
     if path is not None:
-        config = _merge(config, _read_toml(Path(path)), str(path), type(config))
-    for override in overrides:
-        config = _merge(config, _parse_override(override), f"--set {_short(override)}", type(config))
+        values = _read_toml(Path(path))
+        config = _merge(config, values, str(path), type(config))
+        given = {name for change, _ in changes for name, _ in _leaves(change)}
+        _refuse_code(type(config), values, str(path), given)
+    for change, source in changes:
+        config = _merge(config, change, source, type(config))
     return config
+
+
+def check_override_in_file(kind: type[Settings], override: str, where: str) -> None:
+    """Check that `section.key=value`, found in a file, names no code to import. Raises ConfigError.
+
+    Whether it is a valid override is not checked.
+    """
+    try:
+        values = _parse_override(override)
+    except ConfigError:
+        return
+    _refuse_code(kind, values, where, set())
+
+
+def _refuse_code(kind: type[Settings], values: Mapping[str, Any], where: str, given: set[str]) -> None:
+    groups = {name: allowed.group for name, allowed in _everything(kind) if allowed.group}
+    for name, value in _leaves(values):
+        group = groups.get(name)
+        if group and name not in given and isinstance(value, str) and is_code_of_others(group, value):
+            package = value.partition(":")[0]
+            raise ConfigError(
+                f"{where}: {name} = {_shown(value)} imports code, which a file may not do unasked: "
+                f"name it on the command line (--set {name}={_short(value)}), "
+                f"or allow the package with {ALLOWED}={_short(package)}"
+            )
+
+
+def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
+    """Yield full name and value of each setting in tables of tables, however deep."""
+    pending = [("", values)]
+    while pending:
+        prefix, table = pending.pop()
+        for key, value in table.items():
+            if isinstance(value, Mapping):
+                pending.append((f"{prefix}{key}.", value))
+            else:
+                yield prefix + key, value
 
 
 def scale_pixel_settings(config: Section, factor: float) -> Section:

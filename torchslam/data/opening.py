@@ -20,7 +20,7 @@ from torchslam.data.readers.bag import BAG
 from torchslam.data.readers.euroc import EUROC
 from torchslam.data.readers.image_sequence import FOLDER
 from torchslam.data.readers.kitti import KITTI, KITTI_RAW
-from torchslam.data.readers.live import LIVE, is_live
+from torchslam.data.readers.live import LIVE, is_address, is_live
 from torchslam.data.readers.rgbd import ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
 from torchslam.data.readers.video import VIDEO
 from torchslam.data.sequence import Reader, Sequence
@@ -28,6 +28,7 @@ from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
 from torchslam.data.transforms import Masked, cut, reduce_rate, resize
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
 from torchslam.geometry.camera import Camera
+from torchslam.utils.text import without_credentials
 
 # The first match is used: readers of specific layouts precede those of plain images.
 READERS = (
@@ -86,8 +87,10 @@ def open_sequence(
 
 
 def full_name(path: str | Path) -> str:
-    """Return a path that opens the sequence from any working directory."""
+    """Return a path that opens the sequence from any working directory; an address without its credentials."""
     path = str(path)
+    if is_address(path):
+        return without_credentials(path)
     return path if is_synthetic(path) or is_live(path) else str(Path(path).absolute())
 
 

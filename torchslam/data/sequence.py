@@ -17,6 +17,7 @@ from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Features, Frame, Trajectory
+from torchslam.utils.text import printable, without_credentials
 
 if TYPE_CHECKING:
     from torchslam.data.camera_argument import GivenCamera
@@ -67,8 +68,8 @@ class Sequence(ABC):
         notes: Iterable[str] = (),
     ) -> None:
         """Take the size of the images (required without a camera); `guessed`: the camera is approximate."""
-        self.name = name
-        self.kind = kind
+        self.name = printable(without_credentials(name))
+        self.kind = printable(kind)
         known = size if camera is None else camera.size
         if known is None:
             raise ValueError("a sequence without a camera needs the size of its images")
@@ -79,7 +80,7 @@ class Sequence(ABC):
             self.calibrated = Calibrated.MISSING
         self.timestamps = timestamps
         self.groundtruth = groundtruth
-        self.notes = tuple(notes)
+        self.notes = tuple(map(printable, notes))
         self.camera_std: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
         self._T_cw: Tensor | None = None
@@ -116,6 +117,11 @@ class Sequence(ABC):
     def known_length(self) -> int | None:
         """Number of frames; None for a live source, which has no end and no `len`."""
         return len(self)
+
+    @property
+    def is_live(self) -> bool:
+        """Whether each frame is there only once, when it comes, also where only so many are taken."""
+        return not len(self.timestamps)
 
     def indices(self, start: int = 0) -> Iterable[int]:
         """Return the frame indices from `start` on; endless for a live source."""

@@ -128,7 +128,7 @@ def _frame_at(sequence: Sequence, text: str | int, which: str) -> int:
 
 def _check_known(sequence: Sequence, what: str) -> None:
     """Raise SequenceError if the timestamps are not known in advance."""
-    if not len(sequence.timestamps):
+    if sequence.is_live:
         raise SequenceError(
             f"{sequence.name}: {what} needs timestamps known in advance, which a live source does not have"
         )

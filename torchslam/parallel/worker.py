@@ -6,9 +6,13 @@ It is forked where that is safe, which takes no time; elsewhere a new interprete
 from __future__ import annotations
 
 import multiprocessing
+import os
 import pickle
 import signal
+import socket
+import struct
 import sys
+import time
 import traceback
 import warnings
 from collections.abc import Callable, Iterator
@@ -26,6 +30,12 @@ from torchslam.errors import TorchslamError
 
 READY = b""  # first message of a worker
 THREADS = Path("/proc/self/task")  # one entry each, on Linux
+SILENCE = 10.0
+"""Seconds without an answer, and without use of the processor, after which a worker is given up."""
+SILENCE_UNKNOWN = 60.0
+"""The same where the system does not tell how much of the processor a process used."""
+LOOK = 0.5  # seconds from one look at its use of the processor to the next
+END = 5.0  # seconds in which a process that is told to end has to
 
 
 def starts_at_once() -> bool:
@@ -61,6 +71,7 @@ class Worker:
         with _without_interrupts(is_copied):
             self._process.start()
         theirs.close()  # so that its end is noticed
+        _limit_send_time(self._ours)
 
     def is_there(self) -> bool:
         """Return True once the process has started, which takes a while, until it ends."""
@@ -76,6 +87,8 @@ class Worker:
         try:
             if self._is_there:
                 self._ours.send_bytes(message)
+        except BlockingIOError:
+            self._give_up()
         except (EOFError, OSError):
             self._lose()
         return self._is_there
@@ -88,28 +101,73 @@ class Worker:
             return True
 
     def receive(self) -> Any:
-        """Wait for the next result, unpickled; None if the process has ended."""
+        """Wait for the next result, unpickled; None if the process has ended, or does not answer."""
+        if self._has_ended:
+            return None
         try:
-            return pickle.loads(self._ours.recv_bytes())
+            if self._answers():
+                return pickle.loads(self._ours.recv_bytes())
+            self._give_up()
         except (EOFError, OSError):
             self._lose()
-            return None
+        return None
 
     def end(self) -> None:
         """Stop the process."""
         self._ours.close()
         self._process.terminate()
+        self._process.join(END)
+        if self._process.exitcode is None:  # it is stopped, and takes no other signal
+            self._process.kill()
+            self._process.join()
+
+    def _answers(self) -> bool:
+        """Wait for a message or the end of the process; False if it neither sends one nor works on it.
+
+        However long it works, on however busy a machine, it is waited for.
+        """
+        used, heard = _processor_time(self._process), time.monotonic()
+        patience = SILENCE_UNKNOWN if used is None else SILENCE
+        while not self._ours.poll(LOOK):
+            now = _processor_time(self._process)
+            if now != used:
+                used, heard = now, time.monotonic()
+            elif time.monotonic() - heard > patience:
+                return False
+        return True
+
+    def _give_up(self) -> None:
+        """Kill the process, which was stopped or is stuck, and warn."""
+        self._process.kill()
         self._process.join()
+        self._end_with("does not answer")
 
     def _lose(self) -> None:
         """Warn that the process was killed."""
         if not self._has_ended:
             self._process.join()
-            status = self._process.exitcode
-            warnings.warn(
-                f"another process of this run has ended ({status}): going on without it", stacklevel=2
-            )
+            self._end_with(f"has ended ({self._process.exitcode})")
+
+    def _end_with(self, reason: str) -> None:
         self._is_there, self._has_ended = False, True
+        warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=3)
+
+
+def _processor_time(process: BaseProcess) -> int | None:
+    """Ticks of the processor that a process has used; None where the system does not tell."""
+    try:
+        fields = Path(f"/proc/{process.pid}/stat").read_bytes().rpartition(b")")[2].split()
+    except OSError:
+        return None
+    return int(fields[11]) + int(fields[12])  # utime and stime: proc(5)
+
+
+def _limit_send_time(connection: Connection) -> None:
+    """Let a message that nobody takes for SILENCE seconds fail with BlockingIOError, where the pipe is a socket."""
+    if sys.platform == "win32":
+        return
+    with socket.socket(fileno=os.dup(connection.fileno())) as ours:  # the option is of both
+        ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, struct.pack("@ll", int(SILENCE), 0))
 
 
 def _copied(work: Callable[..., None], theirs: Connection, ours: Connection) -> None:

@@ -123,7 +123,7 @@ def reader(
         if processes > 1 and is_asked_for:
             print(f"torchslam: frames are read in the main process: {obstacle}", file=sys.stderr)
         return None
-    if not len(sequence.timestamps):
+    if sequence.is_live:
         return LivePrefetcher(sequence, slam.camera, slam.config, slam.clock)
     return FeaturePrefetcher(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
 

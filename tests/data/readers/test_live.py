@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -219,3 +221,34 @@ def test_a_run_ends_with_the_source(clip: Path) -> None:
     assert 0 < len(run.results) <= FRAMES
     assert run.skipped == []
     assert len(run.results) + sequence.dropped == FRAMES
+
+
+def test_a_stream_that_is_stuck_does_not_keep_or_abort_the_process(tmp_path: Path) -> None:
+    code = f"""
+import sys, time
+import cv2, numpy as np
+class Stuck:
+    frames = 0
+    def __init__(self, address): pass
+    def isOpened(self): return True
+    def grab(self):
+        self.frames += 1
+        time.sleep(0.02 if self.frames < 6 else 600)
+        return True
+    def retrieve(self): return True, np.full((48, 64, 3), 100, np.uint8)
+    def get(self, property_id): return 0.0
+    def release(self): pass
+cv2.VideoCapture = Stuck
+from torchslam.cli.main import console
+options = "--camera f=0.8w --limit 3 --processes 1".split()
+sys.argv[1:] = ["run", "rtsp://camera/x", *options, "-o", {str(tmp_path)!r}]
+console()
+"""
+    began = time.monotonic()
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert done.returncode == 3, done.stderr
+    assert "too little texture" in done.stderr
+    assert "frames    3" in done.stdout
+    assert time.monotonic() - began < 200

@@ -62,6 +62,12 @@ class GivenPoses:
     names: tuple[str, ...] = ()
     calibration: Calibration | None = None
 
+    def __post_init__(self) -> None:
+        """Raise TrajectoryError for a name that could not be a word of a line."""
+        wrong = [name for name in self.names if not name.isprintable()]
+        if wrong:
+            raise TrajectoryError(f"{self.path}: the name of an image has control characters: {wrong[0]!r}")
+
     def __len__(self) -> int:
         return len(self.T_cw)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 import re
 import threading
 import time
+import weakref
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
@@ -21,6 +23,7 @@ from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
+from torchslam.utils.text import without_credentials
 
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
 PATIENCE = 15.0
@@ -29,6 +32,8 @@ BACKLOG = 10
 """Maximum number of queued frames; then the oldest one is dropped."""
 STEADY = 1.0
 """Maximum drift of the source's clock from ours in seconds, before it is ignored."""
+EXIT_PATIENCE = 2.0
+"""Seconds for which the interpreter waits for the threads of sources when it exits."""
 STALE = 0.5
 """Age in seconds above which the frame read on opening is discarded."""
 
@@ -78,6 +83,7 @@ class LiveSequence(Sequence):
         self._limit: int | None = None
         self._given, self._time = 0, 0.0
         self._is_watched = False
+        _SOURCES.add(self)
         self._thread = self._watch_until(lambda: bool(self._arrived))
         self._thread.join(patience)
         if not self._arrived:
@@ -160,6 +166,11 @@ class LiveSequence(Sequence):
         if not self._thread.is_alive():
             self._end()
 
+    def has_ended(self, patience: float) -> bool:
+        """Return whether the thread that watches has ended, after some seconds at most."""
+        self._thread.join(max(0.0, patience))
+        return not self._thread.is_alive()
+
     def _begin(self) -> None:
         """Watch from now on, without what was seen long ago."""
         self._is_watched = True
@@ -206,6 +217,23 @@ class LiveSequence(Sequence):
             self._fresh.notify_all()
 
 
+_SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()
+"""Those that there are; a thread keeps its source."""
+
+
+def close_sources(patience: float) -> bool:
+    """Close all sources, and return whether their threads have ended after some seconds at most."""
+    sources = list(_SOURCES)
+    end = time.monotonic() + patience
+    for source in sources:
+        source.close()
+    return all(source.has_ended(end - time.monotonic()) for source in sources)
+
+
+# Threads that end on their own before the interpreter does are not ended by it, in the middle of OpenCV.
+atexit.register(close_sources, EXIT_PATIENCE)
+
+
 class CaptureClock:
     """Capture times on our clock: by the source's own clock, from the first frame on, as long as that runs with ours.
 
@@ -226,9 +254,14 @@ class CaptureClock:
         return self._last
 
 
+def is_address(path: str) -> bool:
+    """Return True for the address of a stream or of a file."""
+    return ADDRESS.fullmatch(path) is not None
+
+
 def is_live(path: str) -> bool:
     """Return True for an address, and for the number of a camera that is not a file."""
-    if ADDRESS.fullmatch(path):
+    if is_address(path):
         return (
             not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
         )  # a file does not drop frames
@@ -238,7 +271,7 @@ def is_live(path: str) -> bool:
 def _open_live(path: str, camera: GivenCamera | None, rate: float | None) -> LiveSequence:
     """A camera or a stream. Raises SequenceError where it cannot be opened."""
     number = path.isdecimal()
-    shown = re.sub(r"//[^/@]*@", "//", path)  # without a password
+    shown = without_credentials(path)
     capture = cv2.VideoCapture(int(path)) if number else cv2.VideoCapture(path)
     if not capture.isOpened():
         raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")

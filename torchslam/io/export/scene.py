@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.data import open_sequence
+from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Sequence
 from torchslam.data.transforms import resize
 from torchslam.errors import ResultsError, SequenceError
@@ -268,6 +269,8 @@ def open_images(
         otherwise: what to do without them, for the error.
     """
     times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
+    if is_live(source):  # nor is it connected to because a results folder says so
+        raise ResultsError(f"{source}: a live source gives each image once; {otherwise}")
     try:
         sequence = open_sequence(source)
         if fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):

@@ -27,6 +27,7 @@ from torchslam.io.results import Results, aligned
 from torchslam.map.atlas import Submap
 from torchslam.system.run import keyframe_trajectory
 from torchslam.types import State, Trajectory
+from torchslam.utils.text import printable
 
 VIEW = "view.html"
 SCRIPTS = ("draw.js", "orbit.js", "scene.js", "view.js")  # in this order, all in one script
@@ -89,9 +90,9 @@ def page_data(results: Results) -> dict[str, Any]:
     budget = MAX_POINTS / max(sum(submap.map.num_points for submap in shown), 1)
     accuracy = f" · ATE {metrics['ate_m']:.3g} m" if "ate_m" in metrics else ""
     return {
-        "title": Path(metrics.get("source") or "torchslam").name,
+        "title": printable(Path(metrics.get("source") or "torchslam").name),
         "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}",
-        "failure": metrics.get("failure", ""),
+        "failure": printable(metrics.get("failure", "")),
         "corners": _corners(results.camera).tolist(),
         "reasons": reasons,
         "frames": {

@@ -1,0 +1,23 @@
+"""A command leaves no thread behind: one that still runs while the interpreter exits may end it with a crash."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads are counted on Linux")
+def test_a_run_has_one_thread_when_it_ends(tmp_path: Path) -> None:
+    code = (
+        "import os, sys; from torchslam.cli.main import main; status = main(sys.argv[1:]); "
+        "print(len(os.listdir('/proc/self/task'))); sys.exit(status)"
+    )
+    arguments = ["run", "synthetic:room?frames=12", "--features", "opencv-orb", "-o", str(tmp_path)]
+    for processes in ("1", "3"):
+        command = [sys.executable, "-c", code, *arguments, "--overwrite", "--processes", processes]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.split()[-1] == "1"
