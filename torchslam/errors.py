@@ -53,5 +53,9 @@ class InitializationError(TorchslamError):
     """No map could be initialized; the message says why (standstill, pure rotation, too few matches)."""
 
 
+class ConvergenceError(TorchslamError):
+    """A least-squares problem that was solved with `strict=True` has no minimum, or the search for it did not end."""
+
+
 class ClipError(TorchslamError):
     """A clip to learn from has no poses to compare."""

@@ -138,7 +138,7 @@ def test_splitting_a_large_batch_does_not_change_the_result(bundle_scene, monkey
     monkeypatch.setattr(minimization, "_MAX_CELLS_CPU", 400)
     reported = []
     batch = batch_of(problems)
-    bundle_adjust(batch, progress=lambda now, most: reported.append((now, most)))
+    bundle_adjust(batch, iterations=20, progress=lambda now, most: reported.append((now, most)))
     given = sanitized(batch, 1.0)
     assert len(minimization._parts(given, select_moving(given))) == 2
     assert reported == sorted(reported)

@@ -5,7 +5,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from torchslam.errors import TorchslamError
+from torchslam.errors import ConvergenceError, TorchslamError
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
 from torchslam.geometry.camera_measurement import CameraMeasurement
@@ -411,3 +411,14 @@ def test_graphs_with_calibrations_are_solved_as_alone():
     together = solve_graphs([given, graph, given])
     for found, alone in zip(together, (given, graph, given), strict=True):
         torch.testing.assert_close(found.T_cw, solve_graph(alone).T_cw, rtol=0, atol=1e-9)
+
+
+def test_strict_raises_where_a_frame_is_not_at_a_minimum():
+    graph = simulated()[1]
+    assert solve_graph(graph, strict=True).converged.all()
+    for solve in (
+        lambda: solve_graph(graph, iterations=1, strict=True),
+        lambda: solve_graphs([graph, graph], iterations=1, strict=True),
+    ):
+        with pytest.raises(ConvergenceError, match=r"frames: .* not converged"):
+            solve()

@@ -32,6 +32,7 @@ _AROUND = 10  # keyframes whose points are searched for in the other map
 _NEEDED = 12  # inliers of the first similarity
 _CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
 _KERNEL_SCALE = 2.0
+_ITERATIONS = 20  # of the refined pose, which rarely needs ten
 _GATE_WIDENING = 2.0  # times the noise, as the Sim(3) has noise of its own
 
 
@@ -240,5 +241,6 @@ def _refined(
         kernel="cauchy",
         scale=_KERNEL_SCALE,
         backward="detached",
+        iterations=_ITERATIONS,
     ).T_cw[0]
     return refined, passes_gate(noise.squared_reprojection(transform(refined, points_w), pixels, camera))

@@ -17,7 +17,9 @@ from torchslam.geometry.robust import Kernel, robustify
 from torchslam.optim._core import tangent
 from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
+    MAX_ITERATIONS,
     Convergence,
+    check_minimum,
     index_tree,
     minimize_batch,
     select_models,
@@ -141,6 +143,11 @@ class LeastSquaresSolution:
     success: Bool[Tensor, " B"]
     convergence: Convergence
 
+    @property
+    def converged(self) -> Bool[Tensor, " B"]:
+        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
+        return self.convergence.converged.view_as(self.success)
+
 
 @full_precision
 def minimize(
@@ -153,8 +160,9 @@ def minimize(
     kernel: Kernel = "none",
     scale: Float[Tensor, "*#scale"] | float = 1.0,
     backward: Backward = "implicit",
-    iterations: int = 50,
+    iterations: int = MAX_ITERATIONS,
     tolerance: float = 1e-10,
+    strict: bool = False,
 ) -> LeastSquaresSolution:
     """Minimize half the sum of rho(weight * |residual|^2) over unknowns by Levenberg-Marquardt, many problems at once.
 
@@ -182,10 +190,12 @@ def minimize(
         backward: how gradients reach inputs, weights and scale.
         iterations: maximum number of steps.
         tolerance: stop where the predicted reduction of the cost is below this share of it.
+        strict: raise an error for any element that is not at a minimum: `success` or `converged` is False.
 
     Raises:
         ValueError: a shape or a dtype does not fit, a name is unknown, or the residual has gradients to tensors other
             than its inputs, which would not receive any.
+        ConvergenceError: with `strict`.
     """
     check_backward(backward)
     unknowns = (start,) if isinstance(start, Tensor) else tuple(start)
@@ -200,6 +210,8 @@ def minimize(
         found[: len(unknowns)],
         found[len(unknowns) :],
     )
+    if strict:
+        check_minimum(success, converged, "elements")
     if backward == "truncated":
         solution = minimization.last_step(solution, tensors, success)
     return LeastSquaresSolution(solution, cost, success, Convergence(steps, converged, initial_cost, cost))

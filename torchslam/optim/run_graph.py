@@ -26,12 +26,15 @@ from torchslam.geometry.camera_measurement import ERROR_FACTOR, CameraMeasuremen
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward
-from torchslam.optim._core.levenberg_marquardt import Progress
+from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Progress, check_minimum
 from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.pose._refinement import refine_pose
 from torchslam.types import Trajectory
 from torchslam.utils.files import check_regular
+
+POSE_ITERATIONS = 30
+"""Enough where no gradient is wanted: poses settle long before the choice of outliers that gradients depend on."""
 
 _FRAMES_AT_ONCE = 64
 _MAX_BYTES = 1 << 34
@@ -239,9 +242,10 @@ def solve_graph(
     scale: Float[Tensor, "*#scale"] | float = 2.45,
     free_camera: bool | Float[Tensor, "P n"] | None = None,
     backward: Backward = "implicit",
-    iterations: int = 30,
+    iterations: int = MAX_ITERATIONS,
     tolerance: float = 1e-10,
     progress: Progress | None = None,
+    strict: bool = False,
 ) -> GraphSolution:
     """Minimize the robust reprojection errors of a run's graph: keyframes and points, then the other frames.
 
@@ -259,12 +263,14 @@ def solve_graph(
         iterations: maximum number of steps.
         tolerance: stop where the predicted reduction of the cost is below this share of it.
         progress: called before each iteration of a bundle adjustment.
+        strict: raise an error for any frame that is not at a minimum: `success` or `converged` is False.
 
     Returns:
         The minimum, differentiable with respect to pixels, weights and camera.
 
     Raises:
         ValueError: a submap has no keyframe, or two submaps see the same point.
+        ConvergenceError: with `strict`.
     """
     options = kernel, scale, backward, iterations, tolerance
     free, prior = (False, None) if free_camera is None else (free_camera, None)
@@ -282,7 +288,10 @@ def solve_graph(
             for row, submap in enumerate(submaps)
         ]
 
-    return _solve([graph], adjust, *options)[0]
+    (solution,) = _solve([graph], adjust, *options)
+    if strict:
+        check_minimum(solution.success, solution.converged, "frames")
+    return solution
 
 
 def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
@@ -409,8 +418,9 @@ def solve_graphs(
     kernel: Kernel = "huber",
     scale: Float[Tensor, "*#scale"] | float = 2.45,
     backward: Backward = "implicit",
-    iterations: int = 30,
+    iterations: int = MAX_ITERATIONS,
     tolerance: float = 1e-10,
+    strict: bool = False,
 ) -> tuple[GraphSolution, ...]:
     """The minimum of every graph as `solve_graph` finds it, up to rounding; options and errors as there.
 
@@ -437,11 +447,17 @@ def solve_graphs(
     found: Sequence[GraphSolution]
     for rows in alike.values():
         if len(rows) == 1:
-            found = (solve_graph(graphs[rows[0]], kernel, scale, None, backward, iterations, tolerance),)
+            found = (solve_graph(graphs[rows[0]], kernel, scale, None, *options[2:]),)
         else:
             found = _solve([graphs[row] for row in rows], adjust, *options)
         solved.update(zip(rows, found, strict=True))
-    return tuple(solved[row] for row in range(len(graphs)))
+    solutions = tuple(solved[row] for row in range(len(graphs)))
+    if strict and solutions:
+        success, converged = (
+            torch.cat([getattr(each, name) for each in solutions]) for name in ("success", "converged")
+        )
+        check_minimum(success, converged, "frames")
+    return solutions
 
 
 def _solve(

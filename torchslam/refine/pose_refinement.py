@@ -27,7 +27,7 @@ from torchslam.errors import FrameError, TrajectoryError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.optim.run_graph import solve_graph
+from torchslam.optim.run_graph import POSE_ITERATIONS, solve_graph
 from torchslam.refine.map_building import align_rotations, build_map
 from torchslam.refine.non_keyframes import FramePoser, graph_of
 from torchslam.refine.tracks import Pair, choose_keyframes, find_pairs, join_matches
@@ -159,7 +159,8 @@ def _connected(
 def _finalize(submap: Submap, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
     """Solve one graph of all frames, with covariances, and align it to the given poses T_cw of the frames."""
     graph = submap.posed_frames.graph(submap.map, camera)
-    submap.posed_frames.apply_solution(solve_graph(graph, backward="detached"), graph, submap.map)
+    solution = solve_graph(graph, backward="detached", iterations=POSE_ITERATIONS)
+    submap.posed_frames.apply_solution(solution, graph, submap.map)
     row_of = {index: row for row, index in enumerate(frames.tolist())}
     posed = [row_of[index] for index in submap.posed_frames.frames["frame_index"].tolist()]
     submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), T_cw[posed]))

@@ -24,7 +24,7 @@ from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames, RunGraph
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.optim import Progress
-from torchslam.optim.run_graph import concatenate_graphs, solve_graph
+from torchslam.optim.run_graph import POSE_ITERATIONS, concatenate_graphs, solve_graph
 from torchslam.system.front_end import source
 from torchslam.system.session import Session
 from torchslam.types import Frame, Reason, State, StepResult, Trajectory
@@ -297,7 +297,7 @@ class FinalAdjustment:
         self.camera, self.given = camera, given or self.given
         submap.posed_frames.remove_outliers(submap.map, camera)
         graph = submap.posed_frames.graph(submap.map, camera, calibration=given)
-        solution = solve_graph(graph, backward="detached", progress=progress)
+        solution = solve_graph(graph, backward="detached", iterations=POSE_ITERATIONS, progress=progress)
         submap.posed_frames.apply_solution(solution, graph, submap.map)
         self.camera = solution.camera
         if given is not None:

@@ -18,11 +18,18 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
+from torchslam.errors import ConvergenceError
+
 INITIAL_DAMPING = 1e-4
 DAMPING_DOWN, DAMPING_UP = 0.1, 10.0
 _DAMPING_RANGE = (1e-10, 1e8)
+_NAMED = 10  # rows that an error lists
 CURVATURE_BELOW = 1e-2
 """Predicted relative reduction of the cost below which the kernel's curvature is used."""
+
+MAX_ITERATIONS = 200
+"""Limit of the steps where the caller gives none. With a fifth of outliers a Huber kernel needs up to 50, and short of
+the minimum the gradient is another one."""
 
 Progress = Callable[[int, int], None]
 """Called before each iteration with its number, from 0, and the maximum number of iterations."""
@@ -103,6 +110,22 @@ class Convergence:
         """Of one element."""
         one = slice(row, row + 1)
         return Convergence(self.iterations[one], self.converged[one], self.initial_cost[one], self.cost[one])
+
+
+def check_minimum(success: Bool[Tensor, "*batch"], converged: Bool[Tensor, "*batch"], what: str) -> None:
+    """Raise ConvergenceError with the rows of the elements, which are named by `what`, that are not at a minimum."""
+    undetermined = (~success).flatten().nonzero().flatten().tolist()
+    unfinished = (success & ~converged).flatten().nonzero().flatten().tolist()
+    parts = [
+        f"{len(rows)} {problem} ({', '.join(map(str, rows[:_NAMED]))}{', ...' if len(rows) > _NAMED else ''})"
+        for rows, problem in (
+            (undetermined, "not determined"),
+            (unfinished, "not converged: allow more iterations"),
+        )
+        if rows
+    ]
+    if parts:
+        raise ConvergenceError(f"of {success.numel()} {what}: {'; '.join(parts)}")
 
 
 Tree = TypeVar("Tree")

@@ -14,7 +14,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
-from torchslam.optim._core.levenberg_marquardt import Convergence, Progress
+from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, Progress, check_minimum
 from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
 from torchslam.optim.bundle._schur import Marginals
@@ -47,6 +47,11 @@ class BundleSolution:
     moved_points: Bool[Tensor, "*batch N"]
     convergence: Convergence
     _marginals: Callable[[], Marginals] = field(repr=False)
+
+    @property
+    def converged(self) -> Bool[Tensor, "*batch"]:
+        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
+        return self.convergence.converged.view_as(self.success)
 
     @cached_property
     def _covariance(self) -> Marginals:
@@ -107,10 +112,11 @@ def bundle_adjust(
     scale: Float[Tensor, "*#scale"] | float = 1.0,
     free_camera: bool | Float[Tensor, "P n"] = False,
     backward: Backward = "implicit",
-    iterations: int = 20,
+    iterations: int = MAX_ITERATIONS,
     tolerance: float = 1e-8,
     progress: Progress | None = None,
     check: bool = True,
+    strict: bool = False,
 ) -> BundleSolution:
     """Minimize robust reprojection errors over poses, points and, if `free_camera`, the cameras' parameters.
 
@@ -133,12 +139,14 @@ def bundle_adjust(
         tolerance: stop where the predicted reduction of the cost is below this share of it.
         progress: called before each iteration with its number and the maximum; its exceptions end the minimization.
         check: test whether all that moves is determined. Without, `success` is that of the start; saves a tenth.
+        strict: raise an error for any problem that is not at a minimum: `success` or `converged` is False.
 
     Returns:
         The minimum, differentiable, with covariances on demand.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
+        ConvergenceError: with `strict`.
     """
     check_backward(backward)
     given = sanitized(problem, scale)
@@ -146,6 +154,8 @@ def bundle_adjust(
         problem.camera, kernel, free_camera, iterations, tolerance, progress, check, given.weights.ndim > 2
     )
     found = BundleMinimum(*find_minimum(minimization, given, backward))
+    if strict:
+        check_minimum(found.success, found.converged, "bundle adjustments")
     detached = [x.detach() for x in given]
     solution = minimization.at_minimum(found, given) if backward == "implicit" else found.estimate
     if backward == "truncated":

@@ -20,7 +20,12 @@ from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
-from torchslam.optim._core.levenberg_marquardt import Convergence, minimize_batch
+from torchslam.optim._core.levenberg_marquardt import (
+    MAX_ITERATIONS,
+    Convergence,
+    check_minimum,
+    minimize_batch,
+)
 from torchslam.optim._core.linear import diagonal_floor, factorize
 from torchslam.optim._core.residuals import (
     ReprojectionData,
@@ -337,6 +342,11 @@ class RefinedPose:
     convergence: Convergence
     _inputs: PoseInputs = field(repr=False)
 
+    @property
+    def converged(self) -> Bool[Tensor, " B"]:
+        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
+        return self.convergence.converged.view_as(self.success)
+
     @cached_property
     def covariance(self) -> Float[Tensor, "B 6 6"]:
         """Covariance of the left perturbation (translation, rotation), detached; zero where `success` is False.
@@ -360,8 +370,9 @@ def refine_pose(
     scale: Float[Tensor, "*#scale"] | float = 1.0,
     prior: PosePrior | None = None,
     backward: Backward = "implicit",
-    iterations: int = 20,
+    iterations: int = MAX_ITERATIONS,
     tolerance: float = 1e-10,
+    strict: bool = False,
 ) -> RefinedPose:
     """Minimize robust reprojection errors over poses by Levenberg-Marquardt, many problems at once.
 
@@ -377,6 +388,7 @@ def refine_pose(
         backward: how gradients reach points, pixels, weights, camera.params, scale and prior.
         iterations: maximum number of steps.
         tolerance: stop where the predicted reduction of the cost is below this share of it.
+        strict: raise an error for any pose that is not at a minimum: `success` or `converged` is False.
 
     Returns:
         The poses. Where `success` is False (too few points, or a pose that they do not determine), the gradient is
@@ -384,6 +396,7 @@ def refine_pose(
 
     Raises:
         ValueError: a shape does not fit, or a name is unknown.
+        ConvergenceError: with `strict`.
     """
     check_backward(backward)
     inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
@@ -391,6 +404,8 @@ def refine_pose(
     tensors = (T_cw, *inputs.tensors())
     found = find_minimum(minimization, tensors, backward)
     refined, success, cost, steps, converged, initial_cost = found
+    if strict:
+        check_minimum(success, converged, "poses")
     if backward == "truncated":
         problem = PoseProblem(inputs)
         last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(cost))

@@ -13,7 +13,7 @@ from torchslam.geometry.lie import sim3_scale
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
-from torchslam.optim._core.levenberg_marquardt import Convergence
+from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, check_minimum
 from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
 from torchslam.utils.indexing import row_mask
 
@@ -32,7 +32,8 @@ class PoseGraph:
         information: inverse covariances of log(S_j S_i^-1 S_ji^-1), symmetric, with D = 7:
             translation, rotation, log scale; D = 6 without scale. Or (B, E) or (E,) weights of the identity; one if
             None.
-        fixed: rows of nodes, or a (B, K) or (K,) bool mask.
+        fixed: rows of nodes, or a (B, K) or (K,) bool mask. Without any, the first node of every connected part stays,
+            and the gradient is right for losses that do not depend on the gauge.
         mask: edges that count, all if None.
         with_scale: free the scales of the nodes. If False, the log scale is not part of the error either.
     """
@@ -54,7 +55,7 @@ class PoseGraphSolution:
         cost: half the sum of robustified squared whitened errors, detached.
         success: some node is free, and all free nodes are determined. If False, the estimate is the best
             one found, but it has no gradient.
-        moved: Nodes that are fixed, not finite, or not connected with a fixed node by counted edges stayed
+        moved: Nodes that are fixed, not finite, or not connected with a node that stays by counted edges stayed
             at their start (the identity where that is not a similarity), with a gradient to that start only.
         convergence: iterations and convergence per element of the batch.
     """
@@ -65,6 +66,11 @@ class PoseGraphSolution:
     moved: Bool[Tensor, "*batch K"]
     convergence: Convergence
 
+    @property
+    def converged(self) -> Bool[Tensor, "*batch"]:
+        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
+        return self.convergence.converged.view_as(self.success)
+
 
 @full_precision
 def pose_graph_optimize(
@@ -72,8 +78,9 @@ def pose_graph_optimize(
     kernel: Kernel = "huber",
     scale: Float[Tensor, "*#scale"] | float = _SCALE,
     backward: Backward = "implicit",
-    iterations: int = 30,
+    iterations: int = MAX_ITERATIONS,
     tolerance: float = 1e-8,
+    strict: bool = False,
 ) -> PoseGraphSolution:
     """Minimize the robust errors log(S_j S_i^-1 S_ji^-1) of the edges over the nodes by Levenberg-Marquardt.
 
@@ -89,12 +96,14 @@ def pose_graph_optimize(
         backward: how gradients reach S_ji, information, scale and fixed nodes, but not the start of free ones.
         iterations: maximum number of steps.
         tolerance: stop where the predicted reduction of the cost is below this share of it.
+        strict: raise an error for any graph that is not at a minimum: `success` or `converged` is False.
 
     Returns:
         The nodes at the minimum, differentiable.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
+        ConvergenceError: with `strict`.
     """
     check_backward(backward)
     counted, fixed, inputs = _sanitized(graph, scale)
@@ -102,6 +111,8 @@ def pose_graph_optimize(
     tensors = (*inputs, counted, fixed, graph.edges)
     found = find_minimum(minimization, tensors, backward)
     solution, success, moving, cost, steps, converged, initial_cost = found
+    if strict:
+        check_minimum(success, converged, "pose graphs")
     at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
     if backward == "implicit":
         solution = torch.where(moving[..., None, None], solution, inputs.S_cw)
@@ -146,7 +157,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
     counted = measured & weighted & nodes[:, edges[:, 0]] & nodes[:, edges[:, 1]]
     if graph.mask is not None:
         counted = counted & graph.mask
-    fixed = row_mask("fixed", graph.fixed, nodes) & nodes
+    fixed = row_mask("fixed", graph.fixed, nodes)
     eye = torch.eye(4, dtype=S_cw.dtype, device=S_cw.device)
     scale = torch.as_tensor(scale, dtype=S_cw.dtype, device=S_cw.device)
     rows = counted[..., None, None]

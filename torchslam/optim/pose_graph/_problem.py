@@ -61,7 +61,7 @@ class PoseGraphLayout:
 
     Attributes:
         i, j: (E,) int64 nodes of the edges
-        moving: nodes that counted edges join with a fixed one
+        moving: nodes that counted edges join with one that stays
         linking: edges that, in some element, join two moving nodes; transposed: (L,) bool, whether the block
             of the pair of nodes is the transpose of the edge's
         by_pair: the edges of each pair
@@ -85,7 +85,11 @@ def build_pose_graph_layout(
     """Find the moving nodes and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
     i, j = edges.unbind(-1)
     num_nodes = fixed.shape[1]
-    moving = _reached(edges, counted, fixed) & ~fixed
+    part = _connected_parts(edges, counted, fixed)
+    is_first = part == torch.arange(num_nodes, device=part.device)
+    stays = torch.where(fixed.any(1, keepdim=True), fixed, is_first)
+    reached = torch.zeros_like(part).scatter_reduce(1, part, stays.long(), "amax").gather(1, part) > 0
+    moving = reached & ~stays
     linking = (counted & moving[:, i] & moving[:, j]).any(0).nonzero().squeeze(-1)
     low, high = edges[linking].amin(-1), edges[linking].amax(-1)
     keys, positions = torch.unique(low * num_nodes + high, return_inverse=True)
@@ -103,8 +107,8 @@ def build_pose_graph_layout(
     )
 
 
-def _reached(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
-    """Which nodes (B, K) counted edges join, over others or not, with a fixed one.
+def _connected_parts(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
+    """The first of the nodes that counted edges join, over others or not, with each node (B, K).
 
     Every node points to one of its component with a number not above its own; edges hook these onto one another, and
     pointers are shortened, until nothing changes: about log K rounds.
@@ -120,10 +124,8 @@ def _reached(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
         hooked = hooked.scatter_reduce(1, ends.expand_as(low), low, "amin")
         shortened = hooked.gather(1, hooked)
         if torch.equal(shortened, label):
-            break
+            return label
         label = shortened
-    has_fixed = torch.zeros_like(label).scatter_reduce(1, label, fixed.long(), "amax")
-    return has_fixed.gather(1, label) > 0
 
 
 # A long loop resists bending as a whole by a tiny share of what its edges do; damped relative to these, it creeps.

@@ -1,0 +1,110 @@
+"""No solver returns something other than a minimum without saying so."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchslam.errors import ConvergenceError
+from torchslam.geometry import se3_exp, se3_inverse
+from torchslam.optim import PoseGraph, bundle_adjust, minimize, pose_graph_optimize, refine_pose
+
+
+def line_residual(slope: Tensor, x: Tensor, y: Tensor) -> Tensor:
+    return torch.exp(slope * x) - y
+
+
+def fit_line(batch: int = 3, **options):
+    x = torch.linspace(0, 1, 10, dtype=torch.float64).expand(batch, 10)
+    return minimize(line_residual, torch.zeros(batch, 1).double(), (x, torch.exp(0.8 * x)), **options)
+
+
+def square_of_poses(**options) -> PoseGraph:
+    S_cw = se3_exp(0.3 * torch.arange(24, dtype=torch.float64).view(4, 6).sin())
+    edges = torch.tensor([(0, 1), (1, 2), (2, 3), (3, 0), (0, 2)])
+    S_ji = S_cw[edges[:, 1]] @ se3_inverse(S_cw[edges[:, 0]])
+    S_ji = se3_exp(0.05 * torch.arange(30, dtype=torch.float64).view(5, 6).cos()) @ S_ji
+    return PoseGraph(S_cw, edges, S_ji, with_scale=False, **options)
+
+
+@pytest.fixture
+def solvers(pose_scene, bundle_scene):
+    """Each solver, on a problem that it solves."""
+    pose, bundle, graph = pose_scene(), bundle_scene().problem, square_of_poses()
+    return {
+        "poses": lambda **options: refine_pose(
+            pose.start, pose.points_w, pose.pixels, pose.camera, **options
+        ),
+        "bundle adjustments": lambda **options: bundle_adjust(bundle, **options),
+        "pose graphs": lambda **options: pose_graph_optimize(graph, **options),
+        "elements": fit_line,
+    }
+
+
+@pytest.mark.parametrize("what", ["poses", "bundle adjustments", "pose graphs", "elements"])
+def test_strict_raises_where_the_search_did_not_end(solvers, what):
+    solve = solvers[what]
+    unfinished, finished = solve(iterations=1), solve(strict=True)
+    assert unfinished.success.all()  # determined, but not at the minimum
+    assert not unfinished.converged.any()
+    assert finished.converged.all()
+    assert finished.converged.shape == finished.success.shape
+    with pytest.raises(ConvergenceError, match=rf"{what}: .* not converged"):
+        solve(iterations=1, strict=True)
+
+
+def test_strict_names_the_elements(pose_scene):
+    scene = pose_scene(batch=4)
+    mask = torch.ones(4, 40, dtype=torch.bool)
+    mask[[1, 3], 2:] = False
+    observed = scene.start, scene.points_w, scene.pixels, scene.camera
+    with pytest.raises(ConvergenceError, match=r"of 4 poses: 2 not determined \(1, 3\)$"):
+        refine_pose(*observed, mask=mask, strict=True)
+    with pytest.raises(ConvergenceError, match=r"of 50 elements: 50 not converged.* \(0, 1, .*9, \.\.\.\)"):
+        fit_line(50, iterations=1, strict=True)
+
+
+@pytest.mark.parametrize("perturbation", [0.01, 0.04])
+def test_bundle_adjust_converges_at_its_defaults_with_a_fifth_of_outliers(bundle_scene, perturbation):
+    def distances(problem, **options):
+        solution = bundle_adjust(problem, **options)
+        centers = se3_inverse(solution.T_cw)[:, :3, 3]
+        lengths = (centers[1:] - centers[:1]).norm(dim=-1)
+        return solution, (lengths / lengths.sum()).square().sum()
+
+    generator = torch.Generator().manual_seed(0)
+    for seed in range(8):
+        problem = bundle_scene(frames=6, points=60, seed=seed, perturbation=perturbation).problem
+        bad = torch.rand(len(problem.pixels), generator=generator) < 0.2
+        off = 30 * torch.randn(len(bad), 2, generator=generator, dtype=torch.float64)
+        pixels = torch.where(bad[:, None], problem.pixels + off, problem.pixels).requires_grad_()
+        problem = replace(problem, pixels=pixels)
+        solution, loss = distances(problem)
+        exact, exact_loss = distances(problem, iterations=1000, tolerance=1e-16)
+        assert solution.converged
+        assert exact.converged
+        (gradient,), (right,) = (torch.autograd.grad(x, pixels) for x in (loss, exact_loss))
+        assert (gradient - right).norm() < 0.01 * right.norm()
+
+
+@pytest.mark.parametrize("parts", [1, 2])
+def test_pose_graph_without_a_fixed_node_has_the_gradient_of_one_with_it(parts):
+    """The first node of every connected part stays; a loss that does not depend on the gauge has one gradient."""
+
+    def gradient(fixed):
+        S_ji = square_of_poses().S_ji.repeat(parts, 1, 1).requires_grad_()
+        one = square_of_poses()
+        S_cw = torch.cat([one.S_cw] * parts)
+        edges = torch.cat([one.edges + 4 * part for part in range(parts)])
+        solution = pose_graph_optimize(PoseGraph(S_cw, edges, S_ji, fixed=fixed, with_scale=False))
+        assert solution.success
+        between = solution.S_cw[1::4] @ se3_inverse(solution.S_cw[2::4])
+        (found,) = torch.autograd.grad(between[:, 0, 3].sum(), S_ji)
+        return solution, found
+
+    solution, free = gradient(())
+    assert solution.moved.tolist() == [False, True, True, True] * parts
+    _, held = gradient(tuple(range(3, 4 * parts, 4)))
+    assert free.abs().max() > 0.01
+    torch.testing.assert_close(free, held)
