@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 import torch
@@ -20,6 +21,7 @@ from torchslam.parallel.workers import (
     WORTH_AT_ONCE,
     BundleWorker,
     best_number,
+    busy_elsewhere,
     prefetch_obstacle,
     processors,
     with_workers,
@@ -97,6 +99,7 @@ def test_accelerators_use_no_workers(capsys: pytest.CaptureFixture[str]) -> None
 def test_the_default_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     long, short = room(WORTH), room(WORTH - 1)
     few = WORTH - 1 - WORTH_AT_ONCE  # frames that are done
+    monkeypatch.setattr("torchslam.parallel.workers.busy_elsewhere", lambda: 0)
     for count, several in ((1, 1), (2, 3), (8, 3)):
         monkeypatch.setattr("torchslam.parallel.workers.processors", lambda known=count: known)
         for at_once in (False, True):
@@ -106,6 +109,18 @@ def test_the_default_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> Non
             assert best_number(short, few) == (several if at_once else 1)
             assert best_number(short, few + 1) == 1
     assert processors() >= 1
+
+
+def test_one_process_where_others_compute(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    load = tmp_path / "loadavg"
+    monkeypatch.setattr("torchslam.parallel.workers.LOAD", load)
+    monkeypatch.setattr("torchslam.parallel.workers.processors", lambda: 2)
+    sequence = room(WORTH)
+    assert best_number(sequence, 0) == 3  # unknown
+    for running, expected in ((1, 3), (2, 1), (3, 1)):
+        load.write_text(f"0.00 0.00 0.00 {running}/345 6789\n")
+        assert busy_elsewhere() == running - 1
+        assert best_number(sequence, 0) == expected
 
 
 def test_workers_are_forked_only_from_a_single_threaded_process() -> None:

@@ -9,10 +9,13 @@ from __future__ import annotations
 
 import os
 import pickle
+import statistics
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from multiprocessing.connection import Connection
+from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
@@ -40,6 +43,10 @@ from torchslam.utils.timing import Stopwatch
 WORTH, WORTH_AT_ONCE = 100, 10
 """Frames of a run for which other processes are worth their start: one that has to import everything costs as much as
 some 40 frames; a copy of this process starts at once."""
+LEAST_FREE = 2
+"""Processors that must be free for three processes, which wait for each other: where one waits for its turn, all do."""
+LOAD = Path("/proc/loadavg")  # on Linux
+SAMPLES, SAMPLING_S = 5, 0.01
 SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
 """The fields of a problem that differ between problems of one run."""
 
@@ -70,11 +77,26 @@ def processors() -> int:
     return os.cpu_count() or 1 if known is None else len(known(0))
 
 
+def busy_elsewhere() -> int:
+    """Number of other threads on this machine that compute now, as the median of some samples; 0 if it is unknown."""
+    samples = []
+    for _ in range(SAMPLES):
+        try:
+            running = LOAD.read_text().split()[3].partition("/")[0]
+        except OSError:  # not on every system
+            return 0
+        samples.append(int(running) - 1)  # without this one
+        time.sleep(SAMPLING_S)
+    return max(0, int(statistics.median(samples)))
+
+
 def best_number(sequence: Sequence, start: int) -> int:
-    """Best number of processes for a sequence from frame `start` on."""
+    """Best number of processes for a sequence from frame `start` on, beside what else the machine does now."""
     length = sequence.known_length
     frames = WORTH if length is None else length - start
-    if processors() == 1 or frames < (WORTH_AT_ONCE if starts_at_once() else WORTH):
+    if processors() - busy_elsewhere() < LEAST_FREE or frames < (
+        WORTH_AT_ONCE if starts_at_once() else WORTH
+    ):
         return 1
     return 3
 

@@ -8,6 +8,8 @@ import statistics
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,25 +60,47 @@ def main() -> None:
     parser = parser_of(__doc__, readme=True)
     parser.add_argument("names", nargs="*", default=[recording.name for recording in RECORDINGS])
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument(
+        "--busy", type=int, default=0, help="other processes that compute meanwhile; the table is not written"
+    )
     arguments = parser.parse_args()
     peer = find_peer()
+    with busy_processes(arguments.busy):
+        rows = measured_rows(arguments.names, arguments.rounds, peer)
+    text = table(HEADER, rows)
+    print(text)
+    if not arguments.no_readme and not arguments.busy:
+        write_between(Path(__file__).parent / "README.md", text)
+
+
+@contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Processes that compute, each on its own, as a browser or a compiler beside would."""
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(count)]
+    try:
+        yield
+    finally:
+        for other in others:
+            other.kill()
+            other.wait()
+
+
+def measured_rows(names: list[str], rounds: int, peer: list[str] | None) -> list[list[str]]:
+    """The rows of the table: medians of the rounds, in which the systems take turns."""
     rows = []
     for recording in RECORDINGS:
-        if recording.name not in arguments.names:
+        if recording.name not in names:
             continue
         if not (DATA_DIR / recording.name).is_dir():
             print(f"{recording.name}: not in {DATA_DIR}, skipped")
             continue
         runs: dict[str, list[Metrics]] = {}
-        for _ in range(arguments.rounds):
+        for _ in range(rounds):
             for system in systems(peer is not None):
                 runs.setdefault(system, []).append(measured(system, recording, peer))
                 print(recording.name, system, runs[system][-1], flush=True)
         rows += [row(recording, system, figures) for system, figures in runs.items()]
-    text = table(HEADER, rows)
-    print(text)
-    if not arguments.no_readme:
-        write_between(Path(__file__).parent / "README.md", text)
+    return rows
 
 
 def systems(with_peer: bool) -> list[str]:
