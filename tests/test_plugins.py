@@ -223,8 +223,20 @@ def test_lightglue_works_as_a_matcher(tmp_path: Path, monkeypatch: pytest.Monkey
     assert len(pairs.first) > 0
     assert pairs.weights is not None
     assert bool((pairs.weights > 0).all())
-    at_the_border = replace(one, keypoints=one.keypoints - one.keypoints.amin(0) - 0.4)
-    assert len(run_matcher(matcher, at_the_border, one).first) > 0  # projections reach half a pixel further
+    for size in (
+        None,
+        (110, 120),
+    ):  # keypoints reach half a pixel beyond the centers of the pixels at the border
+        matcher.image_size = size
+        low = torch.full((2,), -0.5, dtype=torch.float64)
+        high = one.keypoints.amax(0) + 0.5 if size is None else torch.tensor(size, dtype=torch.float64) - 0.5
+        for corner in (low, high, torch.stack([low[0], high[1]])):
+            at_the_border = replace(
+                one, keypoints=one.keypoints.index_copy(0, torch.tensor([3]), corner[None])
+            )
+            for pair in ((at_the_border, one), (one, at_the_border), (at_the_border, at_the_border)):
+                assert len(run_matcher(matcher, *pair).first) > 0
+    matcher.image_size = None
     with pytest.raises(ConfigError, match="its weights are for descriptors of 64 floats, these are 32"):
         matcher(view(32, 1), view(32, 2), None)
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))

@@ -459,3 +459,42 @@ def test_a_killed_run_can_be_resumed(tmp_path: Path) -> None:
     assert [frame.index for frame in read_frames(folder / "frames.csv")] == list(range(FRAMES))
     assert len(read_trajectory(folder / "trajectory.txt")) == FRAMES
     assert not (folder / "checkpoint.safetensors").exists()
+
+
+SIGNALED = CHILD.replace(
+    "time.sleep(float(sys.argv[1]))", "os.kill(os.getpid(), number) if index == point else None"
+)
+SIGNALED = SIGNALED.replace(
+    "import sys, time", "import os, sys\nnumber, point = map(int, sys.argv[1].split(':'))"
+)
+POINTS = [
+    (number, frame)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
+    for frame in range(0, FRAMES, 2)
+]
+
+
+@pytest.mark.slow
+def test_a_run_that_is_ended_anywhere_can_be_resumed_to_the_same_bytes(tmp_path: Path) -> None:
+    """At every second frame, by each signal: a documented status, and then the trajectory of a run in one piece."""
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
+
+    def run(folder: str, number: int, frame: int, *more: str) -> subprocess.CompletedProcess[str]:
+        line = ["run", "walk", "--output", str(tmp_path / folder), *SET, "--checkpoint", "1", *more]
+        command = [sys.executable, "-c", SIGNALED, f"{number}:{frame}", *line]
+        return subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=False)
+
+    assert run("whole", 0, -1).returncode == 0
+    for number, frame in POINTS:
+        folder = f"{number}-{frame}"
+        ended = run(folder, number, frame)
+        assert ended.returncode == ENDS[number], (number, frame, ended.stderr)
+        # Without a checkpoint there is nothing to resume from: what was written is replaced.
+        has_checkpoint = (tmp_path / folder / "checkpoint.safetensors").exists()
+        done = run(folder, 0, -1, "--resume" if has_checkpoint else "--overwrite")
+        assert done.returncode == 0, (number, frame, done.stderr)
+        for name in ("trajectory.txt", "map.safetensors"):
+            assert (tmp_path / folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), (
+                number,
+                frame,
+            )
