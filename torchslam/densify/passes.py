@@ -26,6 +26,7 @@ from torchslam.dense.consistency import merge
 from torchslam.dense.depth_maps import DepthMaps, join, read_about
 from torchslam.dense.estimate import estimate_depth
 from torchslam.dense.fusion import CloudFusion
+from torchslam.dense.learned import learned_depth
 from torchslam.dense.normals import normals
 from torchslam.densify.pictures import write_picture
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
@@ -68,6 +69,7 @@ def densify(
     folder: Path,
     device: torch.device,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
+    is_learned: bool = False,
 ) -> DenseSummary:
     """Compute depth maps and cloud; depth maps and pictures are written.
 
@@ -79,6 +81,7 @@ def densify(
         folder: for the results; its folder of parts is used again if it is of the same views, and deleted at the end.
         device: to compute on.
         on_progress: called after each view of both passes with the numbers done and in all.
+        is_learned: let the network of the package change and rate the depth of each view (`dense.learned`).
 
     Raises:
         ResultsError: too few images can be read.
@@ -88,13 +91,13 @@ def densify(
     for message in skipped:
         warnings.warn(f"skipped a view: {message}", stacklevel=2)
     parts = folder / PARTS
-    _prepare(parts, views)
+    _prepare(parts, views, is_learned)
     opened = ViewImages(views, images)
     total = 2 * len(views)
     for view in range(len(views)):
         path = _alone_path(parts, views, view)
         if not path.exists():
-            _write_alone(path, views, opened, view, device)
+            _write_alone(path, views, opened, view, device, is_learned)
         on_progress(view + 1, total)
     alone = lru_cache(maxsize=CACHED)(lambda view: _read_alone(_alone_path(parts, views, view)))
     for view in range(len(views)):
@@ -111,9 +114,9 @@ def densify(
     return summary
 
 
-def _prepare(parts: Path, views: Views) -> None:
-    """Create the folder of parts; delete those of other views or of another version."""
-    job = {"format": FORMAT, "views": views.fingerprint()}
+def _prepare(parts: Path, views: Views, is_learned: bool) -> None:
+    """Create the folder of parts; delete those of other views, of the other aggregation or of another version."""
+    job = {"format": FORMAT, "views": views.fingerprint(), "learned": is_learned}
     try:
         is_same = parse_json(read_text(parts / JOB, MAX_JOB_BYTES, "a description of depth maps")) == job
     except (OSError, ValueError):
@@ -132,18 +135,20 @@ def _merged_path(parts: Path, views: Views, view: int) -> Path:
     return parts / f"{int(views.frame_index[view]):06d}.merged.safetensors"
 
 
-def _write_alone(path: Path, views: Views, images: ViewImages, view: int, device: torch.device) -> None:
+def _write_alone(
+    path: Path, views: Views, images: ViewImages, view: int, device: torch.device, is_learned: bool
+) -> None:
     """First pass: inverse depth of a view and its confidence."""
     sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
-    found = estimate_depth(
-        images.gray(view)[None].to(device),
-        sources[None].to(device),
-        views.camera.to(device),
-        views.T_sr(view)[None, :SWEPT].to(device),
-        views.near[view, None].to(device),
-        views.far[view, None].to(device),
-    )
-    tensors = {"inverse_depth": found.inverse_depth[0], "confidence": confidence_alone(found)[0]}
+    gray = images.gray(view)[None].to(device)
+    limits = views.near[view, None].to(device), views.far[view, None].to(device)
+    poses = views.T_sr(view)[None, :SWEPT].to(device)
+    found = estimate_depth(gray, sources[None].to(device), views.camera.to(device), poses, *limits)
+    if is_learned:
+        inverse_depth, confidence = learned_depth(found, gray, *limits)
+    else:
+        inverse_depth, confidence = found.inverse_depth, confidence_alone(found)
+    tensors = {"inverse_depth": inverse_depth[0], "confidence": confidence[0]}
     write_whole(path, save({name: rows.cpu().contiguous() for name, rows in tensors.items()}))
 
 
