@@ -84,7 +84,7 @@ def net_inputs(
         near, far: range of depth, map units.
     """
     with torch.no_grad():
-        farthest, step = _steps(found, near, far)
+        farthest, step = steps_of(found, near, far)
         position = (found.inverse_depth - farthest) / step
         coarse = torch.stack((*found.coarse, found.match), dim=1)[..., ::2, ::2]
         middle = F.avg_pool2d(position[:, None], 2)
@@ -114,25 +114,25 @@ def net_inputs(
 
 
 def changed_depth(
-    found: Estimate,
+    inverse_depth: Float[Tensor, "B H W"],
     change: Float[Tensor, "B 4 h w"],
-    near: Float[Tensor, " B"],
-    far: Float[Tensor, " B"],
+    farthest: Float[Tensor, "B 1 1"],
+    step: Float[Tensor, "B 1 1"],
     least_change: float = LEAST_CHANGE,
 ) -> Float[Tensor, "B H W"]:
     """Inverse depth after the changes of the network; it stays positive.
 
-    Differentiable with respect to the changes and the depth found; which changes are made is a decision.
+    Differentiable; which changes are made is a decision.
 
     Args:
-        found, near, far: as for `net_inputs`.
+        inverse_depth: that was found.
         change: of the network, steps.
+        farthest, step: by `steps_of`.
         least_change: smaller changes are not made; 0 in the training.
     """
-    farthest, step = _steps(found, near, far)
     change = F.pixel_shuffle(change, 2)[:, 0]
     change = torch.where(change.abs() >= least_change, change, 0.0)
-    return torch.maximum(found.inverse_depth + step * change, 0.5 * farthest)
+    return torch.maximum(inverse_depth + step * change, 0.5 * farthest)
 
 
 def learned_depth(
@@ -153,13 +153,14 @@ def learned_depth(
     """
     net = trained_net(found.inverse_depth.device).to(found.inverse_depth.dtype) if net is None else net
     change, log_odds = net(net_inputs(found, gray, near, far))
-    return changed_depth(found, change, near, far), torch.sigmoid(F.pixel_shuffle(log_odds, 2)[:, 0])
+    inverse_depth = changed_depth(found.inverse_depth, change, *steps_of(found, near, far))
+    return inverse_depth, torch.sigmoid(F.pixel_shuffle(log_odds, 2)[:, 0])
 
 
-def _steps(
+def steps_of(
     found: Estimate, near: Tensor, far: Tensor
 ) -> tuple[Float[Tensor, "B 1 1"], Float[Tensor, "B 1 1"]]:
-    """Least inverse depth and step of the planes."""
+    """Least inverse depth of the planes of views and the step between them."""
     near, far = (each.to(found.inverse_depth)[:, None, None] for each in (near, far))
     return 1 / far, (1 / near - 1 / far) / (PLANES - 1)
 
