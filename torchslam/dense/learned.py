@@ -66,11 +66,11 @@ class DepthNet(nn.Module):
 
 
 @lru_cache(maxsize=4)
-def trained_net(device: torch.device) -> DepthNet:
+def trained_net(device: torch.device, dtype: torch.dtype = torch.float32) -> DepthNet:
     """The network of the package."""
     net = DepthNet()
     net.load_state_dict(load_file(_WEIGHTS_FILE))
-    return net.to(device).eval().requires_grad_(False)
+    return net.to(device, dtype).requires_grad_(False)
 
 
 def net_inputs(
@@ -151,7 +151,7 @@ def learned_depth(
     Returns:
         Inverse depth, and the probability that it is right within 5 %.
     """
-    net = trained_net(found.inverse_depth.device).to(found.inverse_depth.dtype) if net is None else net
+    net = trained_net(found.inverse_depth.device, found.inverse_depth.dtype) if net is None else net
     change, log_odds = net(net_inputs(found, gray, near, far))
     inverse_depth = changed_depth(found.inverse_depth, change, *steps_of(found, near, far))
     return inverse_depth, torch.sigmoid(F.pixel_shuffle(log_odds, 2)[:, 0])
