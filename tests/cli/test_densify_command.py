@@ -14,6 +14,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from examples.train_depth import of_run
 from torchslam.cli.densify import map_size
 from torchslam.cli.main import main
 from torchslam.data import open_sequence
@@ -128,6 +129,47 @@ def test_other_settings_begin_anew(results: Path, monkeypatch: pytest.MonkeyPatc
     assert main(["densify", str(results), "--resolution", "80x64", "--every", "3"]) == 0
     assert before
     assert DepthMaps.load(results / "dense" / "depths.safetensors").camera.size == (80, 64)
+
+
+def test_learned_aggregation_by_option_and_by_the_configuration(run: Path, results: Path) -> None:
+    assert densify(results, "--aggregation", "learned") == 0
+    by_option = (results / DEPTHS).read_bytes()
+    assert json.loads((results / "metrics.json").read_text())["dense"]["aggregation"] == "learned"
+    assert by_option != (run / DEPTHS).read_bytes()
+    config = (results / "config.toml").read_text()
+    assert 'aggregation = "classical"' in config
+    (results / "config.toml").write_text(config.replace('"classical"', '"learned"'))
+    assert densify(results) == 0
+    assert (results / DEPTHS).read_bytes() == by_option
+    assert densify(results, "--aggregation", "classical") == 0
+    assert (results / DEPTHS).read_bytes() == (run / DEPTHS).read_bytes()
+
+
+def test_parts_of_the_other_aggregation_are_not_used(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def stop(*arguments: Any) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(passes, "_write_merged", stop)
+        assert densify(results) == 130
+    written: list[Path] = []
+    write = passes._write_alone
+    monkeypatch.setattr(
+        passes, "_write_alone", lambda path, *rest: (written.append(path), write(path, *rest))
+    )
+    assert densify(results, "--aggregation", "learned") == 0
+    assert len(written) == len(DepthMaps.load(results / DEPTHS))
+
+
+def test_the_network_is_trained_on_what_the_keyframes_of_a_run_agree_on(run: Path) -> None:
+    views = of_run(run, "96")
+    assert len(views) >= 3
+    for view in views:
+        known = view.target > 0
+        assert 0.2 < float(known.double().mean()) < 1
+        assert view.is_rated[known].all()
+        is_agreeing = (view.inverse_depth / view.target - 1)[known].abs() < 0.05
+        assert float(is_agreeing.double().mean()) > 0.9
 
 
 def test_a_full_disk_is_one_line_and_loses_nothing(

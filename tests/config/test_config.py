@@ -195,6 +195,7 @@ def test_a_slow_or_large_file_is_refused(tmp_path: Path) -> None:
 def test_the_choices_of_settings() -> None:
     assert CHOICES == {
         "scale": ("unit", "groundtruth"),
+        "dense.aggregation": ("classical", "learned"),
         "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
         "initialization.criterion": ("uncertainty", "parallax"),
         "measurement.gate": ("chi_square", "mahalanobis"),

@@ -22,13 +22,14 @@ from tqdm import tqdm
 
 from torchslam.cli import arguments
 from torchslam.cli.progress import shown_warnings
+from torchslam.config import CHOICES, load_config
 from torchslam.densify import DenseSummary, densify
 from torchslam.densify.views import views_of
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.io.export.mesh import import_open3d, write_mesh
 from torchslam.io.export.ply import upright_from_map, write_cloud
 from torchslam.io.export.scene import open_images, pinhole_within, scene_of
-from torchslam.io.results import DENSE_CLOUD, DEPTHS, MAP, MESH, METRICS, read_metrics, read_results
+from torchslam.io.results import CONFIG, DENSE_CLOUD, DEPTHS, MAP, MESH, METRICS, read_metrics, read_results
 from torchslam.io.viewer.page import VIEW, write_view
 from torchslam.map.file import read_atlas
 from torchslam.parallel.workers import processors
@@ -56,6 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="number of processes; results are identical (default: one per processor, at most "
         f"{MAX_PROCESSES})",
+    )
+    parser.add_argument(
+        "--aggregation",
+        choices=CHOICES["dense.aggregation"],
+        help="aggregation of matching costs (dense.aggregation; default: as the run was configured)",
     )
     arguments.add_device(parser)
 
@@ -91,6 +97,7 @@ def execute(options: argparse.Namespace) -> int:
                 options.images,
                 options.mesh,
                 options.processes,
+                options.aggregation,
             )
         )
     )
@@ -105,6 +112,7 @@ def densify_results(
     images: str | None = None,
     mesh: bool = False,
     processes: int | None = None,
+    aggregation: str | None = None,
 ) -> dict[str, str]:
     """Compute dense depth of a results folder and add it to the folder; return rows for `table`.
 
@@ -116,6 +124,7 @@ def densify_results(
         images: where the images are; None: where the run read them.
         mesh: also write a mesh; one of other depth maps is deleted.
         processes: number of processes; None: one per processor, at most MAX_PROCESSES.
+        aggregation: `dense.aggregation`; None: that of the configuration in the folder.
     """
     if mesh:
         import_open3d()
@@ -123,6 +132,8 @@ def densify_results(
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
     metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
+    config = load_config(directory / CONFIG if (directory / CONFIG).is_file() else None)
+    aggregation = aggregation or config.dense.aggregation
     submap = next((each for each in saved.atlas if each.number == metrics["submap"]), None)
     if submap is None:
         raise ResultsError(f"{directory / MAP}: no map to get depth for")
@@ -149,9 +160,11 @@ def densify_results(
 
         with shown_warnings():
             count = min(processors(), MAX_PROCESSES) if processes is None else processes
-            found = densify(views, opened, folder, torch.device(device), on_progress, count)
+            found = densify(
+                views, opened, folder, torch.device(device), on_progress, count, aggregation == "learned"
+            )
     write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map))
-    about = {"dense": _figures(found, size, _processor_time() - started)}
+    about = {"dense": _figures(found, size, aggregation, _processor_time() - started)}
     write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
     if (directory / VIEW).exists():
         write_view(read_results(directory), directory)
@@ -173,12 +186,13 @@ def _processor_time() -> float:
     return sum(os.times()[:4])
 
 
-def _figures(found: DenseSummary, size: tuple[int, int], seconds: float) -> dict[str, Any]:
+def _figures(found: DenseSummary, size: tuple[int, int], aggregation: str, seconds: float) -> dict[str, Any]:
     """The entry `dense` of metrics.json."""
     return {
         "depth_maps": found.views,
         "skipped": len(found.skipped),
         "size": list(size),
+        "aggregation": aggregation,
         "kept_ratio": found.kept,
         "confidence": found.confidence,
         "points": len(found.cloud),

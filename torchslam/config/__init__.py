@@ -13,6 +13,7 @@ from torchslam.config.schema import Settings, choices, merge_settings, scale_pix
 from torchslam.config.sections import (
     BundleAdjustmentConfig,
     CameraConfig,
+    DenseConfig,
     FeaturesConfig,
     IndependentMotionConfig,
     InitializationConfig,
@@ -34,6 +35,7 @@ __all__ = [
     "BundleAdjustmentConfig",
     "CameraConfig",
     "Config",
+    "DenseConfig",
     "FeaturesConfig",
     "IndependentMotionConfig",
     "InitializationConfig",
@@ -81,6 +83,7 @@ class Config(Settings):
     mapping: MappingConfig = field(default_factory=MappingConfig)
     loop_closing: LoopClosingConfig = field(default_factory=LoopClosingConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+    dense: DenseConfig = field(default_factory=DenseConfig)
 
     def for_size(self, size: tuple[int, int]) -> Config:
         """Return the configuration for images of a size (width, height).

@@ -588,3 +588,14 @@ class BundleAdjustmentConfig(Settings, section="bundle_adjustment"):
     global_iterations: int = setting(
         15, "Maximum number of iterations of a global bundle adjustment.", low=1, high=MAX_ITERATIONS
     )
+
+
+@dataclass(frozen=True)
+class DenseConfig(Settings, section="dense"):
+    """Dense depth by `torchslam densify` and `torchslam run --dense`."""
+
+    aggregation: str = setting(
+        "classical",
+        "Aggregation of matching costs; learned: a small network changes and rates what the classical one found.",
+        choices=("classical", "learned"),
+    )

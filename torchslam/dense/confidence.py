@@ -50,9 +50,9 @@ def confidence_together(merged: Merged, alone: Float[Tensor, "H W"]) -> Float[Te
     return torch.where(merged.inverse_depth > 0, _logistic(together_features(merged, alone), TOGETHER), 0.0)
 
 
-def kept(confidence: Float[Tensor, "H W"]) -> Bool[Tensor, "H W"]:
+def kept(confidence: Float[Tensor, "H W"], least: float = LEAST_KEPT) -> Bool[Tensor, "H W"]:
     """Whether depth is kept: it is probable enough, and so is most of what is around it, which specks are not."""
-    is_probable = confidence >= LEAST_KEPT
+    is_probable = confidence >= least
     share = F.avg_pool2d(is_probable.to(confidence.dtype)[None, None], 2 * SPECK + 1, 1, SPECK)[0, 0]
     return is_probable & (share > 0.5)
 

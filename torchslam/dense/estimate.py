@@ -36,12 +36,14 @@ class Estimate(NamedTuple):
         inverse_depth: 1 / map units, positive.
         std: standard deviation of the inverse depth where it is right, 1 / map units; without a gradient.
         coarse: minimum of the cost at half size, of the pixels at full size; its position is in planes.
+        match: matching cost at half size of the plane there, before the aggregation.
         fine: minimum at full size; its position is in steps.
     """
 
     inverse_depth: Float[Tensor, "B H W"]
     std: Float[Tensor, "B H W"]
     coarse: Minimum
+    match: Float[Tensor, "B H W"]
     fine: Minimum
 
 
@@ -78,13 +80,14 @@ def estimate_depth(
         coarse = find_minimum(aggregate(cost, small))
         surface = inverse_depths[:, :1, None] + step[:, None, None] * coarse.position
         surface = F.interpolate(surface[:, None], size=reference.shape[-2:], mode="bilinear")[:, 0]
-        coarse = Minimum(*(F.interpolate(each[:, None], scale_factor=2)[:, 0] for each in coarse))
+        match = cost.gather(1, coarse.position[:, None].round().long())[:, 0]
+        coarse = Minimum(*(_doubled(each) for each in coarse))
     inverse_depth, fine = refine_depth(
         reference, sources, camera, T_sr, surface, REFINEMENT * step, 0.5 / far.to(reference), aggregate
     )
     with torch.no_grad():
         std = REFINEMENT * step[:, None, None] * position_std(fine)
-    return Estimate(inverse_depth, std, coarse, fine)
+    return Estimate(inverse_depth, std, coarse, _doubled(match), fine)
 
 
 def refine_depth(
@@ -119,6 +122,11 @@ def refine_depth(
     )
     found = find_minimum(aggregate(cost, reference))
     return torch.maximum(surface + (found.position - STEPS) * step, least), found
+
+
+def _doubled(values: Float[Tensor, "B H W"]) -> Float[Tensor, "B H2 W2"]:
+    """Values at half size, of the pixels at full size."""
+    return F.interpolate(values[:, None], scale_factor=2)[:, 0]
 
 
 def halved(camera: Camera) -> Camera:

@@ -27,6 +27,7 @@ from torchslam.dense.consistency import merge
 from torchslam.dense.depth_maps import DepthMaps, join, read_about
 from torchslam.dense.estimate import estimate_depth
 from torchslam.dense.fusion import CloudFusion
+from torchslam.dense.learned import learned_depth
 from torchslam.dense.normals import normals
 from torchslam.densify.pictures import write_picture
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
@@ -71,6 +72,7 @@ def densify(
     device: torch.device,
     on_progress: Callable[[int, int], None] = lambda done, total: None,
     processes: int = 1,
+    is_learned: bool = False,
 ) -> DenseSummary:
     """Compute depth maps and cloud; depth maps and pictures are written.
 
@@ -83,6 +85,7 @@ def densify(
         device: to compute on.
         on_progress: called after each view of both passes with the numbers done and in all.
         processes: that compute views, this one included; the results are the same. On a GPU one is used.
+        is_learned: let the network of the package change and rate the depth of each view (`dense.learned`).
 
     Raises:
         ResultsError: too few images can be read.
@@ -92,9 +95,9 @@ def densify(
     for message in skipped:
         warnings.warn(f"skipped a view: {message}", stacklevel=2)
     parts = folder / PARTS
-    _prepare(parts, views)
+    _prepare(parts, views, is_learned)
     opened = ViewImages(views, images)
-    job = DenseJob(views, opened, parts, device)
+    job = DenseJob(views, opened, parts, device, is_learned)
     with SharedTasks(_do, (job,), processes if device.type == "cpu" else 1) as shared:
         done = 0
         for each in Pass:
@@ -113,9 +116,9 @@ def densify(
     return summary
 
 
-def _prepare(parts: Path, views: Views) -> None:
-    """Create the folder of parts; delete those of other views or of another version."""
-    job = {"format": FORMAT, "views": views.fingerprint()}
+def _prepare(parts: Path, views: Views, is_learned: bool) -> None:
+    """Create the folder of parts; delete those of other views, of the other aggregation or of another version."""
+    job = {"format": FORMAT, "views": views.fingerprint(), "learned": is_learned}
     try:
         is_same = parse_json(read_text(parts / JOB, MAX_JOB_BYTES, "a description of depth maps")) == job
     except (OSError, ValueError):
@@ -141,14 +144,18 @@ class DenseJob:
         images: theirs.
         parts: folder of the results of views.
         device: to compute on.
+        is_learned: let the network of the package change and rate the depth of each view.
     """
 
-    def __init__(self, views: Views, images: ViewImages, parts: Path, device: torch.device) -> None:
-        self.views, self.images, self.parts, self.device = views, images, parts, device
+    def __init__(
+        self, views: Views, images: ViewImages, parts: Path, device: torch.device, is_learned: bool
+    ) -> None:
+        self.views, self.images, self.parts = views, images, parts
+        self.device, self.is_learned = device, is_learned
         self.alone = lru_cache(maxsize=CACHED)(lambda view: _read_alone(self.path(Pass.ALONE, view)))
 
     def __reduce__(self) -> tuple[type[DenseJob], tuple[object, ...]]:
-        return DenseJob, (self.views, self.images, self.parts, self.device)
+        return DenseJob, (self.views, self.images, self.parts, self.device, self.is_learned)
 
     def path(self, result: Pass, view: int) -> Path:
         """The file of a view's result."""
@@ -167,15 +174,15 @@ def _write_alone(job: DenseJob, view: int) -> None:
     """First pass: inverse depth of a view and its confidence."""
     views, device = job.views, job.device
     sources = torch.stack([job.images.gray(other) for other in views.neighbors[view][:SWEPT]])
-    found = estimate_depth(
-        job.images.gray(view)[None].to(device),
-        sources[None].to(device),
-        views.camera.to(device),
-        views.T_sr(view)[None, :SWEPT].to(device),
-        views.near[view, None].to(device),
-        views.far[view, None].to(device),
-    )
-    tensors = {"inverse_depth": found.inverse_depth[0], "confidence": confidence_alone(found)[0]}
+    gray = job.images.gray(view)[None].to(device)
+    limits = views.near[view, None].to(device), views.far[view, None].to(device)
+    poses = views.T_sr(view)[None, :SWEPT].to(device)
+    found = estimate_depth(gray, sources[None].to(device), views.camera.to(device), poses, *limits)
+    if job.is_learned:
+        inverse_depth, confidence = learned_depth(found, gray, *limits)
+    else:
+        inverse_depth, confidence = found.inverse_depth, confidence_alone(found)
+    tensors = {"inverse_depth": inverse_depth[0], "confidence": confidence[0]}
     content = save({name: rows.cpu().contiguous() for name, rows in tensors.items()})
     write_whole(job.path(Pass.ALONE, view), content)
 

@@ -1,0 +1,131 @@
+"""Learned beside classical aggregation: errors at the same kept share, and what is kept at the same accuracy.
+
+python -m experiments.dense.compare RESULTS [--depth FOLDER] [--weights FILE]
+
+Views, images, poses and the comparison of the views are the same. `torchslam densify` must have been run. The share is
+the one that the classical aggregation keeps; the learned one keeps as much by another least confidence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import torch
+from safetensors.torch import load_file
+from torch import Tensor
+
+from experiments.dense.peers import Depth, fused
+from experiments.dense.run import LEVELS, opened, truth_of
+from torchslam.dense import DepthMaps
+from torchslam.dense.confidence import LEAST_KEPT, confidence_alone, kept
+from torchslam.dense.estimate import Estimate, estimate_depth
+from torchslam.dense.learned import DepthNet, learned_depth
+from torchslam.densify.views import SWEPT
+from torchslam.io.results import DEPTHS
+
+HALVINGS = 18  # of the interval in which a least confidence is sought
+CANDIDATES = torch.linspace(0.02, 0.998, 100)  # least confidences
+RIGHT = 0.05
+
+
+def kept_with(depth: Depth, truth: Tensor, least: float) -> Tensor:
+    """Pixels with truth that are kept with a least confidence."""
+    return torch.stack([kept(each, least) for each in depth.confidence]) & (truth > 0)
+
+
+def errors(depth: Depth, truth: Tensor, is_kept: Tensor) -> Tensor:
+    """Relative errors of kept depth."""
+    return (1 / (depth.inverse_depth[is_kept] * truth[is_kept]) - 1).abs()
+
+
+def least_for(depth: Depth, truth: Tensor, share: float) -> float:
+    """The least confidence with which so much is kept."""
+    low, high = 0.0, 1.0
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        is_more = float(kept_with(depth, truth, middle).sum() / (truth > 0).sum()) > share
+        low, high = (middle, high) if is_more else (low, middle)
+    return low
+
+
+def most_at(depth: Depth, truth: Tensor, accuracy: float) -> float:
+    """The largest share of the pixels with truth that is kept with so many of them within 5 %."""
+    most = 0.0
+    for least in CANDIDATES.tolist():
+        is_kept = kept_with(depth, truth, least)
+        if bool(is_kept.any()) and float((errors(depth, truth, is_kept) < RIGHT).double().mean()) >= accuracy:
+            most = max(most, float(is_kept.sum() / (truth > 0).sum()))
+    return most
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("results", type=Path)
+    parser.add_argument("--depth", type=Path, help="folder of the sensor's depth; else the scene is rendered")
+    parser.add_argument(
+        "--weights", type=Path, nargs="*", default=[], help="of other networks, to be measured too"
+    )
+    options = parser.parse_args()
+    maps = DepthMaps.load(options.results / DEPTHS)
+    truth, (views, images) = truth_of(options.results, maps, options.depth), opened(options.results, maps)
+    seconds: list[float] = []
+
+    @cache
+    @torch.no_grad()
+    def estimate(view: int) -> Estimate:
+        sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
+        gray, started = images.gray(view)[None], time.process_time()
+        limits, poses = (views.near[view, None], views.far[view, None]), views.T_sr(view)[None, :SWEPT]
+        found = estimate_depth(gray, sources[None], views.camera, poses, *limits)
+        seconds.append(time.process_time() - started)
+        return found
+
+    def classical(view: int) -> tuple[Tensor, Tensor]:
+        found = estimate(view)
+        return found.inverse_depth[0], confidence_alone(found)[0]
+
+    def learned(net: DepthNet | None) -> Callable[[int], tuple[Tensor, Tensor]]:
+        @cache
+        @torch.no_grad()
+        def alone(view: int) -> tuple[Tensor, Tensor]:
+            found, gray, started = estimate(view), images.gray(view)[None], time.process_time()
+            depth, confidence = learned_depth(found, gray, views.near[view, None], views.far[view, None], net)
+            added.append(time.process_time() - started)
+            return depth[0], confidence[0]
+
+        return alone
+
+    rows = list(range(len(views)))
+    base = fused(views, rows, classical)
+    is_kept = kept_with(base, truth, LEAST_KEPT)
+    share, wrong = float(is_kept.sum() / (truth > 0).sum()), errors(base, truth, is_kept)
+    accuracy = float((wrong < RIGHT).double().mean())
+    print("| | kept | wrong by more than 1 % | 2 % | 5 % | 10 % | kept at the same accuracy | CPU s |")
+    print("|---|---|---|---|---|---|---|---|")
+
+    def row(name: str, depth: Depth, wrong: Tensor, taken: float) -> None:
+        shares = [float((wrong > level).double().mean()) for level in LEVELS]
+        cells = [float(len(wrong) / (truth > 0).sum()), *shares, most_at(depth, truth, accuracy)]
+        print(f"| {name} | {' | '.join(f'{each:.1%}' for each in cells)} | {taken:.3f} |", flush=True)
+
+    row("classical", base, wrong, sum(seconds) / len(seconds))
+    for weights in options.weights or [None]:
+        net, added = None, list[float]()
+        if weights is not None:
+            net = DepthNet().requires_grad_(False)
+            net.load_state_dict(load_file(weights))
+        depth = fused(views, rows, learned(net))
+        taken = (sum(seconds) + sum(added)) / len(seconds)
+        name = "learned" if weights is None else weights.stem
+        same = kept_with(depth, truth, least_for(depth, truth, share))
+        row(f"{name}, as much kept", depth, errors(depth, truth, same), taken)
+        row(f"{name}", depth, errors(depth, truth, kept_with(depth, truth, LEAST_KEPT)), taken)
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(1)
+    main()
