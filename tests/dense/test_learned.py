@@ -77,6 +77,7 @@ def test_a_batch_is_a_loop() -> None:
         one = slice(row, row + 1)
         part = Estimate(
             other.inverse_depth[one],
+            other.std[one],
             type(found.coarse)(*(each[one] for each in other.coarse)),
             other.match[one],
             type(found.fine)(*(each[one] for each in other.fine)),
