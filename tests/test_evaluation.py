@@ -294,3 +294,29 @@ def test_the_error_has_first_derivatives_in_both_modes(generator: torch.Generato
     (gradient,) = torch.autograd.grad(ate(leaf, truth), leaf, create_graph=True)
     with pytest.raises(RuntimeError, match="second derivative"):
         gradient.square().sum().backward()
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, 0.0])
+@pytest.mark.parametrize("counts", [True, False])
+def test_a_pose_that_is_not_finite_fails_its_element_alone(
+    bad: float, counts: bool, generator: torch.Generator
+) -> None:
+    truth = torch.stack([_poses(generator, 6) for _ in range(3)])
+    estimate = se3_exp(0.1 * torch.randn(3, 6, 6, generator=generator, dtype=torch.float64)) @ truth
+    mask = torch.ones(3, 6, dtype=torch.bool)
+    mask[1, 2] = counts
+    broken = estimate.clone()
+    broken[1, 2] = bad
+    broken.requires_grad_()
+    for found, expected in (
+        (ate(broken, truth, mask), ate(estimate, truth, mask)),
+        *zip(rpe(broken, truth, 1, mask), rpe(estimate, truth, 1, mask), strict=True),
+    ):
+        if bad == 0:  # no rotation, but finite: the numbers say so
+            assert found.isfinite().all()
+            continue
+        assert torch.equal(found.isnan(), torch.tensor([False, counts, False]))
+        torch.testing.assert_close(found[~found.isnan()], expected[~found.isnan()])
+        (gradient,) = torch.autograd.grad(found.nansum(), broken, retain_graph=True)
+        assert gradient.isfinite().all()
+        assert (gradient[1].abs().max() > 0) != counts

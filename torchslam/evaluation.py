@@ -188,13 +188,14 @@ def ate(
         with_scale: align by a similarity; False: by a rigid transform.
 
     Returns:
-        The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count.
+        The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count or one is not finite.
     """
+    T_cw, T_cw_groundtruth, finite = _counted(T_cw, T_cw_groundtruth, mask)
     centers, truth = _centers(T_cw), _centers(T_cw_groundtruth)
     s, R, t = umeyama(centers, truth, mask, with_scale)
     moved = s[..., None, None] * centers @ R.mT + t[..., None, :]
     error = _rms((moved - truth).square().sum(-1), mask)
-    return torch.where(_enough(T_cw, mask), error, torch.nan)
+    return torch.where(finite & _enough(T_cw, mask), error, torch.nan)
 
 
 @full_precision
@@ -218,13 +219,14 @@ def rpe(
 
     Returns:
         Translation in meters and rotation in radians. Both are NaN, with a gradient of zero, where no two rows that
-        count are `delta` apart, or fewer than `MIN_POSES` count for that alignment.
+        count are `delta` apart, fewer than `MIN_POSES` count for that alignment, or one that counts is not finite.
 
     Raises:
         ValueError: `delta` is not between 1 and N - 1.
     """
     if not 1 <= delta < T_cw.shape[-3]:
         raise ValueError(f"delta must be between 1 and {T_cw.shape[-3] - 1}, got {delta}")
+    T_cw, T_cw_groundtruth, finite = _counted(T_cw, T_cw_groundtruth, mask)
     s, _, _ = umeyama(_centers(T_cw), _centers(T_cw_groundtruth), mask, with_scale)
     motion, true_motion = _motions(T_cw, delta), _motions(T_cw_groundtruth, delta)
     motion = rigid(motion[..., :3, :3], s[..., None, None] * motion[..., :3, 3])
@@ -232,7 +234,7 @@ def rpe(
     pairs = None if mask is None else mask[..., :-delta] & mask[..., delta:]
     translation = error[..., :3, 3].square().sum(-1)
     rotation = so3_log(error[..., :3, :3]).square().sum(-1)
-    known = torch.ones_like(s, dtype=torch.bool) if pairs is None else pairs.any(-1)
+    known = finite if pairs is None else finite & pairs.any(-1)
     known = known & _enough(T_cw, mask) if with_scale else known
     errors = _rms(translation, pairs), _rms(rotation, pairs)
     return torch.where(known, errors[0], torch.nan), torch.where(known, errors[1], torch.nan)
@@ -263,6 +265,18 @@ def _aligned(
 ) -> Float[Tensor, "N 4 4"]:
     """Camera poses after a similarity of the world."""
     return rigid(R @ T_wc[:, :3, :3], s * T_wc[:, :3, 3] @ R.mT + t)
+
+
+def _counted(
+    T_cw: Float[Tensor, "*batch N 4 4"],
+    T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
+    mask: Bool[Tensor, "*batch N"] | None,
+) -> tuple[Float[Tensor, "*batch N 4 4"], Float[Tensor, "*batch N 4 4"], Bool[Tensor, "*batch"]]:
+    """Both with the identity for rows that are not finite, and whether all rows that count are."""
+    finite = torch.isfinite(T_cw).flatten(-2).all(-1) & torch.isfinite(T_cw_groundtruth).flatten(-2).all(-1)
+    eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
+    T_cw, T_cw_groundtruth = (torch.where(finite[..., None, None], T, eye) for T in (T_cw, T_cw_groundtruth))
+    return T_cw, T_cw_groundtruth, (finite if mask is None else finite | ~mask).all(-1)
 
 
 def _enough(

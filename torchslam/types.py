@@ -54,7 +54,7 @@ class Features:
         descriptors: 256 bits as 32 uint8, packed least significant first; or floats of unit length.
         mask: True where the row is a keypoint.
         information: inverse variances of the keypoints in each direction, px^-2, or inverse covariances, positive
-            (definite) where `mask`; None: a keypoint is known to its scale.
+            (definite) where `mask`; None: a keypoint is accurate to half its scale, (0.5 scales)^-2.
     """
 
     keypoints: Float[Tensor, "B N 2"]

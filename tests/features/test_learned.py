@@ -96,3 +96,42 @@ def test_unusable_weights_are_rejected_by_name(kind: type, tmp_path: Path) -> No
 def test_learned_features_need_weights(name: str) -> None:
     with pytest.raises(ConfigError, match="weights"):
         extractor(name)
+
+
+@NETWORKS
+def test_keypoints_read_again_are_the_same_and_stay_in_their_rows(name: str, file: str, width: int) -> None:
+    """After a step of a training a detection has other keypoints in most rows; read at fixed places none moves far."""
+    network, image = extractor(name, 150, weights(file)), scene(150, 230, 1)
+    with torch.no_grad():
+        found = network(image)
+        same = network.read(image, found.keypoints, found.mask)
+        for column in ("keypoints", "scores", "descriptors", "mask"):
+            torch.testing.assert_close(getattr(same, column), getattr(found, column), rtol=1e-5, atol=1e-5)
+    optimizer = torch.optim.Adam(network.parameters(), 1e-4)
+    same = network.read(image, found.keypoints, found.mask)
+    (same.keypoints.square().mean() + same.scores.mean()).backward()
+    optimizer.step()
+    with torch.no_grad():
+        detected, again = network(image), network.read(image, found.keypoints, found.mask)
+    rows = found.mask[0]
+    detected_moved, moved = (
+        (other.keypoints - found.keypoints)[0, rows].norm(dim=-1) for other in (detected, again)
+    )
+    assert (detected_moved > 8).float().mean() > 0.1
+    assert 0 < moved.max() < 4
+    assert torch.equal(again.mask, found.mask)
+
+
+def test_autocast_does_not_move_the_keypoints_of_xfeat() -> None:
+    network, image = extractor("xfeat", 150, weights("xfeat.safetensors")), scene(250, 380, 1)
+    with torch.no_grad():
+        exact = network(image)
+        with torch.autocast("cpu", torch.bfloat16):
+            found = network.read(image, exact.keypoints, exact.mask)
+            detected = network(image)
+    assert torch.equal(found.keypoints, exact.keypoints)
+    assert detected.keypoints.dtype == torch.float32
+    distances = torch.cdist(detected.keypoints[0], exact.keypoints[0])
+    assert (
+        distances.amin(1) == 0
+    ).float().mean() > 0.9  # ranks are by the reliability, which the backbone rounds

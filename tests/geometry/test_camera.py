@@ -255,3 +255,22 @@ def test_torch_func_takes_cameras(make):
     pixels(cameras[0].with_params(params)).sum().backward()
     torch.testing.assert_close(gradient.params, params.grad)
     assert jacrev(pixels)(cameras[0]).params.shape == (2, 2, cameras[0].params.shape[-1])
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf])
+@pytest.mark.parametrize("method", ["normalize", "unproject"])
+def test_a_pixel_that_is_not_finite_leaves_the_gradient_of_the_others(camera, method, bad):
+    pixels = camera.project(points())[0]
+    gradients = []
+    for worst in (False, True):
+        if worst:
+            pixels = torch.cat((pixels, torch.full_like(pixels[:, :1], bad)), dim=1)
+        pixels = pixels.detach().requires_grad_()
+        params = camera.params.clone().requires_grad_()
+        found = getattr(camera.with_params(params), method)(pixels)
+        assert found.isfinite().all()
+        kept = found[:, : found.shape[1] - worst]
+        gradients.append(torch.autograd.grad(kept.square().sum(), (params, pixels)))
+    torch.testing.assert_close(gradients[0][0], gradients[1][0])
+    torch.testing.assert_close(gradients[0][1], gradients[1][1][:, :-1])
+    assert (gradients[1][1][:, -1] == 0).all()

@@ -76,6 +76,15 @@ def test_noise_is_the_same_in_every_representation(kind: str, generator: torch.G
     )
 
 
+def test_half_the_scale_says_the_same_as_nothing(generator: torch.Generator) -> None:
+    """Where the documentation says so: gates, and noise that was made explicit for the weights of a matcher."""
+    scales = 1 + torch.rand(20, generator=generator, dtype=torch.float64)
+    errors = torch.randn(20, 2, generator=generator, dtype=torch.float64)
+    unstated, stated = KeypointNoise.of(scales, None), KeypointNoise.of(scales, (0.5 * scales) ** -2)
+    torch.testing.assert_close(unstated.squared(errors), stated.squared(errors))
+    torch.testing.assert_close(unstated.with_explicit_information().weights, stated.weights)
+
+
 def test_the_gate_keeps_95_percent_of_anisotropic_noise(generator: torch.Generator) -> None:
     """Errors drawn with covariances of their own, ten times as long as wide, pass the gate as often as they should."""
     count = 20_000

@@ -166,3 +166,33 @@ def test_undistorted_coordinates_give_the_same_points() -> None:
     known = RADIAL.normalize(seen[0]), RADIAL.normalize(seen[1])
     one, two = (triangulate(*T_cw, *seen, RADIAL, RADIAL, normalized=x) for x in (None, known))
     assert all(torch.equal(part, vars(two)[name]) for name, part in vars(one).items())
+
+
+@pytest.mark.parametrize("camera", [CAMERA, RADIAL], ids=["pinhole", "radial_tangential"])
+@pytest.mark.parametrize("many", [False, True])
+def test_a_pixel_that_is_not_finite_leaves_the_gradient_of_the_others(camera: Camera, many: bool) -> None:
+    """Also where the mask excludes it."""
+    T_cw, pixels, _ = views(camera, noise=0.5)
+    mask = torch.arange(len(pixels)) != 3
+
+    def gradient(pixels: Tensor) -> Tensor:
+        params = camera.params.clone().requires_grad_()
+        own = camera.with_params(params)
+        if many:
+            found = triangulate_many(T_cw, pixels, own, mask[:, None].expand(-1, 2))
+            errors = found.errors.sum(-1)
+        else:
+            found = triangulate(*T_cw, *pixels.unbind(1), own, own, mask)
+            errors = found.errors_1 + found.errors_2
+        (of_params,) = torch.autograd.grad(
+            torch.where(found.mask[..., None], found.points_w, 0.0).sum()
+            + torch.where(found.mask, errors, 0.0).sum(),
+            params,
+        )
+        return of_params
+
+    bad = pixels.clone()
+    bad[3, 1] = torch.nan
+    expected = gradient(pixels)
+    assert expected.abs().max() > 0
+    torch.testing.assert_close(gradient(bad), expected)

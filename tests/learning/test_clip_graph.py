@@ -181,3 +181,45 @@ def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
     found, expected = (torch.autograd.grad(loss, (keypoints, scores), retain_graph=True) for loss in losses)
     for gradient, other in zip(found, expected, strict=True):
         torch.testing.assert_close(gradient, other, rtol=1e-7, atol=1e-9 * float(other.abs().max()))
+
+
+class SortedEyes(BentEyes):
+    """A front end whose rows are in the order of scores that it learns, as those of a network are."""
+
+    def __init__(self, walk: Walk) -> None:
+        super().__init__(walk, bend=0.01)
+        self.order = torch.arange(self.exact.mask.shape[1])
+
+    def forward(self, images: Tensor) -> Features:
+        return super().forward(images).rows(self.order)
+
+
+class FixedEyes(SortedEyes):
+    """The same, but it can describe given keypoints again."""
+
+    def read(self, images: Tensor, keypoints: Tensor, mask: Tensor) -> Features:
+        assert (keypoints - self.exact.keypoints)[mask].norm(
+            dim=-1
+        ).max() < 8  # those of the graph, in its rows
+        return BentEyes.forward(self, images)
+
+
+def test_keypoints_that_jump_to_other_rows_are_refused_and_fixed_ones_read_again(walk: Walk) -> None:
+    images, truth = clip_of(walk)
+    losses = []
+    for eyes in (SortedEyes(walk), FixedEyes(walk)):
+        clip_slam = ClipSLAM(eyes)
+        graph = clip_slam.build_graph(images, walk.camera)
+        before = clip_slam(images, walk.camera, graph)
+        eyes.order = torch.cat((eyes.order[:100].flip(0), eyes.order[100:]))
+        if isinstance(eyes, FixedEyes):
+            after = clip_slam(images, walk.camera, graph)
+            losses = [ate(poses.T_cw, truth, poses.posed) for poses in (before, after)]
+            continue
+        with pytest.raises(ValueError, match=r"keypoints are up to \d+ px from where the graph has them"):
+            clip_slam(images, walk.camera, graph)
+    assert before.success
+    torch.testing.assert_close(*losses)
+    losses[1].backward()
+    assert eyes.bend.grad is not None
+    assert eyes.bend.grad.abs() > 0

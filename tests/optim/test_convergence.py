@@ -6,9 +6,17 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.optim.conftest import camera_of
 from torchslam.errors import ConvergenceError
-from torchslam.geometry import se3_exp, se3_inverse
-from torchslam.optim import PoseGraph, bundle_adjust, minimize, pose_graph_optimize, refine_pose
+from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.optim import (
+    BundleProblem,
+    PoseGraph,
+    bundle_adjust,
+    minimize,
+    pose_graph_optimize,
+    refine_pose,
+)
 
 
 def line_residual(slope: Tensor, x: Tensor, y: Tensor) -> Tensor:
@@ -108,3 +116,43 @@ def test_pose_graph_without_a_fixed_node_has_the_gradient_of_one_with_it(parts):
     _, held = gradient(tuple(range(3, 4 * parts, 4)))
     assert free.abs().max() > 0.01
     torch.testing.assert_close(free, held)
+
+
+@pytest.mark.parametrize("batched", [False, True])
+@pytest.mark.parametrize(("motion", "determined"), [(0.3, True), (0.0, False)])
+def test_a_window_without_parallax_is_no_success(motion, determined, batched):
+    """A camera that turns on the spot: no depth, so no scale of its translation, and no gradient through either."""
+    generator = torch.Generator().manual_seed(0)
+    T_cw = se3_exp(0.05 * torch.randn(5, 6, generator=generator, dtype=torch.float64) * (torch.arange(6) > 2))
+    T_cw[:, 0, 3] = motion * torch.arange(5)
+    points_w = torch.rand(30, 3, generator=generator, dtype=torch.float64) + torch.tensor([-0.5, -0.5, 4.0])
+    frame_index, point_index = torch.cartesian_prod(torch.arange(5), torch.arange(30)).unbind(-1)
+    pixels = camera_of().project(transform(T_cw, points_w[None].expand(5, 30, 3)))[0].flatten(0, 1)
+    pixels.requires_grad_()
+    problem = BundleProblem(T_cw, points_w, frame_index, point_index, pixels, camera_of())
+    if batched:
+        problem = replace(problem, T_cw=T_cw.repeat(2, 1, 1, 1))
+    solution = bundle_adjust(problem, iterations=10)
+    assert (solution.success == determined).all()
+    (gradient,) = torch.autograd.grad(solution.points_w.square().sum() + solution.T_cw.sum(), pixels)
+    assert (gradient.abs().max() > 0) == determined
+
+
+def test_a_point_without_parallax_has_no_gradient_and_leaves_the_others_theirs(bundle_scene):
+    """At 1e8 times the baseline its depth is noise; the gradient through it was 1e8 times that of the others."""
+    scene = bundle_scene(points=30, noise=0.2)
+    far = torch.tensor([1e7, 0.0, 1e8], dtype=torch.float64)
+    scene.points_w[5], scene.problem.points_w[5] = far, far
+    seen = scene.problem.point_index == 5
+    exact = scene.problem.camera.project(
+        transform(scene.T_cw[scene.problem.frame_index[seen]], far[None])[:, 0]
+    )
+    pixels = scene.problem.pixels.clone()
+    pixels[seen] = exact[0]
+    pixels.requires_grad_()
+    solution = bundle_adjust(replace(scene.problem, pixels=pixels))
+    assert solution.success
+    (through_far,) = torch.autograd.grad(solution.points_w[5].sum(), pixels, retain_graph=True)
+    assert (through_far == 0).all()
+    (gradient,) = torch.autograd.grad(solution.points_w.sum(), pixels)
+    assert 0 < gradient.abs().max() < 1

@@ -66,6 +66,14 @@ def informed(request: pytest.FixtureRequest) -> tuple[SLAM, Run, Say]:
     return *run_with(request.param), request.param
 
 
+def test_information_of_half_the_scale_makes_the_run_of_none() -> None:
+    (_, unstated), (_, stated) = (run_with(say) for say in (lambda _: None, lambda f: (0.5 * f.scales) ** -2))
+    assert len(stated.trajectory) == len(unstated.trajectory) == len(WALK)
+    assert stated.map.num_keyframes == unstated.map.num_keyframes
+    counts = [len(run.graph.pixels) for run in (unstated, stated)]
+    assert abs(counts[0] - counts[1]) < 0.02 * counts[0]
+
+
 def test_a_run_uses_the_given_information(informed: tuple[SLAM, Run, Say]) -> None:
     _, run, say = informed
     assert len(run.trajectory) == len(WALK)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Shaped
@@ -26,6 +27,20 @@ BINARY_BYTES = 32
 
 LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 NORMALIZE = "torch.nn.functional.normalize(descriptors, dim=-1) makes them so"
+
+
+@runtime_checkable
+class FixedKeypoints(Protocol):
+    """A front end that can describe given keypoints again, after its parameters have changed: `XFeat`, `ALIKED`.
+
+    Otherwise a row of its features may be another keypoint after every step of a training, since rows are sorted.
+    """
+
+    def read(
+        self, images: Float[Tensor, "B 1 H W"], keypoints: Float[Tensor, "B N 2"], mask: Bool[Tensor, "B N"]
+    ) -> Features:
+        """The features of these keypoints, in these rows, each located anew near by."""
+        ...
 
 
 def are_unit_or_zero(descriptors: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*batch"]:

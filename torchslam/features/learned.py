@@ -12,7 +12,7 @@ from pathlib import Path
 
 import torch
 import torch.nn.functional as F
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
@@ -20,6 +20,7 @@ from torchslam.features.contract import apply_mask
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
 from torchslam.features.weights import EXTRACTOR, MATCHER, read_weights
+from torchslam.geometry.precision import full_precision
 from torchslam.types import Features
 
 _SCALE = 2.0
@@ -53,6 +54,7 @@ class XFeat(nn.Module):
         state = {name: tensor for name, tensor in state.items() if not name.startswith("net.matcher.")}
         _load(model, state, weights, optional="net.fine_matcher.")
         self.network = model.net.eval()
+        self.network.keypoint_head = _FullPrecision(*self.network.keypoint_head)
 
     def forward(
         self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
@@ -72,28 +74,53 @@ class XFeat(nn.Module):
         from kornia.geometry.subpix import nms2d
 
         check_images(images, mask)
+        coarse, heat, scores = self._maps(images)
+        peaks = nms2d(heat.detach()[:, None], (5, 5), mask_only=True)[:, 0] & (heat > self.threshold)
+        inner = heat.shape[1:]
+        if mask is not None:
+            peaks &= F.interpolate(mask.float(), inner, mode="nearest-exact")[:, 0] > 0
+        ranked = torch.where(peaks, scores, 0).flatten(1)
+        best = ranked.detach().topk(min(self.num_keypoints, ranked.shape[1]))
+        places = torch.stack((best.indices % inner[1], best.indices // inner[1]), dim=-1)
+        return self._features(images, coarse, heat, scores, places, best.values > 0)
+
+    def read(
+        self, images: Float[Tensor, "B 1 H W"], keypoints: Float[Tensor, "B N 2"], mask: Bool[Tensor, "B N"]
+    ) -> Features:
+        """Describe keypoints found before, in the same rows, whatever their scores are now.
+
+        Every keypoint is located anew around the peak that is at most one pixel of the network's input away.
+
+        Args:
+            images: gray, in [0, 1].
+            keypoints: of these images.
+            mask: the rows that are keypoints.
+        """
+        check_images(images)
+        coarse, heat, scores = self._maps(images)
+        positions = (keypoints.to(heat) + 0.5) / _ratio(images, heat) - 0.5
+        return self._features(images, coarse, heat, scores, _peaks_near(heat, positions), mask)
+
+    def _maps(self, images: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Descriptors (B, 64, h, w), and the heat map and the scores (B, H', W'), in float32 also under autocast."""
         height, width = images.shape[-2:]
         # The network halves its input five times.
         inner = (max(32, height // 32 * 32), max(32, width // 32 * 32))
         resized = F.interpolate(images.float(), inner, mode="bilinear", align_corners=False)
-        coarse, logits, reliability = self.network(resized)
+        coarse, logits, reliability = (each.float() for each in self.network(resized))
         # 64 places of a cell of 8x8 pixels, row by row, and one for "no keypoint here".
         heat = F.pixel_shuffle(logits.softmax(1)[:, :64], 8)
         scores = heat * F.interpolate(reliability, inner, mode="bilinear", align_corners=False)
-        peaks = nms2d(heat.detach(), (5, 5), mask_only=True) & (heat > self.threshold)
-        if mask is not None:
-            peaks &= F.interpolate(mask.float(), inner, mode="nearest-exact") > 0
-        ranked = torch.where(peaks, scores, 0).flatten(1)
-        best = ranked.detach().topk(min(self.num_keypoints, ranked.shape[1]))
-        found = best.values > 0
-        x, y = best.indices % inner[1], best.indices // inner[1]
+        return coarse, heat[:, 0], scores[:, 0]
 
-        windows = F.pad(heat[:, 0], (2, 2, 2, 2)).unfold(1, 5, 1).unfold(2, 5, 1)
-        image = torch.arange(len(images), device=images.device)[:, None].expand_as(x)
-        offsets = soft_peak(windows[image, y, x].flatten(0, 1))
-        positions = torch.stack([x, y], dim=-1) + offsets.view(*x.shape, 2)
+    @full_precision
+    def _features(
+        self, images: Tensor, coarse: Tensor, heat: Tensor, scores: Tensor, places: Tensor, found: Tensor
+    ) -> Features:
+        """Features at places (B, N, 2) of the heat map, padded to `num_keypoints` rows."""
+        positions = places + soft_peak(_windows(heat, places).flatten(0, 1)).view(places.shape)
         # Pixels from 0 to W - 1 span the coarse map from edge to edge: so the network was trained.
-        grid = 2 * positions / positions.new_tensor([inner[1] - 1, inner[0] - 1]) - 1
+        grid = 2 * positions / positions.new_tensor([heat.shape[2] - 1, heat.shape[1] - 1]) - 1
         sampled = F.grid_sample(
             F.normalize(coarse, dim=1),
             grid[:, None],
@@ -102,10 +129,10 @@ class XFeat(nn.Module):
             align_corners=False,
         )
         descriptors = F.normalize(sampled[:, :, 0].mT, dim=-1)
-        ratio = positions.new_tensor([width / inner[1], height / inner[0]])
-        keypoints = (positions + 0.5) * ratio - 0.5
-        scores = ranked.gather(1, best.indices)
-        return _features(keypoints, scores, descriptors, found, self.num_keypoints, XFEAT_NOISE)
+        keypoints = (positions + 0.5) * _ratio(images, heat) - 0.5
+        scores = scores[_image_index(places), places[..., 1], places[..., 0]]
+        count = max(self.num_keypoints, found.shape[1])
+        return _features(keypoints, scores, descriptors, found, count, XFEAT_NOISE)
 
 
 class ALIKED(nn.Module):
@@ -162,7 +189,7 @@ class ALIKED(nn.Module):
             _features(
                 one.keypoints[None],
                 one.keypoint_scores[None],
-                one.descriptors[None],
+                one.descriptors[None].float(),
                 torch.ones_like(one.keypoint_scores[None], dtype=torch.bool),
                 self.num_keypoints,
                 ALIKED_NOISE,
@@ -171,6 +198,68 @@ class ALIKED(nn.Module):
         ]
         features = Features.cat(rows)
         return features if mask is None else apply_mask(features, mask)
+
+    def read(
+        self, images: Float[Tensor, "B 1 H W"], keypoints: Float[Tensor, "B N 2"], mask: Bool[Tensor, "B N"]
+    ) -> Features:
+        """Describe keypoints found before, in the same rows, whatever their scores are now; as `XFeat.read`."""
+        check_images(images)
+        maps, heat = self.network.extract_dense_map(images.float().expand(-1, 3, -1, -1))
+        places = _peaks_near(heat[:, 0].float(), keypoints.to(torch.float32))
+        located, scores = self._located(heat, places)
+        descriptors, _ = self.network.desc_head(maps, list(located))
+        size = located.new_tensor([images.shape[3] - 1, images.shape[2] - 1])
+        return _features(
+            size * (located + 1) / 2,
+            scores,
+            torch.stack([each.to(located) for each in descriptors]),
+            mask,
+            max(self.num_keypoints, mask.shape[1]),
+            ALIKED_NOISE,
+        )
+
+    @full_precision
+    def _located(self, heat: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
+        """Keypoints (B, N, 2), from -1 to 1 over the image, and scores (B, N), as the network's detector has them."""
+        detector, heat = self.network.dkd, heat.float()
+        weights = torch.softmax(_windows(heat[:, 0], places).flatten(2) / detector.temperature, dim=-1)
+        positions = places + weights @ torch.as_tensor(detector.hw_grid)
+        located = positions / positions.new_tensor([heat.shape[3] - 1, heat.shape[2] - 1]) * 2 - 1
+        scores = F.grid_sample(heat, located[:, None], mode="bilinear", align_corners=True)
+        return located, scores[:, 0, 0]
+
+
+class _FullPrecision(nn.Sequential):
+    """Layers in the precision of their parameters also under autocast: a rounded logit moves its keypoint."""
+
+    forward = full_precision(nn.Sequential.forward)
+
+
+_RADIUS = 2  # of the window around a peak that locates a keypoint
+
+
+def _image_index(places: Int[Tensor, "B N 2"]) -> Int[Tensor, "B N"]:
+    return torch.arange(len(places), device=places.device)[:, None].expand(places.shape[:2])
+
+
+def _windows(heat: Float[Tensor, "B H W"], places: Int[Tensor, "B N 2"]) -> Float[Tensor, "B N 5 5"]:
+    """The map around places (x, y), zero beyond its edge."""
+    side = 2 * _RADIUS + 1
+    windows = F.pad(heat, (_RADIUS,) * 4).unfold(1, side, 1).unfold(2, side, 1)
+    return windows[_image_index(places), places[..., 1], places[..., 0]]
+
+
+def _peaks_near(heat: Float[Tensor, "B H W"], positions: Float[Tensor, "B N 2"]) -> Int[Tensor, "B N 2"]:
+    """The place (x, y) of the largest value within one pixel: from where a soft peak was located, that of the peak."""
+    most = torch.tensor([heat.shape[2] - 1, heat.shape[1] - 1], device=heat.device)
+    places = torch.minimum(positions.detach().round().long().clamp_min(0), most)
+    near = _windows(heat.detach(), places)[..., 1:-1, 1:-1].flatten(-2).argmax(-1)
+    return torch.minimum((places + torch.stack((near % 3, near // 3), dim=-1) - 1).clamp_min(0), most)
+
+
+def _ratio(images: Tensor, heat: Float[Tensor, "B H W"]) -> Float[Tensor, " 2"]:
+    """Pixels of the images per pixel of the map, along x and y."""
+    return heat.new_tensor([images.shape[3] / heat.shape[2], images.shape[2] / heat.shape[1]])
 
 
 def _features(

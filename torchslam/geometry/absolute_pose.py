@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
+from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient, refuse_transforms
 from torchslam.geometry.lie import rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
@@ -95,7 +95,9 @@ def estimate_absolute_pose(
 
     Raises:
         ValueError: The shapes of points and pixels do not agree.
+        RuntimeError: It is called within a transform of `torch.func`.
     """
+    refuse_transforms("estimate_absolute_pose")
     if points_w.dim() != 3 or pixels.shape != (*points_w.shape[:2], 2):
         shapes = f"{tuple(points_w.shape)} and {tuple(pixels.shape)}"
         raise ValueError(f"points_w and pixels must be (B, N, 3) and (B, N, 2), not {shapes}")

@@ -230,6 +230,8 @@ class Camera:
 
         Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the center.
         """
+        # Replaced before the parameters see it: zero times NaN would be their gradient.
+        pixels = torch.where(torch.isfinite(pixels), pixels, self.params.detach()[..., None, 2:4])
         distorted = (pixels - self.params[..., None, 2:4]) / self.params[..., None, :2]
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])

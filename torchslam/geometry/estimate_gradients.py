@@ -21,6 +21,15 @@ def needs_gradient(*tensors: Tensor) -> bool:
     return recorded or _are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
+def refuse_transforms(name: str) -> None:
+    """Raise RuntimeError within a transform of `torch.func`, for an estimator that chooses among random samples."""
+    if _are_functorch_transforms_active():
+        raise RuntimeError(
+            f"{name} chooses among random samples, which torch.func cannot transform: call it outside, on a batch in "
+            "place of vmap, and differentiate with backward; refine_pose and bundle_adjust can be transformed"
+        )
+
+
 def first_order(tensor: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
     """The tensor, whose first derivatives are right while the second are not: to take these raises RuntimeError."""
     result: Tensor = _FirstOrder.apply(tensor)

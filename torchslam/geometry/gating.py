@@ -72,8 +72,9 @@ class KeypointNoise:
 
     Attributes:
         scales: pixels, the sizes of their pyramid levels.
-        information: px^-2, as a front end provides it. I = 0: none, the standard deviation in each direction is the
-            scale; I = 1: inverse variance in each direction; I = 3: xx, xy, yy of the inverse covariance.
+        information: px^-2, as a front end provides it. I = 0: none, the scale in each direction is the standard
+            deviation times `GATE_FACTOR`; I = 1: inverse variance in each direction; I = 3: xx, xy, yy of the inverse
+            covariance.
     """
 
     scales: Float[Tensor, "*batch"]

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import essential_from_pose, sampson_errors
-from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
+from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient, refuse_transforms
 from torchslam.geometry.homography import transfer_errors
 from torchslam.geometry.lie import rigid, so3_exp
 from torchslam.geometry.motion_models import ESSENTIAL, HOMOGRAPHY, MODELS, ROTATION
@@ -124,7 +124,9 @@ def estimate_relative_pose(
 
     Raises:
         ValueError: Wrong shapes, or an unknown model or kernel.
+        RuntimeError: It is called within a transform of `torch.func`.
     """
+    refuse_transforms("estimate_relative_pose")
     _check(pixels_1, pixels_2, weights, model, kernel)
     if 0 in pixels_1.shape or pixels_1.shape[1] < 5:
         return _nothing(pixels_1)

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.estimate_gradients import first_order, needs_gradient
+from torchslam.geometry.estimate_gradients import first_order, needs_gradient, refuse_transforms
 from torchslam.geometry.lie import cayley_rotation, rigid, so3_exp, transform, vee
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import squared_projections
@@ -51,10 +51,13 @@ def umeyama(
         with_scale: False fixes the scale to one.
 
     Returns:
-        Scale, rotation and translation.
+        Scale, rotation and translation; NaN, with a gradient of zero, where a row that counts is not finite.
     """
     w = torch.ones_like(source[..., 0]) if weights is None else weights.to(source.dtype)
     used = (w > 0)[..., None]
+    rows = used & torch.isfinite(source) & torch.isfinite(target)
+    finite = (rows.all(-1) | ~used[..., 0]).all(-1)
+    used, w = used & finite[..., None, None], torch.where(finite[..., None], w, 0.0)
     source, target = torch.where(used, source, 0.0), torch.where(used, target, 0.0)
     w = (w / w.sum(-1, keepdim=True).clamp_min(torch.finfo(w.dtype).tiny))[..., None]
     mean_source, mean_target = (w * source).sum(-2), (w * target).sum(-2)
@@ -69,7 +72,12 @@ def umeyama(
     else:
         scale = torch.ones_like(mean_source[..., 0])
     t = mean_target - scale[..., None] * (R @ mean_source[..., None]).squeeze(-1)
-    return scale, R, t
+    scale = torch.where(finite, scale, torch.nan)
+    return (
+        scale,
+        torch.where(finite[..., None, None], R, torch.nan),
+        torch.where(finite[..., None], t, torch.nan),
+    )
 
 
 def _nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
@@ -173,8 +181,10 @@ def estimate_similarity(
 
     Raises:
         ValueError: The shapes of points and pixels do not agree.
+        RuntimeError: It is called within a transform of `torch.func`.
     """
     shape, given = points_1.shape[:-1], (points_1, points_2, pixels_1, pixels_2)
+    refuse_transforms("estimate_similarity")
     if len(shape) != 2 or any(x.shape != (*shape, n) for x, n in zip(given, (3, 3, 2, 2), strict=True)):
         shapes = ", ".join(str(tuple(x.shape)) for x in given)
         raise ValueError(f"points must be (B, N, 3) and pixels (B, N, 2), not {shapes}")

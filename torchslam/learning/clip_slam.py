@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Shaped
@@ -18,12 +18,11 @@ from torch import Tensor, nn
 from torchslam.config import CameraConfig, Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
-from torchslam.features.contract import check_features
+from torchslam.features.contract import FixedKeypoints, check_features
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera, KeypointNoise
 from torchslam.geometry.gating import times
-from torchslam.map.posed_frames import RunGraph
-from torchslam.optim.run_graph import GraphSolution, solve_graphs
+from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graphs
 from torchslam.system.run import finish
 from torchslam.system.slam import SLAM
 from torchslam.types import Features, Frame
@@ -34,6 +33,8 @@ OnFailure = Literal["raise", "skip"] | float
 _ITERATIONS = 300
 # Relative cost decrease that the last step predicts: gradients are then right to 1e-6; with 1e-10 to 1e-4.
 _TOLERANCE = 1e-14
+_MAX_MOTION_PX = 8.0
+"""Keypoints that learn move by a pixel or two; another keypoint in the same row is mostly tens of pixels away."""
 
 
 @dataclass(frozen=True)
@@ -46,6 +47,8 @@ class ClipGraph:
         frames: T.
         batched: Whether this holds B clips (B may be 1).
         reasons: One per clip: why no map was initialized, or empty.
+        keypoints: One per clip: the pixels of all rows of its features.
+        masks: One per clip: which of the rows are keypoints.
     """
 
     runs: tuple[RunGraph | None, ...]
@@ -53,6 +56,8 @@ class ClipGraph:
     frames: int
     batched: bool
     reasons: tuple[str, ...]
+    keypoints: tuple[Float[Tensor, "T N 2"], ...]
+    masks: tuple[Bool[Tensor, "T N"], ...]
 
     @staticmethod
     def stack(graphs: Sequence[ClipGraph]) -> ClipGraph:
@@ -63,9 +68,12 @@ class ClipGraph:
         """
         if len({graph.frames for graph in graphs}) != 1 or any(graph.batched for graph in graphs):
             raise ValueError("stack needs graphs of one clip each with the same number of frames")
-        clips = ((graph.runs[0], graph.cameras[0], graph.reasons[0]) for graph in graphs)
-        runs, cameras, reasons = zip(*clips, strict=True)
-        return ClipGraph(runs, cameras, graphs[0].frames, True, reasons)
+
+        def every(name: str) -> tuple[Any, ...]:
+            return tuple(getattr(graph, name)[0] for graph in graphs)
+
+        columns = {name: every(name) for name in ("runs", "cameras", "reasons", "keypoints", "masks")}
+        return ClipGraph(frames=graphs[0].frames, batched=True, **columns)
 
 
 @dataclass(frozen=True)
@@ -165,7 +173,7 @@ class ClipSLAM(nn.Module):
 
         graph = clip_slam.build_graph(images, camera)
         ...
-        poses = clip_slam(images, camera, graph)  # or clip_slam.pose(graph, features)
+        poses = clip_slam(images, camera, graph)  # or clip_slam.pose(graph, clip_slam.extract(images, graph))
 
     Args:
         extractor: Module from images (T, 1, H, W) to Features with differentiable keypoints, such as
@@ -206,19 +214,34 @@ class ClipSLAM(nn.Module):
             ValueError: Images of another shape.
             FrameError: Images of another size than the camera.
         """
-        features = self.extract(images)
+        features = self.extract(images, graph)
         graph = self.build_graph(images, camera, features) if graph is None else graph
         return self.pose(graph, features, camera)
 
-    def extract(self, images: Float[Tensor, "*batch T 1 H W"]) -> Features | list[Features]:
+    def extract(
+        self, images: Float[Tensor, "*batch T 1 H W"], graph: ClipGraph | None = None
+    ) -> Features | list[Features]:
         """Extract the features of a clip, or of each of B clips.
+
+        Args:
+            images: As in `forward`.
+            graph: Of these images: a front end with `read` (`features.contract.FixedKeypoints`) describes the keypoints
+                of the graph, in their rows, whatever it would detect now.
 
         Raises:
             ValueError: Images of another shape.
         """
         if images.ndim not in (4, 5):
             raise ValueError(f"images must be (T, 1, H, W) or (B, T, 1, H, W), not {tuple(images.shape)}")
-        return [self.extractor(clip) for clip in images] if images.ndim == 5 else self.extractor(images)
+        clips, extractor = images if images.ndim == 5 else images[None], self.extractor
+        if graph is not None and isinstance(extractor, FixedKeypoints):
+            places = zip(clips, graph.keypoints, graph.masks, strict=True)
+            features = [
+                extractor.read(clip, *(each.to(clip.device) for each in place)) for clip, *place in places
+            ]
+        else:
+            features = [extractor(clip) for clip in clips]
+        return features if images.ndim == 5 else features[0]
 
     @torch.no_grad()
     def build_graph(
@@ -244,7 +267,10 @@ class ClipSLAM(nn.Module):
         cameras = _cameras(camera, len(clips))
         found = (self._build_graph(*one) for one in zip(clips, seen, cameras, strict=True))
         runs, reasons = zip(*found, strict=True)
-        return ClipGraph(runs, cameras, clips.shape[1], batched, reasons)
+        keypoints, masks = (
+            tuple(getattr(each, name).detach().clone() for each in seen) for name in ("keypoints", "mask")
+        )
+        return ClipGraph(runs, cameras, clips.shape[1], batched, reasons, keypoints, masks)
 
     def pose(
         self, graph: ClipGraph, features: Features | Sequence[Features], camera: Camera | None = None
@@ -253,12 +279,12 @@ class ClipSLAM(nn.Module):
 
         Args:
             graph: Of `build_graph`.
-            features: Of the clip, or one per clip: the same keypoints in the same rows as when the graph was built,
-                possibly moved. Rows with a False mask do not count.
+            features: Of the clip, or one per clip, by `extract(images, graph)`: the same keypoints in the same rows as
+                when the graph was built, possibly moved. Rows with a False mask do not count.
             camera: As in `forward`; that of the graph, without gradient, if None.
 
         Raises:
-            ValueError: The features have other shapes than the graph.
+            ValueError: The features have other shapes than the graph, or other keypoints in their rows.
         """
         seen = _per_clip(features)
         cameras = graph.cameras if camera is None else _cameras(camera, len(graph.runs))
@@ -330,7 +356,16 @@ def _as_seen(
     if features.information is not None:
         weights = KeypointNoise.of(features.scales[rows], features.information[rows]).weights.double()
     weights = times(weights, keypoint_weights[rows])
-    return replace(run, pixels=features.keypoints[rows].double(), weights=weights, camera=camera)
+    pixels = features.keypoints[rows].double()
+    moved = torch.linalg.vector_norm(pixels.detach() - run.pixels, dim=-1)
+    jumped = int((moved > _MAX_MOTION_PX).sum())
+    if jumped:
+        raise ValueError(
+            f"{jumped} of {len(moved)} keypoints are up to {float(moved.max()):.0f} px from where the graph has them: "
+            "their rows hold other keypoints now. Use features of `extract(images, graph)`, of a front end with "
+            "`read`, or build the graph anew"
+        )
+    return replace(run, pixels=pixels, weights=weights, camera=camera)
 
 
 def _posed(

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,37 +12,13 @@ from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, passes_gate
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
-from torchslam.optim.run_graph import GraphSolution, ObservationGraph, Schema
+from torchslam.optim.run_graph import GraphSolution, RunGraph
 from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
 
 # Twice the distance of the gate: the final adjustment moves frames by less.
 _OUTLIER_CHI_SQUARE = 4.0 * CHI_SQUARE_95
 _MIN_INLIER_RATIO = 0.75  # of a frame's observations, to remove the others
 _CHUNK = 1 << 16  # observations that are checked at once, to bound memory
-
-
-@dataclass(frozen=True, kw_only=True)
-class RunGraph(ObservationGraph):
-    """The observation graph of a submap, with the origin of its rows.
-
-    Attributes:
-        frame_ids: Index of each frame in the sequence of its session.
-        sessions: Session of each frame.
-        point_ids: Row of each point in the submap's map.
-        keypoint_index: Row of each observation among the frame's features, to read its pixels anew from a front end.
-    """
-
-    frame_ids: Int[Tensor, " K"]
-    sessions: Int[Tensor, " K"]
-    point_ids: Int[Tensor, " N"]
-    keypoint_index: Int[Tensor, " O"]
-
-    _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
-        "frame_ids": ("K", (), int),
-        "sessions": ("K", (), int),
-        "point_ids": ("N", (), int),
-        "keypoint_index": ("O", (), int),
-    }
 
 
 class PosedFrames:

@@ -121,13 +121,16 @@ class ObservationGraph:
     def load(cls, path: str | Path) -> Self:
         """Read what `save` wrote. Raises TorchslamError where the file is something else.
 
-        A file of a graph that knows more than this class is read without the rest; one from before there were submaps
-        has one.
+        A file of a run's graph gives a `RunGraph`, with the origin of its rows. One from before there were submaps has
+        one.
         """
         try:
             check_regular(path, _MAX_BYTES, "a graph that is read")
             with safe_open(str(path), framework="pt") as file:
                 metadata, known = file.metadata() or {}, set(file.keys())
+                # From here on `cls` is what the file holds; in the signature, what is asked for.
+                if cls is ObservationGraph and set(RunGraph.columns()) <= known | {"submap"}:
+                    cls = RunGraph  # type: ignore[assignment]
                 names = [name for name in cls.columns() if name in known or name != "submap"]
                 given = _CALIBRATION if set(_CALIBRATION) <= known else ()
                 tensors = {name: file.get_tensor(name) for name in (*names, "camera", *given)}
@@ -190,6 +193,30 @@ class ObservationGraph:
     def columns(cls) -> list[str]:
         """The names of all tensors but those of the camera and its calibration."""
         return [column.name for column in fields(cls) if column.name not in ("camera", "calibration")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunGraph(ObservationGraph):
+    """The observation graph of a submap, with the origin of its rows.
+
+    Attributes:
+        frame_ids: index of each frame in the sequence of its session.
+        sessions: session of each frame.
+        point_ids: row of each point in the submap's map.
+        keypoint_index: row of each observation among the frame's features, to read its pixels anew from a front end.
+    """
+
+    frame_ids: Int[Tensor, " K"]
+    sessions: Int[Tensor, " K"]
+    point_ids: Int[Tensor, " N"]
+    keypoint_index: Int[Tensor, " O"]
+
+    _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
+        "frame_ids": ("K", (), int),
+        "sessions": ("K", (), int),
+        "point_ids": ("N", (), int),
+        "keypoint_index": ("O", (), int),
+    }
 
 
 Graph = TypeVar("Graph", bound=ObservationGraph)

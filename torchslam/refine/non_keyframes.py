@@ -13,7 +13,8 @@ from torchslam.config import Config
 from torchslam.geometry import Camera, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.map.posed_frames import PosedFrames, RunGraph
+from torchslam.map.posed_frames import PosedFrames
+from torchslam.optim.run_graph import RunGraph
 from torchslam.tracking.data_association import match_keyframe
 from torchslam.tracking.pose_validation import validate_pose
 from torchslam.tracking.relocalization import single_frame_state

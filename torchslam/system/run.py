@@ -21,10 +21,10 @@ from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Atlas, Submap, main_submap
 from torchslam.map.map import Map
-from torchslam.map.posed_frames import PosedFrames, RunGraph
+from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.optim import Progress
-from torchslam.optim.run_graph import POSE_ITERATIONS, concatenate_graphs, solve_graph
+from torchslam.optim.run_graph import POSE_ITERATIONS, RunGraph, concatenate_graphs, solve_graph
 from torchslam.system.front_end import source
 from torchslam.system.session import Session
 from torchslam.types import Frame, Reason, State, StepResult, Trajectory

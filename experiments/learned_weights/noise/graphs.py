@@ -15,8 +15,7 @@ from torchslam import ORB, SLAM, Config, Features, open_sequence
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import se3_inverse
-from torchslam.map.posed_frames import RunGraph
-from torchslam.optim.run_graph import ObservationGraph
+from torchslam.optim.run_graph import ObservationGraph, RunGraph
 from torchslam.system.front_end import image_extractor
 
 LEAST_KNOWN = 4

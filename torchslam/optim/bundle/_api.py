@@ -30,8 +30,9 @@ class BundleSolution:
         T_cw: world to camera.
         camera: the cameras of the problem, with refined parameters where they were free.
         cost: half the sum of robustified squared whitened residuals and priors, detached.
-        success: all observing frames start finite, and all free unknowns are determined, up to the gauge. If
-            False, the estimate is the best one found, but it has no gradient.
+        success: all observing frames start finite, all free unknowns are determined, up to the gauge, and every free
+            frame sees three points with a parallax, or has a prior. If False, the estimate is the best one found, but
+            it has no gradient.
         moved_frames: False for fixed frames, and for frames with fewer than three points and no prior, which stayed at
             their start; observations of the latter did not count.
         moved_points: False for fixed points, and for points seen by fewer than two frames.
@@ -121,8 +122,9 @@ def bundle_adjust(
     """Minimize robust reprojection errors over poses, points and, if `free_camera`, the cameras' parameters.
 
     Observations that are not finite, or of points behind the camera, do not count. The implicit gradient is zero where
-    the exact Hessian is not positive definite; a point whose own block is not positive definite counts as fixed. With
-    an open gauge the gradient is right for losses that do not depend on it.
+    the exact Hessian is not positive definite; a point whose own block is not positive definite counts as fixed, and
+    one without parallax, whose depth nothing determines, has none. With an open gauge the gradient is right for losses
+    that do not depend on it.
 
     A batch gives what its problems alone would give, by dense algebra over many of them at once. Where a frame sees
     less than an eighth of the points, or one of them twice, they are solved one after the other.
@@ -157,7 +159,10 @@ def bundle_adjust(
     if strict:
         check_minimum(found.success, found.converged, "bundle adjustments")
     detached = [x.detach() for x in given]
-    solution = minimization.at_minimum(found, given) if backward == "implicit" else found.estimate
+    solution = found.estimate
+    if backward == "implicit":
+        points_w = torch.where(found.with_depth[..., None], found.points_w, found.points_w.detach())
+        solution = minimization.at_minimum(found._replace(points_w=points_w), given)
     if backward == "truncated":
         solution = minimization.last_step(found, given)
     params = solution.params if problem.camera_index is not None else solution.params[:, 0]

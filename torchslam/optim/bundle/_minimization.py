@@ -26,6 +26,8 @@ from torchslam.optim.bundle._problem import (
     BundleEstimate,
     MovingParts,
     flat_rows,
+    frames_are_determined,
+    points_with_parallax,
     prior_terms,
     select_moving,
 )
@@ -37,7 +39,8 @@ _MAX_CELLS_CPU, _MAX_CELLS_GPU = 1 << 14, 1 << 20
 
 
 class BundleMinimum(NamedTuple):
-    """Estimates, moved frames (B, K) and points (B, N), counted observations (B, O), and convergence (B,)."""
+    """Estimates, moved frames (B, K) and points (B, N), counted observations (B, O), the moved points that have a depth
+    (B, N), and convergence (B,)."""
 
     T_cw: Tensor
     points_w: Tensor
@@ -46,6 +49,7 @@ class BundleMinimum(NamedTuple):
     moved_frames: Tensor
     moved_points: Tensor
     used: Tensor
+    with_depth: Tensor
     cost: Tensor
     iterations: Tensor
     converged: Tensor
@@ -114,7 +118,7 @@ class BundleMinimization:
         """matrices: whether weights are inverse covariances"""
         self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
             (2, 2, 1),
-            (3, 2, 2, 0, 1, 1, 1, 0, 0, 0, 0),
+            (3, 2, 2, 0, 1, 1, 1, 1, 0, 0, 0, 0),
             (3, 2, 2, 3 if matrices else 1, 2, 0, 3, 3, 2, 3, 1, 0, 1, 1, 1, 1, 1),
         )
         self.camera, self.kernel = camera, kernel
@@ -135,14 +139,19 @@ class BundleMinimization:
         )
         with torch.no_grad():
             success = bundle.solvable & given.finite[part.rows]
+            with_parallax = moving.points
             if self.check:
                 success = success & bundle.definite(model)
+                of_part = given.part(part.rows)
+                with_parallax = points_with_parallax(of_part, moving.counted, bundle.in_order(model.estimate))
+                success = success & frames_are_determined(of_part, moving, with_parallax)
         return BundleMinimum(
             *bundle.in_order(model.estimate),
             success,
             moving.frames,
             moving.points,
             moving.counted,
+            moving.points & with_parallax,
             convergence.cost,
             convergence.iterations,
             convergence.converged,

@@ -159,6 +159,37 @@ def select_moving(given: BundleData) -> MovingParts:
     return MovingParts(counted, given.free_frames & seeing, given.free_points & seen)
 
 
+# Radians, 0.05 pixels with a focal length of 500: depth is then as uncertain as it is large, or more so.
+_MIN_PARALLAX = 1e-4
+
+
+def points_with_parallax(given: BundleData, used: Tensor, at: BundleEstimate) -> Bool[Tensor, "B N"]:
+    """Which points the used observations (B, O) see from different directions: the others have no depth."""
+    in_frames = flat_rows(given.frame_index, at.T_cw.shape[1])
+    in_points = flat_rows(given.point_index, at.points_w.shape[1])
+    centers_w = -(at.T_cw[..., :3, :3].mT @ at.T_cw[..., :3, 3:]).squeeze(-1).flatten(0, 1)
+    points_w = at.points_w.flatten(0, 1)
+    rays_w = torch.nn.functional.normalize(points_w[in_points] - centers_w[in_frames], dim=-1)
+    rays_w = torch.cat((rays_w, torch.ones_like(rays_w[:, :1])), dim=-1) * used.flatten()[:, None]
+    sums = torch.zeros(len(points_w), 4, dtype=rays_w.dtype, device=rays_w.device)
+    sums = sums.index_add(0, in_points, rays_w).unflatten(0, at.points_w.shape[:2])
+    # Two directions an angle a apart have a mean of length cos(a / 2).
+    missing = 1 - (sums[..., :3] / sums[..., 3:].clamp_min(1)).square().sum(-1)
+    least = max((_MIN_PARALLAX / 2) ** 2, 16 * torch.finfo(sums.dtype).eps)
+    return (sums[..., 3] > 0) & (missing > least)
+
+
+def frames_are_determined(
+    given: BundleData, moving: MovingParts, with_parallax: Bool[Tensor, "B N"]
+) -> Bool[Tensor, " B"]:
+    """Whether all frames that move see three points with a depth, or have a prior."""
+    has_depth = (with_parallax | ~moving.points).gather(1, given.point_index)
+    enough = _counts(given.frame_index, moving.counted & has_depth, moving.frames) >= _MIN_POINTS_PER_FRAME
+    if given.inputs.pose_prior is not None:
+        enough = enough | (given.prior_information != 0).flatten(2).any(-1)
+    return (enough | ~moving.frames).all(1)
+
+
 def _counts(index: Tensor, counted: Tensor, of: Tensor) -> Tensor:
     """How many counted rows of index (B, O) there are of each of `of`."""
     rows = flat_rows(index, of.shape[1])[counted.flatten()]
