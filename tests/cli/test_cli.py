@@ -188,7 +188,7 @@ def test_an_interrupt_writes_partial_results(
         return original(self, index)
 
     monkeypatch.setattr(SyntheticSequence, "image", image)
-    status, _, err = run_and_read(capsys, "run", ROOM, "--output", str(tmp_path), *FAST)
+    status, _, err = run_and_read(capsys, "run", ROOM, "--output", str(tmp_path), *FAST, "--processes", "1")
     assert status == 130
     assert "interrupted" in err
     figures = json.loads((tmp_path / "metrics.json").read_text())
