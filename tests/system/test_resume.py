@@ -467,11 +467,8 @@ SIGNALED = CHILD.replace(
 SIGNALED = SIGNALED.replace(
     "import sys, time", "import os, sys\nnumber, point = map(int, sys.argv[1].split(':'))"
 )
-POINTS = [
-    (number, frame)
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL)
-    for frame in range(0, FRAMES, 2)
-]
+ENDS = {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -signal.SIGKILL}
+POINTS = [(number, frame) for number in ENDS for frame in range(0, FRAMES, 2)]
 
 
 @pytest.mark.slow
