@@ -213,3 +213,15 @@ def test_a_split_clip_has_the_poses_of_its_main_submap() -> None:
     poses_found = ClipSLAM(BentEyes(walk, bend=0.0), config=config)(images, walk.camera)
     assert poses_found.posed.tolist() == [True] * 22 + [False] * 10
     assert float(ate(poses_found.T_cw, truth, poses_found.posed).detach()) < 0.01
+
+
+def test_a_short_clip_of_a_wall_starts() -> None:
+    """A run waits for ten frames before it believes in a plane; a clip of eight has poses all the same."""
+    sequence = open_sequence("synthetic:planar", resize_to="320x240", stride=3, limit=8)
+    images = torch.cat([sequence.image(index) for index in range(8)])
+    poses = ClipSLAM(ORB(600))(images, sequence.camera)
+    assert poses.success, poses.reasons
+    assert poses.posed.all()
+    truth = torch.stack([sequence.pose(index) for index in range(8)])
+    path = (truth[-1, :3, 3] - truth[0, :3, 3]).norm()
+    assert ate(poses.T_cw, truth, poses.posed) < 0.05 * path

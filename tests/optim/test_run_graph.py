@@ -9,6 +9,7 @@ from torchslam.errors import ConvergenceError, TorchslamError
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
 from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.optim import DepthPrior, FrameFactors
 from torchslam.optim.run_graph import (
     ObservationGraph,
     RunGraph,
@@ -427,3 +428,37 @@ def test_strict_raises_where_a_frame_is_not_at_a_minimum():
     ):
         with pytest.raises(ConvergenceError, match=r"frames: .* not converged"):
             solve()
+
+
+def test_factors_and_depths_of_a_graph_determine_the_scale_of_every_submap():
+    """Truth 1.2 times as large, said by distances in one submap and by depths in the other."""
+    *_, graph = two_submaps()
+    keyframes = [
+        ((graph.submap == submap) & graph.is_keyframe).nonzero().squeeze(-1) for submap in graph.submaps
+    ]
+    frames = torch.stack((keyframes[0][:-1], keyframes[0][1:]), dim=-1)
+    exact = solve_graph(graph, "none", iterations=200, tolerance=1e-20)
+
+    def centers(solution, rows):
+        return se3_inverse(solution.T_cw)[rows, :3, 3]
+
+    long = (centers(exact, frames[:, 1]) - centers(exact, frames[:, 0])).norm(dim=-1).detach()
+    distances = (1.2 * long).requires_grad_()
+    factors = (FrameFactors.distances(frames, distances, torch.full((len(frames),), 1e8).double()),)
+    seen = exact.T_cw[graph.frame_index, 2, :3] * exact.points_w[graph.point_index]
+    depths = 1.2 * (seen.sum(-1) + exact.T_cw[graph.frame_index, 2, 3])
+    information = torch.where(graph.submap[graph.frame_index] == graph.submaps[1], 1e4, 0.0).double()
+    prior = DepthPrior(depths.detach(), information)
+    solution = solve_graph(graph, "none", strict=True, frame_factors=factors, depth_prior=prior)
+    for rows in keyframes:
+        grown = centers(solution, rows) - centers(solution, rows[:1])
+        before = centers(exact, rows) - centers(exact, rows[:1])
+        torch.testing.assert_close(grown.norm(dim=-1), 1.2 * before.norm(dim=-1), rtol=2e-3, atol=1e-6)
+    (gradient,) = torch.autograd.grad(centers(solution, frames[:, 1]).norm(dim=-1).sum(), distances)
+    assert gradient.abs().max() > 0
+    joined = torch.stack((keyframes[0][:1], keyframes[1][:1]), dim=-1)
+    other = (~graph.is_keyframe).nonzero()[:1, 0]
+    for pair in (joined, torch.stack((keyframes[0][:1], other), dim=-1)):
+        wrong = FrameFactors.distances(pair, torch.ones(1).double(), torch.ones(1).double())
+        with pytest.raises(ValueError, match="keyframes of one submap"):
+            solve_graph(graph, frame_factors=(wrong,))

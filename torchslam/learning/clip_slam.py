@@ -181,7 +181,8 @@ class ClipSLAM(nn.Module):
             mode their normalization statistics would follow the clip.
         keypoint_weight: Module or function from Features to weights (T, N) >= 0 that multiply the information of each
             keypoint (for example its score); 1 if None.
-        config: Of the system; its features section is not read.
+        config: Of the system; its features section is not read. Scenes that look planar are accepted after half of the
+            frames of a clip at the latest.
     """
 
     def __init__(
@@ -321,8 +322,11 @@ class ClipSLAM(nn.Module):
         """The graph of one clip, or None and the reason why no map was initialized."""
         check_features(features, images, type(self.extractor).__name__)
         features = features.to(camera.params.device)
-        # The caller's camera is the one that poses are differentiated by.
-        slam = SLAM(camera, replace(self.config, camera=CameraConfig(std=0.0)), self.extractor)
+        # The camera is the one that poses are differentiated by. A clip is too short for the patience of a run.
+        start = self.config.initialization
+        start = replace(start, min_planar_frames=min(start.min_planar_frames, len(images) // 2))
+        config = replace(self.config, camera=CameraConfig(std=0.0), initialization=start)
+        slam = SLAM(camera, config, self.extractor)
         frames = [
             Frame(index, float(index), image[None], features=features[index : index + 1])
             for index, image in enumerate(images)

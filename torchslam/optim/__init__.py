@@ -5,6 +5,12 @@ from torchslam.optim._core.levenberg_marquardt import Convergence, Progress
 from torchslam.optim._core.tangent import CameraPrior, PosePrior
 from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, minimize
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim.bundle._factors import (
+    DepthPrior,
+    FrameFactors,
+    log_distance_error,
+    relative_pose_error,
+)
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.pose._refinement import RefinedPose, refine_pose
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, pose_graph_optimize
@@ -15,6 +21,8 @@ __all__ = [
     "BundleSolution",
     "CameraPrior",
     "Convergence",
+    "DepthPrior",
+    "FrameFactors",
     "LeastSquaresSolution",
     "Manifold",
     "Marginals",
@@ -24,7 +32,9 @@ __all__ = [
     "Progress",
     "RefinedPose",
     "bundle_adjust",
+    "log_distance_error",
     "minimize",
     "pose_graph_optimize",
     "refine_pose",
+    "relative_pose_error",
 ]

@@ -29,6 +29,7 @@ from torchslam.optim._core.implicit import Backward
 from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Progress, check_minimum
 from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
 from torchslam.optim.pose._refinement import refine_pose
 from torchslam.types import Trajectory
 from torchslam.utils.files import check_regular
@@ -273,6 +274,8 @@ def solve_graph(
     tolerance: float = 1e-10,
     progress: Progress | None = None,
     strict: bool = False,
+    frame_factors: Sequence[FrameFactors] = (),
+    depth_prior: DepthPrior | None = None,
 ) -> GraphSolution:
     """Minimize the robust reprojection errors of a run's graph: keyframes and points, then the other frames.
 
@@ -291,15 +294,20 @@ def solve_graph(
         tolerance: stop where the predicted reduction of the cost is below this share of it.
         progress: called before each iteration of a bundle adjustment.
         strict: raise an error for any frame that is not at a minimum: `success` or `converged` is False.
+        frame_factors: measured motions or distances between keyframes of one submap, or errors of one's own, with rows
+            of the graph's frames.
+        depth_prior: depths of the observations. Those of frames that are not keyframes do not count.
 
     Returns:
-        The minimum, differentiable with respect to pixels, weights and camera.
+        The minimum, differentiable with respect to pixels, weights and camera, depths and what factors measure.
 
     Raises:
-        ValueError: a submap has no keyframe, or two submaps see the same point.
+        ValueError: a submap has no keyframe, two submaps see the same point, or a factor joins other frames than
+            keyframes of one submap.
         ConvergenceError: with `strict`.
     """
     options = kernel, scale, backward, iterations, tolerance
+    _check_factors(graph, frame_factors)
     free, prior = (False, None) if free_camera is None else (free_camera, None)
     if free_camera is None and graph.calibration is not None:
         free, prior = graph.calibration.directions, camera_prior(graph.calibration)
@@ -309,16 +317,52 @@ def solve_graph(
             return bundle_adjust(problem, kernel, scale, free, backward, iterations, tolerance, progress)
 
         main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
-        first = solved(replace(submaps[main].problem, camera_prior=prior), free)
+        problems = [_with_factors(submap, graph, frame_factors, depth_prior) for submap in submaps]
+        first = solved(replace(problems[main], camera_prior=prior), free)
         return [
-            first if row == main else solved(replace(submap.problem, camera=first.camera), False)
-            for row, submap in enumerate(submaps)
+            first if row == main else solved(replace(problem, camera=first.camera), False)
+            for row, problem in enumerate(problems)
         ]
 
     (solution,) = _solve([graph], adjust, *options)
     if strict:
         check_minimum(solution.success, solution.converged, "frames")
     return solution
+
+
+def _check_factors(graph: ObservationGraph, factors: Sequence[FrameFactors]) -> None:
+    """Raises ValueError where a factor joins other frames than keyframes of one submap."""
+    for factor in factors:
+        if factor.frames.numel() and not 0 <= int(factor.frames.min()) <= int(factor.frames.max()) < len(
+            graph.T_cw
+        ):
+            raise ValueError(f"frames of factors must lie in 0 ... {len(graph.T_cw) - 1}")
+        submaps = graph.submap[factor.frames]
+        if not bool(graph.is_keyframe[factor.frames].all()) or bool((submaps[:, 0] != submaps[:, 1]).any()):
+            raise ValueError("factors must join keyframes of one submap")
+
+
+def _with_factors(
+    submap: _GraphSubmap,
+    graph: ObservationGraph,
+    factors: Sequence[FrameFactors],
+    depth_prior: DepthPrior | None,
+) -> BundleProblem:
+    """The bundle adjustment of a submap with its share of the factors and depths of its graph."""
+    slots = torch.full_like(graph.submap, -1)
+    slots[submap.keyframes] = torch.arange(len(submap.keyframes), device=slots.device)
+    own = []
+    for factor in factors:
+        rows = (slots[factor.frames[:, 0]] >= 0).nonzero().squeeze(-1)
+        own.append(
+            FrameFactors(
+                slots[factor.frames[rows]], factor.measured[rows], factor.information[rows], factor.error
+            )
+        )
+    if depth_prior is not None:
+        rows = submap.rows
+        depth_prior = DepthPrior(depth_prior.depths[rows], depth_prior.information[rows])
+    return replace(submap.problem, frame_factors=tuple(own), depth_prior=depth_prior)
 
 
 def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
@@ -340,8 +384,8 @@ def _check_submaps(graph: ObservationGraph) -> None:
         raise ValueError("a point is seen in two submaps")
 
 
-def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, BundleProblem]:
-    """The keyframes (k,) of one submap, its points (p,), and their bundle adjustment."""
+def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, Tensor, BundleProblem]:
+    """The keyframes (k,) of one submap, its points (p,), the observations (o,), and their bundle adjustment."""
     frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
     slots = torch.full_like(graph.submap, -1)
@@ -357,7 +401,7 @@ def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Ten
         graph.weights[rows],
         fixed_frames=(0,),
     )
-    return keyframes, points, problem
+    return keyframes, points, rows, problem
 
 
 def _bundle_converged(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
@@ -426,11 +470,12 @@ def concatenate_graphs(graphs: Sequence[Graph]) -> Graph:
 
 
 class _GraphSubmap(NamedTuple):
-    """A submap of a graph: rows of its keyframes and of its points there, and its bundle adjustment."""
+    """A submap of a graph: rows of its keyframes, points and observations there, and its bundle adjustment."""
 
     graph: int
     keyframes: Tensor
     points: Tensor
+    rows: Tensor
     problem: BundleProblem
 
     @property

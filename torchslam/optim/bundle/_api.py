@@ -15,6 +15,7 @@ from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, Progress, check_minimum
+from torchslam.optim.bundle._factors import factor_kinds
 from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
 from torchslam.optim.bundle._schur import Marginals
@@ -136,7 +137,8 @@ def bundle_adjust(
         free_camera: True frees all P parameters of every camera. A tensor (P, n) frees steps along its n columns, of
             which the covariances then are. Every problem of a batch finds its own parameters.
         backward: how gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed poses and fixed
-            points. Nothing flows to the start of free unknowns.
+            points, and depths and what factors measure, with their information. Nothing flows to the start of free
+            unknowns.
         iterations: maximum number of steps.
         tolerance: stop where the predicted reduction of the cost is below this share of it.
         progress: called before each iteration with its number and the maximum; its exceptions end the minimization.
@@ -153,7 +155,15 @@ def bundle_adjust(
     check_backward(backward)
     given = sanitized(problem, scale)
     minimization = BundleMinimization(
-        problem.camera, kernel, free_camera, iterations, tolerance, progress, check, given.weights.ndim > 2
+        problem.camera,
+        kernel,
+        free_camera,
+        iterations,
+        tolerance,
+        progress,
+        check,
+        given.weights.ndim > 2,
+        factor_kinds(problem.frame_factors),
     )
     found = BundleMinimum(*find_minimum(minimization, given, backward))
     if strict:

@@ -89,8 +89,8 @@ def suits_dense(given: BundleData, moving: MovingParts) -> bool:
     """Whether grids are the faster way: no point is seen twice in a frame, and few cells are empty."""
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     cells = moving.frames.numel() * num_points
-    if given.weights.ndim > 2:
-        return False  # the dense equations take scalar weights only
+    if given.weights.ndim > 2 or given.depths.shape[1] or given.measured.shape[1]:
+        return False  # the dense equations take scalar weights only, and neither depths nor factors
     if not 0 < cells <= _MAX_CELLS_PER_OBSERVATION * int(moving.counted.sum()):
         return False
     places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)
@@ -528,6 +528,8 @@ class DenseBundle:
 
     def _priors(self, estimate: DenseEstimate, exact: bool = False) -> PriorTerms | None:
         inputs, free = self.data.inputs, self.data.layout.free
+        if not inputs.has_priors:
+            return None
         if inputs.pose_prior is not None:
             leading = free.shape[1]
             inputs = inputs._replace(
@@ -536,7 +538,7 @@ class DenseBundle:
             )
         T_cw = estimate.T_cw[:, : free.shape[1]]
         terms = prior_terms(inputs, T_cw, estimate.params, free, self.directions, exact)
-        return None if terms is None else terms.in_world(T_cw[..., :3, :3])
+        return terms.in_world(T_cw[..., :3, :3])
 
     def _split(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """The parts of (B, D) that are of the free frames (B, K', 6) and of the cameras."""
@@ -576,7 +578,7 @@ class DenseBundle:
             motions = torch.cat((motions, rest), dim=-1)
         with torch.no_grad():
             priors = self._priors(estimate)
-            motions = motions if priors is None else open_motions(motions, priors.frames)
+            motions = motions if priors is None else open_motions(motions, priors)
         return motions.flatten(1, 2)
 
 

@@ -21,6 +21,7 @@ from torchslam.optim.bundle._dense import (
     dense_data,
     suits_dense,
 )
+from torchslam.optim.bundle._factors import FactorKind, depth_terms, factor_slope
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
@@ -114,17 +115,18 @@ class BundleMinimization:
         progress: Progress | None,
         check: bool = True,
         matrices: bool = False,
+        kinds: Sequence[FactorKind] = (),
     ) -> None:
-        """matrices: whether weights are inverse covariances"""
+        """matrices: whether weights are inverse covariances; kinds: of factors"""
         self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
             (2, 2, 1),
             (3, 2, 2, 0, 1, 1, 1, 1, 0, 0, 0, 0),
-            (3, 2, 2, 3 if matrices else 1, 2, 0, 3, 3, 2, 3, 1, 0, 1, 1, 1, 1, 1),
+            (3, 2, 2, 3 if matrices else 1, 2, 0, 3, 3, 2, 3, 1, 1, 1, 1, 1, 0, 1, 1, 1, 1, 1),
         )
         self.camera, self.kernel = camera, kernel
         self.free_camera = free_camera
         self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
-        self.check = check
+        self.check, self.kinds = check, kinds
         self._last: tuple[Tensor, MovingParts, list[BatchPart]] | None = None
 
     def minimize(self, inputs: Tensors) -> BundleMinimum:
@@ -144,7 +146,7 @@ class BundleMinimization:
                 success = success & bundle.definite(model)
                 of_part = given.part(part.rows)
                 with_parallax = points_with_parallax(of_part, moving.counted, bundle.in_order(model.estimate))
-                success = success & frames_are_determined(of_part, moving, with_parallax)
+                success = success & frames_are_determined(of_part, moving, with_parallax, self.kinds)
         return BundleMinimum(
             *bundle.in_order(model.estimate),
             success,
@@ -202,12 +204,19 @@ class BundleMinimization:
             turning = turning.expand(len(velocity), -1) if in_cameras is None else turning[in_cameras]
             velocity = torch.cat((velocity, turning), dim=-1)
         slope = (lin.gradient_wrt_residual[:, None, :] @ lin.J @ velocity[..., None]).sum()
-        terms = prior_terms(
+        if given.depths.shape[1]:
+            counted = torch.where(found.used, given.depth_information, 0.0).flatten()
+            terms = depth_terms(given.depths.flatten(), counted, points_c[:, 2], exact=False)
+            slope = slope + (terms.slope * velocity[:, 2]).sum()
+        if self.kinds:
+            moved = torch.where(found.moved_frames[..., None], frames, 0.0)
+            slope = slope + factor_slope(self.kinds, at.T_cw, given.measured, given.factor_information, moved)
+        if not given.inputs.has_priors:
+            return slope
+        priors = prior_terms(
             given.inputs, at.T_cw, at.params, found.moved_frames, self._directions(at.params), exact=False
         )
-        if terms is None:
-            return slope
-        return slope + (terms.frames_gradient * frames).sum() + (terms.camera_gradient * camera).sum()
+        return slope + (priors.frames_gradient * frames).sum() + (priors.camera_gradient * camera).sum()
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         frames, points, camera = direction
@@ -283,12 +292,14 @@ class BundleMinimization:
         if isinstance(layout, DenseLayout):
             return DenseBundle(dense_data(layout, given), self.camera, self.kernel, directions)
         one = BundleData(*(tensor[0] for tensor in given))
-        return SparseBundle(layout, one.inputs, self.camera, self.kernel, directions, given.camera_of[0])
+        return SparseBundle(
+            layout, one.inputs, self.camera, self.kernel, directions, given.camera_of[0], self.kinds
+        )
 
     def _laid_out(self, given: BundleData) -> tuple[MovingParts, list[BatchPart]]:
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""
         if self._last is None or not torch.equal(self._last[0], given.counted):
-            moving = select_moving(given)
+            moving = select_moving(given, self.kinds)
             self._last = given.counted, moving, _parts(given, moving)
         return self._last[1:]
 

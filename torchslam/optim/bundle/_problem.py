@@ -15,6 +15,14 @@ from torchslam.geometry.lie import se3_adjoint, transform
 from torchslam.geometry.precision import check_dtypes
 from torchslam.optim._core.residuals import only, usable
 from torchslam.optim._core.tangent import CameraPrior, PosePrior, prior_expansion, prior_hessian, rotated
+from torchslam.optim.bundle._factors import (
+    DepthPrior,
+    FactorKind,
+    FrameBlocks,
+    FrameFactors,
+    frames_with_factors,
+    packed_factors,
+)
 from torchslam.utils.indexing import row_mask
 
 
@@ -40,6 +48,9 @@ class BundleProblem:
         camera_index: camera of each frame.
         pose_prior: T_cw (K, 4, 4) and information (K, 6, 6), zero for frames without a prior.
         camera_prior: prior on the parameters of free cameras.
+        depth_prior: measured depths of the observed points.
+        frame_factors: measured motions or distances between frames, or errors of one's own. A batch with factors or
+            depths is solved one problem after the other.
     """
 
     T_cw: Float[Tensor, "*#batch K 4 4"]
@@ -55,6 +66,8 @@ class BundleProblem:
     camera_index: Int[Tensor, "*#batch K"] | None = None
     pose_prior: PosePrior | None = None
     camera_prior: CameraPrior | None = None
+    depth_prior: DepthPrior | None = None
+    frame_factors: Sequence[FrameFactors] = ()
 
     @property
     def is_batch(self) -> bool:
@@ -64,7 +77,8 @@ class BundleProblem:
 class BundleInputs(NamedTuple):
     """All that gradients may flow to, in the order of the problem; every tensor of a batch of B leads with it.
 
-    params (C, P), scale (); priors have no rows where there are none.
+    params (C, P), scale (); priors, depths and factors have no rows where there are none. Depths are by observation,
+    what the factors measure and their information flat, as `packed_factors` has them.
     """
 
     T_cw: Tensor
@@ -77,10 +91,19 @@ class BundleInputs(NamedTuple):
     prior_information: Tensor
     prior_params: Tensor
     prior_params_information: Tensor
+    depths: Tensor
+    depth_information: Tensor
+    measured: Tensor
+    factor_information: Tensor
 
     @property
     def pose_prior(self) -> PosePrior | None:
         return PosePrior(self.prior_T_cw, self.prior_information) if self.prior_T_cw.shape[-3] else None
+
+    @property
+    def has_priors(self) -> bool:
+        """Whether there is a prior, on poses or on the camera."""
+        return self.pose_prior is not None or self.camera_prior is not None
 
     @property
     def camera_prior(self) -> CameraPrior | None:
@@ -104,6 +127,10 @@ class BundleData(NamedTuple):
     prior_information: Tensor
     prior_params: Tensor
     prior_params_information: Tensor
+    depths: Tensor
+    depth_information: Tensor
+    measured: Tensor
+    factor_information: Tensor
     counted: Tensor
     finite: Tensor
     frame_index: Tensor
@@ -146,15 +173,14 @@ class MovingParts(NamedTuple):
     points: Bool[Tensor, "B N"]
 
 
-def select_moving(given: BundleData) -> MovingParts:
-    """Of what may move, points seen less than twice and frames that see less than three points and have no prior stay,
-    and are not observed."""
+def select_moving(given: BundleData, kinds: Sequence[FactorKind] = ()) -> MovingParts:
+    """Of what may move, points seen less than twice and frames that see less than three points and have no prior and no
+    factor stay, and are not observed."""
     frame_index, point_index, counted = given.frame_index, given.point_index, given.counted
     seen = _counts(point_index, counted, given.free_points) >= _MIN_FRAMES_PER_POINT
     counted = counted & (seen | ~given.free_points).gather(1, point_index)
     seeing = _counts(frame_index, counted, given.free_frames) >= _MIN_POINTS_PER_FRAME
-    if given.inputs.pose_prior is not None:
-        seeing = seeing | (given.prior_information != 0).flatten(2).any(-1)
+    seeing = seeing | _held_frames(given, kinds)
     counted = counted & (seeing | ~given.free_frames).gather(1, frame_index)
     return MovingParts(counted, given.free_frames & seeing, given.free_points & seen)
 
@@ -180,14 +206,20 @@ def points_with_parallax(given: BundleData, used: Tensor, at: BundleEstimate) ->
 
 
 def frames_are_determined(
-    given: BundleData, moving: MovingParts, with_parallax: Bool[Tensor, "B N"]
+    given: BundleData, moving: MovingParts, with_parallax: Bool[Tensor, "B N"], kinds: Sequence[FactorKind]
 ) -> Bool[Tensor, " B"]:
-    """Whether all frames that move see three points with a depth, or have a prior."""
+    """Whether all frames that move see three points with a depth, or have a prior or a factor."""
     has_depth = (with_parallax | ~moving.points).gather(1, given.point_index)
     enough = _counts(given.frame_index, moving.counted & has_depth, moving.frames) >= _MIN_POINTS_PER_FRAME
+    return (enough | _held_frames(given, kinds) | ~moving.frames).all(1)
+
+
+def _held_frames(given: BundleData, kinds: Sequence[FactorKind]) -> Tensor:
+    """Which frames (B, K) have a prior or a factor."""
+    held = frames_with_factors(kinds, given.factor_information, given.T_cw.shape[1])
     if given.inputs.pose_prior is not None:
-        enough = enough | (given.prior_information != 0).flatten(2).any(-1)
-    return (enough | ~moving.frames).all(1)
+        held = held | (given.prior_information != 0).flatten(2).any(-1)
+    return held
 
 
 def _counts(index: Tensor, counted: Tensor, of: Tensor) -> Tensor:
@@ -212,6 +244,8 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
     points_w, pixels, weights, mask = _rows(problem, T_cw)
     params, camera_index = _cameras(problem, T_cw)
     priors = _priors(problem, T_cw, params)
+    depths, depth_information = _depths(problem, mask)
+    measured, factor_information = packed_factors(problem.frame_factors, T_cw)
     check_dtypes(
         T_cw=T_cw,
         points_w=points_w,
@@ -222,6 +256,10 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         prior_information=priors[1],
         prior_params=priors[2],
         prior_params_information=priors[3],
+        depths=depths,
+        depth_information=depth_information,
+        factors=measured,
+        factor_information=factor_information,
     )
     (batch, num_frames), num_points = T_cw.shape[:2], points_w.shape[1]
     rows = mask.shape
@@ -242,6 +280,9 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         params,
         torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device).expand(batch),
         *priors,
+        *usable_depths(depths, depth_information, counted),
+        measured,
+        factor_information,
         counted,
         (is_finite | ~is_observing).all(-1),
         frame_index,
@@ -272,6 +313,25 @@ def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor,
         _over("weights", "(O,) or (O, 2, 2)", weights, (batch, count, *matrix)),
         _over("mask", "(O,)", mask, (batch, count)),
     )
+
+
+def _depths(problem: BundleProblem, mask: Tensor) -> tuple[Tensor, Tensor]:
+    """Depths and their information (B, O), or (B, 0) where there are none."""
+    batch, like, prior = len(mask), problem.T_cw, problem.depth_prior
+    if prior is None:
+        return like.new_zeros(batch, 0), like.new_zeros(batch, 0)
+    return (
+        _over("depth_prior.depths", "(O,)", prior.depths, tuple(mask.shape)),
+        _over("depth_prior.information", "(O,)", prior.information, tuple(mask.shape)),
+    )
+
+
+def usable_depths(depths: Tensor, information: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
+    """Depths and information (B, O), one and zero where a depth is none or its observation does not count."""
+    if not depths.shape[1]:
+        return depths, information
+    use = counted & depths.isfinite() & (depths > 0) & information.isfinite() & (information > 0)
+    return torch.where(use, depths, 1.0), torch.where(use, information, 0.0)
 
 
 def _cameras(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor]:
@@ -331,6 +391,7 @@ class PriorTerms(NamedTuple):
     frames: Tensor
     camera_gradient: Tensor
     camera: Tensor
+    between: FrameBlocks | None = None
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
         """The same for frames (..., K, 3, 3) that move along the axes of the world."""
@@ -341,8 +402,8 @@ class PriorTerms(NamedTuple):
 
 def prior_terms(
     inputs: BundleInputs, T_cw: Tensor, params: Tensor, moving: Tensor, directions: Tensor | None, exact: bool
-) -> PriorTerms | None:
-    """The terms at poses (..., K, 4, 4) and parameters (..., C, P); None where there are no priors.
+) -> PriorTerms:
+    """The terms at poses (..., K, 4, 4) and parameters (..., C, P).
 
     Args:
         moving: (..., K) bool, of which frames the prior counts
@@ -350,8 +411,6 @@ def prior_terms(
         exact: the exact Hessian, not that of Gauss and Newton
     """
     poses, camera = inputs.pose_prior, inputs.camera_prior
-    if poses is None and camera is None:
-        return None
     cost = T_cw.new_zeros(T_cw.shape[:-3])
     g_frames, H_frames = T_cw.new_zeros(*T_cw.shape[:-2], 6), T_cw.new_zeros(*T_cw.shape[:-2], 6, 6)
     if poses is not None:
@@ -385,11 +444,13 @@ def gauge_motions(T_cw: Float[Tensor, "*batch K 4 4"], origin_w: Tensor) -> Floa
     return rotated(T_cw[..., :3, :3].mT, torch.cat((scaling, -se3_adjoint(T_cw)), dim=-1))
 
 
-def open_motions(
-    motions: Float[Tensor, "*batch K 6 g"], H_frames: Float[Tensor, "*batch K 6 6"]
-) -> Float[Tensor, "*batch K 6 g"]:
-    """Of orthonormal motions (..., K, 6, g) of all frames those that priors (..., K, 6, 6) do not hinder; else zero."""
-    held = torch.einsum("...fag,...fab,...fbh->...gh", motions, H_frames, motions)
+def open_motions(motions: Float[Tensor, "*batch K 6 g"], terms: PriorTerms) -> Float[Tensor, "*batch K 6 g"]:
+    """Of orthonormal motions (..., K, 6, g) of all frames those that priors and factors do not hinder; else zero."""
+    held = torch.einsum("...fag,...fab,...fbh->...gh", motions, terms.frames, motions)
+    if terms.between is not None:
+        first, second, blocks = terms.between
+        across = torch.einsum("fag,fab,fbh->gh", motions[first], blocks, motions[second])
+        held = held + across + across.mT
     stiffness, mixtures = torch.linalg.eigh(held)
     is_open = stiffness <= torch.finfo(held.dtype).eps ** 0.5 * stiffness[..., -1:]
     return motions @ (mixtures * is_open[..., None, :])[..., None, :, :]

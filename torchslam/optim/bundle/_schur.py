@@ -19,6 +19,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
+from torchslam.optim.bundle._factors import FrameBlocks
 
 # Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call. Where many
 # frames see a place again and again, a tile has a column for each of them: fewer points share them better.
@@ -150,6 +151,7 @@ class NormalEquations:
     Attributes:
         coupling: the point-frame blocks as the tiles store them
         free_points: the points that move
+        between: blocks between two free frames, by slots, where there are factors
     """
 
     structure: Structure
@@ -161,6 +163,7 @@ class NormalEquations:
     points_camera: Float[Tensor, "N 3 P"]
     coupling: Float[Tensor, "R 6"]
     free_points: Bool[Tensor, " N"]
+    between: FrameBlocks | None = None
 
     def factorized(
         self, damping: Float[Tensor, "*#scale"] | None = None, gauge: Float[Tensor, "K 6 g"] | None = None
@@ -196,6 +199,12 @@ class NormalEquations:
             eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
             frames = frames + diagonal_floor(frames.dtype) * eye
         reduced[rows[:, :, None], rows[:, None, :]] = frames
+        if self.between is not None:
+            first, second, blocks = self.between
+            reduced.index_put_((rows[first][:, :, None], rows[second][:, None, :]), blocks, accumulate=True)
+            reduced.index_put_(
+                (rows[second][:, :, None], rows[first][:, None, :]), blocks.mT, accumulate=True
+            )
         if num_camera:
             split = 6 * num_frames
             across = self.frames_camera.reshape(split, num_camera)

@@ -8,7 +8,7 @@ Rows run along the observations: every operation streams through contiguous memo
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -32,6 +32,7 @@ from torchslam.optim._core.residuals import (
     variance_factor,
 )
 from torchslam.optim._core.tangent import cross_entries, retract, rotated
+from torchslam.optim.bundle._factors import FactorKind, FrameBlocks, depth_terms, factor_terms, with_depths
 from torchslam.optim.bundle._problem import (
     BundleEstimate,
     BundleInputs,
@@ -193,8 +194,10 @@ class SparseBundle:
         kernel: Kernel,
         directions: Tensor | None,
         camera_of: Tensor,
+        kinds: Sequence[FactorKind],
     ) -> None:
-        """directions: (P, n) in which the parameters move, None where they do not; camera_of: (O,)"""
+        """directions: (P, n) in which the parameters move, None where they stay; camera_of: (O,); kinds: of factors"""
+        self.kinds = kinds
         self.layout, self.inputs, self.directions = layout, inputs, directions
         self.camera, self.kernel = camera, kernel
         self.camera_of: Tensor | None = None  # where there are several, of each observation
@@ -208,7 +211,14 @@ class SparseBundle:
         self.start = BundleEstimate(
             inputs.T_cw, inputs.points_w.index_select(0, layout.point_order), inputs.params
         )
-        has_prior = inputs.pose_prior is not None and len(layout.free_frames) > 0
+        self.depths: tuple[Tensor, Tensor] | None = None
+        if len(inputs.depths):
+            depths = inputs.depths, inputs.depth_information
+            self.depths = (
+                depths[0].index_select(0, layout.observations),
+                depths[1].index_select(0, layout.observations),
+            )
+        has_prior = (inputs.pose_prior is not None or len(kinds) > 0) and len(layout.free_frames) > 0
         solvable = len(layout.observations) > 0 or has_prior
         self.solvable = torch.tensor([solvable], device=inputs.pixels.device)
 
@@ -222,6 +232,8 @@ class SparseBundle:
         seen, terms = self._seen(estimate), self._priors(estimate)
         lin = self._linearize(estimate, seen)
         cost = lin.cost.sum() if terms is None else lin.cost.sum() + terms.cost
+        if self.depths is not None:
+            cost = cost + depth_terms(*self.depths, seen.points_c[:, 2], exact=False).cost.sum()
         return SparseModel(
             estimate, cost[None], lambda: _with_priors(self._equations(seen, lin, use_curvature), terms)
         )
@@ -280,16 +292,22 @@ class SparseBundle:
         origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
         motions = gauge_motions(T_free, origin)
         motions = motions[..., :1] if len(anchors) else motions
+        if self.depths is not None and bool(
+            (self.depths[1] > 0).any()
+        ):  # they hold the scale, which comes first
+            if len(anchors):
+                return None
+            motions = motions[..., 1:]
         motions = torch.linalg.qr(motions.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
             priors = self._priors(estimate)
-            return motions if priors is None else open_motions(motions, priors.frames)
+            return motions if priors is None else open_motions(motions, priors)
 
     def _priors(self, estimate: BundleEstimate, exact: bool = False) -> PriorTerms | None:
-        """What the priors on free frames (K') and the cameras add, in the axes of the world."""
+        """What priors on free frames (K') and cameras, and factors, add, in the axes of the world."""
         frames, inputs = self.layout.free_frames, self.inputs
         poses = inputs.pose_prior
-        if poses is None and inputs.camera_prior is None:
+        if not inputs.has_priors and not self.kinds:
             return None
         if poses is not None:
             T_cw, information = (x.index_select(0, frames) for x in (poses.T_cw, poses.information))
@@ -297,18 +315,37 @@ class SparseBundle:
         T_cw = estimate.T_cw.index_select(0, frames)
         moving = torch.ones_like(frames).bool()
         terms = prior_terms(inputs, T_cw, estimate.params, moving, self.directions, exact)
-        return None if terms is None else terms.in_world(T_cw[:, :3, :3])
+        return self._with_factors(terms.in_world(T_cw[:, :3, :3]), estimate, exact)
+
+    def _with_factors(self, terms: PriorTerms, estimate: BundleEstimate, exact: bool) -> PriorTerms:
+        """The terms with those of the factors, of which what belongs to frames that stay is left out."""
+        if not self.kinds:
+            return terms
+        given, frames, T_cw = self.inputs, self.layout.free_frames, estimate.T_cw
+        found = factor_terms(self.kinds, T_cw, given.measured, given.factor_information, exact)
+        found = found.in_world(T_cw[:, :3, :3])
+        slots = torch.full((len(T_cw),), -1, device=frames.device)
+        slots[frames] = torch.arange(len(frames), device=frames.device)
+        first, second, blocks = found.between
+        joined = (slots[first] >= 0) & (slots[second] >= 0)
+        return terms._replace(
+            cost=terms.cost + found.cost,
+            frames_gradient=terms.frames_gradient + found.gradient[frames],
+            frames=terms.frames + found.diagonal[frames],
+            between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
+        )
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (1, K, 6, 6), (1, N, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
         estimate = self.ordered(estimate)
         seen = self._seen(estimate)
         lin = self._linearize(estimate, seen)
-        equations = self._equations(seen, lin, torch.zeros_like(self.solvable))
         layout, structure = self.layout, self.layout.structure
-        num_parameters = 6 * structure.num_frames + 3 * int(layout.free_points.sum()) + len(equations.camera)
+        num_camera = 0 if self.directions is None else len(estimate.params) * self.directions.shape[1]
+        num_parameters = 6 * structure.num_frames + 3 * int(layout.free_points.sum()) + num_camera
         factor = variance_factor(self.observations, lin, num_parameters)
-        # Priors are in absolute units, which the residuals do not calibrate.
+        # Priors, depths and factors are in absolute units, which the residuals do not calibrate.
+        equations = self._equations(seen, lin, torch.zeros_like(self.solvable), share=factor)
         equations = _with_priors(equations, self._priors(estimate), share=factor)
         free, points, camera = equations.factorized(gauge=self._gauge(estimate)).marginals()
         R_cw = estimate.T_cw[layout.free_frames, :3, :3]
@@ -367,21 +404,35 @@ class SparseBundle:
             return self.observations
         return self._observed(self.observations.pixels, self.observations.weights, estimate.params)
 
-    def _equations(self, seen: Seen, lin: Linearization, use_curvature: Tensor) -> NormalEquations:
-        """Without the curvature of the projection, and without priors."""
+    def _equations(
+        self, seen: Seen, lin: Linearization, use_curvature: Tensor, share: Tensor | float = 1.0
+    ) -> NormalEquations:
+        """Without the curvature of the projection, and without priors; with a share of the depths."""
         expansion = gauss_newton_expansion(
             lin, self._in_world(lin.J.movedim(0, -1), seen.R_cw), use_curvature
         )
+        expansion = self._with_depths(expansion, seen, exact=False, share=share)
         return assemble_sparse(
             self.layout.structure, expansion, seen.rays_w, self.layout.free_points, exact=False
         )
 
+    def _with_depths(
+        self, expansion: Expansion, seen: Seen, exact: bool, share: Tensor | float = 1.0
+    ) -> Expansion:
+        if self.depths is None:
+            return expansion
+        depths, information = self.depths
+        terms = depth_terms(depths, share * information, seen.points_c[:, 2], exact)
+        return with_depths(expansion, terms, seen.R_cw[2])
+
     def _exact_equations(self, estimate: BundleEstimate) -> NormalEquations:
-        R_cw, rays_w, points_c = self._seen(estimate)
+        seen = self._seen(estimate)
+        R_cw, rays_w, points_c = seen
         observations, is_free = self._observations(estimate), self.directions is not None
         gradient, hessian = exact_expansion_of_each(observations, points_c, is_free)
         half = self._in_world(hessian.movedim(0, -1), R_cw).transpose(0, 1)
         expansion = Expansion(self._in_world(gradient.mT[None], R_cw)[0], self._in_world(half, R_cw))
+        expansion = self._with_depths(expansion, seen, exact=True)
         layout = self.layout
         equations = assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=True)
         return _with_priors(equations, self._priors(estimate, exact=True))
@@ -397,9 +448,13 @@ def _with_priors(
     gradient = gradient._replace(
         frames=gradient.frames + terms.frames_gradient, camera=gradient.camera + terms.camera_gradient
     )
+    between = None
+    if terms.between is not None:
+        between = terms.between._replace(blocks=share * terms.between.blocks)
     return replace(
         equations,
         gradient=gradient,
+        between=between,
         frames=equations.frames + share * terms.frames,
         camera=equations.camera + share * terms.camera,
     )

@@ -167,9 +167,11 @@ class _Bundle:
 
 def _rows_of(problem: BundleProblem) -> tuple[Array, Array, Array]:
     """Frame and point of each observation, (O,) twice, and the mask (K,) of the fixed frames."""
-    names = ("fixed_points", "mask", "camera_index", "pose_prior", "camera_prior")
-    if problem.is_batch or any(getattr(problem, name) is not None for name in names):
-        raise ValueError(f"the NumPy backend takes one problem without {', '.join(names)}: use bundle_adjust")
+    names = ("fixed_points", "mask", "camera_index", "pose_prior", "camera_prior", "depth_prior")
+    if problem.is_batch or problem.frame_factors or any(getattr(problem, name) is not None for name in names):
+        raise ValueError(
+            f"the NumPy backend takes one problem without {', '.join(names)} and factors: use bundle_adjust"
+        )
     shape = (1, len(problem.pixels))
     frame = checked_rows("frame_index", problem.frame_index, shape, len(problem.T_cw))
     point = checked_rows("point_index", problem.point_index, shape, len(problem.points_w))

@@ -1,0 +1,251 @@
+"""Depths, distances, relative poses and errors of one's own beside the reprojection errors."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from torchslam.geometry import se3_exp, se3_inverse, se3_log, transform
+from torchslam.optim import (
+    DepthPrior,
+    FrameFactors,
+    bundle_adjust,
+    minimize,
+    relative_pose_error,
+)
+from torchslam.optim.bundle.dense_numpy import bundle_adjust_numpy
+
+CONVERGED = {"iterations": 100, "tolerance": 1e-18, "strict": True}
+
+
+def draw(*shape, seed=0):
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def spd(count, size, weight=1e3):
+    A = draw(count, size, size, seed=5)
+    return weight * (A @ A.mT + torch.eye(size))
+
+
+def depths_of(scene):
+    """z of every observation in truth."""
+    problem = scene.problem
+    return transform(scene.T_cw[problem.frame_index], scene.points_w[problem.point_index][:, None])[:, 0, 2]
+
+
+def motions_of(T_cw, frames):
+    return T_cw[frames[:, 1]] @ se3_inverse(T_cw[frames[:, 0]])
+
+
+def centers(T_cw):
+    return se3_inverse(T_cw)[..., :3, 3]
+
+
+@pytest.mark.parametrize("fixed", [(0,), ()])
+@pytest.mark.parametrize("kind", ["depths", "distances", "motions"])
+def test_each_determines_the_scale(bundle_scene, kind, fixed):
+    """With the truth 1.3 times as large, the map grows by as much; without, it keeps the scale of the start."""
+    scene = bundle_scene(noise=0.0, frames=6, points=50, fixed_frames=fixed)
+    frames = torch.tensor([(1, 4), (5, 2)])
+    pairs = centers(scene.T_cw)[frames]
+    long = (pairs[:, 1] - pairs[:, 0]).norm(dim=-1)
+    T_21 = motions_of(scene.T_cw, frames)
+    T_21[:, :3, 3] *= 1.3
+    more = {
+        "depths": {
+            "depth_prior": DepthPrior(1.3 * depths_of(scene), torch.ones(len(scene.problem.pixels)).double())
+        },
+        "distances": {
+            "frame_factors": (FrameFactors.distances(frames, 1.3 * long, torch.full((2,), 1e4).double()),)
+        },
+        "motions": {
+            "frame_factors": (
+                FrameFactors.relative_poses(frames, T_21, 1e4 * torch.eye(6).double().expand(2, 6, 6)),
+            )
+        },
+    }[kind]
+    solution = bundle_adjust(replace(scene.problem, **more), "none", **CONVERGED)
+    found = (centers(solution.T_cw)[1:] - centers(solution.T_cw)[0]).norm(dim=-1)
+    true = (centers(scene.T_cw)[1:] - centers(scene.T_cw)[0]).norm(dim=-1)
+    torch.testing.assert_close(found, 1.3 * true, rtol=1e-5, atol=0)
+    assert solution.cost < 1e-9
+
+
+def mixed(scene, frames):
+    """A problem with all kinds, with noise, and the tensors that it has gradients to."""
+    problem = scene.problem
+    pairs = centers(scene.T_cw)[frames]
+    tensors = {
+        "T_21": se3_exp(0.02 * draw(len(frames), 6, seed=1)) @ motions_of(scene.T_cw, frames),
+        "T_information": spd(len(frames), 6),
+        "distances": (pairs[:, 1] - pairs[:, 0]).norm(dim=-1) * (0.05 * draw(len(frames), seed=2)).exp(),
+        "distance_information": torch.full((len(frames),), 400.0).double(),
+        "depths": depths_of(scene) * (0.1 * draw(len(problem.pixels), seed=3)).exp(),
+        "depth_information": 50 + 50 * torch.rand(len(problem.pixels)).double(),
+        "heights": 0.01 * draw(len(frames), seed=4),
+    }
+
+    def with_all(tensors, **options):
+        factors = (
+            FrameFactors.relative_poses(frames, tensors["T_21"], tensors["T_information"]),
+            FrameFactors.distances(frames, tensors["distances"], tensors["distance_information"]),
+            FrameFactors(
+                frames,
+                tensors["heights"],
+                torch.full((len(frames), 1, 1), 1e3).double(),
+                difference_of_heights,
+            ),
+        )
+        depths = DepthPrior(tensors["depths"], tensors["depth_information"])
+        return replace(problem, frame_factors=factors, depth_prior=depths, **options)
+
+    return with_all, tensors
+
+
+def difference_of_heights(T_1w, T_2w, measured):
+    """An error of one's own: the second camera is so much lower than the first."""
+    return (centers(T_2w)[..., 1] - centers(T_1w)[..., 1] - measured)[..., None]
+
+
+def test_the_minimum_is_that_of_the_written_out_cost(bundle_scene):
+    """Against `minimize`, with one dense Hessian: poses, and the gradient to everything that is measured."""
+    scene = bundle_scene(noise=1.0, frames=4, points=12, visible=1.0, fixed_frames=(0,))
+    frames = torch.tensor([(0, 2), (1, 2), (3, 1), (1, 2)])
+    with_all, tensors = mixed(scene, frames)
+    problem = scene.problem
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in tensors.items()}
+    pixels = problem.pixels.clone().requires_grad_()
+    solution = bundle_adjust(with_all(leaves, pixels=pixels), "none", **CONVERGED)
+
+    def residual(T_free, points_w, T_21, T_info, distances, d_info, depths, z_info, heights, pixels):
+        T_cw = torch.cat((problem.T_cw[:1].expand(len(T_free), 1, 4, 4), T_free), dim=1)
+        points_c = (T_cw[:, problem.frame_index, :3, :3] @ points_w[:, problem.point_index, :, None]).squeeze(
+            -1
+        ) + T_cw[:, problem.frame_index, :3, 3]
+        seen = problem.camera.project(points_c)[0] - pixels
+        T_1w, T_2w = T_cw[:, frames[:, 0]], T_cw[:, frames[:, 1]]
+        between = (centers(T_2w) - centers(T_1w)).norm(dim=-1)
+        L = torch.linalg.cholesky(T_info)
+        parts = (
+            seen,
+            (L.mT @ relative_pose_error(T_1w, T_2w, T_21)[..., None]).squeeze(-1),
+            d_info.sqrt() * (between / distances).log(),
+            z_info.sqrt() * (points_c[..., 2] / depths).log(),
+            1e3**0.5 * difference_of_heights(T_1w, T_2w, heights),
+        )
+        return torch.cat([part.flatten(1) for part in parts], dim=1)
+
+    start = problem.T_cw[None, 1:], problem.points_w[None]
+    other = [tensor.clone().requires_grad_() for tensor in (*tensors.values(), problem.pixels)]
+    expected = minimize(
+        residual, start, [x[None] for x in other], ("se3", "euclidean"), iterations=100, tolerance=1e-18
+    )
+    assert expected.success.all()
+    torch.testing.assert_close(solution.T_cw[1:], expected.unknowns[0][0], rtol=0, atol=1e-9)
+    torch.testing.assert_close(solution.points_w, expected.unknowns[1][0], rtol=0, atol=1e-8)
+    torch.testing.assert_close(solution.cost, expected.cost[0], rtol=1e-9, atol=0)
+    weights = draw(3, 3, seed=9), draw(12, 3, seed=10)
+    loss = (weights[0] * solution.T_cw[1:, :3, 3]).sum() + (weights[1] * solution.points_w).sum()
+    wanted = (weights[0] * expected.unknowns[0][0, :, :3, 3]).sum() + (
+        weights[1] * expected.unknowns[1][0]
+    ).sum()
+    found = torch.autograd.grad(loss, [*leaves.values(), pixels])
+    for name, mine, right in zip((*leaves, "pixels"), found, torch.autograd.grad(wanted, other), strict=True):
+        mine, right = (0.5 * (x + x.mT) if name == "T_information" else x for x in (mine, right))
+        assert right.abs().max() > 0, name
+        torch.testing.assert_close(mine, right, rtol=1e-5, atol=1e-9 * float(right.abs().max()), msg=name)
+
+
+def test_the_gradient_agrees_with_differences_with_free_camera_and_kernel(bundle_scene):
+    scene = bundle_scene(noise=1.0, frames=6, points=40, fixed_frames=(0,))
+    with_all, tensors = mixed(scene, torch.tensor([(0, 2), (1, 5), (3, 4)]))
+    along = torch.tensor([[1.0], [1.0], [0.0], [0.0]]).double()
+
+    def loss(tensors):
+        options = {"free_camera": along, **CONVERGED}
+        return bundle_adjust(with_all(tensors), "cauchy", 2.0, **options).T_cw[5, 0, 3]
+
+    for name in ("T_21", "distances", "depths", "depth_information", "heights"):
+        leaf = tensors[name].clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(tensors | {name: leaf}), leaf)
+        step = 1e-4 * draw(*leaf.shape, seed=11)
+        up, down = (loss(tensors | {name: tensors[name] + sign * step}) for sign in (1, -1))
+        torch.testing.assert_close((gradient * step).sum(), 0.5 * (up - down), rtol=1e-3, atol=1e-12)
+
+
+def test_a_frame_that_sees_nothing_follows_its_factors(bundle_scene):
+    scene = bundle_scene(noise=0.0, frames=5, points=40)
+    problem = scene.problem
+    frames = torch.tensor([(1, 4)])
+    T_21 = motions_of(scene.T_cw, frames)
+    factors = (FrameFactors.relative_poses(frames, T_21, torch.eye(6).double()[None]),)
+    blind = replace(problem, mask=problem.frame_index != 4, frame_factors=factors)
+    solution = bundle_adjust(blind, "none", **CONVERGED)
+    torch.testing.assert_close(solution.T_cw, scene.T_cw, atol=1e-7, rtol=0)
+    unheld = bundle_adjust(replace(blind, frame_factors=()), "none")
+    assert torch.equal(unheld.T_cw[4], problem.T_cw[4])
+
+
+def test_covariances_shrink_by_what_is_measured(bundle_scene):
+    scene = bundle_scene(noise=0.5, frames=5, points=40)  # two fixed frames: the scale is not open without
+    with_all, tensors = mixed(scene, torch.tensor([(0, 2), (1, 2)]))
+    bare, held = (bundle_adjust(p, "none").covariance().frames for p in (scene.problem, with_all(tensors)))
+    assert (held[2:].diagonal(dim1=1, dim2=2) > 0).all()
+    assert held[2].trace() < 0.9 * bare[2].trace()
+
+
+def test_a_batch_gives_what_its_problems_alone_give(bundle_scene):
+    scene = bundle_scene(noise=1.0, frames=5, points=30, visible=1.0)
+    frames = torch.tensor([(1, 2), (3, 4)])
+    with_all, tensors = mixed(scene, frames)
+    noisy = scene.problem.pixels + torch.stack([draw(*scene.problem.pixels.shape, seed=s) for s in (0, 1)])
+    both = with_all(tensors, pixels=noisy, T_cw=scene.problem.T_cw.repeat(2, 1, 1, 1))
+    together = bundle_adjust(both, **CONVERGED)
+    for row in range(2):
+        alone = bundle_adjust(with_all(tensors, pixels=noisy[row]), **CONVERGED)
+        torch.testing.assert_close(together.T_cw[row], alone.T_cw, rtol=0, atol=1e-10)
+    T_21 = torch.stack([tensors["T_21"], se3_exp(0.01 * draw(2, 6)) @ tensors["T_21"]])
+    own = (FrameFactors.relative_poses(frames, T_21, tensors["T_information"].expand(2, -1, -1, -1)),)
+    apart = bundle_adjust(replace(both, frame_factors=own), **CONVERGED)
+    assert se3_log(apart.T_cw[1] @ se3_inverse(together.T_cw[1])).norm() > 1e-4
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_what_does_not_fit_is_refused(bundle_scene):
+    problem = bundle_scene().problem
+    one, eye = torch.eye(4).double()[None], torch.eye(6).double()[None]
+
+    def refused(match, frames, measured=one, information=eye):
+        factors = (FrameFactors.relative_poses(torch.tensor(frames), measured, information),)
+        with pytest.raises(ValueError, match=match):
+            bundle_adjust(replace(problem, frame_factors=factors))
+
+    refused("lie in 0", [(0, 5)])
+    refused("with itself", [(1, 1)])
+    refused(r"\(F, 2\)", [0, 1])
+    refused("F = 2", [(0, 1), (1, 2)])
+    with pytest.raises(ValueError, match="depths must be"):
+        bundle_adjust(
+            replace(problem, depth_prior=DepthPrior(torch.ones(3).double(), torch.ones(3).double()))
+        )
+    one_factor = (FrameFactors.relative_poses(torch.tensor([(0, 1)]), one, eye),)
+    with pytest.raises(ValueError, match="use bundle_adjust"):
+        bundle_adjust_numpy(replace(problem, frame_factors=one_factor), 1.0, 5, 1e-8)
+
+
+def test_second_derivatives_and_transforms(bundle_scene):
+    """The Jacobian to the distances by both modes, under vmap."""
+    scene = bundle_scene(noise=0.5, frames=4, points=20, fixed_frames=(0,))
+    frames = torch.tensor([(0, 2), (1, 3)])
+    long = (centers(scene.T_cw)[frames[:, 1]] - centers(scene.T_cw)[frames[:, 0]]).norm(dim=-1)
+
+    def last(distances):
+        factors = (FrameFactors.distances(frames, distances, torch.full((2,), 1e3).double()),)
+        return bundle_adjust(replace(scene.problem, frame_factors=factors), "none").T_cw[3, :3, 3]
+
+    reverse, forward = torch.func.jacrev(last)(long), torch.func.jacfwd(last)(long)
+    torch.testing.assert_close(forward, reverse, rtol=1e-6, atol=1e-10)
+    hessian = torch.func.jacfwd(torch.func.jacrev(lambda d: last(d)[0]))(long)
+    step = 1e-4 * torch.tensor([1.0, -0.5]).double()
+    difference = torch.func.jacrev(last)(long + step)[0] - torch.func.jacrev(last)(long - step)[0]
+    torch.testing.assert_close(hessian @ step, 0.5 * difference, rtol=1e-3, atol=1e-10)
