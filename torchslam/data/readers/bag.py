@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -216,6 +217,7 @@ class Recording:
         self._types = get_typestore(Stores.ROS1_NOETIC if self._is_ros1 else Stores.ROS2_HUMBLE)
         self._reader: Reader1 | Reader2 = Reader1(path) if self._is_ros1 else Reader2(path)
         self._reader.open()
+        weakref.finalize(self, self._reader.close)  # when no sequence needs it anymore
 
     @property
     def connections(self) -> list[Connection]:
