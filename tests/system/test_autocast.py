@@ -23,9 +23,11 @@ from torchslam.optim import (
     BundleProblem,
     PosePrior,
     bundle_adjust,
+    log_distance_error,
     minimize,
     pose_graph_optimize,
     refine_pose,
+    relative_pose_error,
 )
 from torchslam.optim.run_graph import solve_graph
 
@@ -195,6 +197,12 @@ def solver_cases() -> dict[str, Case]:
         "minimize": (align, (start, points_w, points_w + 0.1 * normal(*points_w.shape, seed=8))),
         "refine_pose": (refine, (start, points_w, pixels, params, spd(6)[:1])),
         "bundle_adjust": (bundle, (graph.T_cw, graph.points_w, graph.pixels, graph.camera.params)),
+        "relative_pose_error": (
+            relative_pose_error, (se3_exp(0.3 * normal(2, 6)), start, se3_exp(0.3 * normal(2, 6, seed=3)))
+        ),
+        "log_distance_error": (
+            log_distance_error, (se3_exp(0.3 * normal(2, 6)), se3_exp(normal(2, 6, seed=4)), 1 + normal(2).square())
+        ),
         "solve_graph": (solve, (graph.pixels, graph.camera.params)),
         "pose_graph_optimize": (
             lambda S: pose_graph_optimize(replace(cast(pose_graph, S), S_ji=S)), (pose_graph.S_ji,)

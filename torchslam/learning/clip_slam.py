@@ -33,8 +33,8 @@ OnFailure = Literal["raise", "skip"] | float
 _ITERATIONS = 300
 # Relative cost decrease that the last step predicts: gradients are then right to 1e-6; with 1e-10 to 1e-4.
 _TOLERANCE = 1e-14
-_MAX_MOTION_PX = 8.0
-"""Keypoints that learn move by a pixel or two; another keypoint in the same row is mostly tens of pixels away."""
+_MAX_MOTION_PX = 16.0
+"""Keypoints that learn move by a pixel or two, with noise by ten; another one in the same row is a hundred away."""
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from torch import Tensor
 from torch.func import grad, jvp, vmap
 
 from torchslam.geometry.lie import se3_inverse, so3_log
+from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.residuals import Expansion
 from torchslam.optim._core.tangent import retract, rotated
 
@@ -25,6 +26,7 @@ FrameError = Callable[[Tensor, Tensor, Tensor], Tensor]
 """error(T_1w, T_2w, measured) -> (..., F, D), of poses (..., F, 4, 4), each row from its own rows alone."""
 
 
+@full_precision
 def relative_pose_error(
     T_1w: Float[Tensor, "*batch 4 4"], T_2w: Float[Tensor, "*batch 4 4"], T_21: Float[Tensor, "*batch 4 4"]
 ) -> Float[Tensor, "*batch 6"]:
@@ -33,6 +35,7 @@ def relative_pose_error(
     return torch.cat((E[..., :3, 3], so3_log(E[..., :3, :3])), dim=-1)
 
 
+@full_precision
 def log_distance_error(
     T_1w: Float[Tensor, "*batch 4 4"], T_2w: Float[Tensor, "*batch 4 4"], distances: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 1"]:
