@@ -159,7 +159,7 @@ def add_processes(parser: argparse.ArgumentParser) -> None:
         type=positive,
         metavar="N",
         help="number of processes: 2 adds a feature prefetcher, 3 also a bundle-adjustment worker; results are "
-        "identical (default: 3 if there are two processors and enough frames, else 1)",
+        "identical (default: 3 if two processors are free and there are enough frames, else 1)",
     )
 
 
