@@ -51,15 +51,20 @@ def is_code_of_others(group: str, name: str) -> bool:
     return bool(colon) and name not in registered(group) and package not in (each.strip() for each in allowed)
 
 
+def instantiate(kind: type, **arguments: object) -> Any:
+    """Instantiate a class with those of the arguments that it takes and that are not None."""
+    return kind(**_taken(kind, arguments))
+
+
 def load(
-    group: str, name: str, make: Callable[..., Any] | None = None, **arguments: object
+    group: str, name: str, make: Callable[..., Any] = instantiate, **arguments: object
 ) -> Callable[..., Any]:
-    """Load the plugin of a name; instantiate a class with those of the arguments that it takes and that are not None.
+    """Load the plugin of a name.
 
     Args:
         group: of entry points.
         name: of the plugin.
-        make: instantiates a class instead, from it and all arguments.
+        make: what a class becomes, from it and the arguments.
         **arguments: of a class.
 
     Raises:
@@ -83,7 +88,7 @@ def load(
         part = getattr(part, each)
     if isinstance(part, type):
         try:
-            part = part(**_taken(part, arguments)) if make is None else make(part, **arguments)
+            part = make(part, **arguments)
         except ConfigError:
             raise
         except Exception as error:
@@ -99,11 +104,8 @@ def load_front_end(name: str, num_keypoints: int, weights: str | None) -> Callab
     from torchslam.features import EXTRACTORS, extractor
     from torchslam.features.kornia_modules import is_kornia_module, make_kornia_front_end
 
-    def make(kind: type, num_keypoints: int, weights: str | None) -> Callable[..., Any]:
-        if is_kornia_module(kind):
-            return make_kornia_front_end(kind, num_keypoints, weights)
-        made: Callable[..., Any] = kind(**_taken(kind, {"num_keypoints": num_keypoints, "weights": weights}))
-        return made
+    def make(kind: type, **arguments: Any) -> Any:
+        return (make_kornia_front_end if is_kornia_module(kind) else instantiate)(kind, **arguments)
 
     if name in EXTRACTORS or not is_known(FRONT_ENDS, name):
         return extractor(name, num_keypoints, weights)

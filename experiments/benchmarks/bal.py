@@ -21,6 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from experiments.benchmarks.ceres import solve_by_ceres
 from experiments.common import parser_of, table
 from torchslam import SLAM
 from torchslam.config import load_config
@@ -157,50 +158,22 @@ def ceres(problem: BundleProblem, iterations: int, free: bool) -> list[str]:
     """The same by COLMAP's Ceres: a camera RADIAL for each image."""
     import pycolmap
 
-    model = pycolmap.Reconstruction()
-    place: dict[int, tuple[int, int]] = {}
-    for frame, T_cw in enumerate(problem.T_cw):
-        f, k1, k2 = problem.camera.params[frame, [0, 4, 5]].tolist()
-        width, height = problem.camera.size
-        camera = pycolmap.Camera(model="RADIAL", width=width, height=height, params=[f, 0.0, 0.0, k1, k2])
-        camera.camera_id = frame + 1
-        model.add_camera_with_trivial_rig(camera)
-        rows = torch.nonzero(problem.frame_index == frame)[:, 0].tolist()
-        place |= {row: (frame + 1, at) for at, row in enumerate(rows)}
-        image = pycolmap.Image(
-            name=str(frame), keypoints=problem.pixels[rows].numpy(), camera_id=frame + 1, image_id=frame + 1
-        )
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T_cw[:3].numpy()))
-    tracks = [pycolmap.Track() for _ in problem.points_w]
-    for row, point in enumerate(problem.point_index.tolist()):
-        tracks[point].add_element(*place[row])
-    for point, track in zip(problem.points_w, tracks, strict=True):
-        model.add_point3D(point.numpy(), track)
-    config = pycolmap.BundleAdjustmentConfig()
-    for frame in range(len(problem.T_cw)):
-        config.add_image(frame + 1)
-    config.set_constant_rig_from_world_pose(1)
+    width, height = problem.camera.size
+    cameras = []
+    for f, k1, k2 in problem.camera.params[:, [0, 4, 5]].tolist():
+        numbers = [f, 0.0, 0.0, k1, k2]
+        cameras.append(pycolmap.Camera(model="RADIAL", width=width, height=height, params=numbers))
     options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary, options.refine_principal_point = False, False
+    options.refine_principal_point = False
     options.refine_focal_length = options.refine_extra_params = free
-    options.ceres.solver_options.num_threads = 1
     options.ceres.solver_options.max_num_iterations = iterations
-    began = time.process_time()
-    solved: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
-    spent = time.process_time() - began
-    summary = solved.ceres_summary
-    done = summary.num_successful_steps + summary.num_unsuccessful_steps
-    frames = range(1, len(problem.T_cw) + 1)
-    T_cw = [
-        torch.from_numpy(np.vstack((model.images[n].cam_from_world().matrix(), [0, 0, 0, 1]))) for n in frames
-    ]
-    params = torch.zeros(len(T_cw), 9, dtype=torch.float64)
-    for frame in frames:
-        f, _, _, k1, k2 = model.cameras[frame].params
-        params[frame - 1, [0, 1, 4, 5]] = torch.tensor([f, f, k1, k2], dtype=torch.float64)
-    points = [model.points3D[n + 1].xyz.tolist() for n in range(len(problem.points_w))]
-    reached = cost(problem, torch.stack(T_cw), torch.tensor(points, dtype=torch.float64), params)
-    return ["Ceres (pycolmap)", str(done), f"{reached:.1f}", f"{spent:.2f}", "none"]
+    solved = solve_by_ceres(problem, cameras, (0,), options)
+    params = torch.zeros(len(cameras), 9, dtype=torch.float64)
+    for row, camera in zip(params, solved.cameras, strict=True):
+        f, _, _, k1, k2 = camera.params
+        row[[0, 1, 4, 5]] = torch.tensor([f, f, k1, k2], dtype=torch.float64)
+    reached = cost(problem, solved.T_cw, solved.points_w, params)
+    return ["Ceres (pycolmap)", str(solved.iterations), f"{reached:.1f}", f"{solved.seconds:.2f}", "none"]
 
 
 def main() -> None:

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from experiments.benchmarks.ceres import solve_by_ceres
 from experiments.benchmarks.problems import PEERS, load_problems
 from experiments.common import milliseconds, parser_of, table
 from torchslam.geometry import Camera, rigid, so3_exp, transform
@@ -186,49 +187,10 @@ def colmap_solve(problem: BundleProblem) -> Peer:
     """The same problem by pycolmap. Fixed intrinsics, no robust loss, one thread."""
     import pycolmap
 
-    reconstruction = pycolmap.Reconstruction()
     model = pycolmap.Camera(model="PINHOLE", width=SIZE[0], height=SIZE[1], params=[FOCAL, FOCAL, *CENTER])
-    model.camera_id = 1
-    reconstruction.add_camera_with_trivial_rig(model)
-    rows = [[] for _ in problem.T_cw]  # type: list[list[int]]
-    for row, frame in enumerate(problem.frame_index.tolist()):
-        rows[frame].append(row)
-    place = {}
-    for frame, T_cw in enumerate(problem.T_cw):
-        image = pycolmap.Image(
-            name=str(frame), keypoints=problem.pixels[rows[frame]].numpy(), camera_id=1, image_id=frame + 1
-        )
-        place.update({row: (frame + 1, position) for position, row in enumerate(rows[frame])})
-        reconstruction.add_image_with_trivial_frame(image, pycolmap.Rigid3d(T_cw[:3].numpy()))
-    tracks = [pycolmap.Track() for _ in problem.points_w]
-    for row, point in enumerate(problem.point_index.tolist()):
-        tracks[point].add_element(*place[row])
-    for point, track in zip(problem.points_w, tracks, strict=True):
-        reconstruction.add_point3D(point.numpy(), track)
-
-    config = pycolmap.BundleAdjustmentConfig()
-    for frame in range(len(problem.T_cw)):
-        config.add_image(frame + 1)
-    for frame in (1, 2):
-        config.set_constant_rig_from_world_pose(frame)
-    config.set_constant_cam_intrinsics(1)
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary = False
-    options.ceres.solver_options.num_threads = 1
-    begin = time.process_time()
-    solved: Any = pycolmap.create_default_ceres_bundle_adjuster(options, config, reconstruction).solve()
-    elapsed = 1e3 * (time.process_time() - begin)
-    iterations = solved.ceres_summary.num_successful_steps + solved.ceres_summary.num_unsuccessful_steps
-
-    T_cw = torch.eye(4, dtype=torch.float64).repeat(len(problem.T_cw), 1, 1)
-    for frame in range(len(T_cw)):
-        T_cw[frame, :3] = torch.from_numpy(reconstruction.images[frame + 1].cam_from_world().matrix())
-    points_w = torch.tensor(
-        [reconstruction.points3D[point + 1].xyz.tolist() for point in range(len(problem.points_w))],
-        dtype=torch.float64,
-    )
-    reached = rmse(replace(problem, T_cw=T_cw, points_w=points_w))
-    return Peer(elapsed, iterations, reached, T_cw, points_w)
+    solved = solve_by_ceres(problem, [model], (0, 1), pycolmap.BundleAdjustmentOptions())
+    reached = rmse(replace(problem, T_cw=solved.T_cw, points_w=solved.points_w))
+    return Peer(1e3 * solved.seconds, solved.iterations, reached, solved.T_cw, solved.points_w)
 
 
 def rmse(problem: BundleProblem) -> float:

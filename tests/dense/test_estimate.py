@@ -21,7 +21,7 @@ from torchslam.dense.cost_volume import (
     warp,
 )
 from torchslam.dense.estimate import estimate_depth, halved, refine_depth
-from torchslam.dense.minimum import find_minimum, position_std
+from torchslam.dense.minimum import STD_FACTOR, find_minimum, position_std
 from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
 from torchslam.dense.normals import normals
 from torchslam.geometry import Camera, se3_inverse
@@ -67,6 +67,12 @@ def test_the_standard_deviation_of_depth_grows_with_the_noise_of_the_images(nois
     assert bool((found.std > 0).all())
     ratio = inside((found.inverse_depth[0] - 1 / depth) / found.std[0]).abs()
     assert 0.4 < float(ratio.median()) / 0.6745 < 1.6  # the median of a Gaussian's absolute value
+
+
+def test_the_standard_deviation_of_a_known_minimum() -> None:
+    found = find_minimum(torch.tensor([0.5, 0.12, 0.04, 0.12, 0.5], dtype=torch.float64)[:, None, None])
+    assert float(found.curvature) == pytest.approx(0.16)
+    assert float(position_std(found)) == pytest.approx(STD_FACTOR * 0.5)  # the root of 0.04 over 0.16
 
 
 def test_a_flat_cost_has_no_position() -> None:

@@ -36,8 +36,13 @@ def test_sift_by_name_finds_what_kornia_finds(sequence: Sequence) -> None:
         dim=-1
     )
     torch.testing.assert_close(cosines, torch.ones(count))
-    assert bool((found.scales >= 1).all())
+    scales = (
+        KF.get_laf_scale(lafs)[0, order, 0, 0] / 9.6
+    )  # of regions of 6 sigma, with a sigma of 1.6 at the finest level
+    torch.testing.assert_close(found.scales[0, :count], scales.clamp_min(1.0))
     assert bool((found.scales > 2).any())
+    angles = torch.deg2rad(KF.get_laf_orientation(lafs)[0, order, 0])
+    torch.testing.assert_close(found.angles[0, :count], angles)
 
 
 def test_a_run_with_an_object_of_kornia(sequence: Sequence) -> None:

@@ -39,7 +39,7 @@ from torchslam.utils.files import write_whole
 LONG_SIDE = 320
 """Default resolution: about a second per keyframe."""
 MAX_PROCESSES = 4
-"""Unless asked for: each takes as much memory, up to about 1 GB at 640 x 480."""
+"""Unless asked for: each takes up to 1.4 GB of memory at 640 x 480."""
 SMALLEST = 64
 """Width and height of a depth map, pixels: windows at half size must be a small part of it."""
 
@@ -128,7 +128,7 @@ def densify_results(
     """
     if mesh:
         import_open3d()
-    started = _processor_time()
+    started = _cpu_seconds()
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
     metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
@@ -164,7 +164,7 @@ def densify_results(
                 views, opened, folder, torch.device(device), on_progress, count, aggregation == "learned"
             )
     write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map))
-    about = {"dense": _figures(found, size, aggregation, _processor_time() - started)}
+    about = {"dense": _figures(found, size, aggregation, _cpu_seconds() - started)}
     write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
     if (directory / VIEW).exists():
         write_view(read_results(directory), directory)
@@ -181,7 +181,7 @@ def densify_results(
     return rows
 
 
-def _processor_time() -> float:
+def _cpu_seconds() -> float:
     """Processor seconds of this process and of those that it has waited for."""
     return sum(os.times()[:4])
 

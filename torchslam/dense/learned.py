@@ -1,7 +1,7 @@
 """A small network on top of semi-global aggregation: depth where matching found a wrong one, and how certain it is.
 
 It reads the image and the minima of the aggregated costs at half and at full size, in a U-net at half size, and gives
-for each pixel a change of the depth and the probability that the depth is right. Trained by `experiments.dense.train`;
+for each pixel a change of the depth and the probability that the depth is right. `examples/train_depth.py` trains it;
 `experiments/dense/README.md` says what it gains.
 """
 

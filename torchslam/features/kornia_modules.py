@@ -39,12 +39,10 @@ def make_kornia_front_end(kind: type[nn.Module], num_keypoints: int, weights: st
     """Make the front end of a class: with weights from a file, or those that kornia downloads for it.
 
     Raises:
-        ConfigError: The weights do not fit, or the class needs arguments.
+        ConfigError: The weights do not fit.
     """
-    if weights is None:
-        made = getattr(kind, _PRETRAINED, None)
-        if made is not None:
-            return KorniaFeatures(made(), num_keypoints)
+    if weights is None and hasattr(kind, _PRETRAINED):
+        return KorniaFeatures(getattr(kind, _PRETRAINED)(), num_keypoints)
     options = {"num_features": num_keypoints} if "num_features" in signature(kind).parameters else {}
     module = kind(**options)
     if weights is not None:
@@ -106,15 +104,13 @@ class KorniaFeatures(nn.Module):
         """Rows of the keypoints inside of the image."""
         keypoints, scores = found.keypoints, _scores(found)
         assert scores is not None
-        is_inside = ((keypoints >= 0) & (keypoints <= keypoints.new_tensor((size[1] - 1, size[0] - 1)))).all(
-            -1
-        )
+        last = keypoints.new_tensor((size[1] - 1, size[0] - 1))
+        is_inside = ((keypoints >= 0) & (keypoints <= last)).all(-1)
         keypoints, scores = keypoints[is_inside], scores[is_inside]
-        constant = torch.full_like(scores, _SCALE)
         return {
             "keypoints": keypoints,
             "scores": scores,
-            "scales": constant,
+            "scales": torch.full_like(scores, _SCALE),
             "angles": torch.zeros_like(scores),
             "descriptors": found.descriptors[is_inside],
         }

@@ -1,6 +1,7 @@
-"""Cameras and poses of kornia, from and to ours. Pixels mean the same in both: (0, 0) is the center of the first one.
+"""Cameras of kornia, from and to ours. Pixels mean the same in both: (0, 0) is the center of the first one.
 
 kornia's PinholeCamera holds K and a pose, world to camera; here a camera and poses are apart. Gradients flow through.
+Poses need no conversion: kornia's `Se3.from_matrix` takes them, and `Se3.matrix()` gives them.
 """
 
 from __future__ import annotations
@@ -15,7 +16,6 @@ from torchslam.geometry.camera import Camera
 
 if TYPE_CHECKING:  # kornia is slow to import
     from kornia.geometry import PinholeCamera
-    from kornia.geometry.liegroup import Se3
 
 
 def to_kornia_camera(camera: Camera, T_cw: Float[Tensor, "B 4 4"]) -> PinholeCamera:
@@ -35,11 +35,10 @@ def to_kornia_camera(camera: Camera, T_cw: Float[Tensor, "B 4 4"]) -> PinholeCam
             f"kornia's camera has no distortion, this one is of the model {camera.model!r}: undistort the images"
         )
     batch = len(T_cw)
-    K = torch.nn.functional.pad(camera.K.to(T_cw), (0, 1, 0, 1)).expand(batch, 4, 4)
-    corner = torch.zeros(4, 4, dtype=T_cw.dtype, device=T_cw.device)
-    corner[3, 3] = 1.0
+    K = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device).repeat(batch, 1, 1)
+    K[:, :3, :3] = camera.K
     height, width = (torch.full((batch,), side, device=T_cw.device) for side in (camera.height, camera.width))
-    return PinholeCamera(K + corner, T_cw, height, width)
+    return PinholeCamera(K, T_cw, height, width)
 
 
 def from_kornia_camera(camera: PinholeCamera) -> tuple[Camera, Float[Tensor, "B 4 4"]]:
@@ -56,16 +55,3 @@ def from_kornia_camera(camera: PinholeCamera) -> tuple[Camera, Float[Tensor, "B 
         raise ValueError("a camera with a skew is not a pinhole here")
     params = torch.stack((K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]), dim=-1)
     return Camera("pinhole", params, sizes.pop()), camera.extrinsics
-
-
-def to_kornia_poses(T: Float[Tensor, "B 4 4"]) -> Se3:
-    """Poses as kornia's Se3."""
-    from kornia.geometry.liegroup import Se3
-
-    return Se3.from_matrix(T)
-
-
-def from_kornia_poses(poses: Se3) -> Float[Tensor, "B 4 4"]:
-    """The matrices of kornia's Se3."""
-    matrices: Tensor = poses.matrix()
-    return matrices

@@ -36,9 +36,8 @@ CAMERA = "camera.params"
 MAX_NUMBER = 1 << 31  # of submaps and of sessions
 MAX_BYTES = 1 << 34  # of a map of 100,000 keyframes
 MAX_PIXELS = 1 << 26  # of the images; readers of images take no more
-MAX_LENGTH = (
-    1e12  # of a position in map units and of a pixel's coordinate: products of a few of them stay finite
-)
+MAX_LENGTH = 1e12
+"""Of a position in map units and of a pixel's coordinate: products of a few of them stay finite."""
 MAX_SKEW = 1e-3  # of a rotation: largest entry of R^T R - I
 
 

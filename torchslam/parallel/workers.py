@@ -47,6 +47,7 @@ LEAST_FREE = 2
 """Processors that must be free for three processes, which wait for each other: where one waits for its turn, all do."""
 LOAD = Path("/proc/loadavg")  # on Linux
 SAMPLES, SAMPLING_S = 5, 0.01
+"""Looks at the load, and seconds between them: a median does not count what wakes up for a moment."""
 SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
 """The fields of a problem that differ between problems of one run."""
 
