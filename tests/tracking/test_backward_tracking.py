@@ -14,7 +14,13 @@ from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
 from torchslam.config import Config, PoseValidationConfig
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking import backward_tracking as backwards
-from torchslam.tracking.backward_tracking import MAX_CONSECUTIVE_FAILURES, UnposedFrames, track_back
+from torchslam.tracking.backward_tracking import (
+    MAX_CONSECUTIVE_FAILURES,
+    GapLink,
+    UnposedFrames,
+    track_back,
+    track_into_earlier_keyframe,
+)
 from torchslam.tracking.initialization import ProvisionalMap
 from torchslam.tracking.pose_validation import PendingFrame
 from torchslam.tracking.tracker import Tracker
@@ -195,3 +201,47 @@ def test_a_provisional_map_counts_frames_from_its_initialization() -> None:
     assert provisional.age == 3
     assert [view.index for view in provisional.views] == [0, 1, 2, 3, 4]
     assert provisional.submap is submap
+
+
+# --- the keyframe before a gap ------------------------------------------------------------------------------------
+
+
+def at_a_gap(gap: int, T_earlier: Tensor) -> tuple[Atlas, Submap]:
+    """Frames up to 97 - `gap` in a submap of their own, frames from 98 on in another, which is tracked backward."""
+    earlier = submap_of_scene(SCENE, T_earlier, first=98 - gap - len(T_earlier) + 1)
+    later = submap_of_scene(SCENE, sideways(4), first=98, number=1)
+    atlas = Atlas(CAMERA.params)
+    atlas._submaps = [earlier, later]
+    state = later.fork()
+    Tracker(CAMERA, Config()).reset_to_keyframe(state, 0)
+    return atlas, state
+
+
+def link_of(atlas: Atlas, state: Submap, before: int = 98) -> GapLink | None:
+    return track_into_earlier_keyframe(Tracker(CAMERA, Config()), state, atlas, before, Config())
+
+
+def test_the_last_keyframe_before_a_gap_is_tracked_in_the_map_after_it() -> None:
+    T_earlier = sideways(3, start=-0.5)
+    atlas, state = at_a_gap(1, T_earlier)
+    before = state.T_cw.clone()
+    link = link_of(atlas, state)
+    assert link is not None
+    assert link.before == 97
+    (after,) = torch.nonzero(state.map.keys == link.after)[:, 0].tolist()
+    torch.testing.assert_close(link.T_ba @ state.map.T_cw[after], T_earlier[-1], atol=1e-6, rtol=0)
+    assert torch.equal(state.T_cw, before)
+
+
+@pytest.mark.parametrize(
+    ("gap", "is_found"), [(MAX_CONSECUTIVE_FAILURES, True), (MAX_CONSECUTIVE_FAILURES + 1, False)]
+)
+def test_a_keyframe_far_from_the_gap_is_not_tried(gap: int, is_found: bool) -> None:
+    link = link_of(*at_a_gap(gap, sideways(3, start=-0.5)))
+    assert (link is not None) is is_found
+
+
+def test_a_keyframe_that_sees_something_else_gives_no_link() -> None:
+    assert link_of(*at_a_gap(1, AWAY.expand(1, 4, 4).clone())) is None
+    jumped = sideways(3, start=-0.5)
+    assert link_of(*at_a_gap(1, jumped), before=80) is None  # nothing was posed before

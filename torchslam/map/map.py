@@ -463,7 +463,7 @@ class Map:
             column[rows[known]] = covariances[known]
 
 
-def key_of(sessions: Int[Tensor, " N"], frames: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
+def key_of(sessions: Int[Tensor, "*shape"], frames: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
     """Return the keys of frames of sessions."""
     return (sessions << SESSION_BITS) + frames
 

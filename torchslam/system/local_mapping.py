@@ -4,12 +4,19 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import torch
+
 from torchslam.map.atlas import Submap, TrackingState
-from torchslam.map.map import MapSnapshot
+from torchslam.map.map import MapSnapshot, key_of
 from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.mapping.mapper import keyframe_reason
 from torchslam.system.session import SystemContext
-from torchslam.tracking.backward_tracking import UnposedFrames, track_back
+from torchslam.tracking.backward_tracking import (
+    GapLink,
+    UnposedFrames,
+    track_back,
+    track_into_earlier_keyframe,
+)
 from torchslam.tracking.pose_validation import PendingFrame
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate
 
@@ -122,12 +129,17 @@ class TentativeMapping:
 
 
 class BackwardTracking:
-    """Keeps frames without a pose, and poses them by tracking backward in time once there is a map."""
+    """Keeps frames without a pose, and poses them by tracking backward in time once there is a map.
+
+    Attributes:
+        gap_link: The motion between the earliest frame that was posed last and the keyframe before; None if unknown.
+    """
 
     def __init__(self, context: SystemContext, mapping: LocalMapping) -> None:
         self.context, self.mapping = context, mapping
         self.tentative = TentativeMapping(context, mapping)
         self.unposed = UnposedFrames(context.config.initialization.max_unposed_frames)
+        self.gap_link: GapLink | None = None
 
     def from_first_keyframe(self, submap: Submap) -> list[FrameFeatures]:
         """Pose the frames from before the first keyframe of a submap; return those that got a pose."""
@@ -146,8 +158,18 @@ class BackwardTracking:
         with context.clock("backwards"):
             earlier = [view for view in self.unposed if view.index < before]
             posed = track_back(context.tracker, backward, reversed(earlier), context.config, self)
+            first = min([before, *(view.index for view in posed)])
+            key = int(key_of(torch.tensor(context.session.number), torch.tensor(first)))
+            self.gap_link = track_into_earlier_keyframe(
+                context.tracker, backward, context.session.atlas, key, context.config
+            )
         self.unposed.remove(posed)
         return posed
+
+    def pop_gap_link(self) -> GapLink | None:
+        """Return and forget the motion over the last gap."""
+        link, self.gap_link = self.gap_link, None
+        return link
 
     def add_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Add a frame with a confirmed pose."""

@@ -10,6 +10,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import torch
+
+from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.map.atlas import Submap
 from torchslam.mapping.culling import remove_masked_observations
 from torchslam.mapping.local_bundle import ApplyAt
@@ -208,21 +211,34 @@ class KeyframeActions:
             count: Number of the newest keyframes, of which every `_LOOP_STRIDE`-th is checked until one closes a loop.
         """
         context, submap = self.context, self.active_map.current
-        newest = submap.map.num_keyframes - 1
         with context.clock("loops"):
-            keyframes = range(newest, newest - count, -_LOOP_STRIDE)
+            keyframes = torch.argsort(submap.map.keys, descending=True)[:count:_LOOP_STRIDE].tolist()
             detected = (context.loop_closer.detect(submap, keyframe) for keyframe in keyframes)
             found = next((candidate for candidate in detected if candidate is not None), None)
-            if found is None:
-                return
-            if not found.is_loop:
-                self.initialization.confirm_map()
-                self.initialization.start_check.cancel()  # the other map agrees with this one
-            since = newest - found.keyframe
-            submap, keyframe = context.loop_closer.close(found)
-            self.active_map.replace(submap)
-            context.tracker.reset_to_keyframe(submap, keyframe + since)
-            context.non_static_filter.forget_last()  # its pose was one of the map before
+            if found is not None:
+                self._close(found)
+
+    def close_gap(self) -> None:
+        """Join both sides of a gap of lost frames, once backward tracking has reached the frames from before it."""
+        context, link = self.context, self.initialization.backward.pop_gap_link()
+        if link is None or not context.session.mapping or self.active_map.submap is None:
+            return
+        with context.clock("loops"):
+            found = context.loop_closer.detect_at_gap(link)
+            if found is not None and found.submap is self.active_map.submap:
+                self._close(found)
+
+    def _close(self, found: LoopCandidate) -> None:
+        context = self.context
+        newest = int(found.submap.map.keys.argmax())  # rows after it are of frames that were tracked backward
+        if not found.is_loop:
+            self.initialization.confirm_map()
+            self.initialization.start_check.cancel()  # the other map agrees with this one
+        since = newest - found.keyframe
+        submap, keyframe = context.loop_closer.close(found)
+        self.active_map.replace(submap)
+        context.tracker.reset_to_keyframe(submap, keyframe + since)
+        context.non_static_filter.forget_last()  # its pose was one of the map before
 
     def _cull_and_compact(self, submap: Submap) -> None:
         keys = submap.map.keys
@@ -334,6 +350,7 @@ class StateMachine:
         self.initialization.confirm_map()
         if self.active_map.submap is not None:
             self.start_check.step(self.active_map.submap, is_last=True)
+        self.keyframe_actions.close_gap()
 
     def confirm_map(self) -> None:
         """Confirm a provisional map as it is, with its tentative keyframes: backward tracking adds to the same map."""
@@ -375,6 +392,7 @@ class StateMachine:
             actions.apply_pending_adjustment(view.index)
         if not mapping.adjustment.is_pending:
             self.start_check.step(self.active_map.current)
+            actions.close_gap()
         notes = [reason, Reason.STATIC_OVERLAY if has_new_overlay else None, motion]
         reasons = [note for note in notes if note is not None]
         return FrameOutcome(reasons, self.active_map.submap, estimate, is_keyframe)
@@ -412,18 +430,20 @@ class StateMachine:
         self.mapping.add_pending_frames(submap, frames)
         self.initialization.add_confirmed(frames)
         if was_relocalized:
-            first, first_estimate, _, _ = frames[0]
-            self.backward.from_frame(submap, first, first_estimate)
+            self.backward.from_frame(submap, *frames[0][:2])
         self.active_map.set_state(State.TRACKING)
+        self.keyframe_actions.close_gap()
         self.keyframe_actions.detect_loop(num_new)
         return FrameOutcome([], self.active_map.current, estimate)
 
     def _keep_uncertain(self) -> int:
         """Keep the poses of frames that are held back, and their tentative keyframes; return the number of these."""
-        submap = self.active_map.current
-        num_new = self.tentative.commit(submap)
-        for pending in self.context.confirmation.pop_all():
+        submap, confirmation = self.active_map.current, self.context.confirmation
+        num_new, frames = self.tentative.commit(submap), confirmation.pop_all()
+        for pending in frames:
             submap.posed_frames.add(*pending)
+        if frames and confirmation.is_relocalized:
+            self.backward.from_frame(submap, *frames[0][:2])
         return num_new
 
     def _on_lost(self, view: FrameFeatures) -> FrameOutcome:
@@ -434,5 +454,6 @@ class StateMachine:
         self.tentative.rollback(self.active_map.current)
         self.backward.unposed.add(*self.context.confirmation.views(), view)
         is_discarded = self.initialization.on_lost()
+        self.keyframe_actions.close_gap()
         self.lost.enter()
         return FrameOutcome([Reason.LOST_AT_START if is_discarded else Reason.LOST])

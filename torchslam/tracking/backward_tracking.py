@@ -4,10 +4,15 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from typing import Protocol
 
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
 from torchslam.config import Config
-from torchslam.map.atlas import Submap
+from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking.pose_validation import (
     PendingFrame,
     PoseConfirmation,
@@ -111,3 +116,61 @@ def track_back(
     posed += confirmation.views()
     builder.commit(submap, confirmation.pop_all())
     return posed
+
+
+@dataclass(frozen=True)
+class GapLink:
+    """The motion over a gap of lost frames, between a keyframe from before it and one from after it.
+
+    Attributes:
+        before: key of the keyframe from before the gap.
+        after: key of the keyframe from after the gap.
+        T_ba: pose of the first camera relative to the second, in the unit of the map after the gap.
+    """
+
+    before: int
+    after: int
+    T_ba: Float[Tensor, "4 4"]
+
+
+def track_into_earlier_keyframe(
+    tracker: Tracker, submap: Submap, atlas: Atlas, before: int, config: Config
+) -> GapLink | None:
+    """Track one frame further back in time: the last keyframe from before the frames that backward tracking posed.
+
+    Args:
+        tracker: poses the keyframe.
+        submap: the map, with the tracking state after backward tracking; it is not changed.
+        atlas: the submaps with earlier frames of the same session.
+        before: key of the earliest frame that was posed.
+        config: thresholds of the pose validation.
+
+    Returns:
+        The motion; None if no posed frame is near, or if the keyframe is not found in the map.
+    """
+    earlier = _last_before(atlas, before)
+    if earlier is None:
+        return None
+    other, keyframe = earlier
+    state = submap.fork()
+    predicted = None if state.tracking.velocity is None else tracker.predict(state)
+    estimate = tracker.track(state, other.map.frame_features(keyframe), is_sure=False)
+    if estimate is None or check_pose_quality(estimate, predicted, config.pose_validation):
+        return None
+    reference = submap.map.key(state.tracking.reference)
+    return GapLink(other.map.key(keyframe), reference, state.tracking.T_cr)
+
+
+def _last_before(atlas: Atlas, key: int) -> tuple[Submap, int] | None:
+    """The submap of the last posed frame before `key`, and its last keyframe before it; None if there is a long gap."""
+    last: tuple[int, Submap] | None = None
+    for submap in atlas:
+        keys = submap.posed_frames.keys
+        keys = keys[(keys < key) & (keys >= key - MAX_CONSECUTIVE_FAILURES)]
+        if len(keys) and (last is None or int(keys.max()) > last[0]):
+            last = int(keys.max()), submap
+    if last is None:
+        return None
+    keys = last[1].map.keys
+    rows = torch.nonzero(keys <= last[0])[:, 0]
+    return (last[1], int(rows[keys[rows].argmax()])) if len(rows) else None
