@@ -32,9 +32,9 @@ _AROUND = 10  # keyframes whose points are searched for in the other map
 _NEEDED = 12  # inliers of the first similarity
 _CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
 _SCALE_POINTS, _SCALE_SPREAD = (
-    3,
+    2,
     1.2,
-)  # fewest points and largest spread of the depths that give a scale to a pose
+)  # fewest points, and largest ratio of their quartiles, that give a pose a scale
 _KERNEL_SCALE = 2.0
 _ITERATIONS = 20  # of the refined pose, which rarely needs ten
 _GATE_WIDENING = 2.0  # times the noise, as the Sim(3) has noise of its own
@@ -108,7 +108,7 @@ def relative_sim3_of_pose(
     """Estimate the Sim(3) between two maps from the pose of a keyframe of map 1 in map 2; None if it is not certain.
 
     Keyframes that are neighbors in time may have few points in common although they see the same place, as the camera
-    turned. With fewer than 3 of them, or where their depths disagree, the scale is 1, and `shared_points` is 0: it is
+    turned. With fewer than 2 of them, or where their depths disagree, the scale is 1, and `shared_points` is 0: it is
     unknown.
 
     Args:
