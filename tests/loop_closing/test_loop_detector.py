@@ -152,6 +152,21 @@ def test_the_submaps_on_both_sides_of_a_gap_are_joined(S_21: Tensor) -> None:
     torch.testing.assert_close(found.relation.S_21, sim3_inverse(S_21), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize(("needed", "is_found"), [(30, True), (31, False)])
+def test_submaps_are_joined_at_a_gap_by_as_many_matches_as_at_a_loop(
+    S_21: Tensor, needed: int, is_found: bool
+) -> None:
+    one, other = two_submaps(S_21)
+    T_ba = SIDE[3] @ se3_inverse(OTHER[0])
+    T_ba[:3, 3] *= sim3_scale(S_21)
+    both = (one.map.points["times_observed"] == 4) & (other.map.points["times_observed"] == 4)
+    other.map.remove_points(torch.nonzero(torch.cumsum(both, 0) * both - 1 >= 30)[:, 0])
+    other.map.remove_points(torch.nonzero(~both & other.map.points["is_valid"])[:, 0])
+    detector = loop_detector(one, other, overrides=(f"loop_closing.min_matches={needed}",))
+    found = detector.detect_at_gap(gap_link(one, 3, other, 0, T_ba))
+    assert (found is not None) is is_found
+
+
 def thinned_to(slam_map: Map, count: int) -> None:
     """Leave the points that most keyframes observe."""
     order = torch.argsort(slam_map.points["times_observed"], descending=True, stable=True)

@@ -123,7 +123,8 @@ class LoopDetector:
         if relation is None:
             return None
         if earlier is not later:
-            if relation.shared_points == 0:
+            # Submaps stay apart unless the place is seen as well as in a loop: a wrong merger cannot be undone.
+            if relation.shared_points == 0 or relation.inliers_1 < self.config.loop_closing.min_matches:
                 return None
             inverse = replace(relation, S_21=sim3_inverse(relation.S_21))
             return LoopCandidate(later, matched_keyframe, earlier, keyframe, inverse)
