@@ -153,8 +153,10 @@ _CROSS = torch.linalg.cross(_AXES[:, None].expand(3, 3, 3), _AXES.expand(3, 3, 3
 
 
 class DenseExpansion(NamedTuple):
-    """`residuals.Expansion` of every frame and point: gradient (B, K, D, N), hessian (B, K, D, D, N), D = 3 + n with the
-    n directions in which the frame's camera moves."""
+    """`residuals.Expansion` of every frame and point: gradient (B, K, D, N), hessian (B, K, D, D, N).
+
+    D = 3 + n, with the n directions in which the frame's camera moves.
+    """
 
     gradient: Float[Tensor, "B K D N"]
     hessian: Float[Tensor, "B K D D N"]
