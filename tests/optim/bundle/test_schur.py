@@ -80,6 +80,13 @@ def test_schur_complement_solves_the_dense_system(system):
     torch.testing.assert_close(flat(solution), torch.linalg.solve(dense, gradient))
 
 
+def test_cameras_of_one_frame_each_need_as_much_room_as_the_frames(height, generator):
+    slots, points = (torch.rand(6, 40, generator=generator) < 0.2).nonzero().unbind(-1)
+    structure = build_structure(slots, points, 40, torch.arange(6), slots, 6)
+    assert structure.camera_coupling.size == structure.coupling.size
+    assert torch.equal(structure.camera_coupling.rows, structure.coupling.rows)
+
+
 def test_damping_increases_the_diagonal(system):
     equations, dense, gradient = system
     damping = torch.tensor([0.3], dtype=torch.float64)
