@@ -237,9 +237,9 @@ def _sum_by_camera(values: Tensor, camera_of: Tensor, num_cameras: int, over_poi
     """Sums (B, C, ...) of values (B, K, ..., N) over the frames of each camera and, unless told not to, the points."""
     if num_cameras == 1:
         return values.sum((1, -1) if over_points else 1)[:, None]
-    values = (values.sum(-1) if over_points else values).flatten(0, 1)
-    sums = values.new_zeros(len(camera_of) * num_cameras, *values.shape[1:])
-    return sums.index_add(0, flat_rows(camera_of, num_cameras), values).unflatten(0, (-1, num_cameras))
+    values = values.sum(-1) if over_points else values
+    own = torch.nn.functional.one_hot(camera_of, num_cameras).to(values.dtype)
+    return (own.mT @ values.flatten(2)).unflatten(2, values.shape[2:])
 
 
 def _times(R: Tensor, columns: Tensor) -> Tensor:

@@ -50,17 +50,17 @@ class Coupling(NamedTuple):
     of every member of the tile.
 
     Attributes:
-        rows: storage row of each row of the observations' blocks, which have three
+        rows: storage row of each row of the blocks, which have three
         size: number of storage rows
     """
 
     rows: Int[Tensor, " R"]
     size: int
 
-    def sum(self, blocks: Float[Tensor, "3 n O"]) -> Float[Tensor, "S n"]:
-        """The blocks of all observations as they are stored."""
-        flat = blocks.permute(2, 0, 1).reshape(len(self.rows), blocks.shape[1])
-        return flat.new_zeros(self.size, blocks.shape[1]).index_add_(0, self.rows, flat)
+    def stored(self, blocks: Float[Tensor, "M 3 n"]) -> Float[Tensor, "S n"]:
+        """The blocks as they are stored, summed where a point and a member have several."""
+        flat = blocks.reshape(len(self.rows), blocks.shape[2])
+        return flat.new_zeros(self.size, blocks.shape[2]).index_add_(0, self.rows, flat)
 
 
 @dataclass(frozen=True)
@@ -77,8 +77,10 @@ class Structure:
         cameras: camera of each free frame
         camera_ends: for every camera, the end of its observations when they are ordered by camera
         by_camera: that order; None for a single camera
+        by_pair: the observations ordered by point and camera
+        pair_counts: number of observations of each pair that there is of a point and a camera
         coupling: of the observations by free frames
-        camera_coupling: of all observations
+        camera_coupling: of those pairs
     """
 
     num_points: int
@@ -88,6 +90,8 @@ class Structure:
     cameras: Int[Tensor, " K"]
     camera_ends: list[int]
     by_camera: Int[Tensor, " O"] | None
+    by_pair: Int[Tensor, " O"]
+    pair_counts: Int[Tensor, " M"]
     coupling: Coupling
     camera_coupling: Coupling
     tiles: list[Tile]
@@ -104,9 +108,11 @@ class Structure:
 
     def sum_by_point(self, values: Float[Tensor, "O ..."]) -> Float[Tensor, "N ..."]:
         """Sums over each point's observations. (O, ...) -> (N, ...)."""
-        flat = values.flatten(1)[self.by_point]
-        total = torch.segment_reduce(flat, "sum", lengths=self.point_counts, unsafe=True)
-        return total.view(self.num_points, *values.shape[1:])
+        return _sum_segments(values, self.by_point, self.point_counts)
+
+    def sum_by_pair(self, values: Float[Tensor, "O ..."]) -> Float[Tensor, "M ..."]:
+        """Sums over each pair's observations. (O, ...) -> (M, ...)."""
+        return _sum_segments(values, self.by_pair, self.pair_counts)
 
     def sum_by_frame(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "K ..."]:
         """Sums over each free frame's observations. (..., O) -> (K, ...)."""
@@ -116,6 +122,13 @@ class Structure:
         """Sums over each camera's observations. (..., O) -> (C, ...)."""
         ordered = values if self.by_camera is None else values.index_select(-1, self.by_camera)
         return _sum_runs(ordered, self.camera_ends)
+
+
+def _sum_segments(values: Tensor, order: Int[Tensor, " O"], counts: Int[Tensor, " M"]) -> Tensor:
+    """Sums over runs of values (O, ...) in an order, in the order of each run: the same bytes on every run."""
+    flat = values.flatten(1)[order]
+    total = torch.segment_reduce(flat, "sum", lengths=counts, unsafe=True)
+    return total.view(len(counts), *values.shape[1:])
 
 
 def _sum_runs(values: Float[Tensor, "... O"], ends: Sequence[int]) -> Float[Tensor, "R ..."]:
@@ -144,16 +157,22 @@ def build_structure(
     linked = frame_ends[-1] if frame_ends else 0
     height = _TILE_POINTS if num_frames <= _MANY_FRAMES else _TILE_POINTS_OF_MANY
     coupling, frames_of = _stored(frame_slots[:linked], point_index[:linked], num_frames, num_points, height)
-    camera_coupling, cameras_of = _stored(camera_of, point_index, num_cameras, num_points, height)
+    by_point, pair = torch.argsort(point_index, stable=True), point_index * num_cameras + camera_of
+    by_pair = torch.argsort(pair, stable=True) if num_cameras > 1 else by_point
+    pairs, pair_counts = torch.unique_consecutive(pair[by_pair], return_counts=True)
+    of_pairs = pairs % num_cameras, pairs // num_cameras
+    camera_coupling, cameras_of = _stored(*of_pairs, num_cameras, num_points, height)
     runs = [slice(start, min(start + height, num_points)) for start in range(0, num_points, height)]
     return Structure(
         num_points,
         frame_ends,
-        torch.argsort(point_index, stable=True),
+        by_point,
         torch.bincount(point_index, minlength=num_points),
         cameras,
         torch.bincount(camera_of, minlength=num_cameras).cumsum(0).tolist(),
         torch.argsort(camera_of, stable=True) if num_cameras > 1 else None,
+        by_pair,
+        pair_counts,
         coupling,
         camera_coupling,
         [Tile(*parts) for parts in zip(runs, frames_of, cameras_of, strict=True)],
@@ -161,8 +180,8 @@ def build_structure(
 
 
 def _stored(
-    members: Int[Tensor, " O"],
-    points: Int[Tensor, " O"],
+    members: Int[Tensor, " M"],
+    points: Int[Tensor, " M"],
     num_members: int,
     num_points: int,
     height: int,

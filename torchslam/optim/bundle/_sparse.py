@@ -140,7 +140,7 @@ def assemble_sparse(
         against_points = against_points - torch.stack(cross_entries(slope, eye))
         outer = slope[:, None] * rays_w
         twice = twice + 0.5 * (outer + outer.transpose(0, 1)) - outer.diagonal().sum(-1) * eye
-    coupling = structure.coupling.sum(torch.cat((moved[:, :3], against_points)).transpose(0, 1))
+    coupling = structure.coupling.stored(torch.cat((moved[:, :3], against_points)).permute(2, 1, 0))
     moved, rotated, twice = (structure.sum_by_frame(values) for values in (moved, rotated, twice))
     upper = torch.cat((moved[..., :3], rotated[..., :3].mT), dim=-1)
     lower = torch.cat((rotated[..., :3], twice), dim=-1)
@@ -153,7 +153,7 @@ def assemble_sparse(
         structure.sum_by_camera(hessian[3:, 3:]),
         rest[..., 1:],
         coupling,
-        structure.camera_coupling.sum(hessian[:3, 3:]),
+        structure.camera_coupling.stored(structure.sum_by_pair(hessian[:3, 3:].permute(2, 0, 1))),
         free_points,
     )
 
