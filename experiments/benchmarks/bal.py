@@ -38,7 +38,6 @@ FREE = torch.zeros(9, 3, dtype=torch.float64).index_put(
 )
 """What is free of a camera: the focal length, k1, k2."""
 STEPS = (1, 2, 3, 5, 8, 12, 20)
-STEPS_FREE = (1, 2, 5)
 
 
 def read_bal(path: Path) -> BundleProblem:
@@ -176,6 +175,15 @@ def ceres(problem: BundleProblem, iterations: int, free: bool) -> list[str]:
     return ["Ceres (pycolmap)", str(solved.iterations), f"{reached:.1f}", f"{solved.seconds:.2f}", "none"]
 
 
+def distinct(rows: list[list[str]]) -> list[list[str]]:
+    """The rows without those that differ from one before in the seconds alone: of a solver that ended early."""
+    first: dict[tuple[str, ...], list[str]] = {}
+    for row in rows:
+        solver, iterations, reached, _, gradient = row
+        first.setdefault((solver, iterations, reached, "" if gradient == "none" else "with"), row)
+    return list(first.values())
+
+
 def main() -> None:
     parser = parser_of(__doc__, HERE / "bal.md")
     parser.add_argument("file", type=Path, nargs="?")
@@ -194,15 +202,14 @@ def main() -> None:
         problem, source = read_bal(arguments.file), arguments.file.name
     start = cost(problem, problem.T_cw, problem.points_w, problem.camera.params)
     beside = "beside Ceres as COLMAP uses it" if find_spec("pycolmap") else "without pycolmap"
-    ours(problem, 2, gradient=False, free=False)  # what a first call does once
+    ours(problem, 2, gradient=True, free=False)  # what a first call does once
     tables = []
-    for free, steps in ((False, STEPS), (True, STEPS_FREE)):
-        rows = [ours(problem, most, gradient=False, free=free) for most in steps]
-        rows.append(ours(problem, steps[-1], gradient=True, free=free))
+    for free in (False, True):
+        rows = [ours(problem, most, gradient=False, free=free) for most in STEPS]
+        rows.append(ours(problem, STEPS[-1], gradient=True, free=free))
         rows += [ceres(problem, most, free) for most in STEPS] if find_spec("pycolmap") else []
-        tables.append(
-            table("solver | iterations | cost, px^2 | solve, s | gradient to all pixels, s more", rows)
-        )
+        header = "solver | iterations | cost, px^2 | solve, s | gradient to all pixels, s more"
+        tables.append(table(header, distinct(rows)))
     counts = (
         f"{len(problem.T_cw)} cameras, {len(problem.points_w)} points, {len(problem.pixels)} observations"
     )
@@ -219,10 +226,9 @@ def main() -> None:
         "",
         tables[1],
         "",
-        "`bundle_adjust` is made for a few cameras that many frames share; a free one for each frame is slow.",
-        "",
-        "Each row is a solve of its own, from the start, with at most so many iterations: `python -m "
-        "experiments.benchmarks.bal`, or with the path of a problem from the collection.",
+        "Each row is a solve of its own, from the start, with at most so many iterations; where a solver ends "
+        "earlier, once. Written by `python -m experiments.benchmarks.bal`, or with the path of a problem from the "
+        "collection.",
     ]
     text = "\n".join(lines) + "\n"
     print(text)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
 import torch
 
-from experiments.benchmarks.bal import cost, read_bal, write_bal
-from torchslam.geometry import so3_exp, transform
+from experiments.benchmarks.bal import ceres, cost, distinct, disturbed, ours, read_bal, write_bal
+from torchslam.geometry import Camera, se3_exp, so3_exp, transform
+from torchslam.optim import BundleProblem
 
 CAMERA = [0.1, -0.2, 0.3, 0.5, -0.4, -6.0, 500.0, -0.1, 0.02]
 POINT = [0.3, -0.2, 0.5]
@@ -35,3 +37,32 @@ def test_a_pixel_is_where_the_format_says(tmp_path: Path) -> None:
     for name in ("T_cw", "points_w", "pixels", "frame_index"):
         torch.testing.assert_close(getattr(again, name), getattr(problem, name))
     torch.testing.assert_close(again.camera.params, problem.camera.params)
+
+
+def test_the_minimum_with_all_9_numbers_free_is_that_of_ceres() -> None:
+    pytest.importorskip("pycolmap", reason="pycolmap is not installed")
+    generator = torch.Generator().manual_seed(0)
+
+    def normal(*shape: int) -> torch.Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    T_cw = se3_exp(0.2 * normal(6, 6))
+    points_w = normal(80, 3) + torch.tensor([0.0, 0.0, 5.0]).double()
+    params = torch.tensor([[500.0, 500.0, 0, 0, -0.05, 0.01, 0, 0, 0]], dtype=torch.float64).repeat(6, 1)
+    camera = Camera("radial_tangential", params, (640, 480))
+    pixels = camera.project(transform(T_cw, points_w))[0] + 0.5 * normal(6, 80, 2)
+    frames, points = (normal(6, 80) < 1).nonzero().unbind(-1)
+    index = torch.arange(6)
+    exact = BundleProblem(T_cw, points_w, frames, points, pixels[frames, points], camera, camera_index=index)
+    problem = disturbed(exact)
+    row, expected = ours(problem, 50, gradient=False, free=True), ceres(problem, 100, free=True)
+    assert float(row[2]) == pytest.approx(float(expected[2]), abs=0.11)
+    assert float(row[2]) < 1.0 * len(frames)
+
+
+def test_rows_that_say_the_same_are_shown_once() -> None:
+    rows = [["torchslam", "5", "1.0", "0.10", "none"], ["torchslam", "5", "1.0", "0.11", "none"]]
+    assert distinct([*rows, ["torchslam", "5", "1.0", "0.11", "0.05"]]) == [
+        rows[0],
+        ["torchslam", "5", "1.0", "0.11", "0.05"],
+    ]

@@ -133,6 +133,31 @@ def test_every_problem_estimates_its_own_camera(bundle_scene, directions):
     assert_as_alone(replace(batch, camera=camera), alone, free_camera=directions, iterations=40)
 
 
+@pytest.mark.parametrize("cameras", [2, 6])
+@pytest.mark.parametrize("grids", [True, False])
+def test_every_problem_estimates_its_several_cameras(bundle_scene, cameras, grids, monkeypatch):
+    """Other cameras in each, one of which no frame may have."""
+    if not grids:
+        monkeypatch.setattr(minimization, "suits_dense", lambda *_: False)
+    alone = [bundle_scene(frames=frames, points=60, seed=frames).problem for frames in (5, 6)]
+    batch, eye = batch_of(alone), torch.eye(4, dtype=torch.float64)
+    factors = 1 + 0.02 * torch.linspace(-1, 1, 2 * cameras, dtype=torch.float64).view(2, cameras, 1)
+    params = factors * batch.camera.params
+    prior = CameraPrior(params, 1e-2 * eye.expand(2, cameras, 4, 4))
+    index = torch.stack((torch.arange(6), torch.arange(6).flip(0))) % cameras
+    batch = replace(batch, camera=batch.camera.with_params(params), camera_index=index, camera_prior=prior)
+    alone = [
+        replace(
+            problem,
+            camera=batch.camera[row],
+            camera_index=index[row, : len(problem.T_cw)],
+            camera_prior=CameraPrior(prior.params[row], prior.information[row]),
+        )
+        for row, problem in enumerate(alone)
+    ]
+    assert_as_alone(batch, alone, "cauchy", 2.0, free_camera=True, iterations=40)
+
+
 def test_splitting_a_large_batch_does_not_change_the_result(bundle_scene, monkeypatch):
     problems = mixed(bundle_scene)
     monkeypatch.setattr(minimization, "_MAX_CELLS_CPU", 400)

@@ -80,7 +80,8 @@ def test_tiles_are_smaller_where_many_frames_share_points(monkeypatch):
     monkeypatch.setattr(schur, "_MANY_FRAMES", 4)
     for frames, height in ((4, schur._TILE_POINTS), (5, schur._TILE_POINTS_OF_MANY)):
         slots = torch.arange(frames).repeat_interleave(1000)
-        structure = schur.build_structure(slots, torch.arange(1000).repeat(frames), frames, 1000)
+        cameras, points = torch.zeros(frames, dtype=torch.int64), torch.arange(1000).repeat(frames)
+        structure = schur.build_structure(slots, points, 1000, cameras, cameras[slots], 1)
         assert structure.tiles[0].points.stop == height
         assert structure.tiles[-1].points.stop == 1000
 

@@ -48,6 +48,56 @@ def test_every_camera_is_found(bundle_scene, directions):
     assert solution.covariance().camera.shape == (size, size)
 
 
+def one_each(problem: BundleProblem) -> BundleProblem:
+    """The problem with a camera for each frame."""
+    index = problem.camera_index
+    return replace(problem, camera=problem.camera[index], camera_index=torch.arange(len(index)))
+
+
+def test_a_camera_per_frame_is_found(bundle_scene):
+    """Also those of the two frames whose poses are fixed."""
+    problem, params = zoomed(bundle_scene)
+    problem, params = one_each(problem), params[problem.camera_index]
+    off = 1 + torch.linspace(-0.03, 0.03, 8, dtype=torch.float64)[:, None] * torch.tensor([1, 1, 0, 0])
+    problem = replace(problem, camera=problem.camera.with_params(off * params))
+    solution = bundle_adjust(problem, "none", free_camera=True, iterations=60, tolerance=1e-16)
+    assert solution.success
+    torch.testing.assert_close(solution.camera.params, params, atol=1e-4, rtol=1e-6)
+    assert solution.covariance().camera.shape == (32, 32)
+
+
+def test_cameras_tied_by_a_prior_are_as_one(bundle_scene):
+    """A camera per frame, held by a strong prior at shared ones; the prior is then its covariance."""
+    shared, _ = zoomed(bundle_scene, noise=1.0)
+    one = bundle_adjust(shared, "cauchy", 2.0, free_camera=True, **CONVERGED)
+    eye = 1e6 * torch.eye(4, dtype=torch.float64).expand(8, 4, 4)
+    mean = one.camera.params[shared.camera_index]
+    tied = replace(one_each(shared), camera_prior=CameraPrior(mean, eye))
+    found = bundle_adjust(tied, "cauchy", 2.0, free_camera=True, **CONVERGED)
+    torch.testing.assert_close(found.T_cw, one.T_cw, atol=1e-5, rtol=0)
+    torch.testing.assert_close(found.camera.params, mean, atol=1e-3, rtol=0)
+    spread = found.covariance().camera.unflatten(0, (8, 4)).unflatten(2, (8, 4)).diagonal(dim1=0, dim2=2)
+    torch.testing.assert_close(spread.movedim(-1, 0), torch.linalg.inv(eye), rtol=0.1, atol=1e-8)
+
+
+def test_the_gradient_of_a_camera_per_frame_by_gradcheck(bundle_scene):
+    """With respect to pixels, weights, the scale of the kernel, and what does not move of the cameras."""
+    problem, _ = zoomed(bundle_scene, noise=1.0, perturbation=1e-3)
+    problem = one_each(problem)
+    focal = torch.tensor([[1.0], [1.02], [0.0], [0.0]], dtype=torch.float64)
+
+    def solve(pixels, weights, scale, centers):
+        params = torch.cat((problem.camera.params[:, :2], centers), dim=1)
+        moved = replace(problem, pixels=pixels, weights=weights, camera=problem.camera.with_params(params))
+        solution = bundle_adjust(moved, "cauchy", scale, focal, iterations=30, tolerance=0.0)
+        return solution.T_cw[:, :3], solution.points_w, solution.camera.params
+
+    weights, scale = torch.ones_like(problem.pixels[:, 0]), torch.tensor(3.0).double()
+    inputs = [problem.pixels, weights, scale, problem.camera.params[:, 2:]]
+    leaves = [x.clone().requires_grad_() for x in inputs]
+    assert torch.autograd.gradcheck(solve, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
+
+
 def test_two_equal_cameras_give_the_result_of_one(bundle_scene, model):
     problem = bundle_scene(model=model).problem
     index = torch.tensor([0, 1, 0, 1, 1])

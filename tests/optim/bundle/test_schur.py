@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -5,8 +7,8 @@ from torchslam.optim.bundle import _schur as schur
 from torchslam.optim.bundle._schur import BundleTangent, NormalEquations, build_structure
 
 
-def random_system(generator, num_frames=5, num_points=12, num_camera=2):
-    """Normal equations of a random J^T J, with the dense matrix they stand for."""
+def random_system(generator, num_cameras, num_frames=5, num_points=12, num_free=2):
+    """Normal equations of a random J^T J, with the dense matrix they stand for; the last frame is fixed."""
 
     def normal(*shape):
         return torch.randn(*shape, generator=generator, dtype=torch.float64)
@@ -14,56 +16,76 @@ def random_system(generator, num_frames=5, num_points=12, num_camera=2):
     seen = torch.rand(num_frames + 1, num_points, generator=generator) < 0.6
     slots, points = seen.nonzero().unbind(-1)
     slots, points = torch.cat((slots, slots[-1:])), torch.cat((points, points[-1:]))  # one of them twice
-    count, size = len(slots), 6 * num_frames + 3 * num_points + num_camera
-    J_frame, J_point, J_camera = normal(count, 4, 6), normal(count, 4, 3), normal(count, 4, num_camera)
+    cameras = torch.randperm(num_frames + 1, generator=generator) % num_cameras
+    camera_of = cameras[slots]
+    split, count = 6 * num_frames, len(slots)
+    before_cameras = split + 3 * num_points
+    size = before_cameras + num_cameras * num_free
+    J_frame, J_point, J_camera = normal(count, 4, 6), normal(count, 4, 3), normal(count, 4, num_free)
     J = torch.zeros(count, 4, size, dtype=torch.float64)
     for row in range(count):
         if slots[row] < num_frames:
             J[row, :, 6 * slots[row] : 6 * slots[row] + 6] = J_frame[row]
-        start = 6 * num_frames + 3 * points[row]
+        start = split + 3 * points[row]
         J[row, :, start : start + 3] = J_point[row]
-        J[row, :, size - num_camera :] = J_camera[row]
+        start = before_cameras + num_free * camera_of[row]
+        J[row, :, start : start + num_free] = J_camera[row]
     dense = J.flatten(0, 1).mT @ J.flatten(0, 1)
 
-    structure = build_structure(slots, points, num_frames, num_points)
+    structure = build_structure(slots, points, num_points, cameras[:-1], camera_of, num_cameras)
     linked = structure.num_linked
-    blocks = (J_frame.mT @ J_point)[:linked]
-    coupling = blocks.new_zeros(structure.storage_rows, 6)
-    coupling.index_add_(0, structure.coupling, blocks.mT.reshape(-1, 6))
-    split = 6 * num_frames
-    diagonal = dense[:split, :split].unflatten(0, (-1, 6)).unflatten(2, (-1, 6)).diagonal(dim1=0, dim2=2)
+    by_frame, by_camera = (x.movedim(0, -1) for x in (J_frame, J_camera))
     gradient = normal(size)
     equations = NormalEquations(
         structure,
         BundleTangent(
-            gradient[:split].view(-1, 6), gradient[split:-num_camera].view(-1, 3), gradient[-num_camera:]
+            gradient[:split].view(-1, 6),
+            gradient[split:before_cameras].view(-1, 3),
+            gradient[before_cameras:].view(-1, num_free),
         ),
-        diagonal.movedim(-1, 0),
+        structure.sum_by_frame(of_each(by_frame, by_frame)[..., :linked]),
         structure.sum_by_point(J_point.mT @ J_point),
-        dense[-num_camera:, -num_camera:],
-        dense[:split, -num_camera:].unflatten(0, (-1, 6)),
-        structure.sum_by_point(J_point.mT @ J_camera),
-        coupling,
+        structure.sum_by_camera(of_each(by_camera, by_camera)),
+        structure.sum_by_frame(of_each(by_frame, by_camera)[..., :linked]),
+        structure.coupling.stored((J_point.mT @ J_frame)[:linked]),
+        structure.camera_coupling.stored(structure.sum_by_pair(J_point.mT @ J_camera)),
         torch.ones(num_points, dtype=torch.bool),
     )
     return equations, dense, gradient
 
 
+def of_each(A, B):
+    """A^T B of matrices (4, m, O) and (4, n, O)."""
+    return torch.einsum("amo,ano->mno", A, B)
+
+
 @pytest.fixture(params=["one tile", "many tiles"])
-def system(request, generator, monkeypatch):
+def height(request, monkeypatch):
     if request.param == "many tiles":
         monkeypatch.setattr(schur, "_TILE_POINTS", 2)
-    return random_system(generator)
+
+
+@pytest.fixture(params=[1, 2, 6], ids=["one camera", "two cameras", "a camera per frame"])
+def system(request, height, generator):
+    return random_system(generator, request.param)
 
 
 def flat(tangent):
-    return torch.cat((tangent.frames.flatten(), tangent.points.flatten(), tangent.camera))
+    return torch.cat((tangent.frames.flatten(), tangent.points.flatten(), tangent.cameras.flatten()))
 
 
 def test_schur_complement_solves_the_dense_system(system):
     equations, dense, gradient = system
     solution = equations.factorized().solve(equations.gradient)
     torch.testing.assert_close(flat(solution), torch.linalg.solve(dense, gradient))
+
+
+def test_cameras_of_one_frame_each_need_as_much_room_as_the_frames(height, generator):
+    slots, points = (torch.rand(6, 40, generator=generator) < 0.2).nonzero().unbind(-1)
+    structure = build_structure(slots, points, 40, torch.arange(6), slots, 6)
+    blocks = torch.randn(len(slots), 3, 2, generator=generator)
+    of_cameras = structure.camera_coupling.stored(structure.sum_by_pair(blocks))
+    assert torch.equal(of_cameras, structure.coupling.stored(blocks))
 
 
 def test_damping_increases_the_diagonal(system):
@@ -84,12 +106,11 @@ def test_marginals_are_blocks_of_the_inverse(system):
     for row in range(12):
         block = slice(30 + 3 * row, 33 + 3 * row)
         torch.testing.assert_close(marginals.points[row], inverse[block, block])
-    torch.testing.assert_close(marginals.camera, inverse[-2:, -2:])
+    torch.testing.assert_close(marginals.camera, inverse[66:, 66:])
 
 
 def test_a_singular_system_is_flagged_and_has_a_zero_solution(system):
     equations, _, _ = system
-    fields = vars(equations) | {"frames": torch.zeros_like(equations.frames)}
-    factorized = NormalEquations(**fields).factorized()
+    factorized = replace(equations, frames=torch.zeros_like(equations.frames)).factorized()
     assert not factorized.reduced.definite
     assert (flat(factorized.solve(equations.gradient)) == 0).all()

@@ -290,20 +290,18 @@ def _projection_curvature(
     free_camera: bool,
 ) -> Float[Tensor, "*batch N D D"]:
     """sum_k force_k * Hessian of pixel_k in (points_c, camera.params)."""
-    dims = 3 + (camera.params.shape[-1] if free_camera else 0)
     with torch.enable_grad():
-        # One copy of every observation per row of the Hessian, each with its own camera where that is free.
-        points = points_c.detach().expand(dims, *points_c.shape).clone().requires_grad_()
-        if free_camera:
-            params = camera.params.detach()[..., None, :]
-            params = params.expand(*points.shape[:-1], -1).clone().requires_grad_()
-            J = _project(camera.with_params(params), points[..., None, :], free_camera)[2].squeeze(-3)
-            variables = [points, params]
-        else:
-            J = _project(camera, points, free_camera)[2]
-            variables = [points]
+        points = points_c.detach().clone().requires_grad_()
+        variables = [points]
+        if free_camera:  # a camera for each observation, which then has a gradient of its own
+            params = camera.params.detach()[..., None, :].expand(*points.shape[:-1], -1)
+            variables.append(params.clone().requires_grad_())
+            camera, points = camera.with_params(variables[1]), points[..., None, :]
+        J = _project(camera, points, free_camera)[2].reshape(*points_c.shape[:-1], 2, -1)
         gradient = (J.mT @ gradient_wrt_residual).squeeze(-1)
-        rows = torch.autograd.grad(gradient.movedim(-1, 0).diagonal().sum(), variables)
+        entries = torch.eye(gradient.shape[-1], dtype=J.dtype, device=J.device)
+        entries = entries.expand(*gradient.shape, -1).movedim(-1, 0)
+        rows = torch.autograd.grad(gradient, variables, entries, is_grads_batched=True)
     return torch.cat(rows, dim=-1).movedim(0, -2)
 
 

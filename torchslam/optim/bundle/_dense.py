@@ -153,7 +153,10 @@ _CROSS = torch.linalg.cross(_AXES[:, None].expand(3, 3, 3), _AXES.expand(3, 3, 3
 
 
 class DenseExpansion(NamedTuple):
-    """`residuals.Expansion` of every frame and point: gradient (B, K, D, N), hessian (B, K, D, D, N), D = 3 + P."""
+    """`residuals.Expansion` of every frame and point: gradient (B, K, D, N), hessian (B, K, D, D, N).
+
+    D = 3 + n, with the n directions in which the frame's camera moves.
+    """
 
     gradient: Float[Tensor, "B K D N"]
     hessian: Float[Tensor, "B K D D N"]
@@ -161,7 +164,7 @@ class DenseExpansion(NamedTuple):
 
 class DenseEquations(NamedTuple):
     """Gradient and Hessian over K free frames, which move along the axes of the world as in `_sparse`, and the
-    cameras, D = 6 K + P, and points.
+    cameras, D = 6 K + C n, and points.
     """
 
     gradient: Float[Tensor, "B D"]
@@ -176,6 +179,8 @@ def assemble_dense(
     rays_w: Float[Tensor, "B K 3 N"],
     R_cw: Float[Tensor, "B K 3 3"],
     free: Bool[Tensor, "B F"],
+    camera_of: Int[Tensor, "B K"],
+    num_cameras: int,
     exact: bool,
 ) -> DenseEquations:
     """Normal equations over the first frames, of which those that are free (B, K') move, all points, and the cameras.
@@ -183,13 +188,15 @@ def assemble_dense(
     Args:
         expansion: in the points in the camera frames
         rays_w: from the cameras to the points, in the axes of the world
+        camera_of: the camera of each frame
         exact: include the second-order terms of the rotation
     """
     dims, leading, R_wc = expansion.gradient.shape[2], free.shape[1], R_cw.mT
     upper = expansion.hessian[:, :, :3]
     curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, K, 3, 3, N): R^T C R
     slope, across = R_wc @ expansion.gradient[:, :, :3], _times(R_wc, upper[:, :, :, 3:])
-    points, points_gradient, points_camera = curve.sum(1), slope.sum(1), across.sum(1)
+    points, points_gradient = curve.sum(1), slope.sum(1)
+    points_cameras = _sum_by_camera(across, camera_of, num_cameras, over_points=False)
 
     slope, curve, across, rays_w = (part[:, :leading] for part in (slope, curve, across, rays_w))
     coupling = torch.stack(
@@ -208,19 +215,31 @@ def assemble_dense(
         frames_camera = torch.where(free[..., None, None], frames_camera, 0.0)
         coupling = torch.where(free[..., None, None, None], coupling, 0.0)
     coupling, reduced = coupling.flatten(1, 2), block_diagonal(frames)
+    cameras_gradient = _sum_by_camera(expansion.gradient[:, :, 3:], camera_of, num_cameras)
     if dims > 3:
-        frames_camera = frames_camera.flatten(1, 2)
-        camera = expansion.hessian[:, :, 3:, 3:].sum((1, -1))
-        coupling = torch.cat((coupling, points_camera.transpose(1, 2)), dim=1)
+        every = torch.arange(num_cameras, device=camera_of.device)
+        own = camera_of[:, :leading, None, None, None] == every[:, None]  # (B, K', 1, C, 1)
+        frames_cameras = torch.where(own, frames_camera[..., None, :], 0.0).flatten(3).flatten(1, 2)
+        cameras = block_diagonal(_sum_by_camera(expansion.hessian[:, :, 3:, 3:], camera_of, num_cameras))
+        coupling = torch.cat((coupling, points_cameras.transpose(2, 3).flatten(1, 2)), dim=1)
         reduced = torch.cat(
             (
-                torch.cat((reduced, frames_camera), dim=-1),
-                torch.cat((frames_camera.mT, camera), dim=-1),
+                torch.cat((reduced, frames_cameras), dim=-1),
+                torch.cat((frames_cameras.mT, cameras), dim=-1),
             ),
             dim=1,
         )
-    gradient = torch.cat((gradient.flatten(1), expansion.gradient[:, :, 3:].sum((1, -1))), dim=-1)
+    gradient = torch.cat((gradient.flatten(1), cameras_gradient.flatten(1)), dim=-1)
     return DenseEquations(gradient, points_gradient, reduced, points, coupling)
+
+
+def _sum_by_camera(values: Tensor, camera_of: Tensor, num_cameras: int, over_points: bool = True) -> Tensor:
+    """Sums (B, C, ...) of values (B, K, ..., N) over the frames of each camera and, unless told not to, the points."""
+    if num_cameras == 1:
+        return values.sum((1, -1) if over_points else 1)[:, None]
+    values = values.sum(-1) if over_points else values
+    own = torch.nn.functional.one_hot(camera_of, num_cameras).to(values.dtype)
+    return (own.mT @ values.flatten(2)).unflatten(2, values.shape[2:])
 
 
 def _times(R: Tensor, columns: Tensor) -> Tensor:
@@ -448,8 +467,8 @@ class DenseBundle:
         flat = replace(
             observations, pixels=observations.pixels.flatten(1, 2), weights=observations.weights.flatten(1)
         )
-        columns = 0 if self.directions is None else self._columns.shape[-1] - 3
-        num_parameters = 6 * layout.free.sum(1) + 3 * layout.free_points.sum(1) + columns
+        num_cameras = 0 if self.directions is None else estimate.params.shape[1] * self.directions.shape[1]
+        num_parameters = 6 * layout.free.sum(1) + 3 * layout.free_points.sum(1) + num_cameras
         factor = variance_factor(flat, Linearization(*(part.flatten(1, 2) for part in lin)), num_parameters)
         expansion = _expanded(lin, torch.zeros_like(factor))
         equations, _ = self._equations(ordered, expansion, share=factor[:, None, None])
@@ -489,11 +508,10 @@ class DenseBundle:
 
     @property
     def _columns(self) -> Tensor:
-        """From points and directions to points and parameters, (3 + P, 3 + n) or (B, K, 1, 3 + P, 3 + C n)."""
+        """From points and directions to points and parameters, (3 + P, 3 + n)."""
         assert self.directions is not None
-        num_cameras = self.data.inputs.params.shape[1]
-        columns = camera_columns(self.directions, num_cameras)
-        return columns[0] if num_cameras == 1 else columns[self.data.camera_of][:, :, None]
+        eye = torch.eye(3, dtype=self.directions.dtype, device=self.directions.device)
+        return torch.block_diag(eye, self.directions)
 
     def _linearize(self, estimate: DenseEstimate, points_c: Tensor) -> Linearization:
         """Of every frame and point, (B, K, N, ...)."""
@@ -510,12 +528,13 @@ class DenseBundle:
         """The equations with a share of the priors, and the priors' cost (B,)."""
         R_cw, t_cw = estimate.T_cw[..., :3, :3], estimate.T_cw[..., :3, 3:]
         rays_w = estimate.points_w[:, None] + R_cw.mT @ t_cw
-        equations = assemble_dense(expansion, rays_w, R_cw, self.data.layout.free, exact)
+        cameras = self.data.camera_of, estimate.params.shape[1]
+        equations = assemble_dense(expansion, rays_w, R_cw, self.data.layout.free, *cameras, exact)
         terms = self._priors(estimate, exact)
         if terms is None:
             return equations, 0.0
-        gradient = torch.cat((terms.frames_gradient.flatten(1), terms.camera_gradient), dim=1)
-        frames, camera = block_diagonal(terms.frames), terms.camera
+        gradient = torch.cat((terms.frames_gradient.flatten(1), terms.cameras_gradient.flatten(1)), dim=1)
+        frames, camera = block_diagonal(terms.frames), block_diagonal(terms.cameras)
         size, more = frames.shape[-1], camera.shape[-1]
         hessian = torch.nn.functional.pad(frames, (0, more, 0, more))
         hessian = hessian + torch.nn.functional.pad(camera, (size, 0, size, 0))
@@ -592,11 +611,3 @@ def _expanded(lin: Linearization, use_curvature: Tensor) -> DenseExpansion:
 def _as_grid(expansion: Expansion) -> DenseExpansion:
     """The expansion of every frame and point, with the points last."""
     return DenseExpansion(expansion.gradient.mT.contiguous(), expansion.hessian.movedim(2, -1).contiguous())
-
-
-def camera_columns(directions: Tensor, num_cameras: int) -> Tensor:
-    """(C, 3 + P, 3 + C n) from a point and the steps of all cameras along n directions (P, n) to the point and the
-    parameters of one of them."""
-    eye = torch.eye(3, dtype=directions.dtype, device=directions.device)
-    own = torch.eye(num_cameras, dtype=directions.dtype, device=directions.device)
-    return torch.stack([torch.block_diag(eye, torch.kron(row[None], directions)) for row in own])

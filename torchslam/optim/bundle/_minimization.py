@@ -216,7 +216,11 @@ class BundleMinimization:
         priors = prior_terms(
             given.inputs, at.T_cw, at.params, found.moved_frames, self._directions(at.params), exact=False
         )
-        return slope + (priors.frames_gradient * frames).sum() + (priors.camera_gradient * camera).sum()
+        return (
+            slope
+            + (priors.frames_gradient * frames).sum()
+            + (priors.cameras_gradient.flatten(1) * camera).sum()
+        )
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         frames, points, camera = direction
@@ -321,7 +325,8 @@ def _parts(given: BundleData, moving: MovingParts) -> list[BatchPart]:
             continue
         counted, frames, points = (mask[0] for mask in of_part)
         index = given.frame_index[start], given.point_index[start]
-        parts.append(BatchPart(rows, build_sparse_layout(*index, counted, frames, points)))
+        cameras = given.camera_index[start], given.params.shape[1]
+        parts.append(BatchPart(rows, build_sparse_layout(*index, counted, frames, points, *cameras)))
     return parts
 
 

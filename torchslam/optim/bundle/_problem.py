@@ -384,13 +384,13 @@ def checked_rows(name: str, index: Tensor, shape: tuple[int, ...], size: int) ->
 
 class PriorTerms(NamedTuple):
     """Cost (...), and gradients and Hessians over frames, (..., K, 6), (..., K, 6, 6), and the cameras' n free
-    directions each, (..., C n), (..., C n, C n)."""
+    directions each, (..., C, n), (..., C, n, n)."""
 
     cost: Tensor
     frames_gradient: Tensor
     frames: Tensor
-    camera_gradient: Tensor
-    camera: Tensor
+    cameras_gradient: Tensor
+    cameras: Tensor
     between: FrameBlocks | None = None
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
@@ -428,7 +428,7 @@ def prior_terms(
         pulled = (camera.information @ off[..., None]).squeeze(-1)
         cost = cost + 0.5 * (off * pulled).sum((-2, -1))
         g_camera, H_camera = pulled @ directions, directions.mT @ camera.information @ directions
-    return PriorTerms(cost, g_frames, H_frames, g_camera.flatten(-2), block_diagonal(H_camera))
+    return PriorTerms(cost, g_frames, H_frames, g_camera, H_camera)
 
 
 def block_diagonal(blocks: Float[Tensor, "*batch M D D"]) -> Float[Tensor, "*batch MD MD"]:

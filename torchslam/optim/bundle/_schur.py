@@ -1,16 +1,19 @@
 """The sparse normal equations of a bundle adjustment, solved by the Schur complement on its points.
 
-Poses form 6x6 blocks, points 3x3 blocks, and an observation joins one pose with one point. Eliminating the points
-leaves a dense system over the free poses (and the camera), which is fine up to several hundred keyframes. What makes
-the elimination sparse are *tiles*: runs of points, ordered by the first frame that sees them, with the few frames that
-see any of them. Within a tile the coupling is one dense matrix, so that the Schur complement is a few large matrix
-products instead of very many small ones, and a sum in a fixed order: the same bytes on every run.
+Poses form 6x6 blocks, points 3x3 blocks, free cameras n x n blocks, and an observation joins one pose, one camera and
+one point. Eliminating the points leaves a dense system over the free poses and cameras, which is fine up to several
+hundred keyframes. What makes the elimination sparse are *tiles*: runs of points, ordered by the first frame that sees
+them, with the few frames that see any of them, and their cameras. Within a tile the coupling is one dense matrix, so
+that the Schur complement is a few large matrix products instead of very many small ones, and a sum in a fixed order:
+the same bytes on every run.
 Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -27,24 +30,42 @@ _TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 128
 _MANY_FRAMES = 64
 
 
-@dataclass(frozen=True)
-class Tile:
-    """A run of points and the free frames that see any of them.
+class Columns(NamedTuple):
+    """The frames or the cameras of a tile, in ascending order, and the slice of the coupling's rows with its blocks."""
 
-    Attributes:
-        points: slice of the points
-        storage: slice of the coupling's rows
-        rows: rows of the reduced system that belong to the n frames
-    """
+    members: Int[Tensor, " n"]
+    storage: slice
+
+
+class Tile(NamedTuple):
+    """A run of points, the free frames that see any of them, and the cameras that do."""
 
     points: slice
-    storage: slice
+    frames: Columns
+    cameras: Columns
+
+
+class Coupling(NamedTuple):
+    """How the blocks that join points with frames, or with cameras, are stored: tile by tile, row by row, with a block
+    of every member of the tile.
+
+    Attributes:
+        rows: storage row of each row of the blocks, which have three
+        size: number of storage rows
+    """
+
     rows: Int[Tensor, " R"]
+    size: int
+
+    def stored(self, blocks: Float[Tensor, "M 3 n"]) -> Float[Tensor, "S n"]:
+        """The blocks as they are stored, summed where a point and a member have several."""
+        flat = blocks.reshape(len(self.rows), blocks.shape[2])
+        return flat.new_zeros(self.size, blocks.shape[2]).index_add_(0, self.rows, flat)
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Which observation joins which frame and which point; made once per problem.
+    """Which observation joins which frame, camera and point; made once per problem.
 
     Free frames have slots 0 ... K-1 in the reduced system. Observations are ordered by frame, those of free frames
     first; points by the first free frame that sees them.
@@ -53,17 +74,32 @@ class Structure:
         frame_ends: for every free frame, the end of its observations
         by_point: the observations ordered by point
         point_counts: number of observations of each point
-        coupling: storage row of each row of the observations' 3x6 blocks
+        cameras: camera of each free frame
+        camera_ends: for every camera, the end of its observations when they are ordered by camera
+        by_camera: that order; None for a single camera
+        by_pair: the observations ordered by point and camera
+        pair_counts: number of observations of each pair that there is of a point and a camera
+        coupling: of the observations by free frames
+        camera_coupling: of those pairs
     """
 
-    num_frames: int
     num_points: int
     frame_ends: list[int]
     by_point: Int[Tensor, " O"]
     point_counts: Int[Tensor, " N"]
-    coupling: Int[Tensor, " R"]
-    storage_rows: int
+    cameras: Int[Tensor, " K"]
+    camera_ends: list[int]
+    by_camera: Int[Tensor, " O"] | None
+    by_pair: Int[Tensor, " O"]
+    pair_counts: Int[Tensor, " M"]
+    coupling: Coupling
+    camera_coupling: Coupling
     tiles: list[Tile]
+
+    @property
+    def num_frames(self) -> int:
+        """How many frames are free."""
+        return len(self.frame_ends)
 
     @property
     def num_linked(self) -> int:
@@ -72,72 +108,115 @@ class Structure:
 
     def sum_by_point(self, values: Float[Tensor, "O ..."]) -> Float[Tensor, "N ..."]:
         """Sums over each point's observations. (O, ...) -> (N, ...)."""
-        flat = values.flatten(1)[self.by_point]
-        total = torch.segment_reduce(flat, "sum", lengths=self.point_counts, unsafe=True)
-        return total.view(self.num_points, *values.shape[1:])
+        return _sum_segments(values, self.by_point, self.point_counts)
+
+    def sum_by_pair(self, values: Float[Tensor, "O ..."]) -> Float[Tensor, "M ..."]:
+        """Sums over each pair's observations. (O, ...) -> (M, ...)."""
+        return _sum_segments(values, self.by_pair, self.pair_counts)
 
     def sum_by_frame(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "K ..."]:
         """Sums over each free frame's observations. (..., O) -> (K, ...)."""
-        sums = [values[..., begin:end].sum(-1) for begin, end in pairwise((0, *self.frame_ends))]
-        return torch.stack(sums) if sums else values.new_zeros(0, *values.shape[:-1])
+        return _sum_runs(values, self.frame_ends)
+
+    def sum_by_camera(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "C ..."]:
+        """Sums over each camera's observations. (..., O) -> (C, ...)."""
+        ordered = values if self.by_camera is None else values.index_select(-1, self.by_camera)
+        return _sum_runs(ordered, self.camera_ends)
+
+
+def _sum_segments(values: Tensor, order: Int[Tensor, " O"], counts: Int[Tensor, " M"]) -> Tensor:
+    """Sums over runs of values (O, ...) in an order, in the order of each run: the same bytes on every run."""
+    flat = values.flatten(1)[order]
+    total = torch.segment_reduce(flat, "sum", lengths=counts, unsafe=True)
+    return total.view(len(counts), *values.shape[1:])
+
+
+def _sum_runs(values: Float[Tensor, "... O"], ends: Sequence[int]) -> Float[Tensor, "R ..."]:
+    """Sums over consecutive runs."""
+    sums = [values[..., begin:end].sum(-1) for begin, end in pairwise((0, *ends))]
+    return torch.stack(sums) if sums else values.new_zeros(0, *values.shape[:-1])
 
 
 def build_structure(
-    frame_slots: Int[Tensor, " O"], point_index: Int[Tensor, " O"], num_frames: int, num_points: int
+    frame_slots: Int[Tensor, " O"],
+    point_index: Int[Tensor, " O"],
+    num_points: int,
+    cameras: Int[Tensor, " K"],
+    camera_of: Int[Tensor, " O"],
+    num_cameras: int,
 ) -> Structure:
     """The structure of observations (O,) in the order of `Structure`.
 
     Args:
-        frame_slots: slot of the observing frame, `num_frames` for all fixed ones.
+        frame_slots: slot of the observing frame, K for all fixed ones.
+        cameras: of the free frames
+        camera_of: of the observations
     """
-    counts = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames]
-    frame_ends = counts.cumsum(0).tolist()
+    num_frames = len(cameras)
+    frame_ends = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames].cumsum(0).tolist()
     linked = frame_ends[-1] if frame_ends else 0
-    slots, points = frame_slots[:linked], point_index[:linked]
-
     height = _TILE_POINTS if num_frames <= _MANY_FRAMES else _TILE_POINTS_OF_MANY
-    tile_of = points // height
-    keys, positions = torch.unique(tile_of * max(num_frames, 1) + slots, return_inverse=True)
-    num_tiles = -(-num_points // height)
-    sizes = torch.bincount(keys // max(num_frames, 1), minlength=num_tiles)  # frames per tile
-    first = sizes.cumsum(0) - sizes
-    starts = torch.arange(num_tiles, device=points.device) * height
-    lengths = (num_points - starts).clamp_max(height)
-    storage = 3 * sizes * lengths
-    offsets = storage.cumsum(0) - storage
-
-    axis = torch.arange(3, device=points.device)
-    row_in_tile = (points % height)[:, None] * 3 + axis
-    coupling = offsets[tile_of][:, None] + row_in_tile * sizes[tile_of][:, None]
-    coupling = coupling + (positions - first[tile_of])[:, None]
-
-    rows = (6 * (keys % max(num_frames, 1)))[:, None] + torch.arange(6, device=keys.device)
-    tiles = [
-        Tile(
-            slice(start, start + length), slice(offset, offset + rows_), rows[begin : begin + size].flatten()
-        )
-        for start, length, offset, rows_, begin, size in zip(
-            *(x.tolist() for x in (starts, lengths, offsets, storage, first, sizes)), strict=True
-        )
-    ]
+    coupling, frames_of = _stored(frame_slots[:linked], point_index[:linked], num_frames, num_points, height)
+    by_point, pair = torch.argsort(point_index, stable=True), point_index * num_cameras + camera_of
+    by_pair = torch.argsort(pair, stable=True) if num_cameras > 1 else by_point
+    pairs, pair_counts = torch.unique_consecutive(pair[by_pair], return_counts=True)
+    of_pairs = pairs % num_cameras, pairs // num_cameras
+    camera_coupling, cameras_of = _stored(*of_pairs, num_cameras, num_points, height)
+    runs = [slice(start, min(start + height, num_points)) for start in range(0, num_points, height)]
     return Structure(
-        num_frames,
         num_points,
         frame_ends,
-        torch.argsort(point_index, stable=True),
+        by_point,
         torch.bincount(point_index, minlength=num_points),
-        coupling.flatten(),
-        int(storage.sum()),
-        tiles,
+        cameras,
+        torch.bincount(camera_of, minlength=num_cameras).cumsum(0).tolist(),
+        torch.argsort(camera_of, stable=True) if num_cameras > 1 else None,
+        by_pair,
+        pair_counts,
+        coupling,
+        camera_coupling,
+        [Tile(*parts) for parts in zip(runs, frames_of, cameras_of, strict=True)],
     )
 
 
+def _stored(
+    members: Int[Tensor, " M"],
+    points: Int[Tensor, " M"],
+    num_members: int,
+    num_points: int,
+    height: int,
+) -> tuple[Coupling, list[Columns]]:
+    """How the blocks of points against members are stored in tiles of `height` points, and the columns of each tile."""
+    tile_of = points // height
+    num_tiles = -(-num_points // height)
+    keys = tile_of * num_members + members
+    present = torch.zeros(num_tiles * num_members, dtype=torch.bool, device=keys.device)
+    present[keys] = True
+    sizes = present.view(num_tiles, num_members).sum(1)
+    first = sizes.cumsum(0) - sizes
+    starts = torch.arange(num_tiles, device=keys.device) * height
+    storage = 3 * sizes * (num_points - starts).clamp_max(height)
+    offsets = storage.cumsum(0) - storage
+
+    row_in_tile = (points % height)[:, None] * 3 + torch.arange(3, device=keys.device)
+    position = (present.cumsum(0) - 1)[keys] - first[tile_of]
+    rows = offsets[tile_of][:, None] + row_in_tile * sizes[tile_of][:, None] + position[:, None]
+    of_tiles = present.nonzero().squeeze(-1) % max(num_members, 1)
+    columns = [
+        Columns(of_tiles[begin : begin + size], slice(offset, offset + count))
+        for begin, size, offset, count in zip(
+            *(x.tolist() for x in (first, sizes, offsets, storage)), strict=True
+        )
+    ]
+    return Coupling(rows.flatten(), int(storage.sum())), columns
+
+
 class BundleTangent(NamedTuple):
-    """A vector over all unknowns: frames (K, 6), points (N, 3), camera (P,); P = 0 where the camera is fixed."""
+    """A vector over all unknowns: frames (K, 6), points (N, 3), cameras (C, n); n = 0 where they are fixed."""
 
     frames: Float[Tensor, "K 6"]
     points: Float[Tensor, "N 3"]
-    camera: Float[Tensor, " P"]
+    cameras: Float[Tensor, "C n"]
 
     def dot(self, other: BundleTangent) -> Tensor:
         products = (mine * others for mine, others in zip(self, other, strict=True))
@@ -149,7 +228,9 @@ class NormalEquations:
     """Gradient and block Hessian of a bundle adjustment's cost.
 
     Attributes:
-        coupling: the point-frame blocks as the tiles store them
+        frames_cameras: blocks of frames against their cameras
+        coupling: the blocks of points against frames, as `Structure.coupling` stores them
+        camera_coupling: those against cameras
         free_points: the points that move
         between: blocks between two free frames, by slots, where there are factors
     """
@@ -158,10 +239,10 @@ class NormalEquations:
     gradient: BundleTangent
     frames: Float[Tensor, "K 6 6"]
     points: Float[Tensor, "N 3 3"]
-    camera: Float[Tensor, "P P"]
-    frames_camera: Float[Tensor, "K 6 P"]
-    points_camera: Float[Tensor, "N 3 P"]
+    cameras: Float[Tensor, "C n n"]
+    frames_cameras: Float[Tensor, "K 6 n"]
     coupling: Float[Tensor, "R 6"]
+    camera_coupling: Float[Tensor, "S n"]
     free_points: Bool[Tensor, " N"]
     between: FrameBlocks | None = None
 
@@ -178,53 +259,69 @@ class NormalEquations:
         """
         root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
         root = torch.where(self.free_points[:, None, None], root, 0.0)
-        reduced = self._frames_and_camera(damping)
-        whitened = [self._whitened(tile, root) for tile in self.structure.tiles]
-        for tile, A in zip(self.structure.tiles, whitened, strict=True):
-            rows = self._rows(tile)
+        reduced = self._frames_and_cameras(damping)
+        tiles = [self._whitened(tile, root) for tile in self.structure.tiles]
+        for _, rows, A in tiles:
             reduced.index_put_((rows[:, None], rows[None, :]), -(A.mT @ A), accumulate=True)
         if gauge is not None:
             c = gauge.flatten(0, 1) * reduced.diagonal().mean().sqrt()
             reduced[: len(c), : len(c)] += c @ c.mT
-        return FactorizedEquations(self, root, whitened, factorize(reduced, strict=damping is None))
+        return FactorizedEquations(self, root, tiles, factorize(reduced, strict=damping is None))
 
-    def _frames_and_camera(self, damping: Tensor | None) -> Tensor:
-        """The reduced system before elimination, (6 K + P, 6 K + P)."""
-        num_frames, num_camera = self.structure.num_frames, self.camera.shape[-1]
-        size = 6 * num_frames + num_camera
+    def _frames_and_cameras(self, damping: Tensor | None) -> Tensor:
+        """The reduced system before elimination, (6 K + C n, 6 K + C n)."""
+        frame_rows, camera_rows = self.rows
+        size = frame_rows.numel() + camera_rows.numel()
         reduced = self.frames.new_zeros(size, size)
-        rows = torch.arange(6 * num_frames, device=reduced.device).view(num_frames, 6)
         frames = _damped(self.frames, damping)
         if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
             eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
             frames = frames + diagonal_floor(frames.dtype) * eye
-        reduced[rows[:, :, None], rows[:, None, :]] = frames
+        reduced[_at(frame_rows, frame_rows)] = frames
         if self.between is not None:
             first, second, blocks = self.between
-            reduced.index_put_((rows[first][:, :, None], rows[second][:, None, :]), blocks, accumulate=True)
-            reduced.index_put_(
-                (rows[second][:, :, None], rows[first][:, None, :]), blocks.mT, accumulate=True
-            )
-        if num_camera:
-            split = 6 * num_frames
-            across = self.frames_camera.reshape(split, num_camera)
-            reduced[split:, split:] = _damped(self.camera, damping)
-            reduced[:split, split:], reduced[split:, :split] = across, across.mT
+            first, second = frame_rows[first], frame_rows[second]
+            reduced.index_put_(_at(first, second), blocks, accumulate=True)
+            reduced.index_put_(_at(second, first), blocks.mT, accumulate=True)
+        if camera_rows.numel():
+            own = camera_rows[self.structure.cameras]
+            reduced[_at(camera_rows, camera_rows)] = _damped(self.cameras, damping)
+            reduced[_at(frame_rows, own)] = self.frames_cameras
+            reduced[_at(own, frame_rows)] = self.frames_cameras.mT
         return reduced
 
-    def _whitened(self, tile: Tile, root: Tensor) -> Tensor:
-        """A tile's coupling times the inverse root of its points' blocks, (3 p, 6 f + P)."""
-        count = tile.points.stop - tile.points.start
-        coupling = self.coupling[tile.storage].view(count, 3, len(tile.rows))
-        if self.camera.shape[-1]:
-            coupling = torch.cat((coupling, self.points_camera[tile.points]), dim=-1)
-        return (root[tile.points] @ coupling).flatten(0, 1)
+    @cached_property
+    def rows(self) -> tuple[Int[Tensor, "K 6"], Int[Tensor, "C n"]]:
+        """Rows of the reduced system that belong to each frame, and to each camera."""
+        split, (num_cameras, num_free) = 6 * self.structure.num_frames, self.cameras.shape[:2]
+        rows = torch.arange(split + num_cameras * num_free, device=self.frames.device)
+        return rows[:split].view(-1, 6), rows[split:].view(num_cameras, num_free)
 
-    def _rows(self, tile: Tile) -> Tensor:
-        """Rows of the reduced system that a tile touches, the camera's last."""
-        first = 6 * self.structure.num_frames
-        camera = torch.arange(first, first + self.camera.shape[-1], device=tile.rows.device)
-        return torch.cat((tile.rows, camera))
+    def _whitened(self, tile: Tile, root: Tensor) -> WhitenedTile:
+        """A tile's coupling times the inverse root of its points' blocks."""
+        frame_rows, camera_rows = self.rows
+        count = tile.points.stop - tile.points.start
+        rows = frame_rows[tile.frames.members].flatten()
+        coupling = self.coupling[tile.frames.storage].view(count, 3, len(rows))
+        if camera_rows.numel():
+            more = camera_rows[tile.cameras.members].flatten()
+            of_cameras = self.camera_coupling[tile.cameras.storage].view(count, 3, len(more))
+            rows, coupling = torch.cat((rows, more)), torch.cat((coupling, of_cameras), dim=-1)
+        return WhitenedTile(tile.points, rows, (root[tile.points] @ coupling).flatten(0, 1))
+
+
+def _at(rows: Int[Tensor, "M r"], columns: Int[Tensor, "M c"]) -> tuple[Tensor, Tensor]:
+    """Where blocks (M, r, c) lie in a matrix."""
+    return rows[:, :, None], columns[:, None, :]
+
+
+class WhitenedTile(NamedTuple):
+    """The points of a tile, the rows of the reduced system of its frames and cameras, and the coupling of both, times
+    the inverse root of the points' blocks."""
+
+    points: slice
+    rows: Int[Tensor, " R"]
+    coupling: Float[Tensor, "p3 R"]
 
 
 @dataclass(frozen=True)
@@ -233,53 +330,44 @@ class FactorizedEquations:
 
     Attributes:
         points_root: Q with Q^T Q the inverse of a point's block, zero for points that do not move
-        whitened: per tile (3 p, 6 f + P)
-        reduced: factor of the system over frames and camera
+        reduced: factor of the system over frames and cameras
     """
 
     equations: NormalEquations
     points_root: Float[Tensor, "N 3 3"]
-    whitened: list[Tensor]
+    tiles: list[WhitenedTile]
     reduced: DefiniteFactor
 
     def solve(self, right: BundleTangent) -> BundleTangent:
         """H^-1 right; all zero where the reduced system is not definite."""
-        equations, tiles = self.equations, self.equations.structure.tiles
-        reduced_right = torch.cat((right.frames.flatten(), right.camera))
+        reduced_right = torch.cat((right.frames.flatten(), right.cameras.flatten()))
         halves = (self.points_root @ right.points[..., None]).squeeze(-1)
-        for tile, A in zip(tiles, self.whitened, strict=True):
-            update = A.mT @ halves[tile.points].flatten()
-            reduced_right = reduced_right.index_add(0, equations._rows(tile), -update)
+        for points, rows, A in self.tiles:
+            reduced_right = reduced_right.index_add(0, rows, -(A.mT @ halves[points].flatten()))
         solution = self.reduced.solve(reduced_right[:, None]).squeeze(-1)
-        remainders = [
-            halves[tile.points] - (A @ solution[equations._rows(tile)]).view(-1, 3)
-            for tile, A in zip(tiles, self.whitened, strict=True)
-        ]
+        remainders = [halves[points] - (A @ solution[rows]).view(-1, 3) for points, rows, A in self.tiles]
         halves = torch.cat(remainders) if remainders else halves  # without points there are no tiles
-        points = (self.points_root.mT @ halves[..., None]).squeeze(-1)
-        split = 6 * equations.structure.num_frames
-        points = torch.where(self.reduced.definite, points, 0.0)
-        return BundleTangent(solution[:split].view(-1, 6), points, solution[split:])
+        moved = (self.points_root.mT @ halves[..., None]).squeeze(-1)
+        frame_rows, camera_rows = self.equations.rows
+        moved = torch.where(self.reduced.definite, moved, 0.0)
+        return BundleTangent(solution[frame_rows], moved, solution[camera_rows])
 
     def marginals(self) -> Marginals:
         """The diagonal blocks of H^-1."""
-        equations = self.equations
         size = self.reduced.factor.shape[-1]
         inverse = self.reduced.solve(
             torch.eye(size, dtype=self.points_root.dtype, device=self.points_root.device)
         )
         eye = torch.eye(3, dtype=inverse.dtype, device=inverse.device)
-        points = []
-        for tile, A in zip(equations.structure.tiles, self.whitened, strict=True):
-            rows = equations._rows(tile)
+        blocks = []
+        for points, rows, A in self.tiles:
             moved = (A @ inverse[rows[:, None], rows[None, :]]).unflatten(0, (-1, 3))
-            root = self.points_root[tile.points]
-            points.append(root.mT @ (eye + moved @ A.unflatten(0, (-1, 3)).mT) @ root)
-        split = 6 * equations.structure.num_frames
+            root = self.points_root[points]
+            blocks.append(root.mT @ (eye + moved @ A.unflatten(0, (-1, 3)).mT) @ root)
+        split = 6 * self.equations.structure.num_frames
         frames = inverse[:split, :split].unflatten(0, (-1, 6)).unflatten(-1, (-1, 6))
         frames = frames.diagonal(dim1=0, dim2=2).movedim(-1, 0)
-        blocks = torch.cat(points) if points else self.points_root
-        return Marginals(frames, blocks, inverse[split:, split:])
+        return Marginals(frames, torch.cat(blocks) if blocks else self.points_root, inverse[split:, split:])
 
 
 class Marginals(NamedTuple):

@@ -80,6 +80,8 @@ def build_sparse_layout(
     counted: Bool[Tensor, " O"],
     free_frames: Bool[Tensor, " K"],
     free_points: Bool[Tensor, " N"],
+    camera_index: Int[Tensor, " K"],
+    num_cameras: int,
 ) -> SparseLayout:
     """Order the observations (O,) that count; frames (K,) and points (N,) are free or fixed as in `MovingParts`."""
     num_points = len(free_points)
@@ -92,14 +94,18 @@ def build_sparse_layout(
     point_order = torch.argsort(first, stable=True)
     point_rank = torch.argsort(point_order)
     points = point_rank[point_index[rows]]
-    structure = build_structure(slots[frame_index[rows]], points, count, num_points)
+    free = free_frames.nonzero().squeeze(-1)
+    frames = frame_index[rows]
+    structure = build_structure(
+        slots[frames], points, num_points, camera_index[free], camera_index[frames], num_cameras
+    )
     return SparseLayout(
         rows,
-        frame_index[rows],
+        frames,
         points,
         point_order,
         point_rank,
-        free_frames.nonzero().squeeze(-1),
+        free,
         free_points[point_order],
         structure,
     )
@@ -115,7 +121,8 @@ def assemble_sparse(
     """Normal equations of observations in the order of `structure`, for frames that move along the world's axes.
 
     Args:
-        expansion: gradient (3 + P, O) and Hessian (3 + P, 3 + P, O) in the points in the world and the camera
+        expansion: gradient (3 + n, O) and Hessian (3 + n, 3 + n, O) in the point in the world and what moves of the
+            camera that sees it
         rays_w: from the observing camera to the point, in the axes of the world
         exact: include the second-order terms of the rotation, for the exact Hessian
     """
@@ -123,7 +130,7 @@ def assemble_sparse(
     slope, linked = gradient[:3], structure.num_linked
     # The columns of all blocks: against points, the gradient, against the camera.
     moved = torch.cat((hessian[:3, :3], slope[:, None], hessian[:3, 3:]), dim=1)
-    points = structure.sum_by_point(moved.flatten(0, 1).mT).unflatten(-1, (3, -1))
+    points = structure.sum_by_point(moved[:, :4].flatten(0, 1).mT).unflatten(-1, (3, -1))
     slope, rays_w, moved = slope[:, :linked], rays_w[:, :linked], moved[..., :linked]
     rotated = torch.stack(cross_entries(rays_w, moved))
     twice = torch.stack(cross_entries(rays_w, rotated[:, :3].transpose(0, 1)))
@@ -133,21 +140,20 @@ def assemble_sparse(
         against_points = against_points - torch.stack(cross_entries(slope, eye))
         outer = slope[:, None] * rays_w
         twice = twice + 0.5 * (outer + outer.transpose(0, 1)) - outer.diagonal().sum(-1) * eye
-    blocks = torch.cat((moved[:, :3], against_points)).permute(2, 1, 0).reshape(-1, 6)
-    coupling = blocks.new_zeros(structure.storage_rows, 6).index_add_(0, structure.coupling, blocks)
+    coupling = structure.coupling.stored(torch.cat((moved[:, :3], against_points)).permute(2, 1, 0))
     moved, rotated, twice = (structure.sum_by_frame(values) for values in (moved, rotated, twice))
     upper = torch.cat((moved[..., :3], rotated[..., :3].mT), dim=-1)
     lower = torch.cat((rotated[..., :3], twice), dim=-1)
     rest = torch.cat((moved[..., 3:], rotated[..., 3:]), dim=1)
     return NormalEquations(
         structure,
-        BundleTangent(rest[..., 0], points[..., 3], gradient[3:].sum(-1)),
+        BundleTangent(rest[..., 0], points[..., 3], structure.sum_by_camera(gradient[3:])),
         torch.cat((upper, lower), dim=1),
         points[..., :3],
-        hessian[3:, 3:].sum(-1),
+        structure.sum_by_camera(hessian[3:, 3:]),
         rest[..., 1:],
-        points[..., 4:],
         coupling,
+        structure.camera_coupling.stored(structure.sum_by_pair(hessian[:3, 3:].permute(2, 0, 1))),
         free_points,
     )
 
@@ -250,7 +256,7 @@ class SparseBundle:
         moved = retract(T_free, -rotated(T_free[:, :3, :3], step.frames[..., None])[..., 0])
         params = estimate.params
         if self.directions is not None:
-            params = params - step.camera.view(len(params), -1) @ self.directions.mT
+            params = params - step.cameras @ self.directions.mT
         return (
             BundleEstimate(
                 estimate.T_cw.index_copy(0, frames, moved), estimate.points_w - step.points, params
@@ -341,8 +347,8 @@ class SparseBundle:
         seen = self._seen(estimate)
         lin = self._linearize(estimate, seen)
         layout, structure = self.layout, self.layout.structure
-        num_camera = 0 if self.directions is None else len(estimate.params) * self.directions.shape[1]
-        num_parameters = 6 * structure.num_frames + 3 * int(layout.free_points.sum()) + num_camera
+        num_cameras = 0 if self.directions is None else len(estimate.params) * self.directions.shape[1]
+        num_parameters = 6 * structure.num_frames + 3 * int(layout.free_points.sum()) + num_cameras
         factor = variance_factor(self.observations, lin, num_parameters)
         # Priors, depths and factors are in absolute units, which the residuals do not calibrate.
         equations = self._equations(seen, lin, torch.zeros_like(self.solvable), share=factor)
@@ -361,12 +367,13 @@ class SparseBundle:
         R_cw = ordered.T_cw[layout.free_frames, :3, :3]
 
         def solve(right: Tensors) -> Tensors:
-            frames, points, camera = (part[0] for part in right)
+            frames, points, cameras = (part[0] for part in right)
+            cameras = cameras.view(len(ordered.params), -1)
             free = rotated(R_cw.mT, frames.index_select(0, layout.free_frames)[..., None])[..., 0]
-            solved = exact.solve(BundleTangent(free, points.index_select(0, layout.point_order), camera))
+            solved = exact.solve(BundleTangent(free, points.index_select(0, layout.point_order), cameras))
             free = rotated(R_cw, solved.frames[..., None])[..., 0]
             spread = torch.zeros_like(frames).index_copy(0, layout.free_frames, free)
-            vector = spread, solved.points.index_select(0, layout.point_rank), solved.camera
+            vector = spread, solved.points.index_select(0, layout.point_rank), solved.cameras.flatten()
             return tuple(part[None] for part in vector)
 
         return solve
@@ -384,15 +391,11 @@ class SparseBundle:
         return linearize_each(self._observations(estimate), seen.points_c, self.directions is not None)
 
     def _in_world(self, rows: Tensor, R_cw: Tensor) -> Tensor:
-        """Derivatives (m, 3 + P, O') in points_c and the camera, as such in points_w and what moves of all cameras."""
+        """Derivatives (m, 3 + P, O') in points_c and the camera, as such in points_w and what moves of the camera."""
         points = product(rows[:, :3], R_cw)
         if self.directions is None:
             return points
-        camera = self.directions.mT @ rows[:, 3:]
-        if self.camera_of is not None:
-            every = torch.arange(len(self.inputs.params), device=rows.device)
-            camera = torch.where(self.camera_of == every[:, None, None], camera[:, None], 0.0).flatten(1, 2)
-        return torch.cat((points, camera), dim=1)
+        return torch.cat((points, self.directions.mT @ rows[:, 3:]), dim=1)
 
     def _observed(self, pixels: Tensor, weights: Tensor, params: Tensor) -> ReprojectionData:
         camera = self.camera.with_params(params)
@@ -446,7 +449,7 @@ def _with_priors(
         return equations
     gradient = equations.gradient
     gradient = gradient._replace(
-        frames=gradient.frames + terms.frames_gradient, camera=gradient.camera + terms.camera_gradient
+        frames=gradient.frames + terms.frames_gradient, cameras=gradient.cameras + terms.cameras_gradient
     )
     between = None
     if terms.between is not None:
@@ -456,5 +459,5 @@ def _with_priors(
         gradient=gradient,
         between=between,
         frames=equations.frames + share * terms.frames,
-        camera=equations.camera + share * terms.camera,
+        cameras=equations.cameras + share * terms.cameras,
     )
