@@ -104,13 +104,18 @@ class Loss(nn.Module):
         return clip_halves(even, odd, error, on_failure=FAILED)
 
 
+def is_main() -> bool:
+    """Whether this process reports and saves."""
+    return not dist.is_initialized() or dist.get_rank() == 0
+
+
 class Data:
     """The clips that find a map, and their graphs by the front end before the training."""
 
     def __init__(self, clips: Clips, clip_slam: ClipSLAM) -> None:
         self.graphs = GraphCache(clip_slam)
         self.usable, left_out = clips_with_a_map(clips, self.graphs)
-        for reason, count in left_out.most_common():
+        for reason, count in left_out.most_common() if is_main() else ():
             print(f"{count} of {len(clips)} clips are left out: {reason}")
 
     @torch.no_grad()
@@ -152,7 +157,7 @@ def train(
         training.descend(mean)
         if log is not None:
             log("failure_rate", failure_rate, step)
-        if rank == 0 and (training.step % save_every == 0 or training.step == steps):
+        if is_main() and (training.step % save_every == 0 or training.step == steps):
             training.save(checkpoint)
     if log is not None and other is not None:
         log("held_back_loss", other.mean(loss), steps)
@@ -206,7 +211,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
     clips = clips_of(options.sequences)
     held_back = clips_of(options.held_back) if options.held_back else None
-    if not dist.is_initialized() or dist.get_rank() == 0:
+    if is_main():
         with scalars(options.tensorboard) as log:
             training = train(clips, options.steps, options.checkpoint, supervised, held_back, log=log)
         if options.output is not None:
