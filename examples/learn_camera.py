@@ -10,17 +10,15 @@ the gradient of the trajectory error of clips (or, without truth, of their repro
 from __future__ import annotations
 
 import argparse
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 from torch import Tensor, nn
-from torch.utils.data import DataLoader, Subset
+from torch.utils.data import DataLoader
 
 from torchslam import ORB, Camera, ClipSLAM, Features, open_sequence
-from torchslam.errors import ClipError
 from torchslam.learning import (
     Batches,
     Clip,
@@ -31,6 +29,7 @@ from torchslam.learning import (
     clip_loss,
     clip_mean,
     clip_reprojection,
+    clips_with_a_map,
     collate,
     relative_ate,
 )
@@ -91,26 +90,6 @@ class SeenThrough(nn.Module):
         return replace(found, keypoints=self.lens.straightened(found.keypoints))
 
 
-def clips_with_a_map(clips: Clips, graphs: GraphCache) -> list[int]:
-    """The clips whose start finds a map; says how many there are without, and why.
-
-    Raises:
-        ClipError: There is none.
-    """
-    reasons = {}
-    for number in range(len(clips)):
-        (reasons[number],) = graphs(collate([clips[number]])).reasons
-    failed = Counter(": ".join(reason.split(": ")[:2]) for reason in reasons.values() if reason)
-    for reason, count in failed.most_common():
-        print(f"{count} of {len(clips)} clips are left out: {reason}")
-    usable = [number for number, reason in reasons.items() if not reason]
-    if not usable:
-        raise ClipError(
-            f"none of {len(clips)} clips finds a map: take longer clips, a larger min_parallax, or a better --camera"
-        )
-    return usable
-
-
 def learn(
     clips: Clips,
     start: Camera,
@@ -128,11 +107,13 @@ def learn(
     lens = LearnedCamera(start)
     clip_slam = ClipSLAM(SeenThrough(ORB(600), lens))
     graphs = GraphCache(clip_slam)
-    usable = clips_with_a_map(clips, graphs)
+    usable, left_out = clips_with_a_map(clips, graphs)
+    for reason, count in left_out.most_common():
+        print(f"{count} of {len(clips)} clips are left out: {reason}")
     optimizer = torch.optim.Adam([{"params": [getattr(lens, part)], "lr": RATES[part]} for part in parts])
     training = Training(clip_slam, optimizer, steps, seed=seed, log=log)
     batches = Batches(len(usable), min(batch, len(usable)), seed=seed)
-    loader = DataLoader(Subset(clips, usable), batch_sampler=batches, collate_fn=collate)
+    loader = DataLoader(usable, batch_sampler=batches, collate_fn=collate)
     for _, clip in zip(training, loader, strict=False):
         training.descend(loss_of(clip_slam, lens, clip, graphs, supervised))
     return lens
@@ -174,8 +155,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         start = Camera.pinhole(fx, fy, cx, cy, size=start.size)
     supervised = not options.without_truth
     clips = Clips(sequences, per_sequence=options.clips, supervised=supervised)
-    if len(clips) == 0:
-        raise ClipError("no clip has enough parallax: take longer recordings, or a camera that moves more")
 
     def log(name: str, value: float, step: int) -> None:
         print(f"{step:5d} {name} {value:.4g}", flush=True)

@@ -29,6 +29,15 @@ T = TypeVar("T")
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
 
+DRONE_CAMERA, DRONE_TRUTH = "553,553,319.5,179.5", "drone_colmap.txt"
+"""Of drone.mp4, which comes without: as COLMAP found them."""
+WEIGHTS_DIR = DATA_DIR.parent / "weights"
+LEARNED_FEATURES = {"xfeat": "xfeat.safetensors", "aliked": "aliked-t16.safetensors"}
+"""Files of the learned front ends in the folder of `add_weights`."""
+CONTROL = "synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3"
+"""A rendered room that nothing is trained on: with other textures, noise and exposure, and exact poses."""
+
+
 def place_of(name: str) -> str:
     """The argument of `open_sequence` for a rendered sequence or one in `DATA_DIR`."""
     return name if name.startswith("synthetic:") else str(DATA_DIR / name)
@@ -48,6 +57,11 @@ def available(names: Iterable[str]) -> list[str]:
         else:
             print(f"{name}: not at {DATA_DIR}, left out")
     return found
+
+
+def part_of(sequence: Frames, share: tuple[float, float]) -> range:
+    """The frames of a sequence from one share of its length to another."""
+    return range(*(round(end * len(sequence)) for end in share))
 
 
 def row_of(name: str, *labels: str, overrides: Iterable[str] = (), **more: Any) -> Row:
@@ -93,6 +107,20 @@ def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
     parser.add_argument("--workers", type=int, metavar="N", help="of --engine ray")
 
 
+def add_weights(parser: argparse.ArgumentParser) -> None:
+    """Add the option for the folder of the weights of learned front ends."""
+    parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR, help="folder of the weights")
+
+
+def weights_of(name: str, folder: Path) -> Path | None:
+    """The weights of a learned front end; None, with a message, if they are not in the folder."""
+    weights = (folder / LEARNED_FEATURES[name]).absolute()
+    if not weights.is_file():
+        print(f"{name}: no {weights}, left out")
+        return None
+    return weights
+
+
 def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: bool = False) -> list[Columns]:
     """Run the rows with the options of `add_engine`; return the metrics of each, times included.
 
@@ -116,9 +144,12 @@ def tabulate_runs(
 
     cells: maps the number of a row and its metrics to its line of the table; module: file next to the README
     """
-    text = table(
-        header, [cells(number, metrics) for number, metrics in enumerate(metrics_of_runs(rows, options))]
-    )
+    found = enumerate(metrics_of_runs(rows, options))
+    publish(table(header, [cells(number, metrics) for number, metrics in found]), options, module)
+
+
+def publish(text: str, options: argparse.Namespace, module: str) -> None:
+    """Print the result of an experiment, and write it into the README next to its module without --no-readme."""
     print(text)
     if not options.no_readme:
         write_between(Path(module).parent / "README.md", text)
@@ -188,6 +219,12 @@ def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
             result, spent = timed(task)
             record.append(result if isinstance(result, float) else spent)
     return [statistics.median(record[2:]) for record in times]
+
+
+def interval_of(draws: Tensor) -> tuple[float, float]:
+    """95 % interval of a mean by its bootstrap draws."""
+    low, high = draws.quantile(draws.new_tensor([0.025, 0.975])).tolist()
+    return low, high
 
 
 def table(header: str | Sequence[str], rows: Iterable[Sequence[str]]) -> str:

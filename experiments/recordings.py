@@ -9,7 +9,17 @@ from dataclasses import dataclass
 
 import torch
 
-from experiments.common import DATA_DIR, add_engine, available, metrics_of_runs, row_of, table
+from experiments.common import (
+    DATA_DIR,
+    DRONE_CAMERA,
+    DRONE_TRUTH,
+    add_engine,
+    available,
+    interval_of,
+    metrics_of_runs,
+    row_of,
+    table,
+)
 from torchslam.batch import Columns, Row
 from torchslam.batch.result_store import RUNS
 from torchslam.io.results import read_metrics
@@ -53,7 +63,7 @@ RECORDINGS = {
     "shelf_bin": Recording("shelf_bin", "shelf_bin"),
     "fr2_desk_20": Recording("fr2_desk_20", "fr2_desk_20"),
     "drone, 160 frames": Recording(
-        "drone.mp4", "drone", camera="553,553,319.5,179.5", groundtruth="drone_colmap.txt", limit=160
+        "drone.mp4", "drone", camera=DRONE_CAMERA, groundtruth=DRONE_TRUTH, limit=160
     ),
 }
 """kitti07 with the camera that comes with it, which is 3 % wrong, and with COLMAP's; drone by COLMAP's poses, whose
@@ -154,8 +164,7 @@ def interval(
         some = [values for number in drawn(len(families)) for values in families[number]]
         each = [sum(values[k] for k in drawn(len(values))) / len(values) for values in some]
         means.append(math.exp(sum(each) / len(each)))
-    low, high = torch.tensor(means).quantile(torch.tensor([0.025, 0.975])).tolist()
-    return low, high
+    return interval_of(torch.tensor(means))
 
 
 HEADER = ["recording", "arm", "posed, %", "ATE"]

@@ -72,7 +72,8 @@ def load(
     """
     what = f"{group.rpartition('.')[2].rstrip('s').replace('_', ' ')} {name}"
     point = registered(group).get(name)
-    package, _, attribute = (point.value if point else name).partition(":")
+    place = name.replace(KORNIA, KORNIA_FEATURES, 1) if name.startswith(KORNIA) else name
+    package, _, attribute = (point.value if point else place).partition(":")
     try:
         part: Any = import_module(package)
     except ModuleNotFoundError as error:
@@ -109,8 +110,7 @@ def load_front_end(name: str, num_keypoints: int, weights: str | None) -> Callab
 
     if name in EXTRACTORS or not is_known(FRONT_ENDS, name):
         return extractor(name, num_keypoints, weights)
-    place = name.replace(KORNIA, KORNIA_FEATURES, 1) if name.startswith(KORNIA) else name
-    return load(FRONT_ENDS, place, make, num_keypoints=num_keypoints, weights=weights)
+    return load(FRONT_ENDS, name, make, num_keypoints=num_keypoints, weights=weights)
 
 
 def _taken(kind: type, arguments: dict[str, object]) -> dict[str, object]:

@@ -32,8 +32,10 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Make the links of CONTRIBUTING.md into docs/ relative to docs/."""
-    return markdown.replace("](docs/", "](") if page.file.src_uri == "CONTRIBUTING.md" else markdown
+    """Make the links of files from outside into docs/ relative to docs/."""
+    if (ROOT / "docs" / page.file.src_uri).exists():
+        return markdown
+    return markdown.replace("](docs/", "](").replace("../docs/", "../")
 
 
 def _settings() -> str:

@@ -10,11 +10,10 @@ assuming a chi-square distribution with two degrees of freedom, so that outliers
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import torch
 
-from experiments.common import DATA_DIR, parser_of, sequences, table
+from experiments.common import add_weights, parser_of, sequences, table
 from experiments.front_ends.run import FRONT_ENDS, NAMES, overrides
 from torchslam import SLAM, load_config
 from torchslam.geometry import squared_reprojection_errors, transform
@@ -44,7 +43,7 @@ def main() -> None:
     parser.add_argument(
         "--front-ends", nargs="*", default=["orb", "xfeat", "aliked"], choices=list(FRONT_ENDS)
     )
-    parser.add_argument("--weights", type=Path, default=DATA_DIR.parent / "weights")
+    add_weights(parser)
     parser.add_argument("--limit", type=int, default=120, help="frames of each sequence")
     arguments = parser.parse_args()
     rows = []

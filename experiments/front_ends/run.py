@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.common import DATA_DIR, add_engine, available, parser_of, row_of, tabulate_runs
+from experiments.common import (
+    LEARNED_FEATURES,
+    add_engine,
+    add_weights,
+    available,
+    parser_of,
+    row_of,
+    tabulate_runs,
+    weights_of,
+)
 from torchslam.batch import Columns
 
 NAMES = ["shelf_bin", "fr2_desk_20", "kitti07", "machine_hall"]
-FRONT_ENDS = {"orb": "", "opencv-orb": "", "xfeat": "xfeat.safetensors", "aliked": "aliked-t16.safetensors"}
+FRONT_ENDS = ("orb", "opencv-orb", *LEARNED_FEATURES)
 
 
 def main() -> None:
     parser = parser_of(__doc__, readme=True)
     parser.add_argument("names", nargs="*", default=NAMES)
     parser.add_argument("--front-ends", nargs="*", default=list(FRONT_ENDS), choices=list(FRONT_ENDS))
-    parser.add_argument(
-        "--weights", type=Path, default=DATA_DIR.parent / "weights", help="folder of the weights"
-    )
+    add_weights(parser)
     add_engine(parser, "front_ends")
     arguments = parser.parse_args()
     settings = {
@@ -33,13 +40,10 @@ def main() -> None:
 
 def overrides(kind: str, folder: Path) -> list[str] | None:
     """The settings of a front end; None, with a message, if its weights are not in the folder."""
-    if not FRONT_ENDS[kind]:
+    if kind not in LEARNED_FEATURES:
         return [f"features.kind={kind}"]
-    weights = (folder / FRONT_ENDS[kind]).absolute()
-    if not weights.is_file():
-        print(f"{kind}: no {weights}, left out")
-        return None
-    return [f"features.kind={kind}", f'features.weights="{weights}"']
+    weights = weights_of(kind, folder)
+    return None if weights is None else [f"features.kind={kind}", f'features.weights="{weights}"']
 
 
 def cells(found: Columns) -> list[str]:

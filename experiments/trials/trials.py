@@ -9,7 +9,7 @@ from functools import partial
 
 import torch
 
-from experiments.common import DATA_DIR, place_of
+from experiments.common import DATA_DIR, DRONE_CAMERA, DRONE_TRUTH, place_of
 from experiments.trials import edits
 from experiments.trials.edited import Edited, Shot, shots, strangers
 from experiments.trials.faults import FAULTS, Fault
@@ -21,7 +21,6 @@ from torchslam.data.trajectories import nearest, read_trajectory
 from torchslam.geometry import rigid, se3_inverse, so3_exp
 
 POSED = ("redkitchen", "kitti07", "machine_hall", "shelf_bin", "fr2_desk_20")
-DRONE_CAMERA = "553,553,319.5,179.5"
 WAITING = 60  # frames before the camera goes
 TURN = math.radians(8.0)
 STARTS = {
@@ -84,7 +83,7 @@ def every_second(name: str, first: int) -> Edited:
 def drone() -> Edited:
     """A user's video with COLMAP's poses where available."""
     video = open_sequence(DATA_DIR / "drone.mp4", camera=DRONE_CAMERA)
-    truth = read_trajectory(DATA_DIR / "drone_colmap.txt")
+    truth = read_trajectory(DATA_DIR / DRONE_TRUTH)
     rows, distances = nearest(video.timestamps, truth.timestamps)
     parts = [
         Shot(video, index, None, se3_inverse(truth.T_wc[row]) if distance < 0.5 / video.frame_rate else None)

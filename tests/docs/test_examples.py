@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from pathlib import Path
 
 import cv2
 import pytest
 
-from examples import live_camera, own_loop, refine_and_export
+from examples import live_camera, own_loop, refine_and_export, train_weights
+from torchslam.cli.main import main as run
 from torchslam.data import read_trajectory
 from torchslam.map.file import read_map
 
@@ -46,6 +48,22 @@ def test_the_live_camera_example_runs(
     live_camera.main()
     assert " poses, " in capsys.readouterr().out
     assert Path("live.safetensors").exists()
+
+
+@pytest.mark.slow
+def test_training_without_truth_from_videos_to_a_run(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tensorboard")
+    given = ["video.mp4", "--held-back", "video.mp4", "--camera", CAMERA, "--without-truth", "--clips", "4"]
+    written = ["--tensorboard", "logs", "--output", "weights.safetensors"]
+    train_weights.main([*given, "--steps", "2", *written])
+    before, after = re.findall(r"held_back_loss ([\d.]+)", capsys.readouterr().out)
+    assert before != after
+    assert next(Path("logs").iterdir()).stat().st_size > 0
+    trained = ["--features", "examples.train_weights:Weighed", "--weights", "weights.safetensors"]
+    assert run(["run", "video.mp4", "--camera", CAMERA, "--limit", "25", *trained, "--output", "out"]) == 0
+    assert len(read_trajectory("out/trajectory.txt")) == 25
 
 
 @pytest.mark.slow

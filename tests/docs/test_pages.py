@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,14 @@ def results_of_the_first_tutorial() -> None:
     assert main(command) == 0
 
 
-BEFORE = {"colmap_splat.md": results_of_the_first_tutorial}
+def a_folder_of_videos() -> None:
+    pytest.importorskip("tensorboard")
+    Path("videos").mkdir()
+    for name in ("one", "two"):
+        shutil.copy("video.mp4", f"videos/{name}.mp4")
+
+
+BEFORE = {"colmap_splat.md": results_of_the_first_tutorial, "train.md": a_folder_of_videos}
 
 
 @pytest.mark.parametrize(

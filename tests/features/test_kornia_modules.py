@@ -45,8 +45,9 @@ def test_sift_by_name_finds_what_kornia_finds(sequence: Sequence) -> None:
     torch.testing.assert_close(found.angles[0, :count], angles)
 
 
-def test_a_run_with_an_object_of_kornia(sequence: Sequence) -> None:
-    run = SLAM(sequence.camera, extractor=KF.SIFTFeature(500)).run(sequence)
+def test_a_run_with_a_front_end_and_a_matcher_of_kornia(sequence: Sequence) -> None:
+    matcher = KF.DescriptorMatcher("mnn")
+    run = SLAM(sequence.camera, extractor=KF.SIFTFeature(500), matcher=matcher).run(sequence)
     assert len(run.trajectory) == len(sequence)
     assert sequence.groundtruth is not None
     assert evaluate(run.trajectory, sequence.groundtruth).ate_m < 0.05

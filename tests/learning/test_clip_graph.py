@@ -11,7 +11,9 @@ from torch import Tensor
 from tests.learning.test_clip_slam import CONFIG, FRAMES, BentEyes, clip_of, derivative
 from tests.walks import Walk, arc, still
 from torchslam import Camera, ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
+from torchslam.errors import ClipError
 from torchslam.evaluation import ate
+from torchslam.learning import clip_halves
 
 
 @pytest.fixture
@@ -223,3 +225,41 @@ def test_keypoints_that_jump_to_other_rows_are_refused_and_fixed_ones_read_again
     losses[1].backward()
     assert eyes.bend.grad is not None
     assert eyes.bend.grad.abs() > 0
+
+
+def test_halves_share_no_observation_and_their_difference_has_right_gradients(walk: Walk) -> None:
+    images, _ = clip_of(walk)
+    eyes = BentEyes(walk, bend=0.01)
+    clip_slam = ClipSLAM(eyes)
+    graph = clip_slam.build_graph(torch.stack([images, images]), walk.camera)
+    (whole, _), (even, _), (odd, _) = graph.runs, *(half.runs for half in graph.halves())
+    assert not set(even.point_index.tolist()) & set(odd.point_index.tolist())
+    assert len(even.pixels) + len(odd.pixels) == len(whole.pixels)
+
+    def loss(bend: float | Tensor) -> Tensor:
+        with torch.no_grad():
+            eyes.bend.copy_(torch.as_tensor(bend))
+        features = clip_slam.extract(torch.stack([images, images]), graph)
+        poses = [clip_slam.pose(half, features, walk.camera) for half in graph.halves()]
+        assert all(each.success.all() for each in poses)
+        return clip_halves(*poses).loss
+
+    found = loss(0.01)
+    found.backward()
+    assert float(found.detach()) > 0
+    assert eyes.bend.grad is not None
+    assert float(eyes.bend.grad) == pytest.approx(derivative(loss, 0.01, 1e-5), rel=1e-3)
+
+
+def test_a_clip_with_a_failed_half_counts_as_failed(walk: Walk) -> None:
+    images, _ = clip_of(walk)
+    clip_slam = ClipSLAM(BentEyes(walk, bend=0.01))
+    graph = clip_slam.build_graph(images, walk.camera)
+    even, _ = graph.halves()
+    nothing = replace(even, runs=(None,), reasons=("too few points",))
+    good, bad = (clip_slam.pose(half, clip_slam.extract(images)) for half in (even, nothing))
+    for pair in ((good, bad), (bad, good)):
+        loss, failure_rate = clip_halves(*pair, on_failure=7.0)
+        assert (float(loss.detach()), float(failure_rate)) == (7.0, 1.0)
+        with pytest.raises(ClipError, match="too few points"):
+            clip_halves(*pair)

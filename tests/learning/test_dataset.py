@@ -14,9 +14,9 @@ from torch.utils.data import DataLoader
 from tests.learning.test_clip_slam import FRAMES, BentEyes
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, turn
-from torchslam import Camera, ClipSLAM, Features
-from torchslam.data.sequence import Sequence
-from torchslam.errors import SequenceError
+from torchslam import ORB, Camera, ClipSLAM, Features, open_sequence
+from torchslam.data.sequence import Sequence, Transformed
+from torchslam.errors import ClipError, SequenceError
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import rigid, se3_inverse, so3_exp
 from torchslam.learning import dataset
@@ -25,6 +25,7 @@ from torchslam.learning.dataset import (
     Clip,
     Clips,
     GraphCache,
+    clips_with_a_map,
     collate,
     frames_in,
     parallax,
@@ -233,3 +234,28 @@ def test_clip_graphs_are_computed_once() -> None:
     again = looking(collate([Clip.of(walk, 0, FRAMES, 1, 5)]))
     assert again.runs[0] is graphs.runs[1]
     assert torch.equal(clip_slam(batch.images, batch.camera, graphs).posed, torch.ones(2, FRAMES).bool())
+
+
+class StillRoom(Transformed):
+    """One frame again and again."""
+
+    def image(self, index: int) -> Tensor:
+        return super().image(0)
+
+
+def test_clips_without_a_map_are_left_out_with_the_reason() -> None:
+    room = open_sequence("synthetic:room", resize_to="320x240", stride=3, limit=10)
+    clips = Clips([room], frames=5, per_sequence=1)
+    clips.sequences.append(StillRoom(room))
+    clips.chosen.append((1, 0, 1))
+
+    usable, left_out = clips_with_a_map(clips, GraphCache(ClipSLAM(ORB(400))))
+    assert list(usable.indices) == [0]
+    ((reason, count),) = left_out.items()
+    assert (count, "no map was initialized" in reason) == (1, True)
+
+    clips.chosen = clips.chosen[1:]
+    with pytest.raises(ClipError, match=r"none of 1 clips .* larger min_parallax.* no map was initialized"):
+        clips_with_a_map(clips, GraphCache(ClipSLAM(ORB(400))))
+    with pytest.raises(ClipError, match=r"no clips: .*supervised=False"):
+        clips_with_a_map(Clips([room.part(stop=1)]), GraphCache(ClipSLAM(ORB(400))))

@@ -5,10 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from examples.learn_camera import PARTS, LearnedCamera, SeenThrough, clips_with_a_map, learn
-from torchslam import ORB, Camera, ClipSLAM, Features, open_sequence
-from torchslam.errors import ClipError
-from torchslam.learning import Clips, GraphCache
+from examples.learn_camera import PARTS, LearnedCamera, learn
+from torchslam import Camera, open_sequence
+from torchslam.learning import Clips
 
 CAMERA = Camera.pinhole(260.0, 262.0, 159.5, 119.5, size=(320, 240))
 
@@ -34,20 +33,6 @@ def test_the_grid_moves_keypoints_near_its_nodes() -> None:
         )  # two pixels to the right and one up, at the top left
     at = torch.tensor([[[0.0, 0.0], [319.0, 239.0]]], dtype=torch.float64)
     torch.testing.assert_close(lens.straightened(at) - at, torch.tensor([[[2.0, -1.0], [0.0, 0.0]]]).double())
-
-
-def test_clips_without_a_map_are_named_with_the_reason(capsys: pytest.CaptureFixture[str]) -> None:
-    sequence = open_sequence("synthetic:room", resize_to="320x240", stride=3, limit=12)
-    clips = Clips([sequence], frames=5, per_sequence=1, min_parallax=0.0)
-
-    class Blind(torch.nn.Module):
-        def forward(self, images: torch.Tensor) -> Features:
-            return ORB(20)(images)
-
-    blind = SeenThrough(Blind(), LearnedCamera(sequence.camera))
-    with pytest.raises(ClipError, match=r"none of 1 clips .* larger min_parallax"):
-        clips_with_a_map(clips, GraphCache(ClipSLAM(blind)))
-    assert "1 of 1 clips are left out: no map was initialized" in capsys.readouterr().out
 
 
 def test_a_wrong_focal_length_moves_towards_the_true_one() -> None:

@@ -100,7 +100,8 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--features",
         metavar="NAME",
-        help=f"feature extractor (features.kind): {', '.join(CHOICES['features.kind'])}, a plugin, or PACKAGE:NAME",
+        help=f"feature extractor (features.kind): {', '.join(CHOICES['features.kind'])}, kornia:NAME, "
+        "a plugin, or PACKAGE:NAME",
     )
     parser.add_argument(
         "--weights",
@@ -110,7 +111,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--matcher",
         metavar="NAME",
-        help="matcher (matching.matcher): descriptors, lightglue, a plugin, or PACKAGE:NAME",
+        help="matcher (matching.matcher): descriptors, lightglue, kornia:NAME, a plugin, or PACKAGE:NAME",
     )
     parser.add_argument(
         "--camera-std",

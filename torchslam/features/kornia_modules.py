@@ -22,7 +22,7 @@ PACKAGE = "kornia"
 _PRETRAINED = "from_pretrained"
 _DIVISOR = 16
 """Images are padded to a multiple of it, which the networks need."""
-_BLOB_RADIUS = 6.0 * 1.6
+BLOB_RADIUS = 6.0 * 1.6
 """Radius of a region, pixels, at the finest level of kornia's detectors: 6 (`mr_size`) times a sigma of 1.6 pixels."""
 _SCALE = 1.0
 """Scale of keypoints without regions, pixels."""
@@ -125,7 +125,7 @@ class KorniaFeatures(nn.Module):
         return {
             "keypoints": get_laf_center(lafs)[0],
             "scores": scores[0, is_there],
-            "scales": (get_laf_scale(lafs)[0, :, 0, 0] / _BLOB_RADIUS).clamp_min(1.0),
+            "scales": (get_laf_scale(lafs)[0, :, 0, 0] / BLOB_RADIUS).clamp_min(1.0),
             "angles": get_laf_orientation(lafs)[0, :, 0].deg2rad(),
             "descriptors": descriptors[0, is_there],
         }

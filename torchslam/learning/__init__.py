@@ -1,7 +1,24 @@
 """Train through SLAM: clips of sequences, differentiable poses of clips, losses, and resumable training."""
 
-from torchslam.learning.clip_slam import ClipGraph, ClipLoss, ClipPoses, ClipSLAM, clip_loss, clip_mean
-from torchslam.learning.dataset import Batches, Clip, Clips, GraphCache, collate, frames_in, parallax
+from torchslam.learning.clip_slam import (
+    ClipGraph,
+    ClipLoss,
+    ClipPoses,
+    ClipSLAM,
+    clip_halves,
+    clip_loss,
+    clip_mean,
+)
+from torchslam.learning.dataset import (
+    Batches,
+    Clip,
+    Clips,
+    GraphCache,
+    clips_with_a_map,
+    collate,
+    frames_in,
+    parallax,
+)
 from torchslam.learning.losses import (
     clip_reprojection,
     epipolar_loss,
@@ -25,9 +42,11 @@ __all__ = [
     "GraphCache",
     "Log",
     "Training",
+    "clip_halves",
     "clip_loss",
     "clip_mean",
     "clip_reprojection",
+    "clips_with_a_map",
     "collate",
     "epipolar_loss",
     "frames_in",

@@ -75,6 +75,14 @@ class ClipGraph:
         columns = {name: every(name) for name in ("runs", "cameras", "reasons", "keypoints", "masks")}
         return ClipGraph(frames=graphs[0].frames, batched=True, **columns)
 
+    def halves(self) -> tuple[ClipGraph, ClipGraph]:
+        """The same clips with every other point: two problems that share no observation, for `clip_halves`."""
+        even, odd = (
+            replace(self, runs=tuple(None if run is None else _every_other(run, first) for run in self.runs))
+            for first in (0, 1)
+        )
+        return even, odd
+
 
 @dataclass(frozen=True)
 class ClipPoses:
@@ -153,6 +161,37 @@ def clip_mean(poses: ClipPoses, errors: Float[Tensor, "*batch"], on_failure: OnF
     errors = torch.where(poses.success, errors, cost)
     counted = torch.ones_like(poses.success) if not isinstance(on_failure, str) else poses.success
     return ClipLoss(errors.sum() / counted.sum(), poses.failure_rate)
+
+
+def clip_halves(
+    even: ClipPoses,
+    odd: ClipPoses,
+    error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
+    on_failure: OnFailure = "raise",
+) -> ClipLoss:
+    """Average an error between poses from two halves of the points over the clips; needs no ground truth.
+
+        graph = clip_slam.build_graph(images, camera)
+        features = clip_slam.extract(images, graph)
+        even, odd = (clip_slam.pose(half, features, camera) for half in graph.halves())
+        loss, failure_rate = clip_halves(even, odd, on_failure=0.1)
+
+    Errors of keypoints are different ones in the two halves, so the loss falls with what they do to the poses. What
+    both halves have in common, such as a wrong camera, does not count.
+
+    Args:
+        even: Of a clip, or of B clips, from the first of `ClipGraph.halves`.
+        odd: From the second.
+        error: As for `clip_loss`; lengths are in the unit of the clips, the median depth of their first maps.
+        on_failure: See `clip_mean`; a clip fails if one of its halves does.
+
+    Raises:
+        ClipError: As `clip_mean`.
+    """
+    posed = even.posed & odd.posed
+    reasons = tuple(one or other for one, other in zip(even.reasons, odd.reasons, strict=True))
+    both = replace(even, posed=posed, success=even.success & odd.success, reasons=reasons)
+    return clip_mean(both, error(even.T_cw, odd.T_cw, posed), on_failure)
 
 
 class ClipSLAM(nn.Module):
@@ -394,7 +433,16 @@ def _posed(
 
 def _still_seen(graph: RunGraph, mask: Bool[Tensor, "T N"]) -> RunGraph:
     """The graph without the observations of keypoints that the mask excludes."""
-    kept = mask[graph.frame_ids[graph.frame_index], graph.keypoint_index]
+    return _with_observations(graph, mask[graph.frame_ids[graph.frame_index], graph.keypoint_index])
+
+
+def _every_other(graph: RunGraph, first: int) -> RunGraph:
+    """The graph with every other point, from the first or the second on."""
+    return _with_observations(graph, graph.point_index % 2 == first)
+
+
+def _with_observations(graph: RunGraph, kept: Bool[Tensor, " O"]) -> RunGraph:
+    """The graph with some of its observations."""
     columns = ("frame_index", "point_index", "pixels", "weights", "keypoint_index")
     return replace(graph, **{name: getattr(graph, name)[kept] for name in columns})
 

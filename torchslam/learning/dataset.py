@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Several
 from dataclasses import dataclass, replace
@@ -11,10 +12,10 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
-from torch.utils.data import Dataset, Sampler
+from torch.utils.data import Dataset, Sampler, Subset
 
 from torchslam.data.sequence import Sequence
-from torchslam.errors import SequenceError
+from torchslam.errors import ClipError, SequenceError
 from torchslam.features import ORB, match
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse
 from torchslam.learning.clip_slam import ClipGraph, ClipSLAM
@@ -264,6 +265,34 @@ class GraphCache:
             if number not in self._graphs:
                 self._graphs[number] = self._clip_slam.build_graph(clips.images[row], clips.camera[row])
         return ClipGraph.stack([self._graphs[number] for number in numbers])
+
+
+def clips_with_a_map(clips: Clips, graphs: GraphCache) -> tuple[Subset[Clip], Counter[str]]:
+    """Select the clips whose start finds a map; the graphs of all of them are built.
+
+    Returns:
+        These clips, and how many of the others have no map for which reason.
+
+    Raises:
+        ClipError: There is none.
+    """
+    reasons: list[str] = []
+    for number in range(len(clips)):
+        reasons += graphs(collate([clips[number]])).reasons
+    usable = [number for number, reason in enumerate(reasons) if not reason]
+    left_out = Counter(reason for reason in reasons if reason)
+    if not clips.chosen:
+        raise ClipError(
+            "no clips: the sequences are too short, their camera moves too little (min_parallax), or they have no true "
+            "poses (supervised=False needs none)"
+        )
+    if not usable:
+        why = "; ".join(f"{count} of them: {reason}" for reason, count in left_out.most_common())
+        raise ClipError(
+            f"none of {len(clips)} clips finds a map: take longer clips, a larger min_parallax, or a better camera; "
+            f"{why}"
+        )
+    return Subset(clips, usable), left_out
 
 
 @torch.no_grad()

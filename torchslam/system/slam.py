@@ -52,7 +52,7 @@ class SLAM:
             `features.max_image_pixels` reduces them, and are scaled for larger ones.
         extractor: The front end, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
             bring their own features, as those of `front_end.Simulated`, are not passed to it.
-        matcher: The matcher of two views, see `types.Matcher`; the configured one if None.
+        matcher: The matcher of two views, see `types.Matcher`, or one of kornia; the configured one if None.
     """
 
     def __init__(

@@ -12,8 +12,9 @@ from torch import Tensor
 from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
 from torchslam.features import match, match_by_projection
+from torchslam.features.kornia_modules import is_kornia_module
 from torchslam.features.weights import MATCHER_OF
-from torchslam.plugins import MATCHERS, load
+from torchslam.plugins import MATCHERS, instantiate, load
 from torchslam.tracking.epipolar import match_free
 from torchslam.types import Frame, FrameFeatures, Matcher, Matches, MatchIndices, MatchPrior
 
@@ -74,16 +75,35 @@ def make_matcher(
 ) -> Matcher:
     """The given matcher, or else the configured one for images of a size (width, height) and a kind of features.
 
+    One of kornia's gets torchslam's interface.
+
     Raises:
-        ConfigError: if the name of the configured one is unknown.
+        ConfigError: if the name of the configured one is unknown, or kornia's takes no descriptors.
     """
     if matcher is None and settings.matcher == "lightglue":
         from torchslam.tracking.lightglue import LightGlue
 
         return LightGlue(settings.weights or MATCHER_OF.get(features, "xfeat-lighterglue"), image_size)
     if matcher is None and settings.matcher != "descriptors":
-        return load(MATCHERS, settings.matcher, weights=settings.weights or None)
+        return _load(settings.matcher, features, settings.weights or None)
+    if is_kornia_module(matcher):
+        from torchslam.tracking.kornia_matchers import KorniaMatcher
+
+        return KorniaMatcher(matcher)  # type: ignore[arg-type]
     return DescriptorMatcher(settings) if matcher is None else matcher
+
+
+def _load(name: str, features: str, weights: str | None) -> Matcher:
+    """The matcher of a name: one of kornia's (`kornia:LightGlueMatcher`), or a plugin."""
+
+    def make(kind: type, weights: str | None) -> Matcher:
+        if is_kornia_module(kind):
+            from torchslam.tracking.kornia_matchers import make_kornia_matcher
+
+            return make_kornia_matcher(kind, features, weights)
+        return instantiate(kind, weights=weights)
+
+    return load(MATCHERS, name, make, weights=weights)
 
 
 def prepare_view(view: FrameFeatures, frame: Frame, matcher: Matcher) -> FrameFeatures:
@@ -147,6 +167,13 @@ def check_matches(found: Any, view_1: FrameFeatures, view_2: FrameFeatures, matc
             refuse(f"weights must be positive floats {shape}")
 
 
+def best_of_each(rows: Int[Tensor, " M"], distances: Float[Tensor, " M"], count: int) -> Bool[Tensor, " M"]:
+    """Which matches are the nearest of those with the same row, of `count` rows; the first one of equal ones."""
+    rank = torch.argsort(torch.argsort(distances, stable=True))
+    first = torch.full((count,), len(rows), dtype=torch.int64, device=rows.device)
+    return first.scatter_reduce(0, rows, rank, "amin")[rows] == rank
+
+
 def nearest_keypoints(
     pixels: Float[Tensor, "N 2"], rows: Int[Tensor, " N"], view: FrameFeatures, radius_px: float = 1.5
 ) -> Matches:
@@ -162,11 +189,7 @@ def nearest_keypoints(
     """
     distances = torch.cdist(pixels.to(view.keypoints), view.keypoints).masked_fill(~view.mask, torch.inf)
     nearest, column = distances.min(1)
-    order = torch.argsort(nearest, stable=True)
-    first = torch.full((len(view.mask),), len(rows), dtype=torch.int64, device=rows.device)
-    rank = torch.argsort(order)
-    first = first.scatter_reduce(0, column, rank, "amin")
-    mask = (nearest <= radius_px) & (first[column] == rank)
+    mask = (nearest <= radius_px) & best_of_each(column, nearest, len(view.mask))
     return Matches(
         torch.where(mask, rows, 0)[None],
         torch.where(mask, column, 0)[None],

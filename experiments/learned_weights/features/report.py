@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from experiments.common import table
+from experiments.common import interval_of, table
 from experiments.learned_weights.features.evaluation import PairErrors
 
 BLOCK = 5  # neighboring pairs that are drawn together: they see much of the same
@@ -109,5 +109,4 @@ def bootstrap(logs: list[Tensor], block: int) -> tuple[float, float]:
         sizes = torch.tensor([len(run) for run in runs], dtype=torch.float64)
         drawn = torch.randint(len(runs), (DRAWS, len(runs)), generator=generator)
         totals, counts = totals + sums[drawn].sum(-1), counts + sizes[drawn].sum(-1)
-    low, high = (totals / counts).exp().quantile(totals.new_tensor([0.025, 0.975])).tolist()
-    return low, high
+    return interval_of((totals / counts).exp())

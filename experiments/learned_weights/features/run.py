@@ -12,7 +12,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from experiments.common import parser_of, sequences, write_between
+from experiments.common import CONTROL, LEARNED_FEATURES, WEIGHTS_DIR, parser_of, part_of, publish, sequences
 from experiments.learned_weights.features.evaluation import (
     APART_S,
     FRAMES,
@@ -31,8 +31,7 @@ from torchslam import ORB, ClipSLAM, XFeat
 from torchslam.data.sequence import Sequence
 from torchslam.learning.dataset import frames_in
 
-HERE = Path(__file__).parent
-WEIGHTS = Path(__file__).parents[3] / "shared" / "weights" / "xfeat.safetensors"
+WEIGHTS = WEIGHTS_DIR / LEARNED_FEATURES["xfeat"]
 # Shares of the frames of a sequence.
 TRAINING = ("machine_hall", (0.0, 0.6))
 UNSEEN = {
@@ -42,7 +41,6 @@ UNSEEN = {
     "shelf_bin": (0.0, 1.0),
     "kitti07": (0.0, 1.0),
 }
-CONTROL = {"synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3": (0.0, 1.0)}  # with exact poses
 KEYPOINTS = 600
 BEFORE, AFTER = "XFeat", "XFeat, trained"
 
@@ -61,10 +59,6 @@ class Part:
         last_pair = frames.stop - frames_in(APART_S, sequence) - 1
         last_clip = frames.stop - FRAMES * frames_in(STEP_S, sequence)
         return cls(sequence, spread(pairs, frames.start, last_pair), spread(clips, frames.start, last_clip))
-
-
-def part_of(sequence: Sequence, share: tuple[float, float]) -> range:
-    return range(*(round(end * len(sequence)) for end in share))
 
 
 def spread(count: int, first: int, last: int) -> list[int]:
@@ -118,12 +112,10 @@ def main() -> None:
         train(trained, Tracks.of(xfeat, sequence, part_of(sequence, share), device), settings)
     candidates = {BEFORE: xfeat, AFTER: trained, "ORB": ORB(KEYPOINTS)}
     text = ""
-    for title, parts in (("", UNSEEN), ("\nIn a rendered room, poses exact:\n\n", CONTROL)):
+    for title, parts in (("", UNSEEN), ("\nIn a rendered room, poses exact:\n\n", {CONTROL: (0.0, 1.0)})):
         results = measure(candidates, parts_of(parts, arguments.pairs, arguments.clips), device)
         text += title + medians(results) + "\n" + ratios(results[BEFORE], results[AFTER])
-    print(text)
-    if not arguments.no_readme:
-        write_between(HERE / "README.md", text)
+    publish(text, arguments, __file__)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from experiments.common import table
+from experiments.common import interval_of, table
 from experiments.learned_weights.matches.evaluation import pose_errors, relative_errors
 from experiments.learned_weights.matches.problems import Problems
 
@@ -65,7 +65,7 @@ def _interval(parts: list[PartResult], seed: int = 0) -> tuple[float, float]:
             take = torch.cat([rows[block] for block in chosen])
             drawn.append({label: values[:, take] for label, values in relative.items()})
         means.append(_log_gains(drawn).mean())
-    low, high = torch.stack(means).quantile(torch.tensor([0.025, 0.975], dtype=torch.float64)).tolist()
+    low, high = interval_of(torch.stack(means))
     return math.expm1(low), math.expm1(high)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import torch
 
-from experiments.common import parser_of, sequences, write_between
+from experiments.common import CONTROL, parser_of, part_of, publish, sequences
 from experiments.learned_weights.matches.evaluation import (
     Learned,
     Method,
@@ -27,8 +27,7 @@ from experiments.learned_weights.matches.training import Settings, train
 from experiments.learned_weights.matches.weighting import MatchWeights
 
 RENDERED = "synthetic:"
-HERE = Path(__file__).parent
-CACHE = HERE / "results"
+CACHE = Path(__file__).parent / "results"
 # Sequences and the range of their frames, as fractions.
 TRAINING = {
     "redkitchen": (0.0, 0.5),
@@ -44,20 +43,18 @@ UNSEEN = {
     "shelf_bin": (0.0, 1.0),
     "fr2_desk_20": (0.0, 1.0),
 }
-# Rendered with other textures, noise and exposure than the training sequences; its poses are exact.
-CONTROL = {"synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3": (0.0, 1.0)}
 SEEDS = (0, 1, 2)
 
 
 def problems_of(parts: dict[str, tuple[float, float]]) -> dict[str, Problems]:
     """The problems of parts of sequences, read from the cache where they exist."""
     found = {}
-    for name, (first, last) in parts.items():
+    for name, share in parts.items():
+        first, last = share
         path = CACHE / f"{re.sub(r'[^a-z0-9_]', '_', name)}_{first:g}_{last:g}.pt"
         if not path.exists():
             for sequence in sequences([name]):
-                part = range(round(first * len(sequence)), round(last * len(sequence)))
-                make_problems(sequence, part, reference_poses(sequence, CACHE)).save(path)
+                make_problems(sequence, part_of(sequence, share), reference_poses(sequence, CACHE)).save(path)
         if path.exists():
             found[name] = Problems.load(path)
             print(f"{name} from {first:.0%} to {last:.0%}: {len(found[name])} problems", flush=True)
@@ -102,10 +99,8 @@ def main() -> None:
     for seed in SEEDS:
         networks.append(MatchWeights(seed=seed))
         train(networks[-1], list(training.values()), replace(Settings(), steps=arguments.steps, seed=seed))
-    text = evaluate(networks, training, problems_of(UNSEEN), problems_of(CONTROL))
-    print(text)
-    if not arguments.no_readme:
-        write_between(HERE / "README.md", text)
+    text = evaluate(networks, training, problems_of(UNSEEN), problems_of({CONTROL: (0.0, 1.0)}))
+    publish(text, arguments, __file__)
 
 
 if __name__ == "__main__":

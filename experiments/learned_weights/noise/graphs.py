@@ -8,7 +8,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.common import DATA_DIR
+from experiments.common import place_of
 from experiments.learned_weights.noise.cues import Cues, describe
 from experiments.trials.trials import drone
 from torchslam import ORB, SLAM, Config, Features, open_sequence
@@ -28,8 +28,7 @@ def opened(name: str) -> Sequence:
     """A sequence of the experiment. Raises SequenceError if it is not available."""
     if name == "drone":
         return drone()
-    place = name if name.startswith("synthetic:") else DATA_DIR / name
-    return open_sequence(place, camera=KITTI_CAMERA if name == "kitti07" else None)
+    return open_sequence(place_of(name), camera=KITTI_CAMERA if name == "kitti07" else None)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from experiments.common import DATA_DIR, parser_of, write_between
+from experiments.common import DATA_DIR, parser_of, publish
 from experiments.learned_weights.noise.graphs import Example, example_of, opened
 from experiments.learned_weights.noise.model import NoiseModel, constant, load, save
 from experiments.learned_weights.noise.report import (
@@ -26,7 +26,6 @@ from experiments.learned_weights.noise.training import Settings, at_level, fit_l
 from torchslam import load_config
 from torchslam.geometry.gating import GATE_FACTOR
 
-HERE = Path(__file__).parent
 SEQUENCES = ("fr2_desk_20", "shelf_bin", "kitti07", "machine_hall", "drone", "redkitchen")
 SEEDS = (0, 1, 2)
 KINDS = {LIKELIHOOD: "directed", SHAPE: "isotropic"}
@@ -94,9 +93,7 @@ def main() -> None:
         }
         for name in SEQUENCES
     }
-    print(text := run_table(runs), flush=True)
-    if not arguments.no_readme:
-        write_between(HERE / "README.md", text)
+    publish(run_table(runs), arguments, __file__)
 
 
 if __name__ == "__main__":

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 
 import torch
 
 from examples.learn_camera import LearnedCamera, SeenThrough, describe, learn
-from experiments.common import parser_of, place_of, table, write_between
+from experiments.common import parser_of, place_of, publish, table
 from torchslam import ORB, SLAM, Camera, evaluate, load_config, open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.learning import Clips
 
-HERE = Path(__file__).parent
 OFF = 1.05  # how wrong the focal lengths at the start are
 STEPS = 40
 SEEDS = (0, 1, 2)
@@ -76,9 +74,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     text = table(HEADER, [row for name in arguments.recordings for row in rows_of(name)])
-    print(text)
-    if not arguments.no_readme:
-        write_between(HERE / "README.md", text)
+    publish(text, arguments, __file__)
 
 
 if __name__ == "__main__":
