@@ -13,7 +13,7 @@ from torchslam.cli.main import main
 
 DOCS = Path(__file__).parents[2] / "docs"
 RUN_HERE = sorted(page for page in DOCS.rglob("*.md") if any(blocks(page)))
-SLOW = {"own_video.md", "colmap_splat.md", "train.md"}  # several runs, a refinement, a training
+SLOW = {"own_video.md", "own_front_end.md", "colmap_splat.md", "train.md"}  # several runs, a training
 
 
 def results_of_the_first_tutorial() -> None:

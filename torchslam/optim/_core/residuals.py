@@ -297,7 +297,8 @@ def _projection_curvature(
             params = camera.params.detach()[..., None, :].expand(*points.shape[:-1], -1)
             variables.append(params.clone().requires_grad_())
             camera, points = camera.with_params(variables[1]), points[..., None, :]
-        J = _project(camera, points, free_camera)[2].reshape(*points_c.shape[:-1], 2, -1)
+        J = _project(camera, points, free_camera)[2]
+        J = J.reshape(*points_c.shape[:-1], *J.shape[-2:])
         gradient = (J.mT @ gradient_wrt_residual).squeeze(-1)
         entries = torch.eye(gradient.shape[-1], dtype=J.dtype, device=J.device)
         entries = entries.expand(*gradient.shape, -1).movedim(-1, 0)
