@@ -65,7 +65,7 @@ def simulated(seed: int, slope: float = 0.0, sigma: float = 0.3) -> Example:
         torch.ones(FRAMES, dtype=torch.bool),
     )
     directions = torch.eye(2, dtype=torch.float64).repeat(len(frame_index), 1, 1)
-    return Example(graph, values, directions, T_cw.clone(), torch.ones(FRAMES, dtype=torch.bool))
+    return Example(graph, values, directions, T_cw.clone(), torch.ones(FRAMES, dtype=torch.bool), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +122,7 @@ def test_the_likelihood_is_highest_at_the_true_noise() -> None:
         torch.zeros(20000, len(NAMES)).double(),
         torch.eye(2).double().expand(20000, 2, 2),
         errors[:, 0] * 0 + 1,
+        torch.zeros(20000, dtype=torch.int64),
     )
     with torch.no_grad():
         low, right, high = (float(negative_log_likelihood(constant(s**-2), found)) for s in (0.2, 0.25, 0.31))

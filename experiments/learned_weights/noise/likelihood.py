@@ -1,0 +1,200 @@
+"""Whether what a keypoint shows predicts its residual better than one number per recording does. See README.md.
+
+python -m experiments.learned_weights.noise.likelihood
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from copy import deepcopy
+from dataclasses import dataclass, replace
+from pathlib import Path
+from statistics import fmean
+
+import torch
+from torch import Tensor
+
+from experiments.common import interval_of, parser_of, table, write_between
+from experiments.learned_weights.noise.consistency import nees
+from experiments.learned_weights.noise.cues import NAMES
+from experiments.learned_weights.noise.graphs import LEAST_KNOWN, Example
+from experiments.learned_weights.noise.model import NoiseModel, constant
+from experiments.learned_weights.noise.report import geometric_mean
+from experiments.learned_weights.noise.run import SEEDS, SEQUENCES, Experiment
+from experiments.learned_weights.noise.training import (
+    BEND,
+    Residuals,
+    Settings,
+    fit_residuals,
+    losses,
+    residuals,
+    solved,
+    weighed,
+)
+from torchslam.geometry.gating import GATE_FACTOR
+from torchslam.geometry.robust import robustify
+
+ROW = len(NAMES)
+"""Column of the row of the image, after those of the cues."""
+FOUR = (*map(NAMES.index, ("level", "contrast", "sharpness")), ROW)
+"""Scale, contrast, blur and row: sharpness is low where an image is blurred."""
+ELEVEN = tuple(range(ROW + 1))
+RECORDINGS = (*SEQUENCES, "office_loop")
+ITERATIONS = 50
+DRAWS = 2000
+LOG_NORMALIZER = math.log(2 * math.pi * (1 + math.exp(-(BEND**2) / 2) / BEND**2))
+"""Of the density exp(-rho / 2) over the plane, with Huber's rho."""
+NUMBER, ITSELF = "one number", "4, its other half"
+LEARNED = {"4 cues": FOUR, "11 cues": ELEVEN}
+STATED = ("scale", "half scale", "`noise_variance`")
+
+
+@dataclass(frozen=True)
+class Recording:
+    """example: a run at the minimum of its graph by scales; found: its residuals. Cues are differences from their mean
+    over the recording; the row of the image comes last."""
+
+    example: Example
+    found: Residuals
+
+    @classmethod
+    def of(cls, example: Example) -> Recording:
+        """Of the keyframes of a run."""
+        rows = example.graph.pixels[:, 1:] / example.graph.camera.height
+        values = torch.cat((example.values, rows), dim=-1)
+        example = solved(replace(example, values=values - values.mean(0)))
+        return cls(example, residuals(example, example))
+
+    def seeing(self, cues: Sequence[int]) -> Recording:
+        """With some of the cues."""
+        example, found = (
+            replace(part, values=part.values[:, list(cues)]) for part in (self.example, self.found)
+        )
+        return Recording(example, found)
+
+
+@torch.no_grad()
+def variance_of(model: NoiseModel, found: Residuals) -> Tensor:
+    """The most likely variance of residuals in x and in y, in units of what an isotropic model states."""
+    squared = model.log_factor(found.values).exp() * found.errors.square().sum(-1)
+    variance = squared.mean() / 2
+    for _ in range(ITERATIONS):
+        whitened = squared / variance
+        weight = robustify(whitened, "huber", squared.new_tensor(BEND)).weight
+        variance = variance * (weight * whitened).mean() / 2
+    return variance
+
+
+@torch.no_grad()
+def at_number(model: NoiseModel, found: Residuals) -> NoiseModel:
+    """The model times the number that the residuals of a recording give, without any truth."""
+    moved = deepcopy(model)
+    moved.level -= variance_of(model, found).log()
+    return moved
+
+
+@torch.no_grad()
+def log_likelihoods(model: NoiseModel, found: Residuals) -> Tensor:
+    """(n,) nats of each error in scales, by the density whose logarithm is the kernel of `solve_graph`."""
+    return -losses(model, found) - LOG_NORMALIZER
+
+
+def fitted(recordings: Sequence[Residuals], seed: int) -> NoiseModel:
+    """The function under which residuals are most likely once those of each recording are divided by its number."""
+    settings, parts = Settings(seed=seed), []
+    for each in recordings:
+        deviation = variance_of(constant(1.0), each).sqrt()
+        parts.append(replace(each, errors=each.errors / deviation).drawn(settings.observations, seed))
+    found = Residuals.cat(parts)
+    model = NoiseModel("isotropic", seed, found.values.shape[-1])
+    model.standardize(found.values)
+    fit_residuals(model, found, settings)
+    return model
+
+
+def models_of(test: str, recordings: dict[str, Recording], seed: int) -> dict[str, NoiseModel]:
+    """Each noise of a recording, to which the learned ones have not been fitted."""
+    found, variance = recordings[test].found, recordings[test].example.noise_variance
+    stated = (1.0, GATE_FACTOR**2, GATE_FACTOR**2 / variance)
+    models = {name: constant(level) for name, level in zip(STATED, stated, strict=True)}
+    models[NUMBER] = at_number(constant(1.0), found)
+    for rule, cues in LEARNED.items():
+        model = fitted([each.seeing(cues).found for name, each in recordings.items() if name != test], seed)
+        models[rule] = at_number(model, recordings[test].seeing(cues).found)
+    return models
+
+
+def gains_of(recording: Recording, models: dict[str, NoiseModel], seed: int) -> dict[str, Tensor]:
+    """(n,) by how much each noise makes each error more likely than the recording's number does, in nats."""
+    logs = {
+        rule: log_likelihoods(model, recording.seeing(LEARNED.get(rule, FOUR)).found)
+        for rule, model in models.items()
+    }
+    found, itself = recording.seeing(FOUR).found, torch.empty_like(logs[NUMBER])
+    second_half = found.frames >= len(recording.example.known) // 2
+    for rows in (second_half, ~second_half):
+        model = fitted([found.at(~rows)], seed)
+        itself[rows] = log_likelihoods(at_number(model, found), found.at(rows))
+    logs[ITSELF] = itself
+    return {rule: log - logs[NUMBER] for rule, log in logs.items()}
+
+
+def interval(gains: Tensor, frames: Tensor) -> tuple[float, float]:
+    """95 % interval of the mean of gains (n,), by drawing the keyframes (n,) that they are in."""
+    sums = gains.new_zeros(int(frames.max()) + 1, 2)
+    sums.index_add_(0, frames, torch.stack((gains, torch.ones_like(gains)), dim=-1))
+    sums = sums[sums[:, 1] > 0]
+    rows = torch.randint(len(sums), (DRAWS, len(sums)), generator=torch.Generator().manual_seed(0))
+    total, count = sums[rows].sum(1).unbind(-1)
+    return interval_of(total / count)
+
+
+def tables(recordings: dict[str, Recording], seeds: Sequence[int]) -> str:
+    """How likely errors are, and NEES, by each noise."""
+    likely, errors, means = [], [], {}
+    for name, recording in recordings.items():
+        models = [models_of(name, recordings, seed) for seed in seeds]
+        drawn = [gains_of(recording, each, seed) for each, seed in zip(models, seeds, strict=True)]
+        gains = {rule: torch.stack([each[rule] for each in drawn]).mean(0) for rule in drawn[0]}
+        frames, level = recording.found.frames, models[0][NUMBER].level
+        cells = {rule: f"{math.exp(gain.mean()):.3f}" for rule, gain in gains.items()}
+        for rule in (*LEARNED, ITSELF):
+            low, high = (math.exp(end) for end in interval(gains[rule], frames))
+            cells[rule] += f" ({low:.3f} to {high:.3f})"
+        for rule, gain in gains.items():
+            means.setdefault(rule, []).append(float(gain.mean()))
+        known = f"{math.exp(-level / 2):.2f}", f"{recording.example.noise_variance:.2f}"
+        likely.append([name, f"{len(frames)}", *known, *(cells[rule] for rule in cells if rule != NUMBER)])
+        if int(recording.example.known.sum()) >= LEAST_KNOWN:
+            found = {rule: fmean(nees_of(recording, each[rule], rule) for each in models) for rule in models[0]}
+            errors.append([name, f"{len(recording.example.known)}", *(f"{each:.1f}" for each in found.values())])
+        print(likely[-1], errors[-1:], flush=True)
+    rules = [rule for rule in means if rule != NUMBER]
+    likely.append(["**all**", "", "", "", *(geometric_mean(means[rule]) for rule in rules)])
+    header = ["recording", "observations", "its number", "of the run", *rules]
+    return f"{table(header, likely)}\n{table(['recording', 'keyframes', *models[0]], errors)}"
+
+
+def nees_of(recording: Recording, model: NoiseModel, rule: str) -> float:
+    """NEES of the keyframes after their graph is solved with a noise."""
+    with torch.no_grad():
+        example = solved(weighed(recording.seeing(LEARNED.get(rule, FOUR)).example, model))
+        return nees(example.graph, example.T_cw, example.known, BEND)
+
+
+def main() -> None:
+    parser = parser_of(__doc__, readme=True)
+    parser.add_argument("--output", type=Path, default=Path("results") / "noise_model", metavar="DIR")
+    parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
+    arguments = parser.parse_args()
+    torch.set_num_threads(1)
+    experiment = Experiment(arguments.output)
+    text = tables({name: Recording.of(experiment.example(name)) for name in RECORDINGS}, arguments.seeds)
+    print(text, flush=True)
+    if not arguments.no_readme:
+        write_between(Path(__file__).parent / "README.md", text, "<!-- likelihood -->\n")
+
+
+if __name__ == "__main__":
+    main()
