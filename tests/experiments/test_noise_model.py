@@ -223,7 +223,7 @@ def test_intervals_are_those_of_students_t() -> None:
 
 def test_runs_are_compared_by_the_seeds_that_both_posed() -> None:
     def outcome(ate_m: float, posed: int) -> Outcome:
-        return Outcome(ate_m, posed, 100)
+        return Outcome(ate_m, posed, 100, 0)
 
     hand = {0: outcome(0.1, 100), 1: outcome(0.2, 100)}
     lost, half = outcome(0.001, 30), outcome(0.1, 100)

@@ -45,9 +45,10 @@ ITERATIONS = 50
 DRAWS = 2000
 LOG_NORMALIZER = math.log(2 * math.pi * (1 + math.exp(-(BEND**2) / 2) / BEND**2))
 """Of the density exp(-rho / 2) over the plane, with Huber's rho."""
-NUMBER, ITSELF = "one number", "4, its other half"
+STATED = ("scale", "half scale", "half, by the run")
+NUMBER, ITSELF, HALVES = "one number", "4, fitted to itself", "4, to its other half"
 LEARNED = {"4 cues": FOUR, "11 cues": ELEVEN}
-STATED = ("scale", "half scale", "`noise_variance`")
+"""Fitted to the other recordings. In the tables a noise that is fitted is always times the recording's number."""
 
 
 @dataclass(frozen=True)
@@ -68,10 +69,9 @@ class Recording:
 
     def seeing(self, cues: Sequence[int]) -> Recording:
         """With some of the cues."""
-        example, found = (
-            replace(part, values=part.values[:, list(cues)]) for part in (self.example, self.found)
-        )
-        return Recording(example, found)
+        cues = list(cues)
+        example = replace(self.example, values=self.example.values[:, cues])
+        return Recording(example, replace(self.found, values=self.found.values[:, cues]))
 
 
 @torch.no_grad()
@@ -90,7 +90,7 @@ def variance_of(model: NoiseModel, found: Residuals) -> Tensor:
 def at_number(model: NoiseModel, found: Residuals) -> NoiseModel:
     """The model times the number that the residuals of a recording give, without any truth."""
     moved = deepcopy(model)
-    moved.level -= variance_of(model, found).log()
+    moved.level.sub_(variance_of(model, found).log())
     return moved
 
 
@@ -114,30 +114,33 @@ def fitted(recordings: Sequence[Residuals], seed: int) -> NoiseModel:
 
 
 def models_of(test: str, recordings: dict[str, Recording], seed: int) -> dict[str, NoiseModel]:
-    """Each noise of a recording, to which the learned ones have not been fitted."""
+    """Each noise of a recording."""
     found, variance = recordings[test].found, recordings[test].example.noise_variance
     stated = (1.0, GATE_FACTOR**2, GATE_FACTOR**2 / variance)
     models = {name: constant(level) for name, level in zip(STATED, stated, strict=True)}
     models[NUMBER] = at_number(constant(1.0), found)
+    others = [recording for name, recording in recordings.items() if name != test]
     for rule, cues in LEARNED.items():
-        model = fitted([each.seeing(cues).found for name, each in recordings.items() if name != test], seed)
+        model = fitted([recording.seeing(cues).found for recording in others], seed)
         models[rule] = at_number(model, recordings[test].seeing(cues).found)
-    return models
+    seen = recordings[test].seeing(FOUR).found
+    return models | {ITSELF: at_number(fitted([seen], seed), seen)}
 
 
 def gains_of(recording: Recording, models: dict[str, NoiseModel], seed: int) -> dict[str, Tensor]:
     """(n,) by how much each noise makes each error more likely than the recording's number does, in nats."""
-    logs = {
-        rule: log_likelihoods(model, recording.seeing(LEARNED.get(rule, FOUR)).found)
-        for rule, model in models.items()
-    }
-    found, itself = recording.seeing(FOUR).found, torch.empty_like(logs[NUMBER])
-    second_half = found.frames >= len(recording.example.known) // 2
-    for rows in (second_half, ~second_half):
-        model = fitted([found.at(~rows)], seed)
-        itself[rows] = log_likelihoods(at_number(model, found), found.at(rows))
-    logs[ITSELF] = itself
+    logs = {rule: log_likelihoods(each, seen_by(rule, recording).found) for rule, each in models.items()}
+    found, logs[HALVES] = recording.seeing(FOUR).found, torch.empty_like(logs[NUMBER])
+    second = found.frames >= len(recording.example.known) // 2
+    for half in (second, ~second):
+        model = at_number(fitted([found.at(~half)], seed), found)
+        logs[HALVES][half] = log_likelihoods(model, found.at(half))
     return {rule: log - logs[NUMBER] for rule, log in logs.items()}
+
+
+def seen_by(rule: str, recording: Recording) -> Recording:
+    """A recording with the cues of a rule."""
+    return recording.seeing(LEARNED.get(rule, FOUR))
 
 
 def interval(gains: Tensor, frames: Tensor) -> tuple[float, float]:
@@ -152,34 +155,41 @@ def interval(gains: Tensor, frames: Tensor) -> tuple[float, float]:
 
 def tables(recordings: dict[str, Recording], seeds: Sequence[int]) -> str:
     """How likely errors are, and NEES, by each noise."""
-    likely, errors, means = [], [], {}
+    likely, errors, means = [], [], []
     for name, recording in recordings.items():
         models = [models_of(name, recordings, seed) for seed in seeds]
         drawn = [gains_of(recording, each, seed) for each, seed in zip(models, seeds, strict=True)]
-        gains = {rule: torch.stack([each[rule] for each in drawn]).mean(0) for rule in drawn[0]}
-        frames, level = recording.found.frames, models[0][NUMBER].level
-        cells = {rule: f"{math.exp(gain.mean()):.3f}" for rule, gain in gains.items()}
-        for rule in (*LEARNED, ITSELF):
-            low, high = (math.exp(end) for end in interval(gains[rule], frames))
-            cells[rule] += f" ({low:.3f} to {high:.3f})"
-        for rule, gain in gains.items():
-            means.setdefault(rule, []).append(float(gain.mean()))
-        known = f"{math.exp(-level / 2):.2f}", f"{recording.example.noise_variance:.2f}"
-        likely.append([name, f"{len(frames)}", *known, *(cells[rule] for rule in cells if rule != NUMBER)])
+        gains = {
+            rule: torch.stack([each[rule] for each in drawn]).mean(0) for rule in drawn[0] if rule != NUMBER
+        }
+        means.append({rule: float(each.mean()) for rule, each in gains.items()})
+        ends = {
+            rule: interval(each, recording.found.frames) for rule, each in gains.items() if rule not in STATED
+        }
+        cells = [
+            f"{math.exp(mean):.3f}"
+            + (" ({:.3f} to {:.3f})".format(*map(math.exp, ends[rule])) if rule in ends else "")
+            for rule, mean in means[-1].items()
+        ]
+        deviation = variance_of(constant(1.0), recording.found).sqrt()
+        numbers = f"{deviation:.2f}", f"{recording.example.noise_variance:.2f}"
+        likely.append([name, f"{len(recording.found.frames)}", *numbers, *cells])
         if int(recording.example.known.sum()) >= LEAST_KNOWN:
-            found = {rule: fmean(nees_of(recording, each[rule], rule) for each in models) for rule in models[0]}
-            errors.append([name, f"{len(recording.example.known)}", *(f"{each:.1f}" for each in found.values())])
+            found = [fmean(nees_by(rule, recording, each[rule]) for each in models) for rule in models[0]]
+            errors.append([name, f"{len(recording.example.known)}", *(f"{each:.1f}" for each in found)])
         print(likely[-1], errors[-1:], flush=True)
-    rules = [rule for rule in means if rule != NUMBER]
-    likely.append(["**all**", "", "", "", *(geometric_mean(means[rule]) for rule in rules)])
-    header = ["recording", "observations", "its number", "of the run", *rules]
+    rules = list(means[0])
+    likely.append(
+        ["**all**", "", "", "", *(geometric_mean([each[rule] for each in means]) for rule in rules)]
+    )
+    header = ["recording", "observations", "its number (scales)", "`noise_variance`", *rules]
     return f"{table(header, likely)}\n{table(['recording', 'keyframes', *models[0]], errors)}"
 
 
-def nees_of(recording: Recording, model: NoiseModel, rule: str) -> float:
+def nees_by(rule: str, recording: Recording, model: NoiseModel) -> float:
     """NEES of the keyframes after their graph is solved with a noise."""
     with torch.no_grad():
-        example = solved(weighed(recording.seeing(LEARNED.get(rule, FOUR)).example, model))
+        example = solved(weighed(seen_by(rule, recording).example, model))
         return nees(example.graph, example.T_cw, example.known, BEND)
 
 

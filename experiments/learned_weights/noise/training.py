@@ -102,9 +102,7 @@ def residuals(example: Example, informed: Example) -> Residuals:
     inverse_scale = example.graph.weights[kept].sqrt()  # of the hand-set rule
     errors = (pixels - graph.pixels)[kept] * (inverse_scale / (1 - leverage).clamp_min(0.1).sqrt())[:, None]
     shares = torch.full_like(errors[:, 0], 1 / len(errors))
-    return Residuals(
-        errors, example.values[kept], example.directions[kept], shares, graph.frame_index[kept]
-    )
+    return Residuals(errors, example.values[kept], example.directions[kept], shares, graph.frame_index[kept])
 
 
 def losses(model: NoiseModel, found: Residuals) -> Tensor:
