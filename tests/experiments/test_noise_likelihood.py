@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -15,6 +16,7 @@ from experiments.learned_weights.noise.likelihood import (
     fitted,
     interval,
     log_likelihoods,
+    log_likelihoods_by_t,
     variance_of,
 )
 from experiments.learned_weights.noise.model import constant
@@ -38,8 +40,17 @@ def varying(seed: int, level: float) -> Residuals:
 def test_the_density_integrates_to_one() -> None:
     side = torch.linspace(-6, 6, 601, dtype=torch.float64)
     grid = torch.cartesian_prod(side, side)
-    density = log_likelihoods(constant(4.0), residuals_of(grid, torch.zeros(len(grid), 2).double())).exp()
+    density = log_likelihoods(constant(4.0), residuals_of(grid, grid)).exp()
     assert float(density.sum()) * 0.02**2 == pytest.approx(1.0, abs=1e-3)
+
+
+def test_student_t_has_known_values() -> None:
+    # Two errors of squares 1 and 3: the most likely variance v solves 1 = 1.5 / (4 v + 1) + 4.5 / (4 v + 3).
+    found = residuals_of(torch.tensor([[1.0, 0.0], [0.0, 3.0**0.5]]).double(), torch.zeros(2, 2).double())
+    logs = log_likelihoods_by_t(found)
+    v = (1 + 7**0.5) / 4
+    wanted = [-math.log(2 * math.pi * v) - 3 * math.log(1 + square / (4 * v)) for square in (1.0, 3.0)]
+    assert logs.tolist() == pytest.approx(wanted, rel=1e-6)
 
 
 @pytest.mark.parametrize("deviation", [0.2, 0.7])
@@ -52,6 +63,15 @@ def test_the_number_of_a_recording_is_its_variance_and_the_most_likely(deviation
     for factor in (0.8, 1.25):
         other = constant(factor * float(number.level.detach().exp()))
         assert float(log_likelihoods(other, found).mean()) < best
+
+
+def test_student_t_is_likelier_for_heavy_tails_alone() -> None:
+    mixed = normal(5, 20000, 2) * (1 + 3 * (torch.arange(20000) % 5 == 0).double()[:, None])
+    found = {tails: residuals_of(errors, errors) for tails, errors in ((0, normal(0, 20000, 2)), (1, mixed))}
+    for tails, each in found.items():
+        number = at_number(constant(1.0), each)
+        gain = float((log_likelihoods_by_t(each) - log_likelihoods(number, each)).mean())
+        assert (gain > 0.02) == bool(tails)
 
 
 def test_a_function_of_cues_is_found_across_recordings_of_other_noise() -> None:

@@ -228,5 +228,5 @@ def test_runs_are_compared_by_the_seeds_that_both_posed() -> None:
     hand = {0: outcome(0.1, 100), 1: outcome(0.2, 100)}
     lost, half = outcome(0.001, 30), outcome(0.1, 100)
     lines = run_table({"one": {HAND: hand, SHAPE: {0: lost, 1: half}}}).splitlines()
-    assert lines[3] == "| one | shape | 1, 100 | 0.500 | 30, 100 of 100 |"
-    assert lines[-1] == "| **all** | shape |  | 0.500 |  |"
+    assert lines[3] == "| one | shape | 1, 100 | 0.500 | 30, 100 of 100 | 0, 0 |"
+    assert lines[-1] == "| **all** | shape |  | 0.500 |  |  |"

@@ -42,11 +42,17 @@ FOUR = (*map(NAMES.index, ("level", "contrast", "sharpness")), ROW)
 ELEVEN = tuple(range(ROW + 1))
 RECORDINGS = (*SEQUENCES, "office_loop")
 ITERATIONS = 50
+FREEDOM = 4  # degrees, of Student's t: few, for heavy tails
 DRAWS = 2000
 LOG_NORMALIZER = math.log(2 * math.pi * (1 + math.exp(-(BEND**2) / 2) / BEND**2))
 """Of the density exp(-rho / 2) over the plane, with Huber's rho."""
 STATED = ("scale", "half scale", "half, by the run")
-NUMBER, ITSELF, HALVES = "one number", "4, fitted to itself", "4, to its other half"
+NUMBER, TAILS, ITSELF, HALVES = (
+    "one number",
+    "number, Student's t",
+    "4, fitted to itself",
+    "4, to its other half",
+)
 LEARNED = {"4 cues": FOUR, "11 cues": ELEVEN}
 """Fitted to the other recordings. In the tables a noise that is fitted is always times the recording's number."""
 
@@ -100,6 +106,15 @@ def log_likelihoods(model: NoiseModel, found: Residuals) -> Tensor:
     return -losses(model, found) - LOG_NORMALIZER
 
 
+def log_likelihoods_by_t(found: Residuals) -> Tensor:
+    """(n,) nats of each error in scales, by Student's t in the plane with the most likely scale."""
+    squared = found.errors.square().sum(-1)
+    variance = squared.mean() / 2
+    for _ in range(ITERATIONS):
+        variance = ((FREEDOM + 2) / (FREEDOM + squared / variance) * squared).mean() / 2
+    return -(2 * math.pi * variance).log() - (FREEDOM / 2 + 1) * torch.log1p(squared / (FREEDOM * variance))
+
+
 def fitted(recordings: Sequence[Residuals], seed: int) -> NoiseModel:
     """The function under which residuals are most likely once those of each recording are divided by its number."""
     settings, parts = Settings(seed=seed), []
@@ -130,7 +145,8 @@ def models_of(test: str, recordings: dict[str, Recording], seed: int) -> dict[st
 def gains_of(recording: Recording, models: dict[str, NoiseModel], seed: int) -> dict[str, Tensor]:
     """(n,) by how much each noise makes each error more likely than the recording's number does, in nats."""
     logs = {rule: log_likelihoods(each, seen_by(rule, recording).found) for rule, each in models.items()}
-    found, logs[HALVES] = recording.seeing(FOUR).found, torch.empty_like(logs[NUMBER])
+    found, logs[TAILS] = recording.seeing(FOUR).found, log_likelihoods_by_t(recording.found)
+    logs[HALVES] = torch.empty_like(logs[NUMBER])
     second = found.frames >= len(recording.example.known) // 2
     for half in (second, ~second):
         model = at_number(fitted([found.at(~half)], seed), found)

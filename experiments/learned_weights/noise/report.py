@@ -97,9 +97,12 @@ def run_table(runs: Runs) -> str:
                     ", ".join(f"{1e3 * each.ate_m:.4g}" for each in found.values()),
                     f"{math.exp(logs[rule][name]):.3f}" if common and rule != HAND else "",
                     ", ".join(f"{each.posed}" for each in found.values()) + f" of {found[min(found)].frames}",
+                    ", ".join(f"{each.uncertain}" for each in found.values()),
                 ]
             )
     rows += [
-        ["**all**", rule, "", geometric_mean(list(logs[rule].values())), ""] for rule in logs if rule != HAND
+        ["**all**", rule, "", geometric_mean(list(logs[rule].values())), "", ""]
+        for rule in logs
+        if rule != HAND
     ]
-    return table(["sequence", "rule", "ATE (mm) by seed", "ratio", "posed"], rows)
+    return table(["sequence", "rule", "ATE (mm) by seed", "ratio", "posed", "uncertain"], rows)
