@@ -10,15 +10,14 @@ import torch
 from torch import Tensor
 
 from experiments.learned_weights.noise.consistency import aligned_covariance, nees
-from experiments.learned_weights.noise.likelihood import (
-    Recording,
+from experiments.learned_weights.noise.densities import (
     at_number,
-    fitted,
     interval,
     log_likelihoods,
     log_likelihoods_by_t,
     variance_of,
 )
+from experiments.learned_weights.noise.likelihood import Recording, fitted
 from experiments.learned_weights.noise.model import constant
 from experiments.learned_weights.noise.training import BEND, Residuals, solved
 from tests.experiments.test_noise_model import normal, simulated

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import fmean
@@ -15,9 +14,16 @@ from statistics import fmean
 import torch
 from torch import Tensor
 
-from experiments.common import interval_of, parser_of, table, write_between
+from experiments.common import parser_of, table, write_between
 from experiments.learned_weights.noise.consistency import nees
 from experiments.learned_weights.noise.cues import NAMES
+from experiments.learned_weights.noise.densities import (
+    at_number,
+    interval,
+    log_likelihoods,
+    log_likelihoods_by_t,
+    variance_of,
+)
 from experiments.learned_weights.noise.graphs import LEAST_KNOWN, Example
 from experiments.learned_weights.noise.model import NoiseModel, constant
 from experiments.learned_weights.noise.report import geometric_mean
@@ -27,13 +33,11 @@ from experiments.learned_weights.noise.training import (
     Residuals,
     Settings,
     fit_residuals,
-    losses,
     residuals,
     solved,
     weighed,
 )
 from torchslam.geometry.gating import GATE_FACTOR
-from torchslam.geometry.robust import robustify
 
 ROW = len(NAMES)
 """Column of the row of the image, after those of the cues."""
@@ -41,11 +45,6 @@ FOUR = (*map(NAMES.index, ("level", "contrast", "sharpness")), ROW)
 """Scale, contrast, blur and row: sharpness is low where an image is blurred."""
 ELEVEN = tuple(range(ROW + 1))
 RECORDINGS = (*SEQUENCES, "office_loop")
-ITERATIONS = 50
-FREEDOM = 4  # degrees, of Student's t: few, for heavy tails
-DRAWS = 2000
-LOG_NORMALIZER = math.log(2 * math.pi * (1 + math.exp(-(BEND**2) / 2) / BEND**2))
-"""Of the density exp(-rho / 2) over the plane, with Huber's rho."""
 STATED = ("scale", "half scale", "half, by the run")
 NUMBER, TAILS, ITSELF, HALVES = (
     "one number",
@@ -78,41 +77,6 @@ class Recording:
         cues = list(cues)
         example = replace(self.example, values=self.example.values[:, cues])
         return Recording(example, replace(self.found, values=self.found.values[:, cues]))
-
-
-@torch.no_grad()
-def variance_of(model: NoiseModel, found: Residuals) -> Tensor:
-    """The most likely variance of residuals in x and in y, in units of what an isotropic model states."""
-    squared = model.log_factor(found.values).exp() * found.errors.square().sum(-1)
-    variance = squared.mean() / 2
-    for _ in range(ITERATIONS):
-        whitened = squared / variance
-        weight = robustify(whitened, "huber", squared.new_tensor(BEND)).weight
-        variance = variance * (weight * whitened).mean() / 2
-    return variance
-
-
-@torch.no_grad()
-def at_number(model: NoiseModel, found: Residuals) -> NoiseModel:
-    """The model times the number that the residuals of a recording give, without any truth."""
-    moved = deepcopy(model)
-    moved.level.sub_(variance_of(model, found).log())
-    return moved
-
-
-@torch.no_grad()
-def log_likelihoods(model: NoiseModel, found: Residuals) -> Tensor:
-    """(n,) nats of each error in scales, by the density whose logarithm is the kernel of `solve_graph`."""
-    return -losses(model, found) - LOG_NORMALIZER
-
-
-def log_likelihoods_by_t(found: Residuals) -> Tensor:
-    """(n,) nats of each error in scales, by Student's t in the plane with the most likely scale."""
-    squared = found.errors.square().sum(-1)
-    variance = squared.mean() / 2
-    for _ in range(ITERATIONS):
-        variance = ((FREEDOM + 2) / (FREEDOM + squared / variance) * squared).mean() / 2
-    return -(2 * math.pi * variance).log() - (FREEDOM / 2 + 1) * torch.log1p(squared / (FREEDOM * variance))
 
 
 def fitted(recordings: Sequence[Residuals], seed: int) -> NoiseModel:
@@ -157,16 +121,6 @@ def gains_of(recording: Recording, models: dict[str, NoiseModel], seed: int) -> 
 def seen_by(rule: str, recording: Recording) -> Recording:
     """A recording with the cues of a rule."""
     return recording.seeing(LEARNED.get(rule, FOUR))
-
-
-def interval(gains: Tensor, frames: Tensor) -> tuple[float, float]:
-    """95 % interval of the mean of gains (n,), by drawing the keyframes (n,) that they are in."""
-    sums = gains.new_zeros(int(frames.max()) + 1, 2)
-    sums.index_add_(0, frames, torch.stack((gains, torch.ones_like(gains)), dim=-1))
-    sums = sums[sums[:, 1] > 0]
-    rows = torch.randint(len(sums), (DRAWS, len(sums)), generator=torch.Generator().manual_seed(0))
-    total, count = sums[rows].sum(1).unbind(-1)
-    return interval_of(total / count)
 
 
 def tables(recordings: dict[str, Recording], seeds: Sequence[int]) -> str:
