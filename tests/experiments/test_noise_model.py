@@ -65,7 +65,7 @@ def simulated(seed: int, slope: float = 0.0, sigma: float = 0.3) -> Example:
         torch.ones(FRAMES, dtype=torch.bool),
     )
     directions = torch.eye(2, dtype=torch.float64).repeat(len(frame_index), 1, 1)
-    return Example(graph, values, directions, T_cw.clone(), torch.ones(FRAMES, dtype=torch.bool))
+    return Example(graph, values, directions, T_cw.clone(), torch.ones(FRAMES, dtype=torch.bool), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +122,7 @@ def test_the_likelihood_is_highest_at_the_true_noise() -> None:
         torch.zeros(20000, len(NAMES)).double(),
         torch.eye(2).double().expand(20000, 2, 2),
         errors[:, 0] * 0 + 1,
+        torch.zeros(20000, dtype=torch.int64),
     )
     with torch.no_grad():
         low, right, high = (float(negative_log_likelihood(constant(s**-2), found)) for s in (0.2, 0.25, 0.31))
@@ -222,10 +223,10 @@ def test_intervals_are_those_of_students_t() -> None:
 
 def test_runs_are_compared_by_the_seeds_that_both_posed() -> None:
     def outcome(ate_m: float, posed: int) -> Outcome:
-        return Outcome(ate_m, posed, 100)
+        return Outcome(ate_m, posed, 100, 0)
 
     hand = {0: outcome(0.1, 100), 1: outcome(0.2, 100)}
     lost, half = outcome(0.001, 30), outcome(0.1, 100)
     lines = run_table({"one": {HAND: hand, SHAPE: {0: lost, 1: half}}}).splitlines()
-    assert lines[3] == "| one | shape | 1, 100 | 0.500 | 30, 100 of 100 |"
-    assert lines[-1] == "| **all** | shape |  | 0.500 |  |"
+    assert lines[3] == "| one | shape | 1, 100 | 0.500 | 30, 100 of 100 | 0, 0 |"
+    assert lines[-1] == "| **all** | shape |  | 0.500 |  |  |"

@@ -20,15 +20,16 @@ from torchslam.system.front_end import image_extractor
 
 LEAST_KNOWN = 4
 """Keyframes of which the truth must be known: fewer leave hardly more than the seven directions of their alignment."""
-KITTI_CAMERA = "685,685,601.887,183.110"
-"""With COLMAP's focal length: the one that the sequence gives is 3 % too long, see experiments/self_calibration."""
+CAMERAS = {"kitti07": "685,685,601.887,183.110", "office_loop": "437.4,437.4,260.7,147.0"}
+"""kitti07: with COLMAP's focal length: the one that the sequence gives is 3 % too long, see
+experiments/self_calibration. office_loop: as `torchslam run` finds it."""
 
 
 def opened(name: str) -> Sequence:
     """A sequence of the experiment. Raises SequenceError if it is not available."""
     if name == "drone":
         return drone()
-    return open_sequence(place_of(name), camera=KITTI_CAMERA if name == "kitti07" else None)
+    return open_sequence(place_of(name), camera=CAMERAS.get(name))
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class Example:
     graph:      weights are those of the hand-set rule
     values:     (O, C), directions: (O, 2, 2) the cues of the observations' keypoints
     T_cw:       (F, 4, 4) true poses, and (F,) where they are known
+    noise_variance: what the run found, `Map.noise_variance`
     """
 
     graph: ObservationGraph
@@ -45,6 +47,7 @@ class Example:
     directions: Tensor
     T_cw: Tensor
     known: Tensor
+    noise_variance: float
 
     def save(self, path: Path) -> None:
         columns = {name: getattr(self.graph, name) for name in self.graph.columns()}
@@ -61,7 +64,8 @@ class Example:
     def keyframes_only(self) -> Example:
         """Without the frames between keyframes, which hang on the points and move nothing else."""
         graph, frames, rows = keyframes_of(self.graph)
-        return Example(graph, self.values[rows], self.directions[rows], self.T_cw[frames], self.known[frames])
+        columns = self.values[rows], self.directions[rows], self.T_cw[frames], self.known[frames]
+        return Example(graph, *columns, self.noise_variance)
 
 
 def keyframes_of(graph: ObservationGraph) -> tuple[ObservationGraph, Tensor, Tensor]:
@@ -89,7 +93,8 @@ def keyframes_of(graph: ObservationGraph) -> tuple[ObservationGraph, Tensor, Ten
 
 def truth_of(graph: ObservationGraph, sequence: Sequence) -> tuple[Tensor, Tensor]:
     """(F, 4, 4) true T_cw of a graph's frames, and (F,) where they are known; in the largest submap alone."""
-    assert sequence.groundtruth is not None
+    if sequence.groundtruth is None:
+        return torch.eye(4, dtype=graph.T_cw.dtype).expand_as(graph.T_cw), torch.zeros_like(graph.is_keyframe)
     largest = int(torch.bincount(graph.submap).argmax())
     T_wc, known = interpolate_poses(sequence.groundtruth, graph.timestamps, GROUNDTRUTH_TOLERANCE)
     return se3_inverse(T_wc), known & (graph.submap == largest)
@@ -97,11 +102,13 @@ def truth_of(graph: ObservationGraph, sequence: Sequence) -> tuple[Tensor, Tenso
 
 def example_of(sequence: Sequence, config: Config) -> Example:
     """Run a sequence by the hand-set rule; return its graph and cues."""
-    graph = SLAM(sequence.camera, config).run(sequence).graph
+    run = SLAM(sequence.camera, config).run(sequence)
+    graph = run.graph
     seen = _cues(sequence, config, graph)
     columns = {name: getattr(graph, name) for name in ObservationGraph.columns()}
     plain = ObservationGraph(camera=graph.camera, **columns)
-    return Example(plain, seen.values, seen.directions, *truth_of(graph, sequence))
+    truth = truth_of(graph, sequence)
+    return Example(plain, seen.values, seen.directions, *truth, run.map.noise_variance)
 
 
 class _Watching:

@@ -29,21 +29,21 @@ class NoiseModel(nn.Module):
     deviation: Tensor
     level_of_image: Tensor
 
-    def __init__(self, kind: str = "directed", seed: int = 0) -> None:
+    def __init__(self, kind: str = "directed", seed: int = 0, num_cues: int = len(NAMES)) -> None:
         super().__init__()
         self.kind = kind
         generator = torch.Generator().manual_seed(seed)
         self.level = nn.Parameter(torch.zeros((), dtype=torch.float64))
-        self.line = nn.Parameter(torch.zeros(len(NAMES), dtype=torch.float64))
+        self.line = nn.Parameter(torch.zeros(num_cues, dtype=torch.float64))
         self.inner = nn.Parameter(
-            0.5 * torch.randn(len(NAMES), HIDDEN, generator=generator, dtype=torch.float64)
+            0.5 * torch.randn(num_cues, HIDDEN, generator=generator, dtype=torch.float64)
         )
         self.bend = nn.Parameter(torch.zeros(HIDDEN, dtype=torch.float64))
         self.outer = nn.Parameter(torch.zeros(HIDDEN, dtype=torch.float64))
         self.power = nn.Parameter(torch.zeros((), dtype=torch.float64))
         self.register_buffer("level_of_image", torch.zeros((), dtype=torch.float64))
-        self.register_buffer("mean", torch.zeros(len(NAMES), dtype=torch.float64))
-        self.register_buffer("deviation", torch.ones(len(NAMES), dtype=torch.float64))
+        self.register_buffer("mean", torch.zeros(num_cues, dtype=torch.float64))
+        self.register_buffer("deviation", torch.ones(num_cues, dtype=torch.float64))
 
     def standardize(self, values: Tensor) -> None:
         """Take mean and deviation from values (n, C)."""

@@ -12,6 +12,7 @@ from statistics import fmean, stdev
 from experiments.common import table
 from experiments.learned_weights.noise.graphs import opened
 from torchslam import SLAM, evaluate, load_config
+from torchslam.types import State
 
 HAND, STATED, LIKELIHOOD, SHAPE, TRAJECTORY = "hand-set", "stated", "likelihood", "shape", "trajectory"
 FRONT_END = "experiments.learned_weights.noise.model:Informed"
@@ -28,11 +29,13 @@ STUDENT = (12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262)
 
 @dataclass(frozen=True)
 class Outcome:
-    """ate_m: of all posed frames; posed, frames: their number and that of the sequence's frames."""
+    """ate_m: of all posed frames; posed, frames: their number and that of the sequence's frames; uncertain: the number
+    of those whose pose was returned as uncertain."""
 
     ate_m: float
     posed: int
     frames: int
+    uncertain: int
 
 
 def outcome_of(name: str, seed: int, weights: Path | None, file: Path) -> Outcome:
@@ -46,7 +49,8 @@ def outcome_of(name: str, seed: int, weights: Path | None, file: Path) -> Outcom
     assert sequence.groundtruth is not None
     run = SLAM(sequence.camera, load_config(None, overrides)).run(sequence)
     error = evaluate(run.trajectory, sequence.groundtruth).ate_m
-    outcome = Outcome(error, len(run.trajectory), len(sequence))
+    uncertain = sum(result.state is State.UNCERTAIN for result in run.results)
+    outcome = Outcome(error, len(run.trajectory), len(sequence), uncertain)
     file.parent.mkdir(parents=True, exist_ok=True)
     file.write_text(json.dumps(asdict(outcome)))
     return outcome
@@ -93,9 +97,12 @@ def run_table(runs: Runs) -> str:
                     ", ".join(f"{1e3 * each.ate_m:.4g}" for each in found.values()),
                     f"{math.exp(logs[rule][name]):.3f}" if common and rule != HAND else "",
                     ", ".join(f"{each.posed}" for each in found.values()) + f" of {found[min(found)].frames}",
+                    ", ".join(f"{each.uncertain}" for each in found.values()),
                 ]
             )
     rows += [
-        ["**all**", rule, "", geometric_mean(list(logs[rule].values())), ""] for rule in logs if rule != HAND
+        ["**all**", rule, "", geometric_mean(list(logs[rule].values())), "", ""]
+        for rule in logs
+        if rule != HAND
     ]
-    return table(["sequence", "rule", "ATE (mm) by seed", "ratio", "posed"], rows)
+    return table(["sequence", "rule", "ATE (mm) by seed", "ratio", "posed", "uncertain"], rows)

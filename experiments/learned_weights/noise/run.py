@@ -81,6 +81,8 @@ def main() -> None:
     parser = parser_of(__doc__, readme=True)
     parser.add_argument("--output", type=Path, default=Path("results") / "noise_model", metavar="DIR")
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
+    parser.add_argument("--sequences", nargs="+", choices=SEQUENCES, default=SEQUENCES)
+    parser.add_argument("--rules", nargs="+", choices=RULES, default=RULES, help=f"{HAND} among them")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     missing = [name for name in SEQUENCES if not (DATA_DIR / name).exists() and name != "drone"]
@@ -89,9 +91,10 @@ def main() -> None:
     experiment = Experiment(arguments.output)
     runs = {
         name: {
-            rule: {seed: experiment.outcome(rule, name, seed) for seed in arguments.seeds} for rule in RULES
+            rule: {seed: experiment.outcome(rule, name, seed) for seed in arguments.seeds}
+            for rule in arguments.rules
         }
-        for name in SEQUENCES
+        for name in arguments.sequences
     }
     publish(run_table(runs), arguments, __file__)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -44,26 +44,29 @@ class Settings:
 @dataclass(frozen=True)
 class Residuals:
     """Of n observations: errors (n, 2) in scales, corrected for the fitted points; their cues; shares (n,) by
-    which they count in a mean."""
+    which they count in a mean; frames (n,), the keyframe of its run that each is in."""
 
     errors: Tensor
     values: Tensor
     directions: Tensor
     shares: Tensor
+    frames: Tensor
 
     def drawn(self, count: int, seed: int) -> Residuals:
         """Some of them, at random."""
         order = torch.randperm(len(self.errors), generator=torch.Generator().manual_seed(seed))[:count]
-        return Residuals(self.errors[order], self.values[order], self.directions[order], self.shares[order])
+        return self.at(order)
+
+    def at(self, rows: Tensor) -> Residuals:
+        """Those of some rows, by index or mask."""
+        return Residuals(*(getattr(self, each.name)[rows] for each in fields(self)))
 
     @classmethod
     def cat(cls, parts: Sequence[Residuals]) -> Residuals:
         """Of several runs, which count alike."""
-        errors, values, directions = (
-            torch.cat([getattr(part, name) for part in parts]) for name in ("errors", "values", "directions")
-        )
-        shares = torch.cat([part.shares / part.shares.sum() for part in parts]) / len(parts)
-        return cls(errors, values, directions, shares)
+        columns = {each.name: torch.cat([getattr(part, each.name) for part in parts]) for each in fields(cls)}
+        columns["shares"] = torch.cat([part.shares / part.shares.sum() for part in parts]) / len(parts)
+        return cls(**columns)
 
 
 def weighed(example: Example, model: NoiseModel) -> Example:
@@ -99,11 +102,11 @@ def residuals(example: Example, informed: Example) -> Residuals:
     inverse_scale = example.graph.weights[kept].sqrt()  # of the hand-set rule
     errors = (pixels - graph.pixels)[kept] * (inverse_scale / (1 - leverage).clamp_min(0.1).sqrt())[:, None]
     shares = torch.full_like(errors[:, 0], 1 / len(errors))
-    return Residuals(errors, example.values[kept], example.directions[kept], shares)
+    return Residuals(errors, example.values[kept], example.directions[kept], shares, graph.frame_index[kept])
 
 
-def negative_log_likelihood(model: NoiseModel, found: Residuals) -> Tensor:
-    """Mean over observations, up to a constant; the kernel of `solve_graph` is the logarithm of its density.
+def losses(model: NoiseModel, found: Residuals) -> Tensor:
+    """(n,) negative log-likelihoods but for a constant; the kernel of `solve_graph` is the logarithm of their density.
 
     Of models without a level of the image: these say nothing of how large errors are.
     """
@@ -116,7 +119,22 @@ def negative_log_likelihood(model: NoiseModel, found: Residuals) -> Tensor:
         squared = (found.errors[:, None] @ weights @ found.errors[..., None])[:, 0, 0]
         log_determinant = 2 * model.log_factor(found.values)  # powers are of determinant one
     rho = robustify(squared, "huber", squared.new_tensor(BEND)).rho
-    return 0.5 * (found.shares / found.shares.sum() * (rho - log_determinant)).sum()
+    return 0.5 * (rho - log_determinant)
+
+
+def negative_log_likelihood(model: NoiseModel, found: Residuals) -> Tensor:
+    """The mean of `losses` over observations, by their shares."""
+    return (found.shares / found.shares.sum() * losses(model, found)).sum()
+
+
+def fit_residuals(model: NoiseModel, found: Residuals, settings: Settings) -> None:
+    """Move a model to where residuals are most likely."""
+    optimizer = torch.optim.Adam(model.parameters(), settings.likelihood_rate)
+    for _ in range(settings.likelihood_steps):
+        optimizer.zero_grad()
+        decay = torch.stack([each.square().sum() for each in (model.line, model.outer, model.inner)]).sum()
+        (negative_log_likelihood(model, found) + settings.decay * decay).backward()
+        optimizer.step()
 
 
 def fit_likelihood(examples: Sequence[Example], kind: str, settings: Settings) -> NoiseModel:
@@ -129,15 +147,7 @@ def fit_likelihood(examples: Sequence[Example], kind: str, settings: Settings) -
         with torch.no_grad():
             pairs = [(example, solved(weighed(example, model))) for example in examples]
         parts = [residuals(*pair).drawn(settings.observations, settings.seed) for pair in pairs]
-        found = Residuals.cat(parts)
-        optimizer = torch.optim.Adam(model.parameters(), settings.likelihood_rate)
-        for _ in range(settings.likelihood_steps):
-            optimizer.zero_grad()
-            decay = torch.stack(
-                [each.square().sum() for each in (model.line, model.outer, model.inner)]
-            ).sum()
-            (negative_log_likelihood(model, found) + settings.decay * decay).backward()
-            optimizer.step()
+        fit_residuals(model, Residuals.cat(parts), settings)
     return model
 
 
