@@ -14,6 +14,7 @@ import argparse
 import json
 import os
 import re
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -55,7 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--processes",
         type=arguments.positive,
         metavar="N",
-        help="number of processes; results are identical (default: one per processor, at most "
+        help="number of processes on the CPU; results are identical (default: one per processor, at most "
         f"{MAX_PROCESSES})",
     )
     parser.add_argument(
@@ -160,6 +161,8 @@ def densify_results(
 
         with shown_warnings():
             count = min(processors(), MAX_PROCESSES) if processes is None else processes
+            if (processes or 1) > 1 and torch.device(device).type != "cpu":
+                warnings.warn("--processes is for the CPU: a GPU computes in one process", stacklevel=2)
             found = densify(
                 views, opened, folder, torch.device(device), on_progress, count, aggregation == "learned"
             )

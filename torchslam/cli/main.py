@@ -20,8 +20,6 @@ from torchslam.utils.text import printable, without_credentials
 
 ERROR = 2
 INTERRUPTED = 130
-EXIT_PATIENCE = 1.0
-"""Seconds to wait for the thread of a live source before the process exits."""
 
 # Module and first line of the description of each command; only the module of the requested command is imported.
 COMMANDS = {
@@ -73,7 +71,7 @@ def console() -> NoReturn:
     """
     status = main()
     live = sys.modules.get("torchslam.data.readers.live")  # imports torch
-    if live is not None and not live.close_sources(EXIT_PATIENCE):
+    if live is not None and not live.close_sources():
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(status)

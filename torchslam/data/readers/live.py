@@ -32,8 +32,8 @@ BACKLOG = 10
 """Maximum number of queued frames; then the oldest one is dropped."""
 STEADY = 1.0
 """Maximum drift of the source's clock from ours in seconds, before it is ignored."""
-EXIT_PATIENCE = 2.0
-"""Seconds for which the interpreter waits for the threads of sources when it exits."""
+EXIT_PATIENCE = 1.0
+"""Seconds for which a process waits for the threads of sources when it exits."""
 STALE = 0.5
 """Age in seconds above which the frame read on opening is discarded."""
 
@@ -221,7 +221,7 @@ _SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()
 """Those that there are; a thread keeps its source."""
 
 
-def close_sources(patience: float) -> bool:
+def close_sources(patience: float = EXIT_PATIENCE) -> bool:
     """Close all sources, and return whether their threads have ended after some seconds at most."""
     sources = list(_SOURCES)
     end = time.monotonic() + patience
@@ -231,7 +231,7 @@ def close_sources(patience: float) -> bool:
 
 
 # Threads that end on their own before the interpreter does are not ended by it, in the middle of OpenCV.
-atexit.register(close_sources, EXIT_PATIENCE)
+atexit.register(close_sources)
 
 
 class CaptureClock:
