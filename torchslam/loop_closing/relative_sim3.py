@@ -31,10 +31,8 @@ _RADIUS_PX = 8.0  # around the projection by a first similarity
 _AROUND = 10  # keyframes whose points are searched for in the other map
 _NEEDED = 12  # inliers of the first similarity
 _CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
-_SCALE_POINTS, _SCALE_SPREAD = (
-    2,
-    1.2,
-)  # fewest points, and largest ratio of their quartiles, that give a pose a scale
+_SCALE_POINTS = 2  # fewest shared points that give a scale to a pose
+_SCALE_SPREAD = 1.2  # largest ratio of the quartiles of their depths
 _KERNEL_SCALE = 2.0
 _ITERATIONS = 20  # of the refined pose, which rarely needs ten
 _GATE_WIDENING = 2.0  # times the noise, as the Sim(3) has noise of its own

@@ -140,7 +140,7 @@ def track_into_earlier_keyframe(
 
     Args:
         tracker: poses the keyframe.
-        submap: the map, with the tracking state after backward tracking; it is not changed.
+        submap: the map, with the tracking state after backward tracking, which is not changed.
         atlas: the submaps with earlier frames of the same session.
         before: key of the earliest frame that was posed.
         config: thresholds of the pose validation.
