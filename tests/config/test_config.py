@@ -344,7 +344,7 @@ VALID = st.builds(
 KEYS = [(kind, name, key) for name, kind in {"": Config, **SECTIONS}.items() for key in _settings(kind)]
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=60, deadline=None)
 @given(config=VALID)
 def test_any_valid_configuration_reads_back(tmp_path_factory: pytest.TempPathFactory, config: Config) -> None:
     file = tmp_path_factory.mktemp("valid") / "config.toml"
@@ -352,7 +352,7 @@ def test_any_valid_configuration_reads_back(tmp_path_factory: pytest.TempPathFac
     assert load_config(file) == config
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(place=st.sampled_from(KEYS), data=st.data())
 def test_any_invalid_value_is_rejected_by_name(
     tmp_path_factory: pytest.TempPathFactory, place: tuple[type[Settings], str, str], data: st.DataObject

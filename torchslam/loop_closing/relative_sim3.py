@@ -83,9 +83,9 @@ def estimate_relative_sim3(
         return None
     settings = config.loop_closing
     found = _observed(T_12, map_1, keyframe_1, map_2, keyframe_2, camera, config, settings.min_matches)
-    if found is None or found.num_shared < settings.min_sim3_points:
+    if found is None or len(found.depth_ratios) < settings.min_sim3_points:
         return None
-    relation = _relation(found, map_1, keyframe_1, map_2)
+    relation = found.relation(map_1.T_cw[keyframe_1])
     points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
     T_21 = transfer_pose(map_2.T_cw[keyframe_2], relation.S_21)
     back, _ = inlier_matches(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
@@ -122,11 +122,10 @@ def relative_sim3_of_pose(
     found = _observed(T_12, map_1, keyframe_1, map_2, keyframe_2, camera, config, settings.min_matches // 2)
     if found is None:
         return None
-    ratios = _depth_ratios(found, map_1, keyframe_1, map_2)
+    ratios = found.depth_ratios
     if len(ratios) < _SCALE_POINTS or float(ratios.quantile(0.75) / ratios.quantile(0.25)) > _SCALE_SPREAD:
-        S_21 = se3_inverse(found.T_12) @ map_1.T_cw[keyframe_1]
-        return RelativeSim3(S_21, len(found.keypoints), 0, 0)
-    return _relation(found, map_1, keyframe_1, map_2)
+        found = replace(found, depth_ratios=ratios[:0])
+    return found.relation(map_1.T_cw[keyframe_1])
 
 
 def verify_relative_sim3(
@@ -205,24 +204,23 @@ def inlier_matches(
 
 @dataclass(frozen=True)
 class _Observed:
-    """Points of map 2 that keyframe 1 observes, and its pose by them.
+    """What keyframe 1 observes of map 2.
 
     Attributes:
-        T_12: pose of keyframe 1 in map 2.
-        ids: the points.
-        keypoints: of keyframe 1.
-        own: points of map 1 that these keypoints observe; negative where there is none.
+        T_12: its pose in map 2.
+        inliers: number of points of map 2 that it observes.
+        depth_ratios: depths in map 2 of the points that both maps have, relative to those in map 1.
     """
 
     T_12: Float[Tensor, "4 4"]
-    ids: Int[Tensor, " M"]
-    keypoints: Int[Tensor, " M"]
-    own: Int[Tensor, " M"]
+    inliers: int
+    depth_ratios: Float[Tensor, " P"]
 
-    @property
-    def num_shared(self) -> int:
-        """Number of points that both maps have."""
-        return int((self.own >= 0).sum())
+    def relation(self, T_11: Float[Tensor, "4 4"]) -> RelativeSim3:
+        """The Sim(3), given the pose in map 1. One pose has no scale, but depths have; it is 1 without them."""
+        shared = len(self.depth_ratios)
+        scale = self.depth_ratios.median() if shared else T_11.new_ones(())
+        return RelativeSim3(se3_inverse(self.T_12) @ scaling_sim3(scale) @ T_11, self.inliers, 0, shared)
 
 
 def _observed(
@@ -244,22 +242,11 @@ def _observed(
     ids, keypoints = ids[agrees], keypoints[agrees]
     if len(ids) < needed:
         return None
-    return _Observed(T_12, ids, keypoints, map_1.keyframes["point_ids"][keyframe_1][keypoints])
-
-
-def _relation(found: _Observed, map_1: Map, keyframe_1: int, map_2: Map) -> RelativeSim3:
-    """The Sim(3) by the pose, and by the depths of the points that both maps have: one pose has no scale."""
-    ratios = _depth_ratios(found, map_1, keyframe_1, map_2)
-    S_21 = se3_inverse(found.T_12) @ scaling_sim3(ratios.median()) @ map_1.T_cw[keyframe_1]
-    return RelativeSim3(S_21, len(found.keypoints), 0, len(ratios))
-
-
-def _depth_ratios(found: _Observed, map_1: Map, keyframe_1: int, map_2: Map) -> Float[Tensor, " P"]:
-    """Depths in map 2 of the points that both maps have, relative to those in map 1."""
-    is_shared = found.own >= 0
-    depth_1 = transform(map_1.T_cw[keyframe_1], map_1.positions_w[found.own[is_shared]])[:, 2]
-    depth_2 = transform(found.T_12, map_2.positions_w[found.ids[is_shared]])[:, 2]
-    return depth_2 / depth_1
+    own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
+    is_shared = own >= 0
+    depth_1 = transform(map_1.T_cw[keyframe_1], map_1.positions_w[own[is_shared]])[:, 2]
+    depth_2 = transform(T_12, map_2.positions_w[ids[is_shared]])[:, 2]
+    return _Observed(T_12, len(ids), depth_2 / depth_1)
 
 
 def _first_guess(

@@ -32,7 +32,7 @@ BACKLOG = 10
 """Maximum number of queued frames; then the oldest one is dropped."""
 STEADY = 1.0
 """Maximum drift of the source's clock from ours in seconds, before it is ignored."""
-EXIT_PATIENCE = 1.0
+EXIT_PATIENCE = 2.0
 """Seconds for which a process waits for the threads of sources when it exits."""
 STALE = 0.5
 """Age in seconds above which the frame read on opening is discarded."""
