@@ -187,16 +187,17 @@ def test_with_too_few_shared_points_the_scale_is_unknown(S_21: Tensor, count: in
         torch.testing.assert_close(relation.S_21, se3_inverse(T_12) @ ONE[2], atol=1e-5, rtol=0)
 
 
-def test_shared_points_whose_depths_disagree_give_no_scale(S_21: Tensor) -> None:
+@pytest.mark.parametrize(("factor", "known"), [(1.19, 6), (1.21, 0)])
+def test_shared_points_whose_depths_disagree_give_no_scale(S_21: Tensor, factor: float, known: int) -> None:
     map_1, map_2 = maps(S_21)
     thinned(map_1, in_both(map_1, map_2)[:6])
     T_cw, rows = map_1.T_cw[2], map_1.valid_points()
     points_c = transform(T_cw, map_1.positions_w[rows])
-    points_c[::2] *= 1.4  # the same pixels
+    points_c[::2] *= factor  # the same pixels
     map_1.points["positions_w"][rows] = transform(se3_inverse(T_cw), points_c)
     relation = related_by_pose(map_1, map_2, moved(ONE[2], S_21))
     assert relation is not None
-    assert relation.shared_points == 0
+    assert relation.shared_points == known
 
 
 @pytest.mark.parametrize(("count", "is_found"), [(20, True), (19, False)])

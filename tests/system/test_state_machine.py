@@ -10,6 +10,7 @@ import torch
 
 from tests.loop_closing.ring import END, KEYFRAMES, around, ring_submap
 from tests.scene import CAMERA
+from torchslam import evaluate
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.geometry import se3_inverse
@@ -19,6 +20,7 @@ from torchslam.system.run import no_map_message
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
 from torchslam.tracking.backward_tracking import GapLink
+from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Reason, Rejection, State, StepResult
 
 
@@ -89,6 +91,31 @@ def test_a_camera_without_view_is_lost_and_relocalized(slam: SLAM) -> None:
     assert len(again) == 1
     assert again[0].state is State.UNCERTAIN
     assert slam.state is State.TRACKING
+
+
+def test_frames_lost_before_the_last_relocalization_are_tracked_backward(
+    slam: SLAM, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The recording ends before the relocalized frame is confirmed: it is kept, and so are the ones before it."""
+    locate = Relocalizer.locate
+    monkeypatch.setattr(
+        Relocalizer,
+        "locate",
+        lambda self, view, candidates: None if view.index < 37 else locate(self, view, candidates),
+    )
+    sequence = open_sequence("synthetic:room?frames=60")
+    frames = [sequence[index] for index in range(39)]
+    frames[31] = replace(frames[31], image=torch.full_like(frames[31].image, 0.5))
+    states = [slam.step(frame).state for frame in frames]
+    assert states[31:37] == [State.LOST] * 6
+    assert states[37:] == [State.UNCERTAIN] * 2
+    submap = slam.submap
+    assert submap is not None
+    assert not set(submap.posed_frames.frames["frame_index"].tolist()) & set(range(31, 39))
+    slam.finalize()
+    assert set(range(32, 39)) <= set(submap.posed_frames.frames["frame_index"].tolist())
+    errors = evaluate(slam.trajectory(), sequence.groundtruth)
+    assert errors.ate_m < 0.02
 
 
 def test_a_gap_is_closed_once_both_sides_are_linked() -> None:
