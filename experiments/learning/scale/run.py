@@ -15,6 +15,7 @@ from experiments.learning.scale.ground import FEATURES, Heights, measure_heights
 from torchslam import SLAM, Trajectory, evaluate, load_config, open_sequence
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import rigid, se3_inverse, sim3_scale
+from torchslam.geometry.transforms import without_scale
 from torchslam.optim import FrameFactors
 from torchslam.optim.run_graph import RunGraph, solve_graph
 
@@ -203,12 +204,6 @@ def corrected(one: Observed, prior: HandMade | Learned) -> Tensor:
     """Keyframes of the pose graph, rigid: lengths in the unit of the world."""
     solution = scaled_by_heights(one.T_cw, one.heights.log_height, counted(one, prior), prior.edge_std)
     return without_scale(solution.S_cw[1:])
-
-
-def without_scale(S_cw: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
-    """The rigid transform with the same rotation and camera center."""
-    scaled = S_cw[..., :3, :] / sim3_scale(S_cw)[..., None, None]
-    return rigid(scaled[..., :3], scaled[..., 3])
 
 
 def oracle(one: Observed) -> Tensor:
