@@ -15,9 +15,8 @@ from torchslam.geometry.robust import robustify
 from torchslam.optim.run_graph import ObservationGraph
 
 GAUGE = 7
-_UNDETERMINED = (
-    1e-12  # of the largest information: directions below it have no variance, nothing measures them
-)
+_UNDETERMINED = 1e-12
+"""Of the largest information: directions below it have no variance, nothing measures them."""
 
 
 def nees(graph: ObservationGraph, T_cw: Tensor, known: Tensor, bend: float) -> float:
