@@ -23,7 +23,7 @@ from experiments.dense.run import LEVELS, opened, truth_of
 from torchslam.dense import DepthMaps
 from torchslam.dense.confidence import LEAST_KEPT, confidence_alone, kept
 from torchslam.dense.estimate import Estimate, estimate_depth
-from torchslam.dense.learned import DepthNet, learned_depth
+from torchslam.dense.learned import RatingNet, learned_confidence
 from torchslam.densify.views import SWEPT
 from torchslam.io.results import DEPTHS
 
@@ -88,14 +88,15 @@ def main() -> None:
         found = estimate(view)
         return found.inverse_depth[0], confidence_alone(found)[0]
 
-    def learned(net: DepthNet | None) -> Callable[[int], tuple[Tensor, Tensor]]:
+    def learned(net: RatingNet | None) -> Callable[[int], tuple[Tensor, Tensor]]:
         @cache
         @torch.no_grad()
         def alone(view: int) -> tuple[Tensor, Tensor]:
             found, gray, started = estimate(view), images.gray(view)[None], time.process_time()
-            depth, confidence = learned_depth(found, gray, views.near[view, None], views.far[view, None], net)
+            limits = views.near[view, None], views.far[view, None]
+            confidence = learned_confidence(found, gray, *limits, net)
             added.append(time.process_time() - started)
-            return depth[0], confidence[0]
+            return found.inverse_depth[0], confidence[0]
 
         return alone
 
@@ -116,7 +117,7 @@ def main() -> None:
     for weights in options.weights or [None]:
         net, added = None, list[float]()
         if weights is not None:
-            net = DepthNet().requires_grad_(False)
+            net = RatingNet().requires_grad_(False)
             net.load_state_dict(load_file(weights))
         depth = fused(views, rows, learned(net))
         taken = (sum(seconds) + sum(added)) / len(seconds)

@@ -8,10 +8,12 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d, pixel_shuffle, pixel_unshuffle
 
-from examples.train_depth import Example, crop, losses, of_room, train
+from examples.train_depth import Example, crop, example, loss_of, of_room, train
 from experiments.dense.rooms import samples
+from tests.dense.slanted_plane import FAR, NEAR, scene
 from torchslam.dense.cost_volume import matching_cost
-from torchslam.dense.learned import DepthNet
+from torchslam.dense.estimate import estimate_depth
+from torchslam.dense.learned import RatingNet
 
 SEED = 3
 
@@ -41,7 +43,7 @@ def test_rooms_are_the_same_again() -> None:
 
 
 def test_a_crop_is_a_part_mirrored_or_not(room: list[Example]) -> None:
-    height, width = room[0].target.shape
+    height, width = room[0].is_right.shape
     column, row = (
         torch.arange(width).expand(height, -1).float(),
         torch.arange(height)[:, None].expand(-1, width).float(),
@@ -49,19 +51,18 @@ def test_a_crop_is_a_part_mirrored_or_not(room: list[Example]) -> None:
     inputs = room[0].inputs.float()
     inputs[0] = avg_pool2d(column[None], 2)[0]
     inputs[7:15] = pixel_unshuffle(torch.stack((column, row)), 2)
-    view, generator = (
-        room[0]._replace(inputs=inputs, inverse_depth=column, target=row),
-        torch.Generator().manual_seed(0),
-    )
+    # Marks of columns and rows that are not the same from the other side.
+    view = Example(inputs, column % 3 == 0, row % 3 == 0)
+    generator = torch.Generator().manual_seed(0)
     found = set()
     for _ in range(20):
         part = crop(view, generator, (40, 50))
         assert part.inputs.shape[-2:] == (40, 50)
-        assert torch.equal(
-            pixel_shuffle(part.inputs[7:15], 2), torch.stack((part.inverse_depth, part.target))
-        )
-        assert torch.equal(avg_pool2d(part.inverse_depth[None], 2)[0], part.inputs[0])
-        steps = part.inverse_depth.diff(dim=1).unique().tolist(), part.target.diff(dim=0).unique().tolist()
+        columns, rows = pixel_shuffle(part.inputs[7:15], 2)
+        assert torch.equal(part.is_right, columns % 3 == 0)
+        assert torch.equal(part.is_rated, rows % 3 == 0)
+        assert torch.equal(avg_pool2d(columns[None], 2)[0], part.inputs[0])
+        steps = columns.diff(dim=1).unique().tolist(), rows.diff(dim=0).unique().tolist()
         assert all(each in ([-1], [1]) for each in steps)
         found.add((steps[0][0], steps[1][0]))
     assert len(found) == 4
@@ -71,7 +72,20 @@ def test_a_small_view_is_padded_with_what_does_not_count(room: list[Example]) ->
     part = crop(room[0], torch.Generator().manual_seed(0), (200, 200))
     assert part.inputs.shape[-2:] == (200, 200)
     assert int(part.is_rated.sum()) == int(room[0].is_rated.sum())
-    assert int((part.target > 0).sum()) == int((room[0].target > 0).sum())
+    assert int(part.is_right.sum()) == int(room[0].is_right.sum())
+
+
+def test_depth_is_right_within_5_percent_and_wrong_where_nothing_confirms_it() -> None:
+    reference, sources, camera, T_sr, depth = scene(48, 40)
+    limits = torch.tensor([NEAR]), torch.tensor([FAR])
+    found = estimate_depth(reference[None], sources[None], camera, T_sr[None], *limits)
+    found = found._replace(inverse_depth=(1 / depth)[None].float())
+    target = 1 / depth.float() * torch.where(torch.arange(48) < 24, 1.04, 1.06)
+    target[:9] = 0
+    view = example(found, reference[None], *limits, target, torch.ones_like(target, dtype=torch.bool))
+    assert not view.is_right[:9].any()
+    assert view.is_right[9:, :24].all()
+    assert not view.is_right[9:, 24:].any()
 
 
 def test_the_loss_falls_and_training_gives_the_same_bytes_again(room: list[Example], tmp_path: Path) -> None:
@@ -81,5 +95,5 @@ def test_the_loss_falls_and_training_gives_the_same_bytes_again(room: list[Examp
     views = [each._replace(inputs=each.inputs.float()) for each in room]
     batch = Example(*(torch.stack(each) for each in zip(*views, strict=True)))
     with torch.no_grad():
-        before, after = (losses(each, batch)[1] for each in (DepthNet(), net))
+        before, after = (loss_of(each, batch) for each in (RatingNet(), net))
     assert float(after) < float(before)

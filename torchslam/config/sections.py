@@ -596,6 +596,6 @@ class DenseConfig(Settings, section="dense"):
 
     aggregation: str = setting(
         "classical",
-        "Aggregation of matching costs; learned: a small network changes and rates what the classical one found.",
+        "Aggregation of matching costs; learned: a small network rates what the classical one found.",
         choices=("classical", "learned"),
     )

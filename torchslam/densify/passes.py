@@ -27,7 +27,7 @@ from torchslam.dense.consistency import merge
 from torchslam.dense.depth_maps import DepthMaps, join, read_about
 from torchslam.dense.estimate import estimate_depth
 from torchslam.dense.fusion import CloudFusion
-from torchslam.dense.learned import learned_depth
+from torchslam.dense.learned import learned_confidence
 from torchslam.dense.normals import normals
 from torchslam.densify.pictures import write_picture
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
@@ -85,7 +85,7 @@ def densify(
         device: to compute on.
         on_progress: called after each view of both passes with the numbers done and in all.
         processes: that compute views, this one included; the results are the same. On a GPU one is used.
-        is_learned: let the network of the package change and rate the depth of each view (`dense.learned`).
+        is_learned: let the network of the package rate the depth of each view (`dense.learned`).
 
     Raises:
         ResultsError: too few images can be read.
@@ -144,7 +144,7 @@ class DenseJob:
         images: theirs.
         parts: folder of the results of views.
         device: to compute on.
-        is_learned: let the network of the package change and rate the depth of each view.
+        is_learned: let the network of the package rate the depth of each view.
     """
 
     def __init__(
@@ -178,11 +178,8 @@ def _write_alone(job: DenseJob, view: int) -> None:
     limits = views.near[view, None].to(device), views.far[view, None].to(device)
     poses = views.T_sr(view)[None, :SWEPT].to(device)
     found = estimate_depth(gray, sources[None].to(device), views.camera.to(device), poses, *limits)
-    if job.is_learned:
-        inverse_depth, confidence = learned_depth(found, gray, *limits)
-    else:
-        inverse_depth, confidence = found.inverse_depth, confidence_alone(found)
-    tensors = {"inverse_depth": inverse_depth[0], "confidence": confidence[0]}
+    confidence = learned_confidence(found, gray, *limits) if job.is_learned else confidence_alone(found)
+    tensors = {"inverse_depth": found.inverse_depth[0], "confidence": confidence[0]}
     content = save({name: rows.cpu().contiguous() for name, rows in tensors.items()})
     write_whole(job.path(Pass.ALONE, view), content)
 
