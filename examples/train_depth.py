@@ -7,7 +7,7 @@
 Without truth, the depth that several keyframes of a run agree on is what the depth of each alone is compared with: it
 comes from the poses and images of the run and nothing else. A depth that no other view confirms counts as wrong. An
 interrupted training continues from its checkpoint. Every room takes about 7 seconds and every keyframe one, before the
-training, which takes 4 minutes on one thread.
+training, which takes 9 minutes on one thread.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("results", nargs="*", type=Path, help="folders that `torchslam run` wrote")
     parser.add_argument("--rooms", type=int, default=0, help="number of rendered rooms")
-    parser.add_argument("--steps", type=int, default=3000)
+    parser.add_argument("--steps", type=int, default=6000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--checkpoint", type=Path, default=Path("depth.pt"), help="to continue from")
     parser.add_argument("--output", type=Path, default=Path("depth.safetensors"), help="the weights")
