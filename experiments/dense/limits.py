@@ -97,7 +97,7 @@ def main() -> None:
         minima = (planes[0] + (planes[1] - planes[0]) * lowest_minima(volumes[0][0])).float()
         minima = F.interpolate(minima[None], scale_factor=2)[0]
         depths.append(torch.cat((found.inverse_depth, minima)))
-        has_right.append((truth[view] > 0) & ((depths[-1] * truth[view] - 1).abs() < RIGHT))
+        has_right.append((truth[view] > 0) & ((1 / (depths[-1] * truth[view]) - 1).abs() < RIGHT))
         confidences.append(confidence_alone(found)[0])
         mean = F.avg_pool2d(gray, 7, 1, 3)
         textures.append((F.avg_pool2d(gray * gray, 7, 1, 3) - mean * mean)[0].clamp(min=0).sqrt())
@@ -112,41 +112,42 @@ def main() -> None:
     is_kept = kept_with(base, truth, LEAST_KEPT)
     share, wrong = float(is_kept.sum() / known.sum()), errors(base, truth, is_kept)
     accuracy = float((wrong < RIGHT).double().mean())
-    off = (base.inverse_depth * truth - 1).abs()
     others = depth_of_others(views, truth)
     little = torch.stack(textures) < LITTLE_TEXTURE
     print(f"kept {share:.1%}, of those wrong by more than 5 %: {1 - accuracy:.1%}")
-    for name, some in (
-        ("wrong, of a view alone", known & ~is_right[:, 0]),
-        ("wrong, of what is kept", is_kept & (1 / (base.inverse_depth * truth) - 1).abs().ge(RIGHT)),
+    for name, depth, counted in (
+        ("wrong, of a view alone", alone, known),
+        ("wrong, of what is kept", base.inverse_depth, is_kept),
     ):
+        error = (1 / (depth * truth) - 1).abs()
+        some = counted & (error >= RIGHT)
         judged = some & (others > 0)
         parts = {
             f"lowest of {MINIMA} minima right": is_right[:, 1],
             f"another of {MINIMA} right": is_right[:, 2:].any(1) & ~is_right[:, 1],
-            "error below 10 %": off < 2 * RIGHT,
+            "error below 10 %": error < 2 * RIGHT,
             "at borders": at_borders(truth),
             "little texture, not at borders": little & ~at_borders(truth),
         }
         said = [f"{part}: {float((some & each).sum() / some.sum()):.1%}" for part, each in parts.items()]
         contradicted = judged & ((others * truth - 1).abs() > RIGHT)
-        ours = judged & ((base.inverse_depth / others.clamp(min=1e-9) - 1).abs() < RIGHT)
-        said.append(f"truth of other frames contradicts: {float(contradicted.sum() / judged.sum()):.1%}")
-        said.append(f"and agrees with ours: {float(ours.sum() / judged.sum()):.1%}")
+        ours = judged & ((others / depth - 1).abs() < RIGHT)
+        said.append(f"truth of other frames contradicts it: {float(contradicted.sum() / judged.sum()):.1%}")
+        said.append(f"it agrees with ours: {float(ours.sum() / judged.sum()):.1%}")
         print(f"{name} ({float(some.sum() / known.sum()):.1%} of all): {'; '.join(said)}")
     best = torch.where(is_right[:, 0], 0, is_right.float().argmax(1))  # the found one where none is right
     chosen = torch.stack(depths).gather(1, best[:, None])[:, 0]
     sure = lambda right: torch.where(known, torch.where(right, SURE, 1 - SURE), classical)  # noqa: E731
     print("\n| | wrong by more than 5 % at the same share | kept at the same accuracy |\n|---|---|---|")
-    for name, depth in (
+    for name, either in (
         ("classical", base),
         ("true confidence", of(alone, sure(is_right[:, 0]))),
         (f"true choice of {MINIMA} minima", of(chosen, classical)),
         ("both", of(chosen, sure(is_right.any(1)))),
     ):
-        same = errors(depth, truth, kept_with(depth, truth, least_for(depth, truth, share)))
+        same = errors(either, truth, kept_with(either, truth, least_for(either, truth, share)))
         ratio = float((same > RIGHT).double().mean()) / (1 - accuracy)
-        print(f"| {name} | {ratio:.2f} | {most_at(depth, truth, accuracy):.1%} |", flush=True)
+        print(f"| {name} | {ratio:.2f} | {most_at(either, truth, accuracy):.1%} |", flush=True)
 
 
 if __name__ == "__main__":
