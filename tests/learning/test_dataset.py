@@ -27,6 +27,7 @@ from torchslam.learning.dataset import (
     GraphCache,
     clips_with_a_map,
     collate,
+    count_reasons,
     frames_in,
     parallax,
     stack_cameras,
@@ -234,6 +235,12 @@ def test_clip_graphs_are_computed_once() -> None:
     again = looking(collate([Clip.of(walk, 0, FRAMES, 1, 5)]))
     assert again.runs[0] is graphs.runs[1]
     assert torch.equal(clip_slam(batch.images, batch.camera, graphs).posed, torch.ones(2, FRAMES).bool())
+
+
+def test_reasons_that_differ_in_numbers_are_counted_together() -> None:
+    few = [f"too little parallax: {count} points have enough, 60 are needed" for count in (4, 57)]
+    planar = "the scene looks planar: a homography explains the matches"
+    assert count_reasons((*few, "", planar)) == {"too little parallax": 2, planar: 1}
 
 
 class StillRoom(Transformed):

@@ -16,6 +16,7 @@ from torchslam.learning.dataset import (
     GraphCache,
     clips_with_a_map,
     collate,
+    count_reasons,
     frames_in,
     parallax,
 )
@@ -48,6 +49,7 @@ __all__ = [
     "clip_reprojection",
     "clips_with_a_map",
     "collate",
+    "count_reasons",
     "epipolar_loss",
     "frames_in",
     "motion_difference",

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import itertools
+import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
 from collections.abc import Sequence as Several
@@ -271,7 +272,7 @@ def clips_with_a_map(clips: Clips, graphs: GraphCache) -> tuple[Subset[Clip], Co
     """Select the clips whose start finds a map; the graphs of all of them are built.
 
     Returns:
-        These clips, and how many of the others have no map for which reason.
+        These clips, and how many of the others have no map for which reason (`count_reasons`).
 
     Raises:
         ClipError: There is none.
@@ -280,7 +281,7 @@ def clips_with_a_map(clips: Clips, graphs: GraphCache) -> tuple[Subset[Clip], Co
     for number in range(len(clips)):
         reasons += graphs(collate([clips[number]])).reasons
     usable = [number for number, reason in enumerate(reasons) if not reason]
-    left_out = Counter(reason for reason in reasons if reason)
+    left_out = count_reasons(reasons)
     if not clips.chosen:
         raise ClipError(
             "no clips: the sequences are too short, their camera moves too little (min_parallax), or they have no true "
@@ -293,6 +294,11 @@ def clips_with_a_map(clips: Clips, graphs: GraphCache) -> tuple[Subset[Clip], Co
             f"{why}"
         )
     return Subset(clips, usable), left_out
+
+
+def count_reasons(reasons: Iterable[str]) -> Counter[str]:
+    """Count the reasons of failed clips, those together that differ in their numbers; empty ones do not count."""
+    return Counter(re.sub(r": \d.*", "", reason) for reason in reasons if reason)
 
 
 @torch.no_grad()
