@@ -1,52 +1,68 @@
-"""Learn the camera that recordings share from the poses of clips, with or without true poses.
+"""Learn the camera that recordings share from clips of them, with or without true poses.
 
-    python -m examples.learn_camera path/to/recording ... --camera 700,700,620,190 --steps 60 --output camera.txt
+    python -m examples.learn_camera path/to/recording ... --camera 700,700,620,190 --output camera.txt
     python -m examples.learn_camera path/to/recording ... --camera 700,700,620,190 --without-truth
 
 Focal lengths, principal point, distortion, and what is left of the lens on a small grid over the image, are found by
-the gradient of the trajectory error of clips (or, without truth, of their reprojection error) through `ClipSLAM`.
+the gradient of the reprojection errors of clips: of points between true poses, or, without truth, of the poses and
+points that `ClipSLAM` finds. The parameters are few: L-BFGS over all clips takes the place of many small steps.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor, nn
-from torch.utils.data import DataLoader
 
 from torchslam import ORB, Camera, ClipSLAM, Features, open_sequence
+from torchslam.errors import ClipError
 from torchslam.learning import (
-    Batches,
-    Clip,
+    ClipGraph,
     Clips,
-    GraphCache,
     Log,
-    Training,
-    clip_loss,
     clip_mean,
     clip_reprojection,
-    clips_with_a_map,
-    collate,
-    relative_ate,
+    count_reasons,
+    reprojection_loss,
 )
 
 GRID = (4, 6)  # rows and columns of what is left of the lens
-FAILED = 0.1  # loss of a clip that loses its poses on the way, as a fraction of its path
-PARTS = ("focal", "center", "distortion", "grid")
-RATES = {"focal": 5e-3, "center": 2e-3, "distortion": 2e-3, "grid": 2e-4}
-"""Of Adam, per step: the focal length changes by at most 0.5 %, the center by 0.2 px, the grid by 0.02 px."""
+PARAMETERS = {"focal": (0, 1), "center": (2, 3), "distortion": (4, 5, 6, 7)}
+"""Places of fx, fy, cx, cy, k1, k2, p1, p2 among the parameters of a camera; k3 stays as it is."""
+PARTS = (*PARAMETERS, "grid")
+SAMPLES = (12, 16)  # rows and columns of pixels whose motion tells what a parameter does
+KEYPOINTS = 1500  # per image: with fewer, many clips have too few points with parallax to start
+FRAMES, MIN_PARALLAX = 16, 0.1  # of a clip, and radians between its ends: with less, scenes look planar
+FAILED = 1.0  # loss of a clip that fails on the way, px^2: several times that of a good one
 RESIDUAL_PRIOR = 1e-3  # per squared pixel of the grid: it takes what the parameters do not explain
-_PIXELS = 100.0  # that one unit of a parameter of the grid or the principal point stands for
+ROUNDS, ITERATIONS = 2, 30  # of matching with the camera so far, and of L-BFGS in each
+LEAST_CHANGE = 1e-7  # px^2, of the loss, and px, of a parameter: L-BFGS ends
+BATCH = 8  # clips that are in memory with their gradients
 
 
 class LearnedCamera(nn.Module):
-    """A camera, and a grid of offsets of the pixels (x, y), as deviations from a start."""
+    """A camera near a start, and a grid of offsets of the pixels (x, y).
 
-    def __init__(self, start: Camera) -> None:
+    A unit of each number of `change` moves pixels by 1 px, in the root mean square over the image, and in a pattern at
+    right angles to those of the others. So focal lengths and distortion, which do much the same, are learned alike.
+    The grid is in pixels.
+
+    Args:
+        start: A pinhole camera, or one with radial and tangential distortion.
+        parts: Of `PARTS`, what is learned; the rest stays as at the start.
+
+    Raises:
+        ValueError: The start is of another model.
+    """
+
+    def __init__(self, start: Camera, parts: Sequence[str] = PARTS) -> None:
         super().__init__()
         params = start.params.detach().double()
         if start.model == "pinhole":
@@ -55,26 +71,27 @@ class LearnedCamera(nn.Module):
             raise ValueError(f"the distortion that is learned is radial and tangential, not {start.model}")
         self.size = start.size
         self.register_buffer("start", params)
-        self.focal = nn.Parameter(torch.zeros(2, dtype=torch.float64))  # logarithm of the factor
-        self.center = nn.Parameter(torch.zeros(2, dtype=torch.float64))
-        self.distortion = nn.Parameter(torch.zeros(4, dtype=torch.float64))
-        self.grid = nn.Parameter(torch.zeros(2, *GRID, dtype=torch.float64))
+        self.register_buffer("patterns", _patterns(Camera("radial_tangential", params, self.size), parts))
+        self.change = nn.Parameter(params.new_zeros(torch.as_tensor(self.patterns).shape[1]))
+        self.grid = nn.Parameter(params.new_zeros(2, *GRID), requires_grad="grid" in parts)
 
     def camera(self) -> Camera:
         """The camera now, differentiable."""
-        start = torch.as_tensor(self.start)
-        focal, center = start[:2] * self.focal.exp(), start[2:4] + _PIXELS * self.center
-        bend = start[4:8] + self.distortion
-        return Camera("radial_tangential", torch.cat((focal, center, bend, start[8:])), self.size)
+        params = torch.as_tensor(self.start) + torch.as_tensor(self.patterns) @ self.change
+        return Camera("radial_tangential", params, self.size)
 
-    def straightened(self, keypoints: Tensor) -> Tensor:
-        """Keypoints (B, N, 2) moved to where the camera without the grid would have seen them."""
+    def straightened(self, keypoints: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N 2"]:
+        """Keypoints moved to where the camera without the grid would have seen them."""
         places = 2 * keypoints.double() / (torch.tensor(self.size).double() - 1) - 1
-        grid = _PIXELS * self.grid.expand(len(keypoints), *self.grid.shape)
+        grid = self.grid.expand(len(keypoints), *self.grid.shape)
         offset = torch.nn.functional.grid_sample(
             grid, places[:, None], padding_mode="border", align_corners=True
         )
         return keypoints + offset[:, :, 0].mT
+
+    def seen(self, features: Features) -> Features:
+        """Features with straightened keypoints."""
+        return replace(features, keypoints=self.straightened(features.keypoints))
 
 
 class SeenThrough(nn.Module):
@@ -87,53 +104,142 @@ class SeenThrough(nn.Module):
     def forward(self, images: Tensor) -> Features:
         with torch.no_grad():
             found: Features = self.extractor(images)
-        return replace(found, keypoints=self.lens.straightened(found.keypoints))
+        return self.lens.seen(found)
+
+
+class Example(NamedTuple):
+    """A clip of T frames: its features as they were extracted, what they see, and the true poses."""
+
+    features: Features
+    graph: ClipGraph
+    T_cw: Float[Tensor, "T 4 4"]
 
 
 def learn(
     clips: Clips,
     start: Camera,
-    steps: int,
     supervised: bool,
     parts: Sequence[str] = PARTS,
-    batch: int = 4,
-    seed: int = 0,
+    iterations: int = ITERATIONS,
     log: Log | None = None,
 ) -> LearnedCamera:
-    """The camera that explains clips best; `supervised` by their true poses, or by their own reprojection errors.
+    """The camera that explains clips best.
 
-    parts: of `PARTS`, what is learned; the rest stays as at the start
+    Args:
+        clips: Of recordings of the camera, with true poses if `supervised`.
+        start: A camera to start from.
+        supervised: Points are between the true poses; otherwise poses and points are those that fit best.
+        parts: Of `PARTS`, what is learned; the rest stays as at the start.
+        iterations: Of L-BFGS, in each of two rounds. Matches of the second are found with the camera of the first.
+        log: Receives the loss of every evaluation, px^2, and its number in the round.
+
+    Raises:
+        ClipError: No clip can be used.
     """
-    lens = LearnedCamera(start)
-    clip_slam = ClipSLAM(SeenThrough(ORB(600), lens))
-    graphs = GraphCache(clip_slam)
-    usable, left_out = clips_with_a_map(clips, graphs)
-    for reason, count in left_out.most_common():
-        print(f"{count} of {len(clips)} clips are left out: {reason}")
-    optimizer = torch.optim.Adam([{"params": [getattr(lens, part)], "lr": RATES[part]} for part in parts])
-    training = Training(clip_slam, optimizer, steps, seed=seed, log=log)
-    batches = Batches(len(usable), min(batch, len(usable)), seed=seed)
-    loader = DataLoader(usable, batch_sampler=batches, collate_fn=collate)
-    for _, clip in zip(training, loader, strict=False):
-        training.descend(loss_of(clip_slam, lens, clip, graphs, supervised))
+    lens, clip_slam = LearnedCamera(start, parts), ClipSLAM(ORB(KEYPOINTS))
+    for _ in range(ROUNDS):
+        examples, left_out = matched(clips, clip_slam, lens)
+        for reason, count in left_out.most_common():
+            print(f"{count} of {len(clips)} clips are left out: {reason}")
+        if not examples:
+            raise ClipError("no clip can be used: take longer clips, a larger parallax, or a better camera")
+        _minimize(lens, clip_slam, examples, supervised, iterations, log)
     return lens
 
 
+def matched(clips: Clips, clip_slam: ClipSLAM, lens: LearnedCamera) -> tuple[list[Example], Counter[str]]:
+    """Clips whose frames all find poses with the camera so far, and how many of the others do not, by reason."""
+    examples, reasons = [], []
+    with torch.no_grad():
+        for number in range(len(clips)):
+            clip = clips[number]
+            features = clip_slam.extract(clip.images)
+            assert isinstance(features, Features)
+            graph = clip_slam.build_graph(clip.images, lens.camera(), lens.seen(features))
+            poses = clip_slam.pose(graph, lens.seen(features))
+            lost = "" if poses.posed.all() else "frames without a pose"
+            reasons.append(poses.reasons[0] or lost)
+            if not reasons[-1]:
+                examples.append(Example(features, graph, clip.T_cw))
+    return examples, count_reasons(reasons)
+
+
 def loss_of(
-    clip_slam: ClipSLAM, lens: LearnedCamera, clip: Clip, graphs: GraphCache, supervised: bool
-) -> Tensor:
-    """The loss of a batch of clips."""
-    poses = clip_slam(clip.images, lens.camera(), graphs(clip))
+    clip_slam: ClipSLAM, lens: LearnedCamera, examples: Sequence[Example], supervised: bool
+) -> Float[Tensor, ""]:
+    """The mean loss of clips, px^2."""
+    seen = [lens.seen(each.features) for each in examples]
     if supervised:
-        loss, _ = clip_loss(poses, clip.T_cw, relative_ate, on_failure=FAILED)
+        each = zip(examples, seen, strict=True)
+        loss = torch.stack([_between_true_poses(*one, lens.camera()) for one in each]).mean()
     else:
+        graph = ClipGraph.stack([each.graph for each in examples])
+        poses = clip_slam.pose(graph, seen, lens.camera())
         loss, _ = clip_mean(poses, clip_reprojection(poses), on_failure=FAILED)
-    return loss + RESIDUAL_PRIOR * (_PIXELS * lens.grid).square().mean()
+    return loss + RESIDUAL_PRIOR * lens.grid.square().mean()
 
 
 def describe(camera: Camera) -> str:
     """The parameters as `--camera` and calibration files have them."""
     return ",".join(f"{value:.6g}" for value in camera.params.tolist())
+
+
+def _minimize(
+    lens: LearnedCamera,
+    clip_slam: ClipSLAM,
+    examples: Sequence[Example],
+    supervised: bool,
+    iterations: int,
+    log: Log | None,
+) -> None:
+    """Change what is learned of a camera until the mean loss of the examples is least."""
+    learned = [each for each in lens.parameters() if each.requires_grad and each.numel()]
+    optimizer = torch.optim.LBFGS(
+        learned, max_iter=iterations, tolerance_change=LEAST_CHANGE, line_search_fn="strong_wolfe"
+    )
+    losses: list[float] = []
+
+    def evaluate() -> float:
+        optimizer.zero_grad()
+        losses.append(0.0)
+        for row in range(0, len(examples), BATCH):
+            batch = examples[row : row + BATCH]
+            loss = loss_of(clip_slam, lens, batch, supervised) * len(batch) / len(examples)
+            loss.backward()
+            losses[-1] += float(loss.detach())
+        if log is not None:
+            log("loss", losses[-1], len(losses))
+        return losses[-1]
+
+    optimizer.step(evaluate)
+
+
+def _between_true_poses(example: Example, seen: Features, camera: Camera) -> Float[Tensor, ""]:
+    """The reprojection errors of the points of a clip, triangulated between its true poses."""
+    graph = example.graph.runs[0]
+    assert graph is not None
+    frames = graph.frame_ids[graph.frame_index]
+    at = graph.point_index, frames
+    mask = torch.zeros(len(graph.points_w), len(example.T_cw), dtype=torch.bool)
+    pixels = seen.keypoints.new_zeros(*mask.shape, 2)
+    pixels = pixels.index_put(at, seen.keypoints[frames, graph.keypoint_index])
+    return reprojection_loss(example.T_cw, pixels, camera, mask.index_put(at, torch.tensor(True)))
+
+
+def _patterns(camera: Camera, parts: Iterable[str]) -> Float[Tensor, "P K"]:
+    """Changes of the parameters of a camera, each of which moves the pixels in another pattern, by 1 px each."""
+    columns = [column for part in parts for column in PARAMETERS.get(part, ())]
+    y, x = (
+        (torch.arange(count, dtype=torch.float64) + 0.5) / count * side - 0.5
+        for count, side in zip(SAMPLES, reversed(camera.size), strict=True)
+    )
+    pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1).reshape(-1, 2)
+    rays = camera.unproject(pixels)
+    J = torch.func.jacfwd(lambda params: camera.with_params(params).project(rays)[0])(camera.params)
+    _, S, Vt = torch.linalg.svd(J[..., columns].flatten(0, 1), full_matrices=False)
+    patterns = J.new_zeros(len(camera.params), len(columns))
+    patterns[columns] = Vt.mT / S * len(pixels) ** 0.5
+    return patterns
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -142,8 +248,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--camera", help="fx,fy,cx,cy to start from; the one of the recordings if omitted")
     parser.add_argument("--without-truth", action="store_true")
     parser.add_argument("--parts", default=",".join(PARTS), help="what is learned")
-    parser.add_argument("--steps", type=int, default=60)
     parser.add_argument("--clips", type=int, default=30, help="number of clips per recording")
+    parser.add_argument("--frames", type=int, default=FRAMES, help="of a clip; fewer for a car")
+    parser.add_argument(
+        "--min-parallax", type=float, default=MIN_PARALLAX, help="of a clip, radians; less for a car"
+    )
+    parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--resize-to")
     parser.add_argument("--output", type=Path)
     options = parser.parse_args(arguments)
@@ -154,14 +264,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         fx, fy, cx, cy = map(float, options.camera.split(","))
         start = Camera.pinhole(fx, fy, cx, cy, size=start.size)
     supervised = not options.without_truth
-    clips = Clips(sequences, per_sequence=options.clips, supervised=supervised)
+    clips = Clips(sequences, options.frames, options.clips, options.min_parallax, supervised=supervised)
 
     def log(name: str, value: float, step: int) -> None:
-        print(f"{step:5d} {name} {value:.4g}", flush=True)
+        print(f"{step:5d} {name} {value:.5g}", flush=True)
 
-    lens = learn(clips, start, options.steps, supervised, options.parts.split(","), log=log)
+    lens = learn(clips, start, supervised, options.parts.split(","), options.iterations, log)
     camera = lens.camera()
-    print(f"camera {describe(camera)}, grid up to {float(_PIXELS * lens.grid.detach().abs().max()):.2f} px")
+    print(f"camera {describe(camera)}, grid up to {float(lens.grid.detach().abs().max()):.2f} px")
     if options.output is not None:
         options.output.write_text(describe(camera).replace(",", " ") + "\n")
 
