@@ -31,8 +31,8 @@ OnFailure = Literal["raise", "skip"] | float
 
 # Clips whose keypoints moved by 0.5 px need 5 to 70, by 1.5 px mostly below 200; 30 are too few for a third of them.
 _ITERATIONS = 300
-# Relative cost decrease that the last step predicts: gradients are then right to 1e-6; with 1e-10 to 1e-5. Rounding of
-# the cost of 4000 keypoints is 1e-14: with that, one in five clips of 16 frames did not converge in any time.
+# Relative cost decrease that the last step predicts: gradients are then right to 2e-6; with 1e-10 to 1e-4. Rounding of
+# the cost of 4000 keypoints is 1e-14: with that, one in nine clips of 16 frames never converges.
 _TOLERANCE = 1e-12
 _MAX_MOTION_PX = 16.0
 """Keypoints that learn move by a pixel or two, with noise by ten; another one in the same row is a hundred away."""
