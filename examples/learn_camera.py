@@ -2,6 +2,8 @@
 
     python -m examples.learn_camera path/to/recording ... --camera 700,700,620,190 --output camera.txt
     python -m examples.learn_camera path/to/recording ... --camera 700,700,620,190 --without-truth
+    torchslam run another/recording --camera camera.txt \\
+        --features examples.learn_camera:Straightened --weights camera.safetensors
 
 Focal lengths, principal point, distortion, and what is left of the lens on a small grid over the image, are found by
 the gradient of the reprojection errors of clips: of points between true poses, or, without truth, of the poses and
@@ -18,7 +20,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from safetensors.torch import load_file, save_file
 from torch import Tensor, nn
 
 from torchslam import ORB, Camera, ClipSLAM, Features, open_sequence
@@ -82,29 +85,50 @@ class LearnedCamera(nn.Module):
 
     def straightened(self, keypoints: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N 2"]:
         """Keypoints moved to where the camera without the grid would have seen them."""
-        places = 2 * keypoints.double() / (torch.tensor(self.size).double() - 1) - 1
-        grid = self.grid.expand(len(keypoints), *self.grid.shape)
-        offset = torch.nn.functional.grid_sample(
-            grid, places[:, None], padding_mode="border", align_corners=True
-        )
-        return keypoints + offset[:, :, 0].mT
+        return straighten(keypoints, self.grid, keypoints.new_tensor(self.size, dtype=torch.float64))
 
     def seen(self, features: Features) -> Features:
         """Features with straightened keypoints."""
         return replace(features, keypoints=self.straightened(features.keypoints))
 
+    def weights(self) -> dict[str, Tensor]:
+        """What `Straightened` reads."""
+        return {"grid": self.grid.detach(), "size": torch.tensor(self.size, dtype=torch.float64)}
 
-class SeenThrough(nn.Module):
-    """A front end whose keypoints are straightened by the learned lens."""
 
-    def __init__(self, extractor: nn.Module, lens: LearnedCamera) -> None:
+class Straightened(nn.Module):
+    """ORB with keypoints where the learned camera, which knows no grid, would have seen them.
+
+    Args:
+        num_keypoints: of ORB.
+        weights: a file with the learned grid and the size of the images, or None for no grid.
+    """
+
+    def __init__(self, num_keypoints: int = KEYPOINTS, weights: str | None = None) -> None:
         super().__init__()
-        self.extractor, self.lens = extractor, lens
+        self.orb = ORB(num_keypoints)
+        self.register_buffer("grid", torch.zeros(2, *GRID, dtype=torch.float64))
+        self.register_buffer("size", torch.ones(2, dtype=torch.float64))
+        if weights is not None:
+            self.load_state_dict(load_file(weights))
 
-    def forward(self, images: Tensor) -> Features:
-        with torch.no_grad():
-            found: Features = self.extractor(images)
-        return self.lens.seen(found)
+    def forward(
+        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
+    ) -> Features:
+        found = self.orb(images, mask)
+        grid, size = torch.as_tensor(self.grid), torch.as_tensor(self.size)
+        return replace(found, keypoints=straighten(found.keypoints, grid, size))
+
+
+def straighten(
+    keypoints: Float[Tensor, "B N 2"], grid: Float[Tensor, "2 rows columns"], size: Float[Tensor, "2"]
+) -> Float[Tensor, "B N 2"]:
+    """Keypoints of images of a size (width, height), moved by the offsets of a grid, bilinear between its nodes."""
+    places = 2 * keypoints.double() / (size - 1) - 1
+    offset = torch.nn.functional.grid_sample(
+        grid.expand(len(keypoints), *grid.shape), places[:, None], padding_mode="border", align_corners=True
+    )
+    return keypoints + offset[:, :, 0].mT
 
 
 class Example(NamedTuple):
@@ -255,7 +279,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--iterations", type=int, default=ITERATIONS)
     parser.add_argument("--resize-to")
-    parser.add_argument("--output", type=Path)
+    parser.add_argument("--output", type=Path, help="of the camera; its grid goes beside it, as .safetensors")
     options = parser.parse_args(arguments)
     torch.set_num_threads(1)
     sequences = [open_sequence(name, resize_to=options.resize_to) for name in options.sequences]
@@ -274,6 +298,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"camera {describe(camera)}, grid up to {float(lens.grid.detach().abs().max()):.2f} px")
     if options.output is not None:
         options.output.write_text(describe(camera).replace(",", " ") + "\n")
+        save_file(lens.weights(), options.output.with_suffix(".safetensors"))
 
 
 if __name__ == "__main__":

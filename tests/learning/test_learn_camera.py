@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
+from safetensors.torch import save_file
 from torch import Tensor
 
-from examples.learn_camera import LearnedCamera, SeenThrough, learn
+from examples.learn_camera import LearnedCamera, Straightened, learn
 from experiments.learning.camera.bent_lens import FOCAL, SIZE, Bent, bent_lens, ray_errors
 from torchslam import ORB, Camera, open_sequence
 from torchslam.data import Sequence
@@ -76,9 +79,19 @@ def test_the_grid_moves_keypoints_near_its_nodes() -> None:
         lens.grid[:, 0, 0] = torch.tensor([2.0, -1.0])  # to the right and up, at the top left
     at = torch.tensor([[[0.0, 0.0], [319.0, 239.0]]], dtype=torch.float64)
     torch.testing.assert_close(lens.straightened(at) - at, torch.tensor([[[2.0, -1.0], [0.0, 0.0]]]).double())
-    found = SeenThrough(ORB(50), lens)(torch.rand(1, 1, 240, 320, generator=torch.Generator().manual_seed(0)))
-    plain = ORB(50)(torch.rand(1, 1, 240, 320, generator=torch.Generator().manual_seed(0)))
-    torch.testing.assert_close(found.keypoints, lens.straightened(plain.keypoints))
+
+
+def test_a_front_end_reads_the_learned_grid(tmp_path: Path) -> None:
+    lens = bent_lens(0)
+    save_file(lens.weights(), tmp_path / "camera.safetensors")
+    image = torch.rand(1, 1, *reversed(SIZE), generator=torch.Generator().manual_seed(0))
+    plain = ORB(50)(image)
+    found = Straightened(50, str(tmp_path / "camera.safetensors"))(image)
+    assert torch.equal(found.keypoints, lens.straightened(plain.keypoints))
+    assert not torch.equal(found.keypoints, plain.keypoints)
+    assert torch.equal(Straightened(50)(image).keypoints, plain.keypoints.double())
+    mask = torch.zeros_like(image, dtype=torch.bool)
+    assert not Straightened(50)(image, mask).mask.any()
 
 
 @pytest.fixture(scope="module")

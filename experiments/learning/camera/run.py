@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import torch
 
-from examples.learn_camera import PARTS, LearnedCamera, SeenThrough, describe, learn
-from experiments.common import parser_of, place_of, publish, table
+from examples.learn_camera import PARTS, LearnedCamera, Straightened, describe, learn
+from experiments.common import parser_of, place_of, table, write_between
 from experiments.learning.camera.bent_lens import FOCAL, SIZE, Bent, bent_lens, ray_errors
-from torchslam import ORB, SLAM, Camera, evaluate, load_config, open_sequence
+from torchslam import SLAM, Camera, evaluate, load_config, open_sequence
 from torchslam.data import Sequence as Frames
 from torchslam.learning import Clips
 
@@ -47,7 +48,10 @@ def error(sequence: Frames, camera: Camera, lens: LearnedCamera | None = None, i
     Raises SystemExit if a frame has no pose.
     """
     config = load_config(None, ["camera.std=0"] if is_held else [])
-    front_end = None if lens is None else SeenThrough(ORB(config.features.num_keypoints), lens)
+    front_end = None
+    if lens is not None:
+        front_end = Straightened(config.features.num_keypoints)
+        front_end.load_state_dict(lens.weights())
     with torch.no_grad():
         run = SLAM(camera, config, front_end).run(sequence)
     assert sequence.groundtruth is not None
@@ -132,7 +136,10 @@ def main() -> None:
         text = table(DRIVE_HEADER, drive_rows())
     else:
         text = table(ROOMS_HEADER, [row for seed in arguments.seeds for row in room_rows(seed)])
-    publish(text, arguments, __file__)
+    print(text)
+    if not arguments.no_readme:
+        readme, name = Path(__file__).parent / "README.md", arguments.recordings
+        write_between(readme, text, f"<!-- {name} -->\n", f"<!-- end {name} -->")
 
 
 if __name__ == "__main__":
