@@ -7,7 +7,7 @@
 
 Focal lengths, principal point, distortion, and what is left of the lens on a small grid over the image, are found by
 the gradient of the reprojection errors of clips: of points between true poses, or, without truth, of the poses and
-points that `ClipSLAM` finds. The parameters are few: L-BFGS over all clips takes the place of many small steps.
+points that `ClipSLAM` finds.
 """
 
 from __future__ import annotations
@@ -27,9 +27,11 @@ from torch import Tensor, nn
 from torchslam import ORB, Camera, ClipSLAM, Features, open_sequence
 from torchslam.errors import ClipError
 from torchslam.learning import (
+    Batches,
     ClipGraph,
     Clips,
     Log,
+    Training,
     clip_mean,
     clip_reprojection,
     count_reasons,
@@ -45,9 +47,11 @@ KEYPOINTS = 1500  # per image: with fewer, many clips have too few points with p
 FRAMES, MIN_PARALLAX = 16, 0.1  # of a clip, and radians between its ends: with less, scenes look planar
 FAILED = 1.0  # loss of a clip that fails on the way, px^2: several times that of a good one
 RESIDUAL_PRIOR = 1e-3  # per squared pixel of the grid: it takes what the parameters do not explain
-ROUNDS, ITERATIONS = 2, 30  # of matching with the camera so far, and of L-BFGS in each
+ROUNDS = 2  # of matching with the camera so far
+ITERATIONS, STEPS = 30, 80  # in a round: of L-BFGS with true poses, of Adam without
 LEAST_CHANGE = 1e-7  # px^2, of the loss, and px, of a parameter: L-BFGS ends
-BATCH = 8  # clips that are in memory with their gradients
+RATE, GRID_RATE = 0.5, 0.05  # of Adam, pixels
+BATCH = 4  # clips of a step, or in memory with their gradients
 
 
 class LearnedCamera(nn.Module):
@@ -144,7 +148,8 @@ def learn(
     start: Camera,
     supervised: bool,
     parts: Sequence[str] = PARTS,
-    iterations: int = ITERATIONS,
+    steps: int | None = None,
+    seed: int = 0,
     log: Log | None = None,
 ) -> LearnedCamera:
     """The camera that explains clips best.
@@ -154,8 +159,10 @@ def learn(
         start: A camera to start from.
         supervised: Points are between the true poses; otherwise poses and points are those that fit best.
         parts: Of `PARTS`, what is learned; the rest stays as at the start.
-        iterations: Of L-BFGS, in each of two rounds. Matches of the second are found with the camera of the first.
-        log: Receives the loss of every evaluation, px^2, and its number in the round.
+        steps: In each of two rounds; matches of the second are found with the camera of the first. None: `ITERATIONS`
+            or `STEPS`.
+        seed: Of the order of the clips, without true poses.
+        log: Receives the losses, px^2, and their numbers in the round.
 
     Raises:
         ClipError: No clip can be used.
@@ -167,7 +174,10 @@ def learn(
             print(f"{count} of {len(clips)} clips are left out: {reason}")
         if not examples:
             raise ClipError("no clip can be used: take longer clips, a larger parallax, or a better camera")
-        _minimize(lens, clip_slam, examples, supervised, iterations, log)
+        if supervised:
+            _minimize(lens, clip_slam, examples, steps or ITERATIONS, log)
+        else:
+            _descend(lens, clip_slam, examples, steps or STEPS, seed, log)
     return lens
 
 
@@ -209,14 +219,9 @@ def describe(camera: Camera) -> str:
 
 
 def _minimize(
-    lens: LearnedCamera,
-    clip_slam: ClipSLAM,
-    examples: Sequence[Example],
-    supervised: bool,
-    iterations: int,
-    log: Log | None,
+    lens: LearnedCamera, clip_slam: ClipSLAM, examples: Sequence[Example], iterations: int, log: Log | None
 ) -> None:
-    """Change what is learned of a camera until the mean loss of the examples is least."""
+    """Minimize the loss with true poses: it is smooth, so that L-BFGS over all clips finds the minimum."""
     learned = [each for each in lens.parameters() if each.requires_grad and each.numel()]
     optimizer = torch.optim.LBFGS(
         learned, max_iter=iterations, tolerance_change=LEAST_CHANGE, line_search_fn="strong_wolfe"
@@ -228,7 +233,7 @@ def _minimize(
         losses.append(0.0)
         for row in range(0, len(examples), BATCH):
             batch = examples[row : row + BATCH]
-            loss = loss_of(clip_slam, lens, batch, supervised) * len(batch) / len(examples)
+            loss = loss_of(clip_slam, lens, batch, supervised=True) * len(batch) / len(examples)
             loss.backward()
             losses[-1] += float(loss.detach())
         if log is not None:
@@ -236,6 +241,23 @@ def _minimize(
         return losses[-1]
 
     optimizer.step(evaluate)
+
+
+def _descend(
+    lens: LearnedCamera,
+    clip_slam: ClipSLAM,
+    examples: Sequence[Example],
+    steps: int,
+    seed: int,
+    log: Log | None,
+) -> None:
+    """Descend the loss from the images alone: it jumps where a clip finds another minimum, which many steps average."""
+    rates = [(lens.change, RATE), (lens.grid, GRID_RATE)]
+    groups = [{"params": [each], "lr": rate} for each, rate in rates if each.requires_grad and each.numel()]
+    training = Training(lens, torch.optim.Adam(groups), steps, seed, log)
+    batches = Batches(len(examples), min(BATCH, len(examples)), seed)
+    for _, rows in zip(training, batches, strict=False):
+        training.descend(loss_of(clip_slam, lens, [examples[row] for row in rows], supervised=False))
 
 
 def _between_true_poses(example: Example, seen: Features, camera: Camera) -> Float[Tensor, ""]:
@@ -277,7 +299,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument(
         "--min-parallax", type=float, default=MIN_PARALLAX, help="of a clip, radians; less for a car"
     )
-    parser.add_argument("--iterations", type=int, default=ITERATIONS)
+    parser.add_argument("--steps", type=int, help=f"in each round; {ITERATIONS}, or {STEPS} without truth")
     parser.add_argument("--resize-to")
     parser.add_argument("--output", type=Path, help="of the camera; its grid goes beside it, as .safetensors")
     options = parser.parse_args(arguments)
@@ -293,7 +315,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     def log(name: str, value: float, step: int) -> None:
         print(f"{step:5d} {name} {value:.5g}", flush=True)
 
-    lens = learn(clips, start, supervised, options.parts.split(","), options.iterations, log)
+    lens = learn(clips, start, supervised, options.parts.split(","), options.steps, log=log)
     camera = lens.camera()
     print(f"camera {describe(camera)}, grid up to {float(lens.grid.detach().abs().max()):.2f} px")
     if options.output is not None:

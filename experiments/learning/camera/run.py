@@ -129,7 +129,7 @@ def room_rows(seed: int) -> list[list[str]]:
 def main() -> None:
     parser = parser_of(__doc__, readme=True)
     parser.add_argument("recordings", choices=("drive", "rooms"))
-    parser.add_argument("--seeds", type=int, nargs="*", default=SEEDS, help="of the lenses of rooms")
+    parser.add_argument("--seeds", type=int, nargs="*", default=SEEDS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.recordings == "drive":
