@@ -43,6 +43,8 @@ def test_it_starts_as_the_given_camera_and_everything_has_a_gradient() -> None:
         assert (each.grad != 0).any()
     with pytest.raises(ValueError, match="fisheye"):
         LearnedCamera(Camera.fisheye(260.0, 260.0, 159.5, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240)))
+    with pytest.raises(ValueError, match="must be of focal, center, distortion, grid, not lens"):
+        LearnedCamera(CAMERA, ("lens",))
 
 
 @pytest.mark.parametrize("start", [CAMERA, BENT])
