@@ -72,7 +72,9 @@ class LearnedCamera(nn.Module):
     def __init__(self, start: Camera, parts: Sequence[str] = PARTS) -> None:
         super().__init__()
         if not parts or not set(parts) <= set(PARTS):
-            raise ValueError(f"what is learned of a camera must be of {', '.join(PARTS)}, not {', '.join(parts)}")
+            raise ValueError(
+                f"what is learned of a camera must be of {', '.join(PARTS)}, not {', '.join(parts)}"
+            )
         params = start.params.detach().double()
         if start.model == "pinhole":
             params = torch.nn.functional.pad(params, (0, 5))
