@@ -12,9 +12,8 @@ from torchslam.data.sequence import Sequence, Transformed
 from torchslam.geometry import Camera
 
 SIZE = (320, 240)
-FOCAL = (
-    300.0  # pixels; a longer one than that of the rendered images, which have to cover what the lens bends in
-)
+FOCAL = 300.0
+"""Pixels, longer than that of the rendered images at this size: they have to cover what the lens bends in."""
 SAMPLES = 2  # of a pixel, in each direction
 FOCAL_SPREAD, CENTER_SPREAD = 0.02, 3.0  # share, and pixels
 DISTORTION = (-0.15, 0.03, 0.0, 0.0)  # k1, k2, p1, p2

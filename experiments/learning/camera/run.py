@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from examples.learn_camera import PARTS, LearnedCamera, Straightened, describe, learn
+from examples.learn_camera import FRAMES, MIN_PARALLAX, LearnedCamera, Straightened, describe, learn
 from experiments.common import parser_of, place_of, table, write_between
 from experiments.learning.camera.bent_lens import FOCAL, SIZE, Bent, bent_lens, ray_errors
 from torchslam import SLAM, Camera, evaluate, load_config, open_sequence
@@ -99,7 +99,7 @@ def room_rows(seed: int) -> list[list[str]]:
     given = Camera.pinhole(OFF * FOCAL, OFF * FOCAL, cx, cy, size=SIZE)
     train = [Bent(open_sequence(name, stop=ROOM_FRAMES), lens, given) for name in LEARNED_FROM]
     test = [Bent(open_sequence(name, stop=JUDGED_FRAMES), lens, given) for name in JUDGED_ON]
-    clips = Clips(train, frames=16, per_sequence=ROOM_CLIPS, min_parallax=0.1, seed=seed)
+    clips = Clips(train, FRAMES, ROOM_CLIPS, MIN_PARALLAX, seed=seed)
 
     exact = [error(each, detached(lens), lens) for each in test]
     rows = []
@@ -120,7 +120,7 @@ def room_rows(seed: int) -> list[list[str]]:
     row("the true camera without the grid", [error(each, detached(lens)) for each in test], without_grid)
     for is_supervised, source in SUPERVISED.items():
         began = time.process_time()
-        found = learn(clips, given, is_supervised, PARTS)
+        found = learn(clips, given, is_supervised)
         seconds = time.process_time() - began
         row(f"learned from {source}", [error(each, detached(found), found) for each in test], found, seconds)
     return rows
@@ -129,13 +129,12 @@ def room_rows(seed: int) -> list[list[str]]:
 def main() -> None:
     parser = parser_of(__doc__, readme=True)
     parser.add_argument("recordings", choices=("drive", "rooms"))
-    parser.add_argument("--seeds", type=int, nargs="*", default=SEEDS)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     if arguments.recordings == "drive":
         text = table(DRIVE_HEADER, drive_rows())
     else:
-        text = table(ROOMS_HEADER, [row for seed in arguments.seeds for row in room_rows(seed)])
+        text = table(ROOMS_HEADER, [row for seed in SEEDS for row in room_rows(seed)])
     print(text)
     if not arguments.no_readme:
         readme, name = Path(__file__).parent / "README.md", arguments.recordings
