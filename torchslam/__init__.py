@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from torchslam.data import open_sequence
     from torchslam.errors import TorchslamError
     from torchslam.evaluation import evaluate
-    from torchslam.features import ALIKED, ORB, OpenCVORB, XFeat, match, match_by_projection
+    from torchslam.features import ALIKED, ORB, SIFT, OpenCVORB, XFeat, match, match_by_projection
     from torchslam.geometry import (
         Camera,
         estimate_absolute_pose,
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 __all__ = [
     "ALIKED",
     "ORB",
+    "SIFT",
     "SLAM",
     "BundleProblem",
     "Camera",
@@ -77,7 +78,7 @@ HOMES = {
     "torchslam.data": "open_sequence",
     "torchslam.errors": "TorchslamError",
     "torchslam.evaluation": "evaluate",
-    "torchslam.features": "ALIKED ORB OpenCVORB XFeat match match_by_projection",
+    "torchslam.features": "ALIKED ORB OpenCVORB SIFT XFeat match match_by_projection",
     "torchslam.geometry": "Camera estimate_absolute_pose estimate_relative_pose triangulate umeyama",
     "torchslam.learning.clip_slam": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.system.run": "Run",

@@ -164,6 +164,16 @@ def test_simulated_features_and_true_scale(tmp_path: Path) -> None:
     assert figures["scale"] == pytest.approx(1.0, abs=1e-3)
 
 
+@pytest.mark.usefixtures("without_pictures")
+def test_sift_is_a_kind_of_features(tmp_path: Path) -> None:
+    arguments = ["--features", "sift", "--set", "features.num_keypoints=500", "--limit", "8"]
+    assert main(["run", ROOM, "--output", str(tmp_path), *arguments]) == 0
+    figures = json.loads((tmp_path / "metrics.json").read_text())
+    assert figures["posed"] == 8
+    assert figures["ate_m"] < 0.05 * figures["path_length_m"]
+    assert load_config(tmp_path / "config.toml").features.kind == "sift"
+
+
 def test_a_static_camera_gives_no_map_and_a_reason(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

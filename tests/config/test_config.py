@@ -65,7 +65,7 @@ def test_an_integer_is_accepted_as_a_float() -> None:
         ("num_keypoints=5", "did you mean 'features.num_keypoints'"),
         ("features.num_keypoints=many", "must be of type int"),
         ("features.num_keypoints=true", "must be of type int"),
-        ("features.kind=sift", "must be one of orb, opencv-orb"),
+        ("features.kind=surf", "must be one of orb, opencv-orb, sift"),
         ("features=3", "is a section"),
         ("matching.max_ratio=nan", "matching.max_ratio must be above 0 and at most 1, not nan"),
         ("matching.max_ratio=-0.5", "matching.max_ratio must be above 0 and at most 1, not -0.5"),
@@ -196,7 +196,7 @@ def test_the_choices_of_settings() -> None:
     assert CHOICES == {
         "scale": ("unit", "groundtruth"),
         "dense.aggregation": ("classical", "learned"),
-        "features.kind": ("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
+        "features.kind": ("orb", "opencv-orb", "sift", "simulated", "xfeat", "aliked"),
         "initialization.criterion": ("uncertainty", "parallax"),
         "measurement.gate": ("chi_square", "mahalanobis"),
         "mapping.triangulation_partners": ("covisible", "last"),

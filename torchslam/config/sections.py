@@ -50,7 +50,7 @@ class FeaturesConfig(Settings, section="features"):
     kind: str = setting(
         "orb",
         "Feature extractor that detects and describes keypoints.",
-        choices=("orb", "opencv-orb", "simulated", "xfeat", "aliked"),
+        choices=("orb", "opencv-orb", "sift", "simulated", "xfeat", "aliked"),
         group=FRONT_ENDS,
     )
     num_keypoints: int = setting(1000, "Maximum number of keypoints per image.", low=1, high=MAX_KEYPOINTS)

@@ -12,12 +12,14 @@ from torchslam.features.matching.brute_force import match, match_pairs
 from torchslam.features.matching.by_projection import expand_runs, match_by_projection
 from torchslam.features.matching.hamming import hamming, pack_bits, unpack_bits
 from torchslam.features.orb import ORB, OpenCVORB
+from torchslam.features.sift import SIFT
 from torchslam.features.simulated import SimulatedFeatures
 
 __all__ = [
     "ALIKED",
     "EXTRACTORS",
     "ORB",
+    "SIFT",
     "OpenCVORB",
     "SimulatedFeatures",
     "XFeat",
@@ -31,7 +33,7 @@ __all__ = [
     "unpack_bits",
 ]
 
-EXTRACTORS = ("orb", "opencv-orb", "xfeat", "aliked")
+EXTRACTORS = ("orb", "opencv-orb", "sift", "xfeat", "aliked")
 """Names that `extractor` knows."""
 
 
@@ -54,6 +56,8 @@ def extractor(name: str, num_keypoints: int = 1000, weights: str | Path | None =
         return ORB(num_keypoints)
     if name == "opencv-orb":
         return OpenCVORB(num_keypoints)
+    if name == "sift":
+        return SIFT(num_keypoints)
     if name not in EXTRACTORS:
         raise ConfigError(f"unknown features {name!r}; there are {', '.join(EXTRACTORS)}")
     if name == "xfeat":

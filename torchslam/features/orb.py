@@ -308,6 +308,11 @@ def check_images(images: Tensor, mask: Tensor | None = None) -> None:
         raise ValueError(f"images must be floats in [0, 1], got {images.dtype}")
 
 
+def gray_bytes(images: Float[Tensor, "B 1 H W"]) -> UInt8[Tensor, "B H W"]:
+    """Images as OpenCV takes them, on the CPU."""
+    return images.detach().mul(255).add(0.5).clamp(0, 255).to(torch.uint8)[:, 0].cpu()
+
+
 class OpenCVORB(nn.Module):
     """OpenCV's ORB behind the interface of `ORB`. Not differentiable; results are on the images' device.
 
@@ -334,8 +339,7 @@ class OpenCVORB(nn.Module):
         """Detect and describe keypoints; arguments, result and errors as for `ORB.forward`."""
         check_images(images, mask)
         masks = [None] * len(images) if mask is None else list(mask[:, 0].to(torch.uint8).cpu().numpy())
-        arrays = images.detach().mul(255).add(0.5).clamp(0, 255).to(torch.uint8)[:, 0].cpu()
-        batch = [self._extract(*each, images.dtype) for each in zip(arrays, masks, strict=True)]
+        batch = [self._extract(*each, images.dtype) for each in zip(gray_bytes(images), masks, strict=True)]
         fields = (torch.stack(column) for column in zip(*batch, strict=True))
         return Features(*fields).to(images.device)
 

@@ -68,8 +68,9 @@ def match(
         if temperature is not None:
             similarity = -hamming(descriptors_1, descriptors_2).float()
     else:
-        similarity = descriptors_1 @ descriptors_2.mT
-        nearest = nearest_by_cosine(similarity, *masks, with_second=ratio is not None)
+        nearest = nearest_by_cosine(descriptors_1, descriptors_2, *masks, with_second=ratio is not None)
+        if temperature is not None:
+            similarity = descriptors_1 @ descriptors_2.mT
     mask = nearest.found
     if max_distance is not None:
         mask = mask & (nearest.distance <= max_distance)

@@ -10,6 +10,8 @@ import torch
 from jaxtyping import Bool, Float, Int, Num, Shaped, UInt8
 from torch import Tensor
 
+from torchslam.utils.indexing import true_indices
+
 # Product with this word moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
 _GATHER_BITS = sum(1 << (56 - 7 * i) for i in range(8))
 
@@ -217,20 +219,49 @@ def nearest_by_hamming(
     return NearestNeighbors(column, nearest, nearest <= bits, mutual, second)
 
 
+_ROWS_AT_ONCE = 512
+"""Rows whose similarities are computed at once: they stay in the cache. 256 to 1024 are equally fast, all 2000 of an
+image take twice as long."""
+
+
 def nearest_by_cosine(
-    similarity: Float[Tensor, "B N1 N2"],
+    descriptors_1: Float[Tensor, "B N1 D"],
+    descriptors_2: Float[Tensor, "B N2 D"],
     mask_1: Bool[Tensor, "B N1"],
     mask_2: Bool[Tensor, "B N2"],
     allowed: Bool[Tensor, "B N1 N2"] | None,
     with_second: bool,
 ) -> NearestNeighbors:
-    """Find nearest neighbors by cosine similarity; distances keep their graph."""
-    values = similarity.detach().masked_fill(~_possible(mask_1, mask_2, allowed), -torch.inf)
-    best, column = values.max(2)
-    mutual = best >= values.amax(1).gather(1, column)
-    second = 1 - values.scatter(2, column[..., None], -torch.inf).amax(2) if with_second else None
-    nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
-    return NearestNeighbors(column, nearest, best > -torch.inf, mutual, second)
+    """Find nearest neighbors by cosine similarity of unit descriptors; distances keep their graph."""
+    batch, count = mask_2.shape
+    best_of_column = descriptors_2.new_full((batch, count), -torch.inf)
+    parts = []
+    for rows in torch.arange(mask_1.shape[1], device=mask_1.device).split(_ROWS_AT_ONCE):
+        chunk = slice(int(rows[0]), int(rows[-1]) + 1)
+        similarity = descriptors_1[:, chunk] @ descriptors_2.mT
+        values = similarity.detach()  # changed in place: gradients need the indices and the descriptors alone
+        for element, (own, other) in zip(values, zip(mask_1[:, chunk], mask_2, strict=True), strict=True):
+            element.index_fill_(0, true_indices(~own), -torch.inf)
+            element.index_fill_(1, true_indices(~other), -torch.inf)
+        if allowed is not None:
+            values.masked_fill_(~allowed[:, chunk], -torch.inf)
+        best, column = values.max(2)
+        best_of_column = torch.maximum(best_of_column, values.amax(1))
+        nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
+        nearest = torch.where(best > -torch.inf, nearest, 1.0)
+        second = None
+        if with_second:
+            second = 1 - values.scatter_(2, column[..., None], -torch.inf).amax(2)
+        parts.append((column, nearest, best, second))
+    columns, nearest, best, second = zip(*parts, strict=True)
+    column, most = torch.cat(columns, 1), torch.cat(best, 1)
+    return NearestNeighbors(
+        column,
+        torch.cat(nearest, 1),
+        most > -torch.inf,
+        most >= best_of_column.gather(1, column),
+        torch.cat(second, 1) if with_second else None,
+    )
 
 
 def dual_softmax(
