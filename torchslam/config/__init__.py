@@ -15,6 +15,7 @@ from torchslam.config.sections import (
     CameraConfig,
     DenseConfig,
     FeaturesConfig,
+    GlobalMappingConfig,
     IndependentMotionConfig,
     InitializationConfig,
     KeyframesConfig,
@@ -37,6 +38,7 @@ __all__ = [
     "Config",
     "DenseConfig",
     "FeaturesConfig",
+    "GlobalMappingConfig",
     "IndependentMotionConfig",
     "InitializationConfig",
     "KeyframesConfig",
@@ -83,6 +85,7 @@ class Config(Settings):
     mapping: MappingConfig = field(default_factory=MappingConfig)
     loop_closing: LoopClosingConfig = field(default_factory=LoopClosingConfig)
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
+    global_mapping: GlobalMappingConfig = field(default_factory=GlobalMappingConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
 
     def for_size(self, size: tuple[int, int]) -> Config:

@@ -591,6 +591,24 @@ class BundleAdjustmentConfig(Settings, section="bundle_adjustment"):
 
 
 @dataclass(frozen=True)
+class GlobalMappingConfig(Settings, section="global_mapping"):
+    """Mapping of a whole recording, in no order of time."""
+
+    num_keypoints: int = setting(
+        3000,
+        "Maximum number of keypoints per image, in place of `features.num_keypoints`.",
+        low=1,
+        high=MAX_KEYPOINTS,
+    )
+    max_images: int = setting(
+        300,
+        "Number of images that are spread evenly over the recording; frames between them are posed afterwards.",
+        low=3,
+        high=MAX_COUNT,
+    )
+
+
+@dataclass(frozen=True)
 class DenseConfig(Settings, section="dense"):
     """Dense depth by `torchslam densify` and `torchslam run --dense`."""
 

@@ -1,6 +1,7 @@
-"""Keyframes, verified pairs of keyframes, and the tracks that the matches of all pairs form.
+"""Tracks: observations of one point by many images, joined from the matches of pairs, and their points.
 
-The given poses may be degrees off. They only rule out pairs of views that look in different directions.
+A wrong match joins two points in one track. So a track's point is found by consensus among its observations, and
+observations that disagree are left out, not forgotten: with better poses they are tried again.
 """
 
 from __future__ import annotations
@@ -12,147 +13,31 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.config import Config
-from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log, triangulate_many
-from torchslam.loop_closing.keyframe_database import KeyframeDatabase
+from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.map.map import Map
-from torchslam.tracking.data_association import match_views
 from torchslam.types import FrameFeatures
 
-# A view becomes a keyframe if its matches with the last one moved by this fraction of the image width, or if fewer than
-# this fraction of the matches of the first view after it are left.
-MIN_MOTION, MIN_MATCH_RATIO = 0.08, 0.6
-NUM_RECENT = 4  # previous keyframes that each is matched with
-NUM_SIMILAR = 8  # most similar other keyframes that each is matched with
-MAX_TURN_DEG = 60.0  # between similar views, by their given poses
-MAX_DISAGREEMENT_DEG = 15.0  # of a relative rotation with the given poses: larger for lookalike places
-THRESHOLD_PX = 2.0  # at full size: about the noise plus the effect of a focal length that is 5 % off
-MIN_MATCHES = 20
-_PAIRS_AT_ONCE, _MAX_SAMPLES = 16, 500
-
-
-@dataclass(frozen=True)
-class Pair:
-    """Two overlapping keyframes.
-
-    Attributes:
-        first: Row of a view.
-        second: Row of another one.
-        keypoints_1: Keypoints of the first view.
-        keypoints_2: Matching keypoints of the second view.
-        R_21: Relative rotation by the matches; None if it is ambiguous.
-    """
-
-    first: int
-    second: int
-    keypoints_1: Int[Tensor, " M"]
-    keypoints_2: Int[Tensor, " M"]
-    R_21: Float[Tensor, "3 3"] | None
-
-
-def choose_keyframes(views: list[FrameFeatures], width: int, config: Config) -> list[int]:
-    """Select the rows of views with enough motion between them, by the images alone."""
-    chosen, first_matches = [0], 0
-    for row in range(1, len(views)):
-        last = views[chosen[-1]]
-        at_1, at_2 = match_views(last, views[row], config.matching)
-        first_matches = max(first_matches, len(at_1))
-        motion = torch.linalg.vector_norm(last.keypoints[at_1] - views[row].keypoints[at_2], dim=-1)
-        is_far = len(at_1) < MIN_MATCH_RATIO * first_matches or float(motion.median()) > MIN_MOTION * width
-        if is_far or len(at_1) < MIN_MATCHES:
-            chosen.append(row)
-            first_matches = 0
-    return chosen
-
-
-def find_pairs(
-    views: list[FrameFeatures], T_cw: Float[Tensor, "K 4 4"], camera: Camera, config: Config
-) -> list[Pair]:
-    """Match keyframes with given poses and verify the pairs by their epipolar geometry."""
-    found = [
-        (one, other, *match_views(views[one], views[other], config.matching))
-        for one, other in candidates(views, T_cw)
-    ]
-    found = [pair for pair in found if len(pair[2]) >= MIN_MATCHES]
-    pairs: list[Pair] = []
-    for start in range(0, len(found), _PAIRS_AT_ONCE):
-        pairs += _verified(found[start : start + _PAIRS_AT_ONCE], views, T_cw, camera, config)
-    return pairs
-
-
-def candidates(views: list[FrameFeatures], T_cw: Float[Tensor, "K 4 4"]) -> list[tuple[int, int]]:
-    """Return pairs (lower row first, ascending) close in time, or similar and with similar viewing directions."""
-    places = KeyframeDatabase()
-    for row, view in enumerate(views):
-        places.add(row, view.descriptors, view.mask)
-    axes_w = T_cw[:, 2, :3]  # viewing directions
-    near = axes_w @ axes_w.mT > math.cos(math.radians(MAX_TURN_DEG))
-    pairs = set()
-    for row, view in enumerate(views):
-        pairs |= {(other, row) for other in range(max(0, row - NUM_RECENT), row)}
-        keys, scores = places.query(view.descriptors, view.mask)
-        alike = keys[scores > 0]
-        alike = alike[near[row, alike] & ((alike - row).abs() > NUM_RECENT)][:NUM_SIMILAR]
-        pairs |= {(min(row, other), max(row, other)) for other in alike.tolist()}
-    return sorted(pairs)
-
-
-def _verified(
-    found: list[tuple[int, int, Tensor, Tensor]],
-    views: list[FrameFeatures],
-    T_cw: Tensor,
-    camera: Camera,
-    config: Config,
-) -> list[Pair]:
-    """The pairs whose matches agree on a relative pose that is compatible with the given ones."""
-    size = max(len(at_1) for _, _, at_1, _ in found)
-    pixels = T_cw.new_zeros(2, len(found), size, 2)
-    mask = torch.zeros(len(found), size, dtype=torch.bool, device=T_cw.device)
-    for row, (one, other, at_1, at_2) in enumerate(found):
-        mask[row, : len(at_1)] = True
-        pixels[0, row, : len(at_1)] = views[one].keypoints[at_1]
-        pixels[1, row, : len(at_1)] = views[other].keypoints[at_2]
-    relative = estimate_relative_pose(
-        pixels[0],
-        pixels[1],
-        camera,
-        camera,
-        threshold=THRESHOLD_PX * config.features.reduction(camera.size),
-        mask=mask,
-        seed=config.seed,
-        max_samples=_MAX_SAMPLES,
-        kernel="truncated",
-        min_samples=64,
-    )
-    pairs = []
-    for row, (one, other, at_1, at_2) in enumerate(found):
-        inliers = relative.inliers[row, : len(at_1)]
-        if int(inliers.sum()) < MIN_MATCHES:
-            continue
-        is_known = bool(relative.success[row]) or relative.model[row] == "rotation"
-        R_21 = relative.T_21[row, :3, :3] if is_known else None
-        given = (T_cw[other] @ se3_inverse(T_cw[one]))[:3, :3]
-        if R_21 is None or float(so3_log(R_21 @ given.mT).norm()) < math.radians(MAX_DISAGREEMENT_DEG):
-            pairs.append(Pair(one, other, at_1[inliers], at_2[inliers], R_21))
-    return pairs
-
-
-MAX_VIEWS = 8  # for the triangulation of a track, spread over it
-_TRACKS_AT_ONCE = 4096  # tracks
+MIN_PARALLAX = math.radians(0.5)
+"""Least angle between rays to a point. Points of 0.25 to 1 degree give the same poses; without any limit, far points
+with wrong depths disturb what comes after."""
+_HYPOTHESES = (0.0, 1.0), (0.0, 0.5), (0.5, 1.0), (0.25, 0.75), (0.0, 0.25), (0.75, 1.0)
+"""Pairs of observations, as shares of a track, that propose its point."""
+_SAME_RAY = 1e-12
+"""Squared sine of the angle between two rays below which their intersection is not computed: that of rounding."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Observations of points, ordered by track, then keyframe; a keyframe observes a track at most once.
+    """Observations of points, ordered by track, then image; an image observes a track at most once.
 
     Attributes:
-        track: Number of the track of each observation, from 0 without gaps.
-        keyframe: Row of the keyframe.
-        keypoint: Row among its keypoints.
+        track: number of the track of each observation, from 0 without gaps.
+        view: row of the image.
+        keypoint: row among its keypoints.
     """
 
     track: Int[Tensor, " O"]
-    keyframe: Int[Tensor, " O"]
+    view: Int[Tensor, " O"]
     keypoint: Int[Tensor, " O"]
 
     @property
@@ -160,32 +45,41 @@ class Tracks:
         """The number of tracks."""
         return int(self.track[-1]) + 1 if len(self.track) else 0
 
-    def select(self, keep: Bool[Tensor, " O"]) -> Tracks:
-        """Select the observations of a mask, without tracks that have fewer than two of them."""
-        track, keyframe, keypoint = self.track[keep], self.keyframe[keep], self.keypoint[keep]
-        _, which, counts = torch.unique(track, return_inverse=True, return_counts=True)
-        is_track = counts[which] >= 2
-        _, renumbered = torch.unique(track[is_track], return_inverse=True)
-        return Tracks(renumbered, keyframe[is_track], keypoint[is_track])
+    @property
+    def lengths(self) -> Int[Tensor, " N"]:
+        """Number of observations of each track."""
+        return torch.bincount(self.track, minlength=self.count)
+
+    def __len__(self) -> int:
+        """The number of observations."""
+        return len(self.track)
+
+    def select(self, keep: Bool[Tensor, " O"], least: int = 2) -> tuple[Tracks, Int[Tensor, " M"]]:
+        """The tracks that keep at least some observations of a mask, renumbered, and their former numbers."""
+        counts = torch.bincount(self.track[keep], minlength=self.count)
+        rows = keep & (counts >= least)[self.track]
+        former, renumbered = torch.unique(self.track[rows], return_inverse=True)
+        return Tracks(renumbered, self.view[rows], self.keypoint[rows]), former
 
 
-def join_matches(pairs: list[Pair], keyframes: int, keypoints: int) -> Tracks:
-    """Join matches to tracks, their connected components, without observations by two keypoints of one keyframe.
+def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
+    """Join matches to tracks, their connected components, without observations by two keypoints of one image.
 
     Args:
-        pairs: Of keyframes, with matches.
-        keyframes: Number of keyframes.
-        keypoints: Number of keypoints of a keyframe.
+        pairs: verified.
+        views: number of images.
+        keypoints: number of keypoints of an image.
     """
-    one = torch.cat([pair.first * keypoints + pair.keypoints_1 for pair in pairs])
-    other = torch.cat([pair.second * keypoints + pair.keypoints_2 for pair in pairs])
-    label = _lowest_connected(one, other, keyframes * keypoints)
+    none = torch.zeros(0, dtype=torch.int64)
+    one = torch.cat([none, *(pair.first * keypoints + pair.keypoints_1 for pair in pairs)])
+    other = torch.cat([none, *(pair.second * keypoints + pair.keypoints_2 for pair in pairs)])
+    label = _lowest_connected(one, other, views * keypoints)
     nodes = torch.unique(torch.cat([one, other]))
-    order = torch.argsort(label[nodes], stable=True)  # within a track by keyframe
-    nodes = nodes[order]
-    track, keyframe = label[nodes], nodes // keypoints
-    _, which, counts = torch.unique(track * keyframes + keyframe, return_inverse=True, return_counts=True)
-    return Tracks(track, keyframe, nodes % keypoints).select(counts[which] == 1)
+    nodes = nodes[torch.argsort(label[nodes], stable=True)]  # within a track by image
+    _, track = torch.unique(label[nodes], return_inverse=True)
+    view = nodes // keypoints
+    _, which, counts = torch.unique(track * views + view, return_inverse=True, return_counts=True)
+    return Tracks(track, view, nodes % keypoints).select(counts[which] == 1)[0]
 
 
 def _lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: int) -> Int[Tensor, " R"]:
@@ -200,42 +94,129 @@ def _lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: i
         label = new
 
 
+def longest_tracks(tracks: Tracks, per_view: int) -> Bool[Tensor, " N"]:
+    """The tracks that are among the `per_view` longest ones of some image: they tie all images together."""
+    length = tracks.lengths[tracks.track]
+    order = torch.argsort(tracks.view * (int(length.max()) + 1) - length, stable=True) if len(tracks) else length
+    view = tracks.view[order]
+    first = torch.searchsorted(view, view)  # where the image's observations begin
+    is_long = torch.arange(len(order), device=view.device) - first < per_view
+    chosen = torch.zeros(tracks.count, dtype=torch.bool, device=view.device)
+    chosen[tracks.track[order[is_long]]] = True
+    return chosen
+
+
+@dataclass(frozen=True)
+class TrackPoints:
+    """Points of tracks.
+
+    Attributes:
+        points_w: positions, those of the best hypothesis where nothing agrees.
+        agrees: the observations that agree with their point.
+        parallax_rad: angle between the most different rays of agreeing observations, zero where fewer than two agree.
+    """
+
+    points_w: Float[Tensor, "N 3"]
+    agrees: Bool[Tensor, " O"]
+    parallax_rad: Float[Tensor, " N"]
+
+
 def triangulate_tracks(
     tracks: Tracks,
-    pixels: Float[Tensor, "O 2"],
-    T_cw: Float[Tensor, "K 4 4"],
-    camera: Camera,
-    min_parallax_deg: float,
-) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " N"]]:
-    """Triangulate the points of tracks.
+    rays_w: Float[Tensor, "O 3"],
+    centers_w: Float[Tensor, "O 3"],
+    tolerance_rad: Float[Tensor, " O"],
+) -> TrackPoints:
+    """Find the point of each track by consensus of its rays.
 
     Args:
         tracks: N of them.
-        pixels: Of the observations.
-        T_cw: Poses of the keyframes.
-        camera: Of all keyframes.
-        min_parallax_deg: Least angle between two rays.
-
-    Returns:
-        The points, and whether they are in front of their keyframes with enough parallax.
+        rays_w: unit directions of the observations.
+        centers_w: where they begin.
+        tolerance_rad: angle to the point up to which an observation agrees.
     """
-    length = torch.bincount(tracks.track)
+    length = tracks.lengths
     start = length.cumsum(0) - length
-    slot = torch.arange(MAX_VIEWS, device=length.device)
-    used = length.clamp(max=MAX_VIEWS)[:, None]
-    mask = slot < used
-    # Evenly over the track, including its ends.
-    step = (length[:, None] - 1).double() / (used - 1).clamp(min=1).double()
-    rows = start[:, None] + torch.where(mask, (slot * step).round().long(), 0)
-    points, good = [], []
-    for part in torch.arange(len(length), device=length.device).split(_TRACKS_AT_ONCE):
-        seen = rows[part]
-        found = triangulate_many(
-            T_cw[tracks.keyframe[seen]], pixels[seen][:, None], camera, mask[part][:, None]
-        )
-        points.append(found.points_w[:, 0])
-        good.append(found.mask[:, 0] & (found.angles[:, 0] > math.radians(min_parallax_deg)))
-    return torch.cat(points), torch.cat(good)
+    best_points = rays_w.new_zeros(tracks.count, 3)
+    best_score = rays_w.new_full((tracks.count,), -1.0)
+    for shares in _HYPOTHESES:
+        first, second = (start + ((length - 1) * share).round().long() for share in shares)
+        points_w = _intersections(rays_w, centers_w, first, second)
+        errors = ray_errors(rays_w, centers_w, points_w[tracks.track])
+        gains = (1 - (errors / tolerance_rad).square()).clamp(min=0.0)  # truncated, as MSAC scores
+        score = _sums(tracks, gains)
+        is_better = score > best_score
+        best_points = torch.where(is_better[:, None], points_w, best_points)
+        best_score = torch.where(is_better, score, best_score)
+    agrees = ray_errors(rays_w, centers_w, best_points[tracks.track]) < tolerance_rad
+    points_w = _nearest_to_rays(tracks, rays_w, centers_w, agrees, best_points)
+    errors = ray_errors(rays_w, centers_w, points_w[tracks.track])
+    agrees = errors < tolerance_rad
+    return TrackPoints(points_w, agrees, parallax(tracks, centers_w, points_w, agrees))
+
+
+def ray_errors(
+    rays_w: Float[Tensor, "O 3"], centers_w: Float[Tensor, "O 3"], points_w: Float[Tensor, "O 3"]
+) -> Float[Tensor, " O"]:
+    """Angles between rays and the directions to points, radians; pi / 2 and more for points behind."""
+    seen = points_w - centers_w
+    across = torch.linalg.cross(rays_w, seen).norm(dim=-1)
+    return torch.atan2(across, (rays_w * seen).sum(-1))
+
+
+def parallax(
+    tracks: Tracks,
+    centers_w: Float[Tensor, "O 3"],
+    points_w: Float[Tensor, "N 3"],
+    agrees: Bool[Tensor, " O"],
+) -> Float[Tensor, " N"]:
+    """Angle at each point between the first and the most different agreeing observation, radians."""
+    seen = torch.nn.functional.normalize(points_w[tracks.track] - centers_w, dim=-1)
+    rows = torch.arange(len(tracks), device=seen.device)
+    first = rows.new_full((tracks.count,), len(rows)).scatter_reduce(
+        0, tracks.track[agrees], rows[agrees], "amin"
+    )
+    reference = seen[first.clamp(max=max(len(rows) - 1, 0))][tracks.track]
+    angles = torch.atan2(torch.linalg.cross(seen, reference).norm(dim=-1), (seen * reference).sum(-1))
+    return seen.new_zeros(tracks.count).scatter_reduce(0, tracks.track[agrees], angles[agrees], "amax")
+
+
+def _intersections(
+    rays_w: Tensor, centers_w: Tensor, first: Int[Tensor, " N"], second: Int[Tensor, " N"]
+) -> Float[Tensor, "N 3"]:
+    """The midpoints between two rays each; a point ahead on the first one where they are parallel."""
+    a, b = rays_w[first], rays_w[second]
+    base = centers_w[second] - centers_w[first]
+    cosine = (a * b).sum(-1)
+    sine2 = 1 - cosine.square()
+    along_a, along_b = (base * a).sum(-1), (base * b).sum(-1)
+    crossing = sine2 > _SAME_RAY
+    safe = torch.where(crossing, sine2, 1.0)
+    at_a = torch.where(crossing, (along_a - cosine * along_b) / safe, base.norm(dim=-1) / _SAME_RAY**0.5)
+    at_b = torch.where(crossing, (cosine * along_a - along_b) / safe, at_a)
+    return 0.5 * (centers_w[first] + at_a[:, None] * a + centers_w[second] + at_b[:, None] * b)
+
+
+def _nearest_to_rays(
+    tracks: Tracks, rays_w: Tensor, centers_w: Tensor, agrees: Tensor, otherwise: Float[Tensor, "N 3"]
+) -> Float[Tensor, "N 3"]:
+    """The points nearest to the agreeing rays, weighted by inverse squared distance as angles are."""
+    weight = agrees / (otherwise[tracks.track] - centers_w).square().sum(-1).clamp(min=1e-30)
+    eye = torch.eye(3, dtype=rays_w.dtype, device=rays_w.device)
+    across = weight[:, None, None] * (eye - rays_w[:, :, None] * rays_w[:, None])
+    A = _sums(tracks, across)
+    b = _sums(tracks, (across @ centers_w[..., None])[..., 0])
+    size = A.diagonal(dim1=1, dim2=2).sum(-1)
+    determined = torch.linalg.det(A / size.clamp(min=1e-300)[:, None, None]) > _SAME_RAY
+    points_w = torch.linalg.solve(torch.where(determined[:, None, None], A, eye), b)
+    return torch.where(determined[:, None], points_w, otherwise)
+
+
+def _sums(tracks: Tracks, values: Float[Tensor, "O *n"]) -> Float[Tensor, "N *n"]:
+    """Sums over the observations of each track, in their order: the same bytes on every run."""
+    flat = values.reshape(len(values), -1)
+    total = torch.segment_reduce(flat, "sum", lengths=tracks.lengths, unsafe=True)
+    return total.view(tracks.count, *values.shape[1:])
 
 
 def make_map(
@@ -244,19 +225,20 @@ def make_map(
     tracks: Tracks,
     points_w: Float[Tensor, "N 3"],
 ) -> Map:
-    """Create a map of keyframes with the points of their tracks."""
+    """Create a map of images with the points of their tracks."""
     made = Map()
     for view, T in zip(views, T_cw, strict=True):
         made.add_keyframe(view, T)
     first = torch.searchsorted(tracks.track, torch.arange(tracks.count, device=points_w.device))
-    first_keyframe = tracks.keyframe[first]
-    ids = torch.full_like(first_keyframe, -1)
-    for keyframe, view in enumerate(views):
-        own = torch.nonzero(first_keyframe == keyframe)[:, 0]
+    first_view = tracks.view[first]
+    ids = torch.full_like(first_view, -1)
+    for row, view in enumerate(views):
+        own = torch.nonzero(first_view == row)[:, 0]
         descriptors = view.descriptors[tracks.keypoint[first[own]]]
-        ids[own] = made.add_points(points_w[own], descriptors, keyframe)
-    for keyframe in range(len(views)):
-        own = torch.nonzero(tracks.keyframe == keyframe)[:, 0]
-        made.add_observations(keyframe, tracks.keypoint[own], ids[tracks.track[own]])
+        ids[own] = made.add_points(points_w[own], descriptors, row)
+    for row in range(len(views)):
+        own = torch.nonzero(tracks.view == row)[:, 0]
+        made.add_observations(row, tracks.keypoint[own], ids[tracks.track[own]])
     made.update_appearance(torch.arange(len(views), device=points_w.device))
     return made
+

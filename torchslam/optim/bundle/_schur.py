@@ -212,9 +212,9 @@ def _stored(
 
 
 class BundleTangent(NamedTuple):
-    """A vector over all unknowns: frames (K, 6), points (N, 3), cameras (C, n); n = 0 where they are fixed."""
+    """A vector over all unknowns: frames (K, D), points (N, 3), cameras (C, n); n = 0 where they are fixed."""
 
-    frames: Float[Tensor, "K 6"]
+    frames: Float[Tensor, "K D"]
     points: Float[Tensor, "N 3"]
     cameras: Float[Tensor, "C n"]
 
@@ -237,17 +237,17 @@ class NormalEquations:
 
     structure: Structure
     gradient: BundleTangent
-    frames: Float[Tensor, "K 6 6"]
+    frames: Float[Tensor, "K D D"]
     points: Float[Tensor, "N 3 3"]
     cameras: Float[Tensor, "C n n"]
-    frames_cameras: Float[Tensor, "K 6 n"]
-    coupling: Float[Tensor, "R 6"]
+    frames_cameras: Float[Tensor, "K D n"]
+    coupling: Float[Tensor, "R D"]
     camera_coupling: Float[Tensor, "S n"]
     free_points: Bool[Tensor, " N"]
     between: FrameBlocks | None = None
 
     def factorized(
-        self, damping: Float[Tensor, "*#scale"] | None = None, gauge: Float[Tensor, "K 6 g"] | None = None
+        self, damping: Float[Tensor, "*#scale"] | None = None, gauge: Float[Tensor, "K D g"] | None = None
     ) -> FactorizedEquations:
         """Eliminate the points and factorize what is left, after the diagonals grew by the share `damping`.
 
@@ -275,7 +275,7 @@ class NormalEquations:
         reduced = self.frames.new_zeros(size, size)
         frames = _damped(self.frames, damping)
         if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
-            eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
+            eye = torch.eye(self.frame_dims, dtype=frames.dtype, device=frames.device)
             frames = frames + diagonal_floor(frames.dtype) * eye
         reduced[_at(frame_rows, frame_rows)] = frames
         if self.between is not None:
@@ -291,11 +291,16 @@ class NormalEquations:
         return reduced
 
     @cached_property
-    def rows(self) -> tuple[Int[Tensor, "K 6"], Int[Tensor, "C n"]]:
+    def rows(self) -> tuple[Int[Tensor, "K D"], Int[Tensor, "C n"]]:
         """Rows of the reduced system that belong to each frame, and to each camera."""
-        split, (num_cameras, num_free) = 6 * self.structure.num_frames, self.cameras.shape[:2]
+        split, (num_cameras, num_free) = self.frame_dims * self.structure.num_frames, self.cameras.shape[:2]
         rows = torch.arange(split + num_cameras * num_free, device=self.frames.device)
-        return rows[:split].view(-1, 6), rows[split:].view(num_cameras, num_free)
+        return rows[:split].view(-1, self.frame_dims), rows[split:].view(num_cameras, num_free)
+
+    @property
+    def frame_dims(self) -> int:
+        """Numbers by which a frame moves: six, or three where the rotations are fixed."""
+        return self.frames.shape[-1]
 
     def _whitened(self, tile: Tile, root: Tensor) -> WhitenedTile:
         """A tile's coupling times the inverse root of its points' blocks."""
@@ -364,8 +369,9 @@ class FactorizedEquations:
             moved = (A @ inverse[rows[:, None], rows[None, :]]).unflatten(0, (-1, 3))
             root = self.points_root[points]
             blocks.append(root.mT @ (eye + moved @ A.unflatten(0, (-1, 3)).mT) @ root)
-        split = 6 * self.equations.structure.num_frames
-        frames = inverse[:split, :split].unflatten(0, (-1, 6)).unflatten(-1, (-1, 6))
+        dims = self.equations.frame_dims
+        split = dims * self.equations.structure.num_frames
+        frames = inverse[:split, :split].unflatten(0, (-1, dims)).unflatten(-1, (-1, dims))
         frames = frames.diagonal(dim1=0, dim2=2).movedim(-1, 0)
         return Marginals(frames, torch.cat(blocks) if blocks else self.points_root, inverse[split:, split:])
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import torch
@@ -39,23 +39,33 @@ class FramePoser:
 
     @torch.no_grad()
     def pose(
-        self, submap: Submap, views: list[FrameFeatures], given_cw: Float[Tensor, "F 4 4"]
+        self,
+        submap: Submap,
+        views: Iterable[FrameFeatures],
+        given_cw: Float[Tensor, "F 4 4"] | None = None,
     ) -> list[StepResult]:
         """Add all views to the posed frames of the submap, in order.
 
+        Args:
+            submap: Whose map has some of the views as keyframes.
+            views: In the order of time; each is needed once.
+            given_cw: Poses of the views by another program.
+
         Returns:
-            One result per view, with its given pose as online pose.
+            One result per view, with its given pose as online pose, or else with its own.
         """
         row_of = {index: row for row, index in enumerate(submap.map.keyframes["frame_index"].tolist())}
         self.tracker.reset_to_keyframe(submap, 0)
         results = []
-        for view, T_cw in zip(views, given_cw, strict=True):
+        for row, view in enumerate(views):
             keyframe = row_of.get(view.index)
             if keyframe is not None:
                 result = self._add_keyframe(submap, view, keyframe)
             else:
                 result = self._track(submap, view)
-            results.append(replace(result, T_cw=T_cw, submap=submap.number))
+            if given_cw is not None:
+                result = replace(result, T_cw=given_cw[row], submap=submap.number)
+            results.append(result)
         return results
 
     def _add_keyframe(self, submap: Submap, view: FrameFeatures, keyframe: int) -> StepResult:
@@ -69,7 +79,8 @@ class FramePoser:
             view.index,
             view.timestamp,
             State.TRACKING,
-            None,
+            slam_map.T_cw[keyframe].clone(),
+            submap.number,
             is_keyframe=True,
             matches=own.matches,
             inliers=own.inliers,
@@ -89,7 +100,8 @@ class FramePoser:
             view.index,
             view.timestamp,
             State.UNCERTAIN if rejection else State.TRACKING,
-            None,
+            estimate.T_cw.clone(),
+            submap.number,
             covariance=estimate.covariance,
             matches=estimate.matches,
             inliers=estimate.inliers,
