@@ -1,0 +1,8 @@
+"""Global mapping of a recording: every image against every image that sees the same, in no order of time.
+
+images -> pairs (neighbors in time, similar places) -> matches, verified by two-view geometry -> view graph
+       -> rotations -> tracks -> positions of cameras and points -> rounds of bundle adjustment and filtering
+       -> map -> the other frames -> check by image pairs that mapping did not use
+
+Source: Pan, Baráth, Pollefeys and Schönberger, "Global structure-from-motion revisited", ECCV 2024.
+"""

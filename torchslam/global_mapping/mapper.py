@@ -1,0 +1,295 @@
+"""The global mapper: from a recording, and what an online run says of it, to a run like any other."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator, Sequence as Rows
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchslam.config import Config
+from torchslam.data.sequence import Sequence
+from torchslam.errors import FrameError
+from torchslam.geometry import Camera, so3_log
+from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.global_mapping.frames_between import FramePoser
+from torchslam.global_mapping.rounds import MIN_VIEWS, ObservedTracks, Reconstruction, adjust_in_rounds
+from torchslam.global_mapping.tracks import join_matches, longest_tracks, make_map
+from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph, connected_views
+from torchslam.map.atlas import Atlas, Submap
+from torchslam.optim.global_positioning import position_globally
+from torchslam.optim.rotation_averaging import average_rotations
+from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
+from torchslam.system.run import FinalAdjustment, Run
+from torchslam.tracking.matcher import make_matcher, prepare_view
+from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult
+
+SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
+"""Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
+MAX_ROTATION_ERROR_RAD = 0.1
+"""A pair whose rotation differs more from the averaged ones does not hold. On garden right ones differ by 0.15 degrees
+in the median and wrong ones by 10 and more; tried 0.05 to 0.2."""
+POSITION_TRACKS = 150
+"""Longest tracks of each image that position cameras; more of them do not make positions better."""
+HELD_BACK = 10
+"""One in so many verified pairs is not used for mapping, so that it can tell whether the map is right."""
+HELD_BACK_DISTANCE = 2
+"""Least distance in images of pairs that are held back: pairs of neighbors keep the images together."""
+
+
+Progress = Callable[[str, int, int], None]
+"""Called with the name of a stage, what is done of it, and all that is to be done."""
+
+
+@dataclass(frozen=True)
+class GlobalMap:
+    """The result of global mapping.
+
+    Attributes:
+        run: a run like any other; without a submap where `run.failure` says why.
+        views: features of the images that were mapped, by row.
+        pairs: all verified pairs of them.
+        held_back: rows of the pairs that mapping did not use.
+    """
+
+    run: Run
+    views: list[FrameFeatures]
+    pairs: list[ViewPair]
+    held_back: frozenset[int]
+
+
+def mapping_config(config: Config) -> Config:
+    """The configuration of global mapping: SIFT in place of the features of live tracking, unless others were chosen."""
+    settings = config.global_mapping
+    features = config.features
+    if features.kind != Config().features.kind:
+        return config
+    return replace(
+        config,
+        features=replace(features, kind="sift", num_keypoints=settings.num_keypoints),
+        matching=replace(config.matching, max_ratio=SIFT_RATIO, max_cosine_distance=SIFT_DISTANCE),
+    )
+
+
+def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
+    """The frames that are mapped: evenly over the recording, and all where tracking was lost or doubtful.
+
+    Args:
+        count: number of frames.
+        results: of an online run, if there was one.
+        most: largest number of frames, of those that are spread evenly.
+    """
+    stride = -(-count // most)
+    chosen = set(range(0, count, stride))
+    doubtful = [result.index for result in results if result.state in (State.LOST, State.UNCERTAIN)]
+    if len(doubtful) <= most:
+        chosen |= set(doubtful)
+    return sorted(index for index in chosen if index < count)
+
+
+class GlobalMapper:
+    """Maps the frames of a recording as a whole.
+
+    Args:
+        sequence: the recording.
+        camera: of all frames, with its error; of no error: it stays.
+        config: the configuration of the run.
+        device: of torch.
+        extractor: front end; the configured one if None.
+        matcher: of two views; the configured one if None.
+        progress: receives stages.
+    """
+
+    def __init__(
+        self,
+        sequence: Sequence,
+        camera: Camera,
+        config: Config,
+        std: float,
+        device: torch.device | str = "cpu",
+        extractor: FrontEnd | None = None,
+        matcher: Matcher | None = None,
+        progress: Progress = lambda stage, done, most: None,
+    ) -> None:
+        self.camera = camera.to(device).to(torch.float64)
+        self.config = mapping_config(config)
+        self.scaled = self.config.for_size(camera.size)
+        self.given = CameraMeasurement.of(self.camera, std) if std else None
+        self.sequence = source(sequence, self.config, self.camera)
+        self.extract: Extractor | None = None
+        if not self.sequence.brings_features:
+            self.extract = image_extractor(self.config, device, extractor)
+        self.matcher = make_matcher(
+            self.scaled.matching, matcher, camera.size, self.scaled.features.kind
+        )
+        self.progress = progress
+        self.skipped: list[str] = []
+
+    @torch.no_grad()
+    def run(self, results: Rows[StepResult] = ()) -> GlobalMap:
+        """Map the recording; `results`: of an online run over it, whose doubtful frames are mapped as well."""
+        images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
+        views = [view for view in self._views(images, "features") if view is not None]
+        if len(views) < MIN_VIEWS:
+            return self._failed(f"no map: {len(views)} images are too few", views, [])
+        matcher = PairMatcher(views, self.camera, self.matcher, self.scaled)
+        pairs = build_view_graph(matcher, lambda done, most: self.progress("matches", done, most))
+        held_back = choose_held_back(pairs)
+        found = self.reconstruct(views, [pair for row, pair in enumerate(pairs) if row not in held_back])
+        if isinstance(found, str):
+            return self._failed(found, views, pairs)
+        run = self._finish(views, *found)
+        return GlobalMap(run, views, pairs, held_back)
+
+    def reconstruct(
+        self, views: list[FrameFeatures], pairs: list[ViewPair]
+    ) -> tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction] | str:
+        """Rotations, positions and rounds of adjustment of the largest connected set of views.
+
+        Returns:
+            Rows of the views that have a pose, the tracks in all views, and what was found; or why there is no map.
+        """
+        self.progress("rotations", 0, 1)
+        edges = torch.tensor([(pair.first, pair.second) for pair in pairs], dtype=torch.int64).view(-1, 2)
+        if len(edges) == 0:
+            return f"no map: no two of {len(views)} images see the same"
+        R_21 = torch.stack([pair.T_21[:3, :3] for pair in pairs])
+        weights = torch.tensor([float(len(pair)) for pair in pairs]).to(R_21)
+        average = average_rotations(edges, R_21, len(views), weights / weights.mean())
+        off = so3_log(R_21 @ average.R_cw[edges[:, 0]] @ average.R_cw[edges[:, 1]].mT).norm(dim=-1)
+        pairs = [pair for pair, angle in zip(pairs, off.tolist(), strict=True) if angle < MAX_ROTATION_ERROR_RAD]
+        rows = connected_views(pairs, len(views))
+        is_connected = torch.zeros(len(views), dtype=torch.bool)
+        is_connected[rows] = True
+        pairs = [pair for pair in pairs if bool(is_connected[pair.first])]
+        tracks = join_matches(pairs, len(views), len(views[0].mask))
+        tracks, _ = tracks.select(torch.ones(len(tracks), dtype=torch.bool), MIN_VIEWS)
+        if tracks.count == 0:
+            return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
+        observed = ObservedTracks.of(tracks, views)
+        self.progress("positions", 0, 1)
+        T_cw = torch.eye(4).to(R_21).repeat(len(views), 1, 1)
+        T_cw[:, :3, :3] = average.R_cw
+        longest = observed.select(longest_tracks(tracks, POSITION_TRACKS))
+        camera = self.camera if self.given is None else self.given.camera
+        rays_w, _ = longest.rays(T_cw, camera)
+        positions = position_globally(
+            longest.tracks.view, longest.tracks.track, rays_w, len(views), longest.tracks.count
+        )
+        T_cw[:, :3, 3] = -(T_cw[:, :3, :3] @ positions.centers_w[..., None])[..., 0]
+        self.progress("adjustment", 0, 1)
+        found = adjust_in_rounds(
+            observed, T_cw, self.given, camera, log=lambda words: self.progress(words, 0, 1)
+        )
+        seen = torch.unique(tracks.view[found.agrees])
+        return seen, observed, found
+
+    def _finish(
+        self,
+        views: list[FrameFeatures],
+        rows: Int[Tensor, " K"],
+        observed: ObservedTracks,
+        found: Reconstruction,
+    ) -> Run:
+        """The map of the posed views, the other frames, and the final adjustment of all."""
+        atlas = Atlas(self.camera.params)
+        submap = atlas.create()
+        fill_submap(submap, views, rows, observed, found, self.config.features.num_keypoints)
+        poser = FramePoser(found.camera, self.scaled)
+        mapped = {view.index: view for view in views}
+        results = poser.pose(submap, self._all_views(mapped))
+        final = FinalAdjustment(self.camera, self.config)
+        final.camera = found.camera
+        final.adjust(atlas, 0, lambda done, most: self.progress("final adjustment", done, most))
+        return Run(
+            tuple(atlas),
+            final.camera,
+            self.config,
+            results,
+            self.skipped,
+            False,
+            "",
+            given=final.given,
+            calibration=final.calibration,
+        )
+
+    def _views(self, indices: Rows[int], stage: str) -> Iterator[FrameFeatures | None]:
+        """The features of frames; None for those that cannot be read, which are counted once."""
+        for done, index in enumerate(indices):
+            self.progress(stage, done, len(indices))
+            try:
+                frame = self.sequence[index]
+                check_size(frame, self.camera)
+            except FrameError as error:
+                if str(error) not in self.skipped:
+                    warnings.warn(f"skipped a frame: {error}", stacklevel=2)
+                    self.skipped.append(str(error))
+                yield None
+                continue
+            yield self._view(frame)
+
+    def _view(self, frame: Frame) -> FrameFeatures:
+        features = frame.features
+        if self.extract is not None:
+            with torch.inference_mode():
+                features = self.extract(frame)
+        assert features is not None
+        return prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
+
+    def _all_views(self, mapped: dict[int, FrameFeatures]) -> Iterator[FrameFeatures]:
+        """All frames in order, those that were mapped without extracting their features again."""
+        for index in range(len(self.sequence)):
+            self.progress("frames between", index, len(self.sequence))
+            if index in mapped:
+                yield mapped[index]
+                continue
+            for view in self._views([index], "frames between"):
+                if view is not None:
+                    yield view
+
+    def _failed(self, reason: str, views: list[FrameFeatures], pairs: list[ViewPair]) -> GlobalMap:
+        results = [StepResult(view.index, view.timestamp, State.LOST, None, reason=reason) for view in views]
+        run = Run((), self.camera, self.config, results, self.skipped, False, reason)
+        return GlobalMap(run, views, pairs, frozenset())
+
+
+def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:
+    """Rows of the pairs that mapping does not use: one in ten of those that are no direct neighbors in time."""
+    far = [row for row, pair in enumerate(pairs) if pair.second - pair.first >= HELD_BACK_DISTANCE]
+    return frozenset(far[HELD_BACK // 2 :: HELD_BACK])
+
+
+def fill_submap(
+    submap: Submap,
+    views: list[FrameFeatures],
+    rows: Int[Tensor, " K"],
+    observed: ObservedTracks,
+    found: Reconstruction,
+    keypoints: int,
+) -> None:
+    """Make the map of a submap from the posed views and the points with observations that agree."""
+    tracks, former = observed.tracks.select(found.agrees)
+    row_of = torch.full((len(views),), -1)
+    row_of[rows] = torch.arange(len(rows))
+    tracks = replace(tracks, view=row_of[tracks.view])
+    submap.map = make_map([views[row] for row in rows.tolist()], found.T_cw[rows], tracks, found.points_w[former])
+
+
+def poses_of(run: Run, views: list[FrameFeatures]) -> tuple[Float[Tensor, "K 4 4"], Tensor]:
+    """The poses of views in the main submap of a run, and which have one."""
+    T_cw = torch.eye(4, dtype=torch.float64).repeat(len(views), 1, 1)
+    known = torch.zeros(len(views), dtype=torch.bool)
+    if run.main is None:
+        return T_cw, known
+    frames = run.posed_frames
+    own = frames.frames["session"] == run.session
+    posed = dict(
+        zip(frames.frames["frame_index"][own].tolist(), frames.T_cw(run.map)[own], strict=True)
+    )
+    for row, view in enumerate(views):
+        if view.index in posed:
+            T_cw[row], known[row] = posed[view.index], True
+    return T_cw, known

@@ -1,0 +1,188 @@
+"""Rounds of bundle adjustment and filtering: wrong observations lose their weight, then leave.
+
+The kernel starts wide and convex, so that a start that is pixels or tens of pixels off still attracts, and ends
+redescending and narrow, so that what is wrong does not pull at all (graduated non-convexity: Black and Rangarajan, "On
+the unification of line processes", 1996; Yang et al., "Graduated non-convexity for robust spatial perception", 2020).
+After every round all observations of all tracks are tried anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchslam.geometry import Camera, KeypointNoise, se3_inverse, transform
+from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.geometry.robust import Kernel
+from torchslam.global_mapping.tracks import MIN_PARALLAX, Tracks, longest_tracks, parallax, triangulate_tracks
+from torchslam.optim import BundleProblem, bundle_adjust
+from torchslam.optim.run_graph import camera_prior
+from torchslam.types import FrameFeatures
+
+COARSE: tuple[tuple[Kernel, float], ...] = (("cauchy", 20.0), ("cauchy", 6.0), ("geman_mcclure", 6.0))
+"""Kernels and their scales, in standard deviations of a keypoint, while poses are pixels off."""
+FINE: tuple[Kernel, float] = ("geman_mcclure", 5.0)
+"""The same where poses are right to about a pixel. Tried 3 to 6, and Cauchy at 2, which is as good."""
+COARSE_TRACKS = 150
+"""Longest tracks of each image that the coarse rounds use: poses settle with these in a third of the time."""
+ITERATIONS, COARSE_TOLERANCE, TOLERANCE = 100, 1e-6, 1e-7
+"""The scale of one part against another across a weak link changes the cost little: stopped at 1e-4, it is 5 % off."""
+COARSE_GATE, GATE = 3.0, 8.0
+"""Up to where an observation belongs to its point: in coarse rounds in scales of the next kernel, then in standard
+deviations. Narrower gates (3 to 6) leave out what could correct a weak link; the kernel makes up for the wide one."""
+FINE_START = 1.5
+"""Factor on the gate before the first fine round, as poses are right to about a pixel."""
+MIN_VIEWS = 3
+"""Images that must agree on a point: two rays nearly always meet somewhere."""
+MAX_ROUNDS, MIN_CHANGE = 4, 0.005
+"""Fine rounds go on until less than this share of the observations changes sides."""
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Poses, camera and the points of tracks.
+
+    Attributes:
+        T_cw: of the images.
+        camera: of all images.
+        points_w: of the tracks.
+        agrees: observations that agree with their point.
+    """
+
+    T_cw: Float[Tensor, "K 4 4"]
+    camera: Camera
+    points_w: Float[Tensor, "N 3"]
+    agrees: Bool[Tensor, " O"]
+
+
+@dataclass(frozen=True)
+class ObservedTracks:
+    """Tracks with the pixels of their observations and the errors of these.
+
+    Attributes:
+        tracks: N of them.
+        pixels: of the observations.
+        noise: of the observations.
+    """
+
+    tracks: Tracks
+    pixels: Float[Tensor, "O 2"]
+    noise: KeypointNoise
+
+    @classmethod
+    def of(cls, tracks: Tracks, views: list[FrameFeatures]) -> ObservedTracks:
+        """Read the observations of tracks in images."""
+        at = tracks.view, tracks.keypoint
+        columns = (
+            torch.stack([getattr(view, name) for view in views])[at]
+            for name in ("keypoints", "scales", "information")
+        )
+        pixels, scales, information = columns
+        return cls(tracks, pixels, KeypointNoise(scales, information).with_explicit_information())
+
+    def select(self, keep: Bool[Tensor, " N"]) -> ObservedTracks:
+        """Some of the tracks, renumbered."""
+        rows = keep[self.tracks.track]
+        return ObservedTracks(self.tracks.select(rows, 1)[0], self.pixels[rows], self.noise[rows])
+
+    def errors(self, found: Reconstruction) -> Float[Tensor, " O"]:
+        """Reprojection errors in standard deviations, infinite behind the camera."""
+        T_cw = found.T_cw[self.tracks.view]
+        points_c = transform(T_cw, found.points_w[self.tracks.track][:, None])[:, 0]
+        pixels, valid = found.camera.project(points_c)
+        distance = (pixels - self.pixels).norm(dim=-1) / self.noise.sigmas
+        return distance.where(valid & (points_c[:, 2] > 0), torch.inf)
+
+    def rays(self, T_cw: Float[Tensor, "K 4 4"], camera: Camera) -> tuple[Tensor, Tensor]:
+        """Unit directions (O, 3) of the observations and the camera centers (O, 3) where they begin, in the world."""
+        T_wc = se3_inverse(T_cw)[self.tracks.view]
+        return (T_wc[:, :3, :3] @ camera.unproject(self.pixels)[..., None])[..., 0], T_wc[:, :3, 3]
+
+    def triangulate(
+        self, T_cw: Float[Tensor, "K 4 4"], camera: Camera, gate: float
+    ) -> Reconstruction:
+        """The points of all tracks by given poses; `gate`: standard deviations up to which observations agree."""
+        tolerance = gate * self.noise.sigmas / camera.focal
+        found = triangulate_tracks(self.tracks, *self.rays(T_cw, camera), tolerance)
+        made = Reconstruction(T_cw, camera, found.points_w, found.agrees)
+        return self.filter(made, gate)
+
+    def filter(self, found: Reconstruction, gate: float) -> Reconstruction:
+        """Try all observations: those within the gate, of points that enough images see under an angle."""
+        agrees = self.errors(found) < gate
+        centers_w = se3_inverse(found.T_cw)[self.tracks.view, :3, 3]
+        angles = parallax(self.tracks, centers_w, found.points_w, agrees)
+        count = torch.bincount(self.tracks.track[agrees], minlength=self.tracks.count)
+        good = (count >= MIN_VIEWS) & (angles > MIN_PARALLAX)
+        return replace(found, agrees=agrees & good[self.tracks.track])
+
+
+def adjust(
+    observed: ObservedTracks,
+    found: Reconstruction,
+    kernel: Kernel,
+    scale: float,
+    tolerance: float,
+    given: CameraMeasurement | None,
+) -> Reconstruction:
+    """Adjust poses and points, and the camera with its prior if given, by the observations that agree."""
+    tracks, former = observed.tracks.select(found.agrees)
+    rows = found.agrees & torch.isin(observed.tracks.track, former)
+    problem = BundleProblem(
+        found.T_cw,
+        found.points_w[former],
+        tracks.view,
+        tracks.track,
+        observed.pixels[rows],
+        found.camera,
+        weights=observed.noise[rows].weights,
+        camera_prior=None if given is None else camera_prior(given),
+    )
+    free: bool | Tensor = False if given is None else given.directions
+    solution = bundle_adjust(problem, kernel, scale, free, "detached", ITERATIONS, tolerance, check=False)
+    points_w = found.points_w.clone()
+    points_w[former] = solution.points_w
+    return Reconstruction(solution.T_cw, solution.camera, points_w, found.agrees)
+
+
+def adjust_in_rounds(
+    observed: ObservedTracks,
+    T_cw: Float[Tensor, "K 4 4"],
+    given: CameraMeasurement | None,
+    camera: Camera,
+    coarse: bool = True,
+    log: Callable[[str], None] = lambda words: None,
+) -> Reconstruction:
+    """Find poses, points, camera and the observations that agree, from approximate poses.
+
+    Args:
+        observed: the tracks.
+        T_cw: approximate poses.
+        given: the given camera with its error, a prior; None: the camera is exact.
+        camera: to start with.
+        coarse: whether poses may be many pixels off.
+        log: receives what each round found.
+    """
+    if coarse:
+        chosen = observed.select(longest_tracks(observed.tracks, COARSE_TRACKS))
+        found = chosen.triangulate(T_cw, camera, COARSE_GATE * COARSE[0][1])
+        for (kernel, scale), (_, following) in pairwise((*COARSE, FINE)):
+            found = adjust(chosen, found, kernel, scale, COARSE_TOLERANCE, given)
+            found = chosen.filter(found, COARSE_GATE * following)
+            log(f"{kernel} {scale:g}: {int(found.agrees.sum())} of {len(chosen.tracks)} observations agree")
+        T_cw, camera = found.T_cw, found.camera
+    found = observed.triangulate(T_cw, camera, FINE_START * GATE)
+    for number in range(MAX_ROUNDS):
+        before = found.agrees
+        adjusted = adjust(observed, found, *FINE, TOLERANCE, given)
+        found = observed.triangulate(adjusted.T_cw, adjusted.camera, GATE)
+        change = float((found.agrees != before).double().mean())
+        log(f"round {number + 1}: {int(found.agrees.sum())} observations agree, {change:.1%} changed")
+        if change < MIN_CHANGE:
+            break
+    return found
