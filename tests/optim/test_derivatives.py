@@ -13,7 +13,7 @@ from torch.func import jacfwd, jacrev, jvp, vmap
 
 from tests.optim.pose_graph.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
-from torchslam.geometry import se3_exp, se3_inverse, sim3_exp
+from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
 from torchslam.optim import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
 from torchslam.optim.run_graph import solve_graph
 
@@ -104,8 +104,34 @@ def pose_graph_problem(with_scale=True) -> Problem:
     return nodes, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
 
 
+def rotation_graph_problem() -> Problem:
+    graph = make_scene(nodes=4, with_scale=False, information=None).graph
+
+    def nodes(x: Tensor) -> Tensor:
+        ramp = torch.linspace(-1, 1, len(graph.edges), dtype=torch.float64)[:, None]
+        moved = replace(
+            graph,
+            S_cw=graph.S_cw[..., :3, :3],
+            S_ji=so3_exp(0.1 * x[:3] * ramp) @ graph.S_ji[..., :3, :3],
+            information=4e4 * (1 + x[3] * ramp.squeeze(-1)),
+        )
+        return pose_graph_optimize(moved, "cauchy", 3 + x[4], iterations=100, tolerance=1e-26).S_cw
+
+    return nodes, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
+
+
 @pytest.fixture(
-    params=["pose", "fisheye", "prior", "bundle", "free camera", "graph", "pose graph", "rigid pose graph"]
+    params=[
+        "pose",
+        "fisheye",
+        "prior",
+        "bundle",
+        "free camera",
+        "graph",
+        "pose graph",
+        "rigid pose graph",
+        "rotation graph",
+    ]
 )
 def problem(request, pose_scene, bundle_scene) -> Problem:
     makers: dict[str, Callable[[], Problem]] = {
@@ -117,6 +143,7 @@ def problem(request, pose_scene, bundle_scene) -> Problem:
         "graph": graph_problem,
         "pose graph": pose_graph_problem,
         "rigid pose graph": lambda: pose_graph_problem(with_scale=False),
+        "rotation graph": rotation_graph_problem,
     }
     return makers[request.param]()
 

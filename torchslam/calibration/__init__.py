@@ -1,6 +1,6 @@
-"""Calibration from images: runs alternate with estimation of the intrinsics on their graphs."""
+"""The camera from images: its focal length from pairs of them, its intrinsics from the graph of a run."""
 
+from torchslam.calibration.from_pairs import FocalSearch, search_focal
 from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
-from torchslam.calibration.rounds import CalibrationResult, CalibrationRound, calibrate
 
-__all__ = ["CalibrationResult", "CalibrationRound", "IntrinsicsEstimate", "calibrate", "estimate_intrinsics"]
+__all__ = ["FocalSearch", "IntrinsicsEstimate", "estimate_intrinsics", "search_focal"]

@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import math
-import warnings
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from torchslam.calibration import CalibrationRound, calibrate, estimate_intrinsics
-from torchslam.calibration.intrinsics import IntrinsicsEstimate
-from torchslam.calibration.rounds import CalibrationResult
+from torchslam.calibration.from_pairs import FocalSearch, search_focal
+from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
 from torchslam.config import CameraConfig, Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, read_numbers, write_calibration
@@ -23,8 +21,14 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.io.results import CALIBRATION
 from torchslam.system.run import Run
 
-RADIAL = 2
-"""Number of distortion coefficients that may be estimated."""
+LEAST_STD = 0.05
+"""Relative standard deviation of a camera that pairs of images gave: distortion, of which they know little, is in it."""
+STD_FACTOR = 2.0
+"""On the stated error of such a focal length: on six recordings they are off by up to three of them."""
+GUESS_STD = 0.15
+"""The same where pairs do not determine the focal length: phones and webcams have 0.7 to 1 widths, the guess is 0.85."""
+ROUGH_STD = 0.1
+"""The same of a given camera that is to be refined."""
 
 
 def find_camera(
@@ -32,51 +36,55 @@ def find_camera(
     config: Config,
     output: Path,
     device: torch.device,
-    radial: int,
     resume: bool = False,
     on_progress: Callable[[str], None] = lambda words: None,
 ) -> tuple[Sequence, str]:
-    """Calibrate a sequence from its images and write the calibration file.
+    """Find the focal length of an unknown camera from pairs of images, and write the calibration file.
 
     Args:
-        sequence: With a given or guessed camera to start from.
-        config: Of the runs.
+        sequence: With a guessed camera to start from.
+        config: Of the run.
         output: Folder of the calibration file.
         device: Of torch.
-        radial: Maximum number of distortion coefficients.
         resume: Use the camera of the resumed run, if there is one.
         on_progress: Receives messages.
 
     Returns:
-        The sequence with its camera, and a description of the camera.
+        The sequence with its camera and the error of this, and a description of the camera.
     """
     if config.features.kind == "simulated":
         raise ConfigError("simulated features are made with the camera, so it cannot be estimated")
     path = output / CALIBRATION
     check_replaceable(path)
     if resume and path.exists():
-        found = read_numbers(path)
-        return sequence.with_camera(found.camera(sequence.size), std=found.std), f"from {path}"
-    with warnings.catch_warnings():  # the run itself reports unreadable frames
-        warnings.simplefilter("ignore", UserWarning)
-        calibrated = calibrate(
-            sequence,
-            config,
-            radial,
-            sequence.calibrated is Calibrated.GUESSED,
-            device,
-            on_progress=lambda done: on_progress(_describe_round(done)),
-        )
-    description = describe_camera(calibrated)
-    frames = calibrated.rounds[-1].frames
-    remarks = [
-        description,
-        f"{len(calibrated.rounds)} runs, the last over {frames} of {len(sequence)} frames",
-    ]
-    std = 1.0 if calibrated.estimate is None else min(calibrated.estimate.focal_std, 1.0)
-    write_calibration(path, calibrated.camera, remarks, std)
+        known = read_numbers(path)
+        return sequence.with_camera(known.camera(sequence.size), std=known.std), f"from {path}"
+    search = search_focal(sequence, config, device)
+    camera, std = sequence.camera, GUESS_STD
+    if search.found is not None and search.is_determined:
+        focal = search.found.focal.detach()
+        camera = camera.with_params(torch.cat([focal.to(camera.params).expand(2), camera.params[2:]]))
+        std = max(LEAST_STD, STD_FACTOR * float(search.found.std))
+    description = describe_search(search, camera)
+    write_calibration(path, camera, [description], std)
     on_progress(description)
-    return sequence.with_camera(calibrated.camera.to("cpu"), std=std), description
+    return sequence.with_camera(camera, std=std), description
+
+
+def describe_search(search: FocalSearch, camera: Camera) -> str:
+    """Describe the camera that pairs of images gave, or say that they do not determine it."""
+    focal = float(camera.focal)
+    if search.found is not None and search.is_determined:
+        return f"focal length {_with_error(focal, focal * float(search.found.std))} px by {search.pairs} image pairs"
+    if search.pairs == 0:
+        return (
+            f"unknown: no two images could be matched; the focal length of {focal:.0f} px is a guess, which may be "
+            "wrong by a factor of two"
+        )
+    return (
+        f"{search.pairs} image pairs do not determine it ({DEGENERATE}): "
+        f"the focal length of {focal:.0f} px is a guess to start with"
+    )
 
 
 def with_stated_std(config: Config, sequence: Sequence) -> Config:
@@ -121,16 +129,6 @@ def describe_calibration(found: CameraMeasurement) -> str:
     return described + "".join(f", {name} {k:.3f} ± {std:.3f}" for k, std, name in terms)
 
 
-def _describe_round(done: CalibrationRound) -> str:
-    focal, estimate = float(done.camera.focal), done.estimate
-    asks = (
-        "no map"
-        if estimate is None
-        else f"{float(estimate.camera.focal):.0f} px, {estimate.focal_std:.1%} uncertain"
-    )
-    return f"{done.frames} frames with {focal:.0f} px ask for {asks}"
-
-
 # The images contradict a given focal length if it is off by this many standard errors and this ratio, or by a larger
 # ratio with a relative cost decrease.
 MIN_SIGMAS, MIN_RATIO = 3.0, 0.01
@@ -138,27 +136,6 @@ LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02
 REMEDY = "--refine-camera looks for a better one"
 CONSEQUENCE = "poses and map may be badly wrong with it"
 DEGENERATE = "pure rotation, straight motion and planes do not determine it"
-
-
-def describe_camera(calibrated: CalibrationResult) -> str:
-    """Describe a camera with its standard errors, or say that it is not determined and how wrong it may be."""
-    camera, estimate = calibrated.camera, calibrated.estimate
-    if estimate is None:
-        return (
-            f"unknown: no map could be made; the focal length of {float(camera.focal):.0f} px is a guess, which may be "
-            "wrong by a factor of two"
-        )
-    if not estimate.is_determined:
-        wrong = f"{200 * estimate.focal_std:.0f} %" if estimate.focal_std < 0.5 else "a factor of two"
-        return (
-            f"not determined by the motion ({DEGENERATE}): "
-            f"the focal length of {float(camera.focal):.0f} px may be wrong by {wrong}"
-        )
-    terms = zip(camera.params[4:6].tolist(), estimate.k_std, ("k1", "k2"), strict=False)
-    bends = [f"{name} {k:.3f} ± {std:.3f}" for k, std, name in terms]
-    return ", ".join(
-        [f"focal length {_focal(estimate, estimate.focal_std)}", *(bends or ["no other distortion"])]
-    )
 
 
 def contradiction(given: Camera, estimate: IntrinsicsEstimate) -> str:

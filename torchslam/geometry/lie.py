@@ -111,7 +111,8 @@ def so3_left_jacobian(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
     return torch.eye(3, dtype=omega.dtype, device=omega.device) + b * W + c * (W @ W)
 
 
-def _so3_left_jacobian_inverse(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+@full_precision
+def so3_left_jacobian_inverse(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Inverse of the left Jacobian, for angles below 2 pi."""
     _, b, c, d = _rodrigues((omega * omega).sum(-1)[..., None, None])
     W = skew(omega)
@@ -181,7 +182,7 @@ def se3_exp(xi: Float[Tensor, "*batch 6"]) -> Float[Tensor, "*batch 4 4"]:
 def se3_log(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 6"]:
     """Tangent vectors [rho, omega] of rigid transforms."""
     omega = so3_log(T[..., :3, :3])
-    rho = (_so3_left_jacobian_inverse(omega) @ T[..., :3, 3:]).squeeze(-1)
+    rho = (so3_left_jacobian_inverse(omega) @ T[..., :3, 3:]).squeeze(-1)
     return torch.cat((rho, omega), dim=-1)
 
 
@@ -301,7 +302,7 @@ def sim3_left_jacobian(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7
 def sim3_left_jacobian_inverse(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7 7"]:
     """Inverse of the left Jacobian, for angles below 2 pi."""
     (W, Q, q), _ = _sim3_left_jacobian_blocks(xi)
-    rotation = _so3_left_jacobian_inverse(xi[..., 3:6])
+    rotation = so3_left_jacobian_inverse(xi[..., 3:6])
     W = torch.linalg.inv_ex(W)[0]
     return _sim3_jacobian_from_blocks(W, -W @ Q @ rotation, (W @ q[..., None]).squeeze(-1), rotation)
 

@@ -14,6 +14,7 @@ from torchslam.optim.bundle._factors import (
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.pose._refinement import RefinedPose, refine_pose
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, pose_graph_optimize
+from torchslam.optim.rotation_averaging import RotationAverage, average_rotations
 
 __all__ = [
     "Backward",
@@ -31,6 +32,8 @@ __all__ = [
     "PosePrior",
     "Progress",
     "RefinedPose",
+    "RotationAverage",
+    "average_rotations",
     "bundle_adjust",
     "log_distance_error",
     "minimize",

@@ -15,6 +15,7 @@ from torchslam.geometry import (
     sim3_left_jacobian_inverse,
     sim3_log,
     sim3_scale,
+    so3_exp,
 )
 from torchslam.optim import PoseGraph, pose_graph_optimize
 from torchslam.optim.pose_graph._api import _sanitized
@@ -142,6 +143,53 @@ def test_derivatives_of_an_edge_agree_with_autograd(angle: float, sigma: float, 
         torch.testing.assert_close(diagonal, hessian[rows, rows], rtol=1e-8, atol=1e-8 * scale)
     assert problem.layout.structure.pairs.tolist() == [[0, 1]]
     torch.testing.assert_close(model.across[0, 0], hessian[:dims, dims:], rtol=1e-8, atol=1e-8 * scale)
+
+
+def test_rotations_are_rigid_poses_without_translation() -> None:
+    """The same minimum and gradients, with an outlier, information of their own and no node fixed by name."""
+    scene = make_scene(outliers=1, with_scale=False, fixed=())
+    S_cw, S_ji = (
+        torch.nn.functional.pad(S[..., :3, :3], (0, 1, 0, 1)) for S in (scene.graph.S_cw, scene.graph.S_ji)
+    )
+    S_cw[..., 3, 3] = S_ji[..., 3, 3] = 1
+    A = 0.3 * draw(5, len(scene.graph.edges), 3, 3) + torch.eye(3)
+    results = []
+    for dims in (3, 6):
+        n = 3 if dims == 3 else 4
+        twist = torch.zeros(2, len(A), 3, dtype=torch.float64, requires_grad=True)
+        root = A.clone().requires_grad_()
+        information = torch.nn.functional.pad(4e4 * root.mT @ root, (dims - 3, 0, dims - 3, 0))
+        information = information + torch.diag((torch.arange(dims) < dims - 3).double())
+        turned = so3_exp(twist) if dims == 3 else sim3_exp(torch.nn.functional.pad(twist, (3, 1)))
+        graph = replace(
+            scene.graph, S_cw=S_cw[..., :n, :n], S_ji=turned @ S_ji[..., :n, :n], information=information
+        )
+        solution = pose_graph_optimize(graph, kernel="cauchy", **CONVERGED)
+        assert solution.success.all()
+        R_cw = solution.S_cw[..., :3, :3]
+        gradient = torch.autograd.grad((R_cw * draw(6, 2, 12, 3, 3)).sum(), (twist, root))
+        results.append((R_cw.detach(), solution.cost, *gradient))
+    for rotations, poses in zip(*results, strict=True):
+        torch.testing.assert_close(rotations, poses, rtol=1e-6, atol=1e-9)
+
+
+def test_a_start_at_the_minimum_is_seen_to_be_one() -> None:
+    """Along edges without a loop nothing is left to be reduced but roundings."""
+    scene = make_scene()
+    tree = scene.graph.edges[:, 1] == scene.graph.edges[:, 0] + 1
+    S = [scene.graph.S_cw[:, 0]]
+    for S_ji in scene.graph.S_ji[:, tree].unbind(1):
+        S.append(S_ji @ S[-1])
+    graph = replace(
+        scene.graph,
+        S_cw=torch.stack(S, dim=1),
+        edges=scene.graph.edges[tree],
+        S_ji=scene.graph.S_ji[:, tree],
+        information=scene.graph.information[tree],
+    )
+    convergence = pose_graph_optimize(graph).convergence
+    assert convergence.converged.all()
+    assert (convergence.iterations <= 1).all()
 
 
 @pytest.mark.parametrize("with_scale", [True, False])
@@ -501,8 +549,12 @@ def test_invalid_input_is_rejected_by_name() -> None:
     graph = make_scene().graph
     with pytest.raises(ValueError, match=r"\(E, 2\)"):
         pose_graph_optimize(replace(graph, edges=graph.edges[:, :1]))
+    with pytest.raises(ValueError, match=r"\(E, 2\)"):
+        pose_graph_optimize(replace(graph, S_cw=graph.S_cw[..., :3, :]))
     with pytest.raises(ValueError, match="S_ji"):
         pose_graph_optimize(replace(graph, S_ji=graph.S_ji[:, 1:]))
+    with pytest.raises(ValueError, match=r"S_ji must be \(B, E, 3, 3\)"):
+        pose_graph_optimize(replace(graph, S_cw=graph.S_cw[..., :3, :3]))
     with pytest.raises(ValueError, match="information"):
         pose_graph_optimize(replace(graph, with_scale=False))
     with pytest.raises(ValueError, match=r"0 \.\.\. 11"):

@@ -1,4 +1,4 @@
-"""Pose graph optimization over similarities, or rigid poses: sparse, robust, batched, differentiable."""
+"""Pose graph optimization over similarities, rigid poses or rotations: sparse, robust, batched, differentiable."""
 
 from __future__ import annotations
 
@@ -9,7 +9,6 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchslam.geometry.lie import sim3_scale
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
@@ -23,24 +22,25 @@ _SCALE = 3.75
 
 @dataclass(frozen=True)
 class PoseGraph:
-    """Nodes with measured relative similarities, or rigid poses; a batch shares the edges.
+    """Nodes with measured relative similarities, rigid poses or rotations; a batch shares the edges.
 
     Attributes:
-        S_cw: similarities from the world to the nodes, the start.
+        S_cw: similarities from the world to the nodes, the start, with n = 4; or rotations, with n = 3.
         edges: nodes (i, j).
         S_ji: measurements, from node i to node j.
         information: inverse covariances of log(S_j S_i^-1 S_ji^-1), symmetric, with D = 7:
-            translation, rotation, log scale; D = 6 without scale. Or (B, E) or (E,) weights of the identity; one if
-            None.
+            translation, rotation, log scale; D = 6 without scale, D = 3 for rotations. Or (B, E) or (E,) weights of
+            the identity; one if None.
         fixed: rows of nodes, or a (B, K) or (K,) bool mask. Without any, the first node of every connected part stays,
             and the gradient is right for losses that do not depend on the gauge.
         mask: edges that count, all if None.
-        with_scale: free the scales of the nodes. If False, the log scale is not part of the error either.
+        with_scale: free the scales of the nodes. If False, the log scale is not part of the error either. Rotations
+            have none.
     """
 
-    S_cw: Float[Tensor, "*#batch K 4 4"]
+    S_cw: Float[Tensor, "*#batch K n n"]
     edges: Int[Tensor, "E 2"]
-    S_ji: Float[Tensor, "*#batch E 4 4"]
+    S_ji: Float[Tensor, "*#batch E n n"]
     information: Float[Tensor, "*#batch E D D"] | Float[Tensor, "*#batch E"] | None = None
     fixed: Shaped[Tensor, "..."] | Sequence[int] = (0,)
     mask: Bool[Tensor, "*#batch E"] | None = None
@@ -60,7 +60,7 @@ class PoseGraphSolution:
         convergence: iterations and convergence per element of the batch.
     """
 
-    S_cw: Float[Tensor, "*batch K 4 4"]
+    S_cw: Float[Tensor, "*batch K n n"]
     cost: Float[Tensor, "*batch"]
     success: Bool[Tensor, "*batch"]
     moved: Bool[Tensor, "*batch K"]
@@ -130,26 +130,26 @@ def pose_graph_optimize(
 def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor, PoseGraphInputs]:
     """Edges that count (B, E), fixed nodes (B, K), and the tensors, all batched and finite."""
     S_cw, S_ji, edges = graph.S_cw, graph.S_ji, graph.edges
-    if S_cw.ndim not in (3, 4) or S_cw.shape[-2:] != (4, 4) or edges.ndim != 2 or edges.shape[1] != 2:
+    if S_cw.ndim not in (3, 4) or S_cw.shape[-2:] not in ((4, 4), (3, 3)) or edges.shape[1:] != (2,):
         raise ValueError(
-            "S_cw and edges must be (B, K, 4, 4) or (K, 4, 4) and (E, 2), not "
+            "S_cw and edges must be (B, K, 4, 4) or (K, 4, 4), or 3 by 3, and (E, 2), not "
             f"{tuple(S_cw.shape)} and {tuple(edges.shape)}"
         )
     S_cw = S_cw if S_cw.ndim == 4 else S_cw[None]
-    (batch, num_nodes), num_edges = S_cw.shape[:2], len(edges)
-    if S_ji.shape[-3:] != (num_edges, 4, 4):
+    (batch, num_nodes, n, _), num_edges = S_cw.shape, len(edges)
+    if S_ji.shape[-3:] != (num_edges, n, n):
         raise ValueError(
-            f"S_ji must be (B, E, 4, 4) or (E, 4, 4) with E = {num_edges}, not {tuple(S_ji.shape)}"
+            f"S_ji must be (B, E, {n}, {n}) or (E, {n}, {n}) with E = {num_edges}, not {tuple(S_ji.shape)}"
         )
     if num_edges and not 0 <= int(edges.min()) <= int(edges.max()) < num_nodes:
         raise ValueError(f"edges must lie in 0 ... {num_nodes - 1}")
     if (edges[:, 0] == edges[:, 1]).any():
         raise ValueError("an edge must join two nodes, not one with itself")
-    S_ji = S_ji.expand(batch, num_edges, 4, 4)
+    S_ji = S_ji.expand(batch, num_edges, n, n)
     check_dtypes(S_cw=S_cw, S_ji=S_ji, information=graph.information)
     information = _information(graph, S_cw, batch, num_edges)
 
-    nodes, measured = _is_similarity(S_cw), _is_similarity(S_ji)
+    nodes, measured = is_similarity(S_cw), is_similarity(S_ji)
     diagonal = information.detach().diagonal(dim1=-2, dim2=-1)
     weighted = (
         torch.isfinite(information).flatten(2).all(-1) & (diagonal >= 0).all(-1) & (diagonal > 0).any(-1)
@@ -158,7 +158,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
     if graph.mask is not None:
         counted = counted & graph.mask
     fixed = row_mask("fixed", graph.fixed, nodes)
-    eye = torch.eye(4, dtype=S_cw.dtype, device=S_cw.device)
+    eye = torch.eye(n, dtype=S_cw.dtype, device=S_cw.device)
     scale = torch.as_tensor(scale, dtype=S_cw.dtype, device=S_cw.device)
     rows = counted[..., None, None]
     return (
@@ -175,7 +175,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
 
 def _information(graph: PoseGraph, S_cw: Tensor, batch: int, num_edges: int) -> Tensor:
     """Symmetric (B, E, D, D) from any of the forms it may be given in."""
-    dims = 7 if graph.with_scale else 6
+    dims = 3 if S_cw.shape[-1] == 3 else 7 if graph.with_scale else 6
     eye = torch.eye(dims, dtype=S_cw.dtype, device=S_cw.device)
     given = S_cw.new_ones(num_edges) if graph.information is None else graph.information
     if given.ndim in (1, 2) and given.shape[-1] == num_edges:
@@ -188,6 +188,6 @@ def _information(graph: PoseGraph, S_cw: Tensor, batch: int, num_edges: int) -> 
     return (0.5 * (given + given.mT)).expand(batch, num_edges, dims, dims)
 
 
-def _is_similarity(S: Float[Tensor, "*batch 4 4"]) -> Bool[Tensor, "*batch"]:
+def is_similarity(S: Float[Tensor, "*batch n n"]) -> Bool[Tensor, "*batch"]:
     """Whether matrices are finite and have a scale."""
-    return torch.isfinite(S).flatten(-2).all(-1) & (sim3_scale(S.detach()) > 0)
+    return torch.isfinite(S).flatten(-2).all(-1) & (S.detach()[..., 0, :3].norm(dim=-1) > 0)

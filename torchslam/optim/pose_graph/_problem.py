@@ -16,18 +16,11 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry.lie import (
-    sim3_adjoint,
-    sim3_inverse,
-    sim3_left_jacobian_inverse,
-    sim3_log,
-    skew,
-)
 from torchslam.geometry.robust import Kernel, Robustified, robustify
 from torchslam.optim._core.implicit import Ndims, Tensors
 from torchslam.optim._core.levenberg_marquardt import minimize_batch, select_models
 from torchslam.optim._core.linear import diagonal_floor
-from torchslam.optim._core.tangent import pull_back_sim3, push_sim3, retract_sim3
+from torchslam.optim.pose_graph._groups import Group, group_of
 from torchslam.optim.pose_graph._sparse_cholesky import (
     BlockStructure,
     SparseFactor,
@@ -85,7 +78,7 @@ def build_pose_graph_layout(
     """Find the moving nodes and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
     i, j = edges.unbind(-1)
     num_nodes = fixed.shape[1]
-    part = _connected_parts(edges, counted, fixed)
+    part = connected_parts(edges, counted, fixed)
     is_first = part == torch.arange(num_nodes, device=part.device)
     stays = torch.where(fixed.any(1, keepdim=True), fixed, is_first)
     reached = torch.zeros_like(part).scatter_reduce(1, part, stays.long(), "amax").gather(1, part) > 0
@@ -107,7 +100,7 @@ def build_pose_graph_layout(
     )
 
 
-def _connected_parts(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
+def connected_parts(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
     """The first of the nodes that counted edges join, over others or not, with each node (B, K).
 
     Every node points to one of its component with a number not above its own; edges hook these onto one another, and
@@ -130,13 +123,16 @@ def _connected_parts(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
 
 # A long loop resists bending as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
 _DAMPING_SHARE = 1e-4
+# The error of an edge ends in so many roundings of the largest coordinate, with room to spare. A start along a tree of
+# edges without a loop is off the minimum by these alone.
+_ROUNDINGS = 16.0
 
 
 class PoseGraphInputs(NamedTuple):
-    """All that gradients may flow to: S_cw (B, K, 4, 4), S_ji (B, E, 4, 4), information (B, E, D, D), scale."""
+    """All that gradients may flow to: S_cw (B, K, n, n), S_ji (B, E, n, n), information (B, E, D, D), scale."""
 
-    S_cw: Float[Tensor, "B K 4 4"]
-    S_ji: Float[Tensor, "B E 4 4"]
+    S_cw: Float[Tensor, "B K n n"]
+    S_ji: Float[Tensor, "B E n n"]
     information: Float[Tensor, "B E D D"]
     scale: Tensor
 
@@ -150,7 +146,7 @@ class EdgeLinearization(NamedTuple):
         weighted_residual: information @ error
         squared: error^T information error
         kernel: rho and its derivatives (B, E); zero where the edge does not count
-        sigma: the error in log scale, a constant where the scale is fixed
+        rest: what the logarithm has beyond the error: its log scale where scales are fixed, a constant
     """
 
     error: Float[Tensor, "B E D"]
@@ -159,7 +155,7 @@ class EdgeLinearization(NamedTuple):
     weighted_residual: Float[Tensor, "B E D"]
     squared: Float[Tensor, "B E"]
     kernel: Robustified
-    sigma: Float[Tensor, "B E"]
+    rest: Float[Tensor, "B E rest"]
 
     @property
     def gradient_wrt_eta(self) -> Float[Tensor, "B E D"]:
@@ -168,13 +164,13 @@ class EdgeLinearization(NamedTuple):
 
 
 class PoseGraphModel(NamedTuple):
-    """The local model of the cost (B,) at nodes S_cw (B, K, 4, 4).
+    """The local model of the cost (B,) at nodes S_cw (B, K, n, n).
 
     Attributes:
         across: the Hessian, the identity where nothing moves
     """
 
-    S_cw: Float[Tensor, "B K 4 4"]
+    S_cw: Float[Tensor, "B K n n"]
     cost: Float[Tensor, " B"]
     gradient: Float[Tensor, "B K D"]
     diagonal: Float[Tensor, "B K D D"]
@@ -186,8 +182,14 @@ class PoseGraphProblem:
 
     def __init__(self, layout: PoseGraphLayout, inputs: PoseGraphInputs, kernel: Kernel) -> None:
         self.layout, self.inputs, self.kernel = layout, inputs, kernel
-        self.dims = inputs.information.shape[-1]
+        self.group = group_of(inputs.information.shape[-1])
         self.solvable = layout.moving.any(-1)
+
+    def rounding(self) -> Tensor:
+        S_cw, S_ji, information, _ = (part.detach() for part in self.inputs)
+        size = torch.cat((S_cw.flatten(1), S_ji.flatten(1)), dim=-1).abs().amax(-1)
+        rounding = _ROUNDINGS * torch.finfo(size.dtype).eps * size
+        return 0.5 * information.diagonal(dim1=-2, dim2=-1).sum((1, 2)) * rounding.square()
 
     def evaluate(self, S_cw: Tensor, use_curvature: Tensor) -> PoseGraphModel:
         lin = self._linearize(S_cw)
@@ -206,7 +208,9 @@ class PoseGraphProblem:
         factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
         xi = factor.solve(model.gradient)
         predicted_reduction = 0.5 * (xi * model.gradient).sum((-2, -1))
-        moved = torch.where(self.layout.moving[..., None, None], retract_sim3(model.S_cw, -xi), model.S_cw)
+        moved = torch.where(
+            self.layout.moving[..., None, None], self.group.retract(model.S_cw, -xi), model.S_cw
+        )
         return moved, torch.where(factor.definite, predicted_reduction, torch.inf)
 
     def select(self, accept: Tensor, new: PoseGraphModel, old: PoseGraphModel) -> PoseGraphModel:
@@ -219,11 +223,13 @@ class PoseGraphProblem:
     def exact_model(self, S_cw: Tensor) -> PoseGraphModel:
         """The model with the exact Hessian of the cost in the left perturbations."""
         lin = self._linearize(S_cw)
-        return self._assemble(S_cw, lin, self._exact_hessian(lin), twist=_bracket(lin.gradient_wrt_eta))
+        return self._assemble(
+            S_cw, lin, self._exact_hessian(lin), twist=self.group.bracket(lin.gradient_wrt_eta)
+        )
 
     def _linearize(self, S_cw: Tensor) -> EdgeLinearization:
         layout = self.layout
-        return linearize_edges(S_cw, layout.i, layout.j, layout.counted, self.inputs, self.kernel)
+        return linearize_edges(S_cw, layout.i, layout.j, layout.counted, self.inputs, self.group, self.kernel)
 
     def _assemble(
         self, S_cw: Tensor, lin: EdgeLinearization, hessian: Tensor, twist: Tensor | None
@@ -235,7 +241,7 @@ class PoseGraphProblem:
         ends = torch.cat((at_i, torch.cat((hessian, gradient_wrt_eta[..., None]), dim=-1)), dim=1)
         moving = layout.moving[..., None]
         nodes = torch.where(moving[..., None], layout.by_node.sum(ends), 0.0)
-        eye = torch.eye(self.dims, dtype=S_cw.dtype, device=S_cw.device)
+        eye = torch.eye(self.group.dims, dtype=S_cw.dtype, device=S_cw.device)
         # Where an edge lost all its weight, its nodes stay solvable: their step is zero.
         floor = torch.where(moving[..., None], diagonal_floor(S_cw.dtype), 1.0) * eye
 
@@ -258,17 +264,16 @@ class PoseGraphProblem:
         The derivative of the force J^T (rho' information error) by autograd, through the analytic Jacobian; its
         symmetric part, because J itself turns with eta.
         """
-        dims, information = self.dims, self.inputs.information.detach()
+        dims, information = self.group.dims, self.inputs.information.detach()
         with torch.enable_grad():
             # One copy of every edge per row.
             error = lin.error.detach().expand(dims, *lin.error.shape).clone().requires_grad_()
-            sigma = lin.sigma.detach().expand(dims, *lin.sigma.shape)[..., None]
-            full = error if dims == 7 else torch.cat((error, sigma), dim=-1)
+            full = torch.cat((error, lin.rest.detach().expand(dims, *lin.rest.shape)), dim=-1)
             weighted_residual = (information @ error[..., None]).squeeze(-1)
             slope = robustify(
                 (error * weighted_residual).sum(-1), self.kernel, self.inputs.scale.detach()
             ).weight
-            J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
+            J = self.group.left_jacobian_inverse(full)
             gradient_wrt_eta = (J.mT @ (slope[..., None] * weighted_residual)[..., None]).squeeze(-1)
             (rows,) = torch.autograd.grad(gradient_wrt_eta.movedim(-1, 0).diagonal().sum(), error)
         hessian = rows.movedim(0, -2) @ lin.J
@@ -276,42 +281,31 @@ class PoseGraphProblem:
 
 
 def linearize_edges(
-    S_cw: Float[Tensor, "B K 4 4"],
+    S_cw: Float[Tensor, "B K n n"],
     i: Int[Tensor, " E"],
     j: Int[Tensor, " E"],
     counted: Bool[Tensor, "B E"],
     inputs: PoseGraphInputs,
+    group: Group,
     kernel: Kernel,
 ) -> EdgeLinearization:
     """Errors of the edges from nodes i to j, (E,) each, and how they change; counted: (B, E)."""
-    dims = inputs.information.shape[-1]
-    relative = S_cw.index_select(1, j) @ sim3_inverse(S_cw).index_select(1, i)
-    full = sim3_log(relative @ sim3_inverse(inputs.S_ji))
-    error, sigma = full[..., :dims], full[..., 6]
+    relative = S_cw.index_select(1, j) @ group.inverse(S_cw).index_select(1, i)
+    full = group.log(relative @ group.inverse(inputs.S_ji))
+    error, rest = full.tensor_split((group.dims,), dim=-1)
     weighted_residual = (inputs.information @ error[..., None]).squeeze(-1)
     squared = (error * weighted_residual).sum(-1)
     robust = robustify(squared, kernel, inputs.scale)
     robust = Robustified(*(torch.where(counted, x, 0.0) for x in robust))
-    J = sim3_left_jacobian_inverse(full)[..., :dims, :dims]
-    carry = sim3_adjoint(relative)[..., :dims, :dims]
-    return EdgeLinearization(error, J, carry, weighted_residual, squared, robust, sigma)
-
-
-def _bracket(gradient_wrt_eta: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D D"]:
-    """Half of force . [a, b] as a bilinear form a^T M b of tangent vectors."""
-    v, omega = skew(gradient_wrt_eta[..., :3]), skew(gradient_wrt_eta[..., 3:6])
-    M = torch.cat((torch.cat((torch.zeros_like(v), -v), -1), torch.cat((-v, -omega), -1)), dim=-2)
-    if gradient_wrt_eta.shape[-1] == 7:
-        M = torch.nn.functional.pad(M, (0, 1, 0, 1))
-        M[..., 6, :3], M[..., :3, 6] = gradient_wrt_eta[..., :3], -gradient_wrt_eta[..., :3]
-    return 0.5 * M
+    J, carry = group.left_jacobian_inverse(full), group.adjoint(relative)
+    return EdgeLinearization(error, J, carry, weighted_residual, squared, robust, rest)
 
 
 class PoseGraphMinimization:
     """A pose graph; its inputs are those of `PoseGraphInputs`, edges that count (B, E), fixed nodes (B, K), and
     the edges (E, 2).
 
-    Found are the nodes (B, K, 4, 4), `success` (B,), what moved (B, K), and how it went; vectors are (B, K, D).
+    Found are the nodes (B, K, n, n), `success` (B,), what moved (B, K), and how it went; vectors are (B, K, D).
     """
 
     num_unknowns = 1
@@ -319,7 +313,7 @@ class PoseGraphMinimization:
     ndims: tuple[Ndims, Ndims, Ndims] | None = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1, 2))
 
     def __init__(self, dims: int, kernel: Kernel, iterations: int, tolerance: float) -> None:
-        self.dims, self.kernel = dims, kernel
+        self.group, self.kernel = group_of(dims), kernel
         self.iterations, self.tolerance = iterations, tolerance
         self._last: tuple[tuple[Tensor, Tensor], PoseGraphLayout] | None = None
 
@@ -345,19 +339,19 @@ class PoseGraphMinimization:
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
         given, (xi,), (i, j) = PoseGraphInputs(*inputs[:4]), direction, inputs[6].unbind(-1)
         S_cw = torch.where(found[2][..., None, None], found[0], given.S_cw)
-        lin = linearize_edges(S_cw, i, j, inputs[4], given, self.kernel)
+        lin = linearize_edges(S_cw, i, j, inputs[4], given, self.group, self.kernel)
         xi_i, xi_j = xi.index_select(1, i)[..., None], xi.index_select(1, j)[..., None]
         velocity = (lin.J @ (xi_j - lin.carry @ xi_i)).squeeze(-1)
         return (lin.kernel.weight * (lin.weighted_residual * velocity).sum(-1)).sum()
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
-        return retract_sim3(found[0], direction[0]), *found[1:]
+        return self.group.retract(found[0], direction[0]), *found[1:]
 
     def push(self, found: Tensors, direction: Tensors) -> Tensors:
-        return (push_sim3(found[0], direction[0]),)
+        return (self.group.push(found[0], direction[0]),)
 
     def pull_back(self, found: Tensors, gradient: Tensors) -> Tensors:
-        return (pull_back_sim3(found[0], gradient[0])[..., : self.dims],)
+        return (self.group.pull_back(found[0], gradient[0]),)
 
     def last_step(self, S_cw: Tensor, inputs: Tensors, success: Tensor) -> Tensor:
         """The nodes after one more step from the minimum, with the gradient of that step."""
@@ -372,5 +366,5 @@ class PoseGraphMinimization:
         """The layout for counted edges and fixed nodes; the last one is cached."""
         key = counted, fixed
         if self._last is None or not all(map(torch.equal, self._last[0], key)):
-            self._last = key, build_pose_graph_layout(edges, counted, fixed, self.dims)
+            self._last = key, build_pose_graph_layout(edges, counted, fixed, self.group.dims)
         return self._last[1]
