@@ -402,6 +402,7 @@ class Reason(StrEnum):
     LOW_EXPLAINED_RATIO = "the map explains only {ratio:.0%} of the image"
     LOW_COVERAGE_RATIO = "only {ratio:.0%} of the image shows what the map expects there"
     MOVING_MAJORITY = "most of the image moves by itself"
+    WEAK_LINK = "nothing ties this part to the rest of the map, or the check contradicts the tie"
     MOVING_REMAINDER = "{count} matches in the rest of the image move against the map"
 
 

@@ -24,7 +24,7 @@ from torchslam.batch.result_store import (
     run_or_reuse,
 )
 from torchslam.batch.rows import Row
-from torchslam.calibration.find_camera import RADIAL, find_camera, with_stated_std
+from torchslam.calibration.find_camera import find_camera, with_stated_std
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.camera_argument import unknown_camera
@@ -34,6 +34,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
 from torchslam.data.transforms import WithGroundTruth
 from torchslam.errors import SequenceError
+from torchslam.global_mapping.recording import map_recording
 from torchslam.io.report import compute_metrics
 from torchslam.io.write_run import write_run
 from torchslam.system.run import Run
@@ -172,13 +173,15 @@ def _run(task: Task, folder: Path) -> Columns:
     if sequence.calibrated is Calibrated.MISSING:
         sequence = sequence.with_camera(unknown_camera(sequence.size), Calibrated.GUESSED)
     if sequence.calibrated is Calibrated.GUESSED:
-        sequence, camera = find_camera(sequence, config, folder, device, RADIAL)
+        sequence, camera = find_camera(sequence, config, folder, device)
     config = with_stated_std(config, sequence)
     finished = SLAM(sequence.camera.to(device), config).run(sequence)
-    seconds = time.process_time() - start
     if finished.interrupted:
         raise KeyboardInterrupt
-    metrics = compute_metrics(finished, sequence, camera)
+    mapped = map_recording(sequence, finished, config, sequence.camera, device=device)
+    finished = mapped.run
+    seconds = time.process_time() - start
+    metrics = compute_metrics(finished, sequence, camera, mapped=mapped)
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
     metrics |= {"source": full_name(row.resolve(row.sequence)), "source_fps": row.fps}

@@ -151,3 +151,48 @@ class ProgressBar:
         self._bar.close()
         if self._adjusting is not None:
             self._adjusting.close()
+
+
+class StageBar:
+    """Progress line on stderr of stages that follow one another, with the time left of the present one.
+
+    Args:
+        stop_signals: the signal handler.
+    """
+
+    def __init__(self, stop_signals: StopSignals) -> None:
+        self._stopping = stop_signals
+        self._warnings = shown_warnings()
+        self._stage = ""
+        self._bar: tqdm | None = None
+
+    def update(self, stage: str, done: int, most: int) -> None:
+        """Advance to a step of a stage. Raises KeyboardInterrupt after a signal."""
+        if stage != self._stage or self._bar is None:
+            self._close()
+            self._stage = stage
+            self._bar = tqdm(
+                total=most,
+                desc=stage,
+                **tqdm_options(),
+                bar_format="{desc} |{bar:24}| {n_fmt}/{total_fmt}, {remaining} left",
+            )
+        self._bar.total = most
+        self._bar.update(done - self._bar.n)
+        self._stopping.check()
+
+    def _close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+            self._bar = None
+
+    def __enter__(self) -> StageBar:
+        self._warnings.__enter__()
+        self._stopping.begin("and keeping the run as it is, after this step")
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._warnings.__exit__(kind, error, trace)
+        self._close()

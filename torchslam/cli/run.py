@@ -4,8 +4,9 @@ Without a calibration, or with `--camera auto`, the intrinsics are estimated fro
 calibration.txt in the results. The final adjustment refines a given camera as well, which is a measurement with an
 error (--camera-std).
 
-If few frames get a pose with the default features, and the weights of XFeat and LightGlue are on this machine, the run
-is tried again with them, and the better run is kept; --features orb prevents it.
+A recording is mapped frame by frame first. Image pairs that mapping did not use then tell whether the map is right; if
+they contradict it, or frames were lost, the recording is mapped as a whole, and the map that the pairs prefer is kept
+(--mapping).
 
 Exit status: 0 done, 2 an error, 3 no map could be initialized or no frame could be localized; 130 and 143 ended by
 Ctrl-C and by SIGTERM (the results so far are written, and --resume continues from the last checkpoint).
@@ -22,10 +23,10 @@ from pathlib import Path
 
 import torch
 
-from torchslam.calibration.find_camera import RADIAL, find_camera, with_stated_std
+from torchslam.calibration.find_camera import ROUGH_STD, find_camera, with_stated_std
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
-from torchslam.cli.progress import ProgressBar, StopSignals
+from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found
@@ -33,9 +34,9 @@ from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
-from torchslam.features.weights import PUBLISHED, find_weights
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
+from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
@@ -53,12 +54,6 @@ from torchslam.utils.console import table
 
 DONE = 0
 NO_MAP = 3
-FEW_POSED = 0.9
-"""Ratio of posed frames below which another front end is tried."""
-LEARNED = "xfeat-lighterglue"
-"""Weights of the front end that is tried then: XFeat, matched by LightGlue."""
-LEARNED_WAIT = 3
-"""Frames after a loss before it starts another submap: views are far apart then, and its submaps are joined later."""
 CHECKPOINT_EVERY = 20  # keyframes
 GROWTH = 0.05
 """Minimum ratio of new keyframes between two checkpoints, so that all checkpoints together cost O(n)."""
@@ -73,12 +68,12 @@ class RunPlan:
         output: results folder; `overwrite` it, or `resume` from its checkpoint.
         map: saved map to continue; without `mapping` only to localize in it.
         checkpoint: keyframes between two checkpoints; 0: none.
-        refine: refine the given camera from the images first; `distortion`: also its distortion.
+        refine: take the given camera for a rough guess, which the adjustments correct.
         processes: number of processes; None: chosen automatically.
         view: show the run live in rerun; `video`: write a video of the tracked frames.
         camera_std: stated relative standard deviation of the focal length; None: that of the calibration file, or of
             the configuration.
-        may_fall_back: try a learned front end if few frames are posed.
+        mapping_mode: whether the recording is mapped as a whole as well; None: it is no whole recording.
     """
 
     source: str
@@ -90,13 +85,12 @@ class RunPlan:
     mapping: bool = True
     checkpoint: int = CHECKPOINT_EVERY
     refine: bool = False
-    distortion: bool = False
     processes: int | None = None
     view: bool = False
     video: bool = False
     fps: float | None = None
     camera_std: float | None = None
-    may_fall_back: bool = False
+    mapping_mode: Mapping | None = Mapping.AUTO
 
 
 class Checkpoints:
@@ -154,10 +148,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="save the state at most every N keyframes, for --resume; 0: never (default: %(default)s)",
     )
     parser.add_argument(
-        "--refine-camera", action="store_true", help="refine the focal length from the images before the run"
+        "--mapping",
+        choices=[each.value for each in Mapping],
+        default=Mapping.AUTO.value,
+        help="auto: frame by frame, and then as a whole if frames were lost or image pairs contradict the map; "
+        "online: frame by frame alone; global: always as a whole as well (default: %(default)s)",
     )
     parser.add_argument(
-        "--refine-distortion", action="store_true", help="also refine k1 and k2, if the images require them"
+        "--refine-camera",
+        action="store_true",
+        help=f"the given focal length and distortion may be {ROUGH_STD:.0%} off (--camera-std {ROUGH_STD:g})",
     )
     parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
     parser.add_argument(
@@ -174,7 +174,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Execute `torchslam run`; returns the exit status."""
-    if options.map is not None and (options.refine_camera or options.refine_distortion):
+    if options.map is not None and options.refine_camera:
         raise ConfigError("--refine-camera cannot be combined with --map: a map keeps its camera")
     if options.localize and options.map is None:
         raise ConfigError("--localize requires --map")
@@ -202,8 +202,7 @@ def execute(options: argparse.Namespace) -> int:
         map=saved,
         mapping=not options.localize,
         checkpoint=options.checkpoint,
-        refine=options.refine_camera or options.refine_distortion,
-        distortion=options.refine_distortion,
+        refine=options.refine_camera,
         processes=options.processes,
         view=options.view,
         video=options.video,
@@ -213,10 +212,11 @@ def execute(options: argparse.Namespace) -> int:
     opened, config = _sequence(options), arguments.config(options)
     if options.dense:
         map_size(options.resolution, opened.size)  # raises now rather than after the run
-    is_recorded = not opened.is_live and not (options.view or options.video)
-    is_default = config.features == Config().features and config.matching == Config().matching
-    is_default = is_default and options.features is None
-    status = run(opened, config, replace(plan, may_fall_back=is_recorded and is_default and saved is None))
+    is_recorded = not opened.is_live and saved is None
+    if not is_recorded and options.mapping == Mapping.GLOBAL.value:
+        raise ConfigError("--mapping global needs a recording, and no --map")
+    mode = Mapping(options.mapping) if is_recorded else None
+    status = run(opened, config, replace(plan, mapping_mode=mode))
     if options.dense and status == DONE:
         dense = densify_results(
             options.output,
@@ -252,6 +252,7 @@ class Attempt:
         found: description of the camera, if it was estimated from the images.
         latencies: milliseconds from capture to pose, of a live source.
         watching: the viewers, open until the results are written.
+        mapped: the check, and whether the recording was mapped as a whole; None where it is no recording.
     """
 
     finished: Run
@@ -259,11 +260,7 @@ class Attempt:
     found: str
     latencies: list[float]
     watching: FrameViewers
-
-    @property
-    def posed_ratio(self) -> float:
-        """Ratio of the frames that have a pose in the main submap."""
-        return len(self.finished.trajectory) / max(len(self.finished.results), 1)
+    mapped: MappedRecording | None = None
 
 
 def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
@@ -272,9 +269,8 @@ def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     check_replaceable(plan.output / CALIBRATION)
     with StopSignals() as stop_signals, ExitStack() as viewers:
         attempt = _attempt(sequence, config, plan, stop_signals, viewers)
-        hint = ""
-        if plan.may_fall_back and attempt.posed_ratio < FEW_POSED and not attempt.finished.interrupted:
-            attempt, hint = _fall_back(attempt, sequence, config, plan, stop_signals, viewers)
+        if plan.mapping_mode is not None and not attempt.finished.interrupted:
+            attempt = _map_recording(attempt, plan.mapping_mode, plan.device, stop_signals)
         stop_signals.begin("when the results are written")
         metrics = _write(attempt, plan)
         attempt.watching.end(attempt.finished)
@@ -283,7 +279,7 @@ def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
     written |= {"video": plan.output / VIDEO} if plan.video else {}
     words = summary(metrics) | {label: str(path) for label, path in written.items()}
     print(f"\n{sequence.name}\n{table(words)}")
-    for warning in filter(None, [*result_warnings(metrics), hint]):
+    for warning in result_warnings(metrics):
         print(f"torchslam: warning: {warning}", file=sys.stderr)
     if finished.interrupted:
         print("torchslam: interrupted; the results so far were written", file=sys.stderr)
@@ -325,47 +321,21 @@ def _attempt(
     return Attempt(finished, sequence, found, latencies, watching)
 
 
-def _fall_back(
-    first: Attempt,
-    sequence: Sequence,
-    config: Config,
-    plan: RunPlan,
-    stop_signals: StopSignals,
-    viewers: ExitStack,
-) -> tuple[Attempt, str]:
-    """Try a learned front end where the classical one posed few frames; return the better run, and a hint.
-
-    Args:
-        first: run with the classical front end.
-        sequence, config, plan: as they were given.
-        stop_signals, viewers: of both runs.
-    """
-    few = f"{first.posed_ratio:.0%} of the frames are posed in one map"
-    if find_weights(LEARNED) is None:
-        published = PUBLISHED[LEARNED]
-        return first, (
-            f"{few}; learned features may pose more: `torchslam download {LEARNED}` fetches their weights "
-            f"({published.about}, {published.package.license}), and the next run will use them if it must"
-        )
-    print(f"torchslam: {few}: trying again with {LEARNED}", file=sys.stderr)
-    if first.finished.calibration is not None and first.found and not first.finished.failure:
-        std = first.finished.calibration.focal_std
-        sequence = sequence.with_camera(first.finished.camera.to("cpu"), std=std)
-    learned = replace(
-        config,
-        features=replace(config.features, kind="xfeat", weights=LEARNED),
-        matching=replace(config.matching, matcher="lightglue", weights=LEARNED),
-        relocalization=replace(config.relocalization, frames_before_new_submap=LEARNED_WAIT),
-    )
-    second = _attempt(sequence, learned, replace(plan, checkpoint=0, resume=False), stop_signals, viewers)
-    second = replace(second, found=second.found or first.found)  # the camera was found by the first run
-    is_better = len(second.finished.trajectory) > len(first.finished.trajectory)
-    kept = LEARNED if is_better else config.features.kind
-    print(
-        f"torchslam: {second.posed_ratio:.0%} of the frames are posed with {LEARNED}: keeping the run with {kept}",
-        file=sys.stderr,
-    )
-    return second if is_better else first, ""
+def _map_recording(
+    attempt: Attempt, mapping: Mapping, device: torch.device, stop_signals: StopSignals
+) -> Attempt:
+    """Check the run, and map the recording as a whole where that is wanted or needed; Ctrl-C keeps the run."""
+    online, config = attempt.finished, attempt.finished.config
+    try:
+        with StageBar(stop_signals) as bar:
+            mapped = map_recording(
+                attempt.sequence, online, config, attempt.sequence.camera, mapping, device, bar.update
+            )
+    except KeyboardInterrupt:
+        return replace(attempt, finished=replace(online, interrupted=True))
+    if mapped.why:
+        print(f"torchslam: mapped as a whole, since {mapped.why}; kept: {mapped.kept}", file=sys.stderr)
+    return replace(attempt, finished=mapped.run, mapped=mapped)
 
 
 def _with_camera(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[Sequence, str]:
@@ -375,14 +345,14 @@ def _with_camera(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[Seq
         if not plan.resume and is_found(plan.output / CALIBRATION):
             (plan.output / CALIBRATION).unlink()
         return sequence, ""
-    radial = RADIAL if plan.distortion or is_guess else 0
+    if not is_guess:
+        return sequence.with_camera(sequence.camera, std=ROUGH_STD), ""
     goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
     return find_camera(
         sequence,
         config,
         plan.output,
         plan.device,
-        radial,
         goes_on,
         lambda words: print(f"torchslam: camera: {words}", file=sys.stderr),
     )
@@ -431,6 +401,7 @@ def _write(attempt: Attempt, plan: RunPlan) -> dict[str, object]:
         sequence,
         attempt.found,
         lambda words: print(f"torchslam: warning: {words}", file=sys.stderr),
+        attempt.mapped,
     )
     if latencies:
         median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()

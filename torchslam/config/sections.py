@@ -600,6 +600,13 @@ class GlobalMappingConfig(Settings, section="global_mapping"):
         low=1,
         high=MAX_KEYPOINTS,
     )
+    max_image_pixels: int = setting(
+        1_000_000,
+        "Number of pixels to which much larger images are reduced, in place of `features.max_image_pixels`.",
+        low=32 * 32,
+        high=MAX_PIXELS,
+        also=0,
+    )
     max_images: int = setting(
         300,
         "Number of images that are spread evenly over the recording; frames between them are posed afterwards.",

@@ -158,10 +158,11 @@ def triangulate_tracks(
 def ray_errors(
     rays_w: Float[Tensor, "O 3"], centers_w: Float[Tensor, "O 3"], points_w: Float[Tensor, "O 3"]
 ) -> Float[Tensor, " O"]:
-    """Angles between rays and the directions to points, radians; pi / 2 and more for points behind."""
+    """Angles between rays and the directions to points, radians; pi / 2 and more for points behind or at the center."""
     seen = points_w - centers_w
     across = torch.linalg.cross(rays_w, seen).norm(dim=-1)
-    return torch.atan2(across, (rays_w * seen).sum(-1))
+    angles = torch.atan2(across, (rays_w * seen).sum(-1))
+    return angles.where((seen != 0).any(-1), torch.pi)
 
 
 def parallax(
@@ -214,7 +215,7 @@ def _nearest_to_rays(
 
 def _sums(tracks: Tracks, values: Float[Tensor, "O *n"]) -> Float[Tensor, "N *n"]:
     """Sums over the observations of each track, in their order: the same bytes on every run."""
-    flat = values.reshape(len(values), -1)
+    flat = values.reshape(len(values), math.prod(values.shape[1:]))
     total = torch.segment_reduce(flat, "sum", lengths=tracks.lengths, unsafe=True)
     return total.view(tracks.count, *values.shape[1:])
 

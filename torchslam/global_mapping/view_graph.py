@@ -26,9 +26,10 @@ FAR = 16
 """Distance from which on, doubling, neighbors are matched where those at the distance before held."""
 PLACES = 2
 """Images of similar places that each image is matched with, beyond its neighbors in time."""
-MIN_MATCHES = 30
-"""Least number of verified matches of a pair. On a phone's walk (garden, SIFT) 0.3 % of the relative rotations of such
-pairs are off by more than 5 degrees, 1.7 % of those with 20 or more, 3.5 % with 15 or more; tried 15 to 50."""
+MIN_MATCHES = 20
+"""Least number of verified matches of a pair. On a phone's walk (garden, SIFT) 1.7 % of the relative rotations of pairs
+with 20 or more are off by more than 5 degrees, 0.3 % with 30 or more, 3.5 % with 15 or more; averaging tolerates a
+third. Between bare walls there are no more. Tried 15 to 50."""
 MIN_RATIO = 0.25
 """Least ratio of verified to all matches: below, repetitive structure or chance explains them; tried 0.15 to 0.4."""
 THRESHOLD_PX = 1.5

@@ -15,6 +15,7 @@ from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, ate_apart, evaluate
 from torchslam.geometry import transform
+from torchslam.global_mapping.recording import MappedRecording
 from torchslam.system.run import Run
 from torchslam.types import State, StepResult, Trajectory
 
@@ -22,7 +23,11 @@ Errors = TypeVar("Errors")
 
 
 def compute_metrics(
-    finished: Run, sequence: Sequence, camera: str, log: Callable[[str], None] = lambda words: None
+    finished: Run,
+    sequence: Sequence,
+    camera: str,
+    log: Callable[[str], None] = lambda words: None,
+    mapped: MappedRecording | None = None,
 ) -> dict[str, Any]:
     """Compute the content of metrics.json, with the errors if there are ground truth and poses to compare.
 
@@ -31,6 +36,7 @@ def compute_metrics(
         sequence: its images, with the ground truth if known.
         camera: remark on the estimated camera, from `find_camera`.
         log: receives the reason if the evaluation is impossible.
+        mapped: how the recording was mapped, and the check of its map.
     """
 
     def measured(measure: Callable[[Trajectory], Errors]) -> Errors | None:
@@ -51,7 +57,20 @@ def compute_metrics(
         "camera": camera_remark(finished, camera),
         "rolling_shutter": rolling_shutter_remark(finished),
     }
-    return metrics | remarks | {"dropped": sequence.dropped}
+    return metrics | remarks | check_metrics(mapped) | {"dropped": sequence.dropped}
+
+
+def check_metrics(mapped: MappedRecording | None) -> dict[str, Any]:
+    """How a recording was mapped, and what image pairs say of the map; empty where it was not checked."""
+    if mapped is None:
+        return {}
+    check = mapped.check
+    if check is None:
+        return {"mapping": mapped.kept.value, "mapping_reason": mapped.why, "check": None}
+    counts = {name: getattr(check, name) for name in ("pairs", "agreeing", "triplets", "consistent")}
+    breaks = [str(each) for each in check.breaks]
+    found = counts | {"score": check.score, "breaks": breaks, "sentence": check.sentence()}
+    return {"mapping": mapped.kept.value, "mapping_reason": mapped.why, "check": found}
 
 
 FEW = 10
@@ -102,14 +121,19 @@ def run_metrics(
     return metrics
 
 
+FAR_PX = 4.0
+"""Reprojection error beyond which an observation counts as wrong in the report."""
+
+
 @torch.no_grad()
 def quality(run: Run) -> dict[str, float | None]:
     """Compute the quality of the map over the frames of this run; None without observations.
 
-    - `reprojection_px`: mean reprojection error.
+    - `reprojection_px`: median reprojection error.
+    - `far_ratio`: ratio of the observations that are more than `FAR_PX` off, or behind the camera.
     - `track_length`: mean number of frames that observe a point.
     """
-    found: dict[str, float | None] = {"reprojection_px": None, "track_length": None}
+    found: dict[str, float | None] = {"reprojection_px": None, "far_ratio": None, "track_length": None}
     if run.main is None or run.map.num_points == 0:
         return found
     graph = run.posed_frames.graph(run.map, run.camera)
@@ -117,7 +141,9 @@ def quality(run: Run) -> dict[str, float | None]:
     T_cw, points_w = graph.T_cw[graph.frame_index[rows]], graph.points_w[graph.point_index[rows]]
     pixels, valid = run.camera.project(transform(T_cw, points_w[:, None])[:, 0])
     if bool(valid.any()):
-        found["reprojection_px"] = float((pixels - graph.pixels[rows])[valid].norm(dim=-1).mean())
+        errors = (pixels - graph.pixels[rows]).norm(dim=-1).where(valid, torch.inf)
+        found["reprojection_px"] = float(errors.median())
+        found["far_ratio"] = float((errors > FAR_PX).double().mean())
         found["track_length"] = len(rows) / len(torch.unique(graph.point_index[rows]))
     return found
 
@@ -189,9 +215,13 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
     }
     if metrics.get("reprojection_px") is not None:
         rows["quality"] = (
-            f"{metrics['reprojection_px']:.2f} px mean reprojection error, points seen in "
+            f"{metrics['reprojection_px']:.2f} px median reprojection error, {metrics['far_ratio']:.1%} of the "
+            f"observations off by more than {FAR_PX:g} px, points seen in "
             f"{metrics['track_length']:.1f} frames, {metrics['uncertain'] / frames:.1%} of the frames uncertain"
         )
+    if metrics.get("check"):
+        how = {"online": "frame by frame", "global": "mapped as a whole"}[metrics["mapping"]]
+        rows["check"] = f"{how}: {metrics['check']['sentence']}"
     rows |= _describe_submaps(metrics)
     rows |= {"camera": metrics["camera"]} if metrics.get("camera") else {}
     rows |= {

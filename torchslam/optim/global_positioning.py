@@ -93,3 +93,16 @@ def position(frame, point, rays_w, K, N, weights=None, kernel="huber", scale=0.1
     ang = torch.nn.functional.cosine_similarity(m.u, p.rays, dim=-1)
     angles = torch.empty_like(ang); angles[L.observations] = torch.arccos(ang.clamp(-1, 1))
     return m.estimate.centers, m.estimate.points[L.point_rank], angles, conv
+
+
+class _Positions(NamedTuple):
+    """Until the finished function replaces this file."""
+
+    centers_w: Tensor
+    points_w: Tensor
+    angles: Tensor
+    convergence: object
+
+
+def position_globally(view_index: Tensor, point_index: Tensor, rays_w: Tensor, num_views: int, num_points: int, **options: object) -> _Positions:
+    return _Positions(*position(view_index, point_index, rays_w, num_views, num_points, **options))  # type: ignore[arg-type]

@@ -233,18 +233,22 @@ def nearest_by_cosine(
     with_second: bool,
 ) -> NearestNeighbors:
     """Find nearest neighbors by cosine similarity of unit descriptors; distances keep their graph."""
-    batch, count = mask_2.shape
+    batch, rows, count = len(mask_2), _used(mask_1), _used(mask_2)
+    descriptors_2, mask_2 = descriptors_2[:, :count], mask_2[:, :count]
     best_of_column = descriptors_2.new_full((batch, count), -torch.inf)
     parts = []
-    for rows in torch.arange(mask_1.shape[1], device=mask_1.device).split(_ROWS_AT_ONCE):
-        chunk = slice(int(rows[0]), int(rows[-1]) + 1)
-        similarity = descriptors_1[:, chunk] @ descriptors_2.mT
+    with_gradient = torch.is_grad_enabled() and (descriptors_1.requires_grad or descriptors_2.requires_grad)
+    room = descriptors_2.new_empty(batch, min(_ROWS_AT_ONCE, rows), count)  # once: new pages cost as much as products
+    for start in range(0, rows, _ROWS_AT_ONCE):
+        chunk = slice(start, min(start + _ROWS_AT_ONCE, rows))
+        out = None if with_gradient else room[:, : chunk.stop - start]
+        similarity = torch.matmul(descriptors_1[:, chunk], descriptors_2.mT, out=out)
         values = similarity.detach()  # changed in place: gradients need the indices and the descriptors alone
         for element, (own, other) in zip(values, zip(mask_1[:, chunk], mask_2, strict=True), strict=True):
             element.index_fill_(0, true_indices(~own), -torch.inf)
             element.index_fill_(1, true_indices(~other), -torch.inf)
         if allowed is not None:
-            values.masked_fill_(~allowed[:, chunk], -torch.inf)
+            values.masked_fill_(~allowed[:, chunk, :count], -torch.inf)
         best, column = values.max(2)
         best_of_column = torch.maximum(best_of_column, values.amax(1))
         nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
@@ -255,13 +259,20 @@ def nearest_by_cosine(
         parts.append((column, nearest, best, second))
     columns, nearest, best, second = zip(*parts, strict=True)
     column, most = torch.cat(columns, 1), torch.cat(best, 1)
+    tail = 0, mask_1.shape[1] - rows
     return NearestNeighbors(
-        column,
-        torch.cat(nearest, 1),
-        most > -torch.inf,
-        most >= best_of_column.gather(1, column),
-        torch.cat(second, 1) if with_second else None,
+        torch.nn.functional.pad(column, tail),
+        torch.nn.functional.pad(torch.cat(nearest, 1), tail, value=1.0),
+        torch.nn.functional.pad(most > -torch.inf, tail),
+        torch.nn.functional.pad(most >= best_of_column.gather(1, column), tail),
+        torch.nn.functional.pad(torch.cat(second, 1), tail, value=1.0) if with_second else None,
     )
+
+
+def _used(mask: Bool[Tensor, "B N"]) -> int:
+    """Number of rows up to the last one that some element uses, at least one: front ends pad at the end."""
+    used = torch.nonzero(mask.any(0))
+    return int(used[-1]) + 1 if len(used) else 1
 
 
 def dual_softmax(

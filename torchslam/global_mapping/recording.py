@@ -1,0 +1,149 @@
+"""A recording is mapped twice, in time and as a whole; the check from outside decides which of both to believe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import torch
+
+from torchslam.config import Config
+from torchslam.data.sequence import Sequence
+from torchslam.geometry import Camera
+from torchslam.global_mapping.check import MapCheck, check_map
+from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
+from torchslam.global_mapping.view_graph import PairMatcher
+from torchslam.system.run import Run, keyframe_rows
+from torchslam.tracking.matcher import make_matcher
+from torchslam.types import Reason, State, StepResult
+
+FEW_POSED = 0.98
+"""Share of the frames with a pose in the main submap below which a recording is mapped as a whole as well."""
+CHECKED_DISTANCES = 1, 2, 4
+"""Distances, in keyframes, of the pairs that check an online run."""
+LITTLE_BETTER = 0.01
+"""Difference of two scores that does not tell which map is better."""
+
+
+class Mapping(StrEnum):
+    """How a recording is mapped."""
+
+    AUTO = "auto"
+    """Online; then as a whole if frames were lost, or if the check contradicts the map."""
+    ONLINE = "online"
+    """Frame by frame, in the order of time."""
+    GLOBAL = "global"
+    """As a whole as well, whatever the check says."""
+
+
+@dataclass(frozen=True)
+class MappedRecording:
+    """The run that was kept.
+
+    Attributes:
+        run: the run.
+        check: the check of its map; None without a map, or without image pairs.
+        kept: which mapping it is from.
+        why: why the recording was mapped as a whole; empty if it was not.
+    """
+
+    run: Run
+    check: MapCheck | None
+    kept: Mapping
+    why: str
+
+
+def map_recording(
+    sequence: Sequence,
+    online: Run,
+    config: Config,
+    camera: Camera,
+    mapping: Mapping = Mapping.AUTO,
+    device: torch.device | str = "cpu",
+    progress: Progress = lambda stage, done, most: None,
+) -> MappedRecording:
+    """Check an online run, and map its recording as a whole where that is wanted or needed.
+
+    Args:
+        sequence: the recording.
+        online: a finished first session over it.
+        config: of the run.
+        camera: the given camera, with the error `config.camera.std`.
+        mapping: when to map as a whole.
+        device: of torch.
+        progress: receives the stages.
+    """
+    check = None
+    why = _loss(online)
+    if not why or mapping is Mapping.ONLINE:
+        progress("check", 0, 1)
+        check = check_run(online)
+        if check is not None and not check.is_right:
+            why = f"the check says: {check.sentence()}"
+    if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
+        return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
+    mapper = GlobalMapper(sequence, camera, config, config.camera.std, device, progress=progress)
+    made = mapper.run(online.results)
+    if made.run.failure:
+        check = check_run(online) if check is None else check
+        return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, why)
+    reduction = mapper.scaled.features.reduction(camera.size)
+    checks = [
+        check_map(
+            *poses_of(run, made.views), made.views, made.pairs, run.camera.to(camera.params), made.held_back, reduction
+        )
+        for run in (made.run, online)
+    ]
+    whole, before = checks
+    is_better = whole.score > before.score - LITTLE_BETTER
+    if abs(whole.score - before.score) < LITTLE_BETTER:
+        is_better = len(made.run.trajectory) >= len(online.trajectory)
+    run, check, kept = (made.run, whole, Mapping.GLOBAL) if is_better else (online, before, Mapping.ONLINE)
+    return MappedRecording(with_doubts(run, check), check, kept, why or "as asked")
+
+
+def _loss(run: Run) -> str:
+    """What was lost in a run; empty if nothing was."""
+    if run.failure:
+        return run.failure
+    posed, frames = len(run.trajectory), len(run.results)
+    if posed < FEW_POSED * frames:
+        return f"{posed} of {frames} frames are posed in one map"
+    lost = sum(result.state is State.LOST for result in run.results)
+    return f"tracking was lost in {lost} frames" if lost else ""
+
+
+@torch.no_grad()
+def check_run(run: Run) -> MapCheck | None:
+    """Check the main submap of a run by pairs of its keyframes, matched anew; None if there is nothing to check."""
+    rows = keyframe_rows(run.map, run.session).tolist()
+    if len(rows) < 3 or run.config.features.kind == "simulated":
+        return None
+    views = [run.map.frame_features(row) for row in rows]
+    scaled = run.config.for_size(run.camera.size)
+    matcher = make_matcher(scaled.matching, None, run.camera.size, scaled.features.kind)
+    pairs = PairMatcher(views, run.camera, matcher, scaled).match(
+        (row, row + distance)
+        for row in range(len(rows))
+        for distance in CHECKED_DISTANCES
+        if row + distance < len(rows)
+    )
+    known = torch.ones(len(rows), dtype=torch.bool)
+    reduction = scaled.features.reduction(run.camera.size)
+    return check_map(run.map.T_cw[rows], known, views, pairs, run.camera, None, reduction)
+
+
+def with_doubts(run: Run, check: MapCheck | None) -> Run:
+    """The run with the frames that the check doubts, and those up to the next checked one, called uncertain."""
+    if check is None or not check.uncertain:
+        return run
+    doubted, results = False, list[StepResult]()
+    uncertain = set(check.uncertain)
+    certain = set(check.certain)
+    for result in run.results:
+        if result.index in uncertain or result.index in certain:
+            doubted = result.index in uncertain
+        if doubted and result.state is State.TRACKING:
+            result = replace(result, state=State.UNCERTAIN, reason=Reason.WEAK_LINK.value)
+        results.append(result)
+    return replace(run, results=results)
