@@ -9,8 +9,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchslam.calibration import CalibrationResult, estimate_intrinsics
-from torchslam.calibration.find_camera import contradiction, describe_camera
+from torchslam.calibration import estimate_intrinsics
+from torchslam.calibration.find_camera import contradiction
 from torchslam.calibration.intrinsics import adjust_with_camera, frames_of, problem_of
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import FOCAL, K1
@@ -139,8 +139,6 @@ def test_a_frontal_plane_does_not_determine_the_camera(simulated: Make, truth: C
     wall = simulated(pinhole, noise=0.5, twists=twists, frames=12, depth=0.0)
     estimate = estimate_intrinsics(replace(wall, camera=off), off, radial=2, principal_point=True)
     assert not estimate.is_determined
-    said = describe_camera(CalibrationResult(estimate.camera, estimate, []))
-    assert said.startswith("not determined by the motion (pure rotation, straight motion and planes")
     twists[:, 4] += 0.5 * torch.cos(5 * way)
     twists[:, 3] += 0.3 * torch.sin(5 * way)
     tilted = simulated(pinhole, noise=0.5, twists=twists, frames=12, depth=0.0)

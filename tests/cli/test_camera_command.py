@@ -37,7 +37,7 @@ def test_images_without_a_calibration_are_calibrated(
     assert main(["run", str(folder), "-o", str(results), *FAST]) == 0
     captured = capsys.readouterr()
     assert "no calibration found; estimating intrinsics" in captured.err
-    assert f"{FRAMES} frames with 544 px ask for" in captured.err
+    assert "torchslam: camera: " in captured.err
     said = json.loads((results / "metrics.json").read_text())["camera"]
     assert said in captured.out
     before, _, after = said.partition("; over all frames ")

@@ -19,7 +19,7 @@ from torchslam.global_mapping.chained_positions import chained_positions
 from torchslam.global_mapping.frames_between import FramePoser
 from torchslam.global_mapping.rounds import MIN_VIEWS, ObservedTracks, Reconstruction, adjust_in_rounds
 from torchslam.global_mapping.tracks import join_matches, make_map
-from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph, connected_views
+from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair, build_view_graph, connected_views
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.optim.rotation_averaging import average_rotations
 from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
@@ -35,6 +35,9 @@ real recordings, with a long tail. Tried 0.005 to 0.02."""
 MAX_ROTATION_ERROR_RAD = 0.1
 """A pair whose rotation differs more from the averaged ones does not hold. On garden right ones differ by 0.15 degrees
 in the median and wrong ones by 10 and more; tried 0.05 to 0.2."""
+MIN_GENERAL = 0.2
+"""Least share of pairs that determine a direction of motion: a camera that only turns has none, or, with a wrong focal
+length, a few; walks have 0.8 and more."""
 HELD_BACK = 10
 """One in so many verified pairs is not used for mapping, so that it can tell whether the map is right."""
 HELD_BACK_DISTANCE = 2
@@ -168,6 +171,9 @@ class GlobalMapper:
         average = average_rotations(edges, R_21, len(views), weights, backward="detached")
         off = so3_log(R_21 @ average.R_cw[edges[:, 0]] @ average.R_cw[edges[:, 1]].mT).norm(dim=-1)
         pairs = [pair for pair, angle in zip(pairs, off.tolist(), strict=True) if angle < MAX_ROTATION_ERROR_RAD]
+        general = sum(pair.relation is Relation.GENERAL for pair in pairs)
+        if general < MIN_GENERAL * len(pairs):
+            return f"no map: the camera only turns, or sees a plane, in {len(pairs) - general} of {len(pairs)} pairs"
         rows = connected_views(pairs, len(views))
         is_connected = torch.zeros(len(views), dtype=torch.bool)
         is_connected[rows] = True
@@ -188,6 +194,8 @@ class GlobalMapper:
             observed, T_cw, self.given, camera, log=lambda words: self.progress(words, 0, 1)
         )
         seen = torch.unique(tracks.view[found.agrees])
+        if len(seen) < MIN_VIEWS:
+            return f"no map: {len(views)} images agree on no points; the camera may only turn"
         return seen, observed, found
 
     def _finish(

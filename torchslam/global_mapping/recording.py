@@ -95,6 +95,9 @@ def map_recording(
         for run in (made.run, online)
     ]
     whole, before = checks
+    if online.failure and not whole.is_right:
+        # A camera that only turns, with a wrong focal length, makes maps that contradict themselves.
+        return MappedRecording(online, None, Mapping.ONLINE, why)
     is_better = whole.score > before.score - LITTLE_BETTER
     if abs(whole.score - before.score) < LITTLE_BETTER:
         is_better = len(made.run.trajectory) >= len(online.trajectory)

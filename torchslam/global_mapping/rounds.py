@@ -30,7 +30,7 @@ FINE: tuple[Kernel, float] = ("geman_mcclure", 5.0)
 """The same where poses are right to about a pixel. Tried 3 to 6, and Cauchy at 2, which is as good."""
 COARSE_TRACKS = 150
 """Longest tracks of each image that the coarse rounds use: poses settle with these in a third of the time."""
-ITERATIONS, COARSE_TOLERANCE, TOLERANCE = 50, 1e-5, 1e-6
+ITERATIONS, COARSE_TOLERANCE, TOLERANCE = 100, 1e-6, 1e-7
 """The scale of one part against another across a weak link changes the cost little: stopped at 1e-4, it is 5 % off."""
 COARSE_GATE, GATE = 3.0, 8.0
 """Up to where an observation belongs to its point: in coarse rounds in scales of the next kernel, then in standard

@@ -256,16 +256,15 @@ def nearest_by_cosine(
         second = None
         if with_second:
             second = 1 - values.scatter_(2, column[..., None], -torch.inf).amax(2)
-        parts.append((column, nearest, best, second))
-    columns, nearest, best, second = zip(*parts, strict=True)
-    column, most = torch.cat(columns, 1), torch.cat(best, 1)
+        parts.append((column, nearest, best, best if second is None else second))
+    column, nearest, most, seconds = (torch.cat(each, 1) for each in zip(*parts, strict=True))
     tail = 0, mask_1.shape[1] - rows
     return NearestNeighbors(
         torch.nn.functional.pad(column, tail),
-        torch.nn.functional.pad(torch.cat(nearest, 1), tail, value=1.0),
+        torch.nn.functional.pad(nearest, tail, value=1.0),
         torch.nn.functional.pad(most > -torch.inf, tail),
         torch.nn.functional.pad(most >= best_of_column.gather(1, column), tail),
-        torch.nn.functional.pad(torch.cat(second, 1), tail, value=1.0) if with_second else None,
+        torch.nn.functional.pad(seconds, tail, value=1.0) if with_second else None,
     )
 
 
