@@ -22,13 +22,16 @@ from experiments.common import (
 )
 from torchslam.batch import DONE, Columns
 from torchslam.batch.result_store import RECORD, RUNS, read_record
-from torchslam.calibration import CalibrationResult, CalibrationRound, calibrate, estimate_intrinsics
-from torchslam.calibration.find_camera import contradiction
+from torchslam.calibration import FocalSearch, search_focal
+from torchslam.calibration.find_camera import GUESS_STD, LEAST_STD, STD_FACTOR, camera_remark, with_stated_std
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
-from torchslam.data.sequence import Sequence
+from torchslam.data.camera_argument import unknown_camera
+from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.global_mapping.recording import map_recording
 from torchslam.system.front_end import Simulated, true_poses
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
@@ -36,8 +39,8 @@ from torchslam.system.slam import SLAM
 HERE = Path(__file__).parent
 WRONG = 1.2  # how far off a given focal length is that a run should warn of
 HEADER = (
-    "sequence | found: f (px), k1, k2 | of COLMAP, else given | f off | in standard errors | determined | runs"
-    " | frames used | posed | ATE (m) | ATE, given camera (m) | CPU (s)"
+    "sequence | by pairs: f (px) | over all frames: f (px), k1, k2 | of COLMAP, else given | off, by pairs"
+    " | off, over all frames | posed | ATE (m) | ATE, given camera (m) | CPU (s)"
 )
 
 
@@ -88,6 +91,7 @@ def open_case(case: Case) -> tuple[Sequence, Sequence | None, Config]:
     config = load_config(None, case.overrides)
     path = place_of(case.name)
     unknown = open_sequence(path, "auto", limit=case.frames)
+    unknown = unknown.with_camera(unknown_camera(unknown.size), Calibrated.GUESSED)
     if case.simulated:
         known: Sequence | None = open_sequence(path, limit=case.frames)
         assert known is not None
@@ -103,22 +107,19 @@ def found(label: str, case: Case) -> list[str]:
     """Find the camera of a case, run with it and with the given one, and return the row of the table."""
     unknown, known, config = open_case(case)
     start = time.process_time()
-    result = calibrate(unknown, config, on_progress=lambda done: print_round(label, done))
+    search = search_focal(unknown, config)
+    sequence = with_found(unknown, search)
+    run = recorded(sequence, config)
     seconds = time.process_time() - start
-    run = SLAM(result.camera, config).run(unknown)
-    given = None if known is None else SLAM(known.camera, config).run(known)
+    given = None if known is None else recorded(known, config)
     reference = case.peer or (math.nan if known is None else float(known.camera.focal))
-    off = math.log(float(result.camera.focal) / reference)
-    std = math.nan if result.estimate is None else result.estimate.focal_std
     row = [
         label,
-        describe(result),
+        describe_search(search),
+        describe_run(run.calibration),
         f"{reference:.1f}",
-        f"{100 * math.expm1(off):+.1f} %",
-        f"{off / std:+.1f}",
-        "yes" if result.is_determined else "no",
-        str(len(result.rounds)),
-        f"{result.rounds[-1].frames} of {len(unknown)}",
+        "" if not search.is_determined else off(sequence.camera, reference),
+        "" if run.calibration is None else off(run.calibration.camera, reference),
         f"{len(run.trajectory)} of {len(unknown)}",
         error_of(run, unknown),
         "" if given is None or known is None else error_of(given, known),
@@ -128,24 +129,44 @@ def found(label: str, case: Case) -> list[str]:
     return row
 
 
-def print_round(label: str, done: CalibrationRound) -> None:
-    """Print a line per round."""
-    estimate = done.estimate
-    result = "no map"
-    if estimate is not None:
-        focal = f"{float(estimate.camera.focal):.1f} px, error {estimate.focal_std:.2%}"
-        result = f"{focal}, {estimate.num_radial} radial terms"
-    print(f"{label}: {done.frames} frames with {float(done.camera.focal):.1f} px -> {result}", flush=True)
+def with_found(unknown: Sequence, search: FocalSearch) -> Sequence:
+    """The sequence with the camera that pairs gave, and the error that a run states for it; else with the guess."""
+    if search.found is None or not search.is_determined:
+        return unknown.with_camera(unknown.camera, std=GUESS_STD)
+    params = unknown.camera.params
+    focal = search.found.focal.to(params).expand(2)
+    camera = unknown.camera.with_params(torch.cat([focal, params[2:]]))
+    return unknown.with_camera(camera, std=max(LEAST_STD, STD_FACTOR * float(search.found.std)))
 
 
-def describe(result: CalibrationResult) -> str:
-    """Focal length and the coefficients that were fitted, with their standard errors."""
-    estimate = result.estimate
-    if estimate is None:
+def recorded(sequence: Sequence, config: Config) -> Run:
+    """A run as `torchslam run` makes it: online, then as a whole where frames were lost or the check says so."""
+    config = with_stated_std(config, sequence)
+    online = SLAM(sequence.camera, config).run(sequence)
+    return map_recording(sequence, online, config, sequence.camera).run
+
+
+def describe_search(search: FocalSearch) -> str:
+    """The focal length by pairs with its standard error."""
+    if search.found is None or not search.is_determined:
+        return f"not determined by {search.pairs} pairs"
+    focal = float(search.found.focal)
+    return f"{focal:.1f} ± {focal * float(search.found.std):.1f} ({search.pairs})"
+
+
+def describe_run(found: CameraMeasurement | None) -> str:
+    """Focal length and distortion of the final adjustment, with their standard errors."""
+    if found is None:
         return "no map"
-    words = [f"{float(result.camera.focal):.1f} ± {float(result.camera.focal) * estimate.focal_std:.1f}"]
-    terms = zip(result.camera.params[4:6].tolist(), estimate.k_std, strict=False)
-    return ", ".join([*words, *(f"{k:.3f} ± {std:.3f}" for k, std in terms)])
+    focal = float(found.camera.focal)
+    terms = zip(found.camera.params[4:6].tolist(), found.radial_std, strict=False)
+    words = [f"{focal:.1f} ± {focal * found.focal_std:.1f}", *(f"{k:.3f} ± {std:.3f}" for k, std in terms)]
+    return ", ".join(words)
+
+
+def off(camera: Camera, reference: float) -> str:
+    """How far the focal length is from the reference."""
+    return f"{100 * (float(camera.focal) / reference - 1):+.1f} %"
 
 
 def error_of(run: Run, sequence: Sequence) -> str:
@@ -162,8 +183,8 @@ def warned(label: str, case: Case) -> None:
         return
     for factor in (1 / WRONG, 1.0, WRONG):
         camera = scaled(known.camera.to(torch.float64), factor)
-        run = SLAM(camera, config).run(known)
-        said = run.failure or contradiction(camera, estimate_intrinsics(run.graph)) or "nothing"
+        run = SLAM(camera, config).run(known.with_camera(camera))
+        said = run.failure or camera_remark(run, "") or "nothing"
         print(f"{label}, given {float(camera.focal):.1f} px: {said}", flush=True)
 
 
@@ -198,7 +219,8 @@ def main() -> None:
     cases = [{"label": label, "output": str(output)} for label in labels]
     check(run_cases(attempt, cases, arguments, lambda columns: print(columns["name"], columns["status"])))
     records = [read_record(output / RUNS / label / RECORD) for label in CASES]
-    write_between(HERE / "README.md", table(HEADER, [record["cells"] for record in records if record]))
+    text = table(HEADER, [record["cells"] for record in records if record])
+    write_between(HERE / "README.md", text)
 
 
 if __name__ == "__main__":

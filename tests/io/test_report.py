@@ -8,7 +8,9 @@ import torch
 
 from torchslam.evaluation import evaluate
 from torchslam.geometry import transform
-from torchslam.io.report import quality, result_warnings, run_metrics, summary
+from torchslam.global_mapping.check import Break, BreakKind, MapCheck
+from torchslam.global_mapping.recording import MappedRecording, Mapping
+from torchslam.io.report import check_metrics, quality, result_warnings, run_metrics, summary
 from torchslam.map.atlas import Submap
 from torchslam.system.run import Run
 from torchslam.types import PoseEstimate, State, Trajectory
@@ -35,20 +37,27 @@ def test_quality(run: Run) -> None:
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])[:, 0]
     pixels, valid = run.camera.project(points_c)
     assert valid.any()
-    expected = float((pixels - graph.pixels).norm(dim=-1)[valid].mean())
+    errors = (pixels - graph.pixels).norm(dim=-1).where(valid, torch.inf)
+    expected, far = float(errors.median()), float((errors > 4.0).double().mean())
     seen = torch.bincount(graph.point_index)
     found = quality(run)
     assert found["reprojection_px"] == pytest.approx(expected)
+    assert found["far_ratio"] == pytest.approx(far)
+    assert 0 < far < 1
     assert found["track_length"] == pytest.approx(float(seen[seen > 0].double().mean()))
     figures = run_metrics(run)
     assert figures["uncertain"] == 0
     assert summary(figures)["quality"] == (
-        f"{expected:.2f} px mean reprojection error, points seen in {found['track_length']:.1f} frames, "
-        "0.0% of the frames uncertain"
+        f"{expected:.2f} px median reprojection error, {far:.1%} of the observations off by more than 4 px, "
+        f"points seen in {found['track_length']:.1f} frames, 0.0% of the frames uncertain"
     )
     assert "quality" not in summary(figures | {"reprojection_px": None})
     assert quality(replace(run, submaps=())) == quality(replace(run, session=7))
-    assert quality(replace(run, session=7)) == {"reprojection_px": None, "track_length": None}
+    assert quality(replace(run, session=7)) == {
+        "reprojection_px": None,
+        "far_ratio": None,
+        "track_length": None,
+    }
 
 
 @pytest.mark.parametrize(
@@ -61,6 +70,34 @@ def test_half_of_the_frames_being_keyframes_is_reported(
     assert [text.partition(":")[0] for text in found] == [
         f"{keyframes} of {posed} posed frames are keyframes"
     ] * said
+
+
+def test_every_image_of_a_global_map_may_be_a_keyframe(run: Run) -> None:
+    figures = run_metrics(run) | {"keyframes": 23, "posed": 23}
+    assert len(result_warnings(figures)) == 1
+    assert result_warnings(figures | {"mapping": "global"}) == []
+
+
+def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
+    check = MapCheck(9, 4, 3, 10, 9, 0.8, 0.5, (Break(3, 4, BreakKind.SCALE, 1.2),), (0, 1, 2), (4, 5))
+    mapped = MappedRecording(run, check, Mapping.GLOBAL, "tracking was lost in 3 frames")
+    found = check_metrics(mapped)
+    assert found["mapping"] == "global"
+    assert found["mapping_reason"] == "tracking was lost in 3 frames"
+    assert {name: found["check"][name] for name in ("pairs", "agreeing", "triplets", "consistent")} == {
+        "pairs": 4,
+        "agreeing": 3,
+        "triplets": 10,
+        "consistent": 9,
+    }
+    assert found["check"]["score"] == pytest.approx(0.8 * 0.9 * 3 / 9)
+    assert found["check"]["breaks"] == ["between frames 3 and 4 the scale differs by 20%"]
+    row = summary(run_metrics(run) | found)["check"]
+    assert row.startswith(
+        "mapped as a whole: 75% of 4 image pairs that mapping did not use agree, and 90% of 10"
+    )
+    assert check_metrics(None) == {}
+    assert check_metrics(MappedRecording(run, None, Mapping.ONLINE, ""))["check"] is None
 
 
 def test_a_rolling_shutter_is_a_warning(run: Run) -> None:

@@ -22,11 +22,11 @@ from torchslam.io.results import CALIBRATION
 from torchslam.system.run import Run
 
 LEAST_STD = 0.05
-"""Relative standard deviation of a camera that pairs of images gave: distortion, of which they know little, is in it."""
+"""Relative standard deviation of a camera by pairs of images: distortion, of which they know little, is in it."""
 STD_FACTOR = 2.0
 """On the stated error of such a focal length: on six recordings they are off by up to three of them."""
 GUESS_STD = 0.15
-"""The same where pairs do not determine the focal length: phones and webcams have 0.7 to 1 widths, the guess is 0.85."""
+"""The same where pairs do not determine the focal length: phones and webcams have 0.7 to 1 widths, the guess 0.85."""
 ROUGH_STD = 0.1
 """The same of a given camera that is to be refined."""
 

@@ -77,7 +77,9 @@ def search_focal(
     extract = None if sequence.brings_features else image_extractor(config, device)
     last = max(len(sequence) - 1 - OFFSETS[-1], 0)
     starts = sorted({round(last * place / max(PLACES - 1, 1)) for place in range(PLACES)})
-    wanted = sorted({start + offset for start in starts for offset in OFFSETS if start + offset < len(sequence)})
+    wanted = sorted(
+        {start + offset for start in starts for offset in OFFSETS if start + offset < len(sequence)}
+    )
     views: dict[int, FrameFeatures] = {}
     for done, index in enumerate(wanted):
         progress(done, len(wanted))

@@ -157,7 +157,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--refine-camera",
         action="store_true",
-        help=f"the given focal length and distortion may be {ROUGH_STD:.0%} off (--camera-std {ROUGH_STD:g})",
+        help=f"the given focal length and distortion may be wrong: as --camera-std {ROUGH_STD:g}",
     )
     parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
     parser.add_argument(

@@ -55,7 +55,7 @@ def chained_positions(
     if not told:
         return R_cw.new_zeros(len(R_cw), 3)
     lengths = pair_lengths(told, views, camera)
-    ends = torch.tensor([(pair.first, pair.second) for pair in told])
+    ends = torch.tensor([(pair.first, pair.second) for pair in told], device=R_cw.device)
     T_12 = se3_inverse(torch.stack([pair.T_21 for pair in told]))
     baselines_w = lengths[:, None] * (R_cw[ends[:, 0]].mT @ T_12[:, :3, 3:])[..., 0]
     return solve_differences(ends, baselines_w, DIRECTION_STD * lengths, len(R_cw))
@@ -81,7 +81,7 @@ def pair_lengths(
     # Inverse depths are in units of the inverse baseline: with twice the baseline, they are twice as large.
     logs = like.new_tensor([ratio.log_ratio for ratio in found]).view(-1, 1)
     stds = like.new_tensor([math.hypot(ratio.std, SYSTEMATIC_STD) for ratio in found])
-    index = torch.tensor(edges, dtype=torch.int64).view(-1, 2)
+    index = torch.tensor(edges, dtype=torch.int64, device=like.device).view(-1, 2)
     return solve_differences(index, logs, stds, len(pairs))[:, 0].exp()
 
 
@@ -113,7 +113,8 @@ def solve_differences(
             weights = information * robustify(squared, "cauchy", squared.new_tensor(width)).weight
         diagonal = by_node.sum(weights.repeat(2)[None])[0]
         diagonal = diagonal + FEEBLE * diagonal.max()
-        factor = factorize_sparse(structure, diagonal[None, :, None, None], -by_pair.sum(weights[None])[..., None, None])
+        across = -by_pair.sum(weights[None])[..., None, None]
+        factor = factorize_sparse(structure, diagonal[None, :, None, None], across)
         pull = weights[:, None] * residuals
         right = by_node.sum(torch.cat((-pull, pull))[None])[0]
         x = x + torch.cat([factor.solve(column[None, :, None])[0] for column in right.unbind(-1)], dim=-1)

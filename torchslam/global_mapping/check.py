@@ -46,6 +46,7 @@ MIN_AGREEING = 0.5
 MIN_SCORE = 0.8
 """Score below which a map counts as wrong even without a break; right ones have 0.98 and more."""
 
+
 class BreakKind(Enum):
     """How the two sides of a moment do not fit together."""
 
@@ -88,6 +89,7 @@ class MapCheck:
         triplets: number of triplets that tell a ratio of scales, images without a pose included.
         consistent: number of those that agree with the map.
         used_agreeing: share of all pairs, used or not, that agree.
+        distance_px: median distance of the matches of pairs that mapping did not use from where the map allows them.
         breaks: moments at which the map does not fit together, in the order of time.
         certain: frames of the images in the longest stretch without a break, ascending.
         uncertain: frames of the other images that have a pose.
@@ -99,6 +101,7 @@ class MapCheck:
     triplets: int
     consistent: int
     used_agreeing: float
+    distance_px: float
     breaks: tuple[Break, ...]
     certain: tuple[int, ...]
     uncertain: tuple[int, ...]
@@ -160,6 +163,7 @@ def check_map(
         reduction: factor by which images are reduced before features are found.
     """
     posed = known.tolist()
+    T_cw = T_cw.to(camera.params)
     depths = {
         row: PairDepths.of(T_cw[pair.second] @ se3_inverse(T_cw[pair.first]), views, pair, camera)
         for row, pair in enumerate(pairs)
@@ -167,11 +171,11 @@ def check_map(
     }
     depth = _median_depth(depths.values())
     limit = AGREE_PX * reduction
-    agrees = [
-        row in depths
-        and _distance_px(T_cw, views, pair, camera, 1 / (NEAREST * depth)) < limit
+    distances = [
+        _distance_px(T_cw, views, pair, camera, 1 / (NEAREST * depth)) if row in depths else math.inf
         for row, pair in enumerate(pairs)
     ]
+    agrees = [distance < limit for distance in distances]
     unused = range(len(pairs)) if held_back is None else sorted(held_back)
     triplets, untold = _triplets(depths, pairs, posed)
     breaks, stretches = _breaks(posed, pairs, agrees, triplets, views)
@@ -184,6 +188,7 @@ def check_map(
         len(triplets) + untold,
         sum(triplet.agrees for triplet in triplets),
         sum(agrees) / len(agrees) if agrees else 0.0,
+        float(np.median([distances[row] for row in unused])) if len(unused) else 0.0,
         breaks,
         tuple(views[row].index for row in longest),
         tuple(views[row].index for row in others),
@@ -229,9 +234,7 @@ def _triplets(
             ratio = depth_ratio(depths[one], 1, depths[other], 0)
             if ratio is not None and ratio.std < MAX_RATIO_STD:
                 agrees = abs(ratio.log_ratio) < MAX_SCALE_ERROR + 2 * ratio.std
-                found.append(
-                    _Triplet(pairs[one].first, middle, pairs[other].second, ratio.log_ratio, agrees)
-                )
+                found.append(_Triplet(pairs[one].first, middle, pairs[other].second, ratio.log_ratio, agrees))
     return found, untold
 
 
@@ -242,7 +245,7 @@ def _breaks(
     triplets: Sequence[_Triplet],
     views: Sequence[FrameFeatures],
 ) -> tuple[tuple[Break, ...], list[list[int]]]:
-    """The moments between posed images at which pairs or triplets disagree, and the images in stretches between them."""
+    """The moments at which pairs or triplets disagree, and the posed images in the stretches between them."""
     rows = [row for row, known in enumerate(posed) if known]
     told = [row for row, pair in enumerate(pairs) if posed[pair.first] and posed[pair.second]]
     ends = np.array([(pairs[row].first, pairs[row].second) for row in told]).reshape(-1, 2)

@@ -1,4 +1,4 @@
-"""Depths of the matches of a pair of images by its relative pose, and what two pairs with a common image tell by them."""
+"""Depths of the matches of a pair of images by its relative pose; what two pairs with a common image tell by them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.types import FrameFeatures
 
 MIN_PARALLAX_SIGMAS = 5.0
-"""Parallax of a keypoint that takes part in a ratio of depths, in units of its noise: below, inverse depths are biased."""
+"""Parallax of a keypoint that takes part in a ratio, in units of its noise: below, inverse depths are biased."""
 SIGMA_PX = 0.7
 """Noise of a parallax: that of a keypoint in either image."""
 MIN_POINTS = 12

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator, Sequence as Rows
+from collections.abc import Callable, Iterator
+from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 
 import torch
@@ -19,7 +20,13 @@ from torchslam.global_mapping.chained_positions import chained_positions
 from torchslam.global_mapping.frames_between import FramePoser
 from torchslam.global_mapping.rounds import MIN_VIEWS, ObservedTracks, Reconstruction, adjust_in_rounds
 from torchslam.global_mapping.tracks import join_matches, make_map
-from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair, build_view_graph, connected_views
+from torchslam.global_mapping.view_graph import (
+    PairMatcher,
+    Relation,
+    ViewPair,
+    build_view_graph,
+    connected_views,
+)
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.optim.rotation_averaging import average_rotations
 from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
@@ -66,7 +73,7 @@ class GlobalMap:
 
 
 def mapping_config(config: Config) -> Config:
-    """The configuration of global mapping: SIFT in place of the features of live tracking, unless others were chosen."""
+    """The configuration of global mapping: SIFT in place of the default features, unless others were chosen."""
     settings = config.global_mapping
     features = config.features
     if features.kind != Config().features.kind:
@@ -104,8 +111,9 @@ class GlobalMapper:
 
     Args:
         sequence: the recording.
-        camera: of all frames, with its error; of no error: it stays.
+        camera: of all frames.
         config: the configuration of the run.
+        given: the camera with its error; None: it is exact.
         device: of torch.
         extractor: front end; the configured one if None.
         matcher: of two views; the configured one if None.
@@ -117,7 +125,7 @@ class GlobalMapper:
         sequence: Sequence,
         camera: Camera,
         config: Config,
-        std: float,
+        given: CameraMeasurement | None,
         device: torch.device | str = "cpu",
         extractor: FrontEnd | None = None,
         matcher: Matcher | None = None,
@@ -126,14 +134,12 @@ class GlobalMapper:
         self.camera = camera.to(device).to(torch.float64)
         self.config = mapping_config(config)
         self.scaled = self.config.for_size(camera.size)
-        self.given = CameraMeasurement.of(self.camera, std) if std else None
+        self.given = given
         self.sequence = source(sequence, self.config, self.camera)
         self.extract: Extractor | None = None
         if not self.sequence.brings_features:
             self.extract = image_extractor(self.config, device, extractor)
-        self.matcher = make_matcher(
-            self.scaled.matching, matcher, camera.size, self.scaled.features.kind
-        )
+        self.matcher = make_matcher(self.scaled.matching, matcher, camera.size, self.scaled.features.kind)
         self.progress = progress
         self.skipped: list[str] = []
 
@@ -141,7 +147,7 @@ class GlobalMapper:
     def run(self, results: Rows[StepResult] = ()) -> GlobalMap:
         """Map the recording; `results`: of an online run over it, whose doubtful frames are mapped as well."""
         images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
-        views = [view for view in self._views(images, "features") if view is not None]
+        views = [view for view in self.views(images) if view is not None]
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
         matcher = PairMatcher(views, self.camera, self.matcher, self.scaled)
@@ -150,7 +156,7 @@ class GlobalMapper:
         found = self.reconstruct(views, [pair for row, pair in enumerate(pairs) if row not in held_back])
         if isinstance(found, str):
             return self._failed(found, views, pairs)
-        run = self._finish(views, *found)
+        run = self.finish(views, *found)
         return GlobalMap(run, views, pairs, held_back)
 
     def reconstruct(
@@ -162,29 +168,35 @@ class GlobalMapper:
             Rows of the views that have a pose, the tracks in all views, and what was found; or why there is no map.
         """
         self.progress("rotations", 0, 1)
-        edges = torch.tensor([(pair.first, pair.second) for pair in pairs], dtype=torch.int64).view(-1, 2)
+        device = self.camera.params.device
+        ends = [(pair.first, pair.second) for pair in pairs]
+        edges = torch.tensor(ends, dtype=torch.int64, device=device).view(-1, 2)
         if len(edges) == 0:
             return f"no map: no two of {len(views)} images see the same"
         R_21 = torch.stack([pair.T_21[:3, :3] for pair in pairs])
-        weights = torch.tensor([float(len(pair)) for pair in pairs]).to(R_21)
+        weights = R_21.new_tensor([float(len(pair)) for pair in pairs])
         weights = weights / weights.mean() / ROTATION_STD_RAD**2
         average = average_rotations(edges, R_21, len(views), weights, backward="detached")
         off = so3_log(R_21 @ average.R_cw[edges[:, 0]] @ average.R_cw[edges[:, 1]].mT).norm(dim=-1)
-        pairs = [pair for pair, angle in zip(pairs, off.tolist(), strict=True) if angle < MAX_ROTATION_ERROR_RAD]
+        pairs = [
+            pair for pair, angle in zip(pairs, off.tolist(), strict=True) if angle < MAX_ROTATION_ERROR_RAD
+        ]
         general = sum(pair.relation is Relation.GENERAL for pair in pairs)
         if general < MIN_GENERAL * len(pairs):
-            return f"no map: the camera only turns, or sees a plane, in {len(pairs) - general} of {len(pairs)} pairs"
+            return (
+                f"no map: the camera stands still, only turns, or sees a plane in {len(pairs) - general} of "
+                f"{len(pairs)} pairs of images"
+            )
         rows = connected_views(pairs, len(views))
-        is_connected = torch.zeros(len(views), dtype=torch.bool)
-        is_connected[rows] = True
-        pairs = [pair for pair in pairs if bool(is_connected[pair.first])]
+        connected = set(rows.tolist())
+        pairs = [pair for pair in pairs if pair.first in connected]
         tracks = join_matches(pairs, len(views), len(views[0].mask))
-        tracks, _ = tracks.select(torch.ones(len(tracks), dtype=torch.bool), MIN_VIEWS)
+        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
         if tracks.count == 0:
             return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
         observed = ObservedTracks.of(tracks, views)
         self.progress("positions", 0, 1)
-        T_cw = torch.eye(4).to(R_21).repeat(len(views), 1, 1)
+        T_cw = torch.eye(4, dtype=R_21.dtype, device=device).repeat(len(views), 1, 1)
         T_cw[:, :3, :3] = average.R_cw
         camera = self.camera if self.given is None else self.given.camera
         centers_w = chained_positions(pairs, average.R_cw, views, self.camera)
@@ -198,23 +210,38 @@ class GlobalMapper:
             return f"no map: {len(views)} images agree on no points; the camera may only turn"
         return seen, observed, found
 
-    def _finish(
+    def finish(
         self,
         views: list[FrameFeatures],
         rows: Int[Tensor, " K"],
         observed: ObservedTracks,
         found: Reconstruction,
+        frames: Rows[int] | None = None,
+        given_cw: Float[Tensor, "F 4 4"] | None = None,
+        keep: bool = False,
     ) -> Run:
-        """The map of the posed views, the other frames, and the final adjustment of all."""
+        """The map of the posed views, the other frames, and the final adjustment of all.
+
+        Args:
+            views: of the mapped images.
+            rows: of the views that have a pose.
+            observed: the tracks.
+            found: poses, camera and points.
+            frames: to be posed, all if None.
+            given_cw: poses of these frames by another program.
+            keep: keep poses and camera as they are, those of frames between as given, instead of adjusting them.
+        """
         atlas = Atlas(self.camera.params)
         submap = atlas.create()
-        fill_submap(submap, views, rows, observed, found, self.config.features.num_keypoints)
+        fill_submap(submap, views, rows, observed, found)
         poser = FramePoser(found.camera, self.scaled)
         mapped = {view.index: view for view in views}
-        results = poser.pose(submap, self._all_views(mapped))
-        final = FinalAdjustment(self.camera, self.config)
+        frames = range(len(self.sequence)) if frames is None else frames
+        results = poser.pose(submap, self._all_views(frames, mapped), given_cw)
+        final = FinalAdjustment(self.camera, with_camera_std(self.config, 0.0), self.given)
         final.camera = found.camera
-        final.adjust(atlas, 0, lambda done, most: self.progress("final adjustment", done, most))
+        if not keep:
+            final.adjust(atlas, 0, lambda done, most: self.progress("final adjustment", done, most))
         return Run(
             tuple(atlas),
             final.camera,
@@ -227,7 +254,7 @@ class GlobalMapper:
             calibration=final.calibration,
         )
 
-    def _views(self, indices: Rows[int], stage: str) -> Iterator[FrameFeatures | None]:
+    def views(self, indices: Rows[int], stage: str = "features") -> Iterator[FrameFeatures | None]:
         """The features of frames; None for those that cannot be read, which are counted once."""
         for done, index in enumerate(indices):
             self.progress(stage, done, len(indices))
@@ -250,14 +277,14 @@ class GlobalMapper:
         assert features is not None
         return prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
 
-    def _all_views(self, mapped: dict[int, FrameFeatures]) -> Iterator[FrameFeatures]:
-        """All frames in order, those that were mapped without extracting their features again."""
-        for index in range(len(self.sequence)):
-            self.progress("frames between", index, len(self.sequence))
+    def _all_views(self, frames: Rows[int], mapped: dict[int, FrameFeatures]) -> Iterator[FrameFeatures]:
+        """Frames in order, those that were mapped without extracting their features again."""
+        for done, index in enumerate(frames):
+            self.progress("frames between", done, len(frames))
             if index in mapped:
                 yield mapped[index]
                 continue
-            for view in self._views([index], "frames between"):
+            for view in self.views([index], "frames between"):
                 if view is not None:
                     yield view
 
@@ -265,6 +292,11 @@ class GlobalMapper:
         results = [StepResult(view.index, view.timestamp, State.LOST, None, reason=reason) for view in views]
         run = Run((), self.camera, self.config, results, self.skipped, False, reason)
         return GlobalMap(run, views, pairs, frozenset())
+
+
+def with_camera_std(config: Config, std: float) -> Config:
+    """The configuration with another error of the given camera."""
+    return replace(config, camera=replace(config.camera, std=std))
 
 
 def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:
@@ -279,27 +311,26 @@ def fill_submap(
     rows: Int[Tensor, " K"],
     observed: ObservedTracks,
     found: Reconstruction,
-    keypoints: int,
 ) -> None:
     """Make the map of a submap from the posed views and the points with observations that agree."""
     tracks, former = observed.tracks.select(found.agrees)
-    row_of = torch.full((len(views),), -1)
-    row_of[rows] = torch.arange(len(rows))
+    row_of = torch.full((len(views),), -1, device=rows.device)
+    row_of[rows] = torch.arange(len(rows), device=rows.device)
     tracks = replace(tracks, view=row_of[tracks.view])
-    submap.map = make_map([views[row] for row in rows.tolist()], found.T_cw[rows], tracks, found.points_w[former])
+    submap.map = make_map(
+        [views[row] for row in rows.tolist()], found.T_cw[rows], tracks, found.points_w[former]
+    )
 
 
 def poses_of(run: Run, views: list[FrameFeatures]) -> tuple[Float[Tensor, "K 4 4"], Tensor]:
     """The poses of views in the main submap of a run, and which have one."""
-    T_cw = torch.eye(4, dtype=torch.float64).repeat(len(views), 1, 1)
+    T_cw = torch.eye(4, dtype=torch.float64, device=run.camera.params.device).repeat(len(views), 1, 1)
     known = torch.zeros(len(views), dtype=torch.bool)
     if run.main is None:
         return T_cw, known
     frames = run.posed_frames
     own = frames.frames["session"] == run.session
-    posed = dict(
-        zip(frames.frames["frame_index"][own].tolist(), frames.T_cw(run.map)[own], strict=True)
-    )
+    posed = dict(zip(frames.frames["frame_index"][own].tolist(), frames.T_cw(run.map)[own], strict=True))
     for row, view in enumerate(views):
         if view.index in posed:
             T_cw[row], known[row] = posed[view.index], True

@@ -10,6 +10,7 @@ import torch
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.view_graph import PairMatcher
@@ -82,7 +83,8 @@ def map_recording(
             why = f"the check says: {check.sentence()}"
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
         return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
-    mapper = GlobalMapper(sequence, camera, config, config.camera.std, device, progress=progress)
+    given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
+    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress)
     made = mapper.run(online.results)
     if made.run.failure:
         check = check_run(online) if check is None else check
@@ -90,7 +92,12 @@ def map_recording(
     reduction = mapper.scaled.features.reduction(camera.size)
     checks = [
         check_map(
-            *poses_of(run, made.views), made.views, made.pairs, run.camera.to(camera.params), made.held_back, reduction
+            *poses_of(run, made.views),
+            made.views,
+            made.pairs,
+            run.camera.to(camera.params),
+            made.held_back,
+            reduction,
         )
         for run in (made.run, online)
     ]

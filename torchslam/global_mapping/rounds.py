@@ -103,9 +103,7 @@ class ObservedTracks:
         T_wc = se3_inverse(T_cw)[self.tracks.view]
         return (T_wc[:, :3, :3] @ camera.unproject(self.pixels)[..., None])[..., 0], T_wc[:, :3, 3]
 
-    def triangulate(
-        self, T_cw: Float[Tensor, "K 4 4"], camera: Camera, gate: float
-    ) -> Reconstruction:
+    def triangulate(self, T_cw: Float[Tensor, "K 4 4"], camera: Camera, gate: float) -> Reconstruction:
         """The points of all tracks by given poses; `gate`: standard deviations up to which observations agree."""
         tolerance = gate * self.noise.sigmas / camera.focal
         found = triangulate_tracks(self.tracks, *self.rays(T_cw, camera), tolerance)

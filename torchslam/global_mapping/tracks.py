@@ -70,7 +70,7 @@ def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
         views: number of images.
         keypoints: number of keypoints of an image.
     """
-    none = torch.zeros(0, dtype=torch.int64)
+    none = torch.zeros(0, dtype=torch.int64, device=pairs[0].keypoints_1.device if pairs else None)
     one = torch.cat([none, *(pair.first * keypoints + pair.keypoints_1 for pair in pairs)])
     other = torch.cat([none, *(pair.second * keypoints + pair.keypoints_2 for pair in pairs)])
     label = _lowest_connected(one, other, views * keypoints)
@@ -97,7 +97,9 @@ def _lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: i
 def longest_tracks(tracks: Tracks, per_view: int) -> Bool[Tensor, " N"]:
     """The tracks that are among the `per_view` longest ones of some image: they tie all images together."""
     length = tracks.lengths[tracks.track]
-    order = torch.argsort(tracks.view * (int(length.max()) + 1) - length, stable=True) if len(tracks) else length
+    order = (
+        torch.argsort(tracks.view * (int(length.max()) + 1) - length, stable=True) if len(tracks) else length
+    )
     view = tracks.view[order]
     first = torch.searchsorted(view, view)  # where the image's observations begin
     is_long = torch.arange(len(order), device=view.device) - first < per_view
@@ -242,4 +244,3 @@ def make_map(
         made.add_observations(row, tracks.keypoint[own], ids[tracks.track[own]])
     made.update_appearance(torch.arange(len(views), device=points_w.device))
     return made
-

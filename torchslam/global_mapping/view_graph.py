@@ -20,8 +20,8 @@ from torchslam.tracking.matcher import run_matcher
 from torchslam.types import FrameFeatures, Matcher
 
 NEAR = 1, 2, 3, 5, 8
-"""Distances in images at which all neighbors in time are matched: a blurred image breaks no chain. On garden all of 1 to
-8 give the same poses, for half more time."""
+"""Distances in images at which all neighbors in time are matched: a blurred image breaks no chain. On garden all of 1
+to 8 give the same poses, for half more time."""
 FAR = 16
 """Distance from which on, doubling, neighbors are matched where those at the distance before held."""
 PLACES = 2
@@ -33,7 +33,7 @@ third. Between bare walls there are no more. Tried 15 to 50."""
 MIN_RATIO = 0.25
 """Least ratio of verified to all matches: below, repetitive structure or chance explains them; tried 0.15 to 0.4."""
 THRESHOLD_PX = 1.5
-"""Distance from the epipolar line, at the size at which features are found; about twice the noise of SIFT. Tried 1 to 3."""
+"""Distance from the epipolar line, at the size at which features are found: twice the noise of SIFT. Tried 1 to 3."""
 _PAIRS_AT_ONCE, _MIN_SAMPLES, _MAX_SAMPLES = 32, 64, 500
 
 
@@ -80,9 +80,7 @@ class PairMatcher:
         config: for the size of the images.
     """
 
-    def __init__(
-        self, views: list[FrameFeatures], camera: Camera, matcher: Matcher, config: Config
-    ) -> None:
+    def __init__(self, views: list[FrameFeatures], camera: Camera, matcher: Matcher, config: Config) -> None:
         self.views, self.camera, self.matcher, self.config = views, camera, matcher, config
         self.threshold_px = THRESHOLD_PX * config.features.reduction(camera.size)
 
@@ -175,7 +173,7 @@ def build_view_graph(
 
 
 def similar_places(views: list[FrameFeatures]) -> list[tuple[int, int]]:
-    """The pairs of images further apart than near neighbors that look most alike, of every other image the best ones."""
+    """The pairs of images that look most alike, further apart than neighbors; the best of every other image."""
     places = KeyframeDatabase()
     for row, view in enumerate(views):
         places.add(row, view.descriptors, view.mask)
@@ -188,7 +186,7 @@ def similar_places(views: list[FrameFeatures]) -> list[tuple[int, int]]:
 
 
 def connected_views(pairs: list[ViewPair], count: int) -> Int[Tensor, " K"]:
-    """The rows of the largest set of `count` views that pairs connect, ascending; of equal ones that with the lowest."""
+    """The rows of the largest set of `count` views that pairs connect, ascending; of equal ones the lowest."""
     label = torch.arange(count)
     if not pairs:
         return label[:1]

@@ -152,7 +152,7 @@ def result_warnings(metrics: Mapping[str, Any]) -> list[str]:
     """Return warnings about a successful run."""
     keyframes, posed = metrics["keyframes"], metrics["posed"]
     found = [shutter] if (shutter := metrics.get("rolling_shutter")) else []
-    if posed < FEW or 2 * keyframes < posed:
+    if posed < FEW or 2 * keyframes < posed or metrics.get("mapping") == "global":
         return found
     return [
         f"{keyframes} of {posed} posed frames are keyframes: too few points are tracked between frames; "

@@ -1,15 +1,15 @@
 """Refine the poses of another program with the images: better poses, a map and a better camera, in the same frame.
 
-given poses -> keyframes -> verified pairs -> rotations and points, adjusted -> camera; repeated until it is stable
+given poses -> images -> view graph -> rounds from the given poses, or anew where the images contradict them -> camera
             -> the other frames -> one graph of all frames, with covariances -> frame and unit of the given poses
+
+The pairs of images that this did not use decide between the given and the refined poses.
 """
 
 from __future__ import annotations
 
-import math
-import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
 
@@ -19,23 +19,41 @@ from torch import Tensor
 
 from torchslam.calibration.find_camera import contradiction
 from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
-from torchslam.calibration.rounds import MAX_ROUNDS, MIN_CHANGE, MIN_CHANGE_IN_STD
 from torchslam.config import Config
 from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
-from torchslam.errors import FrameError, TrajectoryError
+from torchslam.errors import TrajectoryError
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.map.atlas import Submap
-from torchslam.map.map import Map
-from torchslam.optim.run_graph import POSE_ITERATIONS, solve_graph
-from torchslam.refine.map_building import align_rotations, build_map
-from torchslam.refine.non_keyframes import FramePoser, graph_of
-from torchslam.refine.tracks import Pair, choose_keyframes, find_pairs, join_matches
-from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
+from torchslam.geometry.camera_measurement import (
+    FOCAL,
+    K1,
+    K2,
+    CameraMeasurement,
+    intrinsics_directions,
+    with_radial_terms,
+)
+from torchslam.global_mapping.check import MapCheck, check_map
+from torchslam.global_mapping.mapper import GlobalMapper, choose_held_back, choose_images
+from torchslam.global_mapping.rounds import (
+    GATE,
+    MIN_VIEWS,
+    ObservedTracks,
+    Reconstruction,
+    adjust_in_rounds,
+)
+from torchslam.global_mapping.tracks import join_matches
+from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph, connected_views
+from torchslam.system.front_end import FrontEnd
 from torchslam.system.run import Run
-from torchslam.types import FrameFeatures, State, StepResult, Trajectory
+from torchslam.types import State, StepResult, Trajectory
 
-MIN_KEYFRAMES = 2  # keyframes of a map
+GOOD_POSES = 0.9
+"""Share of image pairs that agree with the given poses, from which on the rounds start with them."""
+FREE_STD = 1.0
+"""Relative standard deviation of a camera that the images decide."""
+IMPROVED = 0.9
+"""Distance of the matches of unused pairs from where the poses allow them, refined to given, up to which the images
+improve on the given poses; two maps of one recording by different features differ by 5 %."""
 
 
 class CameraChoice(Enum):
@@ -63,6 +81,7 @@ class RefinementResult:
         pose_rows: Row of the given pose of each frame of the sequence, -1 for none.
         intrinsics: Estimate of the camera; None if it was fixed or no map was built.
         rounds: Number of cameras with which a map was built.
+        kept: Whether the given poses were kept, since the images do not improve on them.
     """
 
     run: Run
@@ -70,6 +89,7 @@ class RefinementResult:
     pose_rows: Int[Tensor, " F"]
     intrinsics: IntrinsicsEstimate | None
     rounds: int
+    kept: bool = False
 
     @property
     def without_image(self) -> int:
@@ -103,7 +123,7 @@ def refine_poses(
         choice: How the given camera is treated.
         radial: Maximum number of distortion coefficients that may be estimated.
         device: Of torch.
-        extractor: Front end; the configured one if None.
+        extractor: Front end; SIFT if None and the configured one is the default.
         on_progress: Receives messages.
 
     Returns:
@@ -116,54 +136,133 @@ def refine_poses(
     config, log = config or Config(), on_progress or (lambda words: None)
     given = _as_given(poses)
     rows = given.rows(sequence)
+    frames = torch.nonzero(rows >= 0)[:, 0].tolist()
     camera = sequence.camera.to(device).to(torch.float64)
-    source_frames = source(sequence, config, camera)
-    extract = None if source_frames.brings_features else image_extractor(config, device, extractor)
-    views, skipped = _extract_features(source_frames, rows, camera, extract)
-    frames = torch.tensor([view.index for view in views], dtype=torch.int64)
-    T_cw = given.T_cw[rows[frames]].to(camera.params)
-    log(f"{len(views)} images with poses")
-    scaled = config.for_size(camera.size)  # for the image size, as in a run
-    chosen, pairs, failure = _connected(views, T_cw, camera, scaled)
+    free = _measurement(camera, radial) if choice is CameraChoice.FREE else None
+    mapper = GlobalMapper(sequence, camera, config, free, device, extractor)
+    chosen = [frames[row] for row in choose_images(len(frames), (), mapper.config.global_mapping.max_images)]
+    refinement = _Refinement(mapper, frames, chosen, given.T_cw[rows].to(camera.params))
+    failure = refinement.failure
+    if not failure:
+        log(
+            f"{len(refinement.views)} images, {len(refinement.pairs)} pairs; given: {refinement.before.sentence()}"
+        )
+        failure = refinement.map()
     if failure:
-        return RefinementResult(_run((), camera, config, views, [], skipped, failure), given, rows, None, 0)
-    log(f"{len(chosen)} connected keyframes, {len(pairs)} pairs")
-    keyframes = [views[row] for row in chosen]
-    slam_map, camera, estimate, rounds = _rounds(
-        keyframes, T_cw[chosen], pairs, camera, scaled, choice, radial, log
-    )
-    submap = Submap.empty(0, camera.params)
-    submap.map = slam_map
-    results = FramePoser(camera, scaled).pose(submap, views, T_cw)
-    _finalize(submap, camera, frames, T_cw)
-    run = _run((submap,), camera, config, views, results, skipped, "")
-    return RefinementResult(run, given, rows, estimate, rounds)
+        run = Run((), camera, config, refinement.lost(failure), mapper.skipped, False, failure)
+        return RefinementResult(run, given, rows, None, 0)
+    rounds, estimate = 1, None
+    if choice is not CameraChoice.FIXED:
+        estimate = estimate_intrinsics(refinement.run.graph, camera, radial)
+    may_change = choice is CameraChoice.IF_CONTRADICTED and estimate is not None and estimate.is_determined
+    if may_change and estimate is not None and contradiction(camera, estimate):
+        mapper.given = _measurement(estimate.camera, radial)
+        refinement.map()
+        rounds, estimate = 2, estimate_intrinsics(refinement.run.graph, camera, radial)
+    kept = refinement.keep_given_unless_improved(is_free=mapper.given is not None)
+    log(f"refined: {refinement.after.sentence()}" + ("; the given poses are kept" if kept else ""))
+    return RefinementResult(refinement.run, given, rows, estimate, rounds, kept)
 
 
-def _connected(
-    views: list[FrameFeatures], T_cw: Tensor, camera: Camera, config: Config
-) -> tuple[list[int], list[Pair], str]:
-    """The rows of the keyframes, their verified pairs, and the reason if there are none."""
-    if len(views) < MIN_KEYFRAMES:
-        return [], [], f"no map: {len(views)} images with a pose are not enough"
-    chosen = choose_keyframes(views, camera.width, config)
-    if len(chosen) < MIN_KEYFRAMES:
-        return [], [], f"no map: no motion in the {len(views)} images"
-    pairs = find_pairs([views[row] for row in chosen], T_cw[chosen], camera, config)
-    if not pairs:
-        return [], [], f"no map: no two of {len(chosen)} keyframes overlap"
-    connected = largest_connected_part(pairs, len(chosen))
-    return [chosen[row] for row in connected], _renumbered(pairs, connected), ""
+def _measurement(camera: Camera, radial: int) -> CameraMeasurement:
+    """The given camera as a guess of its focal length and of up to `radial` coefficients of distortion."""
+    camera = with_radial_terms(camera)
+    return CameraMeasurement(camera, FREE_STD * intrinsics_directions(camera, [FOCAL, K1, K2][: 1 + radial]))
 
 
-def _finalize(submap: Submap, camera: Camera, frames: Tensor, T_cw: Tensor) -> None:
-    """Solve one graph of all frames, with covariances, and align it to the given poses T_cw of the frames."""
-    graph = submap.posed_frames.graph(submap.map, camera)
-    solution = solve_graph(graph, backward="detached", iterations=POSE_ITERATIONS)
-    submap.posed_frames.apply_solution(solution, graph, submap.map)
-    row_of = {index: row for row, index in enumerate(frames.tolist())}
-    posed = [row_of[index] for index in submap.posed_frames.frames["frame_index"].tolist()]
-    submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), T_cw[posed]))
+class _Refinement:
+    """The images with given poses, and the map that is made of them.
+
+    Attributes:
+        failure: why no map can be made; empty if one can.
+        before, after: the check of the given and of the refined poses.
+        run: in the frame and unit of the given poses, once it is mapped.
+    """
+
+    run: Run
+    after: MapCheck
+
+    def __init__(
+        self, mapper: GlobalMapper, frames: list[int], chosen: list[int], given_cw: Float[Tensor, "N 4 4"]
+    ) -> None:
+        """given_cw: by frame of the sequence; of frames without a pose, any."""
+        self.mapper, self.frames, self.given_cw = mapper, frames, given_cw
+        self.views = [view for view in mapper.views(chosen) if view is not None]
+        self.pairs: list[ViewPair] = []
+        self.failure = ""
+        if len(self.views) < MIN_VIEWS:
+            self.failure = f"no map: {len(self.views)} images with a pose are not enough"
+            return
+        self.pairs = build_view_graph(PairMatcher(self.views, mapper.camera, mapper.matcher, mapper.scaled))
+        self.held_back = choose_held_back(self.pairs)
+        self.used = [pair for row, pair in enumerate(self.pairs) if row not in self.held_back]
+        if not self.used:
+            self.failure = f"no map: no two of {len(self.views)} images overlap"
+            return
+        self.T_cw = given_cw[torch.tensor([view.index for view in self.views])]
+        self.before = self._check(self.T_cw, torch.ones(len(self.views), dtype=torch.bool), mapper.camera)
+
+    @torch.no_grad()
+    def map(self) -> str:
+        """Map the images, and pose the other frames; returns why that failed, or nothing."""
+        found = self._from_given() if self.before.used_agreeing >= GOOD_POSES else None
+        made = self.mapper.reconstruct(self.views, self.used) if found is None else found
+        if isinstance(made, str):
+            return made
+        rows, _, reconstruction = made
+        known = torch.zeros(len(self.views), dtype=torch.bool)
+        known[rows.cpu()] = True
+        self.after = self._check(reconstruction.T_cw, known, reconstruction.camera)
+        self.run = self.mapper.finish(self.views, *made, self.frames, self.given_cw[self.frames])
+        submap = self.run.submaps[0]
+        posed = submap.posed_frames.frames["frame_index"]
+        submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), self.given_cw[posed]))
+        return ""
+
+    @torch.no_grad()
+    def keep_given_unless_improved(self, is_free: bool) -> bool:
+        """Whether the given poses are kept, by pairs that mapping did not use; a better camera counts as improved."""
+        enough = self.before.pairs > 0 and self.before.used_agreeing >= GOOD_POSES and not is_free
+        if not enough or self.after.distance_px < IMPROVED * self.before.distance_px:
+            return False
+        observed = self._tracks()
+        found = observed.triangulate(self.T_cw, self.mapper.camera, GATE)
+        rows = torch.unique(observed.tracks.view[found.agrees])
+        self.run = self.mapper.finish(
+            self.views, rows, observed, found, self.frames, self.given_cw[self.frames], keep=True
+        )
+        submap = self.run.submaps[0]
+        frames = submap.posed_frames.frames
+        T_rw = submap.map.T_cw[frames["reference_keyframe"]]
+        frames["T_cr"][:] = self.given_cw[frames["frame_index"]] @ se3_inverse(T_rw)
+        self.after = self.before
+        return True
+
+    def lost(self, reason: str) -> list[StepResult]:
+        """A result for every image, without a pose."""
+        return [
+            StepResult(view.index, view.timestamp, State.LOST, None, reason=reason) for view in self.views
+        ]
+
+    def _check(self, T_cw: Tensor, known: Tensor, camera: Camera) -> MapCheck:
+        reduction = self.mapper.scaled.features.reduction(camera.size)
+        return check_map(T_cw, known, self.views, self.pairs, camera, self.held_back, reduction)
+
+    def _tracks(self) -> ObservedTracks:
+        connected = set(connected_views(self.used, len(self.views)).tolist())
+        pairs = [pair for pair in self.used if pair.first in connected]
+        tracks = join_matches(pairs, len(self.views), len(self.views[0].mask))
+        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
+        return ObservedTracks.of(tracks, self.views)
+
+    def _from_given(self) -> tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction] | None:
+        """The rounds from the given poses; None if no points agree with them."""
+        observed = self._tracks()
+        measured = self.mapper.given
+        camera = self.mapper.camera if measured is None else measured.camera
+        found = adjust_in_rounds(observed, self.T_cw, measured, camera, coarse=False)
+        rows = torch.unique(observed.tracks.view[found.agrees])
+        return (rows, observed, found) if len(rows) >= MIN_VIEWS else None
 
 
 def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
@@ -172,96 +271,6 @@ def _as_given(poses: GivenPoses | Trajectory | str | Path) -> GivenPoses:
             raise TrajectoryError("the trajectory has no poses")
         return GivenPoses(TUM, Path(), se3_inverse(poses.T_wc), poses.timestamps)
     return poses if isinstance(poses, GivenPoses) else read_poses(poses)
-
-
-def _extract_features(
-    sequence: Sequence, rows: Tensor, camera: Camera, extractor: Extractor | None
-) -> tuple[list[FrameFeatures], list[str]]:
-    """Features of the frames that have a pose, and messages for the unreadable ones."""
-    views, skipped = [], []
-    for index in torch.nonzero(rows >= 0)[:, 0].tolist():
-        try:
-            frame = sequence[index]
-            check_size(frame, camera)
-        except FrameError as error:
-            warnings.warn(f"skipped a frame: {error}", stacklevel=3)
-            skipped.append(str(error))
-            continue
-        with torch.inference_mode():
-            features = frame.features if extractor is None else extractor(frame)
-            assert features is not None
-        views.append(FrameFeatures.of(frame, features, camera.params))
-    return views, skipped
-
-
-def _rounds(
-    keyframes: list[FrameFeatures],
-    T_cw: Tensor,
-    pairs: list[Pair],
-    camera: Camera,
-    config: Config,
-    choice: CameraChoice,
-    radial: int,
-    log: Callable[[str], None],
-) -> tuple[Map, Camera, IntrinsicsEstimate | None, int]:
-    """Alternate building the map and estimating the camera, since a wrong camera leads to wrong matches."""
-    given, T_cw = camera, align_rotations(T_cw, pairs)
-    tracks = join_matches(pairs, len(keyframes), len(keyframes[0].mask))
-    rounds, estimate = 0, None
-    while True:
-        is_free = choice is not CameraChoice.FIXED and camera is not given
-        slam_map, camera = build_map(keyframes, T_cw, tracks, camera, config, free_focal=is_free)
-        rounds += 1
-        T_cw = slam_map.T_cw.clone()
-        log(f"round {rounds}: {slam_map.num_points} points, focal length {float(camera.focal):.1f} px")
-        if choice is CameraChoice.FIXED:
-            return slam_map, camera, None, rounds
-        estimate = estimate_intrinsics(graph_of(slam_map, camera), given, radial)
-        if not estimate.is_determined or rounds == MAX_ROUNDS:
-            return slam_map, camera, estimate, rounds
-        if choice is CameraChoice.IF_CONTRADICTED and not is_free and not contradiction(given, estimate):
-            return slam_map, camera, estimate, rounds
-        change = abs(math.log(float(estimate.camera.focal) / float(camera.focal)))
-        if is_free and change < max(MIN_CHANGE, MIN_CHANGE_IN_STD * estimate.focal_std):
-            return slam_map, camera, estimate, rounds
-        camera = estimate.camera
-
-
-def largest_connected_part(pairs: list[Pair], count: int) -> list[int]:
-    """Return the largest connected set of `count` keyframes, ascending; among equal ones that with the lowest."""
-    label = list(range(count))
-    for _ in range(count):
-        before = list(label)
-        for pair in pairs:
-            label[pair.first] = label[pair.second] = min(label[pair.first], label[pair.second])
-        if label == before:
-            break
-    best = max(set(label), key=lambda part: (label.count(part), -part), default=0)
-    return [row for row, part in enumerate(label) if part == best]
-
-
-def _renumbered(pairs: list[Pair], connected: list[int]) -> list[Pair]:
-    """The pairs among the connected keyframes, with new rows."""
-    row_of = {old: new for new, old in enumerate(connected)}
-    return [
-        replace(pair, first=row_of[pair.first], second=row_of[pair.second])
-        for pair in pairs
-        if pair.first in row_of and pair.second in row_of
-    ]
-
-
-def _run(
-    submaps: tuple[Submap, ...],
-    camera: Camera,
-    config: Config,
-    views: list[FrameFeatures],
-    results: list[StepResult],
-    skipped: list[str],
-    failure: str,
-) -> Run:
-    if failure:
-        results = [StepResult(view.index, view.timestamp, State.LOST, None, reason=failure) for view in views]
-    return Run(submaps, camera, config, results, skipped, False, failure)
 
 
 MAX_OUTLIER_RATIO = 4.0  # times the median error: given positions further off are ignored

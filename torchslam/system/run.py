@@ -269,8 +269,12 @@ class FinalAdjustment:
         calibration: `camera` with its error; None as `given`.
     """
 
-    def __init__(self, camera: Camera, config: Config) -> None:
-        self.camera, self.settings, self._std = camera, config.bundle_adjustment, config.camera.std
+    def __init__(self, camera: Camera, config: Config, measured: CameraMeasurement | None = None) -> None:
+        """Create the adjustment; `measured`: the given camera with its error, that of the configuration if None."""
+        self.camera, self.settings = camera, config.bundle_adjustment
+        if measured is None and config.camera.std:
+            measured = CameraMeasurement.of(camera, config.camera.std)
+        self._measured = measured
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
 
@@ -285,8 +289,7 @@ class FinalAdjustment:
         main = atlas.main(session)
         if main is None or not (self.settings.local and self.settings.global_at_end):
             return
-        given = CameraMeasurement.of(self.camera, self._std) if self._std else None
-        self._adjust(main, given, progress)
+        self._adjust(main, self._measured, progress)
         for submap in atlas:
             if submap is not main:
                 self._adjust(submap, None, progress)

@@ -238,7 +238,9 @@ def nearest_by_cosine(
     best_of_column = descriptors_2.new_full((batch, count), -torch.inf)
     parts = []
     with_gradient = torch.is_grad_enabled() and (descriptors_1.requires_grad or descriptors_2.requires_grad)
-    room = descriptors_2.new_empty(batch, min(_ROWS_AT_ONCE, rows), count)  # once: new pages cost as much as products
+    room = descriptors_2.new_empty(
+        batch, min(_ROWS_AT_ONCE, rows), count
+    )  # once: new pages cost as much as products
     for start in range(0, rows, _ROWS_AT_ONCE):
         chunk = slice(start, min(start + _ROWS_AT_ONCE, rows))
         out = None if with_gradient else room[:, : chunk.stop - start]
