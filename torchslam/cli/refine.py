@@ -198,4 +198,6 @@ def _describe_poses(refined: RefinementResult, sequence: Sequence) -> dict[str, 
         words += f"; {refined.without_image} have no image"
     if refined.without_pose:
         words += f"; {refined.without_pose} of {len(sequence)} images have no pose"
+    if refined.kept:
+        words += "; the images do not improve on them: kept"
     return {"poses": words}
