@@ -22,6 +22,7 @@ from torchslam.geometry import Camera, rigid, se3_exp, sim3_exp, so3_exp
 from torchslam.optim import (
     BundleProblem,
     PosePrior,
+    average_rotations,
     bundle_adjust,
     log_distance_error,
     minimize,
@@ -206,6 +207,9 @@ def solver_cases() -> dict[str, Case]:
         "solve_graph": (solve, (graph.pixels, graph.camera.params)),
         "pose_graph_optimize": (
             lambda S: pose_graph_optimize(replace(cast(pose_graph, S), S_ji=S)), (pose_graph.S_ji,)
+        ),
+        "average_rotations": (
+            lambda R: average_rotations(torch.tensor(((0, 1), (1, 2), (0, 2))), R, 3), (so3_exp(0.1 * normal(3, 3)),)
         ),
     }  # fmt: skip
 

@@ -24,7 +24,8 @@ FIRST_SIGMA = 1.6  # blur of the first image of an octave, pixels of that octave
 CONTRAST_THRESHOLD = 0.01
 """Contrast of a keypoint in images of 0 to 1, times the layers of an octave: OpenCV divides by them. Half of COLMAP's
 0.02 / 3, a quarter of OpenCV's default: where texture is plenty, the strongest keypoints are the same, and between bare
-walls (office_loop) there are half as many again. Tried 0.007 to 0.04."""
+walls (office_loop) there are half as many again. Tried 0.007 to 0.04. `LOCALIZATION` was measured at 0.02: with the
+weaker keypoints the noise is up to 1.3 times that, within `RUN_NOISE`."""
 
 LOCALIZATION, LEAST_SIZE = 0.025, 8.0
 """Standard deviation of a keypoint as a ratio of its size, the diameter of 2 sigma in pixels. Below 8 pixels it falls

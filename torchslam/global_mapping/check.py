@@ -90,8 +90,8 @@ class MapCheck:
         consistent: number of those that agree with the map.
         used_agreeing: share of all pairs, used or not, that agree.
         distance_px: median distance of the matches of pairs that mapping did not use from where the map allows them.
-        breaks: moments at which the map does not fit together, in the order of time.
-        certain: frames of the images in the longest stretch without a break, ascending.
+        breaks: moments at which the map does not fit together, or may not, in the order of time.
+        certain: frames of the images in the longest stretch that nothing contradicts, ascending.
         uncertain: frames of the other images that have a pose.
     """
 
@@ -117,8 +117,13 @@ class MapCheck:
 
     @property
     def is_right(self) -> bool:
-        """Whether nothing contradicts the map, and all of it is tied together."""
-        return not self.breaks and self.score > MIN_SCORE
+        """Whether nothing contradicts the map."""
+        return self.weak_links == len(self.breaks) and self.score > MIN_SCORE
+
+    @property
+    def weak_links(self) -> int:
+        """Number of moments at which nothing tells whether the scale is the same."""
+        return sum(each.kind is BreakKind.UNKNOWN for each in self.breaks)
 
     def sentence(self) -> str:
         """The check in a sentence."""
@@ -277,8 +282,11 @@ def _breaks(
             stretches[-1].append(after)
             continue
         breaks.append(Break(views[before].index, views[after].index, kind, ratio))
-        stretches.append([after])
+        if kind is BreakKind.UNKNOWN and crossing.any():  # weak, but nothing contradicts it
+            stretches[-1].append(after)
+        else:
+            stretches.append([after])
     if disagree(~near, good):
         first, last = ends[~near & ~good][0].tolist()
         breaks.append(Break(views[first].index, views[last].index, BreakKind.LOOP))
-    return tuple(breaks), stretches
+    return tuple(sorted(breaks, key=lambda each: each.before)), stretches

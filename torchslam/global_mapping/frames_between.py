@@ -42,14 +42,14 @@ class FramePoser:
         self,
         submap: Submap,
         views: Iterable[FrameFeatures],
-        given_cw: Float[Tensor, "F 4 4"] | None = None,
+        given_cw: dict[int, Float[Tensor, "4 4"]] | None = None,
     ) -> list[StepResult]:
         """Add all views to the posed frames of the submap, in order.
 
         Args:
             submap: Whose map has some of the views as keyframes.
             views: In the order of time; each is needed once.
-            given_cw: Poses of the views by another program.
+            given_cw: Poses of the views by another program, by frame.
 
         Returns:
             One result per view, with its given pose as online pose, or else with its own.
@@ -57,14 +57,14 @@ class FramePoser:
         row_of = {index: row for row, index in enumerate(submap.map.keyframes["frame_index"].tolist())}
         self.tracker.reset_to_keyframe(submap, 0)
         results = []
-        for row, view in enumerate(views):
+        for view in views:
             keyframe = row_of.get(view.index)
             if keyframe is not None:
                 result = self._add_keyframe(submap, view, keyframe)
             else:
                 result = self._track(submap, view)
             if given_cw is not None:
-                result = replace(result, T_cw=given_cw[row], submap=submap.number)
+                result = replace(result, T_cw=given_cw[view.index], submap=submap.number)
             results.append(result)
         return results
 

@@ -217,7 +217,7 @@ class GlobalMapper:
         observed: ObservedTracks,
         found: Reconstruction,
         frames: Rows[int] | None = None,
-        given_cw: Float[Tensor, "F 4 4"] | None = None,
+        given_cw: dict[int, Float[Tensor, "4 4"]] | None = None,
         keep: bool = False,
     ) -> Run:
         """The map of the posed views, the other frames, and the final adjustment of all.
@@ -228,7 +228,7 @@ class GlobalMapper:
             observed: the tracks.
             found: poses, camera and points.
             frames: to be posed, all if None.
-            given_cw: poses of these frames by another program.
+            given_cw: poses of these frames by another program, by frame.
             keep: keep poses and camera as they are, those of frames between as given, instead of adjusting them.
         """
         atlas = Atlas(self.camera.params)
@@ -260,7 +260,8 @@ class GlobalMapper:
             self.progress(stage, done, len(indices))
             try:
                 frame = self.sequence[index]
-                check_size(frame, self.camera)
+                if frame.features is None or frame.image.numel():
+                    check_size(frame, self.camera)
             except FrameError as error:
                 if str(error) not in self.skipped:
                     warnings.warn(f"skipped a frame: {error}", stacklevel=2)

@@ -42,7 +42,13 @@ from torchslam.global_mapping.rounds import (
     adjust_in_rounds,
 )
 from torchslam.global_mapping.tracks import join_matches
-from torchslam.global_mapping.view_graph import PairMatcher, ViewPair, build_view_graph, connected_views
+from torchslam.global_mapping.view_graph import (
+    PairMatcher,
+    Relation,
+    ViewPair,
+    build_view_graph,
+    connected_views,
+)
 from torchslam.system.front_end import FrontEnd
 from torchslam.system.run import Run
 from torchslam.types import State, StepResult, Trajectory
@@ -208,12 +214,17 @@ class _Refinement:
         found = self._from_given() if self.before.used_agreeing >= GOOD_POSES else None
         made = self.mapper.reconstruct(self.views, self.used) if found is None else found
         if isinstance(made, str):
-            return made
+            # Small motions in front of planes leave two-view geometry ambiguous, but not the given poses.
+            moves = any(pair.relation is Relation.GENERAL for pair in self.used)
+            found = self._from_given(coarse=True) if moves else None
+            if found is None:
+                return made
+            made = found
         rows, _, reconstruction = made
         known = torch.zeros(len(self.views), dtype=torch.bool)
         known[rows.cpu()] = True
         self.after = self._check(reconstruction.T_cw, known, reconstruction.camera)
-        self.run = self.mapper.finish(self.views, *made, self.frames, self.given_cw[self.frames])
+        self.run = self.mapper.finish(self.views, *made, self.frames, self._given())
         submap = self.run.submaps[0]
         posed = submap.posed_frames.frames["frame_index"]
         submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), self.given_cw[posed]))
@@ -229,7 +240,7 @@ class _Refinement:
         found = observed.triangulate(self.T_cw, self.mapper.camera, GATE)
         rows = torch.unique(observed.tracks.view[found.agrees])
         self.run = self.mapper.finish(
-            self.views, rows, observed, found, self.frames, self.given_cw[self.frames], keep=True
+            self.views, rows, observed, found, self.frames, self._given(), keep=True
         )
         submap = self.run.submaps[0]
         frames = submap.posed_frames.frames
@@ -244,6 +255,10 @@ class _Refinement:
             StepResult(view.index, view.timestamp, State.LOST, None, reason=reason) for view in self.views
         ]
 
+    def _given(self) -> dict[int, Float[Tensor, "4 4"]]:
+        """The given poses, by frame."""
+        return {frame: self.given_cw[frame] for frame in self.frames}
+
     def _check(self, T_cw: Tensor, known: Tensor, camera: Camera) -> MapCheck:
         reduction = self.mapper.scaled.features.reduction(camera.size)
         return check_map(T_cw, known, self.views, self.pairs, camera, self.held_back, reduction)
@@ -255,12 +270,14 @@ class _Refinement:
         tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
         return ObservedTracks.of(tracks, self.views)
 
-    def _from_given(self) -> tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction] | None:
+    def _from_given(
+        self, coarse: bool = False
+    ) -> tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction] | None:
         """The rounds from the given poses; None if no points agree with them."""
         observed = self._tracks()
         measured = self.mapper.given
         camera = self.mapper.camera if measured is None else measured.camera
-        found = adjust_in_rounds(observed, self.T_cw, measured, camera, coarse=False)
+        found = adjust_in_rounds(observed, self.T_cw, measured, camera, coarse)
         rows = torch.unique(observed.tracks.view[found.agrees])
         return (rows, observed, found) if len(rows) >= MIN_VIEWS else None
 

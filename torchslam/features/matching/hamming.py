@@ -245,7 +245,7 @@ def nearest_by_cosine(
         chunk = slice(start, min(start + _ROWS_AT_ONCE, rows))
         out = None if with_gradient else room[:, : chunk.stop - start]
         similarity = torch.matmul(descriptors_1[:, chunk], descriptors_2.mT, out=out)
-        values = similarity.detach()  # changed in place: gradients need the indices and the descriptors alone
+        values = similarity.detach().clone() if with_gradient else similarity  # changed in place
         for element, (own, other) in zip(values, zip(mask_1[:, chunk], mask_2, strict=True), strict=True):
             element.index_fill_(0, true_indices(~own), -torch.inf)
             element.index_fill_(1, true_indices(~other), -torch.inf)

@@ -1,0 +1,249 @@
+"""Which mapping of a recording is kept: decisions by what was lost and by what the check says."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from tests.global_mapping.synthetic import CAMERA
+from torchslam import SLAM, open_sequence
+from torchslam.config import Config, load_config
+from torchslam.global_mapping import recording
+from torchslam.global_mapping.check import Break, BreakKind, MapCheck
+from torchslam.global_mapping.recording import MappedRecording, Mapping, check_run, map_recording, with_doubts
+from torchslam.system.run import Run
+from torchslam.types import Reason, State, StepResult, Trajectory
+
+
+@dataclass(frozen=True)
+class FakeRun(Run):
+    """A run with a number of posed frames."""
+
+    posed: int = 0
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """So many poses."""
+        return Trajectory(
+            torch.arange(self.posed, dtype=torch.float64), torch.eye(4).double().repeat(self.posed, 1, 1)
+        )
+
+
+def a_run(posed: int = 100, frames: int = 100, lost: int = 0, failure: str = "") -> FakeRun:
+    states = [State.LOST] * lost + [State.TRACKING] * (frames - lost)
+    results = [StepResult(row, 0.1 * row, state, None) for row, state in enumerate(states)]
+    return FakeRun((), CAMERA, Config(), results, [], False, failure, posed=posed)
+
+
+def a_check(score: float = 1.0, is_broken: bool = False, uncertain: tuple[int, ...] = ()) -> MapCheck:
+    """A check with a score."""
+    breaks = (Break(3, 4, BreakKind.SCALE, 1.5),) * is_broken
+    return MapCheck(
+        images=100,
+        pairs=10,
+        agreeing=10,
+        triplets=0,
+        consistent=0,
+        used_agreeing=score,
+        distance_px=0.5,
+        breaks=breaks,
+        certain=tuple(range(100)),
+        uncertain=uncertain,
+    )
+
+
+class World:
+    """What the mapper and the checks answer, and whether they were asked."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.whole = a_run()
+        self.checks: dict[bool, MapCheck] = {
+            True: a_check(),
+            False: a_check(),
+        }  # by whether it is the whole map
+        self.online_check: MapCheck | None = a_check()
+        self.mapped: list[Any] = []
+        self.given: Any = "not asked"
+        self.checked_online = 0
+        self.stages: list[str] = []
+        world = self
+
+        class FakeMapper:
+            def __init__(
+                self, sequence: Any, camera: Any, config: Config, given: Any, *more: Any, **rest: Any
+            ):
+                world.given = given
+                self.scaled = config
+
+            def run(self, results: Any) -> SimpleNamespace:
+                world.mapped.append(results)
+                return SimpleNamespace(run=world.whole, views=[], pairs=["pair"], held_back=frozenset({0}))
+
+        def check_online(run: Run) -> MapCheck | None:
+            world.checked_online += 1
+            return world.online_check
+
+        monkeypatch.setattr(recording, "GlobalMapper", FakeMapper)
+        monkeypatch.setattr(recording, "check_run", check_online)
+        monkeypatch.setattr(recording, "poses_of", lambda run, views: (run, "known"))
+        monkeypatch.setattr(recording, "check_map", lambda run, *more: world.checks[run is world.whole])
+
+    def map(self, online: Run, mapping: Mapping = Mapping.AUTO, *overrides: str) -> MappedRecording:
+        """Map a recording with this online run."""
+        return map_recording(
+            None,  # type: ignore[arg-type]
+            online,
+            load_config(None, list(overrides)),
+            CAMERA,
+            mapping,
+            progress=lambda stage, done, most: self.stages.append(stage),
+        )
+
+
+@pytest.fixture
+def world(monkeypatch: pytest.MonkeyPatch) -> World:
+    return World(monkeypatch)
+
+
+def test_a_complete_run_that_the_check_calls_right_is_kept(world: World) -> None:
+    online = a_run()
+    kept = world.map(online)
+    assert (kept.run, kept.check, kept.kept, kept.why) == (online, world.online_check, Mapping.ONLINE, "")
+    assert world.mapped == []
+    assert world.stages == ["check"]
+    world.online_check = None  # nothing to check by
+    assert world.map(online).kept is Mapping.ONLINE
+    assert world.mapped == []
+
+
+@pytest.mark.parametrize(
+    ("online", "why"),
+    [
+        (a_run(posed=98), ""),
+        (a_run(posed=97), "97 of 100 frames are posed in one map"),
+        (a_run(lost=1), "tracking was lost in 1 frames"),
+        (a_run(posed=0, failure="no map was initialized"), "no map was initialized"),
+    ],
+)
+def test_a_recording_with_lost_frames_is_mapped_as_a_whole(world: World, online: FakeRun, why: str) -> None:
+    """Two of a hundred may have no pose; with the frames that were lost in mind."""
+    kept = world.map(online)
+    assert kept.why == why
+    assert world.mapped == ([online.results] if why else [])
+    assert (kept.kept is Mapping.GLOBAL) == bool(why)
+    assert (kept.run is world.whole) == bool(why)
+    assert world.checked_online == (not why)
+
+
+def test_a_run_that_the_check_contradicts_is_mapped_as_a_whole(world: World) -> None:
+    world.online_check = a_check(is_broken=True)
+    world.checks[False] = a_check(0.9)
+    kept = world.map(a_run())
+    assert kept.kept is Mapping.GLOBAL
+    assert kept.check is world.checks[True]
+    assert kept.why == f"the check says: {world.online_check.sentence()}"
+
+
+def test_a_user_may_choose(world: World) -> None:
+    """Online whatever was lost, but checked; or as a whole as well, although nothing was."""
+    kept = world.map(a_run(posed=10), Mapping.ONLINE)
+    assert (kept.kept, kept.why, world.mapped) == (Mapping.ONLINE, "", [])
+    assert kept.check is world.online_check
+    kept = world.map(a_run(), Mapping.GLOBAL)
+    assert (kept.kept, kept.why, len(world.mapped)) == (Mapping.GLOBAL, "as asked", 1)
+
+
+@pytest.mark.parametrize(
+    ("whole", "before", "posed", "kept"),
+    [
+        (0.95, 0.5, 10, Mapping.GLOBAL),
+        (0.5, 0.95, 10, Mapping.ONLINE),
+        (0.9, 0.92, 10, Mapping.ONLINE),
+        (0.92, 0.9, 200, Mapping.GLOBAL),
+        (0.9, 0.905, 90, Mapping.GLOBAL),  # as good: the one with more poses
+        (0.9, 0.905, 89, Mapping.GLOBAL),
+        (0.9, 0.905, 91, Mapping.ONLINE),
+        (0.905, 0.9, 91, Mapping.ONLINE),
+    ],
+)
+def test_the_map_with_the_better_score_is_kept(
+    world: World, whole: float, before: float, posed: int, kept: Mapping
+) -> None:
+    """Of the pairs that the whole map did not use; where they say the same, the map with more poses."""
+    world.whole = a_run(posed=90)
+    world.checks = {True: a_check(whole), False: a_check(before)}
+    online = a_run(posed=posed, frames=300)
+    made = world.map(online, Mapping.GLOBAL)
+    assert made.kept is kept
+    assert made.run is (world.whole if kept is Mapping.GLOBAL else online)
+    assert made.check is world.checks[kept is Mapping.GLOBAL]
+
+
+def test_without_any_map_the_whole_one_must_be_right(world: World) -> None:
+    failed = a_run(posed=0, failure="the camera only turns")
+    world.checks = {True: a_check(0.7), False: a_check(0.0)}
+    made = world.map(failed)
+    assert (made.run, made.check, made.kept) == (failed, None, Mapping.ONLINE)
+    assert made.why == "the camera only turns"
+    world.checks[True] = a_check(0.9)
+    assert world.map(failed).kept is Mapping.GLOBAL
+
+
+def test_a_recording_without_a_whole_map_keeps_the_online_run(world: World) -> None:
+    """Checked once, before or after."""
+    world.whole = a_run(posed=0, failure="no map: 2 images are too few")
+    online = a_run(posed=50)
+    kept = world.map(online)
+    assert (kept.run, kept.kept, kept.check) == (online, Mapping.ONLINE, world.online_check)
+    assert kept.why == "50 of 100 frames are posed in one map"
+    assert world.checked_online == 1
+    world.map(a_run(), Mapping.GLOBAL)
+    assert world.checked_online == 2
+
+
+def test_the_camera_is_given_with_its_error(world: World) -> None:
+    world.map(a_run(posed=1), Mapping.GLOBAL, "camera.std=0.03")
+    assert world.given.focal_std == pytest.approx(0.03)
+    assert torch.equal(world.given.camera.params[:4], CAMERA.params.double())
+    world.map(a_run(posed=1), Mapping.GLOBAL, "camera.std=0")
+    assert world.given is None
+
+
+def test_doubted_frames_are_uncertain() -> None:
+    """Up to the next checked one that is certain; lost ones stay lost, and nothing else changes."""
+    online = a_run(frames=12, lost=1)
+    check = replace(a_check(uncertain=(4, 6)), certain=(0, 2, 8, 10))
+    doubted = with_doubts(online, check).results
+    assert [row for row, each in enumerate(doubted) if each.state is State.UNCERTAIN] == [4, 5, 6, 7]
+    assert {each.reason for each in doubted if each.state is State.UNCERTAIN} == {Reason.WEAK_LINK.value}
+    assert [each.reason for each in doubted if each.state is not State.UNCERTAIN] == [""] * 8
+    first = with_doubts(online, replace(check, uncertain=(0,), certain=(3,))).results
+    assert [each.state for each in first[:4]] == [
+        State.LOST,
+        State.UNCERTAIN,
+        State.UNCERTAIN,
+        State.TRACKING,
+    ]
+    assert with_doubts(online, None) is online
+    assert with_doubts(online, a_check()) is online
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_an_online_run_is_checked_by_pairs_of_its_keyframes() -> None:
+    """Its features are matched anew, one, two and four keyframes apart; without images there are none."""
+    sequence = open_sequence("synthetic:room").part(0, 30, 2)
+    run = SLAM(sequence.camera).run(sequence)
+    found = check_run(run)
+    assert found is not None
+    keyframes = run.map.num_keyframes
+    assert found.images == keyframes >= 4
+    assert found.pairs == sum(keyframes - distance for distance in (1, 2, 4) if distance < keyframes)
+    assert found.agreeing == found.pairs
+    assert found.used_agreeing == 1
+    simulated = replace(run, config=load_config(None, ["features.kind=simulated"]))
+    assert check_run(simulated) is None
+    assert check_run(replace(run, submaps=())) is None
