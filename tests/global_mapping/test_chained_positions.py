@@ -190,16 +190,20 @@ def test_wrong_differences_lose_their_weight() -> None:
     assert float(found[2] - found[1]) == pytest.approx(5, abs=1e-3)
 
 
-def test_the_kernel_is_that_of_cauchy_of_three_errors() -> None:
-    """Where two differences of error one are ten apart, and one of these has two votes: the minimum is known."""
+@pytest.mark.parametrize("columns", [1, 2])
+def test_the_kernel_is_that_of_cauchy_of_three_errors(columns: int) -> None:
+    """Of the length of an error, at the minimum its pulls cancel: by differences that are ten apart in each column."""
     edges = torch.tensor([[0, 1], [0, 1]])
-    differences = torch.tensor([[0.0], [10.0]], dtype=torch.float64)
+    differences = torch.tensor([[0.0], [10.0]], dtype=torch.float64).expand(2, columns)
     stds = torch.tensor([1.0, 0.5], dtype=torch.float64)
     found = solve_differences(edges, differences, stds, 2)
-    x = float(found[1] - found[0])
-    residuals = (x / 1.0, (x - 10) / 0.5)
-    pull = residuals[0] / (1 + residuals[0] ** 2 / 9) / 1.0 + residuals[1] / (1 + residuals[1] ** 2 / 9) / 0.5
-    assert pull == pytest.approx(0, abs=1e-2)
+    x = float(found[1, 0] - found[0, 0])
+    torch.testing.assert_close(found[1] - found[0], torch.full((columns,), x).double())
+    pulls = [
+        (x - difference) / std**2 / (1 + columns * ((x - difference) / std) ** 2 / 9)
+        for difference, std in ((0, 1.0), (10, 0.5))
+    ]
+    assert sum(pulls) == pytest.approx(0, abs=1e-3)
     assert 9 < x < 10
 
 

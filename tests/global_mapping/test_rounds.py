@@ -83,6 +83,22 @@ def test_errors_are_in_standard_deviations() -> None:
     assert observed.errors(away)[1] == pytest.approx(math.hypot(400 * 0.5 / 3 - 50, 400 * 0.2 / 3 - 20) / 1.5)
 
 
+def test_points_that_a_camera_cannot_show_are_infinitely_off() -> None:
+    """Where distortion would fold the image over, as well as behind a wide lens that sees to the side."""
+    sight = torch.tensor([[2.0, 0, 1], [2, 0, -0.5], [0, 0, 1]], dtype=torch.float64)
+    rows = torch.arange(3)
+    noise = KeypointNoise(torch.ones(3).double(), torch.zeros(3, 0).double()).with_explicit_information()
+    observed = ObservedTracks(Tracks(rows, rows * 0, rows), torch.zeros(3, 2).double(), noise)
+    radial = torch.tensor([400, 400, 319.5, 239.5, -0.5, 0, 0, 0, 0], dtype=torch.float64)
+    wide = torch.tensor([200, 200, 319.5, 239.5, 0, 0, 0, 0], dtype=torch.float64)
+    for camera, shown in (
+        (Camera("radial_tangential", radial, CAMERA.size), [False, False, True]),
+        (Camera("fisheye", wide, CAMERA.size), [True, False, True]),
+    ):
+        errors = observed.errors(Reconstruction(EYE[None], camera, sight, rows > 9))
+        assert torch.isfinite(errors).tolist() == shown
+
+
 def se3_along(z: float) -> Tensor:
     T = EYE.clone()
     T[2, 3] = z
@@ -113,6 +129,14 @@ def test_observations_within_the_gate_agree(factor: float, agrees: bool) -> None
         assert filtered.points_w is found.points_w
         assert filtered.T_cw is found.T_cw
         assert filtered.camera is found.camera
+
+
+def test_an_error_of_the_gate_does_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+    errors = torch.full((len(SCENE.tracks),), math.nextafter(8.0, 0.0), dtype=torch.float64)
+    errors[13] = 8.0
+    monkeypatch.setattr(ObservedTracks, "errors", lambda self, found: errors)
+    agrees = SCENE.observed.filter(exact(SCENE), 8.0).agrees
+    assert (~agrees).nonzero()[:, 0].tolist() == [13]
 
 
 def test_three_images_must_agree_on_a_point() -> None:

@@ -61,6 +61,12 @@ def test_connected_matches_are_one_track() -> None:
     assert (tracks.count, len(tracks), tracks.lengths.tolist()) == (4, 9, [3, 2, 2, 2])
 
 
+def test_there_may_be_more_tracks_than_images() -> None:
+    matches = [(row, (3 * row) % 8) for row in range(8)]
+    tracks = join_matches([view_pair(0, 1, *matches)], views=2, keypoints=8)
+    assert rows(tracks) == [(row, *node) for row, both in enumerate(matches) for node in enumerate(both)]
+
+
 def test_two_keypoints_of_one_image_are_both_left_out() -> None:
     """Nobody knows which is right; the rest stays if it is of two images."""
     around = [view_pair(0, 1, (0, 0)), view_pair(1, 2, (0, 0)), view_pair(0, 2, (0, 1))]
@@ -131,6 +137,8 @@ def test_the_longest_tracks_of_some_image_are_chosen() -> None:
     assert longest_tracks(tracks, 2).tolist() == [True, True, True, True]
     assert longest_tracks(tracks, 0).tolist() == [False] * 4
     assert longest_tracks(tracks_of(2, 2, 2), 2).tolist() == [True, True, False]
+    single = Tracks(torch.tensor([0, 0, 1]), torch.tensor([1, 2, 0]), torch.zeros(3, dtype=torch.int64))
+    assert longest_tracks(single, 1).tolist() == [True, True]
     assert longest_tracks(tracks_of(), 5).tolist() == []
 
 
