@@ -39,6 +39,9 @@ FINE_START = 1.5
 """Factor on the gate before the first fine round, as poses are right to about a pixel."""
 MIN_VIEWS = 3
 """Images that must agree on a point: two rays nearly always meet somewhere."""
+MIN_OBSERVATIONS = 15
+"""Observations that must agree with the pose of an image. With a handful a pose is hardly determined, and a single one
+that flies off stops the steps of all others. COLMAP asks for 30 to register an image; tried 10 to 30."""
 MAX_ROUNDS, MIN_CHANGE = 4, 0.005
 """Fine rounds go on until less than this share of the observations changes sides."""
 
@@ -113,6 +116,8 @@ class ObservedTracks:
     def filter(self, found: Reconstruction, gate: float) -> Reconstruction:
         """Try all observations: those within the gate, of points that enough images see under an angle."""
         agrees = self.errors(found) < gate
+        held = torch.bincount(self.tracks.view[agrees], minlength=len(found.T_cw)) >= MIN_OBSERVATIONS
+        agrees = agrees & held[self.tracks.view]
         centers_w = se3_inverse(found.T_cw)[self.tracks.view, :3, 3]
         angles = parallax(self.tracks, centers_w, found.points_w, agrees)
         count = torch.bincount(self.tracks.track[agrees], minlength=self.tracks.count)

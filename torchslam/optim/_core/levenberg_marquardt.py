@@ -191,8 +191,9 @@ def minimize_batch(
         steps = steps.index_add(0, rows, active.long())
         active = active & (relative_reduction > tolerance) & (model.cost.detach() > vanished)
         model = problem.select(accept, trial, model)
+        stuck = ~accept & (damping >= _DAMPING_RANGE[1])  # no shorter step is to be had
         damping = torch.where(accept, damping * DAMPING_DOWN, damping * DAMPING_UP).clamp(*_DAMPING_RANGE)
-        if not active.any():
+        if not (active & ~stuck).any():
             break
         if isinstance(problem, Divisible) and not active.all():
             done, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
