@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.geometry import Camera, KeypointNoise, se3_inverse, transform
+from torchslam.geometry import Camera, KeypointNoise, estimate_absolute_pose, se3_inverse, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.robust import Kernel
 from torchslam.global_mapping.tracks import MIN_PARALLAX, Tracks, longest_tracks, parallax, triangulate_tracks
@@ -24,7 +24,7 @@ from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import FrameFeatures
 
-COARSE: tuple[tuple[Kernel, float], ...] = (("cauchy", 20.0), ("geman_mcclure", 6.0))
+COARSE: tuple[tuple[Kernel, float], ...] = (("cauchy", 100.0), ("cauchy", 20.0), ("geman_mcclure", 6.0))
 """Kernels and their scales, in standard deviations of a keypoint, while poses are pixels off."""
 FINE: tuple[Kernel, float] = ("geman_mcclure", 5.0)
 """The same where poses are right to about a pixel. Tried 3 to 6, and Cauchy at 2, which is as good."""
@@ -124,6 +124,23 @@ class ObservedTracks:
         good = (count >= MIN_VIEWS) & (angles > MIN_PARALLAX)
         return replace(found, agrees=agrees & good[self.tracks.track])
 
+    def resect(self, found: Reconstruction) -> Reconstruction:
+        """Pose the images of which too few observations agree anew, by the points that other images agree on."""
+        counts = torch.bincount(self.tracks.view[found.agrees], minlength=len(found.T_cw))
+        known = torch.zeros(self.tracks.count, dtype=torch.bool, device=counts.device)
+        known[self.tracks.track[found.agrees]] = True
+        T_cw = found.T_cw.clone()
+        for view in torch.nonzero(counts < MIN_OBSERVATIONS)[:, 0].tolist():
+            rows = torch.nonzero((self.tracks.view == view) & known[self.tracks.track])[:, 0]
+            if len(rows) < MIN_OBSERVATIONS:
+                continue
+            points_w = found.points_w[self.tracks.track[rows]]
+            threshold = FINE[1] * float(self.noise.sigmas[rows].median())
+            pose = estimate_absolute_pose(points_w[None], self.pixels[rows][None], found.camera, threshold)
+            if bool(pose.success[0]):
+                T_cw[view] = pose.T_cw[0]
+        return replace(found, T_cw=T_cw)
+
 
 def adjust(
     observed: ObservedTracks,
@@ -182,6 +199,8 @@ def adjust_in_rounds(
     found = observed.triangulate(T_cw, camera, FINE_START * GATE)
     for number in range(MAX_ROUNDS):
         before = found.agrees
+        posed = observed.resect(found).T_cw
+        found = observed.triangulate(posed, found.camera, GATE if number else FINE_START * GATE)
         adjusted = adjust(observed, found, *FINE, TOLERANCE, given)
         found = observed.triangulate(adjusted.T_cw, adjusted.camera, GATE)
         change = float((found.agrees != before).double().mean())

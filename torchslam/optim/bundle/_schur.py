@@ -2,10 +2,10 @@
 
 Poses form 6x6 blocks, points 3x3 blocks, free cameras n x n blocks, and an observation joins one pose, one camera and
 one point. Eliminating the points leaves a dense system over the free poses and cameras, which is fine up to several
-hundred keyframes. What makes the elimination sparse are *tiles*: runs of points, ordered by the first frame that sees
-them, with the few frames that see any of them, and their cameras. Within a tile the coupling is one dense matrix, so
-that the Schur complement is a few large matrix products instead of very many small ones, and a sum in a fixed order:
-the same bytes on every run.
+hundred keyframes. What makes the elimination sparse are *tiles*: runs of points, ordered by the first and last frame
+that see them, with the few frames that see any of them, and their cameras. Within a tile the coupling is one dense
+matrix, so that the Schur complement is a few large matrix products instead of very many small ones, and a sum in a
+fixed order: the same bytes on every run.
 Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 """
 
@@ -26,7 +26,7 @@ from torchslam.optim.bundle._factors import FrameBlocks
 
 # Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call. Where many
 # frames see a place again and again, a tile has a column for each of them: fewer points share them better.
-_TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 128
+_TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 64
 _MANY_FRAMES = 64
 
 

@@ -98,7 +98,10 @@ def build_sparse_layout(
     rows = rows[torch.argsort(slots[frame_index[rows]], stable=True)]
     first = torch.full((num_points,), count, device=rows.device)
     first = first.scatter_reduce(0, point_index[rows], slots[frame_index[rows]], "amin")
-    point_order = torch.argsort(first, stable=True)
+    last = torch.full_like(first, -1)
+    last = last.scatter_reduce(0, point_index[rows], slots[frame_index[rows]], "amax")
+    # So that the frames of a tile are few.
+    point_order = torch.argsort(first * (count + 2) + last, stable=True)
     point_rank = torch.argsort(point_order)
     points = point_rank[point_index[rows]]
     free = free_frames.nonzero().squeeze(-1)
