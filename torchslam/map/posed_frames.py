@@ -173,29 +173,46 @@ class PosedFrames:
         if bool((renamed < 0).any()):
             self.observations.keep(torch.nonzero(renamed >= 0)[:, 0])
 
-    def remove_outliers(self, slam_map: Map, camera: Camera) -> None:
+    def remove_outliers(
+        self,
+        slam_map: Map,
+        camera: Camera,
+        chi_square: float = _OUTLIER_CHI_SQUARE,
+        least_ratio: float = _MIN_INLIER_RATIO,
+    ) -> None:
         """Remove observations far from the current reprojection, since their point was merged or has moved.
 
-        A frame with many of them keeps its observations, since its pose may be wrong.
+        Args:
+            slam_map: the map.
+            camera: of all frames.
+            chi_square: squared error, in units of the stated noise, from which on an observation is far.
+            least_ratio: of its observations that must be near; else a frame keeps all, since its pose may be wrong.
         """
         T_cw, seen_by = self.T_cw(slam_map), self.observations["frame_row"]
         every = torch.arange(len(seen_by), device=T_cw.device)
-        agrees = torch.cat([self._agree(rows, T_cw, slam_map, camera) for rows in every.split(_CHUNK)])
+        agrees = torch.cat(
+            [self._agree(rows, T_cw, slam_map, camera, chi_square) for rows in every.split(_CHUNK)]
+        )
         count = torch.bincount(seen_by, minlength=len(self))
-        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= _MIN_INLIER_RATIO * count
+        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= least_ratio * count
         kept = agrees | ~is_right[seen_by]
         if not bool(kept.all()):
             self.observations.keep(torch.nonzero(kept)[:, 0])
 
     def _agree(
-        self, rows: Int[Tensor, " O"], T_cw: Float[Tensor, "F 4 4"], slam_map: Map, camera: Camera
+        self,
+        rows: Int[Tensor, " O"],
+        T_cw: Float[Tensor, "F 4 4"],
+        slam_map: Map,
+        camera: Camera,
+        chi_square: float,
     ) -> Bool[Tensor, " O"]:
         """Test which observations are near their reprojection by the frames."""
         seen = {name: values[rows] for name, values in self.observations.columns().items()}
         points_w = slam_map.positions_w[slam_map.follow_merges(seen["point_ids"])]
         points_c = transform(T_cw[seen["frame_row"]], points_w[:, None])[:, 0]
         noise = KeypointNoise(seen["scales"], seen["information"])
-        return passes_gate(noise.squared_reprojection(points_c, seen["pixels"], camera), _OUTLIER_CHI_SQUARE)
+        return passes_gate(noise.squared_reprojection(points_c, seen["pixels"], camera), chi_square)
 
     def graph(
         self,

@@ -219,11 +219,15 @@ def remove_outliers(slam_map: Map, seen: Observations, camera: Camera) -> None:
 
     Update the noise of the map before.
     """
-    points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
-    squared = seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera)
+    squared = squared_errors(slam_map, seen, camera)
     slam_map.update_noise(squared)
-    wrong = ~passes_gate(squared)
-    slam_map.remove_masked_observations(seen, wrong)
+    slam_map.remove_masked_observations(seen, ~passes_gate(squared))
+
+
+def squared_errors(slam_map: Map, seen: Observations, camera: Camera) -> Float[Tensor, " O"]:
+    """Squared reprojection errors in units of the stated noise."""
+    points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
+    return seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera)
 
 
 def select(seen: Observations, rows: Int[Tensor, " R"]) -> Observations:

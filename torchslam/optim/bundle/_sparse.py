@@ -285,7 +285,9 @@ class SparseBundle:
         damping = torch.full_like(estimate.points_w[:, 0], _INNER_DAMPING)
         cost, gradient, hessian = self._of_points(estimate)
         for _ in range(_INNER_STEPS):
-            trial = estimate._replace(points_w=estimate.points_w - self._point_steps(gradient, hessian, damping))
+            trial = estimate._replace(
+                points_w=estimate.points_w - self._point_steps(gradient, hessian, damping)
+            )
             found = self._of_points(trial)
             better = found[0] < cost
             gain = torch.where(better, cost - found[0], 0.0).sum()
