@@ -43,7 +43,7 @@ class FocalSearch:
     """What pairs of images say of an unknown camera.
 
     Attributes:
-        found: the focal length with its standard error; None with too few pairs.
+        found: fx with its standard error; None with too few pairs.
         pairs: number of pairs.
         images: number of images.
     """
@@ -67,7 +67,7 @@ def search_focal(
     """Find the focal length by pairs of images; unreadable images are left out, the run itself reports them.
 
     Args:
-        sequence: with a guessed camera, of which the principal point is used.
+        sequence: with a guessed camera, of which the principal point and fy / fx are used.
         config: of the run.
         device: of torch.
         progress: called with the number of images done, and of all.
@@ -130,20 +130,23 @@ def _fundamental(
 
 
 def _solve(pairs: list[tuple[Tensor, Tensor, Tensor]], camera: Camera, scale: float) -> ViewGraphFocal:
-    """The focal length of all pairs."""
-    F = torch.stack([pair[0] for pair in pairs]).double()
+    """fx by all pairs, in images that are scaled in height so that their pixels are square."""
+    stretch = torch.stack([torch.ones(()), (camera.fx / camera.fy).detach().cpu(), torch.ones(())]).double()
+    F = torch.stack([pair[0] for pair in pairs]).double() / (stretch[:, None] * stretch)
     pixels_1, pixels_2 = (
-        torch.nn.utils.rnn.pad_sequence([pair[side] for pair in pairs], batch_first=True) for side in (1, 2)
+        torch.nn.utils.rnn.pad_sequence([pair[side] for pair in pairs], batch_first=True).double()
+        * stretch[:2]
+        for side in (1, 2)
     )
     mask = torch.nn.utils.rnn.pad_sequence(
         [torch.ones(len(pair[1]), dtype=torch.bool) for pair in pairs], batch_first=True
     )
     return focal_from_pairs(
         F,
-        pixels_1.double(),
-        pixels_2.double(),
+        pixels_1,
+        pixels_2,
         mask,
-        camera.params[2:4].detach().cpu().double(),
-        camera.size,
+        camera.params[2:4].detach().cpu().double() * stretch[:2],
+        (camera.width, round(camera.height * float(stretch[1]))),
         threshold=THRESHOLD_PX * scale,
     )

@@ -77,10 +77,10 @@ class Calibration:
 
 @dataclass(frozen=True)
 class FocalGuess:
-    """A guessed focal length: square pixels, no distortion, centered principal point.
+    """A guessed focal length: no distortion, centered principal point.
 
     Attributes:
-        focal: in units of `unit`: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
+        focal: fx in units of `unit`: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
         source: origin of the guess, for messages.
     """
 
@@ -89,11 +89,12 @@ class FocalGuess:
     source: str
     guessed: bool = True
 
-    def camera(self, size: Size) -> Camera:
-        """The camera for images of `size`."""
-        unit = {"px": 1.0, "w": float(size[0]), "diagonal": math.hypot(*size)}[self.unit]
+    def camera(self, size: Size, pixel_aspect: float = 1.0) -> Camera:
+        """The camera for images of `size`, with pixels of that ratio of width to height."""
+        width, height = size
+        unit = {"px": 1.0, "w": float(width), "diagonal": math.hypot(width, height / pixel_aspect)}[self.unit]
         focal = self.focal * unit
-        return Camera.pinhole(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, size=size)
+        return Camera.pinhole(focal, focal * pixel_aspect, (width - 1) / 2, (height - 1) / 2, size=size)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,87 @@
+"""Frames of OpenCV's video decoder that are certain to be frames of the video.
+
+OpenCV does not look whether FFmpeg has converted a frame. From FFmpeg 7.1 on (OpenCV 4.13), interlaced frames are not:
+`retrieve` still returns True, with what lies in its buffer, which is the frame before or memory of anything else. Only
+FFmpeg's log tells. It is read where a frame may be such a one: the first one, and one that repeats the one before.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+import threading
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import UInt8
+
+from torchslam.errors import FrameError
+
+STDERR = 2
+SAMPLED = 16
+"""Every so many rows are compared with the frame before."""
+CONVERSION = b"[swscaler"
+"""How FFmpeg's log begins a line on a conversion that failed; what succeeds is silent."""
+
+_LOCK = threading.Lock()
+
+
+class Retrievable(Protocol):
+    """The part of cv2.VideoCapture that `Retriever` uses."""
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        """Decode the last frame that was grabbed, BGR; False if it is damaged."""
+
+
+class Retriever:
+    """Retrieves the frames of one capture, and refuses those that were not converted.
+
+    Args:
+        capture: where frames were grabbed.
+        command: how the video is converted to one without interlaced frames, for messages.
+    """
+
+    def __init__(self, capture: Retrievable, command: str) -> None:
+        self._capture, self._command = capture, command
+        self._before: np.ndarray | None = None
+
+    def retrieve(self) -> UInt8[np.ndarray, "H W 3"] | None:
+        """Return the frame that was grabbed last; None if it is damaged. Raises FrameError if it was not converted."""
+        converted = True
+        if self._before is None:
+            decoded, image, converted = _retrieve_with_log(self._capture)
+        else:
+            decoded, image = self._capture.retrieve()
+        if not decoded:
+            return None
+        sample = image[::SAMPLED].copy()
+        if self._before is not None and np.array_equal(sample, self._before):
+            _, _, converted = _retrieve_with_log(self._capture)
+        if not converted:
+            self._before = None  # the next one is likely to be such a frame, too
+            raise FrameError(f"interlaced, which this OpenCV does not decode; convert it: {self._command}")
+        self._before = sample
+        return image
+
+
+def _retrieve_with_log(capture: Retrievable) -> tuple[bool, np.ndarray, bool]:
+    """Retrieve a frame; also whether the log says nothing against it. Other lines go on to the error stream."""
+    with _LOCK, tempfile.TemporaryFile() as log:
+        try:
+            kept = os.dup(STDERR)
+        except OSError:  # it is closed
+            kept = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(log.fileno(), STDERR)
+            try:
+                decoded, image = capture.retrieve()
+            finally:
+                os.dup2(kept, STDERR)
+            log.seek(0)
+            written = log.read()
+            converted = CONVERSION not in written
+            if converted and written:
+                os.write(kept, written)
+        finally:
+            os.close(kept)
+    return decoded, image, converted
