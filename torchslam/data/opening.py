@@ -131,16 +131,44 @@ def _open_archive(path: str, open_folder: OpenFolder) -> Sequence:
     folder = Path(holder.name) / archive.stem
     try:
         unpack(archive, folder)
-        sequence = open_folder(str(folder))
+        sequence = open_folder(_only_sequence(archive, folder))
     except BaseException as error:
         holder.cleanup()
         if isinstance(error, DownloadError):
             raise SequenceError(str(error)) from error
         if isinstance(error, TorchslamError):
-            raise type(error)(str(error).replace(str(folder), path)) from error
+            message = str(error).replace(str(folder), path)
+            hint = "; unpack it first" if f"'{path}/" in message else ""  # a part of it cannot be opened
+            raise type(error)(message + hint) from error
         raise
     sequence.holder = holder  # the files are deleted with the sequence
     return sequence
+
+
+def _only_sequence(archive: Path, folder: Path) -> str:
+    """Return the folder of an unpacked archive, or the one file or folder in it that is a sequence.
+
+    Raises SequenceError for several of them: what is in an archive cannot be named.
+    """
+    if find_reader(str(folder)):
+        return str(folder)
+    inside = [entry for entry in _entries(folder) if not entry.name.startswith((".", "__MACOSX"))]
+    found = [entry for entry in inside if find_reader(str(entry))]
+    if len(found) == 1:
+        return str(found[0])
+    if found:
+        names = ", ".join(entry.name for entry in found[:SHOWN])
+        raise SequenceError(
+            f"{archive}: holds {len(found)} sequences ({names}{', ...' * (len(found) > SHOWN)}); "
+            "unpack it and open one of them"
+        )
+    packed = [entry.name for entry in inside if entry.suffix.lower() == ".zip"]
+    if packed:
+        raise SequenceError(
+            f"{archive}: holds archives ({', '.join(packed[:SHOWN])}); unpack it and open one"
+        )
+    suffixes = ", ".join(sorted(SUFFIXES))
+    raise SequenceError(f"{archive}: no images ({suffixes}), no video and no other sequence in it")
 
 
 MAX_ENTRIES = 10_000
