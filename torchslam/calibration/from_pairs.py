@@ -115,14 +115,17 @@ def _fundamental(
     if len(at_1) < MIN_MATCHES:
         return None
     pixels_1, pixels_2 = one.keypoints[at_1].cpu(), other.keypoints[at_2].cpu()
-    F, mask = cv2.findFundamentalMat(
-        pixels_1.numpy(),
-        pixels_2.numpy(),
-        cv2.USAC_MAGSAC,
-        THRESHOLD_PX * scale,
-        CONFIDENCE,
-        MAX_SAMPLES,
-    )
+    try:
+        F, mask = cv2.findFundamentalMat(
+            pixels_1.numpy(),
+            pixels_2.numpy(),
+            cv2.USAC_MAGSAC,
+            THRESHOLD_PX * scale,
+            CONFIDENCE,
+            MAX_SAMPLES,
+        )
+    except cv2.error:  # so OpenCV says of some degenerate matches that it found no matrix
+        return None
     if F is None or F.shape != (3, 3) or np.count_nonzero(mask) < MIN_MATCHES:
         return None
     agreeing = torch.from_numpy(mask[:, 0] > 0)
