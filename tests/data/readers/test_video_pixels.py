@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from collections.abc import Callable
@@ -109,6 +110,24 @@ def test_a_stream_of_interlaced_frames_is_decoded_or_refused(clip: Path) -> None
     set_interlaced(clip, [True] * COUNT)
     said = refusal(lambda: is_right(LIVE.open(str(clip), None, None).image(0), 0))
     assert said == "" or "interlaced" in said
+
+
+@pytest.mark.parametrize("variable", ["OPENCV_FFMPEG_DEBUG=1", "OPENCV_FFMPEG_LOGLEVEL=-8"])
+def test_a_silenced_log_hides_nothing(variable: str) -> None:
+    path = Path(__file__).parents[1] / "interlaced.mp4"
+    code = (
+        "import os; from torchslam.data import open_sequence; from torchslam.errors import SequenceError\n"
+        f"try: said = str(float(open_sequence({str(path)!r}).image(0).mean()))\n"
+        "except SequenceError as error: said = str(error)\n"
+        "print(os.environ['{}'], said)".format(variable.partition("=")[0])
+    )
+    name, _, value = variable.partition("=")
+    command = [sys.executable, "-c", code]
+    said = subprocess.run(
+        command, capture_output=True, check=True, env=os.environ | {name: value}
+    ).stdout.decode()
+    assert said.startswith(value)
+    assert "interlaced" in said or float(said.split()[1]) == pytest.approx(0.475, abs=0.004)
 
 
 def test_videos_are_read_where_the_error_stream_is_closed(clip: Path) -> None:

@@ -8,10 +8,12 @@ FFmpeg's log tells. It is read where a frame may be such a one: the first one, a
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 import threading
 from typing import Protocol
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -20,10 +22,22 @@ from torchslam.errors import FrameError
 STDERR = 2
 SAMPLED = 16
 """Every so many rows are compared with the frame before."""
-CONVERSION = b"[swscaler"
-"""How FFmpeg's log begins a line on a conversion that failed; what succeeds is silent."""
+FAILURE = re.compile(rb"(Cannot convert interlaced)|: fmt:\S+ csp:")
+"""What FFmpeg's log says of a conversion that failed: from which format to which, and why."""
+
+SILENCING = ("OPENCV_FFMPEG_DEBUG", "OPENCV_FFMPEG_LOGLEVEL")
+"""Variables that send FFmpeg's log elsewhere, or silence it. OpenCV looks at them when it first opens a video."""
 
 _LOCK = threading.Lock()
+
+
+def open_capture(source: str) -> cv2.VideoCapture:
+    """Open a video or a stream; FFmpeg's errors go to the error stream, whatever the environment says."""
+    hidden = {name: os.environ.pop(name) for name in SILENCING if name in os.environ}
+    try:
+        return cv2.VideoCapture(source)
+    finally:
+        os.environ.update(hidden)
 
 
 class Retrievable(Protocol):
@@ -47,25 +61,26 @@ class Retriever:
 
     def retrieve(self) -> UInt8[np.ndarray, "H W 3"] | None:
         """Return the frame that was grabbed last; None if it is damaged. Raises FrameError if it was not converted."""
-        converted = True
+        failure = None
         if self._before is None:
-            decoded, image, converted = _retrieve_with_log(self._capture)
+            decoded, image, failure = _retrieve_with_log(self._capture)
         else:
             decoded, image = self._capture.retrieve()
         if not decoded:
             return None
         sample = image[::SAMPLED].copy()
         if self._before is not None and np.array_equal(sample, self._before):
-            _, _, converted = _retrieve_with_log(self._capture)
-        if not converted:
+            _, _, failure = _retrieve_with_log(self._capture)
+        if failure is not None:
             self._before = None  # the next one is likely to be such a frame, too
-            raise FrameError(f"interlaced, which this OpenCV does not decode; convert it: {self._command}")
+            what = "interlaced" if failure[1] else "of a format"
+            raise FrameError(f"{what}, which this OpenCV does not decode; convert it: {self._command}")
         self._before = sample
         return image
 
 
-def _retrieve_with_log(capture: Retrievable) -> tuple[bool, np.ndarray, bool]:
-    """Retrieve a frame; also whether the log says nothing against it. Other lines go on to the error stream."""
+def _retrieve_with_log(capture: Retrievable) -> tuple[bool, np.ndarray, re.Match[bytes] | None]:
+    """Retrieve a frame; also what the log says of a failure. Other lines go on to the error stream."""
     with _LOCK, tempfile.TemporaryFile() as log:
         try:
             kept = os.dup(STDERR)
@@ -79,9 +94,9 @@ def _retrieve_with_log(capture: Retrievable) -> tuple[bool, np.ndarray, bool]:
                 os.dup2(kept, STDERR)
             log.seek(0)
             written = log.read()
-            converted = CONVERSION not in written
-            if converted and written:
+            failure = FAILURE.search(written)
+            if failure is None and written:
                 os.write(kept, written)
         finally:
             os.close(kept)
-    return decoded, image, converted
+    return decoded, image, failure

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import gray_to_tensor
-from torchslam.data.readers.capture import Retriever
+from torchslam.data.readers.capture import Retriever, open_capture
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -281,7 +281,7 @@ def _open_live(path: str, camera: GivenCamera | None, rate: float | None) -> Liv
     """A camera or a stream. Raises SequenceError where it cannot be opened."""
     number = path.isdecimal()
     shown = without_credentials(path)
-    capture = cv2.VideoCapture(int(path)) if number else cv2.VideoCapture(path)
+    capture = cv2.VideoCapture(int(path)) if number else open_capture(path)
     if not capture.isOpened():
         raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")
     return LiveSequence(f"camera {path}" if number else shown, capture, camera)

@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
-from torchslam.data.readers.capture import Retriever
+from torchslam.data.readers.capture import Retriever, open_capture
 from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
 from torchslam.errors import FrameError, SequenceError, TorchslamError
 from torchslam.utils.console import tqdm_options
@@ -116,7 +116,7 @@ class VideoSequence(Sequence):
 
     def _rewind(self) -> None:
         # As an absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
-        self._capture = cv2.VideoCapture(str(self._path.absolute()))
+        self._capture = open_capture(str(self._path.absolute()))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         self._retriever = Retriever(self._capture, _conversion(self._path))
         self._position = 0  # of the decoder, among all frames that can be decoded
