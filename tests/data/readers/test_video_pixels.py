@@ -184,3 +184,11 @@ def test_a_name_with_a_colon(clip: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         sequence = open_sequence(path)
         assert (sequence.name, len(sequence)) == ("2024-05-01T12:30:05", COUNT)
         assert is_right(sequence.image(2), 2)
+
+
+def test_a_name_that_is_not_utf8(clip: Path) -> None:
+    """OpenCV would crash."""
+    named = clip.with_name(os.fsdecode(b"clip\xff.mkv"))
+    clip.rename(named)
+    with pytest.raises(SequenceError, match="its name is not UTF-8, which OpenCV cannot open; rename it"):
+        open_sequence(named)

@@ -66,7 +66,7 @@ class Retriever:
             decoded, image, failure = _retrieve_with_log(self._capture)
         else:
             decoded, image = self._capture.retrieve()
-        if not decoded:
+        if not decoded or image is None:  # both happen
             return None
         sample = image[::SAMPLED].copy()
         if self._before is not None and np.array_equal(sample, self._before):

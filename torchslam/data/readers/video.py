@@ -200,7 +200,11 @@ def _open_video(
 
 
 def _check(path: Path) -> None:
-    """Raise SequenceError for a special file, and for an MP4 that declares more frames than it has bytes."""
+    """Raise SequenceError for a special file, a name that OpenCV crashes on, and an MP4 with more frames than bytes."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise SequenceError(f"{path}: its name is not UTF-8, which OpenCV cannot open; rename it") from None
     try:
         check_regular(path, MAX_BYTES, "a video that is read")
         claimed = claimed_samples(path) if path.suffix.lower() in MP4 else 0
