@@ -407,6 +407,17 @@ def test_opencv_files_say_whether_they_are_of_a_fisheye(tmp_path: Path, suffix: 
             "<a><K>5 0 3 0 5 2 0 0 1</K><distortion_model>omni</distortion_model></a>",
             "distortion model `omni` is not known",
         ),
+        (
+            "a.json",
+            NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k1": 0.3'),
+            "frame images/0.png has a k1 of its own",
+        ),
+        (
+            "a.json",
+            NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k4": 0.3'),
+            "frame images/0.png has a k4 of its own",
+        ),
+        ("a.txt", "1 FISHEYE624 64 48 5 5 3 2\n", "camera model FISHEYE624 is not known"),
         ("a.yaml", "K: [5, 0, 0, 0, 5, 0, 3, 2, 1]\n", "a camera matrix is fx 0 cx, 0 fy cy, 0 0 1, not"),
         ("a.yaml", "K: [5, 1, 3, 0, 5, 2, 0, 0, 1]\n", "a skew of 1 is not modeled"),
     ],
@@ -423,6 +434,13 @@ def test_zeros_and_distances_are_no_distortion(tmp_path: Path) -> None:
     text = PYYAML + "k4: 0\nmarker_distance: 2.5\nfisheye: false\ndistortion_type: none\n"
     (tmp_path / "a.yaml").write_text(text)
     assert read_calibration(tmp_path / "a.yaml").params == pytest.approx(BROWN)
+
+
+def test_frames_that_repeat_the_shared_camera(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(
+        NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k1": 0.1, "w": 640')
+    )
+    assert read_calibration(tmp_path / "a.json").params == pytest.approx(BROWN)
 
 
 @pytest.mark.parametrize("text", ['"is_fisheye": true', '"camera_model": "OPENCV_FISHEYE"'])

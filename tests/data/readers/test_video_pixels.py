@@ -7,7 +7,9 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,8 @@ import torch
 from tests.data.interlaced import set_interlaced, set_wide, write_mpeg2
 from tests.data.mp4 import write_mp4
 from torchslam.data import Calibrated, Sequence, open_sequence
-from torchslam.data.camera_argument import unknown_camera
+from torchslam.data.camera_argument import parse_calibration, unknown_camera
+from torchslam.data.readers.capture import pixel_aspect
 from torchslam.data.readers.live import LIVE
 from torchslam.errors import FrameError, SequenceError
 
@@ -154,6 +157,24 @@ def test_pixels_that_are_not_square(clip: Path) -> None:
     smaller = open_sequence(clip, "fov=90", resize_to="64x36")
     assert smaller.pixel_aspect == pytest.approx(1.0)
     assert smaller.camera.params.tolist() == pytest.approx([32, 32, 31.5, 17.5])
+
+
+def test_turned_pixels_that_are_not_square() -> None:
+    properties = {cv2.CAP_PROP_SAR_NUM: 4.0, cv2.CAP_PROP_SAR_DEN: 3.0}
+    capture = SimpleNamespace(get=lambda which: properties.get(which, 0.0))
+    assert pixel_aspect(capture, "v.mp4") == pytest.approx(4 / 3)
+    properties[cv2.CAP_PROP_ORIENTATION_META] = 90.0
+    assert pixel_aspect(capture, "v.mp4") == pytest.approx(3 / 4)
+    properties[cv2.CAP_PROP_SAR_NUM] = 1000.0
+    with pytest.raises(SequenceError, match=r"v\.mp4: damaged: its pixels are 1000:3, wide to high"):
+        pixel_aspect(capture, "v.mp4")
+
+
+def test_a_stream_of_pixels_that_are_not_square(clip: Path) -> None:
+    set_wide(clip)
+    stream = LIVE.open(str(clip), parse_calibration("fov=90"), None)
+    assert stream.camera.params.tolist() == pytest.approx([32, 32 * 4 / 3, 31.5, 23.5])
+    assert stream.describe()["size"] == "64x48, pixels of 4:3, wide to high"
 
 
 def test_a_given_camera_that_contradicts_the_pixels_is_kept_and_named(clip: Path) -> None:

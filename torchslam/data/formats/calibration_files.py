@@ -46,6 +46,10 @@ DISTORTION_MODEL = ("distortionmodel", "distortiontype")
 CAMERA_MODEL = ("cameramodel", "modeltype", "cameratype", "projectionmodel")
 IS_FISHEYE = ("fisheyemodel", "isfisheye", "usefisheye", "fisheye")
 FX, FY, CX, CY = ("fx", "fu"), ("fy", "fv"), ("cx", "cu", "ppx"), ("cy", "cv", "ppy")
+OF_A_CAMERA = (
+    *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye"),
+)
+"""Keys of a transforms.json that a frame may have, too."""
 BROWN_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 LOOKS_LIKE_DISTORTION = re.compile(r"dist(?!an)|coef|fisheye|^(camera1?)?(k[1-9]|p[1-9])$|^xi$")
@@ -64,7 +68,7 @@ COLMAP_MODELS = {
     "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
     "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
 }
-COLMAP_LINE = re.compile(r"\d+\s+[A-Z_]+\s+\d{1,9}\s+\d{1,9}\s", re.ASCII)
+COLMAP_LINE = re.compile(r"\d+\s+[A-Z][A-Z_0-9]+\s+\d{1,9}\s+\d{1,9}\s", re.ASCII)
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -417,6 +421,7 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
 
 def _from_transforms(keys: Keys, source: str) -> Calibration:
     """The camera that all frames of a transforms.json share; its pixels count from the corner of the top left one."""
+    _check_shared(keys, source)
     size = keys.size()
     focal, angle = keys.number("flx"), keys.number("cameraanglex")
     if focal is None and size is not None and angle is not None:
@@ -430,3 +435,18 @@ def _from_transforms(keys: Keys, source: str) -> Calibration:
             raise CalibrationError(f"{source}: no {key} in it, nor the size of the images")
         intrinsics.append((extent or 0.0) / 2 - HALF_PIXEL if center is None else center - HALF_PIXEL)
     return _with_distortion(keys, intrinsics, source, size=size)
+
+
+def _check_shared(keys: Keys, source: str) -> None:
+    """Raise CalibrationError for a frame with a camera of its own."""
+    found = keys.value("frames")
+    for frame in found[1] if found is not None and isinstance(found[1], list) else ():
+        for key in OF_A_CAMERA if isinstance(frame, dict) else ():
+            if key not in frame:
+                continue
+            shared = keys.value(_normal(key))
+            if frame[key] != (0 if shared is None else shared[1]):
+                raise CalibrationError(
+                    f"{source}: frame {str(frame.get('file_path', ''))[:80]} has a {key} of its own; "
+                    "only one camera for all frames is read"
+                )

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from torchslam.errors import FrameError
+from torchslam.errors import FrameError, SequenceError
 
 STDERR = 2
 SAMPLED = 16
@@ -27,6 +27,9 @@ FAILURE = re.compile(rb"(Cannot convert interlaced)|: fmt:\S+ csp:")
 
 SILENCING = ("OPENCV_FFMPEG_DEBUG", "OPENCV_FFMPEG_LOGLEVEL")
 """Variables that send FFmpeg's log elsewhere, or silence it. OpenCV looks at them when it first opens a video."""
+
+MAX_ASPECT = 4.0
+"""Largest ratio of the sides of a pixel; anamorphic lenses have 2."""
 
 _LOCK = threading.Lock()
 
@@ -38,6 +41,30 @@ def open_capture(source: str) -> cv2.VideoCapture:
         return cv2.VideoCapture(source)
     finally:
         os.environ.update(hidden)
+
+
+def pixel_aspect(capture: HasProperties, where: str) -> float:
+    """Return width to height of a pixel as it is shown, which may be turned; 1 where the source does not say.
+
+    Raises SequenceError for pixels that no camera has.
+    """
+    across, down = (capture.get(side) for side in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
+    if across <= 0 or down <= 0:
+        return 1.0
+    aspect = across / down
+    if not 1 / MAX_ASPECT <= aspect <= MAX_ASPECT:
+        raise SequenceError(
+            f"{where}: damaged: its pixels are {across:.0f}:{down:.0f}, wide to high; "
+            f"no camera has more than {MAX_ASPECT:g}:1"
+        )
+    return 1 / aspect if capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90 else aspect
+
+
+class HasProperties(Protocol):
+    """The part of cv2.VideoCapture that `pixel_aspect` uses."""
+
+    def get(self, property_id: int) -> float:
+        """Return a property, one of cv2.CAP_PROP_*; 0 if it is unknown."""
 
 
 class Retrievable(Protocol):

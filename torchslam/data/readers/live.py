@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import gray_to_tensor
-from torchslam.data.readers.capture import Retriever, open_capture
+from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -97,13 +97,15 @@ class LiveSequence(Sequence):
             raise SequenceError(f"{name}: no frame came within {patience:g} s: is it there, and free?")
         first = self._arrived[0][1]
         size = (first.shape[1], first.shape[0])
+        aspect = pixel_aspect(capture, name)
         super().__init__(
             name,
             "live",
-            None if camera is None else fit_camera(camera, size, name),
+            None if camera is None else fit_camera(camera, size, name, pixel_aspect=aspect),
             torch.zeros(0, dtype=torch.float64),
             size=size,
             guessed=is_guessed(camera),
+            pixel_aspect=aspect,
         )
 
     def __len__(self) -> int:
@@ -162,7 +164,7 @@ class LiveSequence(Sequence):
             "name": self.name,
             "kind": self.kind,
             "frames": "as they come",
-            "size": f"{self.size[0]}x{self.size[1]}",
+            "size": self._describe_size(),
             "camera": self._describe_camera(),
         }
 

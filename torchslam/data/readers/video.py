@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
-from torchslam.data.readers.capture import Retriever, open_capture
+from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
 from torchslam.errors import FrameError, SequenceError, TorchslamError
 from torchslam.utils.console import tqdm_options
@@ -37,8 +37,6 @@ MAX_FRAMES = 2_000_000
 """Maximum number of frames: 18 hours at 30 frames per second."""
 QUIET = 2.0
 """Seconds of reading times before a progress bar appears."""
-MAX_ASPECT = 4.0
-"""Largest ratio of the sides of a pixel; anamorphic lenses have 2."""
 MAX_ASPECT_ERROR = 0.02
 """Relative error of fy / fx of a given camera before a note says that the file contradicts it."""
 
@@ -80,7 +78,7 @@ class VideoSequence(Sequence):
         if ended and len(times) < promised and path.suffix.lower() in (".mp4", ".mov", ".m4v", ".avi"):
             notes.append(f"{len(times)} frames can be decoded; the file declares {promised}")
         size = (first.shape[1], first.shape[0])
-        aspect = self._pixel_aspect()
+        aspect = pixel_aspect(self._capture, str(path))
         fitted = None if camera is None else fit_camera(camera, size, str(path), pixel_aspect=aspect)
         if fitted is not None and abs(float(fitted.fy / fitted.fx) / aspect - 1) > MAX_ASPECT_ERROR:
             notes.append(
@@ -120,19 +118,6 @@ class VideoSequence(Sequence):
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         self._retriever = Retriever(self._capture, _conversion(self._path))
         self._position = 0  # of the decoder, among all frames that can be decoded
-
-    def _pixel_aspect(self) -> float:
-        """Width to height of a pixel as it is shown, which is turned. Raises SequenceError for what no camera has."""
-        across, down = (self._capture.get(side) for side in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
-        if across <= 0 or down <= 0:  # unknown
-            return 1.0
-        aspect = across / down
-        if not 1 / MAX_ASPECT <= aspect <= MAX_ASPECT:
-            raise SequenceError(
-                f"{self._path}: damaged: its pixels are {across:.0f}:{down:.0f}, wide to high; "
-                f"no camera has more than {MAX_ASPECT:g}:1"
-            )
-        return 1 / aspect if self._capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90 else aspect
 
     def _read_times(self, need: Need, promised: int) -> tuple[np.ndarray | None, list[float], bool]:
         """The first frame, seconds of the frames that are needed as the container has them, and if these are all."""
