@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -143,8 +145,22 @@ def test_a_long_video_shows_its_progress(
     assert capsys.readouterr().err == ""
     monkeypatch.setattr(video, "QUIET", 1e-6)
     monkeypatch.setattr("torchslam.utils.console.INTERVAL", 1e-6)
-    open_sequence(clip, CAMERA)
+    monkeypatch.setattr(video, "MANY", 3)
+    sequence = open_sequence(clip, CAMERA)
     assert "times of the frames of clip.mp4" in capsys.readouterr().err
+    sequence.image(2)
+    assert capsys.readouterr().err == ""
+    sequence.image(7)
+    assert "to frame 7 of clip.mp4" in capsys.readouterr().err
+
+
+def test_opening_leaves_no_thread(clip: Path) -> None:
+    """A process with threads cannot be forked."""
+    code = (
+        "import threading; from torchslam.data import open_sequence\n"
+        f"open_sequence({str(clip)!r}).image(0); print(threading.active_count())"
+    )
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True).stdout == b"1\n"
 
 
 def test_frames_with_non_increasing_times_are_dropped() -> None:

@@ -23,7 +23,10 @@ from torchslam.utils.files import JSON_BYTES
 
 MAX_BYTES = 1 << 18
 LARGEST = 1e12  # JSON numbers may have any number of digits
-FISHEYES = ("equidistant", "fisheye", "kannala", "kannala_brandt", "kannalabrandt8", "opencv_fisheye")
+FISHEYES = (
+    *("equidistant", "fisheye", "opencv_fisheye"),
+    *("kannala", "kannala_brandt", "kannalabrandt", "kannalabrandt8"),
+)
 BROWN = (
     *("plumb_bob", "radtan", "radial-tangential", "radial_tangential", "rational_polynomial"),
     *("brown_conrady", "none", ""),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -27,6 +28,7 @@ from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
 from torchslam.errors import FrameError, SequenceError, TorchslamError
 from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular
+from torchslam.utils.text import printable
 
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
@@ -36,9 +38,17 @@ MAX_BYTES = 1 << 40
 MAX_FRAMES = 2_000_000
 """Maximum number of frames: 18 hours at 30 frames per second."""
 QUIET = 2.0
-"""Seconds of reading times before a progress bar appears."""
+"""Seconds of decoding before a progress bar appears."""
+MANY = 100
+"""Frames that are skipped with a progress bar."""
 MAX_ASPECT_ERROR = 0.02
 """Relative error of fy / fx of a given camera before a note says that the file contradicts it."""
+
+
+class Bar(tqdm):
+    """A progress bar without tqdm's monitor, which is a thread: this process may be forked."""
+
+    monitor_interval = 0
 
 
 class VideoSequence(Sequence):
@@ -136,15 +146,14 @@ class VideoSequence(Sequence):
                 yield times[-1]
             ended = True
 
-        with tqdm(
-            total=promised if 0 < promised <= MAX_FRAMES else None,
-            desc=f"times of the frames of {self._path.name}",
-            delay=QUIET,
-            leave=False,
-            **tqdm_options(),
-        ) as bar:
+        with self._bar("times of the frames", promised if 0 < promised <= MAX_FRAMES else None) as bar:
             need(times[frame] for frame in _rising(grabbed()))
         return first, times, ended
+
+    def _bar(self, what: str, total: int | None) -> Bar:
+        """A progress bar for what takes long."""
+        words = f"{what} of {printable(self._path.name)}"
+        return Bar(total=total, desc=words, delay=QUIET, leave=False, **tqdm_options())
 
     def _retrieve(self, where: str, error: type[TorchslamError]) -> np.ndarray | None:
         try:
@@ -164,10 +173,14 @@ class VideoSequence(Sequence):
         """The (H, W, 3) uint8 frame, blue first; those in between are skipped without conversion. Raises FrameError."""
         if frame < self._position:
             self._rewind()
-        while self._position < frame:
-            if not self._capture.grab():
-                return None
-            self._position += 1
+        skipped = frame - self._position
+        with self._bar(f"to frame {frame}", skipped) if skipped >= MANY else nullcontext() as bar:
+            while self._position < frame:
+                if not self._capture.grab():
+                    return None
+                self._position += 1
+                if bar is not None:
+                    bar.update()
         self._position += 1
         return self._retrieve(where, FrameError) if self._capture.grab() else None
 
