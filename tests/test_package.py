@@ -41,6 +41,14 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return built
 
 
+def test_the_recipe_for_an_opencv_of_ones_own_names_all_else_that_is_required() -> None:
+    page = (ROOT / "docs" / "install.md").read_text()
+    (recipe,) = re.findall(r"^pip install --no-deps \.\npip install (.+)$", page, re.MULTILINE)
+    required = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    names = {re.match(r"[A-Za-z0-9-]+", each)[0] for each in required}
+    assert set(recipe.split()) == names - {"opencv-python-headless"}
+
+
 @pytest.fixture(scope="module")
 def unpacked(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unpacked")

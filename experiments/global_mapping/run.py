@@ -117,7 +117,7 @@ def mapped(case: Columns, folder: Path) -> list[Columns]:
     start = time.process_time()
     sequence = open_sequence(place_of(case["sequence"]), limit=case["limit"])
     if case["unknown"] or sequence.calibrated is Calibrated.MISSING:
-        sequence = sequence.with_camera(unknown_camera(sequence.size), Calibrated.GUESSED)
+        sequence = sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
     config = Config()
     if sequence.calibrated is Calibrated.GUESSED:
         sequence, _ = find_camera(sequence, config, folder, device)

@@ -78,8 +78,8 @@ def page(history: list[Record]) -> str:
         return "\n".join([*lines, "There is no report yet.", ""])
     lines += ["![ATE and CPU time of every sequence, report by report](images/history.png)", ""]
     lines += [
-        "The newest figures of each sequence and benchmark. Times are CPU times, in parentheses if the machine was "
-        "busy.",
+        f"The newest figures of each sequence and benchmark, the last ones of {history[-1]['time'][:10]}: those of the "
+        "README are of today where they differ. Times are CPU times, in parentheses if the machine was busy.",
         "",
     ]
     newest: dict[str, Record] = {}

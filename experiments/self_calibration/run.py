@@ -91,7 +91,7 @@ def open_case(case: Case) -> tuple[Sequence, Sequence | None, Config]:
     config = load_config(None, case.overrides)
     path = place_of(case.name)
     unknown = open_sequence(path, "auto", limit=case.frames)
-    unknown = unknown.with_camera(unknown_camera(unknown.size), Calibrated.GUESSED)
+    unknown = unknown.with_camera(unknown_camera(unknown), Calibrated.GUESSED)
     if case.simulated:
         known: Sequence | None = open_sequence(path, limit=case.frames)
         assert known is not None

@@ -79,6 +79,21 @@ def test_the_camera_is_written_with_its_error_and_read_again(
     assert float(again.camera.focal) == pytest.approx(float(found.camera.focal), rel=1e-6)
 
 
+def test_the_ratio_of_the_focal_lengths_is_kept(
+    room: Sequence, searched: FocalSearch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As of a video whose pixels are 4:3."""
+    params = room.camera.params * torch.tensor([1.0, 4 / 3, 1.0, 1.0], dtype=torch.float64)
+    squeezed = room.with_camera(room.camera.with_params(params), Calibrated.GUESSED)
+    monkeypatch.setattr("torchslam.calibration.find_camera.search_focal", lambda *_: searched)
+    found, _ = find_camera(squeezed, Config(), tmp_path, CPU)
+    assert searched.found is not None
+    focal = float(searched.found.focal)
+    expected = [focal, 4 / 3 * focal, *room.camera.params[2:].tolist()]
+    assert found.camera.params.tolist() == pytest.approx(expected)
+    assert read_numbers(tmp_path / "calibration.txt").params == pytest.approx(expected)
+
+
 def test_undetermined_focal_lengths_stay_a_guess(
     room: Sequence, searched: FocalSearch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

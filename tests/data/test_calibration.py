@@ -7,7 +7,9 @@ from pathlib import Path
 import pytest
 
 from torchslam.data import parse_camera, read_calibration
+from torchslam.data.calibration import write_calibration
 from torchslam.errors import CalibrationError
+from torchslam.geometry import Camera
 
 
 @pytest.mark.parametrize(
@@ -73,6 +75,53 @@ def test_bad_distortion_names_its_own_file(tmp_path: Path, text: str, message: s
     (tmp_path / "distortion.txt").write_text(text)
     with pytest.raises(CalibrationError, match=rf"distortion\.txt:1: .*{message}"):
         read_calibration(tmp_path / "calibration.txt")
+
+
+@pytest.mark.parametrize(
+    ("numbers", "size", "fitting"),
+    [
+        ("1000,1000,639.5,479.5", (640, 480), "1280 x 960"),
+        ("250,250,159.5,119.5", (640, 480), "320 x 240"),
+        ("500,500,319.5,239.5", (640, 360), "640 x 480"),
+        ("500,500,319.5,239.5", (480, 640), "640 x 480"),
+        ("600,600,383.5,287.5,0.1,0,0,0", (640, 480), "768 x 576"),
+        ("fisheye,500,500,0,0,0,0,0,0", (640, 480), "1 x 1"),
+    ],
+)
+def test_a_calibration_of_another_size_that_states_none(
+    numbers: str, size: tuple[int, int], fitting: str
+) -> None:
+    message = (
+        f"--camera: the principal point .* is far from the middle of images of {size[0]}x{size[1]}: "
+        f"it would fit about {fitting} pixels; give the calibration of this size"
+    )
+    with pytest.raises(CalibrationError, match=message):
+        parse_camera(numbers, size)
+
+
+def test_principal_points_of_real_cameras_are_accepted(tmp_path: Path) -> None:
+    for numbers, size in (
+        ("517,516,318.6,255.3", (640, 480)),
+        ("552.55,552.55,682.05,238.77", (1408, 376)),  # KITTI-360, rectified
+        ("1266,1266,816.3,491.5", (1600, 900)),  # nuScenes
+    ):
+        assert parse_camera(numbers, size).size == size
+    cropped = tmp_path / "cropped.yaml"
+    cropped.write_text("fx: 500\nfy: 500\ncx: 100\ncy: 50\nimage_width: 640\nimage_height: 480\n")
+    assert parse_camera(str(cropped), (640, 480)).params.tolist() == [500, 500, 100, 50]
+
+
+def test_a_written_calibration_states_its_size(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.txt"
+    camera = Camera.pinhole(500.0, 500.0, 100.0, 50.0, size=(640, 480))
+    write_calibration(path, camera, ["by hand"], std=0.01)
+    found = read_calibration(path)
+    assert (found.size, found.std) == ((640, 480), 0.01)
+    assert found.camera((640, 480)).params.tolist() == camera.params.tolist()
+    with pytest.raises(
+        CalibrationError, match=r"calibration\.txt:6: .* images of 640x480, these are 320x240"
+    ):
+        found.camera((320, 240))
 
 
 def test_missing_file(tmp_path: Path) -> None:

@@ -286,6 +286,172 @@ def test_fisheyes(tmp_path: Path, name: str, text: str, params: list[float]) -> 
     assert calibration.params == pytest.approx(params)
 
 
+PYYAML = """camera_matrix:
+- - 500.0
+  - 0.0
+  - 320.5
+- - 0.0
+  - 501.0
+  - 240.25
+- - 0.0
+  - 0.0
+  - 1.0
+dist_coeff:
+- - 0.1
+  - -0.2
+  - 0.01
+  - 0.02
+  - 0.0
+"""
+LISTED = '{"K": [[500, 0, 320.5], [0, 501, 240.25], [0, 0, 1]], "D": [0.1, -0.2, 0.01, 0.02], "image_size": [640, 480]}'
+VINS = """%YAML:1.0
+---
+model_type: PINHOLE
+camera_name: front
+image_width: 640
+image_height: 480
+distortion_parameters:
+   k1: 0.1
+   k2: -0.2
+   p1: 0.01
+   p2: 0.02
+projection_parameters:
+   fx: 500.0
+   fy: 501.0
+   cx: 320.5
+   cy: 240.25
+"""
+STELLA = """Camera:
+  name: "a front camera"
+  setup: "monocular"
+  model: "perspective"
+  fx: 500.0
+  fy: 501.0
+  cx: 320.5
+  cy: 240.25
+  k1: 0.1
+  k2: -0.2
+  p1: 0.01
+  p2: 0.02
+  k3: 0.0
+  fps: 30.0
+  cols: 640
+  rows: 480
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("pyyaml.yaml", PYYAML),
+        (
+            "flow.yaml",
+            "camera_matrix: [[500.0, 0, 320.5], [0, 501, 240.25],\n  [0, 0, 1]]\ndist: [[.1, -.2, .01, .02]]\n",
+        ),
+        ("json.json", LISTED),
+        ("vins.yaml", VINS),
+        ("stella.yaml", STELLA),
+        ("stella.yaml", STELLA.replace("\n  ", "\nCamera.").replace("Camera:\n", "")),
+        ("scalars.yaml", "K: [500, 0, 320.5, 0, 501, 240.25, 0, 0, 1]\nk1: .1\nk2: -.2\np1: .01\np2: .02\n"),
+        ("named.yaml", PYYAML.replace("dist_coeff", "distCoeffs")),
+        (
+            "nested.yaml",
+            "left:\n" + "".join(f"  {line}\n" for line in PYYAML.splitlines()) + "right:\n  K: []\n",
+        ),
+        ("tuple.yaml", PYYAML.replace("dist_coeff:", "dist_coeff: !!python/tuple")),
+    ],
+)
+def test_distortions_by_any_name_are_read(tmp_path: Path, name: str, text: str) -> None:
+    (tmp_path / name).write_text(text)
+    calibration = read_calibration(tmp_path / name)
+    assert calibration.params == pytest.approx(BROWN)
+    assert calibration.size == (VGA if "640" in text else None)
+
+
+@pytest.mark.parametrize("suffix", ["yml", "xml", "json"])
+@pytest.mark.parametrize("model", [0, 1])
+def test_opencv_files_say_whether_they_are_of_a_fisheye(tmp_path: Path, suffix: str, model: int) -> None:
+    path = tmp_path / f"camera.{suffix}"
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_WRITE)
+    storage.write("camera_matrix", np.array([[500, 0, 320.5], [0, 501, 240.25], [0, 0, 1.0]]))
+    storage.write("fisheye_model", model)
+    storage.write("distortion_coefficients", np.array([[0.1], [-0.2], [0.01], [0.02]]))
+    storage.release()
+    calibration = read_calibration(path)
+    assert calibration.model == ("fisheye" if model else "radial_tangential")
+    assert calibration.params[:8] == pytest.approx(BROWN[:8])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "message"),
+    [
+        ("a.yaml", PYYAML.replace("dist_coeff", "my_distortion"), "`my_distortion` looks like a distortion"),
+        ("a.yaml", PYYAML + "distortion_coefficients_2: [0.1]\n", "`distortion_coefficients_2` looks like"),
+        ("a.yaml", ORB_SLAM + "Camera1.p3: 0.1\n", "`Camera1.p3` looks like a distortion"),
+        ("a.yaml", ORB_SLAM + "Camera1.k4: 0.1\n", "more than k1 k2 p1 p2 k3"),
+        ("a.yaml", PYYAML + "xi: 1.2\n", r"camera model `omnidirectional` \(xi\) is not known"),
+        ("a.yaml", ORB_SLAM.replace("PinHole", "OCam"), "camera model `ocam` is not known"),
+        ("a.yaml", STELLA.replace("perspective", "equirectangular"), "camera model `equirectangular`"),
+        ("a.yaml", VINS.replace("PINHOLE", "MEI"), "camera model `mei` is not known"),
+        ("a.yaml", "model_type: SCARAMUZZA\n", "camera model `scaramuzza` is not known"),
+        ("a.yaml", ROS.replace("plumb_bob", "thin_prism"), "distortion model `thin_prism` is not known"),
+        ("a.json", NERFSTUDIO.replace("OPENCV", "FISHEYE624"), "camera model `fisheye624` is not known"),
+        ("a.json", NERFSTUDIO.replace("OPENCV", "EQUIRECTANGULAR"), "camera model `equirectangular`"),
+        (
+            "a.json",
+            '{"model": "Inverse Brown Conrady", "fx": 5, "fy": 5, "ppx": 3, "ppy": 2}',
+            "`inverse brown",
+        ),
+        (
+            "a.xml",
+            "<a><K>5 0 3 0 5 2 0 0 1</K><distortion_model>omni</distortion_model></a>",
+            "distortion model `omni` is not known",
+        ),
+        (
+            "a.json",
+            NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k1": 0.3'),
+            "frame images/0.png has a k1 of its own",
+        ),
+        (
+            "a.json",
+            NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k4": 0.3'),
+            "frame images/0.png has a k4 of its own",
+        ),
+        ("a.txt", "1 FISHEYE624 64 48 5 5 3 2\n", "camera model FISHEYE624 is not known"),
+        ("a.yaml", "K: [5, 0, 0, 0, 5, 0, 3, 2, 1]\n", "a camera matrix is fx 0 cx, 0 fy cy, 0 0 1, not"),
+        ("a.yaml", "K: [5, 1, 3, 0, 5, 2, 0, 0, 1]\n", "a skew of 1 is not modeled"),
+    ],
+)
+def test_models_and_distortions_that_are_not_understood(
+    tmp_path: Path, name: str, text: str, message: str
+) -> None:
+    (tmp_path / name).write_text(text)
+    with pytest.raises(CalibrationError, match=rf"{name}: .*{message}"):
+        read_calibration(tmp_path / name)
+
+
+def test_zeros_and_distances_are_no_distortion(tmp_path: Path) -> None:
+    text = PYYAML + "k4: 0\nmarker_distance: 2.5\nfisheye: false\ndistortion_type: none\n"
+    (tmp_path / "a.yaml").write_text(text)
+    assert read_calibration(tmp_path / "a.yaml").params == pytest.approx(BROWN)
+
+
+def test_frames_that_repeat_the_shared_camera(tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_text(
+        NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k1": 0.1, "w": 640')
+    )
+    assert read_calibration(tmp_path / "a.json").params == pytest.approx(BROWN)
+
+
+@pytest.mark.parametrize("text", ['"is_fisheye": true', '"camera_model": "OPENCV_FISHEYE"'])
+def test_fisheyes_of_nerfs(tmp_path: Path, text: str) -> None:
+    start = NERFSTUDIO.replace('"camera_model": "OPENCV"', text).replace("p1", "k3").replace("p2", "k4")
+    (tmp_path / "a.json").write_text(start)
+    calibration = read_calibration(tmp_path / "a.json")
+    assert calibration.model == "fisheye"
+    assert calibration.params == pytest.approx(BROWN[:8])
+
+
 def test_angle_of_a_blender_scene(tmp_path: Path) -> None:
     (tmp_path / "t.json").write_text(f'{{"camera_angle_x": {math.pi / 2}, "w": 640, "h": 480, "frames": []}}')
     assert read_calibration(tmp_path / "t.json").params == pytest.approx([320, 320, 319.5, 239.5])
@@ -305,13 +471,13 @@ def test_angle_of_a_blender_scene(tmp_path: Path) -> None:
         ("a.txt", "1 OPENCV 640 480 500 501 320 240\n", "OPENCV has the parameters fx fy"),
         ("a.txt", "1 FOV 640 480 500 501 320 240 1\n", "camera model FOV is not known"),
         ("a.txt", "1 PINHOLE 4 4 5 5 3 2\n2 PINHOLE 4 4 5 5 3 2\n", "2 cameras"),
-        ("a.json", "{}", "no fl_x in it"),
+        ("a.json", "{}", "no camera in it; looked for"),
         ("a.json", "{]", "not valid JSON"),
-        ("a.json", '{"fl_x": NaN}', "not finite"),
+        ("a.json", '{"fl_x": NaN}', "fl_x: nan is not finite"),
         ("a.json", '{"fl_x": 500}', "no cx in it"),
         ("a.xml", "<a>", "not valid XML"),
         ("a.xml", "<!DOCTYPE a [<!ENTITY b 'c'>]><a/>", "entities are not read"),
-        ("a.xml", "<a/>", "no camera_matrix"),
+        ("a.xml", "<a/>", "no camera in it; looked for"),
     ],
 )
 def test_wrong_files(tmp_path: Path, name: str, text: str, message: str) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.data.mp4 import write_mp4
 from torchslam.data import open_sequence
 from torchslam.data.formats import image_file as image_files
 from torchslam.errors import CalibrationError, FrameError, SequenceError
@@ -117,6 +118,57 @@ def test_zip(tmp_path: Path, tum_folder: Callable[..., Path]) -> None:
     assert kept.exists()
     del part
     assert not kept.exists()
+
+
+def pack(archive: Path, files: dict[str, bytes]) -> Path:
+    with zipfile.ZipFile(archive, "w") as packed:
+        for name, content in files.items():
+            packed.writestr(name, content)
+    return archive
+
+
+def test_zip_of_a_video(tmp_path: Path) -> None:
+    write_mp4(tmp_path / "clip.mp4", [np.full((48, 64, 3), 40 * index, np.uint8) for index in range(3)])
+    video = (tmp_path / "clip.mp4").read_bytes()
+    for files in (
+        {"clip.mp4": video},
+        {"clip.mp4": video, "__MACOSX/._clip.mp4": b"x", ".DS_Store": b"x", "notes.txt": b"x"},
+        {"folder/clip.mp4": video, "folder/notes.txt": b"x"},
+    ):
+        sequence = open_sequence(pack(tmp_path / "a.zip", files), CAMERA, limit=2)
+        assert (sequence.name, sequence.kind, len(sequence)) == ("clip", "video", 2)
+        assert float(sequence.image(1).mean()) == pytest.approx(40 / 255, abs=0.02)
+
+
+def test_zip_of_a_mac(tmp_path: Path, tum_folder: Callable[..., Path]) -> None:
+    folder = tum_folder()
+    files = {
+        f"desk/{path.relative_to(folder)}": path.read_bytes() for path in folder.rglob("*") if path.is_file()
+    }
+    files |= {"__MACOSX/desk/rgb/._0.png": b"x", ".DS_Store": b"x"}
+    assert len(open_sequence(pack(tmp_path / "a.zip", files))) == 5
+
+
+def test_zips_without_one_sequence(tmp_path: Path) -> None:
+    write_mp4(tmp_path / "clip.mp4", [np.full((48, 64, 3), 40 * index, np.uint8) for index in range(3)])
+    video = (tmp_path / "clip.mp4").read_bytes()
+    for files, message in (
+        (
+            {"a.mp4": video, "b.mp4": video},
+            r"holds 2 sequences \(a\.mp4, b\.mp4\); unpack it and open one of them$",
+        ),
+        (
+            {f"{side}{index}.png": b"x" for side in ("left-", "right-0") for index in range(3)},
+            r"several series of images .* Give '.*left-\*\.png' or '.*right-\*\.png'; unpack it first$",
+        ),
+        ({"inner.zip": b"x"}, r"holds archives \(inner\.zip\); unpack it and open one$"),
+        ({"depth/1.png": b"x", "a/b/c.mp4": video}, r"no images .*, no video and no other sequence in it$"),
+        ({"clip.mp4": b"no video" * 100}, r"a\.zip/clip\.mp4: cannot be read as a video$"),
+    ):
+        with pytest.raises(SequenceError, match=message) as caught:
+            open_sequence(pack(tmp_path / "a.zip", files), CAMERA)
+        assert "did you mean" not in str(caught.value)
+        assert "torchslam-" not in str(caught.value)
 
 
 def test_wrong_archives(tmp_path: Path) -> None:

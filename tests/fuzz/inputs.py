@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from tests.fuzz import valid_inputs
+from tests.fuzz import conventions, valid_inputs
 from tests.fuzz.mutators import Mutated, mutate, write
 from tests.fuzz.readers import Reader
 from torchslam.errors import TorchslamError
@@ -50,6 +50,8 @@ def mutated(reader: Reader, number: int) -> Mutated:
     files = dict(reader.files)
     if reader.name == "settings of a run":
         return {"argument": valid_inputs.absurd_setting(rng).encode()}
+    if reader.name == "calibration conventions":
+        return dict(conventions.example(rng))
     if "argument" in files:
         examples = valid_inputs.OVERRIDES if reader.name == "--set" else valid_inputs.CAMERA_ARGUMENTS
         files["argument"] = rng.choice(examples).encode()

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
@@ -15,7 +16,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from tests.fuzz import valid_inputs
+from tests.fuzz import conventions, valid_inputs
 from tests.fuzz.mutators import Files
 from tests.fuzz.sample_files import CONFIG, OVERRIDES, WALK, sample_files
 from tests.walks import T_cw
@@ -97,6 +98,13 @@ def readers() -> dict[str, Reader]:
         Reader("camera argument", lambda: {"argument": b""}, _camera_argument, 700),
         Reader("frame arguments", valid_inputs.folder, _frame_arguments, 700),
         Reader("trajectory", lambda: {"t.txt": valid_inputs.trajectory_text(6).encode()}, _trajectory, 1000),
+        Reader(
+            "calibration conventions",
+            lambda: conventions.example(random.Random("calibration conventions")),
+            conventions.check,
+            1500,
+        ),
+        Reader("zip of a video", valid_inputs.zipped_video, partial(_sequence, name="v.zip"), 300),
         Reader("colmap binary", partial(_some, "colmap", "cameras.bin", "images.bin"), read_poses, 600),
         Reader("colmap text", partial(_some, "colmap", "cameras.txt", "images.txt"), read_poses, 600),
         Reader("transforms.json", partial(_some, "transforms", "transforms.json"), read_poses, 900),

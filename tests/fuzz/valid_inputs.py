@@ -153,6 +153,14 @@ def zipped() -> Files:
     return {"desk.zip": buffer.getvalue()}
 
 
+def zipped_video() -> Files:
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("v.mp4", videos()["mp4"]["v.mp4"])
+        archive.writestr("__MACOSX/._v.mp4", b"x")
+    return {"v.zip": buffer.getvalue()}
+
+
 @cache
 def videos() -> dict[str, Files]:
     found = {}
@@ -212,6 +220,21 @@ CALIBRATIONS: dict[str, Files] = {
         "c.yaml": b'%YAML:1.0\nCamera.type: "KannalaBrandt8"\nCamera1.fx: 60.0\nCamera1.fy: 61.0\nCamera1.cx: 31.5\n'
         b"Camera1.cy: 23.5\nCamera1.k1: 0.01\nCamera1.k2: 0.0\nCamera1.k3: 0\nCamera1.k4: 0\nCamera.width: 64\n"
         b"Camera.height: 48\nCamera.fps: 20\n"
+    },
+    "pyyaml.yaml": {
+        "c.yaml": b"K:\n- - 60.0\n  - 0.0\n  - 31.5\n- - 0.0\n  - 61.0\n  - 23.5\n- - 0.0\n  - 0.0\n  - 1.0\n"
+        b"dist_coeff:\n- - -0.1\n  - 0.01\n  - 0.0\n  - 0.0\n  - 0.0\n"
+    },
+    "stella.yaml": {
+        "c.yaml": b'Camera:\n  model: "fisheye"\n  fx: 60.0\n  fy: 61.0\n  cx: 31.5\n  cy: 23.5\n  k1: 0.01\n'
+        b"  k2: 0.0\n  k3: 0\n  k4: 0\n  cols: 64\n  rows: 48\n"
+    },
+    "vins.yaml": {
+        "c.yaml": b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 64\nimage_height: 48\ndistortion_parameters:\n"
+        b"   k1: -0.1\n   k2: 0.01\nprojection_parameters:\n   fx: 60.0\n   fy: 61.0\n   cx: 31.5\n   cy: 23.5\n"
+    },
+    "lists.json": {
+        "c.json": b'{"camera_matrix": [[60, 0, 31.5], [0, 61, 23.5], [0, 0, 1]], "dist": [-0.1, 0.01, 0, 0]}'
     },
     "colmap.txt": {"c.txt": b"# Camera list\n1 OPENCV 64 48 60 61 32 24 -0.1 0.01 0.001 0.002\n"},
     "transforms.json": {

@@ -171,7 +171,7 @@ def _run(task: Task, folder: Path) -> Columns:
     camera = ""
     start = time.process_time()
     if sequence.calibrated is Calibrated.MISSING:
-        sequence = sequence.with_camera(unknown_camera(sequence.size), Calibrated.GUESSED)
+        sequence = sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
     if sequence.calibrated is Calibrated.GUESSED:
         sequence, camera = find_camera(sequence, config, folder, device)
     config = with_stated_std(config, sequence)

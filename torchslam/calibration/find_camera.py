@@ -62,8 +62,8 @@ def find_camera(
     search = search_focal(sequence, config, device)
     camera, std = sequence.camera, GUESS_STD
     if search.found is not None and search.is_determined:
-        focal = search.found.focal.detach()
-        camera = camera.with_params(torch.cat([focal.to(camera.params).expand(2), camera.params[2:]]))
+        ratio = search.found.focal.detach().to(camera.params) / camera.fx
+        camera = camera.with_params(torch.cat([ratio * camera.params[:2], camera.params[2:]]))
         std = max(LEAST_STD, STD_FACTOR * float(search.found.std))
     description = describe_search(search, camera)
     write_calibration(path, camera, [description], std)

@@ -43,7 +43,7 @@ class FocalSearch:
     """What pairs of images say of an unknown camera.
 
     Attributes:
-        found: the focal length with its standard error; None with too few pairs.
+        found: fx with its standard error; None with too few pairs.
         pairs: number of pairs.
         images: number of images.
     """
@@ -67,7 +67,7 @@ def search_focal(
     """Find the focal length by pairs of images; unreadable images are left out, the run itself reports them.
 
     Args:
-        sequence: with a guessed camera, of which the principal point is used.
+        sequence: with a guessed camera, of which the principal point and fy / fx are used.
         config: of the run.
         device: of torch.
         progress: called with the number of images done, and of all.
@@ -115,14 +115,17 @@ def _fundamental(
     if len(at_1) < MIN_MATCHES:
         return None
     pixels_1, pixels_2 = one.keypoints[at_1].cpu(), other.keypoints[at_2].cpu()
-    F, mask = cv2.findFundamentalMat(
-        pixels_1.numpy(),
-        pixels_2.numpy(),
-        cv2.USAC_MAGSAC,
-        THRESHOLD_PX * scale,
-        CONFIDENCE,
-        MAX_SAMPLES,
-    )
+    try:
+        F, mask = cv2.findFundamentalMat(
+            pixels_1.numpy(),
+            pixels_2.numpy(),
+            cv2.USAC_MAGSAC,
+            THRESHOLD_PX * scale,
+            CONFIDENCE,
+            MAX_SAMPLES,
+        )
+    except cv2.error:  # so OpenCV says of some degenerate matches that it found no matrix
+        return None
     if F is None or F.shape != (3, 3) or np.count_nonzero(mask) < MIN_MATCHES:
         return None
     agreeing = torch.from_numpy(mask[:, 0] > 0)
@@ -130,20 +133,23 @@ def _fundamental(
 
 
 def _solve(pairs: list[tuple[Tensor, Tensor, Tensor]], camera: Camera, scale: float) -> ViewGraphFocal:
-    """The focal length of all pairs."""
-    F = torch.stack([pair[0] for pair in pairs]).double()
+    """fx by all pairs, in images that are scaled in height so that their pixels are square."""
+    stretch = torch.stack([torch.ones(()), (camera.fx / camera.fy).detach().cpu(), torch.ones(())]).double()
+    F = torch.stack([pair[0] for pair in pairs]).double() / (stretch[:, None] * stretch)
     pixels_1, pixels_2 = (
-        torch.nn.utils.rnn.pad_sequence([pair[side] for pair in pairs], batch_first=True) for side in (1, 2)
+        torch.nn.utils.rnn.pad_sequence([pair[side] for pair in pairs], batch_first=True).double()
+        * stretch[:2]
+        for side in (1, 2)
     )
     mask = torch.nn.utils.rnn.pad_sequence(
         [torch.ones(len(pair[1]), dtype=torch.bool) for pair in pairs], batch_first=True
     )
     return focal_from_pairs(
         F,
-        pixels_1.double(),
-        pixels_2.double(),
+        pixels_1,
+        pixels_2,
         mask,
-        camera.params[2:4].detach().cpu().double(),
-        camera.size,
+        camera.params[2:4].detach().cpu().double() * stretch[:2],
+        (camera.width, round(camera.height * float(stretch[1]))),
         threshold=THRESHOLD_PX * scale,
     )

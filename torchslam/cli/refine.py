@@ -137,7 +137,7 @@ def _with_camera(sequence: Sequence, given: GivenPoses, camera: str | None) -> S
         return sequence.with_camera(fit_camera(given.calibration, sequence.size, str(given.path)))
     if sequence.calibrated is Calibrated.MISSING:
         print("torchslam: no calibration found; estimating intrinsics from the images", file=sys.stderr)
-        return sequence.with_camera(unknown_camera(sequence.size), Calibrated.GUESSED)
+        return sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
     return sequence
 
 

@@ -239,7 +239,7 @@ def _sequence(options: argparse.Namespace) -> Sequence:
         "torchslam: no calibration found; estimating intrinsics from the images (--camera auto)",
         file=sys.stderr,
     )
-    return found.with_camera(unknown_camera(found.size), Calibrated.GUESSED)
+    return found.with_camera(unknown_camera(found), Calibrated.GUESSED)
 
 
 @dataclass(frozen=True)

@@ -19,6 +19,12 @@ NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3
 
 Size = tuple[int, int]
 
+MAX_OFF_CENTER = 0.08
+"""Largest distance of the principal point from the middle, in longer sides of the image, without a stated size.
+
+The real cameras of the presets have up to 0.02; the rectified ones of KITTI-360 have 0.04. Half of a 4:3 image that is
+shown as 16:9, or a calibration made at 1.2 times the size, has 0.09 or more."""
+
 
 @dataclass(frozen=True)
 class Calibration:
@@ -67,6 +73,8 @@ class Calibration:
 
     def camera(self, size: Size) -> Camera:
         """Return the camera for images of `size`. Raises CalibrationError if it is for another size."""
+        if self.size is None:
+            self._check_center(size)
         if self.size not in (None, size):
             raise CalibrationError(
                 f"{self.source}: the camera is for images of {size_text(self.size or size)}, "
@@ -74,13 +82,26 @@ class Calibration:
             )
         return Camera(self.model, torch.tensor(self.params, dtype=torch.float64), size)
 
+    def _check_center(self, size: Size) -> None:
+        """Raise CalibrationError if the principal point says that the camera is for another size."""
+        center = self.params[2], self.params[3]
+        off = max(abs(at - (side - 1) / 2) for at, side in zip(center, size, strict=True))
+        if off <= MAX_OFF_CENTER * max(size):
+            return
+        fitting = " x ".join(f"{2 * at + 1:.0f}" for at in center)
+        raise CalibrationError(
+            f"{self.source}: the principal point {center[0]:g}, {center[1]:g} is far from the middle of images of "
+            f"{size_text(size)}: it would fit about {fitting} pixels; give the calibration of this size, or, if the "
+            "images are cropped, a file that states their size (image_width, image_height)"
+        )
+
 
 @dataclass(frozen=True)
 class FocalGuess:
-    """A guessed focal length: square pixels, no distortion, centered principal point.
+    """A guessed focal length: no distortion, centered principal point.
 
     Attributes:
-        focal: in units of `unit`: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
+        focal: fx in units of `unit`: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
         source: origin of the guess, for messages.
     """
 
@@ -89,11 +110,12 @@ class FocalGuess:
     source: str
     guessed: bool = True
 
-    def camera(self, size: Size) -> Camera:
-        """The camera for images of `size`."""
-        unit = {"px": 1.0, "w": float(size[0]), "diagonal": math.hypot(*size)}[self.unit]
+    def camera(self, size: Size, pixel_aspect: float = 1.0) -> Camera:
+        """The camera for images of `size`, with pixels of that ratio of width to height."""
+        width, height = size
+        unit = {"px": 1.0, "w": float(width), "diagonal": math.hypot(width, height / pixel_aspect)}[self.unit]
         focal = self.focal * unit
-        return Camera.pinhole(focal, focal, (size[0] - 1) / 2, (size[1] - 1) / 2, size=size)
+        return Camera.pinhole(focal, focal * pixel_aspect, (width - 1) / 2, (height - 1) / 2, size=size)
 
 
 @dataclass(frozen=True)
@@ -143,7 +165,8 @@ def read_numbers(path: Path) -> Calibration:
     Raises CalibrationError naming file and line.
     """
     number, line = _first_line(path)
-    calibration = replace(parse_numbers(line, f"{path}:{number}"), std=_stated_std(path))
+    size, std = _stated(path)
+    calibration = replace(parse_numbers(line, f"{path}:{number}"), size=size, std=std)
     distortion = path.with_name("distortion.txt")
     if len(calibration.params) > 4 or path == distortion or not distortion.is_file():
         return calibration
@@ -153,15 +176,17 @@ def read_numbers(path: Path) -> Calibration:
     if len(numbers) not in (4, 5):
         raise CalibrationError(f"{where}: expected k1 k2 p1 p2 [k3], got {len(numbers)} numbers")
     whole = Calibration.from_numbers([*calibration.params, *numbers], calibration.source)
-    return replace(whole, std=calibration.std)
+    return replace(whole, size=calibration.size, std=calibration.std)
 
 
-def _stated_std(path: Path) -> float | None:
-    """The relative standard deviation that `write_calibration` wrote; None without one."""
+def _stated(path: Path) -> tuple[Size | None, float | None]:
+    """The image size and the relative standard deviation that `write_calibration` wrote; None without."""
     if not is_found(path):
-        return None
-    found = re.search(rf"^# {FOCAL_STD}: ([0-9.e+-]+)$", path.read_text(encoding="utf-8"), re.MULTILINE)
-    return None if found is None else float(found[1])
+        return None, None
+    text = path.read_text(encoding="utf-8")
+    size = re.search(rf"^# {IMAGE_SIZE}: (\d{{1,9}})x(\d{{1,9}})$", text, re.MULTILINE)
+    std = re.search(rf"^# {FOCAL_STD}: ([0-9.e+-]+)$", text, re.MULTILINE)
+    return None if size is None else (int(size[1]), int(size[2])), None if std is None else float(std[1])
 
 
 def _first_line(path: Path) -> tuple[int, str]:
@@ -211,6 +236,7 @@ _CAMERAS: dict[str, tuple[Calibration, ...]] = {
 PRESETS = {name: Preset(name, cameras) for name, cameras in _CAMERAS.items()}
 
 ESTIMATED_HEADER = "# torchslam: camera estimated from the images"
+IMAGE_SIZE = "size of the images"
 FOCAL_STD = "relative standard error of the focal length"
 PARAMETER_NAMES = {
     "pinhole": "fx fy cx cy",
@@ -239,7 +265,8 @@ def write_calibration(path: Path, camera: Camera, remarks: list[str], std: float
         remarks: comments, one line each.
         std: relative standard deviation of the focal length, if known.
     """
-    stated = [] if std is None else [f"{FOCAL_STD}: {std:.2g}"]
+    stated = [f"{IMAGE_SIZE}: {size_text(camera.size)}"]
+    stated += [] if std is None else [f"{FOCAL_STD}: {std:.2g}"]
     model = "" if camera.model != "fisheye" else "fisheye "
     numbers = " ".join(f"{number:.9g}" for number in camera.params.tolist())
     lines = [

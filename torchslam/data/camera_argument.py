@@ -9,6 +9,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from PIL import Image
 
@@ -28,6 +29,9 @@ from torchslam.data.formats.text_file import parse_floats
 from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
 from torchslam.utils.files import read_bytes
+
+if TYPE_CHECKING:
+    from torchslam.data.sequence import Sequence
 
 EXIF_BLOCK = 0x8769
 FOCAL_LENGTH_35MM = 0xA405
@@ -114,14 +118,19 @@ def parse_calibration(text: str, source: str = "--camera") -> Calibration | Foca
     return parse_numbers(text, source)
 
 
-def fit_camera(camera: GivenCamera, size: Size, where: str, example: Path | None = None) -> Camera:
+def fit_camera(
+    camera: GivenCamera, size: Size, where: str, example: Path | None = None, pixel_aspect: float = 1.0
+) -> Camera:
     """Return the camera for images of `size`. Raises CalibrationError at `where` for a camera of another size.
 
     Args:
         example: an image file of the sequence, for its EXIF block
+        pixel_aspect: width to height of a pixel; the fy / fx of a focal length that is guessed
     """
     if isinstance(camera, FromExif) and example is not None:
-        return read_focal(example).camera(size)
+        camera = read_focal(example)
+    if isinstance(camera, FocalGuess):
+        return camera.camera(size, pixel_aspect)
     if not isinstance(camera, Camera):
         return camera.camera(size)
     if camera.size != size:
@@ -131,9 +140,9 @@ def fit_camera(camera: GivenCamera, size: Size, where: str, example: Path | None
     return camera
 
 
-def unknown_camera(size: Size) -> Camera:
-    """Return the initial guess of an unknown camera."""
-    return UNKNOWN.camera(size)
+def unknown_camera(sequence: Sequence) -> Camera:
+    """Return the initial guess of the unknown camera of a sequence."""
+    return UNKNOWN.camera(sequence.size, sequence.pixel_aspect)
 
 
 def is_guessed(camera: GivenCamera | None) -> bool:

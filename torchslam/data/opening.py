@@ -23,9 +23,9 @@ from torchslam.data.readers.kitti import KITTI, KITTI_RAW
 from torchslam.data.readers.live import LIVE, is_address, is_live
 from torchslam.data.readers.rgbd import ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
 from torchslam.data.readers.video import VIDEO
-from torchslam.data.sequence import Reader, Sequence
+from torchslam.data.sequence import Need, Reader, Sequence, exhaust
 from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
-from torchslam.data.transforms import Masked, cut, reduce_rate, resize
+from torchslam.data.transforms import Masked, cut, need, reduce_rate, resize
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
 from torchslam.geometry.camera import Camera
 from torchslam.utils.text import without_credentials
@@ -71,7 +71,10 @@ def open_sequence(
         raise SequenceError(f"{path}: frames per second must be positive, not {fps:g}")
     given = parse_calibration(str(camera)) if isinstance(camera, str | Path) else camera
     try:
-        sequence = _open(str(path), given, fps)
+        most = None if limit is None else limit * stride
+        # A folder of masks may be matched by the number of all frames.
+        is_whole = mask is not None and Path(mask).is_dir()
+        sequence = _open(str(path), given, fps, exhaust if is_whole else need(start, stop, fps, most))
         if isinstance(given, Calibration):
             sequence.camera_std = given.std
         if mask is not None:
@@ -99,12 +102,14 @@ def find_reader(path: str) -> Reader | None:
     return next((reader for reader in READERS if reader.matches(path)), None)
 
 
-def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence:
+def _open(path: str, camera: GivenCamera | None, rate: float | None, needed: Need) -> Sequence:
     if _is_archive(path):
-        return _open_archive(path, lambda folder: _open(folder, camera, rate))
+        return _open_archive(path, lambda folder: _open(folder, camera, rate, needed))
     reader = find_reader(path)
     if reader is None:
         raise SequenceError(_not_found_message(path))
+    if reader.open_needed is not None:
+        return reader.open_needed(path, camera, rate, needed)
     return reader.open(path, camera, rate)
 
 
@@ -126,16 +131,44 @@ def _open_archive(path: str, open_folder: OpenFolder) -> Sequence:
     folder = Path(holder.name) / archive.stem
     try:
         unpack(archive, folder)
-        sequence = open_folder(str(folder))
+        sequence = open_folder(_only_sequence(archive, folder))
     except BaseException as error:
         holder.cleanup()
         if isinstance(error, DownloadError):
             raise SequenceError(str(error)) from error
         if isinstance(error, TorchslamError):
-            raise type(error)(str(error).replace(str(folder), path)) from error
+            message = str(error).replace(str(folder), path)
+            hint = "; unpack it first" if f"'{path}/" in message else ""  # a part of it cannot be opened
+            raise type(error)(message + hint) from error
         raise
     sequence.holder = holder  # the files are deleted with the sequence
     return sequence
+
+
+def _only_sequence(archive: Path, folder: Path) -> str:
+    """Return the folder of an unpacked archive, or the one file or folder in it that is a sequence.
+
+    Raises SequenceError for several of them: what is in an archive cannot be named.
+    """
+    if find_reader(str(folder)):
+        return str(folder)
+    inside = [entry for entry in _entries(folder) if not entry.name.startswith((".", "__MACOSX"))]
+    found = [entry for entry in inside if find_reader(str(entry))]
+    if len(found) == 1:
+        return str(found[0])
+    if found:
+        names = ", ".join(entry.name for entry in found[:SHOWN])
+        raise SequenceError(
+            f"{archive}: holds {len(found)} sequences ({names}{', ...' * (len(found) > SHOWN)}); "
+            "unpack it and open one of them"
+        )
+    packed = [entry.name for entry in inside if entry.suffix.lower() == ".zip"]
+    if packed:
+        raise SequenceError(
+            f"{archive}: holds archives ({', '.join(packed[:SHOWN])}); unpack it and open one"
+        )
+    suffixes = ", ".join(sorted(SUFFIXES))
+    raise SequenceError(f"{archive}: no images ({suffixes}), no video and no other sequence in it")
 
 
 MAX_ENTRIES = 10_000

@@ -6,6 +6,7 @@ import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -21,6 +22,18 @@ from torchslam.utils.text import printable, without_credentials
 
 if TYPE_CHECKING:
     from torchslam.data.camera_argument import GivenCamera
+
+MAX_ASPECT_TERM = 100
+"""Largest number in the ratio of the sides of a pixel, as it is shown."""
+Need = Callable[[Iterable[float]], None]
+"""Takes the times of frames as they are found, as far as they are needed."""
+
+
+def exhaust(times: Iterable[float]) -> None:
+    """Need all frames."""
+    for _ in times:
+        pass
+
 
 GROUNDTRUTH_TOLERANCE = 0.02
 """Maximum time in seconds between an image and its ground-truth pose."""
@@ -53,6 +66,7 @@ class Sequence(ABC):
         groundtruth: the true trajectory at its own rate, or None.
         notes: remarks for the user on how it was read, one line each.
         camera_std: relative standard deviation of the camera's focal length, if its calibration says so.
+        pixel_aspect: width to height of a pixel; the fy / fx of a camera that is not known yet.
     """
 
     def __init__(
@@ -66,6 +80,7 @@ class Sequence(ABC):
         size: tuple[int, int] | None = None,
         guessed: bool = False,
         notes: Iterable[str] = (),
+        pixel_aspect: float = 1.0,
     ) -> None:
         """Take the size of the images (required without a camera); `guessed`: the camera is approximate."""
         self.name = printable(without_credentials(name))
@@ -74,6 +89,7 @@ class Sequence(ABC):
         if known is None:
             raise ValueError("a sequence without a camera needs the size of its images")
         self.size = known
+        self.pixel_aspect = pixel_aspect
         self._camera = camera
         self.calibrated = Calibrated.GUESSED if guessed else Calibrated.GIVEN
         if camera is None:
@@ -242,11 +258,16 @@ class Sequence(ABC):
             "name": self.name,
             "kind": self.kind,
             "frames": str(len(self)),
-            "size": f"{self.size[0]}x{self.size[1]}",
+            "size": self._describe_size(),
             "rate": f"{self.frame_rate:.2f} Hz over {duration:.2f} s",
             "camera": self._describe_camera(),
             "ground truth": truth,
         }
+
+    def _describe_size(self) -> str:
+        aspect = aspect_text(self.pixel_aspect)
+        of_pixels = "" if aspect == "1:1" else f", pixels of {aspect}, wide to high"
+        return f"{self.size[0]}x{self.size[1]}{of_pixels}"
 
     def _describe_camera(self) -> str:
         if self._camera is None:
@@ -288,6 +309,7 @@ class Transformed(Sequence):
             size=size or whole.size,
             guessed=whole.calibrated is Calibrated.GUESSED,
             notes=(*whole.notes, *notes),
+            pixel_aspect=_resized_aspect(whole, size),
         )
         self.camera_std = whole.camera_std
         self._whole = whole
@@ -341,6 +363,18 @@ class Transformed(Sequence):
         return index if self._indices is None else self._indices[index]
 
 
+def _resized_aspect(whole: Sequence, size: tuple[int, int] | None) -> float:
+    """Width to height of a pixel after images are resized."""
+    width, height = size or whole.size
+    return whole.pixel_aspect * (whole.size[0] / width) / (whole.size[1] / height)
+
+
+def aspect_text(aspect: float) -> str:
+    """`16:15`, for pixels that are a little wider than high."""
+    ratio = Fraction(aspect).limit_denominator(MAX_ASPECT_TERM)
+    return f"{ratio.numerator}:{ratio.denominator}"
+
+
 class Reader(NamedTuple):
     """A kind of sequence: how it is recognized and opened.
 
@@ -349,8 +383,11 @@ class Reader(NamedTuple):
         matches: whether a path is of this kind.
         open: opens a path; the arguments are the path, the camera that overrides its own, and the frame rate for kinds
             without timestamps. Raises SequenceError, CalibrationError or TrajectoryError, naming file and line.
+        open_needed: as `open`, for kinds whose times take long to find; the last argument takes them as far as they are
+            needed, and later frames are left out.
     """
 
     looks_for: str
     matches: Callable[[str], bool]
     open: Callable[[str, GivenCamera | None, float | None], Sequence]
+    open_needed: Callable[[str, GivenCamera | None, float | None, Need], Sequence] | None = None

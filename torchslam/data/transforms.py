@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import cv2
@@ -15,13 +17,15 @@ from torch import Tensor
 from torchslam.data.calibration import size_text
 from torchslam.data.formats.frame_names import natural
 from torchslam.data.formats.image_file import MAX_PIXELS, SUFFIXES, read_gray
-from torchslam.data.sequence import Sequence, Transformed
+from torchslam.data.sequence import Need, Sequence, Transformed
 from torchslam.errors import FrameError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.types import Trajectory
 
 TOLERANCE = 0.25
 """Tolerated earliness of a frame when frames are thinned out, as a ratio of the interval."""
+ROUNDING = 5e-7
+"""Seconds by which a time given as text may be later than its frame: it is rounded, and no frame is that short."""
 SMALLEST = 32
 """Minimum width and height in pixels."""
 
@@ -39,15 +43,51 @@ def cut(sequence: Sequence, start: str | int = 0, stop: str | int | None = None)
 def reduce_rate(sequence: Sequence, rate: float) -> Sequence:
     """Select at most `rate` frames per second by their timestamps."""
     _check_known(sequence, "--fps")
-    elapsed = (sequence.timestamps - sequence.timestamps[:1]).tolist()
-    chosen: list[int] = []
-    last = -1
-    for index, time in enumerate(elapsed):
-        slot = math.floor(time * rate + TOLERANCE)
-        if slot > last:
-            chosen.append(index)
-            last = slot
+    chosen = list(_thinned(sequence.timestamps.tolist(), rate))
     return sequence if len(chosen) == len(sequence) else Transformed(sequence, chosen)
+
+
+def need(
+    start: str | int = 0, stop: str | int | None = None, rate: float | None = None, most: int | None = None
+) -> Need:
+    """Say how far the times of a recording are needed by `cut`, `reduce_rate` and the first `most` frames of these."""
+    begin, end = _place(start, "start"), math.inf if stop is None else _place(stop, "stop")
+
+    def take(times: Iterable[float]) -> None:
+        kept: Iterable[object] = (inside := _between(times, begin, end))
+        if rate is not None:
+            kept = _thinned(inside, rate)
+        for _ in itertools.islice(kept, most):
+            pass
+
+    return take
+
+
+def _between(times: Iterable[float], begin: int | float, end: int | float) -> Iterator[float]:
+    """Yield the times of the frames of [begin, end), which are numbers of frames, or seconds if they are floats."""
+    first: float | None = None
+    for index, time in enumerate(times):
+        first = time if first is None else first
+        if _is_reached(end, index, time - first):
+            return
+        if _is_reached(begin, index, time - first):
+            yield time
+
+
+def _is_reached(place: int | float, index: int, elapsed: float) -> bool:
+    return elapsed >= place - ROUNDING if isinstance(place, float) else index >= place
+
+
+def _thinned(times: Iterable[float], rate: float) -> Iterator[int]:
+    """Yield the indices of the times to keep for at most `rate` a second."""
+    first: float | None = None
+    last = -1
+    for index, time in enumerate(times):
+        first = time if first is None else first
+        slot = math.floor((time - first) * rate + TOLERANCE)
+        if slot > last:
+            yield index
+            last = slot
 
 
 def resize(sequence: Sequence, text: str) -> Sequence:
@@ -110,20 +150,26 @@ def _new_size(size: tuple[int, int], text: str) -> tuple[int, int]:
     return new
 
 
-def _frame_at(sequence: Sequence, text: str | int, which: str) -> int:
-    """Return the index of the first frame at or after `text`."""
+def _place(text: str | int, which: str) -> int | float:
+    """Return a number of a frame as int, a time in seconds as float. Raises SequenceError for other text."""
     if isinstance(text, int) or re.fullmatch(r"\d{1,12}", text):
-        if int(text) < 0:
-            raise SequenceError(f"{sequence.name}: --{which} must be at least 0, not {text}")
         return int(text)
     found = re.fullmatch(r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d+)?)s?", text)
     if found is None:
         raise SequenceError(f"--{which}: expected a frame, as 120, or a time, as 12.5s or 1:30, got `{text}`")
-    seconds = 3600 * int(found[1] or 0) + 60 * int(found[2] or 0) + float(found[3])
+    return 3600.0 * int(found[1] or 0) + 60.0 * int(found[2] or 0) + float(found[3])
+
+
+def _frame_at(sequence: Sequence, text: str | int, which: str) -> int:
+    """Return the index of the first frame at or after `text`."""
+    place = _place(text, which)
+    if isinstance(place, int):
+        if place < 0:
+            raise SequenceError(f"{sequence.name}: --{which} must be at least 0, not {text}")
+        return place
     _check_known(sequence, f"--{which} as a time")
     elapsed = sequence.timestamps - sequence.timestamps[:1]
-    # Times as text are rounded; half a microsecond is less than any frame lasts.
-    return int(torch.searchsorted(elapsed, seconds - 5e-7))
+    return int(torch.searchsorted(elapsed, place - ROUNDING))
 
 
 def _check_known(sequence: Sequence, what: str) -> None:

@@ -80,17 +80,43 @@ def test_groundtruth_is_optional(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("[58.6, 57.2, 31.2, 23.3]", "[58.6, 57.2]", r"expected `intrinsics: \[4 numbers\]`, got 2"),
+        ("[58.6, 57.2, 31.2, 23.3]", "[58.6, 57.2]", r"expected `intrinsics: \[fx, fy, cx, cy\]`, got 2"),
         ("58.6", "-58.6", "focal lengths must be positive"),
         ("58.6", "nan", r"intrinsics: `nan`"),
-        ("radial-tangential", "polynomial", "distortion_model must be one of radial-tangential, equidistant"),
-        ("  data: [0.0, -1.0,", "  data: [-1.0,", r"T_BS: expected `data: \[16 numbers\]`, got 15"),
+        (
+            "radial-tangential",
+            "polynomial",
+            "distortion model `polynomial` is not known; there are plumb_bob",
+        ),
+        ("  data: [0.0, -1.0,", "  data: [-1.0,", r"T_BS: expected 16 numbers, got 15"),
     ],
 )
 def test_bad_calibration(folder: Path, old: str, new: str, message: str) -> None:
     assert old in SENSOR
     (folder / "mav0" / "cam0" / "sensor.yaml").write_text(SENSOR.replace(old, new))
     with pytest.raises(CalibrationError, match=rf"sensor\.yaml: {message}"):
+        open_sequence(folder)
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("[58.6, 57.2, 31.2, 23.3]", "[fx: 58.6, fy: 57.2, cx: 31.2, cy: 23.3]"),
+        ("[58.6, 57.2, 31.2, 23.3]", "{fu: 58.6, fv: 57.2, cu: 31.2, cv: 23.3}"),
+        ("[58.6, 57.2, 31.2, 23.3] #fu, fv, cu, cv", "\n  - 58.6\n  - 57.2\n  - 31.2\n  - 23.3"),
+        ("1.76187114e-05]", "1.76187114e-05, 0.0]"),
+    ],
+)
+def test_calibrations_written_by_hand(folder: Path, old: str, new: str) -> None:
+    assert old in SENSOR
+    expected = open_sequence(folder).camera.params.tolist()
+    (folder / "mav0" / "cam0" / "sensor.yaml").write_text(SENSOR.replace(old, new))
+    assert open_sequence(folder).camera.params.tolist() == expected
+
+
+def test_a_calibration_of_another_resolution(folder: Path) -> None:
+    (folder / "mav0" / "cam0" / "sensor.yaml").write_text(SENSOR.replace("[64, 48]", "[128, 96]"))
+    with pytest.raises(CalibrationError, match="images of 128x96, these are 64x48"):
         open_sequence(folder)
 
 

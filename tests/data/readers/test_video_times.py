@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from tests.data.mp4 import set_durations, set_rotation, write_mp4
 from torchslam.data import Calibrated, open_sequence
-from torchslam.data.readers.video import _rising
-from torchslam.errors import CalibrationError
+from torchslam.data.readers import video
+from torchslam.data.readers.video import VideoSequence, _rising
+from torchslam.data.transforms import cut, reduce_rate
+from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 
 CAMERA = "60,60,32,24"
@@ -77,5 +82,86 @@ def test_a_camera_can_be_set_later(clip: Path) -> None:
         sequence.camera = Camera.pinhole(1, 1, 1, 1, size=(2, 2))
 
 
+@pytest.mark.parametrize(
+    ("options", "grabbed"),
+    [
+        ({"limit": 2}, 2),
+        ({"limit": 2, "stride": 3}, 6),
+        ({"start": 2, "limit": 2}, 4),
+        ({"start": "0.25s", "limit": 1}, 4),
+        ({"stop": 3}, 4),  # the frame after the last one is looked at
+        ({"stop": "0.3s"}, 5),
+        ({"fps": 10, "limit": 3}, 5),
+        ({"start": 20}, 8),
+        ({"stride": 2}, 8),
+        ({}, 8),
+    ],
+)
+def test_times_are_read_as_far_as_they_are_needed(
+    clip: Path, options: dict, grabbed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is chosen is the same as of the whole video."""
+    set_durations(clip, MILLISECONDS)
+    whole = open_sequence(clip, CAMERA)
+    counts: list[int] = []
+    read_times = VideoSequence._read_times
+
+    def counted(self: VideoSequence, *arguments) -> tuple:
+        found = read_times(self, *arguments)
+        counts.append(len(found[1]))
+        return found
+
+    monkeypatch.setattr(VideoSequence, "_read_times", counted)
+    if options.get("start") == 20:
+        with pytest.raises(SequenceError, match="no frames left of 8"):
+            open_sequence(clip, CAMERA, **options)
+    else:
+        chosen = cut(whole, options.get("start", 0), options.get("stop"))
+        chosen = reduce_rate(chosen, options["fps"]) if "fps" in options else chosen
+        stride, limit = options.get("stride", 1), options.get("limit")
+        chosen = chosen.part(stop=None if limit is None else limit * stride, stride=stride)
+        sequence = open_sequence(clip, CAMERA, **options)
+        assert sequence.timestamps.tolist() == chosen.timestamps.tolist()
+        assert [sequence.image_name(i) for i in range(len(sequence))] == [
+            chosen.image_name(i) for i in range(len(chosen))
+        ]
+        assert sequence.notes == ()
+    assert counts == [grabbed]
+
+
+def test_masks_are_matched_by_the_order_of_all_frames(clip: Path, tmp_path: Path) -> None:
+    for index in range(8):
+        mask = np.full((48, 64), 255, np.uint8)
+        mask[:, : 4 * index] = 0
+        assert cv2.imwrite(str(tmp_path / f"mask{index}.png"), mask)
+    sequence = open_sequence(clip, CAMERA, start=2, limit=2, mask=tmp_path)
+    assert [int((~sequence.mask(index)).sum()) // 48 for index in range(2)] == [8, 12]
+
+
+def test_a_long_video_shows_its_progress(
+    clip: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    open_sequence(clip, CAMERA)
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(video, "QUIET", 1e-6)
+    monkeypatch.setattr("torchslam.utils.console.INTERVAL", 1e-6)
+    monkeypatch.setattr(video, "MANY", 3)
+    sequence = open_sequence(clip, CAMERA)
+    assert "times of the frames of clip.mp4" in capsys.readouterr().err
+    sequence.image(2)
+    assert capsys.readouterr().err == ""
+    sequence.image(7)
+    assert "to frame 7 of clip.mp4" in capsys.readouterr().err
+
+
+def test_opening_leaves_no_thread(clip: Path) -> None:
+    """A process with threads cannot be forked."""
+    code = (
+        "import threading; from torchslam.data import open_sequence\n"
+        f"open_sequence({str(clip)!r}).image(0); print(threading.active_count())"
+    )
+    assert subprocess.run([sys.executable, "-c", code], stdout=subprocess.PIPE, check=True).stdout == b"1\n"
+
+
 def test_frames_with_non_increasing_times_are_dropped() -> None:
-    assert _rising([0.0, 0.1, 0.1, 0.05, 0.2, float("nan"), 0.3]) == [0, 1, 4, 6]
+    assert list(_rising([0.0, 0.1, 0.1, 0.05, 0.2, float("nan"), 0.3])) == [0, 1, 4, 6]

@@ -222,6 +222,14 @@ def test_a_video_has_the_frame_rate_of_its_sequence(tmp_path: Path) -> None:
     assert len(frames_of(tmp_path / "tracked.mp4")) == FRAMES
 
 
+def test_a_video_in_a_folder_whose_name_has_a_colon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = Path("2024-05-01T12:30:05")
+    folder.mkdir()
+    VideoRecorder(folder / "it.mp4", (64, 48), 10.0).close()
+    assert (folder / "it.mp4").exists()
+
+
 def test_a_video_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match="cannot write it"):
         VideoRecorder(tmp_path / "nowhere" / "it.mp4", (64, 48), 10.0)

@@ -5,20 +5,19 @@ Source: https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdata
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.formats.calibration_files import read_calibration, read_matrix
 from torchslam.data.formats.text_file import check_later, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
 from torchslam.data.trajectories import checked_poses
-from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
+from torchslam.errors import SequenceError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.types import Trajectory
 
@@ -39,7 +38,7 @@ def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     folder = Path(path)
     root = _root(folder)
     sensor = root / "cam0" / "sensor.yaml"
-    camera = camera if camera is not None else _read_intrinsics(sensor)
+    camera = camera if camera is not None else read_calibration(sensor)
     groundtruth = None
     if (root / TRUTH).is_file():
         groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor))
@@ -64,19 +63,9 @@ def _read_images(folder: Path) -> list[ImageEntry]:
     return entries
 
 
-def _read_intrinsics(path: Path) -> Calibration:
-    model = re.search(r"^distortion_model:\s*(\S+)", _text(path), re.MULTILINE)
-    models = {"radial-tangential": "radial_tangential", "equidistant": "fisheye"}
-    if model is None or model[1] not in models:
-        raise CalibrationError(f"{path}: distortion_model must be one of {', '.join(models)}")
-    numbers = _numbers(path, "intrinsics", 4) + _numbers(path, "distortion_coefficients", 4)
-    return Calibration.from_numbers(numbers, str(path), models[model[1]])
-
-
 def _read_extrinsics(path: Path) -> Float[Tensor, "4 4"]:
     """T_bc: camera to body."""
-    block = _text(path).partition("T_BS:")[2]
-    return torch.tensor(_bracketed(block, f"{path}: T_BS", "data", 16), dtype=torch.float64).view(4, 4)
+    return torch.tensor(read_matrix(path, "T_BS", 16), dtype=torch.float64).view(4, 4)
 
 
 def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
@@ -100,23 +89,6 @@ def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
     T_wb = rigid(matrix_from_quaternion(table[:, [4, 5, 6, 3]]), table[:, :3])
     T_wc = checked_poses(T_wb @ T_bc, path)
     return Trajectory(torch.tensor(times, dtype=torch.float64), T_wc)
-
-
-def _text(path: Path) -> str:
-    return "\n".join(line for _, line in numbered_lines(path, CalibrationError))
-
-
-def _numbers(path: Path, key: str, count: int) -> list[float]:
-    return _bracketed(_text(path), str(path), key, count)
-
-
-def _bracketed(text: str, where: str, key: str, count: int) -> list[float]:
-    """The numbers of `key: [1, 2, ...]`, over as many lines as it takes."""
-    found = re.search(rf"\b{key}:\s*\[([^\]]*)\]", text)
-    numbers = parse_floats(found[1], f"{where}: {key}", CalibrationError) if found else []
-    if len(numbers) != count:
-        raise CalibrationError(f"{where}: expected `{key}: [{count} numbers]`, got {len(numbers)}")
-    return numbers
 
 
 EUROC = Reader("mav0/cam0/data.csv (EuRoC)", _is_euroc, _open_euroc)

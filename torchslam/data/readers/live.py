@@ -20,6 +20,7 @@ from torch import Tensor
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import gray_to_tensor
+from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -74,6 +75,9 @@ class LiveSequence(Sequence):
     ) -> None:
         """Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit."""
         self._capture = capture
+        command = f'ffmpeg -i "{name}" -vf bwdif=send_frame -crf 16 recording.mp4'
+        self._retriever = Retriever(capture, command)
+        self._refusal: FrameError | None = None  # of a frame that cannot be converted
         self._patience = patience
         self._clock = CaptureClock()
         self._fresh = threading.Condition()
@@ -84,20 +88,24 @@ class LiveSequence(Sequence):
         self._given, self._time = 0, 0.0
         self._is_watched = False
         _SOURCES.add(self)
-        self._thread = self._watch_until(lambda: bool(self._arrived))
+        self._thread = self._watch_until(lambda: bool(self._arrived or self._refusal))
         self._thread.join(patience)
         if not self._arrived:
             self.close()
+            if self._refusal is not None:
+                raise SequenceError(f"{name}: {self._refusal}") from self._refusal
             raise SequenceError(f"{name}: no frame came within {patience:g} s: is it there, and free?")
         first = self._arrived[0][1]
         size = (first.shape[1], first.shape[0])
+        aspect = pixel_aspect(capture, name)
         super().__init__(
             name,
             "live",
-            None if camera is None else fit_camera(camera, size, name),
+            None if camera is None else fit_camera(camera, size, name, pixel_aspect=aspect),
             torch.zeros(0, dtype=torch.float64),
             size=size,
             guessed=is_guessed(camera),
+            pixel_aspect=aspect,
         )
 
     def __len__(self) -> int:
@@ -156,7 +164,7 @@ class LiveSequence(Sequence):
             "name": self.name,
             "kind": self.kind,
             "frames": "as they come",
-            "size": f"{self.size[0]}x{self.size[1]}",
+            "size": self._describe_size(),
             "camera": self._describe_camera(),
         }
 
@@ -201,8 +209,11 @@ class LiveSequence(Sequence):
         if not self._capture.grab():
             return False
         captured = self._clock.at(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000, time.time())
-        decoded, frame = self._capture.retrieve()
-        if decoded:
+        try:
+            frame = self._retriever.retrieve()
+        except FrameError as refusal:
+            self._refusal, frame = refusal, None
+        if frame is not None:
             with self._fresh:
                 self._replaced += len(self._arrived) == self._arrived.maxlen
                 self._arrived.append((captured, frame))
@@ -272,7 +283,7 @@ def _open_live(path: str, camera: GivenCamera | None, rate: float | None) -> Liv
     """A camera or a stream. Raises SequenceError where it cannot be opened."""
     number = path.isdecimal()
     shown = without_credentials(path)
-    capture = cv2.VideoCapture(int(path)) if number else cv2.VideoCapture(path)
+    capture = cv2.VideoCapture(int(path)) if number else open_capture(path)
     if not capture.isOpened():
         raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")
     return LiveSequence(f"camera {path}" if number else shown, capture, camera)

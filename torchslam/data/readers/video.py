@@ -7,8 +7,10 @@ durations and offsets, trun the samples of a fragment. A sample takes at least o
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -17,12 +19,16 @@ import numpy as np
 import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
+from tqdm import tqdm
 
 from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
-from torchslam.data.sequence import Reader, Sequence
-from torchslam.errors import FrameError, SequenceError
+from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
+from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
+from torchslam.errors import FrameError, SequenceError, TorchslamError
+from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular
+from torchslam.utils.text import printable
 
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
@@ -31,16 +37,28 @@ MP4 = (".mp4", ".mov", ".m4v", ".3gp")
 MAX_BYTES = 1 << 40
 MAX_FRAMES = 2_000_000
 """Maximum number of frames: 18 hours at 30 frames per second."""
+QUIET = 2.0
+"""Seconds of decoding before a progress bar appears."""
+MANY = 100
+"""Frames that are skipped with a progress bar."""
+MAX_ASPECT_ERROR = 0.02
+"""Relative error of fy / fx of a given camera before a note says that the file contradicts it."""
+
+
+class Bar(tqdm):
+    """A progress bar without tqdm's monitor, which is a thread: this process may be forked."""
+
+    monitor_interval = 0
 
 
 class VideoSequence(Sequence):
     """Frames of a video at their presentation times, in seconds from the beginning of its stream.
 
-    All frames are decoded once to determine their number and times, since the container's values are estimates and
-    wrong for variable frame rates. Frames are rotated to the display orientation of the file.
+    All frames that are needed are decoded once to determine their number and times, since the container's values are
+    estimates and wrong for variable frame rates. Frames are rotated to the display orientation of the file.
     """
 
-    def __init__(self, path: Path, camera: GivenCamera | None) -> None:
+    def __init__(self, path: Path, camera: GivenCamera | None, need: Need = exhaust) -> None:
         """Raises SequenceError for a file that holds no video, CalibrationError for a camera that does not fit."""
         self._path = path
         _check(path)
@@ -53,35 +71,43 @@ class VideoSequence(Sequence):
                 f"{path}: frames of {width:.0f}x{height:.0f}, more than the {MAX_PIXELS} pixels that are read"
             )
         promised = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT))
-        times, notes = self._read_times(), []
+        first, times, ended = self._read_times(need, promised)
+        notes = []
         rate = self._capture.get(cv2.CAP_PROP_FPS)
         if len(times) > 1 and max(times) == min(times) and rate > 0:
             times = [index / rate for index in range(len(times))]
             notes.append(f"the file has no timestamps; {rate:g} frames per second are assumed")
-        self._frames = _rising(times)
-        first = self._read(0) if self._frames else None
-        if first is None:
+        self._frames = list(_rising(times))
+        if first is None or not self._frames:
             raise SequenceError(f"{path}: cannot be read as a video")
         if len(self._frames) < len(times):
             notes.append(
                 f"left out {len(times) - len(self._frames)} frames whose time is not after the one before"
             )
         # Some containers do not know the number; a truncated stream has fewer frames than declared.
-        if len(times) < promised and path.suffix.lower() in (".mp4", ".mov", ".m4v", ".avi"):
+        if ended and len(times) < promised and path.suffix.lower() in (".mp4", ".mov", ".m4v", ".avi"):
             notes.append(f"{len(times)} frames can be decoded; the file declares {promised}")
         size = (first.shape[1], first.shape[0])
+        aspect = pixel_aspect(self._capture, str(path))
+        fitted = None if camera is None else fit_camera(camera, size, str(path), pixel_aspect=aspect)
+        if fitted is not None and abs(float(fitted.fy / fitted.fx) / aspect - 1) > MAX_ASPECT_ERROR:
+            notes.append(
+                f"the file says that its pixels are {aspect_text(aspect)}, wide to high, so fy should be "
+                f"{aspect:.4g} fx; the given camera has {float(fitted.fy / fitted.fx):.4g}"
+            )
         super().__init__(
             path.stem,
             "video",
-            None if camera is None else fit_camera(camera, size, str(path)),
+            fitted,
             torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64),
             size=size,
             guessed=is_guessed(camera),
             notes=notes,
+            pixel_aspect=aspect,
         )
 
     def __getstate__(self) -> dict[str, Any]:
-        return super().__getstate__() | {"_capture": None}
+        return super().__getstate__() | {"_capture": None, "_retriever": None}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state)
@@ -97,37 +123,66 @@ class VideoSequence(Sequence):
         return f"{self._path}#{index}"
 
     def _rewind(self) -> None:
-        self._capture = cv2.VideoCapture(str(self._path))
+        # As an absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
+        self._capture = open_capture(str(self._path.absolute()))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        self._retriever = Retriever(self._capture, _conversion(self._path))
         self._position = 0  # of the decoder, among all frames that can be decoded
 
-    def _read_times(self) -> list[float]:
-        """Seconds of every frame that can be decoded, as the container has them."""
+    def _read_times(self, need: Need, promised: int) -> tuple[np.ndarray | None, list[float], bool]:
+        """The first frame, seconds of the frames that are needed as the container has them, and if these are all."""
+        first: np.ndarray | None = None
         times: list[float] = []
-        while len(times) < MAX_FRAMES and self._capture.grab():
-            times.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
-            self._position += 1
-        return times
+        ended = False
+
+        def grabbed() -> Iterator[float]:
+            nonlocal first, ended
+            while len(times) < MAX_FRAMES and self._capture.grab():
+                self._position += 1
+                if not times:
+                    first = self._retrieve(str(self._path), SequenceError)
+                times.append(self._capture.get(cv2.CAP_PROP_POS_MSEC) / 1000)
+                bar.update()
+                yield times[-1]
+            ended = True
+
+        with self._bar("times of the frames", promised if 0 < promised <= MAX_FRAMES else None) as bar:
+            need(times[frame] for frame in _rising(grabbed()))
+        return first, times, ended
+
+    def _bar(self, what: str, total: int | None) -> Bar:
+        """A progress bar for what takes long."""
+        words = f"{what} of {printable(self._path.name)}"
+        return Bar(total=total, desc=words, delay=QUIET, leave=False, **tqdm_options())
+
+    def _retrieve(self, where: str, error: type[TorchslamError]) -> np.ndarray | None:
+        try:
+            return self._retriever.retrieve()
+        except FrameError as cause:
+            raise error(f"{where}: {cause}") from cause
 
     def _frame(self, index: int) -> np.ndarray:
-        frame = self._read(self._frames[index])
+        frame = self._read(self._frames[index], self.image_name(index))
         if frame is None:
             raise FrameError(f"{self.image_name(index)}: cannot be decoded")
         if (frame.shape[1], frame.shape[0]) != self.size:
             raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
         return frame
 
-    def _read(self, frame: int) -> np.ndarray | None:
-        """The (H, W, 3) uint8 frame, blue first; those in between are skipped without conversion."""
+    def _read(self, frame: int, where: str) -> np.ndarray | None:
+        """The (H, W, 3) uint8 frame, blue first; those in between are skipped without conversion. Raises FrameError."""
         if frame < self._position:
             self._rewind()
-        while self._position < frame:
-            if not self._capture.grab():
-                return None
-            self._position += 1
+        skipped = frame - self._position
+        with self._bar(f"to frame {frame}", skipped) if skipped >= MANY else nullcontext() as bar:
+            while self._position < frame:
+                if not self._capture.grab():
+                    return None
+                self._position += 1
+                if bar is not None:
+                    bar.update()
         self._position += 1
-        decoded, image = self._capture.read()
-        return image if decoded else None
+        return self._retrieve(where, FrameError) if self._capture.grab() else None
 
 
 def _is_video(path: str) -> bool:
@@ -135,13 +190,19 @@ def _is_video(path: str) -> bool:
     return Path(path).suffix.lower() in SUFFIXES and Path(path).is_file()
 
 
-def _open_video(path: str, camera: GivenCamera | None, rate: float | None) -> VideoSequence:
+def _open_video(
+    path: str, camera: GivenCamera | None, rate: float | None, need: Need = exhaust
+) -> VideoSequence:
     """A video file; its times are its own. Raises SequenceError or CalibrationError."""
-    return VideoSequence(Path(path), camera)
+    return VideoSequence(Path(path), camera, need)
 
 
 def _check(path: Path) -> None:
-    """Raise SequenceError for a special file, and for an MP4 that declares more frames than it has bytes."""
+    """Raise SequenceError for a special file, a name that OpenCV crashes on, and an MP4 with more frames than bytes."""
+    try:
+        str(path.absolute()).encode()
+    except UnicodeEncodeError:
+        raise SequenceError(f"{path}: its name is not UTF-8, which OpenCV cannot open; rename it") from None
     try:
         check_regular(path, MAX_BYTES, "a video that is read")
         claimed = claimed_samples(path) if path.suffix.lower() in MP4 else 0
@@ -154,13 +215,18 @@ def _check(path: Path) -> None:
         )
 
 
-def _rising(times: list[float]) -> list[int]:
-    """Return the indices of the times that are later than all before them."""
-    chosen: list[int] = []
+def _conversion(path: Path) -> str:
+    """The command that writes an interlaced video as whole frames, at the same times."""
+    return f'ffmpeg -i "{path.absolute()}" -vf bwdif=send_frame -crf 16 "{path.stem}-progressive.mp4"'
+
+
+def _rising(times: Iterable[float]) -> Iterator[int]:
+    """Yield the indices of the times that are later than all before them."""
+    latest = -math.inf
     for index, time in enumerate(times):
-        if np.isfinite(time) and (not chosen or time > times[chosen[-1]]):
-            chosen.append(index)
-    return chosen
+        if math.isfinite(time) and time > latest:
+            latest = time
+            yield index
 
 
 CONTAINERS = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
@@ -219,4 +285,4 @@ def _samples(file: BinaryIO, kind: bytes, start: int, end: int) -> int:
     return samples
 
 
-VIDEO = Reader(f"a video ({', '.join(sorted(SUFFIXES))})", _is_video, _open_video)
+VIDEO = Reader(f"a video ({', '.join(sorted(SUFFIXES))})", _is_video, _open_video, _open_video)

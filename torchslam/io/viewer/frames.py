@@ -205,8 +205,9 @@ class VideoRecorder:
         self._scale = min(1.0, MAX_WIDTH / size[0])
         # Codecs ask for even sides.
         self._size = (int(size[0] * self._scale) // 2 * 2, int(size[1] * self._scale) // 2 * 2)
+        # An absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
         self._writer = cv2.VideoWriter(
-            str(path), cv2.VideoWriter.fourcc(*"mp4v"), rate, (self._size[0], self._size[1] + BAR)
+            str(path.absolute()), cv2.VideoWriter.fourcc(*"mp4v"), rate, (self._size[0], self._size[1] + BAR)
         )
         if not self._writer.isOpened():
             raise ResultsError(f"{path}: this OpenCV cannot write it")
