@@ -241,7 +241,9 @@ class GlobalMapper:
         final = FinalAdjustment(self.camera, with_camera_std(self.config, 0.0), self.given)
         final.camera = found.camera
         if not keep:
-            final.adjust(atlas, 0, lambda done, most: self.progress("final adjustment", done, most))
+            final.adjust(
+                atlas, 0, lambda done, most: self.progress("final adjustment", done, most), settled=True
+            )
         return Run(
             tuple(atlas),
             final.camera,

@@ -293,25 +293,32 @@ class FinalAdjustment:
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
 
-    def adjust(self, atlas: Atlas, session: int, progress: Progress | None = None) -> None:
+    def adjust(
+        self, atlas: Atlas, session: int, progress: Progress | None = None, settled: bool = False
+    ) -> None:
         """Adjust all submaps, if so configured. The main one determines the camera; the others follow.
 
         Args:
             atlas: the submaps.
             session: the session whose main submap determines the camera.
             progress: called before each iteration; if it raises, what was adjusted so far stays.
+            settled: keyframes and points are at a minimum already.
         """
         main = atlas.main(session)
         if main is None or not (self.settings.local and self.settings.global_at_end):
             return
-        self._adjust(main, self._measured, progress)
+        self._adjust(main, self._measured, progress, settled)
         for submap in atlas:
             if submap is not main:
-                self._adjust(submap, None, progress)
+                self._adjust(submap, None, progress, settled)
 
-    def _adjust(self, submap: Submap, given: CameraMeasurement | None, progress: Progress | None) -> None:
-        camera = self.camera if given is None else given.camera
-        camera = adjust_all(submap.map, camera, self.settings, progress, given)
+    def _adjust(
+        self, submap: Submap, given: CameraMeasurement | None, progress: Progress | None, settled: bool
+    ) -> None:
+        camera = self.camera
+        if not settled:
+            camera = camera if given is None else given.camera
+            camera = adjust_all(submap.map, camera, self.settings, progress, given)
         self.camera, self.given = camera, given or self.given
         submap.posed_frames.remove_outliers(submap.map, camera)
         solution = self._solve(submap, camera, given, progress)
