@@ -182,7 +182,7 @@ def check_map(
     ]
     agrees = [distance < limit for distance in distances]
     unused = range(len(pairs)) if held_back is None else sorted(held_back)
-    triplets, untold = _triplets(depths, pairs, posed)
+    triplets, untold = _triplets(depths, pairs, posed, agrees)
     breaks, stretches = _breaks(posed, pairs, agrees, triplets, views)
     longest = max(stretches, key=len, default=[])
     others = [row for stretch in stretches if stretch is not longest for row in stretch]
@@ -222,9 +222,12 @@ def _median_depth(depths: Collection[PairDepths]) -> float:
 
 
 def _triplets(
-    depths: dict[int, PairDepths], pairs: Sequence[ViewPair], posed: Sequence[bool]
+    depths: dict[int, PairDepths], pairs: Sequence[ViewPair], posed: Sequence[bool], agrees: Sequence[bool]
 ) -> tuple[list[_Triplet], int]:
-    """The triplets that tell a ratio of scales, and the number of those with an image without a pose."""
+    """The triplets of agreeing pairs that tell a ratio of scales, and the number of those with an image without a pose.
+
+    By wrong relative poses, depths mean nothing.
+    """
     before: dict[int, list[int]] = {}
     after: dict[int, list[int]] = {}
     for row, pair in enumerate(pairs):
@@ -236,10 +239,10 @@ def _triplets(
             if one not in depths or other not in depths:
                 untold += not (posed[pairs[one].first] and posed[middle] and posed[pairs[other].second])
                 continue
-            ratio = depth_ratio(depths[one], 1, depths[other], 0)
+            ratio = depth_ratio(depths[one], 1, depths[other], 0) if agrees[one] and agrees[other] else None
             if ratio is not None and ratio.std < MAX_RATIO_STD:
-                agrees = abs(ratio.log_ratio) < MAX_SCALE_ERROR + 2 * ratio.std
-                found.append(_Triplet(pairs[one].first, middle, pairs[other].second, ratio.log_ratio, agrees))
+                is_one = abs(ratio.log_ratio) < MAX_SCALE_ERROR + 2 * ratio.std
+                found.append(_Triplet(pairs[one].first, middle, pairs[other].second, ratio.log_ratio, is_one))
     return found, untold
 
 
@@ -275,14 +278,14 @@ def _breaks(
         if disagree(crossing, good):
             kind = BreakKind.POSE
         elif np.count_nonzero(around) < MIN_SPANNING:
-            kind = BreakKind.UNKNOWN if sizes[crossing].max(initial=0) < STRONG_MATCHES else None
+            kind = BreakKind.UNKNOWN if sizes[crossing & good].max(initial=0) < STRONG_MATCHES else None
         elif disagree(around, right):
             kind, ratio = BreakKind.SCALE, math.exp(float(np.median(ratios[around])))
         if kind is None:
             stretches[-1].append(after)
             continue
         breaks.append(Break(views[before].index, views[after].index, kind, ratio))
-        if kind is BreakKind.UNKNOWN and crossing.any():  # weak, but nothing contradicts it
+        if kind is BreakKind.UNKNOWN and (crossing & good).any():  # weak, but nothing contradicts it
             stretches[-1].append(after)
         else:
             stretches.append([after])
