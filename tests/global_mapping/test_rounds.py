@@ -152,13 +152,64 @@ def test_three_images_must_agree_on_a_point() -> None:
 
 
 @pytest.mark.parametrize(("degrees", "agrees"), [(0.49, False), (0.51, True)])
-def test_points_need_half_a_degree_of_parallax(degrees: float, agrees: bool) -> None:
+def test_points_need_half_a_degree_of_parallax(
+    monkeypatch: pytest.MonkeyPatch, degrees: float, agrees: bool
+) -> None:
     """Between images that agree: a fourth one, from far away, does not."""
+    monkeypatch.setattr(rounds, "MIN_OBSERVATIONS", 1)
     T_cw = EYE.repeat(4, 1, 1)
     T_cw[:, 0, 3] = -5 * math.tan(math.radians(degrees)) * torch.tensor([0.0, 0.5, 1, 9], dtype=torch.float64)
     scene = Recording.of(T_cw, torch.tensor([[0.0, 0, 5]], dtype=torch.float64))
     observed = moved(scene.observed, 3, 5.0)
     assert observed.filter(exact(scene), 8.0).agrees.tolist() == [agrees, agrees, agrees, False]
+
+
+def lost_in(observed: ObservedTracks, view: int, right: int) -> ObservedTracks:
+    """All observations of an image far off, but for some."""
+    rows = torch.nonzero(observed.tracks.view == view)[:, 0]
+    for row in rows[right:].tolist():
+        observed = moved(observed, row, 40.0)
+    return observed
+
+
+@pytest.mark.parametrize("right", [14, 15])
+def test_images_need_fifteen_observations(right: int) -> None:
+    """With fewer the image counts for nothing; the points are those of the others."""
+    observed = lost_in(SCENE.observed, 4, right)
+    agrees = observed.filter(exact(SCENE), 8.0).agrees
+    own = observed.tracks.view == 4
+    assert int(agrees[own].sum()) == (15 if right == 15 else 0)
+    assert bool(agrees[~own].all())
+
+
+def test_an_image_without_a_pose_is_posed_by_the_points_of_others() -> None:
+    """The others stay where they are, to the bit."""
+    found = exact(SCENE)
+    T_cw = found.T_cw.clone()
+    T_cw[4] = se3_along(3.0)
+    lost = SCENE.observed.filter(replace(found, T_cw=T_cw), 8.0)
+    assert not bool(lost.agrees[SCENE.observed.tracks.view == 4].any())
+    posed = SCENE.observed.resect(lost)
+    torch.testing.assert_close(posed.T_cw, found.T_cw, atol=1e-6, rtol=0)
+    others = torch.arange(len(T_cw)) != 4
+    assert torch.equal(posed.T_cw[others], T_cw[others])
+
+
+def test_nothing_is_posed_anew_where_all_images_hold() -> None:
+    found = SCENE.observed.filter(exact(SCENE), 8.0)
+    assert SCENE.observed.resect(found) is found
+
+
+def test_an_image_whose_points_nobody_else_agrees_on_stays_where_it_is() -> None:
+    found = replace(exact(SCENE), agrees=torch.zeros(len(SCENE.tracks), dtype=torch.bool))
+    assert SCENE.observed.resect(found) is found
+
+
+def test_rounds_pose_a_lost_image_and_keep_it() -> None:
+    T_cw = SCENE.T_cw.clone()
+    T_cw[4] = se3_along(3.0)
+    found = adjust_in_rounds(SCENE.observed, T_cw, None, CAMERA, coarse=False)
+    assert bool(found.agrees.all())
 
 
 @pytest.mark.parametrize(("factor", "agrees"), [(0.9, True), (1.1, False)])

@@ -18,6 +18,7 @@ from torchslam.global_mapping.tracks import (
     TrackPoints,
     Tracks,
     join_matches,
+    largest_part,
     longest_tracks,
     make_map,
     parallax,
@@ -386,3 +387,19 @@ def test_a_map_without_points_has_its_images() -> None:
     recording = Recording.of(line(2), torch.tensor([0.0, 0, 4]) + ball(12))
     made = make_map(recording.views, EYE.repeat(2, 1, 1), tracks_of(), torch.zeros(0, 3, dtype=torch.float64))
     assert (made.num_keyframes, len(made.positions_w)) == (2, 0)
+
+
+@pytest.mark.parametrize("shared", [4, 5])
+def test_images_are_held_together_by_shared_points(shared: int) -> None:
+    """Images 0 to 2 share ten points, 3 and 4 nine, and 2 and 3 some."""
+    rows = []
+    for views, count in (((0, 1, 2), 10), ((3, 4), 9), ((2, 3), shared)):
+        for _ in range(count):
+            number = len({row[0] for row in rows})
+            rows += [(number, view, number) for view in views]
+    tracks = Tracks(*(torch.tensor(column) for column in zip(*rows, strict=True)))
+    everything = torch.ones(len(tracks), dtype=torch.bool)
+    held = largest_part(tracks, everything, 6, least_shared=5)
+    assert held.tolist() == [True, True, True, shared == 5, shared == 5, False]
+    only = largest_part(tracks, tracks.view > 2, 6, least_shared=5)
+    assert only.tolist() == [False, False, False, True, True, False]

@@ -277,6 +277,8 @@ def _breaks(
         kind, ratio = None, 1.0
         if disagree(crossing, good):
             kind = BreakKind.POSE
+        elif not (crossing & good).any():
+            kind = BreakKind.UNKNOWN
         elif np.count_nonzero(around) < MIN_SPANNING:
             kind = BreakKind.UNKNOWN if sizes[crossing & good].max(initial=0) < STRONG_MATCHES else None
         elif disagree(around, right):

@@ -19,7 +19,14 @@ from torch import Tensor
 from torchslam.geometry import Camera, KeypointNoise, estimate_absolute_pose, se3_inverse, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.robust import Kernel
-from torchslam.global_mapping.tracks import MIN_PARALLAX, Tracks, longest_tracks, parallax, triangulate_tracks
+from torchslam.global_mapping.tracks import (
+    MIN_PARALLAX,
+    Tracks,
+    largest_part,
+    longest_tracks,
+    parallax,
+    triangulate_tracks,
+)
 from torchslam.optim import BundleProblem, bundle_adjust
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import FrameFeatures
@@ -42,6 +49,9 @@ MIN_VIEWS = 3
 MIN_OBSERVATIONS = 15
 """Observations that must agree with the pose of an image. With a handful a pose is hardly determined, and a single one
 that flies off stops the steps of all others. COLMAP asks for 30 to register an image; tried 10 to 30."""
+MIN_SHARED = 5
+"""Points that must hold an image with its neighbors in a track. Parts that nothing holds go anywhere, and shrink to a
+point where their own rays allow it."""
 MAX_ROUNDS, MIN_CHANGE = 4, 0.005
 """Fine rounds go on until less than this share of the observations changes sides."""
 
@@ -129,7 +139,7 @@ class ObservedTracks:
         counts = torch.bincount(self.tracks.view[found.agrees], minlength=len(found.T_cw))
         known = torch.zeros(self.tracks.count, dtype=torch.bool, device=counts.device)
         known[self.tracks.track[found.agrees]] = True
-        T_cw = found.T_cw.clone()
+        T_cw, changed = found.T_cw.clone(), False
         for view in torch.nonzero(counts < MIN_OBSERVATIONS)[:, 0].tolist():
             rows = torch.nonzero((self.tracks.view == view) & known[self.tracks.track])[:, 0]
             if len(rows) < MIN_OBSERVATIONS:
@@ -138,8 +148,8 @@ class ObservedTracks:
             threshold = FINE[1] * float(self.noise.sigmas[rows].median())
             pose = estimate_absolute_pose(points_w[None], self.pixels[rows][None], found.camera, threshold)
             if bool(pose.success[0]):
-                T_cw[view] = pose.T_cw[0]
-        return replace(found, T_cw=T_cw)
+                T_cw[view], changed = pose.T_cw[0], True
+        return replace(found, T_cw=T_cw) if changed else found
 
 
 def adjust(
@@ -199,12 +209,14 @@ def adjust_in_rounds(
     found = observed.triangulate(T_cw, camera, FINE_START * GATE)
     for number in range(MAX_ROUNDS):
         before = found.agrees
-        posed = observed.resect(found).T_cw
-        found = observed.triangulate(posed, found.camera, GATE if number else FINE_START * GATE)
+        posed = observed.resect(found)
+        if posed is not found:
+            found = observed.triangulate(posed.T_cw, found.camera, GATE)
         adjusted = adjust(observed, found, *FINE, TOLERANCE, given)
         found = observed.triangulate(adjusted.T_cw, adjusted.camera, GATE)
         change = float((found.agrees != before).double().mean())
         log(f"round {number + 1}: {int(found.agrees.sum())} observations agree, {change:.1%} changed")
         if change < MIN_CHANGE:
             break
-    return found
+    held = largest_part(observed.tracks, found.agrees, len(found.T_cw), MIN_SHARED)
+    return replace(found, agrees=found.agrees & held[observed.tracks.view])

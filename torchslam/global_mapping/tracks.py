@@ -73,7 +73,7 @@ def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
     none = torch.zeros(0, dtype=torch.int64, device=pairs[0].keypoints_1.device if pairs else None)
     one = torch.cat([none, *(pair.first * keypoints + pair.keypoints_1 for pair in pairs)])
     other = torch.cat([none, *(pair.second * keypoints + pair.keypoints_2 for pair in pairs)])
-    label = _lowest_connected(one, other, views * keypoints)
+    label = lowest_connected(one, other, views * keypoints)
     nodes = torch.unique(torch.cat([one, other]))
     nodes = nodes[torch.argsort(label[nodes], stable=True)]  # within a track by image
     _, track = torch.unique(label[nodes], return_inverse=True)
@@ -82,7 +82,7 @@ def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
     return Tracks(track, view, nodes % keypoints).select(counts[which] == 1)[0]
 
 
-def _lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: int) -> Int[Tensor, " R"]:
+def lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: int) -> Int[Tensor, " R"]:
     """The lowest node of the connected component of each of `count` nodes with the given edges."""
     label = torch.arange(count, device=one.device)
     while True:
@@ -92,6 +92,25 @@ def _lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: i
         if torch.equal(new, label):
             return label
         label = new
+
+
+def largest_part(
+    tracks: Tracks, agrees: Bool[Tensor, " O"], views: int, least_shared: int
+) -> Bool[Tensor, " {views}"]:
+    """The largest set of images that shared points hold together.
+
+    Args:
+        tracks: observations of points.
+        agrees: those that count.
+        views: number of images.
+        least_shared: points that two images must share, each seen by no image between them, to hold together.
+    """
+    track, view = tracks.track[agrees], tracks.view[agrees]
+    follows = track[1:] == track[:-1]
+    links, counts = torch.unique((view[:-1] * views + view[1:])[follows], return_counts=True)
+    links = links[counts >= least_shared]
+    label = lowest_connected(links // views, links % views, views)
+    return label == torch.bincount(label, minlength=views).argmax()
 
 
 def longest_tracks(tracks: Tracks, per_view: int) -> Bool[Tensor, " N"]:
