@@ -150,6 +150,10 @@ class Sequence(ABC):
     def image_name(self, index: int) -> str:
         """Return the name of an image, for messages."""
 
+    def file_name(self, index: int) -> str:
+        """Return the file of a frame below the folder of all; empty if frames are no files but known by their times."""
+        return ""
+
     def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         """Return the mask of a frame, True where features are allowed; None: everywhere."""
         return None
@@ -317,6 +321,9 @@ class Transformed(Sequence):
 
     def image_name(self, index: int) -> str:
         return self._whole.image_name(self._at(index))
+
+    def file_name(self, index: int) -> str:
+        return self._whole.file_name(self._at(index))
 
     def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         return self._whole.mask(self._at(index))

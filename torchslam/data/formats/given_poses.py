@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import struct
 from collections import Counter
+from collections.abc import Sequence as Listed
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -77,7 +78,7 @@ class GivenPoses:
         Raises TrajectoryError where no frame has one.
         """
         if self.timestamps is None:
-            found = _by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
+            found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
             how = f"no image is called as those in it, such as {self.names[0]}"
         else:
             found = _by_time(self.timestamps, sequence.timestamps)
@@ -122,8 +123,8 @@ def _by_time(times: Float[Tensor, " N"], frames: Float[Tensor, " F"]) -> Int[Ten
     return torch.where((distances <= GROUNDTRUTH_TOLERANCE) & mutual, rows, -1)
 
 
-def _by_name(names: tuple[str, ...], images: list[str]) -> Int[Tensor, " F"]:
-    """The pose with most of the name in common from its end: `0/a.png` is that of `rgb/0/a.png`.
+def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
+    """The row of each image's name, with most in common from its end: `0/a.png` is that of `rgb/0/a.png`; -1 for none.
 
     Without a suffix as well (the first transforms.json had none); a name that two images have is that of none.
     """

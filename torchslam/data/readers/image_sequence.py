@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
 from collections import Counter
 from collections.abc import Iterable
 from collections.abc import Sequence as Listed
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +34,7 @@ from torchslam.data.formats.text_file import check_later
 from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
+from torchslam.utils.text import printable
 
 DEFAULT_RATE = 30.0
 """Frame rate of images without timestamps."""
@@ -100,6 +103,14 @@ class ImageSequence(Sequence):
 
     def image_name(self, index: int) -> str:
         return str(self._entries[index].path)
+
+    def file_name(self, index: int) -> str:
+        return printable(os.path.relpath(self._entries[index].path, self._root))
+
+    @cached_property
+    def _root(self) -> str:
+        """The folder of all images, also where it was unpacked: results must not depend on that place."""
+        return os.path.commonpath({os.path.abspath(entry.path.parent) for entry in self._entries})
 
     def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
         if size != self.size:
