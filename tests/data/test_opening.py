@@ -73,6 +73,69 @@ def test_consecutive_series_are_joined(tmp_path: Path, write_picture: Write) -> 
     assert names(open_sequence(tmp_path, CAMERA)) == ["a1.png", "a2.png", "b3.png", "b4.jpg"]
 
 
+@pytest.mark.parametrize(
+    ("stems", "times"),
+    [
+        (["9.95", "9.983", "10.02", "10.05"], [9.95, 9.983, 10.02, 10.05]),  # decimals
+        (["0", "0.033", "0.07", "0.1"], [0.0, 0.033, 0.07, 0.1]),
+        (["1305031102.0338", "1305031102.166", "1305031102.2"], None),
+        (["rgb-1305031102.0338", "rgb-1305031102.166", "rgb-1305031103.0"], None),
+        (["1_1305031102.0338", "2_1305031102.166", "3_1305031103.0"], None),
+        (["1403636579763555584", "1403636579813555456", "1403636579863555584"], None),
+        (["1403636579763", "1403636579813", "1403636579863"], None),
+        (["cam_1403636579763555", "cam_1403636579813555", "cam_1403636579863555"], None),
+    ],
+)
+def test_images_named_by_times(
+    tmp_path: Path, write_picture: Write, stems: list[str], times: list[float] | None
+) -> None:
+    for index in torch.randperm(len(stems), generator=torch.Generator().manual_seed(0)).tolist():
+        write_picture(tmp_path / f"{stems[index]}.png", index)
+    if times is None:
+        numbers = [stem.replace("_", "-").rpartition("-")[2] for stem in stems]
+        units = {13: 1e3, 16: 1e6, 19: 1e9}
+        times = [float(number) / units.get(len(number) if "." not in number else 0, 1) for number in numbers]
+    sequence = open_sequence(tmp_path, CAMERA)
+    assert names(sequence) == [f"{stem}.png" for stem in stems]
+    torch.testing.assert_close(sequence.timestamps.tolist(), times, rtol=0, atol=1e-6)
+    assert sequence.notes == ("the names of the images are their times",)
+    assert len(open_sequence(tmp_path, CAMERA, fps=1)) < len(stems) or times[-1] - times[0] >= len(stems) - 1
+
+
+@pytest.mark.parametrize(
+    "stems",
+    [
+        ["shot1.8", "shot1.9", "shot1.10", "shot1.11"],  # counters behind a dot
+        ["1.7", "1.9", "1.11", "1.13"],
+        ["frame.0009", "frame.0010", "frame.0011"],
+        ["1.0009", "1.0010", "1.0011"],
+        ["2024.5.1", "2024.5.9", "2024.5.10", "2024.10.2"],  # dates
+        ["v1.2.9", "v1.2.10"],
+        ["a_9", "a_10", "a_1305031102"],
+        ["a1", "a2.5", "b3"],
+    ],
+)
+def test_names_that_are_no_times_keep_their_order(
+    tmp_path: Path, write_picture: Write, stems: list[str]
+) -> None:
+    for index, stem in enumerate(stems):
+        write_picture(tmp_path / "all" / f"{stem}.png", index)
+        write_picture(tmp_path / "masks" / f"{stem}.x.png", index)
+    sequence = open_sequence(tmp_path / "all", CAMERA)
+    assert names(sequence) == [f"{stem}.png" for stem in stems]
+    assert sequence.frame_rate == pytest.approx(30.0)
+    masked = open_sequence(tmp_path / "all", CAMERA, mask=tmp_path / "masks")  # by order
+    assert all(torch.equal(masked.mask(i), sequence.image(i) > 0) for i in range(len(stems)))
+
+
+def test_times_whose_zeros_are_missing_are_refused(tmp_path: Path, write_picture: Write) -> None:
+    """Seconds, a dot and a count of nanoseconds without its leading zeros."""
+    for index, stem in enumerate(("1403636579.63555580", "1403636579.113555584")):
+        write_picture(tmp_path / f"{stem}.png", index)
+    with pytest.raises(SequenceError, match=r"\.63555580 and with .*\.113555584: .* one number of digits"):
+        open_sequence(tmp_path, CAMERA)
+
+
 def test_misspelled_names_get_suggestions(
     tmp_path: Path, tum_folder: Callable[..., Path], write_picture: Write
 ) -> None:

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import size_text
-from torchslam.data.formats.frame_names import natural
+from torchslam.data.formats.frame_names import in_order
 from torchslam.data.formats.image_file import MAX_PIXELS, SUFFIXES, read_gray
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import FrameError, SequenceError
@@ -186,13 +186,8 @@ def _by_frame(folder: Path, sequence: Sequence) -> dict[int, Path]:
     """Return the mask file of each frame."""
     if sequence.known_length is None:
         raise SequenceError(f"{folder}: a live source takes one mask for all frames")
-    files = sorted(
-        (
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
-        ),
-        key=lambda file: natural(file.name),
+    files = in_order(
+        file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
     )
     by_name = {file.stem: file for file in files}
     names = [Path(sequence.image_name(index)) for index in range(len(sequence))]

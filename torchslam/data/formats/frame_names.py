@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import fnmatch
+import itertools
 import re
+import statistics
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from torchslam.data.formats.image_file import SUFFIXES
+from torchslam.data.formats.text_file import UNIX_UNITS
 from torchslam.errors import SequenceError
 
 MAX_FILES = 1_000_000
@@ -53,10 +57,82 @@ class Found:
         return [f"ignored: {kinds}"] if kinds else []
 
 
-def natural(name: str) -> list[tuple[bool, int, str]]:
-    """A sort key under which runs of digits compare as numbers."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
+NUMBER = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)|\d+)")
+"""A run of digits, or two with a dot between them; more dots separate parts of a version or a date."""
+UNIX_DIGITS = range(9, 11)
+"""Digits of the seconds since 1970, from 1973 to 2286."""
+SHORTEST = 1e-3
+"""Seconds between images, below which decimals in names count something else."""
+
+
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """Sort files by name, such that runs of digits compare as numbers and a dot between digits starts a fraction."""
+    files = list(files)
+    has_fractions = _has_fractions(files)
+    return sorted(files, key=lambda file: (natural(file.name, has_fractions), file.name))
+
+
+def natural(name: str, has_fractions: bool) -> list[tuple[bool, int, str]]:
+    """A sort key under which runs of digits compare as numbers, and those after a dot as fractions if they are some."""
+    parts = NUMBER.split(name.lower()) if has_fractions else re.split(r"(\d+)", name.lower())
+    key = []
+    for place, part in enumerate(parts):
+        whole, _, fraction = part.partition(".")
+        key.append((True, int(whole), fraction) if place % 2 else (False, 0, part))
+    return key
+
+
+def _has_fractions(files: list[Path]) -> bool:
+    """Return whether the digits after a dot are fractions, and do not count (1.9, 1.10).
+
+    Fractions have one length, or no zeros at their end. Raises SequenceError for times since 1970 that are neither, as
+    of a program that leaves zeros out after the dot.
+    """
+    numbers = [
+        number.partition(".") for file in files for number in NUMBER.findall(file.stem) if "." in number
+    ]
+    if len({len(fraction) for _, _, fraction in numbers}) < 2:
+        return True
+    is_unix = any(len(whole) in UNIX_DIGITS for whole, _, _ in numbers)
+    if any(len(fraction) > 1 and fraction.endswith("0") for _, _, fraction in numbers):
+        if is_unix:
+            lengths = {len(fraction): "".join((whole, dot, fraction)) for whole, dot, fraction in numbers}
+            short, long = lengths[min(lengths)], lengths[max(lengths)]
+            raise SequenceError(
+                f"{files[0].parent}: names with {short} and with {long}: these are no decimals, or zeros after the dot "
+                "are missing in some; write the times with one number of digits"
+            )
+        return False
+    counts = sorted(int(fraction) for _, _, fraction in numbers)
+    steps = {after - before for before, after in itertools.pairwise(counts)}
+    return is_unix or len(counts) < 3 or len(steps) > 1
+
+
+def times_in_names(frames: list[Path]) -> list[float] | None:
+    """Return the times that images, in order, are named by, seconds; None where names are something else.
+
+    Times are decimals (`0.5.png`), in names with other parts those since 1970 alone (`left_1305031102.0338.png`), or
+    they count milli-, micro- or nanoseconds since then.
+    """
+    names = [NUMBER.split(file.stem) for file in frames]
+    columns = list(zip(*names, strict=False))
+    if len(frames) < 2 or len(set(map(len, names))) > 1 or any(len(set(texts)) > 1 for texts in columns[::2]):
+        return None
+    is_bare = columns[::2] == [("",) * len(frames)] * 2
+    found = [times for times in map(partial(_times, is_bare), columns[1::2]) if times is not None]
+    return found[0] if len(found) == 1 and _has_fractions(frames) else None
+
+
+def _times(is_bare: bool, numbers: tuple[str, ...]) -> list[float] | None:
+    """The numbers in one place of the names as times; None if they are none."""
+    digits = {len(number.partition(".")[0]) for number in numbers}
+    if any("." in number for number in numbers):
+        times = [float(number) for number in numbers] if is_bare or digits <= set(UNIX_DIGITS) else []
+    else:
+        unit = UNIX_UNITS.get(digits.pop()) if len(digits) == 1 else None
+        times = [] if unit is None else [int(number) / unit for number in numbers]
+    intervals = [after - before for before, after in itertools.pairwise(times)]
+    return times if intervals and statistics.median(intervals) >= SHORTEST else None
 
 
 def find_frames(folder: Path) -> Found:
@@ -79,7 +155,7 @@ def sort_out(files: Iterable[Path], where: Path) -> Found:
     if len(rivals) > 1:
         globs = " or ".join(f"'{where / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
         raise SequenceError(f"{where}: several series of images that count alike; which one? Give {globs}")
-    return Found(sorted(frames, key=lambda file: (natural(file.name), file.name)), left_out)
+    return Found(in_order(frames), left_out)
 
 
 def other_kind(file: Path) -> str | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import os
+import statistics
 from collections import Counter
 from collections.abc import Iterable
 from collections.abc import Sequence as Listed
@@ -28,6 +29,7 @@ from torchslam.data.formats.frame_names import (
     is_pattern,
     match_pattern,
     subfolder,
+    times_in_names,
 )
 from torchslam.data.formats.image_file import bit_depth, read_color, read_gray, read_pixels
 from torchslam.data.formats.text_file import check_later
@@ -39,6 +41,9 @@ from torchslam.utils.text import printable
 DEFAULT_RATE = 30.0
 """Frame rate of images without timestamps."""
 CALIBRATION_FILES = ("calibration.txt", "calib.txt")
+SHORTEST, LONGEST = 2e-4, 1e4
+"""Seconds from image to image, beyond which times are taken to have another unit: microseconds read as nanoseconds, or
+nanoseconds since the system was started as seconds."""
 SAMPLES = 20
 """Number of images in which the brightest pixel of a 16-bit sequence is searched."""
 ATTEMPTS = 20
@@ -124,6 +129,13 @@ def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
         raise SequenceError(f"{name}: no images")
     for before, entry in itertools.pairwise(entries):
         check_later(entry.timestamp, before.timestamp, entry.where, SequenceError)
+    intervals = [after.timestamp - before.timestamp for before, after in itertools.pairwise(entries)]
+    interval = statistics.median(intervals) if intervals else 1.0
+    if not SHORTEST < interval < LONGEST:
+        raise SequenceError(
+            f"{entries[-1].where}: the images are {interval:.3g} s apart: their times seem to have another unit than "
+            "the seconds that are expected (EuRoC's data.csv: nanoseconds)"
+        )
 
 
 def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
@@ -171,15 +183,22 @@ def _is_folder(path: str) -> bool:
 
 
 def _open_folder(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """Images in natural order (`9.png` before `10.png`), `rate` a second.
+    """Images in natural order (`9.png` before `10.png`), at the times in their names, or `rate` a second.
 
     `camera` overrides a calibration.txt with them or above them. Raises SequenceError or CalibrationError.
     """
     base = Path(path).parent if is_pattern(path) else Path(path)
     found, folder = _find(path, base)
     camera = camera if camera is not None else find_calibration(folder) or find_calibration(base)
-    entries = at_rate(found.frames, rate or DEFAULT_RATE)
-    return ImageSequence(base.resolve().name, "image folder", entries, camera, None, found.notes)
+    times, notes = times_in_names(found.frames), found.notes
+    if times is None:
+        entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    else:
+        entries = [
+            ImageEntry(time, image, str(image)) for time, image in zip(times, found.frames, strict=True)
+        ]
+        notes = [*notes, "the names of the images are their times"]
+    return ImageSequence(base.resolve().name, "image folder", entries, camera, None, notes)
 
 
 def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:

@@ -19,7 +19,7 @@ from torch import Tensor
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames
-from torchslam.data.formats.text_file import check_later, numbered_lines, parse_floats
+from torchslam.data.formats.text_file import check_later, in_seconds, numbered_lines, parse_floats
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
 from torchslam.data.trajectories import checked_poses
@@ -48,7 +48,8 @@ def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     """
     base = Path(path)
     folder = next(base / name for name in CAMERAS if (base / name).is_dir())
-    times = _read_table(base / "times.txt", 1, SequenceError)[:, 0]
+    listed, rows = base / "times.txt", _read_table(base / "times.txt", 1, SequenceError)[:, 0].tolist()
+    times = torch.tensor([in_seconds(time, str(listed), SequenceError) for time in rows], dtype=torch.float64)
     found = find_frames(folder)
     images = found.frames
     if len(images) != len(times):
