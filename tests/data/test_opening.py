@@ -215,6 +215,8 @@ def test_sixteen_bit_images_are_scaled(tmp_path: Path, bits: int, white: int) ->
         cv2.imwrite(str(tmp_path / f"{index}.png"), image)
     sequence = open_sequence(tmp_path, CAMERA)
     assert sequence.notes == (f"{bits} of 16 bits are used",)
+    expected = (images[1] / white * 255)[..., None].repeat(3, axis=-1)
+    assert np.abs(sequence.color(1).numpy() - expected).max() <= 0.5 + 1e-3
     for index, image in enumerate(images):
         expected = torch.from_numpy(image.astype(np.float32)) / white
         torch.testing.assert_close(sequence.image(index)[0, 0], expected)

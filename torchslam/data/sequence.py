@@ -53,6 +53,7 @@ class Sequence(ABC):
         groundtruth: the true trajectory at its own rate, or None.
         notes: remarks for the user on how it was read, one line each.
         camera_std: relative standard deviation of the camera's focal length, if its calibration says so.
+        as_stored: whether the orientation in the EXIF block of images is ignored, as the program did that calibrated.
     """
 
     def __init__(
@@ -82,6 +83,7 @@ class Sequence(ABC):
         self.groundtruth = groundtruth
         self.notes = tuple(map(printable, notes))
         self.camera_std: float | None = None
+        self.as_stored = False
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
         self._T_cw: Tensor | None = None
         self._has_pose = torch.zeros(len(timestamps), dtype=torch.bool)
@@ -153,6 +155,10 @@ class Sequence(ABC):
     def file_name(self, index: int) -> str:
         """Return the file of a frame below the folder of all; empty if frames are no files but known by their times."""
         return ""
+
+    def is_turned(self, index: int) -> bool:
+        """Return whether an image has another orientation than its pixels in the file. Raises FrameError."""
+        return False
 
     def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         """Return the mask of a frame, True where features are allowed; None: everywhere."""
@@ -293,7 +299,7 @@ class Transformed(Sequence):
             guessed=whole.calibrated is Calibrated.GUESSED,
             notes=(*whole.notes, *notes),
         )
-        self.camera_std = whole.camera_std
+        self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
         self._whole = whole
         self._indices = indices
         self._same_pixels = camera is None and size in (None, whole.size)
@@ -324,6 +330,9 @@ class Transformed(Sequence):
 
     def file_name(self, index: int) -> str:
         return self._whole.file_name(self._at(index))
+
+    def is_turned(self, index: int) -> bool:
+        return self._whole.is_turned(self._at(index))
 
     def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         return self._whole.mask(self._at(index))

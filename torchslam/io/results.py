@@ -19,6 +19,7 @@ from torch import Tensor
 from torchslam.config import to_toml
 from torchslam.data.calibration import write_calibration
 from torchslam.data.formats.image_file import read_gray
+from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
@@ -290,6 +291,12 @@ def read_frames(path: str | Path) -> list[StepResult]:
     return [result for result, _ in _read_rows(path)]
 
 
+def source_of(path: str, fps: float | None, sequence: Sequence) -> dict[str, Any]:
+    """Return the entries of metrics.json from which the images are found again: path and options of `open_sequence`."""
+    entries = {"source": full_name(path), "source_fps": fps}
+    return entries | {"source_as_stored": True} if sequence.as_stored else entries
+
+
 def read_image_source(
     directory: Path, metrics: dict[str, Any], submaps: Iterable[Submap], elsewhere: str | None = None
 ) -> ImageSource | None:
@@ -316,7 +323,9 @@ def read_image_source(
         time = float(main[0].keyframes["timestamp"][keyframe])
         example = ExampleFrame(frame_id, time, read_gray(image, str(image)))
     files = {result.index: file for result, file in rows if file}
-    return ImageSource(path, metrics.get("source_fps"), files, example)
+    return ImageSource(
+        path, metrics.get("source_fps"), files, example, metrics.get("source_as_stored") is True
+    )
 
 
 def _read_rows(path: str | Path) -> list[tuple[StepResult, str]]:

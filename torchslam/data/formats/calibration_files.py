@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import re
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -236,13 +237,12 @@ def _from_transforms(path: Path, text: str) -> Calibration:
 
 
 def _from_corner(values: dict[str, float], fisheye: bool, source: str, size: Size | None) -> Calibration:
-    """A camera whose pixel coordinates count from the corner of the top left pixel."""
+    """A camera of COLMAP, or of what builds on it: pixels count from the corner of the top left one, as stored."""
     fx, fy = values.get("fx", values.get("f", 0.0)), values.get("fy", values.get("f", 0.0))
     intrinsics = [fx, fy, values["cx"] - HALF_PIXEL, values["cy"] - HALF_PIXEL]
-    if fisheye:
-        return checked(intrinsics, [values.get(f"k{n}", 0.0) for n in (1, 2, 3, 4)], source, "fisheye", size)
-    keys = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-    return checked(intrinsics, [values.get(key, 0.0) for key in keys], source, "", size)
+    keys = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    coefficients, model = [values.get(key, 0.0) for key in keys], "fisheye" if fisheye else ""
+    return replace(checked(intrinsics, coefficients, source, model, size), as_stored=True)
 
 
 def _size(width: list[float] | None, height: list[float] | None) -> Size | None:

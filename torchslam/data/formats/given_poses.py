@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 from collections import Counter
@@ -19,7 +20,7 @@ from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap,
 from torchslam.data.formats.text_file import parse_floats, read_text
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.trajectories import nearest, read_trajectory
-from torchslam.errors import CalibrationError, TrajectoryError
+from torchslam.errors import CalibrationError, FrameError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
 from torchslam.geometry.transforms import opengl
 from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
@@ -75,7 +76,8 @@ class GivenPoses:
     def rows(self, sequence: Sequence) -> Int[Tensor, " F"]:
         """Return the row of the pose of each frame of a sequence, -1 without a pose; no pose belongs to two frames.
 
-        Raises TrajectoryError where no frame has one.
+        Raises TrajectoryError where no frame has one, and for images that are turned by their EXIF orientation where
+        the poses are of the images as they are stored.
         """
         if self.timestamps is None:
             found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
@@ -88,7 +90,19 @@ class GivenPoses:
             )
         if not bool((found >= 0).any()):
             raise TrajectoryError(f"{self.path}: no pose is that of an image of {sequence.name}: {how}")
+        if self.timestamps is None:
+            self._check_orientation(sequence, torch.nonzero(found >= 0)[:, 0].tolist())
         return found
+
+    def _check_orientation(self, sequence: Sequence, frames: list[int]) -> None:
+        """Raise TrajectoryError for an image in another orientation than COLMAP, or what builds on it, saw it in."""
+        for frame in frames:
+            with contextlib.suppress(FrameError):  # said when the frame is read
+                if sequence.is_turned(frame):
+                    raise TrajectoryError(
+                        f"{sequence.image_name(frame)}: its EXIF orientation turns it, which {self.path} ignores: open "
+                        "the sequence with the camera in there (without --camera), or remove the tag from the images"
+                    )
 
 
 def read_poses(path: str | Path) -> GivenPoses:

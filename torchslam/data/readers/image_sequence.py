@@ -31,7 +31,14 @@ from torchslam.data.formats.frame_names import (
     subfolder,
     times_in_names,
 )
-from torchslam.data.formats.image_file import bit_depth, read_color, read_gray, read_pixels
+from torchslam.data.formats.image_file import (
+    AS_COLOR,
+    bit_depth,
+    is_turned,
+    read_color,
+    read_gray,
+    read_pixels,
+)
 from torchslam.data.formats.text_file import check_later
 from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -80,7 +87,8 @@ class ImageSequence(Sequence):
         """Raises SequenceError without images, for timestamps out of order or doubled, or where none of the
         first images can be read; CalibrationError for a camera of another image size."""
         _check_order(name, entries)
-        size, self._bits = _examine(entries)
+        as_stored = isinstance(camera, Calibration) and camera.as_stored
+        size, self._bits = _examine(entries, as_stored)
         notes = [*notes, f"{self._bits} of 16 bits are used"] if self._bits > 8 else notes
         super().__init__(
             name,
@@ -93,16 +101,17 @@ class ImageSequence(Sequence):
             notes=notes,
         )
         self._entries = entries
+        self.as_stored = as_stored
 
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         entry = self._entries[index]
-        image = read_gray(entry.path, entry.where, self._bits)
+        image = read_gray(entry.path, entry.where, self._bits, self.as_stored)
         self._check_size(entry, (image.shape[-1], image.shape[-2]))
         return image
 
     def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         entry = self._entries[index]
-        image = read_color(entry.path, entry.where)
+        image = read_color(entry.path, entry.where, self._bits, self.as_stored)
         self._check_size(entry, (image.shape[1], image.shape[0]))
         return image
 
@@ -111,6 +120,9 @@ class ImageSequence(Sequence):
 
     def file_name(self, index: int) -> str:
         return printable(os.path.relpath(self._entries[index].path, self._root))
+
+    def is_turned(self, index: int) -> bool:
+        return is_turned(self._entries[index].path, self.as_stored)
 
     @cached_property
     def _root(self) -> str:
@@ -138,10 +150,10 @@ def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
         )
 
 
-def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
+def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, int], int]:
     """Return the most common size of the first three readable images, since the first may differ, and their bit depth.
 
-    The depth of images of 16 bits is that of the brightest pixel of a sample over the whole sequence.
+    The depth of images of 16 bits is that of the brightest color of a sample over the whole sequence.
     """
     sizes: list[tuple[int, int]] = []
     failures: list[FrameError] = []
@@ -149,7 +161,7 @@ def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
     is_deep = False
     for entry in entries:
         try:
-            image = read_pixels(entry.path, entry.where)
+            image = read_pixels(entry.path, entry.where, as_stored)
             sizes.append((image.shape[1], image.shape[0]))
             bits, is_deep = max(bits, bit_depth([image])), is_deep or image.dtype == np.uint16
         except FrameError as failure:
@@ -160,7 +172,7 @@ def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
         raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
     for entry in entries[:: max(1, len(entries) // SAMPLES)] if is_deep else ():
         with contextlib.suppress(FrameError):  # said when the frame is read
-            bits = max(bits, bit_depth([read_pixels(entry.path, entry.where)]))
+            bits = max(bits, bit_depth([read_pixels(entry.path, entry.where, as_stored, AS_COLOR)]))
     return Counter(sizes).most_common(1)[0][0], bits
 
 

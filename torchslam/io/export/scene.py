@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.data import open_sequence
+from torchslam.data.calibration import Calibration
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Sequence
@@ -274,12 +275,14 @@ class ImageSource:
         fps: frame rate with which the run read images without timestamps.
         files: file of each frame, if frames are files; a file is a frame's own, a time that was counted is not.
         example: frame by whose image the sequence is recognized; None if there is none.
+        as_stored: whether the run ignored the EXIF orientation of images.
     """
 
     path: str
     fps: float | None = None
     files: Mapping[int, str] = field(default_factory=dict)
     example: ExampleFrame | None = None
+    as_stored: bool = False
 
 
 def open_images(
@@ -303,9 +306,11 @@ def open_images(
     if is_live(source.path):  # nor is it connected to because a results folder says so
         raise ResultsError(f"{source.path}: a live source gives each image once; {otherwise}")
     try:
-        sequence = open_sequence(source.path)
+        # The camera is not used: the images may have another size.
+        camera = Calibration("pinhole", (1.0, 1.0, 0.0, 0.0), source.path, as_stored=source.as_stored)
+        sequence = open_sequence(source.path, camera)
         if source.fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):
-            sequence = open_sequence(source.path, fps=source.fps)
+            sequence = open_sequence(source.path, camera, fps=source.fps)
         if sequence.size != scene.camera.size:
             sequence = resize(sequence, "{}x{}".format(*scene.camera.size))
     except SequenceError as error:
