@@ -120,12 +120,14 @@ def test_names_that_are_no_times_keep_their_order(
 ) -> None:
     for index, stem in enumerate(stems):
         write_picture(tmp_path / "all" / f"{stem}.png", index)
-        write_picture(tmp_path / "masks" / f"{stem}.x.png", index)
+        black = np.where(np.arange(64) <= index, 255, 0).astype(np.uint8)[None].repeat(48, 0)
+        (tmp_path / "masks").mkdir(exist_ok=True)
+        cv2.imwrite(str(tmp_path / "masks" / f"{stem}.x.png"), black)
     sequence = open_sequence(tmp_path / "all", CAMERA)
     assert names(sequence) == [f"{stem}.png" for stem in stems]
     assert sequence.frame_rate == pytest.approx(30.0)
     masked = open_sequence(tmp_path / "all", CAMERA, mask=tmp_path / "masks")  # by order
-    assert all(torch.equal(masked.mask(i), sequence.image(i) > 0) for i in range(len(stems)))
+    assert [int(masked.mask(i)[0, 0, 0].sum()) for i in range(len(stems))] == list(range(1, len(stems) + 1))
 
 
 def test_times_whose_zeros_are_missing_are_refused(tmp_path: Path, write_picture: Write) -> None:
@@ -250,3 +252,86 @@ def test_every_read_is_bounded(tmp_path: Path, write_picture: Write, monkeypatch
     monkeypatch.setattr("torchslam.data.formats.text_file.MAX_BYTES", 100)
     with pytest.raises(CalibrationError, match="more than the 100 of a text"):
         open_sequence(tmp_path)
+
+
+# --- the remedy, in one line ---------------------------------------------------------------------------------
+
+
+def refused(path: Path | str, message: str, **options: object) -> None:
+    with pytest.raises(SequenceError, match=message) as error:
+        open_sequence(path, **options)  # type: ignore[arg-type]
+    assert str(error.value).isprintable()
+
+
+def test_patterns_with_counters_are_written_with_stars(tmp_path: Path, write_picture: Write) -> None:
+    write_picture(tmp_path / "frame_000001.png")
+    for name in ("frame_%06d.png", "frame_%d.png"):
+        refused(tmp_path / name, r"does not exist; did you mean '.*/frame_\*\.png'\? In quotes")
+        assert len(open_sequence(tmp_path / "frame_*.png")) == 1
+    refused(tmp_path / "left_%06d.png", r"left_%06d\.png: does not exist")
+
+
+def test_addresses_of_files_are_to_be_downloaded() -> None:
+    refused(
+        "http://me:secret@localhost/a.mp4", r"^http://localhost/a\.mp4: .* download it, and give the file$"
+    )
+    refused("http://localhost:1/a.html", r"cannot be opened as a stream; download a file")
+
+
+@pytest.mark.parametrize("suffix", [".HEIC", ".avif", ".dng"])
+def test_images_of_other_kinds_are_to_be_converted(tmp_path: Path, write_picture: Write, suffix: str) -> None:
+    kind = f"{suffix[1:].upper()} images, which are not read .convert them"
+    for index in range(3):
+        (tmp_path / "mine" / "images").mkdir(parents=True, exist_ok=True)
+        (tmp_path / "mine" / "images" / f"{index}{suffix}").write_bytes(b"ftypheic")
+    for path, message in (
+        (tmp_path / "mine" / "images", f"no frames, only 3 {kind}"),
+        (tmp_path / "mine", f"no frames, only 3 {kind}.* below"),
+        (tmp_path / "mine" / "images" / f"1{suffix}", f"1{suffix}: {kind}"),
+        (tmp_path / "mine" / "images" / f"*{suffix}", f"{suffix}: {kind}"),
+    ):
+        refused(path, message)
+    write_picture(tmp_path / "mine" / "images" / "3.jpg")
+    assert open_sequence(tmp_path / "mine").notes[0].startswith(f"ignored: 3 {suffix[1:].upper()} images")
+
+
+def test_a_stray_image_beside_a_folder_of_images(tmp_path: Path, write_picture: Write) -> None:
+    for index in range(3):
+        write_picture(tmp_path / "images" / f"{index}.png", index)
+    write_picture(tmp_path / "preview.png", 9)
+    sequence = open_sequence(tmp_path)
+    assert names(sequence) == ["0.png", "1.png", "2.png"]
+    assert sequence.notes == ("ignored: 1 images beside images/",)
+    for index in range(4):
+        write_picture(tmp_path / f"{index}.png", index)
+    (tmp_path / "preview.png").unlink()
+    assert names(open_sequence(tmp_path)) == ["0.png", "1.png", "2.png", "3.png"]
+    assert open_sequence(tmp_path).notes == ("ignored: 3 images in images/",)
+
+
+def test_masks_whose_black_is_not_black(tmp_path: Path, write_picture: Write) -> None:
+    write_picture(tmp_path / "0.png")
+    black = np.full((48, 64), 235, np.uint8)
+    black[:24] = 16
+    cv2.imwrite(str(tmp_path / "m.png"), black)
+    refused(tmp_path / "0.png".replace("0", "*"), r"m\.png: the darkest .* are 16", mask=tmp_path / "m.png")
+    cv2.imwrite(str(tmp_path / "m.jpg"), black)  # is never exactly black
+    labels = np.where(black > 16, 3, 1).astype(np.uint8)  # whatever is not 0 is allowed
+    cv2.imwrite(str(tmp_path / "l.png"), labels)
+    for name, expected in (("m.jpg", black > 16), ("l.png", labels > 0)):
+        mask = open_sequence(tmp_path / "0*.png", mask=tmp_path / name).mask(0)
+        assert mask is not None
+        np.testing.assert_array_equal(mask[0, 0].numpy(), expected)
+
+
+def test_transparency(tmp_path: Path, write_picture: Write) -> None:
+    picture = write_picture(tmp_path / "0.png")
+    rgba = np.dstack([np.full((48, 64, 3), 255, np.uint8), picture])
+    cv2.imwrite(str(tmp_path / "m.png"), rgba)
+    refused(tmp_path / "0*.png", r"m\.png: the mask is in the alpha channel", mask=tmp_path / "m.png")
+    cv2.imwrite(str(tmp_path / "0.png"), np.dstack([picture] * 4))
+    assert open_sequence(tmp_path / "0*.png").notes == (
+        "images have transparent pixels, which are used as any other; --mask masks them",
+    )
+    cv2.imwrite(str(tmp_path / "0.png"), np.dstack([picture] * 3 + [np.full_like(picture, 255)]))
+    assert open_sequence(tmp_path / "0*.png").notes == ()

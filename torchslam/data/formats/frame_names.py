@@ -8,11 +8,11 @@ import re
 import statistics
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from torchslam.data.formats.image_file import SUFFIXES
+from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
 from torchslam.data.formats.text_file import UNIX_UNITS
 from torchslam.errors import SequenceError
 
@@ -49,6 +49,10 @@ class Found:
 
     frames: list[Path]
     left_out: Counter[str]
+
+    def without(self, count: int, kind: str) -> Found:
+        """Return the same frames, with images elsewhere that were left out."""
+        return replace(self, left_out=self.left_out + Counter({kind: count}))
 
     @property
     def notes(self) -> list[str]:
@@ -162,6 +166,8 @@ def other_kind(file: Path) -> str | None:
     """Return the kind of an image that is not a frame, in the plural; None for a frame."""
     if file.name.startswith("."):
         return "hidden files"
+    if file.suffix.lower() in FOREIGN:
+        return f"{file.suffix[1:].upper()} images, which are not read (convert them to JPEG or PNG)"
     words = re.split(r"[^a-z]+", file.stem.lower())
     return next((OTHER_KINDS[word] for word in words if word in OTHER_KINDS), None)
 
@@ -181,12 +187,12 @@ def subfolder(folder: Path) -> Path | None:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of a folder with an image's suffix."""
+    """The files of a folder with an image's suffix, also one that is not read."""
     files: list[Path] = []
     for number, file in enumerate(folder.iterdir()):
         if number >= MAX_FILES:
             raise SequenceError(f"{folder}: more than {MAX_FILES} files; give a folder with the images alone")
-        if file.suffix.lower() in SUFFIXES and file.is_file():
+        if file.suffix.lower() in SUFFIXES | FOREIGN and file.is_file():
             files.append(file)
     return files
 

@@ -175,17 +175,25 @@ def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
 
 
 def _text_images(path: Path) -> list[tuple[str, list[float]]]:
-    """Names and `qw qx qy qz tx ty tz`; every second line lists points and may be empty."""
-    lines = [line for line in read_text(path, TrajectoryError).splitlines() if not line.startswith("#")]
-    images = []
-    for line in lines[::2]:
+    """Names and `qw qx qy qz tx ty tz`; the line after an image lists its points, and may be empty or left out."""
+    images, is_points = [], False
+    for line in read_text(path, TrajectoryError).splitlines():
+        if line.startswith("#"):
+            continue
         words = line.split(maxsplit=9)
-        if not words:
+        if not words or (is_points and _are_points(line.split())):
+            is_points = False
             continue
         if len(words) != 10:
             raise TrajectoryError(f"{path}: expected `id qw qx qy qz tx ty tz camera name`, got `{line}`")
         images.append((words[9].strip(), parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)))
+        is_points = True
     return images
+
+
+def _are_points(words: list[str]) -> bool:
+    """Whether a line may be of observations: column, row and the point's number, -1 for none; no name is a number."""
+    return len(words) % 3 == 0 and words[-1].removeprefix("-").isdecimal()
 
 
 def _binary_images(path: Path) -> list[tuple[str, list[float]]]:

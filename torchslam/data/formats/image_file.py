@@ -24,6 +24,11 @@ from torchslam.errors import FrameError
 from torchslam.utils.files import check_regular, read_bytes
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
+FOREIGN = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".exr", ".hdr", ".dng"}
+    | {".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+)
+"""Suffixes of images that are not read."""
 WIDTH, HEIGHT = 256, 257  # tags of a TIFF
 ORIENTATION = 0x0112  # tag of EXIF
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
@@ -64,6 +69,12 @@ def read_pixels(
 ) -> Shaped[np.ndarray, "H W *channels"]:
     """An image file as gray or with `AS_COLOR`, uint8 or uint16. Raises FrameError as `read_gray`."""
     return _read(path, where, flags, as_stored)
+
+
+def has_transparency(path: Path) -> bool:
+    """Return whether an image file has pixels that are not opaque. Raises FrameError as `read_gray`."""
+    image = _read(path, str(path), cv2.IMREAD_UNCHANGED, as_stored=False)
+    return image.shape[2:] == (4,) and int(image[..., 3].min()) < np.iinfo(image.dtype).max
 
 
 def is_turned(path: Path, as_stored: bool) -> bool:

@@ -39,12 +39,15 @@ def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     folder = Path(path)
     root = _root(folder)
     sensor = root / "cam0" / "sensor.yaml"
-    camera = camera if camera is not None else _read_intrinsics(sensor)
-    groundtruth = None
-    if (root / TRUTH).is_file():
-        groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor))
+    groundtruth, notes, has_truth = None, [], (root / TRUTH).is_file()
+    if not sensor.exists():
+        unused = ", and the ground truth is not used, which is of the body" if has_truth else ""
+        notes = [f"no {sensor}: the camera is unknown unless --camera is given{unused}"]
+    else:
+        camera = camera if camera is not None else _read_intrinsics(sensor)
+        groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor)) if has_truth else None
     name = folder.resolve().parent.name if folder.name == "mav0" else folder.name
-    return ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth)
+    return ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth, notes)
 
 
 def _root(path: Path) -> Path:
@@ -69,7 +72,8 @@ def _read_intrinsics(path: Path) -> Calibration:
     models = {"radial-tangential": "radial_tangential", "equidistant": "fisheye"}
     if model is None or model[1] not in models:
         raise CalibrationError(f"{path}: distortion_model must be one of {', '.join(models)}")
-    numbers = _numbers(path, "intrinsics", 4) + _numbers(path, "distortion_coefficients", 4)
+    counts = (4,) if model[1] == "equidistant" else (4, 5)
+    numbers = _numbers(path, "intrinsics", 4) + _numbers(path, "distortion_coefficients", *counts)
     return Calibration.from_numbers(numbers, str(path), models[model[1]])
 
 
@@ -106,15 +110,16 @@ def _text(path: Path) -> str:
     return "\n".join(line for _, line in numbered_lines(path, CalibrationError))
 
 
-def _numbers(path: Path, key: str, count: int) -> list[float]:
-    return _bracketed(_text(path), str(path), key, count)
+def _numbers(path: Path, key: str, *counts: int) -> list[float]:
+    return _bracketed(_text(path), str(path), key, *counts)
 
 
-def _bracketed(text: str, where: str, key: str, count: int) -> list[float]:
+def _bracketed(text: str, where: str, key: str, *counts: int) -> list[float]:
     """The numbers of `key: [1, 2, ...]`, over as many lines as it takes."""
     found = re.search(rf"\b{key}:\s*\[([^\]]*)\]", text)
     numbers = parse_floats(found[1], f"{where}: {key}", CalibrationError) if found else []
-    if len(numbers) != count:
+    if len(numbers) not in counts:
+        count = " or ".join(map(str, counts))
         raise CalibrationError(f"{where}: expected `{key}: [{count} numbers]`, got {len(numbers)}")
     return numbers
 

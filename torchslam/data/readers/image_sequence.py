@@ -34,6 +34,7 @@ from torchslam.data.formats.frame_names import (
 from torchslam.data.formats.image_file import (
     AS_COLOR,
     bit_depth,
+    has_transparency,
     is_turned,
     read_color,
     read_gray,
@@ -53,6 +54,7 @@ SHORTEST, LONGEST = 2e-4, 1e4
 nanoseconds since the system was started as seconds."""
 SAMPLES = 20
 """Number of images in which the brightest pixel of a 16-bit sequence is searched."""
+WITH_ALPHA = frozenset({".png", ".webp", ".tif", ".tiff"})
 ATTEMPTS = 20
 """Number of unreadable images after which opening a sequence fails."""
 
@@ -90,6 +92,8 @@ class ImageSequence(Sequence):
         as_stored = isinstance(camera, Calibration) and camera.as_stored
         size, self._bits = _examine(entries, as_stored)
         notes = [*notes, f"{self._bits} of 16 bits are used"] if self._bits > 8 else notes
+        if _are_transparent(entries):
+            notes = [*notes, "images have transparent pixels, which are used as any other; --mask masks them"]
         super().__init__(
             name,
             kind,
@@ -176,6 +180,16 @@ def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, i
     return Counter(sizes).most_common(1)[0][0], bits
 
 
+def _are_transparent(entries: Listed[ImageEntry]) -> bool:
+    """Return whether the first image that can be read has transparent pixels."""
+    for entry in entries[:ATTEMPTS]:
+        if entry.path.suffix.lower() not in WITH_ALPHA:
+            return False
+        with contextlib.suppress(FrameError):  # said when the frame is read
+            return has_transparency(entry.path)
+    return False
+
+
 def find_calibration(path: Path) -> Calibration | None:
     """The calibration file of a folder, if it has one."""
     for name in CALIBRATION_FILES:
@@ -221,9 +235,13 @@ def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:
 def _find(path: str, base: Path) -> tuple[Found, Path]:
     if is_pattern(path):
         return match_pattern(path), base
-    found = find_frames(base)
-    inner = None if found.frames else subfolder(base)
-    return (found, base) if inner is None else (find_frames(inner), inner)
+    found, inner = find_frames(base), subfolder(base)
+    if inner is None:
+        return found, base
+    inside = find_frames(inner)
+    if len(inside.frames) > len(found.frames):  # a preview beside them, or nothing
+        return inside.without(len(found.frames), f"images beside {inner.name}/"), inner
+    return found.without(len(inside.frames), f"images in {inner.name}/"), base
 
 
 FOLDER = Reader(f"images, or a folder {'/, '.join(FOLDERS)}/ with images", _is_folder, _open_folder)
