@@ -136,6 +136,10 @@ def test_times_whose_zeros_are_missing_are_refused(tmp_path: Path, write_picture
         write_picture(tmp_path / f"{stem}.png", index)
     with pytest.raises(SequenceError, match=r"\.63555580 and with .*\.113555584: .* one number of digits"):
         open_sequence(tmp_path, CAMERA)
+    (tmp_path / "1403636579.63555580.png").rename(tmp_path / "1403636579.63555584.png")
+    write_picture(tmp_path / "1403636579.163555584.png")
+    with pytest.raises(SequenceError, match=r"\.63555584 and with .*\.163555584: .* one number of digits"):
+        open_sequence(tmp_path, CAMERA)
 
 
 def test_misspelled_names_get_suggestions(

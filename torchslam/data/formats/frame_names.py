@@ -65,6 +65,8 @@ NUMBER = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)|\d+)")
 """A run of digits, or two with a dot between them; more dots separate parts of a version or a date."""
 UNIX_DIGITS = range(9, 11)
 """Digits of the seconds since 1970, from 1973 to 2286."""
+FLOAT_DIGITS = 7
+"""The most digits after the dot of the shortest text that is a float of seconds since 1970."""
 SHORTEST = 1e-3
 """Seconds between images, below which decimals in names count something else."""
 
@@ -89,27 +91,40 @@ def natural(name: str, has_fractions: bool) -> list[tuple[bool, int, str]]:
 def _has_fractions(files: list[Path]) -> bool:
     """Return whether the digits after a dot are fractions, and do not count (1.9, 1.10).
 
-    Fractions have one length, or no zeros at their end. Raises SequenceError for times since 1970 that are neither, as
-    of a program that leaves zeros out after the dot.
+    Fractions have one length, or no zeros at their end. Raises SequenceError for times since 1970 that seem to count,
+    as of a program that leaves zeros out after the dot.
     """
     numbers = [
         number.partition(".") for file in files for number in NUMBER.findall(file.stem) if "." in number
     ]
-    if len({len(fraction) for _, _, fraction in numbers}) < 2:
+    by_length = {len(fraction): f"{whole}.{fraction}" for whole, _, fraction in numbers}
+    if len(by_length) < 2:
         return True
-    is_unix = any(len(whole) in UNIX_DIGITS for whole, _, _ in numbers)
-    if any(len(fraction) > 1 and fraction.endswith("0") for _, _, fraction in numbers):
-        if is_unix:
-            lengths = {len(fraction): "".join((whole, dot, fraction)) for whole, dot, fraction in numbers}
-            short, long = lengths[min(lengths)], lengths[max(lengths)]
-            raise SequenceError(
-                f"{files[0].parent}: names with {short} and with {long}: these are no decimals, or zeros after the dot "
-                "are missing in some; write the times with one number of digits"
-            )
-        return False
-    counts = sorted(int(fraction) for _, _, fraction in numbers)
-    steps = {after - before for before, after in itertools.pairwise(counts)}
-    return is_unix or len(counts) < 3 or len(steps) > 1
+    fractions = [fraction for _, _, fraction in numbers if len(fraction) > 1]
+    has_ends = any(fraction.endswith("0") for fraction in fractions)
+    if not any(len(whole) in UNIX_DIGITS for whole, _, _ in numbers):
+        counts = sorted(int(fraction) for _, _, fraction in numbers)
+        steps = {after - before for before, after in itertools.pairwise(counts)}
+        return not has_ends and (len(counts) < 3 or len(steps) > 1)
+    if any(fraction.startswith("0") for fraction in fractions):
+        is_counted = False
+    else:
+        parts = 10 ** max(by_length)
+        counted = [int(whole) + int(fraction) / parts for whole, _, fraction in numbers]
+        decimal = [float(f"{whole}.{fraction}") for whole, _, fraction in numbers]
+        is_long = max(by_length) > FLOAT_DIGITS
+        is_counted = has_ends or is_long or _irregularity(counted) < _irregularity(decimal)
+    if is_counted:
+        raise SequenceError(
+            f"{files[0].parent}: names with {by_length[min(by_length)]} and with {by_length[max(by_length)]}: zeros "
+            "after the dot seem to be missing in some; write the times with one number of digits"
+        )
+    return True
+
+
+def _irregularity(times: list[float]) -> float:
+    """Return the standard deviation of the intervals between times, seconds."""
+    return statistics.pstdev(after - before for before, after in itertools.pairwise(sorted(times)))
 
 
 def times_in_names(frames: list[Path]) -> list[float] | None:
