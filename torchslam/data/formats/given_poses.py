@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import os
 import struct
 from collections import Counter
@@ -192,8 +193,16 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
 
 
 def _are_points(words: list[str]) -> bool:
-    """Whether a line may be of observations: column, row and the point's number, -1 for none; no name is a number."""
-    return len(words) % 3 == 0 and words[-1].removeprefix("-").isdecimal()
+    """Whether a line is of observations: numbers alone, in threes, of which the last may be cut; a line of ten words is
+    that of an image whose name is a number."""
+    return len(words) != 10 and _are_numbers(words)
+
+
+def _are_numbers(words: list[str]) -> bool:
+    try:
+        return all(map(math.isfinite, map(float, words)))
+    except ValueError:
+        return False
 
 
 def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
