@@ -116,6 +116,14 @@ def test_refined_poses_keep_the_format_of_the_input(
         assert "camera_angle_x" not in content
 
 
+def test_a_rendered_sequence_takes_the_camera_of_the_poses(
+    given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = write("colmap", given, tmp_path)
+    assert main(["refine", "synthetic:room?frames=2", "--poses", str(poses), "-o", str(tmp_path / "a")]) == 2
+    assert "no pose is that of an image of room: no image is called" in capsys.readouterr().err
+
+
 def test_images_with_an_orientation_are_refined_as_colmap_saw_them(
     folder: Path, given: Tensor, truth: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

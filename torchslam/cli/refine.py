@@ -23,9 +23,10 @@ from torchslam.cli import arguments
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found, write_calibration
-from torchslam.data.camera_argument import unknown_camera
+from torchslam.data.camera_argument import fit_camera, unknown_camera
 from torchslam.data.formats.given_poses import GivenPoses, read_poses
 from torchslam.data.sequence import Calibrated
+from torchslam.data.synthetic.sequence import is_synthetic
 from torchslam.errors import ConfigError, SequenceError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.io.report import run_metrics, summary
@@ -87,7 +88,14 @@ def execute(options: argparse.Namespace) -> int:
     if options.fix_camera and options.refine_distortion:
         raise ConfigError("--refine-distortion cannot be combined with --fix-camera")
     given = read_poses(options.poses)
-    sequence = _with_camera(arguments.sequence(options, given.calibration))
+    calibration = given.calibration if options.camera is None else None
+    if is_synthetic(options.path):  # which is opened with a camera of its own alone
+        sequence = arguments.sequence(options)
+        if calibration is not None:
+            sequence = sequence.with_camera(fit_camera(calibration, sequence.size, options.poses))
+    else:
+        sequence = arguments.sequence(options, calibration)
+    sequence = _with_camera(sequence)
     is_guess = sequence.calibrated is Calibrated.GUESSED
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.IF_CONTRADICTED
     plan = RefinePlan(

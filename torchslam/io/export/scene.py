@@ -306,8 +306,9 @@ def open_images(
     if is_live(source.path):  # nor is it connected to because a results folder says so
         raise ResultsError(f"{source.path}: a live source gives each image once; {otherwise}")
     try:
-        # The camera is not used: the images may have another size.
-        camera = Calibration("pinhole", (1.0, 1.0, 0.0, 0.0), source.path, as_stored=source.as_stored)
+        camera = None
+        if source.as_stored:  # the numbers are not used: the images may have another size
+            camera = Calibration("pinhole", (1.0, 1.0, 0.0, 0.0), source.path, as_stored=True)
         sequence = open_sequence(source.path, camera)
         if source.fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):
             sequence = open_sequence(source.path, camera, fps=source.fps)
