@@ -53,6 +53,7 @@ class Sequence(ABC):
         groundtruth: the true trajectory at its own rate, or None.
         notes: remarks for the user on how it was read, one line each.
         camera_std: relative standard deviation of the camera's focal length, if its calibration says so.
+        counted_until: where images have no times and are counted at some rate, half an interval after the last one.
         as_stored: whether the orientation in the EXIF block of images is ignored, as the program did that calibrated.
     """
 
@@ -84,6 +85,7 @@ class Sequence(ABC):
         self.notes = tuple(map(printable, notes))
         self.camera_std: float | None = None
         self.as_stored = False
+        self.counted_until: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
         self._T_cw: Tensor | None = None
         self._has_pose = torch.zeros(len(timestamps), dtype=torch.bool)
@@ -300,6 +302,7 @@ class Transformed(Sequence):
             notes=(*whole.notes, *notes),
         )
         self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
+        self.counted_until = whole.counted_until
         self._whole = whole
         self._indices = indices
         self._same_pixels = camera is None and size in (None, whole.size)

@@ -224,7 +224,10 @@ def _open_folder(path: str, camera: GivenCamera | None, rate: float | None) -> I
             ImageEntry(time, image, str(image)) for time, image in zip(times, found.frames, strict=True)
         ]
         notes = [*notes, "the names of the images are their times"]
-    return ImageSequence(base.resolve().name, "image folder", entries, camera, None, notes)
+    sequence = ImageSequence(base.resolve().name, "image folder", entries, camera, None, notes)
+    if times is None:
+        sequence.counted_until = (len(entries) - 0.5) / (rate or DEFAULT_RATE)
+    return sequence
 
 
 def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:
