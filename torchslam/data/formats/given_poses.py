@@ -77,8 +77,8 @@ class GivenPoses:
     def rows(self, sequence: Sequence) -> Int[Tensor, " F"]:
         """Return the row of the pose of each frame of a sequence, -1 without a pose; no pose belongs to two frames.
 
-        Raises TrajectoryError where no frame has one, for poses that are left over where the times of images are counted,
-        and for images that are turned by their EXIF orientation where the poses are of the images as they are stored.
+        Raises TrajectoryError where no frame has one, for poses that are left over where the times of images are
+        counted, and for images that are turned by their EXIF orientation where the poses are of the stored images.
         """
         if self.timestamps is None:
             found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
@@ -89,8 +89,8 @@ class GivenPoses:
             without_image = 0 if until is None else int((self.timestamps > until).sum())
             if without_image and bool((found >= 0).any()):
                 raise TrajectoryError(
-                    f"{self.path}: {without_image} of {len(self)} poses are of no image of {sequence.name}, whose times "
-                    "are counted: with one image more or less, the others have wrong poses; name the images by their "
+                    f"{self.path}: {without_image} of {len(self)} poses are of no image of {sequence.name}, whose "
+                    "times are counted: with one image more or less, the others have wrong poses; name the images by their "
                     "times, or list them in rgb.txt"
                 )
             how = (
