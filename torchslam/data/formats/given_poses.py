@@ -90,8 +90,8 @@ class GivenPoses:
             if without_image and bool((found >= 0).any()):
                 raise TrajectoryError(
                     f"{self.path}: {without_image} of {len(self)} poses are of no image of {sequence.name}, whose "
-                    "times are counted: with one image more or less, the others have wrong poses; name the images by their "
-                    "times, or list them in rgb.txt"
+                    "times are counted: with one image more or less, the others have wrong poses; name the images "
+                    "by their times, or list them in rgb.txt"
                 )
             how = (
                 f"its times, from {float(self.timestamps[0])} to {float(self.timestamps[-1])} s, are not those of the "
