@@ -31,7 +31,7 @@ from torchslam.dense.estimate import Estimate, estimate_depth
 from torchslam.dense.learned import HALF_INPUTS, RatingNet, net_inputs
 from torchslam.densify.views import SWEPT, ViewImages, views_of
 from torchslam.io.export.scene import open_images, pinhole_within, scene_of
-from torchslam.io.results import MAP, read_metrics
+from torchslam.io.results import MAP, read_image_source, read_metrics
 from torchslam.learning import Log, Training
 from torchslam.map.file import read_atlas
 
@@ -87,7 +87,9 @@ def of_run(folder: Path, resolution: str = str(LONG_SIDE)) -> list[Example]:
     submap = next(each for each in saved.atlas if each.number == metrics["submap"])
     scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=True)
     views = views_of(scene, map_size(resolution, pinhole_within(scene.camera).size))
-    images = ViewImages(views, open_images(metrics["source"], scene, views.camera, metrics.get("source_fps")))
+    source = read_image_source(folder, metrics, saved.atlas)
+    assert source is not None, f"{folder}: does not say where its images are"
+    images = ViewImages(views, open_images(source, scene, views.camera))
     found = []
     for view in range(len(views)):
         sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])

@@ -19,7 +19,7 @@ from torchslam.dense import DepthMaps
 from torchslam.densify.views import ViewImages, Views, views_of
 from torchslam.geometry import se3_inverse
 from torchslam.io.export.scene import open_images, scene_of
-from torchslam.io.results import DEPTHS, MAP, read_metrics
+from torchslam.io.results import DEPTHS, MAP, read_image_source, read_metrics
 from torchslam.map.file import read_atlas
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
@@ -58,7 +58,9 @@ def opened(folder: Path, maps: DepthMaps) -> tuple[Views, ViewImages]:
     scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=True)
     views = views_of(scene, maps.camera.size)
     assert torch.equal(views.frame_index, maps.frame_index), "not the views of the depth maps"
-    return views, ViewImages(views, open_images(metrics["source"], scene, views.camera))
+    source = read_image_source(folder, metrics, saved.atlas)
+    assert source is not None, f"{folder}: does not say where its images are"
+    return views, ViewImages(views, open_images(source, scene, views.camera))
 
 
 def main() -> None:

@@ -381,3 +381,21 @@ def test_usage_errors_have_status_2(capsys: pytest.CaptureFixture[str]) -> None:
     ):
         with pytest.raises(SystemExit, match="2"):
             main(arguments)
+
+
+@pytest.mark.parametrize("command", [["info"], ["run", "-o", "results"]])
+def test_a_pattern_that_the_shell_expanded(
+    tmp_path: Path, command: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / f"{index}.png" for index in range(3)]
+    for path in files:
+        path.write_bytes(b"")
+    with pytest.raises(SystemExit) as stopped:
+        main([*command, *map(str, files)])
+    assert stopped.value.code == 2
+    error = capsys.readouterr().err
+    assert f"3 files instead of one path, the first {files[0]}: a shell expands patterns" in error
+    assert f"in quotes: '{tmp_path / '*.png'}'" in error
+    with pytest.raises(SystemExit):
+        main([*command, str(files[0]), "nonsense"])
+    assert "unrecognized arguments: nonsense" in capsys.readouterr().err

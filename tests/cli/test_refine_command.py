@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 from torch import Tensor
 
 from tests.cli.test_cli import FAST, write_tum_folder
@@ -112,6 +114,44 @@ def test_refined_poses_keep_the_format_of_the_input(
         assert content["applied_scale"] == 2.0
         assert content["frames"][0]["sharpness"] == 7
         assert "camera_angle_x" not in content
+
+
+def test_a_rendered_sequence_takes_the_camera_of_the_poses(
+    given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = write("colmap", given, tmp_path)
+    assert main(["refine", "synthetic:room?frames=2", "--poses", str(poses), "-o", str(tmp_path / "a")]) == 2
+    assert "no pose is that of an image of room: no image is called" in capsys.readouterr().err
+
+
+def test_images_with_an_orientation_are_refined_as_colmap_saw_them(
+    folder: Path, given: Tensor, truth: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """COLMAP ignores the EXIF orientation; what reads the images of the results again does so, too."""
+    exif, images, results = Image.Exif(), tmp_path / "images", tmp_path / "results"
+    exif[0x0112] = 3
+    images.mkdir()
+    for index in range(FRAMES):
+        with Image.open(folder / "rgb" / f"{index}.png") as image:
+            image.save(images / f"{index}.jpg", quality=95, exif=exif)
+    poses = write("colmap", given, tmp_path)
+    text = (poses / "images.txt").read_text().replace(".png", ".jpg")
+    (poses / "images.txt").write_text(text)
+    arguments = ["refine", str(images), "--poses", str(poses), "-o", str(results), "--refine-camera"]
+    assert main([*arguments, *FAST]) == 0
+    refined = read_poses(results / "refined")
+    assert shape_errors(refined.T_cw, truth[:-1]) < 0.5 * shape_errors(given[:-1], truth[:-1])
+    assert main(["export", str(results), "--to", "colmap", "-o", str(tmp_path / "model")]) == 0
+    with (
+        Image.open(tmp_path / "model" / "images" / "000000.png") as written,
+        Image.open(folder / "rgb" / "0.png") as image,
+    ):
+        difference = np.asarray(written.convert("L"), float) - np.asarray(image.convert("L"), float)
+    assert np.abs(difference).mean() < 3
+    capsys.readouterr()
+    again = ["refine", str(images), "--poses", str(poses), "-o", str(tmp_path / "b")]
+    assert main([*again, "--camera", "500,500,319.5,239.5"]) == 2
+    assert "0.jpg: its EXIF orientation turns it" in capsys.readouterr().err
 
 
 def shape_errors(T_cw: Tensor, truth: Tensor) -> float:

@@ -47,6 +47,8 @@ class Outcome:
 def mutated(reader: Reader, number: int) -> Mutated:
     """Return the input of a number; it depends on the number alone."""
     rng = random.Random(f"{reader.name} {number}")
+    if reader.generate is not None:
+        return dict(reader.generate(rng))
     files = dict(reader.files)
     if reader.name == "settings of a run":
         return {"argument": valid_inputs.absurd_setting(rng).encode()}
@@ -105,6 +107,8 @@ def _judged(reader: Reader, message: str, root: Path) -> tuple[str, str]:
         return "unclear", f"not one line: {message[:200]!r}"
     places = {root.name, "--", "passwd", *(part for name in reader.files for part in Path(name).parts)}
     places |= {Path(name).stem for name in reader.files}
+    if reader.generate is not None:
+        places.add(str(root))
     if not any(place in message for place in places):
         return "unclear", f"no place: {message[:200]}"
     return "refused", ""

@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from tests.fuzz import conventions, valid_inputs
+from tests.fuzz import conventions, named_images, valid_inputs
 from tests.fuzz.mutators import Files
 from tests.fuzz.sample_files import CONFIG, OVERRIDES, WALK, sample_files
 from tests.walks import T_cw
@@ -67,12 +67,14 @@ FRAMES = 4
 
 @dataclass(frozen=True)
 class Reader:
-    """make: good input, by names in a folder; read: reads that folder; inputs: how many of 30,000 are for it"""
+    """make: good input, by names in a folder; read: reads that folder; inputs: how many of 30,000 are for it; generate:
+    makes an input that is valid and says what it means, in place of a damaged one"""
 
     name: str
     make: Callable[[], Files]
     read: Callable[[Path], object]
     inputs: int
+    generate: Callable[[random.Random], Files] | None = None
 
     @cached_property
     def files(self) -> Files:
@@ -133,6 +135,14 @@ def readers() -> dict[str, Reader]:
             300,
         ),
         Reader("batch record", _row_and_times, _record, 400),
+    ]
+    found += [
+        Reader(name, partial(generate, random.Random(0)), read, inputs, generate)
+        for name, generate, read, inputs in (
+            ("names of images", named_images.named_folder, named_images.read_named_folder, 1500),
+            ("times of images", named_images.listed_images, named_images.read_listed_images, 600),
+            ("images of results", named_images.changed_folder, named_images.read_changed_folder, 900),
+        )
     ]
     found += [
         Reader(f"image {kind}", partial(_kind, valid_inputs.images, kind), _image, 250) for kind in IMAGES

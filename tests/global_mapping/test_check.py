@@ -137,7 +137,8 @@ def test_a_bent_scale_is_found_where_it_is(recording: Recording, factor: float) 
     assert not found.is_right
     assert {each.kind for each in found.breaks} == {BreakKind.SCALE}
     where = {each.before for each in found.breaks}
-    assert 14 in where and where <= {13, 14, 15}
+    assert 14 in where
+    assert where <= {13, 14, 15}
     (here,) = (each for each in found.breaks if each.before == 14)
     assert here.after == 15
     assert here.scale_ratio == pytest.approx(1 / factor, rel=0.02)

@@ -148,6 +148,19 @@ def test_the_same_state_gives_the_same_bytes(checkpoint: Path, tmp_path: Path) -
     assert (tmp_path / "again").read_bytes() == checkpoint.read_bytes()
 
 
+class Files(Walk):
+    """Frames that are files."""
+
+    def file_name(self, index: int) -> str:
+        return f"{index + 7}.png"
+
+
+def test_a_checkpoint_of_other_images_is_refused(checkpoint: Path) -> None:
+    """As many, with the same counted times: one was deleted, and one more is there at the end."""
+    with pytest.raises(ResultsError, match=r"checkpoint\.safetensors: .* with another sequence"):
+        read_checkpoint(checkpoint, Files(PATH), CONFIG)
+
+
 def test_a_checkpoint_of_another_run_is_refused(checkpoint: Path, tmp_path: Path) -> None:
     for other in (Walk(PATH[:-1]), Walk(PATH)):
         if len(other) == FRAMES:

@@ -28,7 +28,6 @@ from torchslam.calibration.find_camera import find_camera, with_stated_std
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.camera_argument import unknown_camera
-from torchslam.data.opening import full_name
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
@@ -36,6 +35,7 @@ from torchslam.data.transforms import WithGroundTruth
 from torchslam.errors import SequenceError
 from torchslam.global_mapping.recording import map_recording
 from torchslam.io.report import compute_metrics
+from torchslam.io.results import source_of
 from torchslam.io.write_run import write_run
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
@@ -184,7 +184,7 @@ def _run(task: Task, folder: Path) -> Columns:
     metrics = compute_metrics(finished, sequence, camera, mapped=mapped)
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
-    metrics |= {"source": full_name(row.resolve(row.sequence)), "source_fps": row.fps}
+    metrics |= source_of(row.resolve(row.sequence), row.fps, sequence)
     write_run(_without_times(finished), sequence, metrics, folder, plots=task.plots, viewer=task.plots)
     return {
         "sequence": without_credentials(row.sequence),

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import torch
 
     from torchslam.data import Sequence
+    from torchslam.data.calibration import Calibration
 
 SEQUENCE_HELP = (
     "folder (ETH3D, TUM, KITTI, KITTI raw, EuRoC, 7-Scenes, TartanAir, ICL-NUIM, or images), pattern of images, "
@@ -62,13 +63,18 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def sequence(options: argparse.Namespace) -> Sequence:
-    """Open the sequence given by the arguments of `add_sequence`; print its notes to stderr."""
+def sequence(options: argparse.Namespace, camera: Calibration | None = None) -> Sequence:
+    """Open the sequence given by the arguments of `add_sequence`; print its notes to stderr.
+
+    Args:
+        options: the arguments.
+        camera: the camera if the user gives none.
+    """
     from torchslam.data import open_sequence
 
     found = open_sequence(
         options.path,
-        options.camera,
+        camera if options.camera is None else options.camera,
         fps=options.fps,
         limit=options.limit,
         stride=options.stride,

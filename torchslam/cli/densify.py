@@ -30,7 +30,17 @@ from torchslam.errors import ConfigError, ResultsError
 from torchslam.io.export.mesh import import_open3d, write_mesh
 from torchslam.io.export.ply import upright_from_map, write_cloud
 from torchslam.io.export.scene import open_images, pinhole_within, scene_of
-from torchslam.io.results import CONFIG, DENSE_CLOUD, DEPTHS, MAP, MESH, METRICS, read_metrics, read_results
+from torchslam.io.results import (
+    CONFIG,
+    DENSE_CLOUD,
+    DEPTHS,
+    MAP,
+    MESH,
+    METRICS,
+    read_image_source,
+    read_metrics,
+    read_results,
+)
 from torchslam.io.viewer.page import VIEW, write_view
 from torchslam.map.file import read_atlas
 from torchslam.parallel.workers import processors
@@ -138,7 +148,7 @@ def densify_results(
     submap = next((each for each in saved.atlas if each.number == metrics["submap"]), None)
     if submap is None:
         raise ResultsError(f"{directory / MAP}: no map to get depth for")
-    source = images or metrics.get("source")
+    source = read_image_source(directory, metrics, saved.atlas, images)
     if source is None:
         raise ResultsError(
             f"{directory / METRICS}: does not say where the images are; give them with --images"
@@ -147,7 +157,7 @@ def densify_results(
     size = map_size(resolution, pinhole_within(scene.camera).size)
     views = views_of(scene, size, every)
     elsewhere = "use --images for its new location"
-    opened = open_images(source, scene, views.camera, metrics.get("source_fps"), elsewhere)
+    opened = open_images(source, scene, views.camera, elsewhere)
     folder = directory / DEPTHS.parent
     with tqdm(
         total=2 * len(views),

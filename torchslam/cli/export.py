@@ -48,13 +48,22 @@ from torchslam.io.export.scene import (
     WITHOUT,
     ExportedScene,
     Images,
+    ImageSource,
     open_images,
     pinhole_within,
     scene_of,
     undistorted,
     write_images,
 )
-from torchslam.io.results import DENSE_CLOUD, DEPTHS, MAP, OTHER_TRAJECTORY, TRAJECTORY, read_metrics
+from torchslam.io.results import (
+    DENSE_CLOUD,
+    DEPTHS,
+    MAP,
+    OTHER_TRAJECTORY,
+    TRAJECTORY,
+    read_image_source,
+    read_metrics,
+)
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
 from torchslam.system.run import keyframe_rows, keyframe_trajectory
@@ -74,7 +83,7 @@ class Job:
     Attributes:
         directory: results folder; `metrics`: its metrics.
         submap, camera: from its map.
-        source, fps: path and frame rate of the images; None if they are not exported.
+        source: of the images; None if they are not exported.
         undistort: convert images and keypoints to a pinhole camera.
     """
 
@@ -85,8 +94,7 @@ class Job:
     output: Path
     keyframes_alone: bool
     undistort: bool
-    source: str | None
-    fps: float | None
+    source: ImageSource | None
 
     @property
     def session(self) -> int:
@@ -131,7 +139,7 @@ class Job:
             pinhole = pinhole_within(scene.camera)
         images = None
         if self.source is not None:
-            images = open_images(self.source, scene, pinhole, self.fps)
+            images = open_images(self.source, scene, pinhole)
         return (scene if pinhole is None else undistorted(scene, pinhole)), images
 
     def trajectory(self) -> Trajectory:
@@ -217,7 +225,7 @@ def _job(options: argparse.Namespace, target: Target) -> Job:
     keyframes_alone = options.frames == "keyframes" or (options.frames is None and target.keyframes)
     source = None
     if target.is_of_images and not options.no_images:
-        source = options.sequence or metrics.get("source")
+        source = read_image_source(directory, metrics, saved.atlas, options.sequence)
         if source is None:
             raise ResultsError(f"{directory}: the location of the images is unknown: {WITHOUT}")
     return Job(
@@ -229,7 +237,6 @@ def _job(options: argparse.Namespace, target: Target) -> Job:
         keyframes_alone=keyframes_alone,
         undistort=options.undistort or options.to == "rerun",
         source=source,
-        fps=metrics.get("source_fps"),
     )
 
 

@@ -11,6 +11,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
+from pathlib import Path
 from typing import Any, NoReturn
 
 import torchslam
@@ -84,7 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
-        options = build_parser(next(iter(arguments), "")).parse_args(arguments)
+        options = _parse(arguments)
         if options.command not in WITHOUT_THREADS:
             _compute_in_one_thread()
         return options.execute(options)
@@ -99,6 +100,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("torchslam: interrupted", file=sys.stderr)
         return INTERRUPTED
+
+
+def _parse(arguments: Sequence[str]) -> argparse.Namespace:
+    """Parse the arguments; say what to do where a shell has made many files of a pattern."""
+    parser = build_parser(next(iter(arguments), ""))
+    options, left = parser.parse_known_args(arguments)
+    files = [Path(word) for word in left if not word.startswith("-") and Path(word).is_file()]
+    first = Path(getattr(options, "path", ""))
+    if files and first.suffix and first.is_file():
+        pattern = first.with_name(f"*{first.suffix}")
+        parser.error(
+            f"{len(files) + 1} files instead of one path, the first {first}: a shell expands patterns; give the folder "
+            f"{first.parent}, or the pattern in quotes: '{pattern}'"
+        )
+    if left:
+        parser.error(f"unrecognized arguments: {' '.join(left)}")
+    return options
 
 
 class Version(argparse.Action):

@@ -25,12 +25,12 @@ from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found, write_calibration
 from torchslam.data.camera_argument import fit_camera, unknown_camera
 from torchslam.data.formats.given_poses import GivenPoses, read_poses
-from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
+from torchslam.data.synthetic.sequence import is_synthetic
 from torchslam.errors import ConfigError, SequenceError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.io.report import run_metrics, summary
-from torchslam.io.results import CALIBRATION, prepare
+from torchslam.io.results import CALIBRATION, prepare, source_of
 from torchslam.io.write_run import write_run
 from torchslam.refine import CameraChoice, RefinementResult, refine_poses
 from torchslam.refine.files import write_refined
@@ -88,7 +88,14 @@ def execute(options: argparse.Namespace) -> int:
     if options.fix_camera and options.refine_distortion:
         raise ConfigError("--refine-distortion cannot be combined with --fix-camera")
     given = read_poses(options.poses)
-    sequence = _with_camera(arguments.sequence(options), given, options.camera)
+    calibration = given.calibration if options.camera is None else None
+    if is_synthetic(options.path):  # which is opened with a camera of its own alone
+        sequence = arguments.sequence(options)
+        if calibration is not None:
+            sequence = sequence.with_camera(fit_camera(calibration, sequence.size, options.poses))
+    else:
+        sequence = arguments.sequence(options, calibration)
+    sequence = _with_camera(sequence)
     is_guess = sequence.calibrated is Calibrated.GUESSED
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.IF_CONTRADICTED
     plan = RefinePlan(
@@ -129,12 +136,10 @@ def run(sequence: Sequence, given: GivenPoses, config: Config, plan: RefinePlan)
     return DONE
 
 
-def _with_camera(sequence: Sequence, given: GivenPoses, camera: str | None) -> Sequence:
-    """Return the sequence with the camera of the poses, unless the user gave one; a guess if there is none."""
+def _with_camera(sequence: Sequence) -> Sequence:
+    """Return the sequence with a guess of its camera if there is none."""
     if sequence.known_length is None:
         raise SequenceError(f"{sequence.name}: a live source has no poses to refine")
-    if camera is None and given.calibration is not None:
-        return sequence.with_camera(fit_camera(given.calibration, sequence.size, str(given.path)))
     if sequence.calibrated is Calibrated.MISSING:
         print("torchslam: no calibration found; estimating intrinsics from the images", file=sys.stderr)
         return sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
@@ -154,9 +159,7 @@ def _write(refined: RefinementResult, sequence: Sequence, plan: RefinePlan) -> d
         "without_image": refined.without_image,
         "rounds": refined.rounds,
         "dropped": sequence.dropped,
-        "source": full_name(plan.source),
-        "source_fps": plan.fps,
-    }
+    } | source_of(plan.source, plan.fps, sequence)
     path = plan.output / CALIBRATION
     if not torch.equal(finished.camera.params.cpu(), sequence.camera.params):
         write_calibration(path, finished.camera, [metrics["camera"]])

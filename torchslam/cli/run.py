@@ -31,7 +31,6 @@ from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found
 from torchslam.data.camera_argument import unknown_camera
-from torchslam.data.opening import full_name
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
@@ -40,7 +39,7 @@ from torchslam.global_mapping.recording import MappedRecording, Mapping, map_rec
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
-from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, prepare
+from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, prepare, source_of
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
@@ -406,6 +405,6 @@ def _write(attempt: Attempt, plan: RunPlan) -> dict[str, object]:
     if latencies:
         median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
         metrics["latency_ms"] = {"median": median, "p95": p95}
-    metrics |= {"source": full_name(plan.source), "source_fps": plan.fps}
+    metrics |= source_of(plan.source, plan.fps, sequence)
     write_run(finished, sequence, metrics, plan.output)
     return metrics

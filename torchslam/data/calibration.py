@@ -37,6 +37,7 @@ class Calibration:
         size: (width, height) of the images, if known.
         guessed: True if only approximate.
         std: relative standard deviation of the focal length, if the source says so.
+        as_stored: True if it is of a program that ignores the orientation in the EXIF block of images.
     """
 
     model: str
@@ -45,6 +46,7 @@ class Calibration:
     size: Size | None = None
     guessed: bool = False
     std: float | None = None
+    as_stored: bool = False
 
     @staticmethod
     def from_numbers(

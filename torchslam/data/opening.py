@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
+import re
 import tempfile
 from collections import Counter
 from collections.abc import Callable
@@ -13,8 +14,8 @@ from pathlib import Path
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera, parse_calibration
 from torchslam.data.download import unpack
-from torchslam.data.formats.frame_names import folder_kind, other_kind, subfolder
-from torchslam.data.formats.image_file import SUFFIXES
+from torchslam.data.formats.frame_names import FOLDERS, folder_kind, is_pattern, other_kind, subfolder
+from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
 from torchslam.data.readers import bag, video
 from torchslam.data.readers.bag import BAG
 from torchslam.data.readers.euroc import EUROC
@@ -183,6 +184,14 @@ def _not_found_message(path: str) -> str:
     target = Path(path)
     if target.is_dir():
         return _why_no_folder(target)
+    if is_address(path):
+        return f"{without_credentials(path)}: a file on the web and no stream: download it, and give the file"
+    counted = target.with_name(re.sub(r"%\d*d", "*", target.name))
+    if counted != target and find_reader(str(counted)):
+        return f"{path}: does not exist; did you mean '{counted}'? In quotes, * stands for any number"
+    foreign = target.suffix.lower() in FOREIGN and (other_kind(target) or "hidden files")
+    if foreign and (target.exists() or is_pattern(path)):
+        return f"{path}: {foreign}"
     if not target.exists():
         near = difflib.get_close_matches(target.name, _names(target.parent), n=1, cutoff=0.6)
         return f"{path}: does not exist" + _meant([target.parent / name for name in near])
@@ -195,12 +204,19 @@ def _why_no_folder(folder: Path) -> str:
     kinds = Counter(
         other_kind(entry) or folder_kind(folder) or "images"
         for entry in entries
-        if entry.is_file() and entry.suffix.lower() in SUFFIXES
+        if entry.is_file() and entry.suffix.lower() in SUFFIXES | FOREIGN
     )
     inner = [entry for entry in entries if entry.is_dir() and not entry.name.startswith(".")][:MAX_FOLDERS]
     below = [entry for entry in inner if find_reader(str(entry))]
     files = [entry for entry in entries if entry.is_file() and find_reader(str(entry))]
     files += [entry for entry in entries if _is_archive(str(entry))]
+    unread = Counter(
+        other_kind(entry)
+        for name in FOLDERS
+        for entry in _entries(folder / name)
+        if entry.suffix.lower() in FOREIGN
+    )
+    kinds = kinds or Counter({f"{kind} below": count for kind, count in unread.items()})
     looked = "; ".join(reader.looks_for for reader in READERS[2:])
     if kinds:
         wrong = (

@@ -67,6 +67,8 @@ class Sequence(ABC):
         notes: remarks for the user on how it was read, one line each.
         camera_std: relative standard deviation of the camera's focal length, if its calibration says so.
         pixel_aspect: width to height of a pixel; the fy / fx of a camera that is not known yet.
+        counted_until: where images have no times and are counted at some rate, half an interval after the last one.
+        as_stored: whether the orientation in the EXIF block of images is ignored, as the program did that calibrated.
     """
 
     def __init__(
@@ -98,6 +100,8 @@ class Sequence(ABC):
         self.groundtruth = groundtruth
         self.notes = tuple(map(printable, notes))
         self.camera_std: float | None = None
+        self.as_stored = False
+        self.counted_until: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
         self._T_cw: Tensor | None = None
         self._has_pose = torch.zeros(len(timestamps), dtype=torch.bool)
@@ -165,6 +169,14 @@ class Sequence(ABC):
     @abstractmethod
     def image_name(self, index: int) -> str:
         """Return the name of an image, for messages."""
+
+    def file_name(self, index: int) -> str:
+        """Return the file of a frame below the folder of all; empty if frames are no files but known by their times."""
+        return ""
+
+    def is_turned(self, index: int) -> bool:
+        """Return whether an image has another orientation than its pixels in the file. Raises FrameError."""
+        return False
 
     def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         """Return the mask of a frame, True where features are allowed; None: everywhere."""
@@ -311,7 +323,8 @@ class Transformed(Sequence):
             notes=(*whole.notes, *notes),
             pixel_aspect=_resized_aspect(whole, size),
         )
-        self.camera_std = whole.camera_std
+        self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
+        self.counted_until = whole.counted_until
         self._whole = whole
         self._indices = indices
         self._same_pixels = camera is None and size in (None, whole.size)
@@ -339,6 +352,12 @@ class Transformed(Sequence):
 
     def image_name(self, index: int) -> str:
         return self._whole.image_name(self._at(index))
+
+    def file_name(self, index: int) -> str:
+        return self._whole.file_name(self._at(index))
+
+    def is_turned(self, index: int) -> bool:
+        return self._whole.is_turned(self._at(index))
 
     def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         return self._whole.mask(self._at(index))

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.data.formats.text_file import check_later, numbered_lines, parse_floats
+from torchslam.data.formats.text_file import check_later, in_seconds, numbered_lines, parse_floats
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid, se3_interpolate
 from torchslam.types import Trajectory
@@ -36,6 +36,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
             )
         if abs(sum(value * value for value in row[4:]) - 1.0) > 0.1:
             raise TrajectoryError(f"{where}: the quaternion {row[4:]} does not have unit length")
+        row[0] = in_seconds(row[0], where, TrajectoryError)
         if rows:
             check_later(row[0], rows[-1][0], where, TrajectoryError)
         rows.append(row)

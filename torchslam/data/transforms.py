@@ -15,8 +15,8 @@ from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import size_text
-from torchslam.data.formats.frame_names import natural
-from torchslam.data.formats.image_file import MAX_PIXELS, SUFFIXES, read_gray
+from torchslam.data.formats.frame_names import in_order
+from torchslam.data.formats.image_file import MAX_PIXELS, SUFFIXES, has_transparency, read_gray
 from torchslam.data.sequence import Need, Sequence, Transformed
 from torchslam.errors import FrameError, SequenceError
 from torchslam.geometry.camera import Camera
@@ -26,6 +26,9 @@ TOLERANCE = 0.25
 """Tolerated earliness of a frame when frames are thinned out, as a ratio of the interval."""
 ROUNDING = 5e-7
 """Seconds by which a time given as text may be later than its frame: it is rounded, and no frame is that short."""
+LOSSY = frozenset({".jpg", ".jpeg"})
+DARK = 32
+"""Gray level of 255 below which the darkest pixels of a mask with white ones are meant to be black: 16 in videos."""
 SMALLEST = 32
 """Minimum width and height in pixels."""
 
@@ -218,12 +221,26 @@ class Masked(Transformed):
     def _read(self, path: Path) -> Tensor:
         try:
             gray = read_gray(path, "--mask")
+            is_uniform = bool(gray.min() == gray.max())
+            is_alpha = is_uniform and has_transparency(path)
         except FrameError as error:
             raise SequenceError(str(error)) from error
         size = (gray.shape[-1], gray.shape[-2])
         if size != self.size:
             raise SequenceError(
                 f"{path}: the mask is {size_text(size)}, the images are {size_text(self.size)}"
+            )
+        if is_alpha:
+            raise SequenceError(
+                f"{path}: the mask is in the alpha channel, which is not read: save it as a black and white image"
+            )
+        if path.suffix.lower() in LOSSY:  # in which black is not exactly 0
+            return gray > 0.5 * float(gray.max())
+        darkest = round(255 * float(gray.min()))
+        if 0 < darkest < DARK and gray.max() > 1 - DARK / 255:
+            raise SequenceError(
+                f"{path}: the darkest pixels of the mask are {darkest}, not 0, so that nothing would be masked; "
+                "save it as a black and white image"
             )
         return gray > 0
 
@@ -232,13 +249,8 @@ def _by_frame(folder: Path, sequence: Sequence) -> dict[int, Path]:
     """Return the mask file of each frame."""
     if sequence.known_length is None:
         raise SequenceError(f"{folder}: a live source takes one mask for all frames")
-    files = sorted(
-        (
-            file
-            for file in folder.iterdir()
-            if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
-        ),
-        key=lambda file: natural(file.name),
+    files = in_order(
+        file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")
     )
     by_name = {file.stem: file for file in files}
     names = [Path(sequence.image_name(index)) for index in range(len(sequence))]

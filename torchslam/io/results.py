@@ -6,7 +6,7 @@ import csv
 import io
 import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,12 +19,14 @@ from torch import Tensor
 from torchslam.config import to_toml
 from torchslam.data.calibration import write_calibration
 from torchslam.data.formats.image_file import read_gray
+from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, rigid, transform
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
+from torchslam.io.export.scene import ExampleFrame, ImageSource
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
@@ -154,7 +156,7 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
         write_calibration(directory / CALIBRATION, run.camera, [remark] if remark else [], std)
     (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     (directory / METRICS).write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-    write_frames(directory / FRAMES, run.results)
+    write_frames(directory / FRAMES, run.results, sequence)
     _write_example_image(directory / EXAMPLE_IMAGE, run, sequence)
 
 
@@ -262,14 +264,14 @@ def _write_example_image(path: Path, run: Run, sequence: Sequence) -> None:
     cv2.imwrite(str(path), (image[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy())
 
 
-FRAME_COLUMNS = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason")
+FRAME_COLUMNS = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason", "image")
 STAGE_SUFFIX = "_ms"
 MAX_FRAMES_BYTES = 1 << 28
 """Size limit of frames.csv, enough for two million frames."""
 
 
-def write_frames(path: str | Path, results: list[StepResult]) -> None:
-    """Write one row per frame; a missing submap or stage is an empty cell. The poses are in online.txt."""
+def write_frames(path: str | Path, results: list[StepResult], sequence: Sequence | None = None) -> None:
+    """Write one row per frame; a missing submap, file or stage is an empty cell. The poses are in online.txt."""
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
@@ -277,19 +279,63 @@ def write_frames(path: str | Path, results: list[StepResult]) -> None:
         for result in results:
             times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
             submap = "" if result.submap is None else result.submap
+            image = "" if sequence is None else sequence.file_name(result.index)
             row = [result.index, repr(result.timestamp), result.state.value, submap]
             writer.writerow(
-                [*row, int(result.is_keyframe), result.matches, result.inliers, result.reason, *times]
+                [*row, int(result.is_keyframe), result.matches, result.inliers, result.reason, image, *times]
             )
 
 
 def read_frames(path: str | Path) -> list[StepResult]:
     """Read the rows of frames.csv, without poses. Raises ResultsError naming file and line."""
+    return [result for result, _ in _read_rows(path)]
+
+
+def source_of(path: str, fps: float | None, sequence: Sequence) -> dict[str, Any]:
+    """Return the entries of metrics.json from which the images are found again: path and options of `open_sequence`."""
+    entries = {"source": full_name(path), "source_fps": fps}
+    return entries | {"source_as_stored": True} if sequence.as_stored else entries
+
+
+def read_image_source(
+    directory: Path, metrics: dict[str, Any], submaps: Iterable[Submap], elsewhere: str | None = None
+) -> ImageSource | None:
+    """Read where the images of a run are, and by what they are found; None if a run does not say where.
+
+    Args:
+        directory: the results folder.
+        metrics: its metrics.
+        submaps: those of its map.
+        elsewhere: the images' new location; None: where the run read them.
+
+    Raises:
+        ResultsError: frames.csv is missing or damaged.
+    """
+    path, session = elsewhere or metrics.get("source"), int(metrics["session"])
+    if path is None:
+        return None
+    rows = _read_rows(directory / FRAMES)
+    main = [submap.map for submap in submaps if submap.number == metrics["submap"]]
+    keyframe = example_keyframe(main[0], session) if main else None
+    image, example = directory / EXAMPLE_IMAGE, None
+    if keyframe is not None and image.exists():
+        frame_id = int(main[0].keyframes["frame_index"][keyframe])
+        time = float(main[0].keyframes["timestamp"][keyframe])
+        example = ExampleFrame(frame_id, time, read_gray(image, str(image)))
+    files = {result.index: file for result, file in rows if file}
+    return ImageSource(
+        path, metrics.get("source_fps"), files, example, metrics.get("source_as_stored") is True
+    )
+
+
+def _read_rows(path: str | Path) -> list[tuple[StepResult, str]]:
+    """The frames and their files, empty if frames are no files."""
     try:
         reader = csv.DictReader(
             io.StringIO(read_text(path, MAX_FRAMES_BYTES, "a list of frames"), newline="")
         )
-        return [_frame_result(row, f"{path}:{reader.line_num}") for row in reader]
+        # Folders that earlier versions wrote have no files.
+        return [(_frame_result(row, f"{path}:{reader.line_num}"), row.get("image") or "") for row in reader]
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
     except (csv.Error, UnicodeDecodeError) as error:

@@ -115,7 +115,9 @@ def fingerprint(of: Sequence | Config) -> str:
     """Hash of a sequence or a configuration."""
     if isinstance(of, Config):
         return hashlib.sha256(to_toml(of).encode()).hexdigest()
-    about = json.dumps([of.name, of.camera.model, of.camera.size, of.camera.params.tolist(), of.known_length])
+    files = [of.file_name(index) for index in range(len(of.timestamps))]
+    camera = of.camera
+    about = json.dumps([of.name, camera.model, camera.size, camera.params.tolist(), of.known_length, files])
     return hashlib.sha256(about.encode() + of.timestamps.cpu().numpy().tobytes()).hexdigest()
 
 

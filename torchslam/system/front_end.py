@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchslam.config import Config
+from torchslam.data.formats.text_file import MAX_SECONDS
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures
@@ -124,10 +125,12 @@ def check_order(frame: Frame, last: tuple[int, float] | None) -> None:
     """Check that a frame comes after the last one, by index and timestamp.
 
     Raises:
-        FrameError: otherwise, or if the timestamp is not finite.
+        FrameError: otherwise, or if the timestamp is not finite, or no seconds.
     """
     if not math.isfinite(frame.timestamp):
         raise FrameError(f"{_name(frame)} has the time {frame.timestamp}")
+    if abs(frame.timestamp) >= MAX_SECONDS:
+        raise FrameError(f"{_name(frame)} has the time {frame.timestamp:g}: times are seconds")
     if last is not None and (frame.index <= last[0] or frame.timestamp <= last[1]):
         raise FrameError(
             f"{_name(frame)}, frame {frame.index} at {frame.timestamp} s, does not come after "

@@ -6,18 +6,23 @@ import json
 import struct
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
 from tests.io.export.conftest import lens, scene
+from torchslam.data import open_sequence
 from torchslam.data.formats.given_poses import GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
+from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import CalibrationError, TorchslamError, TrajectoryError
 from torchslam.geometry import Camera
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.scene import ExportedScene
+from torchslam.types import Trajectory
 
 __all__ = ["lens", "scene"]
 
@@ -143,3 +148,33 @@ def test_several_cameras_are_too_many(tmp_path: Path) -> None:
     (tmp_path / "cameras.bin").write_bytes(b"")
     with pytest.raises(TorchslamError, match="not COLMAP's cameras"):
         read_poses(tmp_path)
+
+
+@pytest.mark.parametrize("points", ["", "10 20 -1 30.5 40 7", None])
+def test_colmap_text_with_and_without_lines_of_points(tmp_path: Path, points: str | None) -> None:
+    """Who writes it by hand, or strips empty lines, leaves no line for the points of an image."""
+    names = ["a 0.jpg", "a 1", "2", "3 b c.jpg"]
+    lines = [f"{index + 1} 1 0 0 0 {index} 0 0 1 {name}" for index, name in enumerate(names)]
+    text = "\n".join(lines if points is None else [part for line in lines for part in (line, points)])
+    (tmp_path / "images.txt").write_text("# by hand\n" + text + "\n")
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 64 48 60 32 24\n")
+    given = read_poses(tmp_path)
+    assert given.names == tuple(names[index] for index in given.T_cw[:, 0, 3].int().tolist())
+    assert sorted(given.T_cw[:, 0, 3].tolist()) == [0.0, 1.0, 2.0, 3.0]
+
+
+def test_times_that_were_counted_must_all_be_there(tmp_path: Path) -> None:
+    """After an image was deleted, the others would have the poses of their neighbors."""
+    for index in range(5):
+        cv2.imwrite(str(tmp_path / f"{index}.png"), np.full((48, 64), 40 * index, np.uint8))
+    times, T_wc = (
+        torch.arange(1, 5, dtype=torch.float64) / 30,
+        torch.eye(4, dtype=torch.float64).repeat(4, 1, 1),
+    )
+    write_trajectory(tmp_path / "trajectory.txt", Trajectory(times, T_wc))
+    given = read_poses(tmp_path / "trajectory.txt")
+    assert given.rows(open_sequence(tmp_path)).tolist() == [-1, 0, 1, 2, 3]
+    assert given.rows(open_sequence(tmp_path, limit=3)).tolist() == [-1, 0, 1]
+    (tmp_path / "2.png").unlink()
+    with pytest.raises(TrajectoryError, match=r"1 of 4 poses are of no image of .* are counted: .* rgb\.txt"):
+        given.rows(open_sequence(tmp_path))

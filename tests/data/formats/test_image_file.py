@@ -10,9 +10,12 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from torchslam.data.formats.image_file import PNG_MAX_CHUNKS, read_color, read_gray
-from torchslam.errors import FrameError
+from torchslam.data import open_sequence
+from torchslam.data.formats.given_poses import read_poses
+from torchslam.data.formats.image_file import PNG_MAX_CHUNKS, is_turned, read_color, read_gray
+from torchslam.errors import FrameError, TrajectoryError
 
 
 @pytest.fixture
@@ -93,3 +96,56 @@ def test_color_becomes_gray_in_unit_range(tmp_path: Path, write_picture: Callabl
     image = read_gray(tmp_path / "image.png", "here")
     assert image.dtype == torch.float32
     assert 0 <= float(image.min()) < float(image.max()) <= 1
+
+
+def test_colors_of_16_bits_are_measured_in_all_channels(tmp_path: Path) -> None:
+    """Of a blue sky gray would be darker than blue, which would then be clipped."""
+    image = np.zeros((48, 64, 3), np.uint16)
+    image[:24] = (4000, 300, 100)  # blue, green, red
+    cv2.imwrite(str(tmp_path / "0.png"), image)
+    sequence = open_sequence(tmp_path)
+    assert sequence.notes == ("12 of 16 bits are used",)
+    assert sequence.color(0)[0, 0].tolist() == [6, 19, 249]
+    gray = (0.114 * 4000 + 0.587 * 300 + 0.299 * 100) / 4095
+    assert float(sequence.image(0)[0, 0, 0, 0]) == pytest.approx(gray, abs=1e-3)
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
+def test_the_orientation_of_exif_is_ignored_on_request(tmp_path: Path, suffix: str) -> None:
+    pixels = np.zeros((48, 64), np.uint8)
+    pixels[:16, :16] = 200
+    exif, path = Image.Exif(), tmp_path / f"a.{suffix}"
+    exif[0x0112] = 3  # turned by 180 degrees
+    Image.fromarray(pixels).convert("RGB").save(path, exif=exif)
+    for image in (read_gray(path, "")[0, 0], read_color(path, "")[..., 1] / 255.0):
+        assert float(image[-8, -8]) > 0.7 > 0.1 > float(image[8, 8])
+    assert is_turned(path, as_stored=False)
+    assert is_turned(path, as_stored=True) == (suffix == "tif")
+    if suffix != "tif":
+        for image in (read_gray(path, "", 8, True)[0, 0], read_color(path, "", 8, True)[..., 1] / 255.0):
+            assert float(image[8, 8]) > 0.7 > 0.1 > float(image[-8, -8])
+    del exif[0x0112]
+    Image.fromarray(pixels).save(path, exif=exif)
+    assert not is_turned(path, as_stored=False)
+
+
+def test_images_are_read_as_colmap_read_them(tmp_path: Path) -> None:
+    """It ignores the orientation, so its camera and poses are of the images as they are stored."""
+    pixels = np.random.default_rng(0).integers(0, 256, (6, 8), np.uint8).repeat(8, 0).repeat(8, 1)
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    (tmp_path / "images").mkdir()
+    for index in range(2):
+        Image.fromarray(pixels).save(tmp_path / "images" / f"{index}.jpg", exif=exif, quality=95)
+    (tmp_path / "cameras.txt").write_text("1 SIMPLE_PINHOLE 64 48 60 32 24\n")
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 0.jpg\n\n2 1 0 0 0 1 0 0 1 1.jpg\n\n")
+    shown, given = open_sequence(tmp_path / "images"), read_poses(tmp_path)
+    stored = open_sequence(tmp_path / "images", tmp_path / "cameras.txt")
+    assert (shown.size, stored.size, stored.part(0, 1).as_stored) == ((48, 64), (64, 48), True)
+    assert np.abs(stored.image(0)[0, 0].numpy() * 255 - pixels).max() < 20
+    assert torch.equal(stored.color(0).rot90(-1), shown.color(0))
+    assert given.rows(stored).tolist() == [0, 1]
+    with pytest.raises(
+        TrajectoryError, match=r"0\.jpg: its EXIF orientation turns it, which .* ignores: open"
+    ):
+        given.rows(shown)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchslam.data import open_sequence
+from torchslam.data import Calibrated, open_sequence
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 
 SENSOR = """\
@@ -138,4 +138,26 @@ def test_bad_lists(folder: Path) -> None:
     images = folder / "mav0" / "cam0" / "data.csv"
     images.write_text("#timestamp [ns],filename\n1403636579.76,x.png\n")
     with pytest.raises(SequenceError, match=r"data\.csv:2: expected `nanoseconds,file`"):
+        open_sequence(folder)
+
+
+def test_without_a_sensor_file_the_camera_is_unknown(folder: Path) -> None:
+    (folder / "mav0" / "cam0" / "sensor.yaml").unlink()
+    sequence = open_sequence(folder)
+    assert (sequence.calibrated, sequence.groundtruth) == (Calibrated.MISSING, None)
+    (note,) = sequence.notes
+    assert (
+        "sensor.yaml: the camera is unknown unless --camera is given, and the ground truth is not used"
+        in note
+    )
+    assert open_sequence(folder, "60,60,32,24").calibrated is Calibrated.GIVEN
+
+
+def test_a_third_radial_coefficient(folder: Path) -> None:
+    path = folder / "mav0" / "cam0" / "sensor.yaml"
+    path.write_text(SENSOR.replace("1.76187114e-05]", "1.76187114e-05, 0.25]"))
+    camera = open_sequence(folder).camera
+    assert (camera.model, float(camera.params[-1])) == ("radial_tangential", 0.25)
+    path.write_text(SENSOR.replace("1.76187114e-05]", "1.76187114e-05, 0.25, 0]"))
+    with pytest.raises(CalibrationError, match=r"distortion_coefficients: \[4 or 5 numbers\]`, got 6"):
         open_sequence(folder)

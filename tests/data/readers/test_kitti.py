@@ -102,3 +102,13 @@ def test_given_camera_needs_no_calibration(folder: Path) -> None:
     assert float(open_sequence(folder, camera="50,50,32,24").camera.fx) == 50.0
     with pytest.raises(CalibrationError, match=r"calib\.txt: cannot be read"):
         open_sequence(folder)
+
+
+def test_a_sequence_without_times_is_refused(folder: Path) -> None:
+    """Not read as any folder of images, three times too fast."""
+    (folder / "times.txt").unlink()
+    with pytest.raises(
+        SequenceError, match=r"no times\.txt, which comes with calib\.txt .*image_0 alone .*--fps 10"
+    ):
+        open_sequence(folder)
+    assert len(open_sequence(folder / "image_0", fps=10)) == 3

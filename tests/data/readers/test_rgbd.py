@@ -225,3 +225,34 @@ def test_real_sequences(
         frame = sequence[index]
         assert frame.image.shape == (1, 1, size[1], size[0])
         assert (frame.T_cw_groundtruth is not None) == (poses is not None)
+
+
+@pytest.mark.parametrize("parts", [1, 10**3, 10**6, 10**9])
+def test_times_since_1970_are_converted(tum_folder: Folder, parts: int) -> None:
+    """As images and poses have them: the poses of ORB-SLAM3 are in nanoseconds where the list is not."""
+    folder, start = tum_folder(), 1403636579
+    frames = [f"{start * parts + index * parts // 10} rgb/{index}.png\n" for index in range(5)]
+    if parts == 1:
+        frames = [f"{start}.{index} rgb/{index}.png\n" for index in range(5)]
+    (folder / "rgb.txt").write_text("".join(frames))
+    poses = [f"{(start * 10 + index) * 10**8}.000000 {index} 0 0 0 0 0 1\n" for index in range(5)]
+    (folder / "groundtruth.txt").write_text("".join(poses))
+    sequence = open_sequence(folder)
+    torch.testing.assert_close(sequence.timestamps, start + torch.arange(5).double() / 10, rtol=0, atol=1e-6)
+    torch.testing.assert_close(sequence.pose(3)[:3, 3].double(), torch.tensor([-3.0, 0, 0]).double())
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        ([1.2e11, 1.3e11, 1.4e11], r"rgb\.txt:1: timestamp 1.2e\+11: times are seconds"),  # since the start
+        ([-1e18, 1, 2], r"rgb\.txt:1: timestamp -1e\+18"),
+        ([0, 33e6, 66e6, 99e6], r"rgb\.txt:4: the images are 3.3e\+07 s apart"),
+        ([0, 33e-6, 66e-6, 99e-6], r"rgb\.txt:4: the images are 3.3e-05 s apart"),
+    ],
+)
+def test_times_of_another_unit_are_refused(tum_folder: Folder, times: list[float], message: str) -> None:
+    folder = tum_folder()
+    (folder / "rgb.txt").write_text("".join(f"{time} rgb/{row}.png\n" for row, time in enumerate(times)))
+    with pytest.raises(SequenceError, match=message):
+        open_sequence(folder)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -417,9 +418,9 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
     fx, fy = (values.get(key, values.get("f", 0.0)) for key in ("fx", "fy"))
     coefficients = [values.get(key, 0.0) for key in (FISHEYE_KEYS if kind == "fisheye" else BROWN_KEYS)]
     intrinsics = [fx, fy, values["cx"] - HALF_PIXEL, values["cy"] - HALF_PIXEL]
-    return checked(
-        intrinsics, coefficients, str(path), "fisheye" if kind == "fisheye" else "", (int(width), int(height))
-    )
+    model = "fisheye" if kind == "fisheye" else ""
+    found = checked(intrinsics, coefficients, str(path), model, (int(width), int(height)))
+    return replace(found, as_stored=True)
 
 
 def _from_transforms(keys: Keys, source: str) -> Calibration:
@@ -437,7 +438,7 @@ def _from_transforms(keys: Keys, source: str) -> Calibration:
         if center is None and extent is None:
             raise CalibrationError(f"{source}: no {key} in it, nor the size of the images")
         intrinsics.append((extent or 0.0) / 2 - HALF_PIXEL if center is None else center - HALF_PIXEL)
-    return _with_distortion(keys, intrinsics, source, size=size)
+    return replace(_with_distortion(keys, intrinsics, source, size=size), as_stored=True)
 
 
 def _check_shared(keys: Keys, source: str) -> None:

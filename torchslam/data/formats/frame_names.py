@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import fnmatch
+import itertools
 import re
+import statistics
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from torchslam.data.formats.image_file import SUFFIXES
+from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
+from torchslam.data.formats.text_file import UNIX_UNITS
 from torchslam.errors import SequenceError
 
 MAX_FILES = 1_000_000
@@ -46,6 +50,10 @@ class Found:
     frames: list[Path]
     left_out: Counter[str]
 
+    def without(self, count: int, kind: str) -> Found:
+        """Return the same frames, with images elsewhere that were left out."""
+        return replace(self, left_out=self.left_out + Counter({kind: count}))
+
     @property
     def notes(self) -> list[str]:
         """Notes on the images that were ignored."""
@@ -53,10 +61,97 @@ class Found:
         return [f"ignored: {kinds}"] if kinds else []
 
 
-def natural(name: str) -> list[tuple[bool, int, str]]:
-    """A sort key under which runs of digits compare as numbers."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(part.isdecimal(), int(part) if part.isdecimal() else 0, part) for part in parts]
+NUMBER = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)|\d+)")
+"""A run of digits, or two with a dot between them; more dots separate parts of a version or a date."""
+UNIX_DIGITS = range(9, 11)
+"""Digits of the seconds since 1970, from 1973 to 2286."""
+FLOAT_DIGITS = 7
+"""The most digits after the dot of the shortest text that is a float of seconds since 1970."""
+SHORTEST = 1e-3
+"""Seconds between images, below which decimals in names count something else."""
+
+
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """Sort files by name, such that runs of digits compare as numbers and a dot between digits starts a fraction."""
+    files = list(files)
+    has_fractions = _has_fractions(files)
+    return sorted(files, key=lambda file: (natural(file.name, has_fractions), file.name))
+
+
+def natural(name: str, has_fractions: bool) -> list[tuple[bool, int, str]]:
+    """A sort key under which runs of digits compare as numbers, and those after a dot as fractions if they are some."""
+    parts = NUMBER.split(name.lower()) if has_fractions else re.split(r"(\d+)", name.lower())
+    key = []
+    for place, part in enumerate(parts):
+        whole, _, fraction = part.partition(".")
+        key.append((True, int(whole), fraction) if place % 2 else (False, 0, part))
+    return key
+
+
+def _has_fractions(files: list[Path]) -> bool:
+    """Return whether the digits after a dot are fractions, and do not count (1.9, 1.10).
+
+    Fractions have one length, or no zeros at their end. Raises SequenceError for times since 1970 that seem to count,
+    as of a program that leaves zeros out after the dot.
+    """
+    numbers = [
+        number.partition(".") for file in files for number in NUMBER.findall(file.stem) if "." in number
+    ]
+    by_length = {len(fraction): f"{whole}.{fraction}" for whole, _, fraction in numbers}
+    if len(by_length) < 2:
+        return True
+    fractions = [fraction for _, _, fraction in numbers if len(fraction) > 1]
+    has_ends = any(fraction.endswith("0") for fraction in fractions)
+    if not any(len(whole) in UNIX_DIGITS for whole, _, _ in numbers):
+        counts = sorted(int(fraction) for _, _, fraction in numbers)
+        steps = {after - before for before, after in itertools.pairwise(counts)}
+        return not has_ends and (len(counts) < 3 or len(steps) > 1)
+    if any(fraction.startswith("0") for fraction in fractions):
+        is_counted = False
+    else:
+        parts = 10 ** max(by_length)
+        counted = [int(whole) + int(fraction) / parts for whole, _, fraction in numbers]
+        decimal = [float(f"{whole}.{fraction}") for whole, _, fraction in numbers]
+        is_long = max(by_length) > FLOAT_DIGITS
+        is_counted = has_ends or is_long or _irregularity(counted) < _irregularity(decimal)
+    if is_counted:
+        raise SequenceError(
+            f"{files[0].parent}: names with {by_length[min(by_length)]} and with {by_length[max(by_length)]}: zeros "
+            "after the dot seem to be missing in some; write the times with one number of digits"
+        )
+    return True
+
+
+def _irregularity(times: list[float]) -> float:
+    """Return the standard deviation of the intervals between times, seconds."""
+    return statistics.pstdev(after - before for before, after in itertools.pairwise(sorted(times)))
+
+
+def times_in_names(frames: list[Path]) -> list[float] | None:
+    """Return the times that images, in order, are named by, seconds; None where names are something else.
+
+    Times are decimals (`0.5.png`), in names with other parts those since 1970 alone (`left_1305031102.0338.png`), or
+    they count milli-, micro- or nanoseconds since then.
+    """
+    names = [NUMBER.split(file.stem) for file in frames]
+    columns = list(zip(*names, strict=False))
+    if len(frames) < 2 or len(set(map(len, names))) > 1 or any(len(set(texts)) > 1 for texts in columns[::2]):
+        return None
+    is_bare = columns[::2] == [("",) * len(frames)] * 2
+    found = [times for times in map(partial(_times, is_bare), columns[1::2]) if times is not None]
+    return found[0] if len(found) == 1 and _has_fractions(frames) else None
+
+
+def _times(is_bare: bool, numbers: tuple[str, ...]) -> list[float] | None:
+    """The numbers in one place of the names as times; None if they are none."""
+    digits = {len(number.partition(".")[0]) for number in numbers}
+    if any("." in number for number in numbers):
+        times = [float(number) for number in numbers] if is_bare or digits <= set(UNIX_DIGITS) else []
+    else:
+        unit = UNIX_UNITS.get(digits.pop()) if len(digits) == 1 else None
+        times = [] if unit is None else [int(number) / unit for number in numbers]
+    intervals = [after - before for before, after in itertools.pairwise(times)]
+    return times if intervals and statistics.median(intervals) >= SHORTEST else None
 
 
 def find_frames(folder: Path) -> Found:
@@ -79,13 +174,15 @@ def sort_out(files: Iterable[Path], where: Path) -> Found:
     if len(rivals) > 1:
         globs = " or ".join(f"'{where / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
         raise SequenceError(f"{where}: several series of images that count alike; which one? Give {globs}")
-    return Found(sorted(frames, key=lambda file: (natural(file.name), file.name)), left_out)
+    return Found(in_order(frames), left_out)
 
 
 def other_kind(file: Path) -> str | None:
     """Return the kind of an image that is not a frame, in the plural; None for a frame."""
     if file.name.startswith("."):
         return "hidden files"
+    if file.suffix.lower() in FOREIGN:
+        return f"{file.suffix[1:].upper()} images, which are not read (convert them to JPEG or PNG)"
     words = re.split(r"[^a-z]+", file.stem.lower())
     return next((OTHER_KINDS[word] for word in words if word in OTHER_KINDS), None)
 
@@ -105,12 +202,12 @@ def subfolder(folder: Path) -> Path | None:
 
 
 def _files(folder: Path) -> list[Path]:
-    """The files of a folder with an image's suffix."""
+    """The files of a folder with an image's suffix, also one that is not read."""
     files: list[Path] = []
     for number, file in enumerate(folder.iterdir()):
         if number >= MAX_FILES:
             raise SequenceError(f"{folder}: more than {MAX_FILES} files; give a folder with the images alone")
-        if file.suffix.lower() in SUFFIXES and file.is_file():
+        if file.suffix.lower() in SUFFIXES | FOREIGN and file.is_file():
             files.append(file)
     return files
 

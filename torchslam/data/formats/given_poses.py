@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
+import math
 import os
 import struct
 from collections import Counter
+from collections.abc import Sequence as Listed
 from dataclasses import dataclass
 from pathlib import Path, PurePath
 from typing import Any
@@ -18,7 +21,7 @@ from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap,
 from torchslam.data.formats.text_file import parse_floats, read_text
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.trajectories import nearest, read_trajectory
-from torchslam.errors import CalibrationError, TrajectoryError
+from torchslam.errors import CalibrationError, FrameError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
 from torchslam.geometry.transforms import opengl
 from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
@@ -74,20 +77,41 @@ class GivenPoses:
     def rows(self, sequence: Sequence) -> Int[Tensor, " F"]:
         """Return the row of the pose of each frame of a sequence, -1 without a pose; no pose belongs to two frames.
 
-        Raises TrajectoryError where no frame has one.
+        Raises TrajectoryError where no frame has one, for poses that are left over where the times of images are
+        counted, and for images that are turned by their EXIF orientation where the poses are of the stored images.
         """
         if self.timestamps is None:
-            found = _by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
+            found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
             how = f"no image is called as those in it, such as {self.names[0]}"
         else:
             found = _by_time(self.timestamps, sequence.timestamps)
+            until = sequence.counted_until
+            without_image = 0 if until is None else int((self.timestamps > until).sum())
+            if without_image and bool((found >= 0).any()):
+                raise TrajectoryError(
+                    f"{self.path}: {without_image} of {len(self)} poses are of no image of {sequence.name}, whose "
+                    "times are counted: with one image more or less, the others have wrong poses; name the images "
+                    "by their times, or list them in rgb.txt"
+                )
             how = (
                 f"its times, from {float(self.timestamps[0])} to {float(self.timestamps[-1])} s, are not those of the "
                 f"images, from {float(sequence.timestamps[0])} to {float(sequence.timestamps[-1])} s"
             )
         if not bool((found >= 0).any()):
             raise TrajectoryError(f"{self.path}: no pose is that of an image of {sequence.name}: {how}")
+        if self.timestamps is None:
+            self._check_orientation(sequence, torch.nonzero(found >= 0)[:, 0].tolist())
         return found
+
+    def _check_orientation(self, sequence: Sequence, frames: list[int]) -> None:
+        """Raise TrajectoryError for an image in another orientation than COLMAP, or what builds on it, saw it in."""
+        for frame in frames:
+            with contextlib.suppress(FrameError):  # said when the frame is read
+                if sequence.is_turned(frame):
+                    raise TrajectoryError(
+                        f"{sequence.image_name(frame)}: its EXIF orientation turns it, which {self.path} ignores: open "
+                        "the sequence with the camera in there (without --camera), or remove the tag from the images"
+                    )
 
 
 def read_poses(path: str | Path) -> GivenPoses:
@@ -122,8 +146,8 @@ def _by_time(times: Float[Tensor, " N"], frames: Float[Tensor, " F"]) -> Int[Ten
     return torch.where((distances <= GROUNDTRUTH_TOLERANCE) & mutual, rows, -1)
 
 
-def _by_name(names: tuple[str, ...], images: list[str]) -> Int[Tensor, " F"]:
-    """The pose with most of the name in common from its end: `0/a.png` is that of `rgb/0/a.png`.
+def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
+    """The row of each image's name, with most in common from its end: `0/a.png` is that of `rgb/0/a.png`; -1 for none.
 
     Without a suffix as well (the first transforms.json had none); a name that two images have is that of none.
     """
@@ -160,17 +184,33 @@ def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
 
 
 def _text_images(path: Path) -> list[tuple[str, list[float]]]:
-    """Names and `qw qx qy qz tx ty tz`; every second line lists points and may be empty."""
-    lines = [line for line in read_text(path, TrajectoryError).splitlines() if not line.startswith("#")]
-    images = []
-    for line in lines[::2]:
+    """Names and `qw qx qy qz tx ty tz`; the line after an image lists its points, and may be empty or left out."""
+    images, is_points = [], False
+    for line in read_text(path, TrajectoryError).splitlines():
+        if line.startswith("#"):
+            continue
         words = line.split(maxsplit=9)
-        if not words:
+        if not words or (is_points and _are_points(line.split())):
+            is_points = False
             continue
         if len(words) != 10:
             raise TrajectoryError(f"{path}: expected `id qw qx qy qz tx ty tz camera name`, got `{line}`")
         images.append((words[9].strip(), parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)))
+        is_points = True
     return images
+
+
+def _are_points(words: list[str]) -> bool:
+    """Whether a line is of observations: numbers alone, in threes, of which the last may be cut; a line of ten words is
+    that of an image whose name is a number."""
+    return len(words) != 10 and _are_numbers(words)
+
+
+def _are_numbers(words: list[str]) -> bool:
+    try:
+        return all(map(math.isfinite, map(float, words)))
+    except ValueError:
+        return False
 
 
 def _binary_images(path: Path) -> list[tuple[str, list[float]]]:

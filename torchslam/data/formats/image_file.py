@@ -21,47 +21,89 @@ from PIL import Image
 from torch import Tensor
 
 from torchslam.errors import FrameError
-from torchslam.utils.files import read_bytes
+from torchslam.utils.files import check_regular, read_bytes
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
+FOREIGN = frozenset(
+    {".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif", ".exr", ".hdr", ".dng"}
+    | {".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
+)
+"""Suffixes of images that are not read."""
 WIDTH, HEIGHT = 256, 257  # tags of a TIFF
+ORIENTATION = 0x0112  # tag of EXIF
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
+AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
 MAX_BYTES = 1 << 29
 """Size limit of image files."""
 MAX_PIXELS = 1 << 26
 """Maximum number of pixels; a small file may declare any number."""
 
 
-def read_gray(path: str | Path, where: str, bits: int = 8) -> Float[Tensor, "1 1 H W"]:
+def read_gray(
+    path: str | Path, where: str, bits: int = 8, as_stored: bool = False
+) -> Float[Tensor, "1 1 H W"]:
     """An image file as gray in [0, 1].
 
     Args:
         bits: number of significant bits in files of 16 bits (`bit_depth`)
+        as_stored: ignore the orientation in the EXIF block
 
     Raises:
         FrameError: at `where` for a file that is missing, truncated, too large or not an image.
     """
-    return gray_to_tensor(read_pixels(path, where), bits)
+    return gray_to_tensor(_read(path, where, AS_GRAY, as_stored), bits)
 
 
-def read_color(path: str | Path, where: str) -> UInt8[Tensor, "H W 3"]:
-    """An image file as red, green, blue. Raises FrameError as `read_gray` does."""
-    return bgr_to_tensor(_read(path, where, cv2.IMREAD_COLOR))
+def read_color(
+    path: str | Path, where: str, bits: int = 8, as_stored: bool = False
+) -> UInt8[Tensor, "H W 3"]:
+    """An image file as red, green, blue; arguments and errors are those of `read_gray`."""
+    image = _read(path, where, AS_COLOR, as_stored)
+    if image.dtype == np.uint16:
+        image = np.rint(image * np.float32(255 / _white(bits))).clip(max=255).astype(np.uint8)
+    return bgr_to_tensor(image)
 
 
-def read_pixels(path: str | Path, where: str) -> Shaped[np.ndarray, "H W"]:
-    """An image file as gray, uint8 or uint16. Raises FrameError as `read_gray`."""
-    return _read(path, where, AS_GRAY)
+def read_pixels(
+    path: str | Path, where: str, as_stored: bool = False, flags: int = AS_GRAY
+) -> Shaped[np.ndarray, "H W *channels"]:
+    """An image file as gray or with `AS_COLOR`, uint8 or uint16. Raises FrameError as `read_gray`."""
+    return _read(path, where, flags, as_stored)
 
 
-def _read(path: str | Path, where: str, flags: int) -> np.ndarray:
+def has_transparency(path: Path) -> bool:
+    """Return whether an image file has pixels that are not opaque. Raises FrameError as `read_gray`."""
+    image = _read(path, str(path), cv2.IMREAD_UNCHANGED, as_stored=False)
+    return image.shape[2:] == (4,) and int(image[..., 3].min()) < np.iinfo(image.dtype).max
+
+
+def is_turned(path: Path, as_stored: bool) -> bool:
+    """Return whether an image is read in another orientation than its pixels are stored in.
+
+    Raises FrameError if the file cannot be read.
+    """
+    try:
+        check_regular(path, MAX_BYTES, "an image that is read")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            with Image.open(path) as image:
+                if as_stored and image.format != "TIFF":  # which OpenCV always turns
+                    return False
+                # Pillow would decode a PNG in search of a block after the pixels.
+                is_searched = image.format != "PNG" or "exif" in image.info
+                return is_searched and image.getexif().get(ORIENTATION, 1) != 1
+    except Exception as cause:  # a damaged block fails in any way
+        raise FrameError(f"{path}: its EXIF block cannot be read: {cause}") from cause
+
+
+def _read(path: str | Path, where: str, flags: int, as_stored: bool) -> np.ndarray:
     try:
         data = read_bytes(path, MAX_BYTES, "an image that is read")
     except OSError as cause:
         raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
     if _is_truncated(data):
         raise FrameError(f"{where}: {path} is truncated: its end marker is missing")
-    image = decode_pixels(data, flags)
+    image = decode_pixels(data, flags | cv2.IMREAD_IGNORE_ORIENTATION if as_stored else flags)
     if image is None:
         raise FrameError(f"{where}: {path} is not an image, or a damaged one")
     return image
@@ -72,7 +114,7 @@ def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
     whole image."""
     if not data or not _has_whole_chunks(data) or _declared_pixels(data) > MAX_PIXELS:
         return None
-    if flags == AS_GRAY and (gray := decode_png_gray(data)) is not None:
+    if flags & ~cv2.IMREAD_IGNORE_ORIENTATION == AS_GRAY and (gray := decode_png_gray(data)) is not None:
         return gray
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
@@ -90,11 +132,15 @@ def bit_depth(images: Iterable[np.ndarray]) -> int:
 def gray_to_tensor(gray: Shaped[np.ndarray, "H W"], bits: int = 8) -> Float[Tensor, "1 1 H W"]:
     """Convert uint8, or uint16 of which `bits` carry something, to float32 in [0, 1]."""
     if gray.dtype == np.uint16:
-        white = (1 << bits) - 1 if bits > 8 else 65535
         floats = gray.astype(np.float32)
-        floats /= white  # in place: of a large image one copy less
+        floats /= _white(bits)  # in place: of a large image one copy less
         return torch.from_numpy(floats).clamp_(max=1.0)[None, None]
     return torch.from_numpy(gray).to(torch.float32).div_(255.0)[None, None]
+
+
+def _white(bits: int) -> int:
+    """The brightest value in an image of 16 bits of which some carry something."""
+    return (1 << bits) - 1 if bits > 8 else 65535
 
 
 def bgr_to_tensor(image: UInt8[np.ndarray, "H W 3"]) -> UInt8[Tensor, "H W 3"]:

@@ -14,6 +14,10 @@ MAX_BYTES = 1 << 27
 """Size limit of text files; a million poses are smaller."""
 MAX_DIGITS = 19
 """Maximum number of digits of an integer; nanoseconds since 1970 have 19."""
+UNIX_UNITS = {13: 10**3, 16: 10**6, 19: 10**9}
+"""Parts of a second that a number of so many digits counts since 1970, from 2001 to 2286."""
+MAX_SECONDS = 1e11
+"""The year 5138."""
 MAX_LINE = 1 << 16
 """Maximum length of a line of numbers."""
 
@@ -62,6 +66,21 @@ def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[flo
 def parse_count(text: str) -> int | None:
     """Parse a non-negative integer of at most 19 digits; None for anything else."""
     return int(text) if text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS else None
+
+
+def in_seconds(number: float, where: str, error: type[TorchslamError]) -> float:
+    """Return a time in seconds; milli-, micro- and nanoseconds since 1970 are converted.
+
+    Raises `error` at `where` for a time that is none of them.
+    """
+    unit = UNIX_UNITS.get(len(str(int(number))))
+    if unit is not None and number > 0:
+        return number / unit
+    if abs(number) >= MAX_SECONDS:
+        raise error(
+            f"{where}: timestamp {number:g}: times are seconds, or milli-, micro- or nanoseconds since 1970"
+        )
+    return number
 
 
 def check_later(timestamp: float, before: float, where: str, error: type[TorchslamError]) -> None:

@@ -38,12 +38,15 @@ def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     folder = Path(path)
     root = _root(folder)
     sensor = root / "cam0" / "sensor.yaml"
-    camera = camera if camera is not None else read_calibration(sensor)
-    groundtruth = None
-    if (root / TRUTH).is_file():
-        groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor))
+    groundtruth, notes, has_truth = None, [], (root / TRUTH).is_file()
+    if not sensor.exists():
+        unused = ", and the ground truth is not used, which is of the body" if has_truth else ""
+        notes = [f"no {sensor}: the camera is unknown unless --camera is given{unused}"]
+    else:
+        camera = camera if camera is not None else read_calibration(sensor)
+        groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor)) if has_truth else None
     name = folder.resolve().parent.name if folder.name == "mav0" else folder.name
-    return ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth)
+    return ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth, notes)
 
 
 def _root(path: Path) -> Path:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import os
+import statistics
 from collections import Counter
 from collections.abc import Iterable
 from collections.abc import Sequence as Listed
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -26,18 +29,32 @@ from torchslam.data.formats.frame_names import (
     is_pattern,
     match_pattern,
     subfolder,
+    times_in_names,
 )
-from torchslam.data.formats.image_file import bit_depth, read_color, read_gray, read_pixels
+from torchslam.data.formats.image_file import (
+    AS_COLOR,
+    bit_depth,
+    has_transparency,
+    is_turned,
+    read_color,
+    read_gray,
+    read_pixels,
+)
 from torchslam.data.formats.text_file import check_later
 from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
+from torchslam.utils.text import printable
 
 DEFAULT_RATE = 30.0
 """Frame rate of images without timestamps."""
 CALIBRATION_FILES = ("calibration.txt", "calib.txt")
+SHORTEST, LONGEST = 2e-4, 1e4
+"""Seconds from image to image, beyond which times are taken to have another unit: microseconds read as nanoseconds, or
+nanoseconds since the system was started as seconds."""
 SAMPLES = 20
 """Number of images in which the brightest pixel of a 16-bit sequence is searched."""
+WITH_ALPHA = frozenset({".png", ".webp", ".tif", ".tiff"})
 ATTEMPTS = 20
 """Number of unreadable images after which opening a sequence fails."""
 
@@ -72,8 +89,11 @@ class ImageSequence(Sequence):
         """Raises SequenceError without images, for timestamps out of order or doubled, or where none of the
         first images can be read; CalibrationError for a camera of another image size."""
         _check_order(name, entries)
-        size, self._bits = _examine(entries)
+        as_stored = isinstance(camera, Calibration) and camera.as_stored
+        size, self._bits = _examine(entries, as_stored)
         notes = [*notes, f"{self._bits} of 16 bits are used"] if self._bits > 8 else notes
+        if _are_transparent(entries):
+            notes = [*notes, "images have transparent pixels, which are used as any other; --mask masks them"]
         super().__init__(
             name,
             kind,
@@ -85,21 +105,33 @@ class ImageSequence(Sequence):
             notes=notes,
         )
         self._entries = entries
+        self.as_stored = as_stored
 
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         entry = self._entries[index]
-        image = read_gray(entry.path, entry.where, self._bits)
+        image = read_gray(entry.path, entry.where, self._bits, self.as_stored)
         self._check_size(entry, (image.shape[-1], image.shape[-2]))
         return image
 
     def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         entry = self._entries[index]
-        image = read_color(entry.path, entry.where)
+        image = read_color(entry.path, entry.where, self._bits, self.as_stored)
         self._check_size(entry, (image.shape[1], image.shape[0]))
         return image
 
     def image_name(self, index: int) -> str:
         return str(self._entries[index].path)
+
+    def file_name(self, index: int) -> str:
+        return printable(os.path.relpath(self._entries[index].path, self._root))
+
+    def is_turned(self, index: int) -> bool:
+        return is_turned(self._entries[index].path, self.as_stored)
+
+    @cached_property
+    def _root(self) -> str:
+        """The folder of all images, also where it was unpacked: results must not depend on that place."""
+        return os.path.commonpath({os.path.abspath(entry.path.parent) for entry in self._entries})
 
     def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
         if size != self.size:
@@ -113,12 +145,19 @@ def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
         raise SequenceError(f"{name}: no images")
     for before, entry in itertools.pairwise(entries):
         check_later(entry.timestamp, before.timestamp, entry.where, SequenceError)
+    intervals = [after.timestamp - before.timestamp for before, after in itertools.pairwise(entries)]
+    interval = statistics.median(intervals) if intervals else 1.0
+    if not SHORTEST < interval < LONGEST:
+        raise SequenceError(
+            f"{entries[-1].where}: the images are {interval:.3g} s apart: their times seem to have another unit than "
+            "the seconds that are expected (EuRoC's data.csv: nanoseconds)"
+        )
 
 
-def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
+def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, int], int]:
     """Return the most common size of the first three readable images, since the first may differ, and their bit depth.
 
-    The depth of images of 16 bits is that of the brightest pixel of a sample over the whole sequence.
+    The depth of images of 16 bits is that of the brightest color of a sample over the whole sequence.
     """
     sizes: list[tuple[int, int]] = []
     failures: list[FrameError] = []
@@ -126,7 +165,7 @@ def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
     is_deep = False
     for entry in entries:
         try:
-            image = read_pixels(entry.path, entry.where)
+            image = read_pixels(entry.path, entry.where, as_stored)
             sizes.append((image.shape[1], image.shape[0]))
             bits, is_deep = max(bits, bit_depth([image])), is_deep or image.dtype == np.uint16
         except FrameError as failure:
@@ -137,8 +176,18 @@ def _examine(entries: Listed[ImageEntry]) -> tuple[tuple[int, int], int]:
         raise SequenceError(f"none of the first {len(failures)} images can be read; the first: {failures[0]}")
     for entry in entries[:: max(1, len(entries) // SAMPLES)] if is_deep else ():
         with contextlib.suppress(FrameError):  # said when the frame is read
-            bits = max(bits, bit_depth([read_pixels(entry.path, entry.where)]))
+            bits = max(bits, bit_depth([read_pixels(entry.path, entry.where, as_stored, AS_COLOR)]))
     return Counter(sizes).most_common(1)[0][0], bits
+
+
+def _are_transparent(entries: Listed[ImageEntry]) -> bool:
+    """Return whether the first image that can be read has transparent pixels."""
+    for entry in entries[:ATTEMPTS]:
+        if entry.path.suffix.lower() not in WITH_ALPHA:
+            return False
+        with contextlib.suppress(FrameError):  # said when the frame is read
+            return has_transparency(entry.path)
+    return False
 
 
 def find_calibration(path: Path) -> Calibration | None:
@@ -160,15 +209,25 @@ def _is_folder(path: str) -> bool:
 
 
 def _open_folder(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """Images in natural order (`9.png` before `10.png`), `rate` a second.
+    """Images in natural order (`9.png` before `10.png`), at the times in their names, or `rate` a second.
 
     `camera` overrides a calibration.txt with them or above them. Raises SequenceError or CalibrationError.
     """
     base = Path(path).parent if is_pattern(path) else Path(path)
     found, folder = _find(path, base)
     camera = camera if camera is not None else find_calibration(folder) or find_calibration(base)
-    entries = at_rate(found.frames, rate or DEFAULT_RATE)
-    return ImageSequence(base.resolve().name, "image folder", entries, camera, None, found.notes)
+    times, notes = times_in_names(found.frames), found.notes
+    if times is None:
+        entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    else:
+        entries = [
+            ImageEntry(time, image, str(image)) for time, image in zip(times, found.frames, strict=True)
+        ]
+        notes = [*notes, "the names of the images are their times"]
+    sequence = ImageSequence(base.resolve().name, "image folder", entries, camera, None, notes)
+    if times is None:
+        sequence.counted_until = (len(entries) - 0.5) / (rate or DEFAULT_RATE)
+    return sequence
 
 
 def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:
@@ -179,9 +238,13 @@ def at_rate(frames: list[Path], rate: float) -> list[ImageEntry]:
 def _find(path: str, base: Path) -> tuple[Found, Path]:
     if is_pattern(path):
         return match_pattern(path), base
-    found = find_frames(base)
-    inner = None if found.frames else subfolder(base)
-    return (found, base) if inner is None else (find_frames(inner), inner)
+    found, inner = find_frames(base), subfolder(base)
+    if inner is None:
+        return found, base
+    inside = find_frames(inner)
+    if len(inside.frames) > len(found.frames):  # a preview beside them, or nothing
+        return inside.without(len(found.frames), f"images beside {inner.name}/"), inner
+    return found.without(len(inside.frames), f"images in {inner.name}/"), base
 
 
 FOLDER = Reader(f"images, or a folder {'/, '.join(FOLDERS)}/ with images", _is_folder, _open_folder)

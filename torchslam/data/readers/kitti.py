@@ -19,7 +19,7 @@ from torch import Tensor
 from torchslam.data.calibration import Calibration
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames
-from torchslam.data.formats.text_file import check_later, numbered_lines, parse_floats
+from torchslam.data.formats.text_file import check_later, in_seconds, numbered_lines, parse_floats, read_text
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
 from torchslam.data.trajectories import checked_poses
@@ -36,8 +36,16 @@ TIME = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,9})?")
 
 
 def _is_kitti(path: str) -> bool:
-    """Return True for a sequence of the odometry benchmark."""
-    return (Path(path) / "times.txt").is_file() and any((Path(path) / name).is_dir() for name in CAMERAS)
+    """Return True for a sequence of the odometry benchmark, also one without times, which is then refused."""
+    base = Path(path)
+    if not any((base / name).is_dir() for name in CAMERAS):
+        return False
+    return (base / "times.txt").is_file() or _is_calibrated(base / "calib.txt")
+
+
+def _is_calibrated(path: Path) -> bool:
+    """Return whether a file has projections, `P0: ...`."""
+    return path.is_file() and read_text(path, CalibrationError).lstrip().startswith("P0:")
 
 
 def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -48,7 +56,13 @@ def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     """
     base = Path(path)
     folder = next(base / name for name in CAMERAS if (base / name).is_dir())
-    times = _read_table(base / "times.txt", 1, SequenceError)[:, 0]
+    if not (base / "times.txt").is_file():
+        raise SequenceError(
+            f"{path}: no times.txt, which comes with calib.txt in data_odometry_calib.zip; {folder} alone is read as "
+            "images of --fps 10, with --camera"
+        )
+    listed, rows = base / "times.txt", _read_table(base / "times.txt", 1, SequenceError)[:, 0].tolist()
+    times = torch.tensor([in_seconds(time, str(listed), SequenceError) for time in rows], dtype=torch.float64)
     found = find_frames(folder)
     images = found.frames
     if len(images) != len(times):

@@ -285,7 +285,8 @@ def _open_live(path: str, camera: GivenCamera | None, rate: float | None) -> Liv
     shown = without_credentials(path)
     capture = cv2.VideoCapture(int(path)) if number else open_capture(path)
     if not capture.isOpened():
-        raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}")
+        file = "; download a file, and give that" if shown.startswith("http") else ""
+        raise SequenceError(f"{shown}: cannot be opened as a {'camera' if number else 'stream'}{file}")
     return LiveSequence(f"camera {path}" if number else shown, capture, camera)
 
 

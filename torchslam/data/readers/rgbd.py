@@ -22,7 +22,7 @@ from torch import Tensor
 from torchslam.data.calibration import PRESETS
 from torchslam.data.camera_argument import GivenCamera
 from torchslam.data.formats.frame_names import find_frames, match_pattern
-from torchslam.data.formats.text_file import numbered_lines, parse_count, parse_floats
+from torchslam.data.formats.text_file import in_seconds, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import (
     DEFAULT_RATE,
     ImageEntry,
@@ -83,6 +83,7 @@ def read_image_list(path: Path) -> list[ImageEntry]:
             timestamp = math.nan
         if len(words) != 2 or not math.isfinite(timestamp):
             raise SequenceError(f"{where}: expected `timestamp file`, got `{line}`")
+        timestamp = in_seconds(timestamp, where, SequenceError)
         entries.append(ImageEntry(timestamp, path.parent / words[1], where))
     if not entries:
         raise SequenceError(f"{path}: no images are listed")

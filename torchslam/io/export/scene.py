@@ -6,7 +6,7 @@ Images and keypoints are undistorted on request.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
@@ -16,10 +16,12 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.data import open_sequence
+from torchslam.data.calibration import Calibration
+from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Sequence
 from torchslam.data.transforms import resize
-from torchslam.errors import ResultsError, SequenceError
+from torchslam.errors import FrameError, ResultsError, SequenceError
 from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
 from torchslam.map.atlas import Submap
 
@@ -249,43 +251,143 @@ class Images:
         return image if self._undistort is None else self._undistort(image)
 
 
+@dataclass(frozen=True)
+class ExampleFrame:
+    """A frame whose image is kept with the results.
+
+    Attributes:
+        frame_id: index of the frame in the run.
+        timestamp: seconds.
+        image: gray in [0, 1].
+    """
+
+    frame_id: int
+    timestamp: float
+    image: Float[Tensor, "1 1 H W"]
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """Where the images of a run are, and by what they are found.
+
+    Attributes:
+        path: of the sequence.
+        fps: frame rate with which the run read images without timestamps.
+        files: file of each frame, if frames are files; a file is a frame's own, a time that was counted is not.
+        example: frame by whose image the sequence is recognized; None if there is none.
+        as_stored: whether the run ignored the EXIF orientation of images.
+    """
+
+    path: str
+    fps: float | None = None
+    files: Mapping[int, str] = field(default_factory=dict)
+    example: ExampleFrame | None = None
+    as_stored: bool = False
+
+
 def open_images(
-    source: str,
+    source: ImageSource,
     scene: ExportedScene,
     pinhole: Camera | None = None,
-    fps: float | None = None,
     otherwise: str = WITHOUT,
 ) -> Images:
     """Open the images of a scene, in the size of the run.
 
-    Images are matched by timestamp, since the run may have read a part of the sequence. Raises ResultsError if the
-    sequence is missing or a different one.
+    Images are found by their file names, and frames of videos and recordings by their times, since the run may have
+    read a part of the sequence. Raises ResultsError if the sequence or an image is missing, or another one.
 
     Args:
-        source: path of the sequence.
+        source: where the images are.
         scene: the exported frames.
         pinhole: camera of the undistorted images; None: the images as they are.
-        fps: frame rate with which the run read images without timestamps.
         otherwise: what to do without them, for the error.
     """
     times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
-    if is_live(source):  # nor is it connected to because a results folder says so
-        raise ResultsError(f"{source}: a live source gives each image once; {otherwise}")
+    if is_live(source.path):  # nor is it connected to because a results folder says so
+        raise ResultsError(f"{source.path}: a live source gives each image once; {otherwise}")
     try:
-        sequence = open_sequence(source)
-        if fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):
-            sequence = open_sequence(source, fps=fps)
+        camera = None
+        if source.as_stored:  # the numbers are not used: the images may have another size
+            camera = Calibration("pinhole", (1.0, 1.0, 0.0, 0.0), source.path, as_stored=True)
+        sequence = open_sequence(source.path, camera)
+        if source.fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):
+            sequence = open_sequence(source.path, camera, fps=source.fps)
         if sequence.size != scene.camera.size:
             sequence = resize(sequence, "{}x{}".format(*scene.camera.size))
     except SequenceError as error:
         raise ResultsError(f"the sequence of this run cannot be read: {error}; {otherwise}") from None
-    row_at = {time: row for row, time in enumerate(sequence.timestamps.tolist())}
-    if not all(time in row_at for time in times.values()):
-        raise ResultsError(
-            f"{source}: not the sequence of this run, whose frames have other times; {otherwise}"
-        )
-    rows = {frame_id: row_at[time] for frame_id, time in times.items()}
+    rows = _image_rows(sequence, source, times, otherwise)
+    _check_example(sequence, source, rows, otherwise)
     return Images(sequence, rows, scene.camera, pinhole)
+
+
+def _image_rows(
+    sequence: Sequence, source: ImageSource, times: Mapping[int, float], otherwise: str
+) -> dict[int, int]:
+    """The index in a sequence of each frame, and of the example if it is there. Raises ResultsError otherwise."""
+    example, wanted = source.example, dict(times)
+    if example is not None:
+        wanted.setdefault(example.frame_id, example.timestamp)
+    present = [sequence.file_name(index) for index in range(len(sequence))]
+    is_of_files, start = any(present), f"{source.path}: not the sequence of this run"
+    if is_of_files and not source.files:
+        raise ResultsError(
+            f"{source.path}: the results do not say which image each frame was: run again, or --no-images"
+        )
+    if source.files and not is_of_files:
+        raise ResultsError(
+            f"{start}, whose frames are files such as {next(iter(source.files.values()))}; {otherwise}"
+        )
+    if is_of_files:
+        ids = [frame_id for frame_id in wanted if frame_id in source.files]
+        found = rows_by_name([source.files[frame_id] for frame_id in ids], present).tolist()
+        rows = {ids[row]: index for index, row in enumerate(found) if row >= 0}
+    else:
+        row_at = {time: row for row, time in enumerate(sequence.timestamps.tolist())}
+        rows = {frame_id: row_at[time] for frame_id, time in wanted.items() if time in row_at}
+    missing = [frame_id for frame_id in times if frame_id not in rows]
+    if missing and not is_of_files:
+        raise ResultsError(f"{start}, whose frames have other times; {otherwise}")
+    if missing:
+        name = source.files.get(missing[0], "no file")
+        raise ResultsError(
+            f"{source.path}: {len(missing)} of {len(times)} images of this run are missing, the first is that of frame "
+            f"{missing[0]}, {name}; {otherwise}"
+        )
+    return rows
+
+
+SAME_PICTURE = 0.9
+"""Correlation from which on an image is that of the run, by another decoder or in other colors: less than that of two
+frames between which anything moves."""
+NOISE = 4 / 255
+"""Difference that a codec may make in an image without contrast."""
+
+
+def _check_example(sequence: Sequence, source: ImageSource, rows: Mapping[int, int], otherwise: str) -> None:
+    """Raise ResultsError where the image that is kept with the results is another one in the sequence."""
+    example = source.example
+    if example is None or example.frame_id not in rows:
+        return
+    try:
+        found = sequence.image(rows[example.frame_id])
+    except FrameError:  # is said when it is needed
+        return
+    if found.shape != example.image.shape or not _is_same_picture(found, example.image):
+        raise ResultsError(
+            f"{source.path}: not the sequence of this run: frame {example.frame_id} shows something else "
+            f"than it did; {otherwise}"
+        )
+
+
+def _is_same_picture(image: Float[Tensor, "1 1 H W"], other: Float[Tensor, "1 1 H W"]) -> bool:
+    """Whether two images are the same, up to noise, brightness and contrast."""
+    centered, other = (values.double() - values.double().mean() for values in (image, other))
+    energy, other_energy = (float(values.square().mean()) for values in (centered, other))
+    covariance = float((centered * other).mean())
+    if covariance > 0 and covariance**2 > SAME_PICTURE**2 * energy * other_energy:
+        return True
+    return max(energy, other_energy) < NOISE**2
 
 
 def write_images(folder: Path, scene: ExportedScene, images: Images) -> None:
