@@ -50,6 +50,9 @@ from torchslam.optim.bundle._schur import (
     build_structure,
 )
 
+_INNER_FRAMES = 32
+"""Free frames from which on points take steps of their own: parts of a window of few frames do not move against each
+other, and it converges in a few steps."""
 _INNER_STEPS, _INNER_GAIN = 3, 1e-4
 """Most steps of the points alone after a joint step, and the share of the cost that one must gain to be followed by
 another."""
@@ -280,7 +283,7 @@ class SparseBundle:
         single point that steps too far does not stop all others.
         Source: Jeong et al., "Pushing the envelope of modern methods for bundle adjustment", 2012, section 4.
         """
-        if not self.layout.free_points.any():
+        if len(self.layout.free_frames) < _INNER_FRAMES or not self.layout.free_points.any():
             return estimate
         damping = torch.full_like(estimate.points_w[:, 0], _INNER_DAMPING)
         cost, gradient, hessian = self._of_points(estimate)
