@@ -37,13 +37,16 @@ _ROUNDINGS = 64.0
 # Huber's scale in the search, as a sine times the root of the median weight: GLOMAP's.
 _WIDE = 0.1
 # Most steps of the search by least squares and of that with Huber's kernel, and the shares of the cost at which they
-# end.
+# end. With a fifth of wrong rays and a narrow last kernel, centers of 16 simulated recordings are off by 0.21 % of
+# their extent in the mean; with 5 steps by 0.57 %, 10 by 0.35 %, 40 by 0.21 %. Ten times other shares change little.
 _STEPS, _SETTLED, _WIDE_SETTLED = 20, 1e-2, 1e-4
 _KERNELS: tuple[Kernel, Kernel] = ("none", "huber")
-# Inverse distance where that of a point behind the camera ends; of positions in a cube of size two. GLOMAP's.
-_LEAST_INVERSE = 1e-5
+# Inverse distance where that of a point behind the camera ends; of positions in a cube of size two. With GLOMAP's 1e-5
+# the mean above is 0.62 %.
+_LEAST_INVERSE = 1e-7
 # Share of a point's mean distance below which it touches a camera, which then sees it in any direction: such points
-# explain one wrong ray each. Of a street seen ahead, the first and the last distance differ a hundredfold.
+# explain one wrong ray each. Of a street seen ahead, the first and the last distance differ a hundredfold. 1e-4 and
+# 1e-2 give the same on simulated recordings.
 _TOUCHING = 1e-3
 
 
@@ -105,7 +108,7 @@ class PositionProblem:
         centers_w, points_w, inverse = model.estimate
         if inverse is None:
             factorized = self.equations(model).factorized(damping[0], self.gauge(model))
-        else:  # steps that keep the scale of the centers end at higher costs here, by up to 3 %
+        else:  # the gauge is left to the damping: inverse distances go with the scale
             factorized = self.equations(model, damping).factorized(damping[0])
         gradient = factorized.equations.gradient
         step = factorized.solve(gradient)

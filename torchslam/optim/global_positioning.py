@@ -92,7 +92,9 @@ def position_globally(
         num_points: N.
         weights: inverse variances of the directions, in rad^-2; one if None.
         start: centers and points to begin with in place of the search.
-        kernel: robust kernel of the last minimization. The search has Huber's, with a scale of 0.1 or more.
+        kernel: robust kernel of the last minimization. The search has Huber's, with a scale of 0.1 or more. Many wrong
+            rays pull the centers with that one too: "geman_mcclure" with a few standard deviations as the scale
+            leaves them behind.
         scale: of the kernel, in units of the whitened error: the sine of the angle times the root of the weight.
         seed: of the random positions from which the search begins.
         backward: how gradients reach rays_w, weights and scale.
