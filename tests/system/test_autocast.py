@@ -27,6 +27,7 @@ from torchslam.optim import (
     log_distance_error,
     minimize,
     pose_graph_optimize,
+    position_globally,
     refine_pose,
     relative_pose_error,
 )
@@ -210,6 +211,10 @@ def solver_cases() -> dict[str, Case]:
         ),
         "average_rotations": (
             lambda R: average_rotations(torch.tensor(((0, 1), (1, 2), (0, 2))), R, 3), (so3_exp(0.1 * normal(3, 3)),)
+        ),
+        "position_globally": (
+            lambda rays_w: position_globally(*torch.cartesian_prod(torch.arange(4), torch.arange(9)).T, rays_w, 4, 9),
+            ((4 * unit(9, 3) - normal(4, 1, 3, seed=1)).flatten(0, 1),),
         ),
     }  # fmt: skip
 

@@ -12,6 +12,7 @@ from torchslam.optim.bundle._factors import (
     relative_pose_error,
 )
 from torchslam.optim.bundle._schur import Marginals
+from torchslam.optim.global_positioning import GlobalPositions, position_globally
 from torchslam.optim.pose._refinement import RefinedPose, refine_pose
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, pose_graph_optimize
 from torchslam.optim.rotation_averaging import RotationAverage, average_rotations
@@ -24,6 +25,7 @@ __all__ = [
     "Convergence",
     "DepthPrior",
     "FrameFactors",
+    "GlobalPositions",
     "LeastSquaresSolution",
     "Manifold",
     "Marginals",
@@ -38,6 +40,7 @@ __all__ = [
     "log_distance_error",
     "minimize",
     "pose_graph_optimize",
+    "position_globally",
     "refine_pose",
     "relative_pose_error",
 ]
