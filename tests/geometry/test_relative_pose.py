@@ -215,6 +215,7 @@ def test_wrong_shapes_and_empty_input() -> None:
     with pytest.raises(ValueError, match=r"\(B, N, 2\)"):
         estimate_relative_pose(torch.zeros(5, 2), torch.zeros(5, 2), CAMERA, CAMERA)
     for shape in ((0, 10, 2), (2, 0, 2), (2, 4, 2)):
-        result = estimate_relative_pose(torch.zeros(shape), torch.zeros(shape), CAMERA, CAMERA)
+        pixels = torch.zeros(shape, dtype=torch.float64)
+        result = estimate_relative_pose(pixels, pixels, CAMERA, CAMERA)
         assert result.T_21.shape == (shape[0], 4, 4)
         assert not result.success.any()

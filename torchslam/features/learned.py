@@ -20,7 +20,7 @@ from torchslam.features.contract import apply_mask
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
 from torchslam.features.weights import EXTRACTOR, MATCHER, read_weights
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features
 
 _SCALE = 2.0
@@ -113,7 +113,7 @@ class XFeat(nn.Module):
         scores = heat * F.interpolate(reliability, inner, mode="bilinear", align_corners=False)
         return coarse, heat[:, 0], scores[:, 0]
 
-    @full_precision
+    @without_autocast
     def _features(
         self, images: Tensor, coarse: Tensor, heat: Tensor, scores: Tensor, places: Tensor, found: Tensor
     ) -> Features:
@@ -218,7 +218,7 @@ class ALIKED(nn.Module):
             ALIKED_NOISE,
         )
 
-    @full_precision
+    @without_autocast
     def _located(self, heat: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (B, N, 2), from -1 to 1 over the image, and scores (B, N), as the network's detector has them."""
         detector, heat = self.network.dkd, heat.float()
@@ -232,7 +232,7 @@ class ALIKED(nn.Module):
 class _FullPrecision(nn.Sequential):
     """Layers in the precision of their parameters also under autocast: a rounded logit moves its keypoint."""
 
-    forward = full_precision(nn.Sequential.forward)
+    forward = without_autocast(nn.Sequential.forward)
 
 
 _RADIUS = 2  # of the window around a peak that locates a keypoint

@@ -304,8 +304,8 @@ def check_images(images: Tensor, mask: Tensor | None = None) -> None:
         raise ValueError(f"a mask must be bool {tuple(images.shape)}, got {mask.dtype} {tuple(mask.shape)}")
     if images.dim() != 4 or images.shape[1] != 1 or 0 in images.shape:
         raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
-    if not images.is_floating_point():
-        raise ValueError(f"images must be floats in [0, 1], got {images.dtype}")
+    if images.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"images must be float32 or float64, in [0, 1], got {images.dtype}")
 
 
 def gray_bytes(images: Float[Tensor, "B 1 H W"]) -> UInt8[Tensor, "B H W"]:

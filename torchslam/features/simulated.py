@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchslam.features.contract import BINARY_BYTES
 from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features
 
 LEVELS, FACTOR = 8, 1.2  # the pyramid of the scales, as that of ORB
@@ -39,6 +40,7 @@ class SimulatedFeatures:
         seed: of all random numbers.
     """
 
+    @without_autocast
     def __init__(
         self,
         T_cw: Float[Tensor, "K 4 4"],
@@ -120,6 +122,7 @@ class SimulatedFeatures:
         angle = torch.atan2(image[:, 1], image[:, 0])
         return pixels, visible & (level >= 0) & (level < LEVELS), level, angle
 
+    @without_autocast
     def __call__(self, T_cw: Float[Tensor, "4 4"], frame_index: int) -> Features:
         """Return the features (a batch of one) of the frame with this true pose."""
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + frame_index) % 2**63)

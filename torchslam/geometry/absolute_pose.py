@@ -94,13 +94,10 @@ def estimate_absolute_pose(
         The poses; `success` is False for a camera with too few points, points on a line, or pure noise.
 
     Raises:
-        ValueError: The shapes of points and pixels do not agree.
+        ValueError: A shape or a dtype does not fit.
         RuntimeError: It is called within a transform of `torch.func`.
     """
     refuse_transforms("estimate_absolute_pose")
-    if points_w.dim() != 3 or pixels.shape != (*points_w.shape[:2], 2):
-        shapes = f"{tuple(points_w.shape)} and {tuple(pixels.shape)}"
-        raise ValueError(f"points_w and pixels must be (B, N, 3) and (B, N, 2), not {shapes}")
     B, N = pixels.shape[:2]
     if B == 0 or N < 3:
         nothing = torch.zeros(B, N, dtype=torch.bool, device=pixels.device)
@@ -366,9 +363,9 @@ def is_success(
     """
     chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
-    weights = inliers[..., None].to(points.dtype)
-    mean = (weights * points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
-    centered = weights * (points - mean)
+    inliers = inliers[..., None]
+    mean = torch.where(inliers, points, 0.0).sum(1, keepdim=True) / inliers.sum(1, keepdim=True).clamp_min(1)
+    centered = torch.where(inliers, points - mean, 0.0)
     spread = torch.linalg.eigvalsh(centered.mT @ centered)
     return significant & (spread[:, 1] > _ON_A_LINE * spread[:, 2])
 

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch._C import _are_functorch_transforms_active
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from torchslam.geometry import distortion
+from torchslam.geometry.precision import without_autocast
 
 Scalar = float | Tensor
 
@@ -127,10 +128,18 @@ class Camera:
         entries = (self.fx, zero, self.cx, zero, self.fy, self.cy, zero, zero, one)
         return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
-    @cached_property
+    @property
     def limit(self) -> Float[Tensor, "*batch"]:
         """Extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
-        return self._distortion.limit(self.params.detach()[..., 4:])
+        k = self.params.detach()[..., 4:]
+        if torch.compiler.is_compiling() or _are_functorch_transforms_active():
+            return self._distortion.limit(k)
+        # Kept, since it takes longer than the distortion itself, until an optimizer changes the parameters in place.
+        known = self.__dict__.get("_limit")
+        if known is None or not torch.equal(known[0], k):
+            known = self.__dict__["_limit"] = k.clone(), self._distortion.limit(k)
+        limit: Tensor = known[1]
+        return limit
 
     @property
     def _distortion(self) -> distortion.Distortion:
@@ -148,7 +157,7 @@ class Camera:
         index = index if isinstance(index, tuple) else (index,)
         chosen = self.with_params(self.params[(*index, ..., slice(None))])
         if self.model != "pinhole":  # found once for each camera, not for each time that it is chosen
-            chosen.__dict__["limit"] = self.limit[index]
+            chosen.__dict__["_limit"] = chosen.params.detach()[..., 4:].clone(), self.limit[index]
         return chosen
 
     @staticmethod
@@ -167,6 +176,7 @@ class Camera:
         """Move the camera to another device or dtype; arguments as of `Tensor.to`."""
         return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
+    @without_autocast
     def project(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"]]:
@@ -180,6 +190,7 @@ class Camera:
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
         return self._to_pixels(distorted, valid), valid
 
+    @without_autocast
     def project_with_point_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"], Float[Tensor, "*#batch N 2 3"]]:
@@ -203,6 +214,7 @@ class Camera:
         J = rows.unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
         return self._to_pixels(distorted, valid), valid, J
 
+    @without_autocast
     def project_with_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[
@@ -225,6 +237,7 @@ class Camera:
         J_params = torch.cat((torch.diag_embed(distorted), J_center, J_coefficients), dim=-1)
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
+    @without_autocast
     def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Compute undistorted image coordinates x/z, y/z of pixels.
 
@@ -236,12 +249,14 @@ class Camera:
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
 
+    @without_autocast
     def unproject(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 3"]:
         """Compute bearings of unit length of pixels."""
         normalized = self.normalize(pixels)
         ray = torch.cat((normalized, torch.ones_like(normalized[..., :1])), dim=-1)
         return ray / ray.norm(dim=-1, keepdim=True)
 
+    @without_autocast
     def in_image(self, pixels: Float[Tensor, "*batch 2"], border: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Test whether pixels lie inside the image, `border` pixels away from its edge."""
         x, y = pixels.unbind(-1)
@@ -249,6 +264,7 @@ class Camera:
         low = border - 0.5
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
+    @without_autocast
     def pixel_scale(self, normalized: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Pixels per unit of undistorted image coordinates, along x and y, locally.
 

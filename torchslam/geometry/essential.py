@@ -116,7 +116,7 @@ def _constraints(basis: Float[Tensor, "B 4 9"]) -> Float[Tensor, "B 10 20"]:
     )
     determinant = (normals[:, None] * E[:, 0]).sum(2)
     rows = (
-        (table @ part.reshape(table.shape[1], -1)).view(len(table), -1, len(basis))
+        (table @ part.reshape(table.shape[1], -1)).view(len(table), math.prod(part.shape[2:-1]), len(basis))
         for part in (cubic, determinant)
     )
     return torch.cat(tuple(rows), dim=1).permute(2, 1, 0)

@@ -70,9 +70,7 @@ class _Last(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        raise RuntimeError(
-            "the second derivative of an estimate by RANSAC, of an alignment or of an undistorted pixel is not known"
-        )
+        raise RuntimeError("the second derivative of an estimate by RANSAC or of an alignment is not known")
 
 
 def implicit_step(

@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch._C import _is_any_autocast_enabled
 
+from torchslam.geometry.signatures import check_arguments
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -18,13 +20,24 @@ _DTYPES = (torch.float32, torch.float64)
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """The function, with the same bits under `torch.autocast` as without.
+    """The function, with the same bits under `torch.autocast` as without, for tensors that its signature allows.
 
-    Autocast would multiply matrices in bfloat16: rotations wrong in the third digit that look like any other.
+    Autocast would multiply matrices in bfloat16: rotations wrong in the third digit that look like any other. All
+    tensors of floats must have one dtype.
     """
+    return _precise(function, one_dtype=True)
 
+
+def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+    """As `full_precision`, for tensors of floats that may be of several dtypes."""
+    return _precise(function, one_dtype=False)
+
+
+def _precise(function: Callable[P, R], one_dtype: bool) -> Callable[P, R]:
     @wraps(function)
     def precise(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not (torch.compiler.is_compiling() or torch.jit.is_tracing()):
+            check_arguments(function, args, kwargs, one_dtype)
         if not _is_any_autocast_enabled():
             return function(*args, **kwargs)
         for device_type in _DEVICE_TYPES:

@@ -123,11 +123,11 @@ def estimate_relative_pose(
         The relative poses.
 
     Raises:
-        ValueError: Wrong shapes, or an unknown model or kernel.
+        ValueError: A shape or a dtype does not fit, or an unknown model or kernel.
         RuntimeError: It is called within a transform of `torch.func`.
     """
     refuse_transforms("estimate_relative_pose")
-    _check(pixels_1, pixels_2, weights, model, kernel)
+    _check(model, kernel)
     if 0 in pixels_1.shape or pixels_1.shape[1] < 5:
         return _nothing(pixels_1)
     mask = _usable(pixels_1, pixels_2, mask, weights)
@@ -175,12 +175,7 @@ def _usable(
     return finite if mask is None else mask & finite
 
 
-def _check(pixels_1: Tensor, pixels_2: Tensor, weights: Tensor | None, model: str, kernel: str) -> None:
-    if pixels_1.dim() != 3 or pixels_1.shape != pixels_2.shape or pixels_1.shape[-1] != 2:
-        shapes = f"{tuple(pixels_1.shape)} and {tuple(pixels_2.shape)}"
-        raise ValueError(f"pixels_1 and pixels_2 must both be (B, N, 2), not {shapes}")
-    if weights is not None and weights.shape != pixels_1.shape[:2]:
-        raise ValueError(f"weights must be {tuple(pixels_1.shape[:2])}, not {tuple(weights.shape)}")
+def _check(model: str, kernel: str) -> None:
     for name, value, known in (("model", model, _MODELS), ("kernel", kernel, _KERNELS)):
         if value not in known:
             raise ValueError(f"unknown {name} {value!r}; known are {', '.join(known)}")

@@ -180,14 +180,11 @@ def estimate_similarity(
         The similarities.
 
     Raises:
-        ValueError: The shapes of points and pixels do not agree.
+        ValueError: A shape or a dtype does not fit.
         RuntimeError: It is called within a transform of `torch.func`.
     """
     shape, given = points_1.shape[:-1], (points_1, points_2, pixels_1, pixels_2)
     refuse_transforms("estimate_similarity")
-    if len(shape) != 2 or any(x.shape != (*shape, n) for x, n in zip(given, (3, 3, 2, 2), strict=True)):
-        shapes = ", ".join(str(tuple(x.shape)) for x in given)
-        raise ValueError(f"points must be (B, N, 3) and pixels (B, N, 2), not {shapes}")
     sigmas = tuple(torch.ones_like(points_1[..., 0]) if s is None else s for s in (sigmas_1, sigmas_2))
     positive = torch.stack((points_1[..., 2], points_2[..., 2], *sigmas), dim=-1)
     use = (positive > 0).all(-1) & torch.isfinite(torch.cat((*given, positive), dim=-1)).all(-1)

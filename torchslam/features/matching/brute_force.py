@@ -18,7 +18,7 @@ from torchslam.features.matching.hamming import (
     nearest_by_cosine,
     nearest_by_hamming,
 )
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features, Matches
 from torchslam.utils.indexing import true_indices
 
@@ -26,7 +26,7 @@ SAME_SCALE = 0.05
 """Relative difference up to which two scales belong to one pyramid level."""
 
 
-@full_precision
+@without_autocast
 def match(
     features_1: Features,
     features_2: Features,
@@ -85,7 +85,7 @@ def match(
     return to_matches(nearest.column, nearest.distance, mask, weights)
 
 
-@full_precision
+@without_autocast
 def match_pairs(
     descriptors_1: Shaped[Tensor, "N1 D"],
     descriptors_2: Shaped[Tensor, "N2 D"],
