@@ -137,7 +137,9 @@ class FrameFeatures:
     mask: Bool[Tensor, " N"]
     T_cw_groundtruth: Float[Tensor, "4 4"] | None = None
     session: int = 0
-    information: Float[Tensor, "N I"] = field(default_factory=lambda: torch.zeros(0))
+    information: Float[Tensor, "N I"] = field(
+        default_factory=lambda: torch.zeros(0, dtype=torch.float32, device="cpu")
+    )
     image: Float[Tensor, "1 1 H W"] | None = None
     backlog: int = 0
 
@@ -335,7 +337,10 @@ class Trajectory:
     @classmethod
     def empty(cls) -> Trajectory:
         """A trajectory without poses."""
-        return cls(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
+        return cls(
+            torch.zeros(0, dtype=torch.float64, device="cpu"),
+            torch.zeros(0, 4, 4, dtype=torch.float64, device="cpu"),
+        )
 
     def __len__(self) -> int:
         return int(self.timestamps.shape[0])

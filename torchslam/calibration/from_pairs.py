@@ -136,7 +136,7 @@ def _solve(pairs: list[tuple[Tensor, Tensor, Tensor]], camera: Camera, scale: fl
         torch.nn.utils.rnn.pad_sequence([pair[side] for pair in pairs], batch_first=True) for side in (1, 2)
     )
     mask = torch.nn.utils.rnn.pad_sequence(
-        [torch.ones(len(pair[1]), dtype=torch.bool) for pair in pairs], batch_first=True
+        [torch.ones(len(pair[1]), dtype=torch.bool, device="cpu") for pair in pairs], batch_first=True
     )
     return focal_from_pairs(
         F,

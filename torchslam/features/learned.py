@@ -223,7 +223,7 @@ class ALIKED(nn.Module):
         """Keypoints (B, N, 2), from -1 to 1 over the image, and scores (B, N), as the network's detector has them."""
         detector, heat = self.network.dkd, heat.float()
         weights = torch.softmax(_windows(heat[:, 0], places).flatten(2) / detector.temperature, dim=-1)
-        positions = places + weights @ torch.as_tensor(detector.hw_grid)
+        positions = places + weights @ torch.as_tensor(detector.hw_grid, device=weights.device)
         located = positions / positions.new_tensor([heat.shape[3] - 1, heat.shape[2] - 1]) * 2 - 1
         scores = F.grid_sample(heat, located[:, None], mode="bilinear", align_corners=True)
         return located, scores[:, 0, 0]

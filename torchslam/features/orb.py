@@ -350,12 +350,14 @@ class OpenCVORB(nn.Module):
         found, described = self._orb.detectAndCompute(image.numpy(), mask) if roomy else ((), None)
         # cv2 may return a few more than asked for when responses tie.
         rows = sorted(range(len(found)), key=lambda row: -found[row].response)[: self.num_keypoints]
-        values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype).repeat(self.num_keypoints, 1)
-        descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8)
-        found_mask = torch.arange(self.num_keypoints) < len(rows)
+        values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype, device="cpu").repeat(self.num_keypoints, 1)
+        descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8, device="cpu")
+        found_mask = torch.arange(self.num_keypoints, device="cpu") < len(rows)
         if described is not None:
             points = [found[row] for row in rows]
-            values[: len(rows)] = torch.tensor([self._row(point) for point in points], dtype=dtype)
+            values[: len(rows)] = torch.tensor(
+                [self._row(point) for point in points], dtype=dtype, device="cpu"
+            )
             descriptors[: len(rows)] = torch.from_numpy(described[rows])
         return values[:, :2], values[:, 2], values[:, 3], values[:, 4], descriptors, found_mask
 

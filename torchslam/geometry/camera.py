@@ -296,10 +296,10 @@ class Camera:
 
 
 def _stack(*values: Scalar) -> Float[Tensor, "*batch P"]:
-    """Parameters from floats and tensors; float64 unless a tensor says otherwise."""
+    """Parameters from floats and tensors; float64 on the CPU unless a tensor says otherwise."""
     tensors = [value for value in values if isinstance(value, Tensor)]
     dtype = tensors[0].dtype if tensors else torch.float64
-    device = tensors[0].device if tensors else None
+    device = tensors[0].device if tensors else "cpu"
     columns = [torch.as_tensor(value, dtype=dtype, device=device) for value in values]
     return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
 

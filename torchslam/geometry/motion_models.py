@@ -154,7 +154,7 @@ def choose(
             certain = is_unlikely(against, count, size, nearby.maximum(chance ** (size - 1)))
         else:
             certain = is_significant(against, count, 2, chance, 1)
-        return certain & (against > _LEAST_SHARE * explained.sum(-1))
+        return certain & (against > _LEAST_SHARE * explained.sum(-1).float())
 
     off = torch.stack((contradicted(homography, essential), contradicted(rotation, essential)))
     if by_noise:
@@ -231,7 +231,7 @@ class PlaneMotions(NamedTuple):
         # All of the plane must be in front of the first camera, and then is in front of the second.
         plane = views.mask & (fits.squared[HOMOGRAPHY] < 1)
         ahead = ((views.h_1 @ normals.mT) > 0) & plane[..., None]
-        share = ahead.sum(1) / plane.sum(1, keepdim=True).clamp_min(1)
+        share = ahead.sum(1).float() / plane.sum(1, keepdim=True).clamp_min(1)
         length = t.norm(dim=-1, keepdim=True)
         direction = t / length.clamp_min(1e-12)
         squared = sampson_squared(views, R, direction)

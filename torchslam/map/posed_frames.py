@@ -182,7 +182,7 @@ class PosedFrames:
         every = torch.arange(len(seen_by), device=T_cw.device)
         agrees = torch.cat([self._agree(rows, T_cw, slam_map, camera) for rows in every.split(_CHUNK)])
         count = torch.bincount(seen_by, minlength=len(self))
-        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= _MIN_INLIER_RATIO * count
+        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= _MIN_INLIER_RATIO * count.float()
         kept = agrees | ~is_right[seen_by]
         if not bool(kept.all()):
             self.observations.keep(torch.nonzero(kept)[:, 0])

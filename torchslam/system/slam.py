@@ -225,7 +225,9 @@ class SLAM:
             and not self.has_custom_components
         ):
             width, height = self.camera.size
-            self.extractor(Frame(-1, 0.0, torch.zeros(1, 1, height, width)))
+            self.extractor(
+                Frame(-1, 0.0, torch.zeros(1, 1, height, width, dtype=torch.float32, device="cpu"))
+            )
 
     @torch.inference_mode()
     def precompute_undistortion(self) -> None:

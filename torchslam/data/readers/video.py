@@ -8,6 +8,7 @@ durations and offsets, trun the samples of a fragment. A sample takes at least o
 from __future__ import annotations
 
 import struct
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,6 +24,7 @@ from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to
 from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.files import check_regular
+from torchslam.utils.forks import forget_in_forks, never_release
 
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
@@ -74,7 +76,7 @@ class VideoSequence(Sequence):
             path.stem,
             "video",
             None if camera is None else fit_camera(camera, size, str(path)),
-            torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64),
+            torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64, device="cpu"),
             size=size,
             guessed=is_guessed(camera),
             notes=notes,
@@ -96,7 +98,12 @@ class VideoSequence(Sequence):
     def image_name(self, index: int) -> str:
         return f"{self._path}#{index}"
 
+    def forget_handle(self) -> None:
+        never_release(self._capture)
+        self._position = sys.maxsize  # so that the next frame opens the file anew
+
     def _rewind(self) -> None:
+        forget_in_forks(self)
         self._capture = cv2.VideoCapture(str(self._path))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         self._position = 0  # of the decoder, among all frames that can be decoded
