@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from torchslam.features.brief import blur, describe, orientations
+from torchslam.features.contract import check_gray
 from torchslam.features.corners import (
     Bands,
     fast_scores,
@@ -133,6 +134,7 @@ class ORB(nn.Module):
 
         Raises:
             ValueError: The images or the mask have another shape or type.
+            FrameError: The images are not in [0, 1].
         """
         corners = self.detect(images, mask)
         stride, dtype = corners.pyramid.stride, images.dtype
@@ -299,6 +301,7 @@ def check_images(images: Tensor, mask: Tensor | None = None) -> None:
 
     Raises:
         ValueError: The images are not (B, 1, H, W) floats, or the mask is not (B, 1, H, W) bool.
+        FrameError: The images are not in [0, 1].
     """
     if mask is not None and (mask.shape != images.shape or mask.dtype != torch.bool):
         raise ValueError(f"a mask must be bool {tuple(images.shape)}, got {mask.dtype} {tuple(mask.shape)}")
@@ -306,6 +309,7 @@ def check_images(images: Tensor, mask: Tensor | None = None) -> None:
         raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
     if images.dtype not in (torch.float32, torch.float64):
         raise ValueError(f"images must be float32 or float64, in [0, 1], got {images.dtype}")
+    check_gray(images, "images")
 
 
 def gray_bytes(images: Float[Tensor, "B 1 H W"]) -> UInt8[Tensor, "B H W"]:

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchslam.config import CameraConfig, Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
-from torchslam.features.contract import FixedKeypoints, check_features
+from torchslam.features.contract import FixedKeypoints, check_features, check_gray
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera, KeypointNoise
 from torchslam.geometry.gating import times
@@ -271,9 +271,11 @@ class ClipSLAM(nn.Module):
 
         Raises:
             ValueError: Images of another shape.
+            FrameError: Images that are not floats in [0, 1].
         """
-        if images.ndim not in (4, 5):
+        if images.ndim not in (4, 5) or images.shape[-3] != 1:
             raise ValueError(f"images must be (T, 1, H, W) or (B, T, 1, H, W), not {tuple(images.shape)}")
+        check_gray(images, "images of a clip")
         clips, extractor = images if images.ndim == 5 else images[None], self.extractor
         if graph is not None and isinstance(extractor, FixedKeypoints):
             places = zip(clips, graph.keypoints, graph.masks, strict=True)
