@@ -341,7 +341,10 @@ def test_trajectories_that_cannot_be_compared_are_refused(generator: torch.Gener
         with pytest.raises(TrajectoryError, match=message):
             Trajectory(times, poses)
     still = Trajectory(unix, T_wc[:1].expand(20, 4, 4))
-    with pytest.raises(TrajectoryError, match="all 20 compared positions of the ground truth are the same, the others are not"):
+    with pytest.raises(
+        TrajectoryError,
+        match="all 20 compared positions of the ground truth are the same, the others are not",
+    ):
         evaluate(other, still)
     with pytest.raises(TrajectoryError, match="all 20 compared positions of the estimate are the same"):
         evaluate(still, other)

@@ -351,7 +351,9 @@ class Trajectory:
                 )
         if times.ndim != 1 or T_wc.shape != (len(times), 4, 4):
             shapes = f"{tuple(times.shape)} and {tuple(T_wc.shape)}"
-            raise TrajectoryError(f"timestamps and T_wc of a trajectory must be (N,) and (N, 4, 4), not {shapes}")
+            raise TrajectoryError(
+                f"timestamps and T_wc of a trajectory must be (N,) and (N, 4, 4), not {shapes}"
+            )
         for name, finite in (("time", times.isfinite()), ("pose", T_wc.isfinite().flatten(1).all(1))):
             if not bool(finite.all()):
                 raise TrajectoryError(f"{name} {int(finite.int().argmin())} of a trajectory is not finite")

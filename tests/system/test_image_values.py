@@ -29,7 +29,11 @@ ENTRIES: dict[str, Callable[[Tensor], object]] = {
 def test_values_out_of_range_are_refused(entry: Callable[[Tensor], object]) -> None:
     hole = GRAY.clone()
     hole[0, 0, 20, 30] = torch.nan
-    for image, span in ((255 * GRAY, "from .* to 25"), (GRAY - 0.5, "from -0.*to 0.4"), (hole, "from nan to nan")):
+    for image, span in (
+        (255 * GRAY, "from .* to 25"),
+        (GRAY - 0.5, "from -0.*to 0.4"),
+        (hole, "from nan to nan"),
+    ):
         with pytest.raises(FrameError, match=rf"must be in \[0, 1\], these are {span}"):
             entry(image)
     entry(GRAY)
@@ -39,7 +43,9 @@ def test_a_frame_of_bytes_or_with_a_mask_of_numbers_is_refused() -> None:
     slam = SLAM(CAMERA)
     with pytest.raises(FrameError, match=r"frame 0 must be floats in \[0, 1\], not torch.uint8: divide"):
         slam.step(Frame(0, 0.0, (255 * GRAY).to(torch.uint8)))
-    with pytest.raises(FrameError, match=r"frame 0 has a mask of torch.float32, not torch.bool: compare it with 0"):
+    with pytest.raises(
+        FrameError, match=r"frame 0 has a mask of torch.float32, not torch.bool: compare it with 0"
+    ):
         slam.step(Frame(0, 0.0, GRAY, mask=torch.ones_like(GRAY)))
     assert slam.step(Frame(0, 0.0, GRAY)).T_cw is None  # the frame can be tried again
     with pytest.raises(FrameError):

@@ -120,7 +120,9 @@ def check_size(frame: Frame, camera: Camera) -> None:
     if frame.mask is not None and frame.mask.shape != frame.image.shape:
         raise FrameError(f"{_name(frame)} has a mask of another shape, {tuple(frame.mask.shape)}")
     if frame.mask is not None and frame.mask.dtype != torch.bool:
-        raise FrameError(f"{_name(frame)} has a mask of {frame.mask.dtype}, not torch.bool: compare it with 0")
+        raise FrameError(
+            f"{_name(frame)} has a mask of {frame.mask.dtype}, not torch.bool: compare it with 0"
+        )
 
 
 def check_order(frame: Frame, last: tuple[int, float] | None) -> None:
