@@ -26,6 +26,7 @@ from torchslam.geometry.ransac import (
     ModelState,
     best_models,
     best_of,
+    check_search,
     gather_rows,
     is_significant,
     levenberg_marquardt,
@@ -98,6 +99,7 @@ def estimate_absolute_pose(
         RuntimeError: It is called within a transform of `torch.func`.
     """
     refuse_transforms("estimate_absolute_pose")
+    check_search(threshold, confidence, max_samples)
     B, N = pixels.shape[:2]
     if B == 0 or N < 3:
         nothing = torch.zeros(B, N, dtype=torch.bool, device=pixels.device)
@@ -151,6 +153,7 @@ def start_pose(
         T_cw, locally optimized on its inliers; None if wrong matches could agree as well, or if the inliers are on a
         line.
     """
+    check_search(threshold, confidence, max_samples)
     if len(points_w) < 4:
         return None
     center = points_w.mean(0)

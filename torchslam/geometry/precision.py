@@ -58,3 +58,10 @@ def check_dtypes(**tensors: Tensor | None) -> None:
             raise ValueError(f"{name} must be float32 or float64, not {dtype}")
         if dtype != expected:
             raise ValueError(f"{name} is {dtype}, but {first} is {expected}: all must be the same")
+
+
+def check_positive(**numbers: float | None) -> None:
+    """Raises ValueError unless all numbers that are given are above zero; names the first that is not."""
+    for name, number in numbers.items():
+        if number is not None and not number > 0:
+            raise ValueError(f"{name} must be above zero, not {number}")

@@ -14,11 +14,19 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.lie import cayley_rotation, identity
+from torchslam.geometry.precision import check_positive
 
 ModelState = tuple[Tensor, ...]
 
 _MAX_VALUES_AT_ONCE = 300_000
 _MIN_ITERATIONS = 2  # before it may stop
+
+
+def check_search(threshold: float, confidence: float, max_samples: int, min_samples: int = 1) -> None:
+    """Raises ValueError for options of a search that make no sense."""
+    check_positive(threshold=threshold, min_samples=min_samples, max_samples=max_samples)
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be a probability, above 0 and below 1, not {confidence}")
 
 
 def levenberg_marquardt(

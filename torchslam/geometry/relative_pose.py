@@ -16,6 +16,7 @@ from torchslam.geometry.homography import transfer_errors
 from torchslam.geometry.lie import rigid, so3_exp
 from torchslam.geometry.motion_models import ESSENTIAL, HOMOGRAPHY, MODELS, ROTATION
 from torchslam.geometry.precision import full_precision
+from torchslam.geometry.ransac import check_search
 from torchslam.geometry.relative_pose_search import (
     KERNEL_WIDTH,
     FoundPose,
@@ -127,7 +128,10 @@ def estimate_relative_pose(
         RuntimeError: It is called within a transform of `torch.func`.
     """
     refuse_transforms("estimate_relative_pose")
-    _check(model, kernel)
+    check_search(threshold, confidence, max_samples, min_samples)
+    for name, value, known in (("model", model, _MODELS), ("kernel", kernel, _KERNELS)):
+        if value not in known:
+            raise ValueError(f"unknown {name} {value!r}; known are {', '.join(known)}")
     if 0 in pixels_1.shape or pixels_1.shape[1] < 5:
         return _nothing(pixels_1)
     mask = _usable(pixels_1, pixels_2, mask, weights)
@@ -173,12 +177,6 @@ def _usable(
     finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     finite = finite if weights is None else finite & (weights > 0) & torch.isfinite(weights)
     return finite if mask is None else mask & finite
-
-
-def _check(model: str, kernel: str) -> None:
-    for name, value, known in (("model", model, _MODELS), ("kernel", kernel, _KERNELS)):
-        if value not in known:
-            raise ValueError(f"unknown {name} {value!r}; known are {', '.join(known)}")
 
 
 def _nothing(pixels: Float[Tensor, "B N 2"]) -> RelativePose:

@@ -113,7 +113,9 @@ class _Call:
         if None not in misfits:
             shapes = " or ".join(form.text + self._sizes_of(form) for form in fitting)
             raise ValueError(f"{name} must be {shapes}, not {tuple(value.shape)}{misfits[0]}")
-        if fitting[0].dtypes and value.dtype in _FLOATS:
+        if (
+            fitting[0].dtypes and value.dtype in _FLOATS and value.ndim > 0
+        ):  # a number takes any dtype, as in PyTorch
             self._agree_on_dtype(name, value.dtype)
 
     def _check_object(self, argument: _Argument, value: Any) -> None:

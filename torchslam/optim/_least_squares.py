@@ -13,7 +13,7 @@ from torch import Tensor
 from torch.func import grad, jvp, vmap
 
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel, robustify
+from torchslam.geometry.robust import Kernel, kernel_scale, robustify
 from torchslam.optim._core import tangent
 from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
@@ -250,7 +250,7 @@ def _checked(
     floats = {f"input {number}": x for number, x in enumerate(inputs) if x.is_floating_point()}
     starts = {f"unknown {number}": x for number, x in enumerate(unknowns)}
     check_dtypes(**starts, **floats, residual=value, weights=weights)
-    scale = torch.as_tensor(scale, dtype=like.dtype, device=like.device)
+    scale = kernel_scale(scale, like)
     return weights.expand(rows), counted.expand(rows), scale.expand(batch)
 
 

@@ -26,7 +26,7 @@ from torchslam.features.matching.brute_force import (
     to_matches,
 )
 from torchslam.features.matching.hamming import hamming_between
-from torchslam.geometry.precision import without_autocast
+from torchslam.geometry.precision import check_positive, without_autocast
 from torchslam.types import Features, Matches
 
 Array = NDArray[Any]
@@ -317,6 +317,7 @@ def match_by_projection(
     Raises:
         ValueError: The descriptors differ in type or length, or are not of unit length.
     """
+    check_positive(ratio=ratio, scale_tolerance=scale_tolerance, angle_tolerance=angle_tolerance)
     check_descriptors(descriptors, features.descriptors)
     batch, rows, columns = len(pixels), pixels.shape[1], features.keypoints.shape[1]
     if rows == 0 or columns == 0:

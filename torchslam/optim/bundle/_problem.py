@@ -13,6 +13,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, transform
 from torchslam.geometry.precision import check_dtypes
+from torchslam.geometry.robust import kernel_scale
 from torchslam.optim._core.residuals import only, usable
 from torchslam.optim._core.tangent import CameraPrior, PosePrior, prior_expansion, prior_hessian, rotated
 from torchslam.optim.bundle._factors import (
@@ -278,7 +279,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         torch.where(counted[..., None], pixels, 0.0),
         only(counted, weights),
         params,
-        torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device).expand(batch),
+        kernel_scale(scale, T_cw).expand(batch),
         *priors,
         *usable_depths(depths, depth_information, counted),
         measured,

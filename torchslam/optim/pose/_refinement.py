@@ -18,7 +18,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel
+from torchslam.geometry.robust import Kernel, kernel_scale
 from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     MAX_ITERATIONS,
@@ -179,7 +179,7 @@ class PoseInputs:
         use = usable(pixels, points_w, weights)
         use = use if mask is None else use & mask
         rows = use[..., None]
-        scale = torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device)
+        scale = kernel_scale(scale, T_cw)
         if prior is not None:
             prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
         observations = ReprojectionData(

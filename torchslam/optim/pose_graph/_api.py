@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel
+from torchslam.geometry.robust import Kernel, kernel_scale
 from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
 from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, check_minimum
 from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
@@ -159,7 +159,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
         counted = counted & graph.mask
     fixed = row_mask("fixed", graph.fixed, nodes)
     eye = torch.eye(n, dtype=S_cw.dtype, device=S_cw.device)
-    scale = torch.as_tensor(scale, dtype=S_cw.dtype, device=S_cw.device)
+    scale = kernel_scale(scale, S_cw)
     rows = counted[..., None, None]
     return (
         counted,
