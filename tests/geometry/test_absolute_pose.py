@@ -244,3 +244,12 @@ def test_points_on_a_line_give_no_pose() -> None:
     points_w = torch.tensor([[0.0, 0.0, 4.0]]).double() + along * torch.tensor([[1.0, 0.2, 0.3]]).double()
     pixels = CAMERA.project(points_w)[0]
     assert start_pose(points_w, UndistortedKeypoints.of(pixels, CAMERA), CAMERA.size, 3.0) is None
+
+
+def test_too_few_points_give_a_gradient_of_zero() -> None:
+    for count in (0, 2):
+        points = torch.rand(2, count, 3, dtype=torch.float64).requires_grad_()
+        found = estimate_absolute_pose(points, torch.rand(2, count, 2, dtype=torch.float64), CAMERA)
+        (gradient,) = torch.autograd.grad(found.T_cw.sum(), points)
+        assert not found.success.any()
+        assert not gradient.any()

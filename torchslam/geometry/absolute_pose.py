@@ -11,7 +11,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient, refuse_transforms
+from torchslam.geometry.estimate_gradients import (
+    implicit_step,
+    needs_gradient,
+    refuse_transforms,
+    with_zero_gradient,
+)
 from torchslam.geometry.lie import rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
@@ -104,7 +109,10 @@ def estimate_absolute_pose(
     if B == 0 or N < 3:
         nothing = torch.zeros(B, N, dtype=torch.bool, device=pixels.device)
         T_cw = torch.eye(4, dtype=points_w.dtype, device=points_w.device).expand(B, 4, 4)
-        return AbsolutePose(T_cw, nothing, torch.zeros_like(T_cw[:, 0, 0], dtype=torch.bool), T_cw[:, 0, 1])
+        T_cw = with_zero_gradient(T_cw, points_w, pixels, camera.params)
+        return AbsolutePose(
+            T_cw, nothing, torch.zeros_like(T_cw[:, 0, 0], dtype=torch.bool), T_cw.detach()[:, 0, 1]
+        )
     finite = torch.isfinite(points_w).all(-1) & torch.isfinite(pixels).all(-1)
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)

@@ -26,8 +26,9 @@ Scalar = float | Tensor
 class Camera:
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
 
-    Every method is differentiable with respect to points, pixels and `params`. A camera is a pytree with `params`
-    as its only leaf, so that `torch.func` and `torch.utils.data.default_collate` accept it.
+    Every method is differentiable with respect to points, pixels and `params`, up to the third order where it undoes a
+    distortion. A camera is a pytree with `params` as its only leaf, so that `torch.func` and
+    `torch.utils.data.default_collate` accept it.
 
     Attributes:
         model: "pinhole", "radial_tangential" or "fisheye".

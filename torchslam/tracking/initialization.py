@@ -221,7 +221,9 @@ class Initializer:
         if others.model[0] != "essential":
             return None if self._relative_pose(view, first, second).model[0] == "essential" else everything
         pixels_1, pixels_2 = self.reference.keypoints[first[still]], view.keypoints[second[still]]
-        across, along = epipolar_offsets(others.T_21[0], pixels_1, pixels_2, self.camera, self.camera)
+        across, along = epipolar_offsets(
+            others.T_21_essential[0], pixels_1, pixels_2, self.camera, self.camera
+        )
         threshold = self.config.initialization.threshold_px
         explained = (across.abs() < threshold) & (along > -threshold)
         if float(explained.double().mean()) >= MIN_EXPLAINED_RATIO:
