@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 import torchslam
 from tests.sweep.test_sweep import default_dtype
@@ -83,3 +84,23 @@ def test_a_camera_does_not_depend_on_the_defaults() -> None:
         camera = torchslam.Camera.pinhole(500.0, 500.0, 319.5, 239.5, size=(640, 480))
     assert camera.params.dtype == torch.float64
     assert camera.params.device.type == "cpu"
+
+
+@pytest.mark.parametrize("name", ["XFeat", "ALIKED"])
+def test_a_network_does_not_depend_on_the_defaults(name: str, tmp_path: Path) -> None:
+    kornia = pytest.importorskip("kornia")
+    torch.manual_seed(0)
+    network = kornia.feature.XFeat() if name == "XFeat" else kornia.feature.ALIKED("aliked-t16", 50)
+    state = {key: value.contiguous() for key, value in network.state_dict().items()}
+    save_file(state, tmp_path / "weights.safetensors")
+    images = torch.rand(1, 1, 96, 128)
+
+    def results() -> list[torch.Tensor]:
+        found = getattr(torchslam, name)(tmp_path / "weights.safetensors", 50)(images)
+        return [found.keypoints, found.scores, found.descriptors]
+
+    expected = results()
+    with default_dtype(torch.float64):
+        assert all(map(torch.equal, results(), expected))
+    with torch.device("meta"):
+        assert all(map(torch.equal, results(), expected))

@@ -295,3 +295,25 @@ def test_vmap(call: Call) -> None:
     found = torch.vmap(function, out_dims=0)(*stacked)
     for a, b in zip(found, expected, strict=True):
         torch.testing.assert_close(a[1], b, rtol=1e-6, atol=1e-8, equal_nan=True)
+
+
+SOLVERS = ("refine_pose", "bundle_adjust", "pose_graph_optimize", "average_rotations", "minimize")
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_what_a_solver_starts_from_may_come_from_inference_mode(name: str) -> None:
+    """As poses of `SLAM.step` do: they have no part in the gradient, or are copied."""
+    call = CALLS[name]
+    with torch.inference_mode():
+        arguments = mapped(call.arguments, torch.clone)
+    for path, tensor in leaves(call.arguments):
+        if tensor.is_floating_point():
+            gradients = []
+            for others in (call.arguments, arguments):
+                leaf = tensor.clone().requires_grad_()
+                found = [x for x in run(call, changed(others, path, leaf)) if x.requires_grad]
+                total = sum(x.nan_to_num(0, 0, 0).square().sum() for x in found)
+                gradients.append(torch.autograd.grad(total, leaf, allow_unused=True)[0] if found else None)
+            assert (gradients[0] is None) == (gradients[1] is None)
+            if gradients[0] is not None:
+                torch.testing.assert_close(gradients[1], gradients[0])

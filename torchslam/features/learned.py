@@ -48,7 +48,8 @@ class XFeat(nn.Module):
         super().__init__()
         self.num_keypoints = num_keypoints
         self.threshold = threshold
-        model = kornia.feature.XFeat()
+        with torch.device("cpu"):
+            model = kornia.feature.XFeat().float()
         # The file may leave out the fine matcher, which only dense matching needs.
         state = {_XFEAT_PREFIX.sub("net.", name): tensor for name, tensor in read_weights(weights).items()}
         state = {name: tensor for name, tensor in state.items() if not name.startswith("net.matcher.")}
@@ -163,7 +164,9 @@ class ALIKED(nn.Module):
         if shape not in variants:
             raise ConfigError(f"{weights}: not the weights of an ALIKED network")
         # Without a threshold the network gives its strongest maxima.
-        self.network = kornia.feature.ALIKED(variants[shape], num_keypoints, detection_threshold=0)
+        with torch.device("cpu"):
+            network = kornia.feature.ALIKED(variants[shape], num_keypoints, detection_threshold=0)
+        self.network = network.float()
         _load(self.network, state, weights, optional="dkd.")  # the detector's grid of pixels is no weight
         self.network.eval()
 
@@ -184,7 +187,8 @@ class ALIKED(nn.Module):
             ValueError: The images or the mask have another shape or type.
         """
         check_images(images, mask)
-        found = self.network(images.float())
+        with images.device:  # kornia makes tensors on the default device
+            found = self.network(images.float())
         rows = [
             _features(
                 one.keypoints[None],
@@ -204,10 +208,12 @@ class ALIKED(nn.Module):
     ) -> Features:
         """Describe keypoints found before, in the same rows, whatever their scores are now; as `XFeat.read`."""
         check_images(images)
-        maps, heat = self.network.extract_dense_map(images.float().expand(-1, 3, -1, -1))
+        with images.device:
+            maps, heat = self.network.extract_dense_map(images.float().expand(-1, 3, -1, -1))
         places = _peaks_near(heat[:, 0].float(), keypoints.to(torch.float32))
         located, scores = self._located(heat, places)
-        descriptors, _ = self.network.desc_head(maps, list(located))
+        with images.device:
+            descriptors, _ = self.network.desc_head(maps, list(located))
         size = located.new_tensor([images.shape[3] - 1, images.shape[2] - 1])
         return _features(
             size * (located + 1) / 2,

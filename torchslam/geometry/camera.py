@@ -44,6 +44,8 @@ class Camera:
     def __post_init__(self) -> None:
         if self.model not in distortion.MODELS:
             raise ValueError(f"unknown camera model {self.model!r}; known are {', '.join(distortion.MODELS)}")
+        if self.params.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"params of a camera must be float32 or float64, not {self.params.dtype}")
         expected = 4 + distortion.MODELS[self.model].num_params
         if self.params.shape[-1:] != (expected,):
             shape = tuple(self.params.shape)
