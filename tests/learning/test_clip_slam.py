@@ -241,6 +241,17 @@ def test_the_gradient_is_the_same_under_detect_anomaly() -> None:
 
 
 @pytest.mark.usefixtures("without_shape_checks")
+def test_weights_of_keypoints_of_another_shape_are_refused() -> None:
+    """As a network with one output gives them: (T, N, 1)."""
+    walk = Walk(arc(FRAMES, length=1.0))
+    for change in (lambda x: x[..., None], lambda x: x[0], lambda x: x.long()):
+        eyes = BentEyes(walk, bend=0.02)
+        clip_slam = ClipSLAM(eyes, lambda features, change=change: change(features.scores), config=CONFIG)
+        with pytest.raises(ValueError, match=r"keypoint_weight must give floats \(T, N\) = \(10, 300\), not"):
+            clip_slam(clip_of(walk)[0], walk.camera)
+
+
+@pytest.mark.usefixtures("without_shape_checks")
 def test_images_that_are_not_gray_are_refused() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, _ = clip_of(walk)

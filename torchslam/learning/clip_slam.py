@@ -327,7 +327,8 @@ class ClipSLAM(nn.Module):
             camera: As in `forward`; that of the graph, without gradient, if None.
 
         Raises:
-            ValueError: The features have other shapes than the graph, or other keypoints in their rows.
+            ValueError: The features have other shapes than the graph, or other keypoints in their rows, or the weights
+                of keypoints are not (T, N).
         """
         seen = _per_clip(features)
         cameras = graph.cameras if camera is None else _cameras(camera, len(graph.runs))
@@ -342,6 +343,12 @@ class ClipSLAM(nn.Module):
             torch.ones_like(each.scores) if self.keypoint_weight is None else self.keypoint_weight(each)
             for each in seen
         ]
+        for weights, each in zip(keypoint_weights, seen, strict=True):
+            if weights.shape != each.mask.shape or not weights.is_floating_point():
+                raise ValueError(
+                    f"keypoint_weight must give floats (T, N) = {tuple(each.mask.shape)}, not {weights.dtype} "
+                    f"{tuple(weights.shape)}"
+                )
         graphs = tuple(
             None if run is None else _as_seen(run, each, weights_of, own)
             for run, each, weights_of, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
