@@ -20,7 +20,7 @@ from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.similarity import umeyama
-from torchslam.types import Trajectory
+from torchslam.types import Trajectory, check_ascending
 
 Association = Literal["interpolate", "nearest"]
 
@@ -105,10 +105,12 @@ def evaluate(
         The errors.
 
     Raises:
-        TrajectoryError: Fewer than three poses can be compared, or one of two paths is a single place.
+        TrajectoryError: Times repeat, fewer than three poses can be compared, or one of two paths is a single place.
         ValueError: An option is unknown or out of range.
     """
     _check_options(association, tolerance, delta)
+    for each in (estimate, groundtruth):
+        check_ascending(each.timestamps, each.timestamps.diff() <= 0)
     device = groundtruth.T_wc.device
     times = estimate.timestamps.to(device=device, dtype=torch.float64)
     T_we = estimate.T_wc.detach().to(device=device, dtype=torch.float64)

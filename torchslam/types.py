@@ -328,7 +328,7 @@ class Trajectory:
     """Camera poses over time, ordered by timestamp.
 
     Attributes:
-        timestamps: float64 seconds, each later than the one before.
+        timestamps: float64 seconds, ascending; frames of several sessions may have the same.
         T_wc: camera to world.
 
     Raises:
@@ -357,13 +357,7 @@ class Trajectory:
         for name, finite in (("time", times.isfinite()), ("pose", T_wc.isfinite().flatten(1).all(1))):
             if not bool(finite.all()):
                 raise TrajectoryError(f"{name} {int(finite.int().argmin())} of a trajectory is not finite")
-        later = times.diff() > 0
-        if not bool(later.all()):
-            row = int(later.int().argmin()) + 1
-            raise TrajectoryError(
-                f"times of a trajectory must increase: {float(times[row])!r} s, row {row}, follows "
-                f"{float(times[row - 1])!r} s"
-            )
+        check_ascending(times, times.diff() < 0)
 
     @classmethod
     def empty(cls) -> Trajectory:
@@ -380,6 +374,16 @@ class Trajectory:
     def positions_w(self) -> Float[Tensor, "N 3"]:
         """Camera centers."""
         return self.T_wc[:, :3, 3]
+
+
+def check_ascending(times: Float[Tensor, " N"], wrong: Bool[Tensor, " M"]) -> None:
+    """Raise TrajectoryError where a step from one time to the next is wrong."""
+    if bool(wrong.any()):
+        row = int(wrong.int().argmax()) + 1
+        raise TrajectoryError(
+            f"times of a trajectory must increase: {float(times[row])!r} s, row {row}, follows "
+            f"{float(times[row - 1])!r} s"
+        )
 
 
 class Reason(StrEnum):
