@@ -342,7 +342,7 @@ def test_trajectories_that_cannot_be_compared_are_refused(generator: torch.Gener
     rounded = Trajectory(unix.float().double(), T_wc)  # as of frames of several sessions
     for pair in ((rounded, other), (other, rounded)):
         with pytest.raises(
-            TrajectoryError, match="times of a trajectory must increase: 16.* s, row 1, follows 16"
+            TrajectoryError, match=r"times of a trajectory must increase: 16.* s, row 1, follows 16"
         ):
             evaluate(*pair)
     still = Trajectory(unix, T_wc[:1].expand(20, 4, 4))
