@@ -150,3 +150,23 @@ def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, gene
     bad.save(tmp_path / "bad")
     with pytest.raises(TorchslamError, match="a negative weight"):
         ObservationGraph.load(tmp_path / "bad")
+
+
+@pytest.mark.parametrize("solver", ["pose", "bundle"])
+def test_a_covariance_is_that_of_the_solution_whatever_moves_in_place_later(pose_scene, bundle_scene, solver):
+    covariances = []
+    for moves in (False, True):
+        if solver == "pose":
+            scene = pose_scene()
+            given = scene.points_w.clone(), scene.pixels.clone(), scene.camera.params.clone()
+            solution = refine_pose(scene.start, given[0], given[1], scene.camera.with_params(given[2]))
+        else:
+            problem = bundle_scene().problem
+            given = problem.points_w.clone(), problem.pixels.clone(), problem.camera.params.clone()
+            camera = problem.camera.with_params(given[2])
+            solution = bundle_adjust(replace(problem, points_w=given[0], pixels=given[1], camera=camera))
+        if moves:
+            for tensor in given:
+                tensor.mul_(1.3)
+        covariances.append(solution.covariance if solver == "pose" else solution.covariance().frames)
+    assert torch.equal(*covariances)

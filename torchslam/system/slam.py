@@ -63,7 +63,8 @@ class SLAM:
         matcher: Matcher | None = None,
     ) -> None:
         self.config = config or Config()
-        self.camera = camera.to(torch.float64)
+        # A copy: parameters may move in place while they learn.
+        self.camera = camera.with_params(camera.params.detach().to(torch.float64, copy=True))
         self.extractor = None  # where frames bring their features
         if extractor is not None or self.config.features.kind != "simulated":
             self.extractor = image_extractor(self.config, self.camera.params.device, extractor)

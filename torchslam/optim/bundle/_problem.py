@@ -337,7 +337,8 @@ def usable_depths(depths: Tensor, information: Tensor, counted: Tensor) -> tuple
 
 def _cameras(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor]:
     """Parameters (B, C, P) and the camera of each frame (B, K)."""
-    params, index = problem.camera.params, problem.camera_index
+    # A copy: parameters may move in place before the covariance is asked for.
+    params, index = problem.camera.params.clone(), problem.camera_index
     if index is None:
         params = _over("camera.params", "(P,)", params, (len(T_cw), params.shape[-1]))
         return params[:, None], torch.zeros(T_cw.shape[:2], dtype=torch.int64, device=T_cw.device)

@@ -182,6 +182,8 @@ class PoseInputs:
         scale = kernel_scale(scale, T_cw)
         if prior is not None:
             prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
+        # A copy, as of the others: parameters may move in place before the covariance is asked for.
+        camera = camera.with_params(camera.params.clone())
         observations = ReprojectionData(
             torch.where(rows, pixels, 0.0), only(use, weights), camera, kernel, scale[..., None]
         )
