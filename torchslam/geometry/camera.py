@@ -44,6 +44,10 @@ class Camera:
     def __post_init__(self) -> None:
         if self.model not in distortion.MODELS:
             raise ValueError(f"unknown camera model {self.model!r}; known are {', '.join(distortion.MODELS)}")
+        if not isinstance(self.params, Tensor):
+            raise TypeError(f"params of a camera must be a tensor, not {type(self.params).__name__}")
+        if len(self.size) != 2 or not all(side > 0 and side == int(side) for side in self.size):
+            raise ValueError(f"size of a camera must be (width, height) in pixels, not {self.size}")
         if self.params.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"params of a camera must be float32 or float64, not {self.params.dtype}")
         expected = 4 + distortion.MODELS[self.model].num_params

@@ -134,6 +134,10 @@ class _Call:
                     raise ValueError(
                         f"{field} must lead with B = {size} of {where} or not at all, not with {lead}"
                     )
+            elif "batch" in self.batches and "batch" in inner.batches:
+                (lead, field), (batch, where) = inner.batches["batch"], self.batches["batch"]
+                if _broadcast(lead, batch) is None:
+                    raise ValueError(f"{field} leads with {lead}, which does not go with {batch} of {where}")
         elif not argument.is_open:
             wanted = _listed(argument.classes) if argument.classes else "a tensor: see torch.as_tensor"
             raise TypeError(f"{name} is of type {type(value).__name__}, but must be {wanted}")

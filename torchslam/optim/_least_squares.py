@@ -15,7 +15,7 @@ from torch.func import grad, jvp, vmap
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale, robustify
 from torchslam.optim._core import tangent
-from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
+from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_options, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     MAX_ITERATIONS,
     Convergence,
@@ -197,7 +197,7 @@ def minimize(
             than its inputs, which would not receive any.
         ConvergenceError: with `strict`.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     unknowns = (start,) if isinstance(start, Tensor) else tuple(start)
     names = (manifolds,) * len(unknowns) if isinstance(manifolds, str) else tuple(manifolds)
     product = Product.of(names, unknowns)

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale, robustify
-from torchslam.optim._core.implicit import Backward, check_backward
+from torchslam.optim._core.implicit import Backward, check_options
 from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence
 from torchslam.optim._rotation_start import RotationEdges, robust_start, spanning_forest
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, is_similarity, pose_graph_optimize
@@ -87,7 +87,7 @@ def average_rotations(
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     _check(edges, R_ji, num_views, weights, start)
     if scale is None:
         scale = _SCALE_OF_UNKNOWN_NOISE if weights is None else _SCALE

@@ -53,8 +53,12 @@ def _alone(function: Callable[P, R]) -> Callable[P, R]:
     return alone
 
 
-def check_backward(backward: str) -> None:
-    """Raises ValueError unless `backward` is one of the modes."""
+def check_options(backward: str, iterations: int, tolerance: float) -> None:
+    """Raises ValueError for a mode that is unknown, and for numbers that no minimization can end by."""
+    if not iterations >= 0:
+        raise ValueError(f"iterations must not be below zero, got {iterations}")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must not be below zero, got {tolerance}")
     if backward not in get_args(Backward):
         raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(get_args(Backward))}")
 

@@ -19,7 +19,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale
-from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
+from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_options, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     MAX_ITERATIONS,
     Convergence,
@@ -400,7 +400,7 @@ def refine_pose(
         ValueError: a shape does not fit, or a name is unknown.
         ConvergenceError: with `strict`.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
     minimization = PoseMinimization(inputs, iterations, tolerance)
     tensors = (T_cw, *inputs.tensors())
