@@ -23,7 +23,7 @@ from torchslam.geometry import Camera, se3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
-from torchslam.io.results import Results, aligned
+from torchslam.io.results import Results, aligned, aligned_poses
 from torchslam.map.atlas import Submap
 from torchslam.system.run import keyframe_trajectory
 from torchslam.types import State, Trajectory
@@ -152,8 +152,7 @@ def _submap(
     )
     keyframes = keyframe_trajectory(submap.map, results.session)
     up = torch.eye(4, dtype=torch.float64, device="cpu")
-    every_keyframe = Trajectory(submap.map.keyframes["timestamp"], se3_inverse(submap.map.T_cw))
-    up[:3, :3] = upright_rotation(aligned(every_keyframe, S).T_wc)
+    up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
     S = up @ S
     points_w, colors = _points(submap)
     box = torch.from_numpy(
