@@ -16,7 +16,9 @@ def check(function: Callable[..., Any]) -> Callable[..., Any]:
     annotations = function.__annotations__
     function.__annotations__ = {name: hint for name, hint in annotations.items() if "Tensor" in str(hint)}
     try:
-        return _check(function)
+        checked = _check(function)
     except BeartypeDecorHintException:  # a hint that only a type checker can read, such as a protocol
-        function.__annotations__ = annotations
-        return function
+        checked = function
+    # As they were, for those who read them.
+    function.__annotations__ = checked.__annotations__ = annotations
+    return checked

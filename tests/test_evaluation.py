@@ -320,3 +320,59 @@ def test_a_pose_that_is_not_finite_fails_its_element_alone(
         (gradient,) = torch.autograd.grad(found.nansum(), broken, retain_graph=True)
         assert gradient.isfinite().all()
         assert (gradient[1].abs().max() > 0) != counts
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_trajectories_that_cannot_be_compared_are_refused(generator: torch.Generator) -> None:
+    T_wc, unix = _poses(generator, 20), 1.6e9 + _times(20)
+    other = Trajectory(unix, _poses(generator, 20))
+    for times, poses, message in (
+        (unix.float(), T_wc, "timestamps of a trajectory must be torch.float64, not torch.float32"),
+        (unix.flip(0), T_wc, "times of a trajectory must increase"),
+        (unix[:, None], T_wc, r"must be \(N,\) and \(N, 4, 4\), not \(20, 1\) and"),
+        (unix[:5], T_wc, r"not \(5,\) and \(20, 4, 4\)"),
+        (unix.long(), T_wc, "not torch.int64"),
+        (unix.numpy(), T_wc, "not ndarray"),
+        (unix, T_wc.half(), "T_wc of a trajectory must be torch.float32 or torch.float64, not torch.float16"),
+        (unix, torch.where(torch.arange(20).view(-1, 1, 1) == 3, torch.nan, T_wc), "pose 3 .* is not finite"),
+        (torch.where(torch.arange(20) == 4, torch.nan, unix), T_wc, "time 4 of a trajectory is not finite"),
+    ):
+        with pytest.raises(TrajectoryError, match=message):
+            Trajectory(times, poses)
+    rounded = Trajectory(unix.float().double(), T_wc)  # as of frames of several sessions
+    for pair in ((rounded, other), (other, rounded)):
+        with pytest.raises(
+            TrajectoryError, match=r"times of a trajectory must increase: 16.* s, row 1, follows 16"
+        ):
+            evaluate(*pair)
+    still = Trajectory(unix, T_wc[:1].expand(20, 4, 4))
+    with pytest.raises(
+        TrajectoryError,
+        match="20 compared positions of the ground truth are the same, the others",
+    ):
+        evaluate(other, still)
+    with pytest.raises(TrajectoryError, match="all 20 compared positions of the estimate are the same"):
+        evaluate(still, other)
+
+
+def test_unknown_options_are_refused(generator: torch.Generator) -> None:
+    path = Trajectory(_times(20), _poses(generator, 20))
+    for options, message in (
+        ({"association": "linear"}, "unknown association 'linear'; known are interpolate, nearest"),
+        ({"tolerance": -0.1}, "tolerance must be seconds, not below zero, got -0.1"),
+        ({"tolerance": math.nan}, "got nan"),
+        ({"delta": 0}, "delta must be a number of poses, at least 1, got 0"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            evaluate(path, path, **options)
+
+
+def test_a_truth_without_extent_has_no_ate(generator: torch.Generator) -> None:
+    """A similarity would shrink any estimate to that place: an error of zero."""
+    estimate = _poses(generator, 9).requires_grad_()
+    still = _poses(generator, 1).expand(9, 4, 4)
+    error = ate(estimate, still)
+    (gradient,) = torch.autograd.grad(error, estimate)
+    assert error.isnan()
+    assert not gradient.any()
+    assert ate(estimate, still, with_scale=False) > 0.1

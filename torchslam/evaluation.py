@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 import torch
 from jaxtyping import Bool, Float
@@ -20,7 +20,9 @@ from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.similarity import umeyama
-from torchslam.types import Trajectory
+from torchslam.types import Trajectory, check_ascending
+
+Association = Literal["interpolate", "nearest"]
 
 TOLERANCE = 0.02
 """Seconds: an estimated pose without a true one this near in time is left out."""
@@ -84,7 +86,7 @@ class Evaluation:
 def evaluate(
     estimate: Trajectory,
     groundtruth: Trajectory,
-    association: Literal["interpolate", "nearest"] = "interpolate",
+    association: Association = "interpolate",
     tolerance: float = TOLERANCE,
     delta: int = 1,
 ) -> Evaluation:
@@ -103,8 +105,12 @@ def evaluate(
         The errors.
 
     Raises:
-        TrajectoryError: Fewer than three poses can be compared.
+        TrajectoryError: Times repeat, fewer than three poses can be compared, or one of two paths is a single place.
+        ValueError: An option is unknown or out of range.
     """
+    _check_options(association, tolerance, delta)
+    for each in (estimate, groundtruth):
+        check_ascending(each.timestamps, each.timestamps.diff() <= 0)
     device = groundtruth.T_wc.device
     times = estimate.timestamps.to(device=device, dtype=torch.float64)
     T_we = estimate.T_wc.detach().to(device=device, dtype=torch.float64)
@@ -117,6 +123,12 @@ def evaluate(
             f"{MIN_POSES} are needed{_ranges(times, truth.timestamps)}"
         )
     matched, reference = T_we[valid], T_wg[valid]
+    moves, has_moved = (bool(_has_extent(T[:, :3, 3])) for T in (matched, reference))
+    if moves != has_moved:
+        name = "ground truth" if moves else "estimate"
+        raise TrajectoryError(
+            f"all {compared} compared positions of the {name} are the same, the others are not: nothing fixes the scale"
+        )
     s, R, t = umeyama(matched[:, :3, 3], reference[:, :3, 3])
     aligned = Trajectory(times, _aligned(T_we, s, R, t))
     errors = (aligned.positions_w[valid] - reference[:, :3, 3]).norm(dim=-1)
@@ -188,14 +200,18 @@ def ate(
         with_scale: align by a similarity; False: by a rigid transform.
 
     Returns:
-        The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count or one is not finite.
+        The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count, one is not finite, or all
+        true centers are at one place, to which a similarity shrinks any other path.
     """
     T_cw, T_cw_groundtruth, finite = _counted(T_cw, T_cw_groundtruth, mask)
     centers, truth = _centers(T_cw), _centers(T_cw_groundtruth)
     s, R, t = umeyama(centers, truth, mask, with_scale)
     moved = s[..., None, None] * centers @ R.mT + t[..., None, :]
     error = _rms((moved - truth).square().sum(-1), mask)
-    return torch.where(finite & _enough(T_cw, mask), error, torch.nan)
+    known = finite & _enough(T_cw, mask)
+    if with_scale:
+        known = known & (_has_extent(truth, mask) | ~_has_extent(centers, mask))
+    return torch.where(known, error, torch.nan)
 
 
 @full_precision
@@ -238,6 +254,29 @@ def rpe(
     known = known & _enough(T_cw, mask) if with_scale else known
     errors = _rms(translation, pairs), _rms(rotation, pairs)
     return torch.where(known, errors[0], torch.nan), torch.where(known, errors[1], torch.nan)
+
+
+def _check_options(association: str, tolerance: float, delta: int) -> None:
+    known = get_args(Association)
+    if association not in known:
+        raise ValueError(f"unknown association {association!r}; known are {', '.join(known)}")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must be seconds, not below zero, got {tolerance}")
+    if delta < 1:
+        raise ValueError(f"delta must be a number of poses, at least 1, got {delta}")
+
+
+def _has_extent(
+    positions: Float[Tensor, "*batch N 3"], mask: Bool[Tensor, "*batch N"] | None = None
+) -> Bool[Tensor, "*batch"]:
+    """Test whether positions that count differ by more than rounding."""
+    positions = positions.detach()
+    used = torch.ones_like(positions[..., 0], dtype=torch.bool) if mask is None else mask
+    used = used[..., None]
+    high = torch.where(used, positions, -torch.inf).amax((-2,))
+    low = torch.where(used, positions, torch.inf).amin((-2,))
+    size = torch.where(used, positions.abs(), 0.0).amax((-2, -1))
+    return (high - low).amax(-1) > 16 * torch.finfo(positions.dtype).eps * size
 
 
 def _associate(

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from torch import Tensor
 
+from torchslam.errors import TrajectoryError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import KeypointNoise, packed_information, unpacked_information
 
@@ -137,7 +138,9 @@ class FrameFeatures:
     mask: Bool[Tensor, " N"]
     T_cw_groundtruth: Float[Tensor, "4 4"] | None = None
     session: int = 0
-    information: Float[Tensor, "N I"] = field(default_factory=lambda: torch.zeros(0))
+    information: Float[Tensor, "N I"] = field(
+        default_factory=lambda: torch.zeros(0, dtype=torch.float32, device="cpu")
+    )
     image: Float[Tensor, "1 1 H W"] | None = None
     backlog: int = 0
 
@@ -325,17 +328,44 @@ class Trajectory:
     """Camera poses over time, ordered by timestamp.
 
     Attributes:
-        timestamps: float64 seconds.
+        timestamps: float64 seconds, ascending; frames of several sessions may have the same.
         T_wc: camera to world.
+
+    Raises:
+        TrajectoryError: Another type, shape or order, or values that are not finite.
     """
 
     timestamps: Float[Tensor, " N"]
     T_wc: Float[Tensor, "N 4 4"]
 
+    def __post_init__(self) -> None:
+        times, T_wc = self.timestamps, self.T_wc
+        for name, values, kinds in (
+            ("timestamps", times, (torch.float64,)),  # others cannot tell apart frames of seconds since 1970
+            ("T_wc", T_wc, (torch.float32, torch.float64)),
+        ):
+            if not isinstance(values, Tensor) or values.dtype not in kinds:
+                found = values.dtype if isinstance(values, Tensor) else type(values).__name__
+                raise TrajectoryError(
+                    f"{name} of a trajectory must be {' or '.join(str(kind) for kind in kinds)}, not {found}"
+                )
+        if times.ndim != 1 or T_wc.shape != (len(times), 4, 4):
+            shapes = f"{tuple(times.shape)} and {tuple(T_wc.shape)}"
+            raise TrajectoryError(
+                f"timestamps and T_wc of a trajectory must be (N,) and (N, 4, 4), not {shapes}"
+            )
+        for name, finite in (("time", times.isfinite()), ("pose", T_wc.isfinite().flatten(1).all(1))):
+            if not bool(finite.all()):
+                raise TrajectoryError(f"{name} {int(finite.int().argmin())} of a trajectory is not finite")
+        check_ascending(times, times.diff() < 0)
+
     @classmethod
     def empty(cls) -> Trajectory:
         """A trajectory without poses."""
-        return cls(torch.zeros(0, dtype=torch.float64), torch.zeros(0, 4, 4, dtype=torch.float64))
+        return cls(
+            torch.zeros(0, dtype=torch.float64, device="cpu"),
+            torch.zeros(0, 4, 4, dtype=torch.float64, device="cpu"),
+        )
 
     def __len__(self) -> int:
         return int(self.timestamps.shape[0])
@@ -344,6 +374,16 @@ class Trajectory:
     def positions_w(self) -> Float[Tensor, "N 3"]:
         """Camera centers."""
         return self.T_wc[:, :3, 3]
+
+
+def check_ascending(times: Float[Tensor, " N"], wrong: Bool[Tensor, " M"]) -> None:
+    """Raise TrajectoryError where a step from one time to the next is wrong."""
+    if bool(wrong.any()):
+        row = int(wrong.int().argmax()) + 1
+        raise TrajectoryError(
+            f"times of a trajectory must increase: {float(times[row])!r} s, row {row}, follows "
+            f"{float(times[row - 1])!r} s"
+        )
 
 
 class Reason(StrEnum):

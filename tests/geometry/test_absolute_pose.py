@@ -164,17 +164,18 @@ def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
 
 @pytest.mark.usefixtures("without_shape_checks")
 def test_wrong_shapes_are_named() -> None:
-    with pytest.raises(ValueError, match=r"\(B, N, 3\) and \(B, N, 2\)"):
+    with pytest.raises(ValueError, match=r"points_w must be \(B, N, 3\), not \(5, 3\)"):
         estimate_absolute_pose(torch.zeros(5, 3), torch.zeros(5, 2), CAMERA)
 
 
 def test_an_empty_batch_or_no_points() -> None:
-    assert estimate_absolute_pose(torch.zeros(0, 10, 3), torch.zeros(0, 10, 2), CAMERA).T_cw.shape == (
+    camera = CAMERA.to(torch.float32)
+    assert estimate_absolute_pose(torch.zeros(0, 10, 3), torch.zeros(0, 10, 2), camera).T_cw.shape == (
         0,
         4,
         4,
     )
-    assert not estimate_absolute_pose(torch.zeros(2, 0, 3), torch.zeros(2, 0, 2), CAMERA).success.any()
+    assert not estimate_absolute_pose(torch.zeros(2, 0, 3), torch.zeros(2, 0, 2), camera).success.any()
 
 
 DISTORTED = Camera.radial_tangential(
@@ -243,3 +244,12 @@ def test_points_on_a_line_give_no_pose() -> None:
     points_w = torch.tensor([[0.0, 0.0, 4.0]]).double() + along * torch.tensor([[1.0, 0.2, 0.3]]).double()
     pixels = CAMERA.project(points_w)[0]
     assert start_pose(points_w, UndistortedKeypoints.of(pixels, CAMERA), CAMERA.size, 3.0) is None
+
+
+def test_too_few_points_give_a_gradient_of_zero() -> None:
+    for count in (0, 2):
+        points = torch.rand(2, count, 3, dtype=torch.float64).requires_grad_()
+        found = estimate_absolute_pose(points, torch.rand(2, count, 2, dtype=torch.float64), CAMERA)
+        (gradient,) = torch.autograd.grad(found.T_cw.sum(), points)
+        assert not found.success.any()
+        assert not gradient.any()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 
 import cv2
@@ -274,3 +275,94 @@ def test_a_pixel_that_is_not_finite_leaves_the_gradient_of_the_others(camera, me
     torch.testing.assert_close(gradients[0][0], gradients[1][0])
     torch.testing.assert_close(gradients[0][1], gradients[1][1][:, :-1])
     assert (gradients[1][1][:, -1] == 0).all()
+
+
+def _inverse_by_bisection(camera: Camera, pixel: Tensor) -> Tensor:
+    """x/z, y/z of a pixel by Newton's method on autograd of `project` alone, in full."""
+    xy = torch.zeros(2, dtype=torch.float64)
+    for _ in range(60):
+
+        def projected(xy: Tensor) -> Tensor:
+            return camera.project(torch.cat((xy, xy.new_ones(1)))[None])[0][0]
+
+        xy = xy - torch.linalg.solve(torch.func.jacrev(projected)(xy), projected(xy) - pixel)
+    return xy
+
+
+DISTORTED = {
+    "radial_tangential": Camera.radial_tangential(
+        458.0, 457.0, 367.0, 248.0, -0.28, 0.07, 2e-4, 2e-5, size=(752, 480)
+    ),
+    "fisheye": Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480)),
+}
+
+
+@pytest.mark.parametrize("camera", DISTORTED.values(), ids=DISTORTED)
+def test_derivatives_of_the_inverse_up_to_the_third_order(camera: Camera) -> None:
+    """Against central differences of the derivative of one order less."""
+    pixel = torch.tensor([120.0, 400.0], dtype=torch.float64)
+    start = torch.cat((pixel, camera.params))
+    towards = torch.cat((torch.tensor([1.0, 0.5]), torch.tensor([2.0, 1.0, 0.3, 0.2]), 0.01 * torch.ones(9)))
+    towards = towards[: len(start)].double()
+
+    def at(step: Tensor) -> Tensor:
+        moved = start + step * towards
+        return camera.with_params(moved[2:]).normalize(moved[None, :2])[0]
+
+    derivatives = [at]
+    for _ in range(3):
+        derivatives.append(torch.func.jacrev(derivatives[-1]))
+    zero, h = torch.zeros((), dtype=torch.float64), 1e-2
+    torch.testing.assert_close(at(zero), _inverse_by_bisection(camera, pixel), rtol=0, atol=1e-12)
+    for lower, higher in itertools.pairwise(derivatives):
+        difference = (
+            8 * (lower(zero + h) - lower(zero - h)) - (lower(zero + 2 * h) - lower(zero - 2 * h))
+        ) / (12 * h)
+        torch.testing.assert_close(higher(zero), difference, rtol=1e-5, atol=1e-13)
+
+
+@pytest.mark.parametrize("camera", DISTORTED.values(), ids=DISTORTED)
+def test_hessians_and_vmap_of_undistorted_pixels_agree_with_double_backward(camera: Camera) -> None:
+    pixels = torch.tensor([[120.0, 400.0], [600.0, 30.0], [320.0, 240.0]], dtype=torch.float64)
+
+    def loss(pixels: Tensor, params: Tensor) -> Tensor:
+        return camera.with_params(params).unproject(pixels[None]).pow(3).sum()
+
+    hessians = torch.vmap(torch.func.hessian(loss), (0, None))(pixels, camera.params)
+    for pixel, hessian in zip(pixels, hessians, strict=True):
+        leaf = pixel.clone().requires_grad_()
+        (gradient,) = torch.autograd.grad(loss(leaf, camera.params), leaf, create_graph=True)
+        rows = [torch.autograd.grad(each, leaf, retain_graph=True)[0] for each in gradient]
+        torch.testing.assert_close(hessian, torch.stack(rows), rtol=1e-8, atol=1e-12)
+
+
+@pytest.mark.parametrize("ways", ["optimizer", "data", "inference"])
+def test_the_limit_follows_parameters_that_an_optimizer_moves(ways: str) -> None:
+    """k1 from 0 to -0.3: an undistorted image has no limit, this one ends at 1.05."""
+    size = (640, 480)
+    params = torch.tensor([300.0, 300.0, 319.5, 239.5, 0.0, 0.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    moved = params.clone()
+    moved[4] = -0.3
+    corners = torch.tensor([[0.0, 0.0], [639.0, 479.0], [320.0, 0.0]], dtype=torch.float64)
+    with torch.inference_mode(ways == "inference"):
+        params = params.clone()
+        camera = Camera("radial_tangential", params, size)
+        assert camera.limit.isinf()
+        camera.normalize(corners)
+        if ways == "data":
+            params.data[4] = -0.3
+        elif ways == "inference":
+            params[4] = -0.3
+        else:
+            optimizer = torch.optim.Adam([params.requires_grad_()], 0.01)
+            while float(params[4]) > -0.3:
+                optimizer.zero_grad()
+                params[4].backward()
+                optimizer.step()
+            moved = params.detach().clone()
+    fresh = Camera("radial_tangential", moved.clone(), size)
+    assert float(camera.limit) == pytest.approx((1 / (-3 * float(moved[4]))) ** 0.5)
+    assert torch.equal(camera.normalize(corners), fresh.normalize(corners))
+    points = torch.tensor([[0.9, 0.0, 1.0], [1.5, 0.0, 1.0]], dtype=torch.float64)
+    assert camera.project(points)[1].tolist() == [True, False]
+    assert camera.with_params(torch.stack((params, moved)))[0].limit == fresh.limit

@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import numpy as np
 import poselib
 import pytest
@@ -215,6 +217,33 @@ def test_wrong_shapes_and_empty_input() -> None:
     with pytest.raises(ValueError, match=r"\(B, N, 2\)"):
         estimate_relative_pose(torch.zeros(5, 2), torch.zeros(5, 2), CAMERA, CAMERA)
     for shape in ((0, 10, 2), (2, 0, 2), (2, 4, 2)):
-        result = estimate_relative_pose(torch.zeros(shape), torch.zeros(shape), CAMERA, CAMERA)
+        pixels = torch.zeros(shape, dtype=torch.float64)
+        result = estimate_relative_pose(pixels, pixels, CAMERA, CAMERA)
         assert result.T_21.shape == (shape[0], 4, 4)
         assert not result.success.any()
+
+
+def gradients(scene: Scene) -> tuple[RelativePose, Tensor]:
+    """The relative pose, and the gradient of all its numbers to the pixels of the first view."""
+    pixels = scene.pixels_1.clone().requires_grad_()
+    found = estimate_relative_pose(pixels, scene.pixels_2, CAMERA, CAMERA)
+    (gradient,) = torch.autograd.grad((found.T_21 * torch.arange(16.0).double().view(4, 4)).sum(), pixels)
+    return found, gradient
+
+
+def test_failures_are_as_the_page_on_gradients_says() -> None:
+    """Noise has no pose and no gradient, few matches neither; a rotation is determined but for its direction."""
+    size = torch.tensor(CAMERA.size, dtype=torch.float64)
+    for count in (4, 5, 80):
+        draws = torch.rand(
+            2, 3, count, 2, generator=torch.Generator().manual_seed(count), dtype=torch.float64
+        )
+        noise = replace(two_views(0), pixels_1=draws[0] * size, pixels_2=draws[1] * size)
+        found, gradient = gradients(noise)
+        assert not found.success.any()
+        assert torch.equal(found.T_21, torch.eye(4, dtype=torch.float64).expand(3, 4, 4))
+        assert not gradient.any()
+    found, gradient = gradients(two_views(0, baseline=0.0))
+    assert (found.model, found.success.tolist()) == (("rotation",), [False])
+    assert not found.T_21[0, :3, 3].any()
+    assert gradient.abs().sum() > 0

@@ -412,8 +412,8 @@ def test_invalid_options_are_rejected_by_name() -> None:
         estimate(scene, model="plane")
     with pytest.raises(ValueError, match="unknown kernel 'tukey'"):
         estimate(scene, kernel="tukey")
-    with pytest.raises(ValueError, match=r"weights must be \(1, 200\), not \(200,\)"):
-        estimate(scene, weights=torch.ones(200))
+    with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(1, 200\), not \(200,\)"):
+        estimate(scene, weights=torch.ones(200).double())
 
 
 def test_a_rejected_model_keeps_its_essential_matrix() -> None:

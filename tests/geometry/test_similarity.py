@@ -355,14 +355,14 @@ def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
 
 @pytest.mark.usefixtures("without_shape_checks")
 def test_wrong_shapes_are_named() -> None:
-    points, pixels = torch.zeros(1, 5, 3), torch.zeros(1, 5, 2)
-    with pytest.raises(ValueError, match=r"\(B, N, 3\)"):
+    points, pixels = torch.zeros(1, 5, 3).double(), torch.zeros(1, 5, 2).double()
+    with pytest.raises(ValueError, match=r"pixels_2 must be \(B, N, 2\) = \(1, 5, 2\), not \(1, 4, 2\)"):
         estimate_similarity(points, points, pixels, pixels[:, 1:], CAMERA, CAMERA)
 
 
 def test_an_empty_batch_or_no_points() -> None:
     for batch, count in ((0, 10), (2, 0), (2, 2)):
-        points, pixels = torch.zeros(batch, count, 3), torch.zeros(batch, count, 2)
+        points, pixels = torch.zeros(batch, count, 3).double(), torch.zeros(batch, count, 2).double()
         result = estimate_similarity(points, points, pixels, pixels, CAMERA, CAMERA)
         assert result.S_21.shape == (batch, 4, 4)
         assert result.inliers.shape == (batch, count)

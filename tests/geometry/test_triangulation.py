@@ -196,3 +196,25 @@ def test_a_pixel_that_is_not_finite_leaves_the_gradient_of_the_others(camera: Ca
     expected = gradient(pixels)
     assert expected.abs().max() > 0
     torch.testing.assert_close(gradient(bad), expected)
+
+
+@pytest.mark.parametrize("many", [False, True], ids=["triangulate", "triangulate_many"])
+def test_the_hessian_through_a_distortion_agrees_with_differences_of_the_gradient(many: bool) -> None:
+    camera = Camera.radial_tangential(458.0, 457.0, 367.0, 248.0, -0.28, 0.07, 2e-4, 2e-5, size=(752, 480))
+    T_cw = se3_exp(torch.tensor([[0.0] * 6, [-0.5, 0.1, 0.0, 0.02, 0.1, 0.03]], dtype=torch.float64))
+    points_w = torch.tensor([[0.3, -0.2, 4.0], [-1.0, 0.5, 3.0]], dtype=torch.float64)
+    pixels = camera.project(transform(T_cw, points_w))[0]
+
+    def loss(pixels: Tensor) -> Tensor:
+        if many:
+            points = triangulate_many(T_cw, pixels.transpose(0, 1), camera).points_w
+        else:
+            points = triangulate(*T_cw, *pixels, camera, camera).points_w
+        return (points**3).sum()
+
+    hessian = torch.func.hessian(loss)(pixels)
+    gradient = torch.func.grad(loss)
+    step = 1e-3 * torch.randn(pixels.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    difference = (gradient(pixels + step) - gradient(pixels - step)) / 2
+    found = torch.tensordot(hessian, step, dims=3)
+    torch.testing.assert_close(found, difference, rtol=1e-5, atol=1e-9)

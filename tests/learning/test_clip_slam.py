@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still
 from torchslam import ORB, Camera, ClipPoses, ClipSLAM, Features, clip_loss, load_config, open_sequence
-from torchslam.errors import ClipError
+from torchslam.errors import ClipError, FrameError
 from torchslam.evaluation import ate, rpe
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_exp
@@ -225,3 +225,38 @@ def test_a_short_clip_of_a_wall_starts() -> None:
     truth = torch.stack([sequence.pose(index) for index in range(8)])
     path = (truth[-1, :3, 3] - truth[0, :3, 3]).norm()
     assert ate(poses.T_cw, truth, poses.posed) < 0.05 * path
+
+
+def test_the_gradient_is_the_same_under_detect_anomaly() -> None:
+    walk, gradients = Walk(arc(FRAMES, length=1.0)), []
+    images, truth = clip_of(walk)
+    for is_detected in (False, True):
+        eyes = BentEyes(walk, bend=0.02)
+        camera = walk.camera.with_params(walk.camera.params.clone().requires_grad_())
+        with torch.autograd.set_detect_anomaly(is_detected):
+            ate(ClipSLAM(eyes, config=CONFIG)(images, camera).T_cw, truth).backward()
+        gradients.append((eyes.bend.grad, camera.params.grad))
+    torch.testing.assert_close(*gradients)
+    assert float(gradients[1][0]) != 0
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_weights_of_keypoints_of_another_shape_are_refused() -> None:
+    """As a network with one output gives them: (T, N, 1)."""
+    walk = Walk(arc(FRAMES, length=1.0))
+    for change in (lambda x: x[..., None], lambda x: x[0], lambda x: x.long()):
+        eyes = BentEyes(walk, bend=0.02)
+        clip_slam = ClipSLAM(eyes, lambda features, change=change: change(features.scores), config=CONFIG)
+        with pytest.raises(ValueError, match=r"keypoint_weight must give floats \(T, N\) = \(10, 300\), not"):
+            clip_slam(clip_of(walk)[0], walk.camera)
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_images_that_are_not_gray_are_refused() -> None:
+    walk = Walk(arc(FRAMES, length=1.0))
+    images, _ = clip_of(walk)
+    clip_slam = ClipSLAM(BentEyes(walk, bend=0.02))
+    with pytest.raises(FrameError, match=r"images of a clip must be in \[0, 1\], these are from .* to 255"):
+        clip_slam(torch.full_like(images, 255.0), walk.camera)
+    with pytest.raises(ValueError, match=r"images must be \(T, 1, H, W\)"):
+        clip_slam(images.expand(-1, 3, -1, -1), walk.camera)

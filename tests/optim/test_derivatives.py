@@ -288,9 +288,9 @@ def test_inconsistent_batch_inputs_are_rejected_by_name(pose_scene, bundle_scene
     with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or .*, not \(40,\)"):
         refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, torch.ones(40).double())
     problem = bundle_scene().problem
-    with pytest.raises(ValueError, match=r"camera_params is torch.float32"):
+    with pytest.raises(ValueError, match=r"camera.params is torch.float32"):
         bundle_adjust(replace(problem, camera=problem.camera.to(torch.float32)))
-    with pytest.raises(ValueError, match=r"weights must be \(O,\)"):
+    with pytest.raises(ValueError, match=r"weights must be \(..., O\) or \(..., O, 2, 2\), not \(3,\)"):
         bundle_adjust(replace(problem, weights=torch.ones(3, dtype=torch.float64)))
     graph = make_scene().graph
     with pytest.raises(ValueError, match=r"S_ji is torch.float32"):

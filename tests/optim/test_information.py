@@ -123,10 +123,10 @@ def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
 @pytest.mark.usefixtures("without_shape_checks")
 def test_wrong_shapes_are_named(pose_scene, bundle_scene, shape):
     scene = pose_scene()
-    with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or \(B, N, 2, 2\), not"):
+    with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or \(B, N, 2, 2\).*, not"):
         refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, torch.ones(shape).double())
     problem = bundle_scene().problem
-    with pytest.raises(ValueError, match=r"weights must be \(O,\) or \(O, 2, 2\) = "):
+    with pytest.raises(ValueError, match=r"weights must be \(..., O\) or \(..., O, 2, 2\), not"):
         bundle_adjust(replace(problem, weights=torch.ones(len(problem.pixels), 3, 3).double()))
 
 
@@ -150,3 +150,23 @@ def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, gene
     bad.save(tmp_path / "bad")
     with pytest.raises(TorchslamError, match="a negative weight"):
         ObservationGraph.load(tmp_path / "bad")
+
+
+@pytest.mark.parametrize("solver", ["pose", "bundle"])
+def test_a_covariance_is_that_of_the_solution_whatever_moves_in_place_later(pose_scene, bundle_scene, solver):
+    covariances = []
+    for moves in (False, True):
+        if solver == "pose":
+            scene = pose_scene()
+            given = scene.points_w.clone(), scene.pixels.clone(), scene.camera.params.clone()
+            solution = refine_pose(scene.start, given[0], given[1], scene.camera.with_params(given[2]))
+        else:
+            problem = bundle_scene().problem
+            given = problem.points_w.clone(), problem.pixels.clone(), problem.camera.params.clone()
+            camera = problem.camera.with_params(given[2])
+            solution = bundle_adjust(replace(problem, points_w=given[0], pixels=given[1], camera=camera))
+        if moves:
+            for tensor in given:
+                tensor.mul_(1.3)
+        covariances.append(solution.covariance if solver == "pose" else solution.covariance().frames)
+    assert torch.equal(*covariances)

@@ -226,18 +226,20 @@ def test_submaps_are_solved_independently():
     _, (one, two), both = two_submaps()
     assert both.submaps == [1, 4]
     solution, first, second = solve_graph(both), solve_graph(one), solve_graph(two)
-    # Frames in between are refined in one batch: on some processors that moves their last digits.
-    close(solution.T_cw, torch.cat([first.T_cw, second.T_cw]))
+    # Frames in between are refined in one batch. That moves last digits, by which a last step, which gains less than
+    # rounding, is taken or not.
+    alone = torch.cat([first.T_cw, second.T_cw])
+    torch.testing.assert_close(solution.T_cw, alone, rtol=0, atol=1e-8)
     keyframes = both.is_keyframe
-    assert torch.equal(solution.T_cw[keyframes], torch.cat([first.T_cw, second.T_cw])[keyframes])
+    assert torch.equal(solution.T_cw[keyframes], alone[keyframes])
     assert torch.equal(solution.points_w, torch.cat([first.points_w, second.points_w]))
     assert torch.equal(solution.success, torch.cat([first.success, second.success]))
     assert torch.equal(solution.moved_points, torch.cat([first.moved_points, second.moved_points]))
     assert [len(bundle.T_cw) for bundle in solution.keyframes] == [3, 4]  # submap 1, submap 4
     assert torch.equal(solution.submap, both.submap)
-    for submap, alone in ((4, first), (1, second)):
+    for submap, only in ((4, first), (1, second)):
         found = solution.trajectory_in(submap).T_wc
-        torch.testing.assert_close(found, alone.trajectory.T_wc, atol=1e-12, rtol=0)
+        torch.testing.assert_close(found, only.trajectory.T_wc, atol=1e-8, rtol=0)
     assert torch.equal(solution.trajectory.T_wc, solution.trajectory_in(4).T_wc)  # ten frames against seven
     assert torch.equal(solution.T_cw[0], both.T_cw[0])
     assert torch.equal(solution.T_cw[10], both.T_cw[10])  # the first keyframe of either

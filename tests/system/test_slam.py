@@ -14,6 +14,7 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, turn, walk_with_jump
 from torchslam import (
     SLAM,
+    Camera,
     Config,
     Frame,
     Run,
@@ -559,3 +560,12 @@ def test_a_delay_costs_no_accuracy() -> None:
         result = evaluate(run.trajectory, walk.groundtruth)
         errors.append(result.ate_m / result.path_length_m)
     assert max(errors) < 0.005
+
+
+def test_the_system_keeps_its_camera_when_parameters_move_in_place() -> None:
+    params = torch.tensor([400.0, 400.0, 319.5, 239.5], dtype=torch.float64).requires_grad_()
+    slam = SLAM(Camera("pinhole", params, (640, 480)))
+    with torch.no_grad():
+        params.mul_(2)
+    assert float(slam.camera.fx) == 400
+    assert not slam.camera.params.requires_grad

@@ -1,10 +1,11 @@
 from __future__ import annotations
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
+from torchslam.utils.indexing import distinct, is_among, ranks_among, row_mask, true_indices
 
 IDS = st.lists(st.integers(-20, 200), max_size=60)
 
@@ -36,3 +37,26 @@ def test_masks_on_any_device(device: torch.device) -> None:
     assert distinct(ids).tolist() == [3, 7, 9]
     assert true_indices(ids == 3).tolist() == [1, 2]
     assert is_among(ids, ids[:1]).tolist() == [True, False, False, False]
+
+
+def test_row_masks_of_ones_and_zeros_are_no_row_numbers() -> None:
+    like = torch.zeros(1, 4)
+    assert row_mask("fixed", [0, -1], like).tolist() == [[True, False, False, True]]
+    assert row_mask("fixed", torch.tensor([2], dtype=torch.int32), like).tolist() == [
+        [False, False, True, False]
+    ]
+    assert not row_mask("fixed", (), like).any()
+    for rows, message in (
+        (torch.tensor([1, 0, 0, 0]), "fixed names a row twice: row numbers differ, and a mask must be bool"),
+        (torch.tensor([1, 0, 0, 0], dtype=torch.uint8), "not torch.uint8"),
+        (
+            torch.tensor([1.0, 0.0, 0.0, 0.0]),
+            r"must be a mask of bool, or row numbers \(n,\), int64, not torch.float32",
+        ),
+        (torch.tensor([[True], [False], [True], [True]]), r"must have shape \(4,\), not \(4, 1\)"),
+        (torch.tensor([[1], [2]]), r"not torch.int64 \(2, 1\)"),
+        ([4], r"fixed must lie in 0 \.\.\. 3"),
+        ([-5], r"fixed must lie in 0 \.\.\. 3"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            row_mask("fixed", rows, like)

@@ -134,7 +134,8 @@ def _fundamental(
 
 def _solve(pairs: list[tuple[Tensor, Tensor, Tensor]], camera: Camera, scale: float) -> ViewGraphFocal:
     """fx by all pairs, in images that are scaled in height so that their pixels are square."""
-    stretch = torch.stack([torch.ones(()), (camera.fx / camera.fy).detach().cpu(), torch.ones(())]).double()
+    ratio = float(camera.fx / camera.fy)
+    stretch = torch.tensor([1.0, ratio, 1.0], dtype=torch.float64, device="cpu")
     F = torch.stack([pair[0] for pair in pairs]).double() / (stretch[:, None] * stretch)
     pixels_1, pixels_2 = (
         torch.nn.utils.rnn.pad_sequence([pair[side] for pair in pairs], batch_first=True).double()
@@ -142,7 +143,7 @@ def _solve(pairs: list[tuple[Tensor, Tensor, Tensor]], camera: Camera, scale: fl
         for side in (1, 2)
     )
     mask = torch.nn.utils.rnn.pad_sequence(
-        [torch.ones(len(pair[1]), dtype=torch.bool) for pair in pairs], batch_first=True
+        [torch.ones(len(pair[1]), dtype=torch.bool, device="cpu") for pair in pairs], batch_first=True
     )
     return focal_from_pairs(
         F,

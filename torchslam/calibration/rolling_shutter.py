@@ -125,7 +125,7 @@ class _Block:
         inverse = torch.where(norms > 0, 1 / norms.masked_fill(norms == 0, 1.0), 0.0)
         scaled = derivatives * inverse[index][:, None]
         gram = scaled.new_zeros(count, size, size).index_add(0, index, scaled.mT @ scaled)
-        gram = gram + torch.diag_embed(torch.where(norms > 0, RIDGE, 1.0))
+        gram = gram + torch.diag_embed(torch.where(norms > 0, RIDGE, 1.0).float())
         factor = torch.linalg.cholesky(gram)
         orthonormal = torch.linalg.solve_triangular(factor[index], scaled.mT, upper=False).mT
         return cls(orthonormal, index, count)

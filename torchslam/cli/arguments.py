@@ -175,7 +175,7 @@ def _device(text: str) -> torch.device:
 
     try:
         device = torch.device(text)
-        torch.zeros(1, device=device).item()  # "meta" only pretends to compute
+        torch.zeros(1, device=device, dtype=torch.float32).item()  # "meta" only pretends to compute
     except (RuntimeError, AssertionError) as error:  # the latter from a torch without CUDA
         reason = str(error).splitlines()[0]
         raise argparse.ArgumentTypeError(f"{text!r} cannot be used here: {reason}") from None

@@ -403,7 +403,11 @@ def _write(attempt: Attempt, plan: RunPlan) -> dict[str, object]:
         attempt.mapped,
     )
     if latencies:
-        median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
+        median, p95 = (
+            torch.tensor(latencies, dtype=torch.float32, device="cpu")
+            .quantile(torch.tensor([0.5, 0.95], dtype=torch.float32, device="cpu"))
+            .tolist()
+        )
         metrics["latency_ms"] = {"median": median, "p95": p95}
     metrics |= source_of(plan.source, plan.fps, sequence)
     write_run(finished, sequence, metrics, plan.output)

@@ -82,7 +82,7 @@ class Calibration:
                 f"{self.source}: the camera is for images of {size_text(self.size or size)}, "
                 f"these are {size_text(size)}"
             )
-        return Camera(self.model, torch.tensor(self.params, dtype=torch.float64), size)
+        return Camera(self.model, torch.tensor(self.params, dtype=torch.float64, device="cpu"), size)
 
     def _check_center(self, size: Size) -> None:
         """Raise CalibrationError if the principal point says that the camera is for another size."""

@@ -104,7 +104,7 @@ class Sequence(ABC):
         self.counted_until: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
         self._T_cw: Tensor | None = None
-        self._has_pose = torch.zeros(len(timestamps), dtype=torch.bool)
+        self._has_pose = torch.zeros(len(timestamps), dtype=torch.bool, device="cpu")
         if groundtruth is not None:
             T_wc, self._has_pose = interpolate_poses(groundtruth, timestamps, GROUNDTRUTH_TOLERANCE)
             self._T_cw = se3_inverse(T_wc)

@@ -42,7 +42,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
         rows.append(row)
     if not rows:
         raise TrajectoryError(f"{path}: no poses")
-    table = torch.tensor(rows, dtype=torch.float64)
+    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
     quaternions = table[:, 4:] / table[:, 4:].norm(dim=-1, keepdim=True)
     T_wc = checked_poses(rigid(matrix_from_quaternion(quaternions), table[:, 1:4]), path)
     return Trajectory(table[:, 0].contiguous(), T_wc)
@@ -51,7 +51,7 @@ def read_trajectory(path: str | Path) -> Trajectory:
 def checked_poses(T_wc: Float[Tensor, "*batch 4 4"], path: Path | str) -> Float[Tensor, "*batch 4 4"]:
     """Return poses unchanged. Raises TrajectoryError for an invalid rotation or position."""
     R, positions_w = T_wc[..., :3, :3], T_wc[..., :3, 3]
-    error = (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs()
+    error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs()
     if not bool((error < ORTHOGONAL).all()):  # not so NaN either
         raise TrajectoryError(f"{path}: a pose is not a rigid transformation")
     if not bool((positions_w.abs() < FARTHEST).all()):

@@ -49,7 +49,7 @@ class PointCloud:
         if len(self) <= limit:
             return self
         generator = torch.Generator().manual_seed(THINNING_SEED)
-        rows = torch.randperm(len(self), generator=generator)[:limit].sort().values
+        rows = torch.randperm(len(self), generator=generator, device="cpu")[:limit].sort().values
         return self[rows.to(self.points_w.device)]
 
     def spacing(self) -> float:
@@ -57,6 +57,8 @@ class PointCloud:
         if len(self) <= SPACING_RANK:
             return 0.0
         points_w = self.points_w.float()
-        rows = torch.linspace(0, len(self) - 1, min(len(self), SPACING_SAMPLE)).long()
+        rows = torch.linspace(
+            0, len(self) - 1, min(len(self), SPACING_SAMPLE), dtype=torch.float32, device="cpu"
+        ).long()
         distances = torch.cdist(points_w[rows.to(points_w.device)], points_w)
         return float(distances.topk(SPACING_RANK + 1, dim=1, largest=False).values[:, -1].median())

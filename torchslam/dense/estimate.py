@@ -17,6 +17,7 @@ from torchslam.dense.aggregation import Aggregation, semi_global
 from torchslam.dense.cost_volume import inverse_depth_planes, matching_cost
 from torchslam.dense.minimum import Minimum, find_minimum, position_std
 from torchslam.geometry import Camera
+from torchslam.geometry.precision import without_autocast
 
 PLANES = 64
 STEPS = 4
@@ -47,6 +48,7 @@ class Estimate(NamedTuple):
     fine: Minimum
 
 
+@without_autocast
 def estimate_depth(
     reference: Float[Tensor, "B H W"],
     sources: Float[Tensor, "B V H W"],
@@ -90,6 +92,7 @@ def estimate_depth(
     return Estimate(inverse_depth, std, coarse, _doubled(match), fine)
 
 
+@without_autocast
 def refine_depth(
     reference: Float[Tensor, "B H W"],
     sources: Float[Tensor, "B V H W"],

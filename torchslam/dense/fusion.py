@@ -39,7 +39,7 @@ class CloudFusion:
     def cloud(self) -> PointCloud:
         """Return the cloud, ordered by voxel."""
         if not self._pending:
-            nothing = torch.zeros(0, 3)
+            nothing = torch.zeros(0, 3, dtype=torch.float32, device="cpu")
             return PointCloud(nothing, nothing, nothing.byte(), nothing[:, 0])
         self._merge()
         sums = self._pending[0][1]

@@ -63,7 +63,8 @@ class RatingNet(nn.Module):
 @lru_cache(maxsize=4)
 def trained_net(device: torch.device, dtype: torch.dtype = torch.float32) -> RatingNet:
     """The network of the package."""
-    net = RatingNet()
+    with torch.device("cpu"):
+        net = RatingNet()
     net.load_state_dict(load_file(_WEIGHTS_FILE))
     return net.to(device, dtype).requires_grad_(False)
 

@@ -35,7 +35,7 @@ def neighbor_scores(
     to_candidate = torch.nn.functional.normalize(centers_w[:, None] - points_w[..., None, :, :], dim=-1)
     cosine = (to_view[..., None, :, :] * to_candidate).sum(-1).clamp(-1, 1)
     angle = torch.rad2deg(torch.acos(cosine))
-    sigma = torch.where(angle < BEST_ANGLE_DEG, BELOW_DEG, ABOVE_DEG)
+    sigma = torch.where(angle < BEST_ANGLE_DEG, BELOW_DEG, ABOVE_DEG).float()
     weight = torch.exp(-0.5 * ((angle - BEST_ANGLE_DEG) / sigma) ** 2)
     is_enough = is_shared.sum(-1) >= LEAST_SHARED
     return torch.where(is_enough, torch.where(is_shared, weight, 0.0).sum(-1), 0.0)

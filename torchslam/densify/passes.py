@@ -110,7 +110,7 @@ def densify(
     paths = [job.path(Pass.MERGED, view) for view in range(len(views))]
     join(folder / DEPTHS.name, paths)
     _draw(folder, views, opened)
-    spreads = torch.tensor([read_about(path)["spread"] for path in paths])
+    spreads = torch.tensor([read_about(path)["spread"] for path in paths], dtype=torch.float32, device="cpu")
     summary = _fuse(folder / DEPTHS.name, opened, spreads, skipped)
     shutil.rmtree(parts)
     return summary

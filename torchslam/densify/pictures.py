@@ -22,7 +22,9 @@ def depth_colors(depth: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
     if not bool(is_known.any()):
         return np.zeros((*depth.shape, 3), np.uint8)
     inverse = torch.where(is_known, 1 / torch.where(is_known, depth, 1.0), 0.0)
-    far, near = inverse[is_known].quantile(torch.tensor(QUANTILES, dtype=inverse.dtype)).tolist()
+    far, near = (
+        inverse[is_known].quantile(torch.tensor(QUANTILES, dtype=inverse.dtype, device="cpu")).tolist()
+    )
     scaled = ((inverse - far) / max(near - far, 1e-12)).clamp(0, 1)
     colors = cv2.applyColorMap((scaled * 255).round().to(torch.uint8).numpy(), cv2.COLORMAP_TURBO)
     colors[~is_known.numpy()] = 0

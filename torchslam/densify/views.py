@@ -144,7 +144,9 @@ def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = No
         ResultsError: fewer than three views are left.
     """
     scene = undistorted(scene)
-    chosen = scene.is_keyframe if every is None else torch.arange(len(scene.frame_ids)) % every == 0
+    chosen = (
+        scene.is_keyframe if every is None else torch.arange(len(scene.frame_ids), device="cpu") % every == 0
+    )
     frames = torch.nonzero(chosen)[:, 0]
     if len(frames) <= LEAST_NEIGHBORS:
         kind = "keyframes" if every is None else "frames"
@@ -169,9 +171,11 @@ def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = No
             continue
         kept.append(view)
         neighbors.append(order[is_there].tolist())
-        ranges.append(depth.quantile(torch.tensor(QUANTILES, dtype=depth.dtype)))
+        ranges.append(depth.quantile(torch.tensor(QUANTILES, dtype=depth.dtype, device="cpu")))
     place = {view: row for row, view in enumerate(kept)}
-    limits = torch.stack(ranges) if ranges else torch.empty(0, len(QUANTILES))
+    limits = (
+        torch.stack(ranges) if ranges else torch.empty(0, len(QUANTILES), dtype=torch.float32, device="cpu")
+    )
     rows = frames[kept]
     views = Views(
         frame_index=scene.frame_ids[rows],

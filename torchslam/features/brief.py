@@ -88,7 +88,7 @@ ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle 
 @lru_cache(maxsize=8)
 def _moment_weights(device: torch.device) -> Int[Tensor, "2 S"]:
     """x and y (int8) of each pixel of the flattened patch within the disk of RADIUS, else 0; they sum to 0."""
-    axis = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32)
+    axis = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32, device="cpu")
     y, x = torch.meshgrid(axis, axis, indexing="ij")
     disk = (x * x + y * y <= (RADIUS + 0.5) ** 2).float()
     return torch.stack([x * disk, y * disk]).flatten(1).to(device, torch.int8)
@@ -142,9 +142,9 @@ def rotated_offsets(
     points: tuple[tuple[int, int], ...], stride: int, device: torch.device
 ) -> Int[Tensor, "256 S"]:
     """Compute flat offsets of points (x, y) around a keypoint, rotated by every angle and rounded."""
-    angles = torch.arange(ANGLE_BINS, dtype=torch.float64) * (2 * math.pi / ANGLE_BINS)
+    angles = torch.arange(ANGLE_BINS, dtype=torch.float64, device="cpu") * (2 * math.pi / ANGLE_BINS)
     cos, sin = angles.cos()[:, None], angles.sin()[:, None]
-    x, y = torch.tensor(points, dtype=torch.float64).unbind(-1)
+    x, y = torch.tensor(points, dtype=torch.float64, device="cpu").unbind(-1)
     offsets = (x * sin + y * cos).round() * stride + (x * cos - y * sin).round()
     return offsets.to(device=device, dtype=torch.int32)
 

@@ -9,8 +9,9 @@ from typing import Protocol, runtime_checkable
 import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
+from torch._C import _are_functorch_transforms_active
 
-from torchslam.errors import ConfigError
+from torchslam.errors import ConfigError, FrameError
 from torchslam.geometry.gating import is_definite
 from torchslam.types import Features
 
@@ -41,6 +42,30 @@ class FixedKeypoints(Protocol):
     ) -> Features:
         """The features of these keypoints, in these rows, each located anew near by."""
         ...
+
+
+_OVER = 1e-3  # beyond black and white, of what resizing or training adds
+
+
+def check_gray(images: Shaped[Tensor, "*batch"], name: str) -> None:
+    """Check that images are floats in [0, 1].
+
+    Args:
+        images: of any shape.
+        name: of the images, for messages.
+
+    Raises:
+        FrameError: They are of another kind, or have other values or NaN.
+    """
+    if not images.is_floating_point():
+        raise FrameError(
+            f"{name} must be floats in [0, 1], not {images.dtype}: divide by what is white, 255 for uint8"
+        )
+    if images.numel() == 0 or _are_functorch_transforms_active() or torch.compiler.is_compiling():
+        return
+    low, high = images.detach().aminmax()
+    if not bool((low >= -_OVER) & (high <= 1 + _OVER)):  # also for NaN
+        raise FrameError(f"{name} must be in [0, 1], these are from {float(low):g} to {float(high):g}")
 
 
 def are_unit_or_zero(descriptors: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*batch"]:

@@ -215,9 +215,12 @@ def gather_patches(
 @lru_cache(maxsize=16)
 def _sobel(side: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """(side^2, 2 (side - 2)^2): the Sobel derivatives along x and y at all inner pixels of a patch, as a matrix."""
-    smooth, slope = torch.tensor([1.0, 2.0, 1.0]), torch.tensor([-1.0, 0.0, 1.0])
+    smooth, slope = (
+        torch.tensor([1.0, 2.0, 1.0], dtype=torch.float32, device="cpu"),
+        torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float32, device="cpu"),
+    )
     inner = side - 2
-    matrix = torch.zeros(side, side, 2, inner, inner)
+    matrix = torch.zeros(side, side, 2, inner, inner, dtype=torch.float32, device="cpu")
     for row in range(inner):
         for column in range(inner):
             matrix[row : row + 3, column : column + 3, 0, row, column] = smooth[:, None] * slope
@@ -229,7 +232,7 @@ def _sobel(side: int, device: torch.device, dtype: torch.dtype) -> Tensor:
 def _window_sums(inner: int, device: torch.device, dtype: torch.dtype) -> Tensor:
     """(inner^2, outputs^2): sums over all Harris windows of an inner x inner map, as a matrix."""
     outputs = inner - HARRIS_WINDOW + 1
-    matrix = torch.zeros(inner, inner, outputs, outputs)
+    matrix = torch.zeros(inner, inner, outputs, outputs, dtype=torch.float32, device="cpu")
     for row in range(outputs):
         for column in range(outputs):
             matrix[row : row + HARRIS_WINDOW, column : column + HARRIS_WINDOW, row, column] = 1
@@ -254,7 +257,11 @@ def harris_responses(patches: Float[Tensor, "N S S"]) -> Float[Tensor, "N S-8 S-
 @lru_cache(maxsize=8)
 def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "9 5"]:
     """3x3 values to the least-squares paraboloid's gx, gy, gxx, gyy, gxy at the center."""
-    slope, curve, ones = torch.tensor([-1.0, 0.0, 1.0]), torch.tensor([1.0, -2.0, 1.0]), torch.ones(3)
+    slope, curve, ones = (
+        torch.tensor([-1.0, 0.0, 1.0], dtype=torch.float32, device="cpu"),
+        torch.tensor([1.0, -2.0, 1.0], dtype=torch.float32, device="cpu"),
+        torch.ones(3, dtype=torch.float32, device="cpu"),
+    )
     fits = [
         torch.outer(ones, slope) / 6,
         torch.outer(slope, ones) / 6,

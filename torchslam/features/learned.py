@@ -20,7 +20,7 @@ from torchslam.features.contract import apply_mask
 from torchslam.features.corners import soft_peak
 from torchslam.features.orb import check_images
 from torchslam.features.weights import EXTRACTOR, MATCHER, read_weights
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features
 
 _SCALE = 2.0
@@ -48,7 +48,8 @@ class XFeat(nn.Module):
         super().__init__()
         self.num_keypoints = num_keypoints
         self.threshold = threshold
-        model = kornia.feature.XFeat()
+        with torch.device("cpu"):
+            model = kornia.feature.XFeat().float()
         # The file may leave out the fine matcher, which only dense matching needs.
         state = {_XFEAT_PREFIX.sub("net.", name): tensor for name, tensor in read_weights(weights).items()}
         state = {name: tensor for name, tensor in state.items() if not name.startswith("net.matcher.")}
@@ -113,7 +114,7 @@ class XFeat(nn.Module):
         scores = heat * F.interpolate(reliability, inner, mode="bilinear", align_corners=False)
         return coarse, heat[:, 0], scores[:, 0]
 
-    @full_precision
+    @without_autocast
     def _features(
         self, images: Tensor, coarse: Tensor, heat: Tensor, scores: Tensor, places: Tensor, found: Tensor
     ) -> Features:
@@ -163,7 +164,9 @@ class ALIKED(nn.Module):
         if shape not in variants:
             raise ConfigError(f"{weights}: not the weights of an ALIKED network")
         # Without a threshold the network gives its strongest maxima.
-        self.network = kornia.feature.ALIKED(variants[shape], num_keypoints, detection_threshold=0)
+        with torch.device("cpu"):
+            network = kornia.feature.ALIKED(variants[shape], num_keypoints, detection_threshold=0)
+        self.network = network.float()
         _load(self.network, state, weights, optional="dkd.")  # the detector's grid of pixels is no weight
         self.network.eval()
 
@@ -184,7 +187,8 @@ class ALIKED(nn.Module):
             ValueError: The images or the mask have another shape or type.
         """
         check_images(images, mask)
-        found = self.network(images.float())
+        with images.device:  # kornia makes tensors on the default device
+            found = self.network(images.float())
         rows = [
             _features(
                 one.keypoints[None],
@@ -204,10 +208,12 @@ class ALIKED(nn.Module):
     ) -> Features:
         """Describe keypoints found before, in the same rows, whatever their scores are now; as `XFeat.read`."""
         check_images(images)
-        maps, heat = self.network.extract_dense_map(images.float().expand(-1, 3, -1, -1))
+        with images.device:
+            maps, heat = self.network.extract_dense_map(images.float().expand(-1, 3, -1, -1))
         places = _peaks_near(heat[:, 0].float(), keypoints.to(torch.float32))
         located, scores = self._located(heat, places)
-        descriptors, _ = self.network.desc_head(maps, list(located))
+        with images.device:
+            descriptors, _ = self.network.desc_head(maps, list(located))
         size = located.new_tensor([images.shape[3] - 1, images.shape[2] - 1])
         return _features(
             size * (located + 1) / 2,
@@ -218,12 +224,12 @@ class ALIKED(nn.Module):
             ALIKED_NOISE,
         )
 
-    @full_precision
+    @without_autocast
     def _located(self, heat: Tensor, places: Tensor) -> tuple[Tensor, Tensor]:
         """Keypoints (B, N, 2), from -1 to 1 over the image, and scores (B, N), as the network's detector has them."""
         detector, heat = self.network.dkd, heat.float()
         weights = torch.softmax(_windows(heat[:, 0], places).flatten(2) / detector.temperature, dim=-1)
-        positions = places + weights @ torch.as_tensor(detector.hw_grid)
+        positions = places + weights @ torch.as_tensor(detector.hw_grid, device=weights.device)
         located = positions / positions.new_tensor([heat.shape[3] - 1, heat.shape[2] - 1]) * 2 - 1
         scores = F.grid_sample(heat, located[:, None], mode="bilinear", align_corners=True)
         return located, scores[:, 0, 0]
@@ -232,7 +238,7 @@ class ALIKED(nn.Module):
 class _FullPrecision(nn.Sequential):
     """Layers in the precision of their parameters also under autocast: a rounded logit moves its keypoint."""
 
-    forward = full_precision(nn.Sequential.forward)
+    forward = without_autocast(nn.Sequential.forward)
 
 
 _RADIUS = 2  # of the window around a peak that locates a keypoint

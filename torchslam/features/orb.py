@@ -17,6 +17,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor, nn
 
 from torchslam.features.brief import blur, describe, orientations
+from torchslam.features.contract import check_gray
 from torchslam.features.corners import (
     Bands,
     fast_scores,
@@ -133,6 +134,7 @@ class ORB(nn.Module):
 
         Raises:
             ValueError: The images or the mask have another shape or type.
+            FrameError: The images are not in [0, 1].
         """
         corners = self.detect(images, mask)
         stride, dtype = corners.pyramid.stride, images.dtype
@@ -299,13 +301,15 @@ def check_images(images: Tensor, mask: Tensor | None = None) -> None:
 
     Raises:
         ValueError: The images are not (B, 1, H, W) floats, or the mask is not (B, 1, H, W) bool.
+        FrameError: The images are not in [0, 1].
     """
     if mask is not None and (mask.shape != images.shape or mask.dtype != torch.bool):
         raise ValueError(f"a mask must be bool {tuple(images.shape)}, got {mask.dtype} {tuple(mask.shape)}")
     if images.dim() != 4 or images.shape[1] != 1 or 0 in images.shape:
         raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
-    if not images.is_floating_point():
-        raise ValueError(f"images must be floats in [0, 1], got {images.dtype}")
+    if images.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"images must be float32 or float64, in [0, 1], got {images.dtype}")
+    check_gray(images, "images")
 
 
 def gray_bytes(images: Float[Tensor, "B 1 H W"]) -> UInt8[Tensor, "B H W"]:
@@ -350,12 +354,14 @@ class OpenCVORB(nn.Module):
         found, described = self._orb.detectAndCompute(image.numpy(), mask) if roomy else ((), None)
         # cv2 may return a few more than asked for when responses tie.
         rows = sorted(range(len(found)), key=lambda row: -found[row].response)[: self.num_keypoints]
-        values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype).repeat(self.num_keypoints, 1)
-        descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8)
-        found_mask = torch.arange(self.num_keypoints) < len(rows)
+        values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype, device="cpu").repeat(self.num_keypoints, 1)
+        descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8, device="cpu")
+        found_mask = torch.arange(self.num_keypoints, device="cpu") < len(rows)
         if described is not None:
             points = [found[row] for row in rows]
-            values[: len(rows)] = torch.tensor([self._row(point) for point in points], dtype=dtype)
+            values[: len(rows)] = torch.tensor(
+                [self._row(point) for point in points], dtype=dtype, device="cpu"
+            )
             descriptors[: len(rows)] = torch.from_numpy(described[rows])
         return values[:, :2], values[:, 2], values[:, 3], values[:, 4], descriptors, found_mask
 

@@ -53,7 +53,7 @@ def plan_grid(
         threshold: the FAST score that a corner must exceed.
         device: of the grid.
     """
-    table = torch.full((pyramid.rows, pyramid.stride), -1, dtype=torch.int32)
+    table = torch.full((pyramid.rows, pyramid.stride), -1, dtype=torch.int32, device="cpu")
     budgets = _level_budgets(num_keypoints, pyramid, border)
     levels: list[int] = []
     for level, ((h, w), (top, left)) in enumerate(zip(pyramid.sizes, pyramid.corners, strict=True)):
@@ -62,8 +62,8 @@ def plan_grid(
             continue
         cell = math.sqrt(inner_h * inner_w * per_cell / budgets[level])
         down, across = max(1, round(inner_h / cell)), max(1, round(inner_w / cell))
-        row = torch.arange(inner_h) * down // inner_h
-        column = torch.arange(inner_w) * across // inner_w
+        row = torch.arange(inner_h, device="cpu") * down // inner_h
+        column = torch.arange(inner_w, device="cpu") * across // inner_w
         cells = row[:, None] * across + column + len(levels)
         table[top + border : top + h - border, left + border : left + w - border] = cells.to(torch.int32)
         levels += [level] * (down * across)

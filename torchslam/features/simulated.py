@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchslam.features.contract import BINARY_BYTES
 from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features
 
 LEVELS, FACTOR = 8, 1.2  # the pyramid of the scales, as that of ORB
@@ -39,6 +40,7 @@ class SimulatedFeatures:
         seed: of all random numbers.
     """
 
+    @without_autocast
     def __init__(
         self,
         T_cw: Float[Tensor, "K 4 4"],
@@ -67,9 +69,11 @@ class SimulatedFeatures:
         self.points_w = T_cw.new_zeros(0, 3)
         self._scatter(T_wc, points_per_view, generator)
         # Where more are visible than a frame may have keypoints, the same ones win in every frame.
-        self.strengths = torch.rand(len(self.points_w), generator=generator)
+        self.strengths = torch.rand(
+            len(self.points_w), generator=generator, dtype=torch.float32, device="cpu"
+        )
         self.descriptors = torch.randint(
-            0, 256, (len(self.points_w), BINARY_BYTES), generator=generator, dtype=torch.uint8
+            0, 256, (len(self.points_w), BINARY_BYTES), generator=generator, dtype=torch.uint8, device="cpu"
         )
 
     def _scatter(self, T_wc: Tensor, per_view: int, generator: torch.Generator) -> None:
@@ -80,10 +84,12 @@ class SimulatedFeatures:
             missing = per_view - int(self._visible(se3_inverse(pose))[1].sum())
             if missing <= 0:
                 continue
-            pixels = torch.rand(missing, 2, generator=generator, dtype=pose.dtype) * pose.new_tensor(
-                [width - 1, height - 1]
+            pixels = torch.rand(
+                missing, 2, generator=generator, dtype=pose.dtype, device="cpu"
+            ) * pose.new_tensor([width - 1, height - 1])
+            depth = near * (far / near) ** torch.rand(
+                missing, 1, generator=generator, dtype=pose.dtype, device="cpu"
             )
-            depth = near * (far / near) ** torch.rand(missing, 1, generator=generator, dtype=pose.dtype)
             rays = self.camera.unproject(pixels)
             self.points_w = torch.cat([self.points_w, transform(pose, rays / rays[:, 2:] * depth)])
             if self.scales:
@@ -93,7 +99,7 @@ class SimulatedFeatures:
         self, T_wc: Float[Tensor, "4 4"], depth: Float[Tensor, " N"], generator: torch.Generator
     ) -> None:
         """Give new points at these depths in the view T_wc sizes, of any level, and directions in its image."""
-        draw = torch.rand(2, len(depth), generator=generator, dtype=depth.dtype)
+        draw = torch.rand(2, len(depth), generator=generator, dtype=depth.dtype, device="cpu")
         sizes = FACTOR ** ((LEVELS - 1) * draw[0]) * depth / self.camera.focal
         angle = 2 * torch.pi * draw[1]
         directions_c = torch.stack([angle.cos(), angle.sin(), torch.zeros_like(angle)], -1)
@@ -120,6 +126,7 @@ class SimulatedFeatures:
         angle = torch.atan2(image[:, 1], image[:, 0])
         return pixels, visible & (level >= 0) & (level < LEVELS), level, angle
 
+    @without_autocast
     def __call__(self, T_cw: Float[Tensor, "4 4"], frame_index: int) -> Features:
         """Return the features (a batch of one) of the frame with this true pose."""
         generator = torch.Generator().manual_seed((self.seed * 1_000_003 + frame_index) % 2**63)
@@ -127,14 +134,18 @@ class SimulatedFeatures:
         width, height = self.camera.size
         pixels, visible, level, angle = self._visible(T_cw)
         ids = torch.nonzero(visible)[:, 0]
-        ids = ids[torch.rand(len(ids), generator=generator) >= self.dropout]
+        ids = ids[
+            torch.rand(len(ids), generator=generator, dtype=torch.float32, device="cpu") >= self.dropout
+        ]
         strongest = torch.argsort(self.strengths[ids], descending=True)[: self.num_keypoints]
-        ids = ids[strongest[torch.randperm(len(strongest), generator=generator)]]
+        ids = ids[strongest[torch.randperm(len(strongest), generator=generator, device="cpu")]]
         scales = FACTOR ** level[ids]
-        noise = torch.randn(len(ids), 2, generator=generator, dtype=pixels.dtype)
+        noise = torch.randn(len(ids), 2, generator=generator, dtype=pixels.dtype, device="cpu")
         keypoints = pixels[ids] + self.noise_px * scales[:, None] * noise
-        anywhere = torch.rand(len(ids), 2, generator=generator, dtype=pixels.dtype)
-        is_outlier = torch.rand(len(ids), 1, generator=generator) < self.outliers
+        anywhere = torch.rand(len(ids), 2, generator=generator, dtype=pixels.dtype, device="cpu")
+        is_outlier = (
+            torch.rand(len(ids), 1, generator=generator, dtype=torch.float32, device="cpu") < self.outliers
+        )
         keypoints = torch.where(is_outlier, anywhere * pixels.new_tensor([width - 1, height - 1]), keypoints)
         return self._padded(keypoints, scales, angle[ids], self.descriptors[ids]).to(device)
 
@@ -147,8 +158,8 @@ class SimulatedFeatures:
     ) -> Features:
         """Features of `num_keypoints` rows, those beyond the keypoints masked."""
         n, N = len(keypoints), self.num_keypoints
-        mask = torch.arange(N) < n
-        ones = torch.ones(1, N, dtype=keypoints.dtype)
+        mask = torch.arange(N, device="cpu") < n
+        ones = torch.ones(1, N, dtype=keypoints.dtype, device="cpu")
         return Features(
             torch.cat([keypoints, keypoints.new_zeros(N - n, 2)])[None],
             ones,

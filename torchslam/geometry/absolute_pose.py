@@ -11,7 +11,12 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient, refuse_transforms
+from torchslam.geometry.estimate_gradients import (
+    implicit_step,
+    needs_gradient,
+    refuse_transforms,
+    with_zero_gradient,
+)
 from torchslam.geometry.lie import rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
@@ -26,6 +31,7 @@ from torchslam.geometry.ransac import (
     ModelState,
     best_models,
     best_of,
+    check_search,
     gather_rows,
     is_significant,
     levenberg_marquardt,
@@ -94,18 +100,19 @@ def estimate_absolute_pose(
         The poses; `success` is False for a camera with too few points, points on a line, or pure noise.
 
     Raises:
-        ValueError: The shapes of points and pixels do not agree.
+        ValueError: A shape or a dtype does not fit.
         RuntimeError: It is called within a transform of `torch.func`.
     """
     refuse_transforms("estimate_absolute_pose")
-    if points_w.dim() != 3 or pixels.shape != (*points_w.shape[:2], 2):
-        shapes = f"{tuple(points_w.shape)} and {tuple(pixels.shape)}"
-        raise ValueError(f"points_w and pixels must be (B, N, 3) and (B, N, 2), not {shapes}")
+    check_search(threshold, confidence, max_samples)
     B, N = pixels.shape[:2]
     if B == 0 or N < 3:
         nothing = torch.zeros(B, N, dtype=torch.bool, device=pixels.device)
         T_cw = torch.eye(4, dtype=points_w.dtype, device=points_w.device).expand(B, 4, 4)
-        return AbsolutePose(T_cw, nothing, torch.zeros_like(T_cw[:, 0, 0], dtype=torch.bool), T_cw[:, 0, 1])
+        T_cw = with_zero_gradient(T_cw, points_w, pixels, camera.params)
+        return AbsolutePose(
+            T_cw, nothing, torch.zeros_like(T_cw[:, 0, 0], dtype=torch.bool), T_cw.detach()[:, 0, 1]
+        )
     finite = torch.isfinite(points_w).all(-1) & torch.isfinite(pixels).all(-1)
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)
@@ -154,6 +161,7 @@ def start_pose(
         T_cw, locally optimized on its inliers; None if wrong matches could agree as well, or if the inliers are on a
         line.
     """
+    check_search(threshold, confidence, max_samples)
     if len(points_w) < 4:
         return None
     center = points_w.mean(0)
@@ -366,9 +374,9 @@ def is_success(
     """
     chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
-    weights = inliers[..., None].to(points.dtype)
-    mean = (weights * points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
-    centered = weights * (points - mean)
+    inliers = inliers[..., None]
+    mean = torch.where(inliers, points, 0.0).sum(1, keepdim=True) / inliers.sum(1, keepdim=True).clamp_min(1)
+    centered = torch.where(inliers, points - mean, 0.0)
     spread = torch.linalg.eigvalsh(centered.mT @ centered)
     return significant & (spread[:, 1] > _ON_A_LINE * spread[:, 2])
 

@@ -7,16 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch._C import _are_functorch_transforms_active
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
 
 from torchslam.geometry import distortion
+from torchslam.geometry.precision import without_autocast
 
 Scalar = float | Tensor
 
@@ -25,8 +26,9 @@ Scalar = float | Tensor
 class Camera:
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
 
-    Every method is differentiable with respect to points, pixels and `params`. A camera is a pytree with `params`
-    as its only leaf, so that `torch.func` and `torch.utils.data.default_collate` accept it.
+    Every method is differentiable with respect to points, pixels and `params`, up to the third order where it undoes a
+    distortion. A camera is a pytree with `params` as its only leaf, so that `torch.func` and
+    `torch.utils.data.default_collate` accept it.
 
     Attributes:
         model: "pinhole", "radial_tangential" or "fisheye".
@@ -42,6 +44,12 @@ class Camera:
     def __post_init__(self) -> None:
         if self.model not in distortion.MODELS:
             raise ValueError(f"unknown camera model {self.model!r}; known are {', '.join(distortion.MODELS)}")
+        if not isinstance(self.params, Tensor):
+            raise TypeError(f"params of a camera must be a tensor, not {type(self.params).__name__}")
+        if len(self.size) != 2 or not all(side > 0 and side == int(side) for side in self.size):
+            raise ValueError(f"size of a camera must be (width, height) in pixels, not {self.size}")
+        if self.params.dtype not in (torch.float32, torch.float64):
+            raise ValueError(f"params of a camera must be float32 or float64, not {self.params.dtype}")
         expected = 4 + distortion.MODELS[self.model].num_params
         if self.params.shape[-1:] != (expected,):
             shape = tuple(self.params.shape)
@@ -127,10 +135,18 @@ class Camera:
         entries = (self.fx, zero, self.cx, zero, self.fy, self.cy, zero, zero, one)
         return torch.stack(entries, dim=-1).unflatten(-1, (3, 3))
 
-    @cached_property
+    @property
     def limit(self) -> Float[Tensor, "*batch"]:
         """Extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
-        return self._distortion.limit(self.params.detach()[..., 4:])
+        k = self.params.detach()[..., 4:]
+        if torch.compiler.is_compiling() or _are_functorch_transforms_active():
+            return self._distortion.limit(k)
+        # Kept, since it takes longer than the distortion itself, until an optimizer changes the parameters in place.
+        known = self.__dict__.get("_limit")
+        if known is None or not torch.equal(known[0], k):
+            known = self.__dict__["_limit"] = k.clone(), self._distortion.limit(k)
+        limit: Tensor = known[1]
+        return limit
 
     @property
     def _distortion(self) -> distortion.Distortion:
@@ -148,7 +164,7 @@ class Camera:
         index = index if isinstance(index, tuple) else (index,)
         chosen = self.with_params(self.params[(*index, ..., slice(None))])
         if self.model != "pinhole":  # found once for each camera, not for each time that it is chosen
-            chosen.__dict__["limit"] = self.limit[index]
+            chosen.__dict__["_limit"] = chosen.params.detach()[..., 4:].clone(), self.limit[index]
         return chosen
 
     @staticmethod
@@ -167,6 +183,7 @@ class Camera:
         """Move the camera to another device or dtype; arguments as of `Tensor.to`."""
         return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
+    @without_autocast
     def project(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"]]:
@@ -180,6 +197,7 @@ class Camera:
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
         return self._to_pixels(distorted, valid), valid
 
+    @without_autocast
     def project_with_point_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"], Float[Tensor, "*#batch N 2 3"]]:
@@ -203,6 +221,7 @@ class Camera:
         J = rows.unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
         return self._to_pixels(distorted, valid), valid, J
 
+    @without_autocast
     def project_with_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[
@@ -225,6 +244,7 @@ class Camera:
         J_params = torch.cat((torch.diag_embed(distorted), J_center, J_coefficients), dim=-1)
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
+    @without_autocast
     def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Compute undistorted image coordinates x/z, y/z of pixels.
 
@@ -236,12 +256,14 @@ class Camera:
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
 
+    @without_autocast
     def unproject(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 3"]:
         """Compute bearings of unit length of pixels."""
         normalized = self.normalize(pixels)
         ray = torch.cat((normalized, torch.ones_like(normalized[..., :1])), dim=-1)
         return ray / ray.norm(dim=-1, keepdim=True)
 
+    @without_autocast
     def in_image(self, pixels: Float[Tensor, "*batch 2"], border: float = 0.0) -> Bool[Tensor, "*batch"]:
         """Test whether pixels lie inside the image, `border` pixels away from its edge."""
         x, y = pixels.unbind(-1)
@@ -249,6 +271,7 @@ class Camera:
         low = border - 0.5
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
+    @without_autocast
     def pixel_scale(self, normalized: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Pixels per unit of undistorted image coordinates, along x and y, locally.
 
@@ -280,10 +303,10 @@ class Camera:
 
 
 def _stack(*values: Scalar) -> Float[Tensor, "*batch P"]:
-    """Parameters from floats and tensors; float64 unless a tensor says otherwise."""
+    """Parameters from floats and tensors; float64 on the CPU unless a tensor says otherwise."""
     tensors = [value for value in values if isinstance(value, Tensor)]
     dtype = tensors[0].dtype if tensors else torch.float64
-    device = tensors[0].device if tensors else None
+    device = tensors[0].device if tensors else "cpu"
     columns = [torch.as_tensor(value, dtype=dtype, device=device) for value in values]
     return torch.stack(torch.broadcast_tensors(*columns), dim=-1)
 

@@ -1,9 +1,9 @@
 """Lens distortions: maps between undistorted (x/z, y/z) and distorted image coordinates at focal length one.
 
 Each model has its map, the map's Jacobians, its inverse, and the limit up to which it is monotone. The
-inverses are solved by Newton's method without a graph; their gradient comes from one differentiable Newton
-step at the solution (implicit function theorem), so it is exact to first order and costs the same however
-many steps were needed. Coefficients are (..., 1 or N, K) against points (..., N, 2).
+inverses are solved by Newton's method without a graph; their gradient comes from two differentiable Newton
+steps at the solution, so it is exact up to the third order and costs the same however many steps were needed.
+Coefficients are (..., 1 or N, K) against points (..., N, 2).
 """
 
 from __future__ import annotations
@@ -15,10 +15,13 @@ from dataclasses import dataclass
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch._C import _are_functorch_transforms_active
 
-from torchslam.geometry.estimate_gradients import first_order, needs_gradient
+from torchslam.geometry.estimate_gradients import needs_gradient
 
 _NEWTON_STEPS = 12
+_GRAPH_STEPS = 2
+"""Newton steps from the solution on that gradients pass: one gives the first derivative, two give three."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,12 @@ def first_positive_root(coefficients: Float[Tensor, "*batch D"]) -> Float[Tensor
 
 
 def _converged(step: Tensor) -> bool:
-    """Test whether the next Newton step, about the square of the largest one, would have no effect."""
+    """Test whether the next Newton step, about the square of the largest one, would have no effect.
+
+    Under `torch.func`, where no decision may depend on values, all steps are taken.
+    """
+    if _are_functorch_transforms_active():
+        return False
     return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.5
 
 
@@ -165,10 +173,11 @@ def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) ->
                 break
     if not needs_gradient(distorted, k):
         return xy
-    slope = _radial_tangential_slope(xy, k.detach())
-    step = _implicit_step(slope, _radial_tangential(xy, k) - distorted)
     clamped = length(xy)[..., None] >= edge * (1 - 1e-9)
-    return xy + torch.where(clamped, 0.0, first_order(step - step.detach()))
+    for _ in range(_GRAPH_STEPS):
+        step = _implicit_step(_radial_tangential_slope(xy, k), _radial_tangential(xy, k) - distorted)
+        xy = xy + torch.where(clamped, 0.0, step - step.detach())
+    return xy
 
 
 def _radial_tangential_limit(k: Tensor) -> Tensor:
@@ -235,10 +244,10 @@ def _fisheye_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
             angle = torch.minimum((angle - (_bent(angle, k) - bent) / slope).clamp_min(0.0), edge)
             if _converged(angle - before):
                 break
-        slope = _bent_slope(angle, k).clamp_min(1e-3)
         clamped = angle >= edge
-    step = -(_bent(angle, k) - bent) / slope
-    angle = angle + torch.where(clamped, 0.0, first_order(step - step.detach()))
+    for _ in range(_GRAPH_STEPS if needs_gradient(distorted, k) else 0):
+        step = -(_bent(angle, k) - bent) / _bent_slope(angle, k).clamp_min(1e-3)
+        angle = angle + torch.where(clamped, 0.0, step - step.detach())
     factor = torch.tan(angle) / bent
     return distorted * torch.where(zero, 1.0, factor)[..., None]
 

@@ -116,7 +116,7 @@ def _constraints(basis: Float[Tensor, "B 4 9"]) -> Float[Tensor, "B 10 20"]:
     )
     determinant = (normals[:, None] * E[:, 0]).sum(2)
     rows = (
-        (table @ part.reshape(table.shape[1], -1)).view(len(table), -1, len(basis))
+        (table @ part.reshape(table.shape[1], -1)).view(len(table), math.prod(part.shape[2:-1]), len(basis))
         for part in (cubic, determinant)
     )
     return torch.cat(tuple(rows), dim=1).permute(2, 1, 0)
@@ -150,7 +150,7 @@ def _elimination(constraints: Float[Tensor, "B 10 20"]) -> Float[Tensor, "B 3 3 
 @lru_cache(maxsize=16)
 def _product_table(degree_a: int, degree_b: int, dtype: torch.dtype, device: torch.device) -> Tensor:
     """((a + 1)(b + 1), a + b + 1) which power each product of two coefficients belongs to."""
-    power = torch.arange(degree_a + 1)[:, None] + torch.arange(degree_b + 1)
+    power = torch.arange(degree_a + 1, device="cpu")[:, None] + torch.arange(degree_b + 1, device="cpu")
     return torch.nn.functional.one_hot(power.flatten()).to(dtype=dtype, device=device)
 
 
@@ -193,7 +193,7 @@ def _real_roots(polynomial: Float[Tensor, "B 11"]) -> tuple[Float[Tensor, " R"],
         return torch.where(inverse, angle.cos() / angle.sin(), angle.tan())
 
     low, high = ends(angle[cell]), ends(angle[cell + 1])
-    sign = torch.where(negative[row, cell], -1.0, 1.0)
+    sign = torch.where(negative[row, cell], -1.0, 1.0).to(polynomial.dtype)
     z = 0.5 * (low + high)
     for _ in range(_NEWTON_STEPS):
         value, slope = torch.addcmul(coefficients[9], coefficients[10], z), coefficients[10]

@@ -21,6 +21,15 @@ def needs_gradient(*tensors: Tensor) -> bool:
     return recorded or _are_functorch_transforms_active() or forward_ad._current_level >= 0
 
 
+def with_zero_gradient(tensor: Float[Tensor, "*batch"], *inputs: Tensor) -> Float[Tensor, "*batch"]:
+    """The tensor, with a gradient of zero to the inputs: without a graph, `backward` would raise an error."""
+    never = torch.zeros((), dtype=torch.bool, device=tensor.device)
+    for each in inputs:
+        if needs_gradient(each):
+            tensor = tensor + torch.where(never, each.sum(), 0.0)
+    return tensor
+
+
 def refuse_transforms(name: str) -> None:
     """Raise RuntimeError within a transform of `torch.func`, for an estimator that chooses among random samples."""
     if _are_functorch_transforms_active():
@@ -70,9 +79,7 @@ class _Last(torch.autograd.Function):
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> Any:
-        raise RuntimeError(
-            "the second derivative of an estimate by RANSAC, of an alignment or of an undistorted pixel is not known"
-        )
+        raise RuntimeError("the second derivative of an estimate by RANSAC or of an alignment is not known")
 
 
 def implicit_step(

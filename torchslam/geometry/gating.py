@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import full_precision, without_autocast
 
 
 def triangle(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 3"]:
@@ -182,6 +182,7 @@ def squared_reprojection_errors(
     return ((projected - pixels) ** 2).sum(-1).where(valid, torch.inf)
 
 
+@without_autocast
 def passes_gate(
     squared: Float[Tensor, "*batch"], chi_square: float = CHI_SQUARE_95
 ) -> Bool[Tensor, "*batch"]:
@@ -191,7 +192,9 @@ def passes_gate(
 
 @full_precision
 def innovation_covariances(
-    J: Float[Tensor, "*#batch 2 D"], covariances: Float[Tensor, "*#batch D D"], sigmas: Float[Tensor, "..."]
+    J: Float[Tensor, "*#batch 2 D"],
+    covariances: Float[Tensor, "*#batch D D"],
+    sigmas: Float[Tensor, "*#batch"] | Float[Tensor, "*#batch 2 2"],
 ) -> Float[Tensor, "*#batch 2 2"]:
     """Covariances S = R + J Sigma J^T of measured minus predicted pixels, px^2.
 

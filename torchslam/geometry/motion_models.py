@@ -108,7 +108,7 @@ def fit_models(
         noise = noise_variance(essential, views.mask).clamp_min(1.0)[:, None]
         off = ((rough.squared[1:] > _CLEARLY_OFF**2 * noise) & near.mask).sum(-1)
         count = near.mask.sum(-1)
-        hopeless = (off > _HOPELESS * count).all(0) & (count >= _MANY)
+        hopeless = (off > _HOPELESS * count.float()).all(0) & (count >= _MANY)
         if bool(hopeless.all()):
             return rough
     (R_only,), _ = best_of(*fit_rotation(views, R_only, _TRIAL_ITERATIONS, FINAL_WIDTH))
@@ -154,7 +154,7 @@ def choose(
             certain = is_unlikely(against, count, size, nearby.maximum(chance ** (size - 1)))
         else:
             certain = is_significant(against, count, 2, chance, 1)
-        return certain & (against > _LEAST_SHARE * explained.sum(-1))
+        return certain & (against > _LEAST_SHARE * explained.sum(-1).float())
 
     off = torch.stack((contradicted(homography, essential), contradicted(rotation, essential)))
     if by_noise:
@@ -204,7 +204,7 @@ def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -
     ahead, parallax = ahead_and_parallax(views, fits.R[:, None], fits.t[:, None])
     # The noise of both images is in it.
     clear = near & (parallax[:, 0] > _FARTHEST * (2 * variance).sqrt())
-    return mostly & ((clear & ahead[:, 0]).sum(-1) < _IN_FRONT * clear.sum(-1))
+    return mostly & ((clear & ahead[:, 0]).sum(-1) < _IN_FRONT * clear.sum(-1).float())
 
 
 class PlaneMotions(NamedTuple):
@@ -231,7 +231,7 @@ class PlaneMotions(NamedTuple):
         # All of the plane must be in front of the first camera, and then is in front of the second.
         plane = views.mask & (fits.squared[HOMOGRAPHY] < 1)
         ahead = ((views.h_1 @ normals.mT) > 0) & plane[..., None]
-        share = ahead.sum(1) / plane.sum(1, keepdim=True).clamp_min(1)
+        share = ahead.sum(1).float() / plane.sum(1, keepdim=True).clamp_min(1)
         length = t.norm(dim=-1, keepdim=True)
         direction = t / length.clamp_min(1e-12)
         squared = sampson_squared(views, R, direction)
@@ -260,7 +260,7 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Bool[Tensor
 
     costs = cost(plane.squared).where(plane.possible, torch.inf)
     excess = costs.amin(-1) - cost(fits.squared[ESSENTIAL][:, None])[:, 0]
-    return excess <= (_FARTHEST**2 * _LEAST_SHARE * near.sum(-1)).clamp_min(_GAIN_OF_A_FIT)
+    return excess <= (_FARTHEST**2 * _LEAST_SHARE * near.sum(-1).float()).clamp_min(_GAIN_OF_A_FIT)
 
 
 def pose_of(

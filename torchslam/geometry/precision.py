@@ -10,6 +10,8 @@ import torch
 from torch import Tensor
 from torch._C import _is_any_autocast_enabled
 
+from torchslam.geometry.signatures import check_arguments
+
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -18,13 +20,24 @@ _DTYPES = (torch.float32, torch.float64)
 
 
 def full_precision(function: Callable[P, R]) -> Callable[P, R]:
-    """The function, with the same bits under `torch.autocast` as without.
+    """The function, with the same bits under `torch.autocast` as without, for tensors that its signature allows.
 
-    Autocast would multiply matrices in bfloat16: rotations wrong in the third digit that look like any other.
+    Autocast would multiply matrices in bfloat16: rotations wrong in the third digit that look like any other. All
+    tensors of floats must have one dtype.
     """
+    return _precise(function, one_dtype=True)
 
+
+def without_autocast(function: Callable[P, R]) -> Callable[P, R]:
+    """As `full_precision`, for tensors of floats that may be of several dtypes."""
+    return _precise(function, one_dtype=False)
+
+
+def _precise(function: Callable[P, R], one_dtype: bool) -> Callable[P, R]:
     @wraps(function)
     def precise(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not (torch.compiler.is_compiling() or torch.jit.is_tracing()):
+            check_arguments(function, args, kwargs, one_dtype)
         if not _is_any_autocast_enabled():
             return function(*args, **kwargs)
         for device_type in _DEVICE_TYPES:
@@ -45,3 +58,10 @@ def check_dtypes(**tensors: Tensor | None) -> None:
             raise ValueError(f"{name} must be float32 or float64, not {dtype}")
         if dtype != expected:
             raise ValueError(f"{name} is {dtype}, but {first} is {expected}: all must be the same")
+
+
+def check_positive(**numbers: float | None) -> None:
+    """Raises ValueError unless all numbers that are given are above zero; names the first that is not."""
+    for name, number in numbers.items():
+        if number is not None and not number > 0:
+            raise ValueError(f"{name} must be above zero, not {number}")

@@ -14,11 +14,19 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.lie import cayley_rotation, identity
+from torchslam.geometry.precision import check_positive
 
 ModelState = tuple[Tensor, ...]
 
 _MAX_VALUES_AT_ONCE = 300_000
 _MIN_ITERATIONS = 2  # before it may stop
+
+
+def check_search(threshold: float, confidence: float, max_samples: int, min_samples: int = 1) -> None:
+    """Raises ValueError for options of a search that make no sense."""
+    check_positive(threshold=threshold, min_samples=min_samples, max_samples=max_samples)
+    if not 0 < confidence < 1:
+        raise ValueError(f"confidence must be a probability, above 0 and below 1, not {confidence}")
 
 
 def levenberg_marquardt(
@@ -42,6 +50,7 @@ def levenberg_marquardt(
     """
     A, cost = evaluate(*state)
     damping = torch.full_like(cost, 1e-4)[:, None, None]
+    less, more = cost.new_tensor((0.1, 10.0), dtype=torch.float32).unbind()
     eye = identity(A.shape[-1] - 1, A.dtype, A.device)
     for iteration in range(iterations):
         H, g = A[:, :-1, :-1], A[:, :-1, -1]
@@ -55,7 +64,7 @@ def levenberg_marquardt(
         better = cost_moved < cost
         A, cost, *rest = _select(better, (A_moved, cost_moved, *moved), (A, cost, *state))
         state = tuple(rest)
-        damping = damping * torch.where(better, 0.1, 10.0)[:, None, None]
+        damping = damping * torch.where(better, less, more)[:, None, None]
     return state, cost
 
 
@@ -115,7 +124,9 @@ def sample_minimal(
     per_permutation = (available // size).clamp_min(1)
     permutations = math.ceil(count / int(per_permutation.min()))
     # Many permutations of few rows are cheap; of many rows few are needed.
-    keys = torch.rand(B, permutations, N, generator=generator).to(mask.device)
+    keys = torch.rand(B, permutations, N, generator=generator, dtype=torch.float32, device="cpu").to(
+        mask.device
+    )
     order = torch.where(mask[:, None], keys, 2.0).argsort(-1).flatten(1)
     sample = torch.arange(count, device=mask.device)
     start = sample // per_permutation[:, None] * N + sample % per_permutation[:, None] * size
@@ -130,7 +141,9 @@ def sample_minimal_of_all(
 ) -> Int[Tensor, "{count} {size}"]:
     """The samples of `sample_minimal` for one problem whose mask has all rows, in few calls."""
     each = rows // size
-    order = torch.rand(math.ceil(count / each), rows, generator=generator).argsort(1)
+    order = torch.rand(
+        math.ceil(count / each), rows, generator=generator, dtype=torch.float32, device="cpu"
+    ).argsort(1)
     return order[:, : size * each].reshape(-1, size)[:count]
 
 
@@ -166,7 +179,7 @@ def samples_needed(
     ratios = [k / max(n, 1) for k, n in zip(inliers.tolist(), available.tolist(), strict=True)]
     clean = [min(max(ratio, 1e-6), 1 - 1e-6) ** size for ratio in ratios]
     needed = [math.log(1 - confidence) / math.log1p(-min(share, 1 - 1e-6)) for share in clean]
-    return torch.tensor(needed, dtype=torch.float64)
+    return torch.tensor(needed, dtype=torch.float64, device="cpu")
 
 
 def gather_rows(

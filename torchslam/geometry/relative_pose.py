@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import get_args
 
@@ -11,11 +12,17 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.essential import essential_from_pose, sampson_errors
-from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient, refuse_transforms
+from torchslam.geometry.estimate_gradients import (
+    implicit_step,
+    needs_gradient,
+    refuse_transforms,
+    with_zero_gradient,
+)
 from torchslam.geometry.homography import transfer_errors
 from torchslam.geometry.lie import rigid, so3_exp
 from torchslam.geometry.motion_models import ESSENTIAL, HOMOGRAPHY, MODELS, ROTATION
 from torchslam.geometry.precision import full_precision
+from torchslam.geometry.ransac import check_search
 from torchslam.geometry.relative_pose_search import (
     KERNEL_WIDTH,
     FoundPose,
@@ -33,8 +40,10 @@ class RelativePose:
     """Relative poses of B pairs of views.
 
     Attributes:
-        T_21: from camera 1 to camera 2, translation of length one, or zero for "rotation". The most
-            likely pose even without `success`; the identity for fewer than six matches.
+        T_21: from camera 1 to camera 2, translation of length one, or zero for "rotation"; the identity, without
+            gradient, where the inliers may be an accident. Where it is `ambiguous`, or a "rotation", which does not
+            determine the direction, this is the more likely pose or the rotation, with its gradient, though
+            `success` is False.
         inliers: matches within the threshold of the chosen model.
         success: whether rotation and direction are determined: the inliers are significant, the motion is no
             pure rotation, and the plane, if any, is not ambiguous.
@@ -123,13 +132,17 @@ def estimate_relative_pose(
         The relative poses.
 
     Raises:
-        ValueError: Wrong shapes, or an unknown model or kernel.
+        ValueError: A shape or a dtype does not fit, or an unknown model or kernel.
         RuntimeError: It is called within a transform of `torch.func`.
     """
     refuse_transforms("estimate_relative_pose")
-    _check(pixels_1, pixels_2, weights, model, kernel)
+    check_search(threshold, confidence, max_samples, min_samples)
+    for name, value, known in (("model", model, _MODELS), ("kernel", kernel, _KERNELS)):
+        if value not in known:
+            raise ValueError(f"unknown {name} {value!r}; known are {', '.join(known)}")
     if 0 in pixels_1.shape or pixels_1.shape[1] < 5:
-        return _nothing(pixels_1)
+        given = pixels_1, pixels_2, camera_1.params, camera_2.params, *([] if weights is None else [weights])
+        return _nothing(pixels_1, given)
     mask = _usable(pixels_1, pixels_2, mask, weights)
     pixels_1, pixels_2 = (torch.where(mask[..., None], pixels, 0.0) for pixels in (pixels_1, pixels_2))
     inputs = [pixels_1, pixels_2, camera_1.params, camera_2.params, *([] if weights is None else [weights])]
@@ -150,8 +163,9 @@ def estimate_relative_pose(
 
 def _answer(T_21: Float[Tensor, "B 4 4"], found: FoundPose) -> RelativePose:
     """The result, with a pose that may carry a gradient."""
+    identity = torch.eye(4, dtype=T_21.dtype, device=T_21.device)
     return RelativePose(
-        T_21,
+        torch.where(found.significant[:, None, None], T_21, identity),
         found.inliers,
         found.significant & (found.model != ROTATION) & ~found.ambiguous,
         found.model,
@@ -175,25 +189,16 @@ def _usable(
     return finite if mask is None else mask & finite
 
 
-def _check(pixels_1: Tensor, pixels_2: Tensor, weights: Tensor | None, model: str, kernel: str) -> None:
-    if pixels_1.dim() != 3 or pixels_1.shape != pixels_2.shape or pixels_1.shape[-1] != 2:
-        shapes = f"{tuple(pixels_1.shape)} and {tuple(pixels_2.shape)}"
-        raise ValueError(f"pixels_1 and pixels_2 must both be (B, N, 2), not {shapes}")
-    if weights is not None and weights.shape != pixels_1.shape[:2]:
-        raise ValueError(f"weights must be {tuple(pixels_1.shape[:2])}, not {tuple(weights.shape)}")
-    for name, value, known in (("model", model, _MODELS), ("kernel", kernel, _KERNELS)):
-        if value not in known:
-            raise ValueError(f"unknown {name} {value!r}; known are {', '.join(known)}")
-
-
-def _nothing(pixels: Float[Tensor, "B N 2"]) -> RelativePose:
+def _nothing(pixels: Float[Tensor, "B N 2"], given: Sequence[Tensor]) -> RelativePose:
     """The answer where there is nothing to sample from."""
     B, N = pixels.shape[:2]
     T_21 = torch.eye(4, dtype=pixels.dtype, device=pixels.device).expand(B, 4, 4)
     score = torch.zeros(B, dtype=pixels.dtype, device=pixels.device)
     model = torch.full((B,), ROTATION, device=pixels.device)
     no = torch.zeros(B, N + 1, dtype=torch.bool, device=pixels.device)
-    return RelativePose(T_21, no[:, :N], no[:, N], model, no[:, N], score, score, score, T_21)
+    return RelativePose(
+        with_zero_gradient(T_21, *given), no[:, :N], no[:, N], model, no[:, N], score, score, score, T_21
+    )
 
 
 def attach_relative_pose(found: FoundPose, views: TwoViews, kernel: Kernel) -> Float[Tensor, "B 4 4"]:

@@ -15,6 +15,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch._C import _are_functorch_transforms_active
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
 """Robust kernels, by the cost of a residual beyond the scale.
@@ -80,6 +81,23 @@ _KERNELS: dict[str, Callable[[Tensor, Tensor], Robustified]] = {
     "geman_mcclure": _geman_mcclure,
     "truncated": _truncated,
 }
+
+
+def kernel_scale(
+    scale: Float[Tensor, "*scale"] | float, like: Float[Tensor, "..."]
+) -> Float[Tensor, "*scale"]:
+    """The scale of a kernel, with the dtype and on the device of another tensor.
+
+    Raises:
+        ValueError: It is not above zero.
+    """
+    if not _are_functorch_transforms_active() and not (
+        bool((scale > 0).all()) if isinstance(scale, Tensor) else scale > 0
+    ):
+        raise ValueError(
+            f"scale must be above zero, not {scale.tolist() if isinstance(scale, Tensor) else scale}"
+        )
+    return torch.as_tensor(scale, dtype=like.dtype, device=like.device)
 
 
 def robustify(

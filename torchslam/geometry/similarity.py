@@ -13,12 +13,13 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.estimate_gradients import first_order, needs_gradient, refuse_transforms
 from torchslam.geometry.lie import cayley_rotation, rigid, so3_exp, transform, vee
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import check_positive, full_precision
 from torchslam.geometry.projections import squared_projections
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
     ModelState,
     best_models,
+    check_search,
     gather_rows,
     is_significant,
     levenberg_marquardt,
@@ -47,13 +48,14 @@ def umeyama(
     Args:
         source: points.
         target: corresponding points.
-        weights: non-negative weights or a boolean mask; rows of weight zero may hold anything.
+        weights: weights or a boolean mask; rows without a finite weight above zero do not count and may hold anything.
         with_scale: False fixes the scale to one.
 
     Returns:
         Scale, rotation and translation; NaN, with a gradient of zero, where a row that counts is not finite.
     """
     w = torch.ones_like(source[..., 0]) if weights is None else weights.to(source.dtype)
+    w = torch.where((w > 0) & torch.isfinite(w), w, 0.0)
     used = (w > 0)[..., None]
     rows = used & torch.isfinite(source) & torch.isfinite(target)
     finite = (rows.all(-1) | ~used[..., 0]).all(-1)
@@ -180,14 +182,13 @@ def estimate_similarity(
         The similarities.
 
     Raises:
-        ValueError: The shapes of points and pixels do not agree.
+        ValueError: A shape or a dtype does not fit.
         RuntimeError: It is called within a transform of `torch.func`.
     """
     shape, given = points_1.shape[:-1], (points_1, points_2, pixels_1, pixels_2)
     refuse_transforms("estimate_similarity")
-    if len(shape) != 2 or any(x.shape != (*shape, n) for x, n in zip(given, (3, 3, 2, 2), strict=True)):
-        shapes = ", ".join(str(tuple(x.shape)) for x in given)
-        raise ValueError(f"points must be (B, N, 3) and pixels (B, N, 2), not {shapes}")
+    check_search(threshold, confidence, max_samples)
+    check_positive(depth_sigma=depth_sigma)
     sigmas = tuple(torch.ones_like(points_1[..., 0]) if s is None else s for s in (sigmas_1, sigmas_2))
     positive = torch.stack((points_1[..., 2], points_2[..., 2], *sigmas), dim=-1)
     use = (positive > 0).all(-1) & torch.isfinite(torch.cat((*given, positive), dim=-1)).all(-1)

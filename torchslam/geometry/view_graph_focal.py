@@ -215,7 +215,9 @@ def _squares(graph: _Graph, focal: Float[Tensor, " G"]) -> _Squares:
     B_1, B_2 = (tangent_basis(e / e.norm(dim=-1, keepdim=True)) * K[:, :, None] for e in null)
     block = (B_2 @ F @ B_1.mT).detach()
     # Of a reflection, one axis is turned around: then it is a rotation.
-    sign = torch.where(block[..., 0, 0] * block[..., 1, 1] < block[..., 0, 1] * block[..., 1, 0], -1.0, 1.0)
+    sign = torch.where(
+        block[..., 0, 0] * block[..., 1, 1] < block[..., 0, 1] * block[..., 1, 0], -1.0, 1.0
+    ).to(block.dtype)
     b_1, b_2 = B_1[..., 0, :], B_1[..., 1, :] * sign[..., None]
     c_1, c_2 = B_2[..., 0, :], B_2[..., 1, :]
 

@@ -328,7 +328,7 @@ def fill_submap(
 def poses_of(run: Run, views: list[FrameFeatures]) -> tuple[Float[Tensor, "K 4 4"], Tensor]:
     """The poses of views in the main submap of a run, and which have one."""
     T_cw = torch.eye(4, dtype=torch.float64, device=run.camera.params.device).repeat(len(views), 1, 1)
-    known = torch.zeros(len(views), dtype=torch.bool)
+    known = torch.zeros(len(views), dtype=torch.bool, device="cpu")
     if run.main is None:
         return T_cw, known
     frames = run.posed_frames

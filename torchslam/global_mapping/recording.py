@@ -147,7 +147,7 @@ def check_run(run: Run) -> MapCheck | None:
         for distance in CHECKED_DISTANCES
         if row + distance < len(rows)
     )
-    known = torch.ones(len(rows), dtype=torch.bool)
+    known = torch.ones(len(rows), dtype=torch.bool, device="cpu")
     reduction = scaled.features.reduction(run.camera.size)
     return check_map(run.map.T_cw[rows], known, views, pairs, run.camera, None, reduction)
 

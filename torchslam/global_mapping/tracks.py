@@ -70,7 +70,7 @@ def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
         views: number of images.
         keypoints: number of keypoints of an image.
     """
-    none = torch.zeros(0, dtype=torch.int64, device=pairs[0].keypoints_1.device if pairs else None)
+    none = torch.zeros(0, dtype=torch.int64, device=pairs[0].keypoints_1.device if pairs else "cpu")
     one = torch.cat([none, *(pair.first * keypoints + pair.keypoints_1 for pair in pairs)])
     other = torch.cat([none, *(pair.second * keypoints + pair.keypoints_2 for pair in pairs)])
     label = lowest_connected(one, other, views * keypoints)
@@ -161,7 +161,7 @@ def triangulate_tracks(
     best_points = rays_w.new_zeros(tracks.count, 3)
     best_score = rays_w.new_full((tracks.count,), -1.0)
     for shares in _HYPOTHESES:
-        first, second = (start + ((length - 1) * share).round().long() for share in shares)
+        first, second = (start + ((length - 1).double() * share).round().long() for share in shares)
         points_w = _intersections(rays_w, centers_w, first, second)
         errors = ray_errors(rays_w, centers_w, points_w[tracks.track])
         gains = (1 - (errors / tolerance_rad).square()).clamp(min=0.0)  # truncated, as MSAC scores

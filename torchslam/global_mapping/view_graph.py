@@ -187,10 +187,10 @@ def similar_places(views: list[FrameFeatures]) -> list[tuple[int, int]]:
 
 def connected_views(pairs: list[ViewPair], count: int) -> Int[Tensor, " K"]:
     """The rows of the largest set of `count` views that pairs connect, ascending; of equal ones the lowest."""
-    label = torch.arange(count)
+    label = torch.arange(count, device="cpu")
     if not pairs:
         return label[:1]
-    ends = torch.tensor([(pair.first, pair.second) for pair in pairs])
+    ends = torch.tensor([(pair.first, pair.second) for pair in pairs], device="cpu")
     while True:
         lower = label[ends].amin(1)
         new = label.scatter_reduce(0, ends.flatten(), lower.repeat_interleave(2), "amin")

@@ -108,7 +108,9 @@ def run_metrics(
         "submaps": submap_counts(run),
         "fps": 1e3 / mean(totals) if totals else 0.0,
         "ms_median": median(totals) if totals else 0.0,
-        "ms_p95": float(torch.tensor(totals).quantile(0.95)) if totals else 0.0,
+        "ms_p95": float(torch.tensor(totals, dtype=torch.float32, device="cpu").quantile(0.95))
+        if totals
+        else 0.0,
         "stage_ms": stage_times(run.results),
         "skipped": run.skipped,
         "interrupted": run.interrupted,

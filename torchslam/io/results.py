@@ -92,12 +92,14 @@ class Results:
 
 
 def aligned(trajectory: Trajectory, S: Float[Tensor, "4 4"]) -> Trajectory:
-    """Return the poses after a similarity of the world."""
+    """Return a trajectory after a similarity of the world."""
+    return Trajectory(trajectory.timestamps, aligned_poses(trajectory.T_wc, S))
+
+
+def aligned_poses(T_wc: Float[Tensor, "N 4 4"], S: Float[Tensor, "4 4"]) -> Float[Tensor, "N 4 4"]:
+    """Return poses after a similarity of the world."""
     rotation = S[:3, :3] / torch.linalg.det(S[:3, :3]) ** (1 / 3)
-    return Trajectory(
-        trajectory.timestamps,
-        rigid(rotation @ trajectory.T_wc[:, :3, :3], transform(S, trajectory.positions_w)),
-    )
+    return rigid(rotation @ T_wc[:, :3, :3], transform(S, T_wc[:, :3, 3]))
 
 
 def prepare(folder: Path, overwrite: bool, resume: bool) -> None:

@@ -117,7 +117,7 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     evaluation, truth = _evaluation(results), None
     trajectory, keyframes = results.trajectory, results.keyframes
     title = f"Path and map{_title_suffix(results)}"
-    S = torch.eye(4, dtype=trajectory.T_wc.dtype)
+    S = torch.eye(4, dtype=trajectory.T_wc.dtype, device="cpu")
     if evaluation is not None:
         yield "errors", _errors(evaluation, results)
         S = evaluation.S_groundtruth_estimate
@@ -192,14 +192,16 @@ def _example(slam_map: Map, session: int, image: Float[Tensor, "H W"]) -> Iterat
         return
     columns = slam_map.keyframes
     mask, ids = columns["mask"][keyframe], columns["point_ids"][keyframe]
-    previous = torch.full((len(slam_map.points) + 1, 2), torch.nan, dtype=columns["keypoints"].dtype)
+    previous = torch.full(
+        (len(slam_map.points) + 1, 2), torch.nan, dtype=columns["keypoints"].dtype, device="cpu"
+    )
     rows = keyframe_rows(slam_map, session).tolist()
     if rows[0] != keyframe:
         before = rows[rows.index(keyframe) - 1]
         seen = columns["point_ids"][before]
         previous[seen[seen >= 0]] = columns["keypoints"][before][seen >= 0]
     # NO_POINT, -1, reads the row at the end.
-    counts = torch.cat((slam_map.points["times_observed"], torch.zeros(1, dtype=torch.int64)))
+    counts = torch.cat((slam_map.points["times_observed"], torch.zeros(1, dtype=torch.int64, device="cpu")))
     yield (
         "features",
         figures.plot_features(

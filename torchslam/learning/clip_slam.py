@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torchslam.config import CameraConfig, Config
 from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
-from torchslam.features.contract import FixedKeypoints, check_features
+from torchslam.features.contract import FixedKeypoints, check_features, check_gray
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera, KeypointNoise
 from torchslam.geometry.gating import times
@@ -271,9 +271,11 @@ class ClipSLAM(nn.Module):
 
         Raises:
             ValueError: Images of another shape.
+            FrameError: Images that are not floats in [0, 1].
         """
-        if images.ndim not in (4, 5):
+        if images.ndim not in (4, 5) or images.shape[-3] != 1:
             raise ValueError(f"images must be (T, 1, H, W) or (B, T, 1, H, W), not {tuple(images.shape)}")
+        check_gray(images, "images of a clip")
         clips, extractor = images if images.ndim == 5 else images[None], self.extractor
         if graph is not None and isinstance(extractor, FixedKeypoints):
             places = zip(clips, graph.keypoints, graph.masks, strict=True)
@@ -325,7 +327,8 @@ class ClipSLAM(nn.Module):
             camera: As in `forward`; that of the graph, without gradient, if None.
 
         Raises:
-            ValueError: The features have other shapes than the graph, or other keypoints in their rows.
+            ValueError: The features have other shapes than the graph, or other keypoints in their rows, or the weights
+                of keypoints are not (T, N).
         """
         seen = _per_clip(features)
         cameras = graph.cameras if camera is None else _cameras(camera, len(graph.runs))
@@ -340,6 +343,12 @@ class ClipSLAM(nn.Module):
             torch.ones_like(each.scores) if self.keypoint_weight is None else self.keypoint_weight(each)
             for each in seen
         ]
+        for weights, each in zip(keypoint_weights, seen, strict=True):
+            if weights.shape != each.mask.shape or not weights.is_floating_point():
+                raise ValueError(
+                    f"keypoint_weight must give floats (T, N) = {tuple(each.mask.shape)}, not {weights.dtype} "
+                    f"{tuple(weights.shape)}"
+                )
         graphs = tuple(
             None if run is None else _as_seen(run, each, weights_of, own)
             for run, each, weights_of, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)

@@ -78,17 +78,17 @@ class Clip:
                 f"{sequence.name}: {frames} frames from {start}, {stride} apart, exceed its {len(sequence)} frames"
             )
         found = [sequence[index] for index in indices]
-        known = torch.tensor([frame.T_cw_groundtruth is not None for frame in found])
+        known = torch.tensor([frame.T_cw_groundtruth is not None for frame in found], device="cpu")
         if supervised and not known.all():
             raise SequenceError(f"{sequence.name}: a frame of the clip from {start} on has no true pose")
-        eye = torch.eye(4, dtype=torch.float64)
+        eye = torch.eye(4, dtype=torch.float64, device="cpu")
         poses = [eye if frame.T_cw_groundtruth is None else frame.T_cw_groundtruth for frame in found]
         return cls(
             torch.cat([frame.image for frame in found]),
             torch.stack(poses),
             known,
             sequence.camera,
-            torch.tensor(number),
+            torch.tensor(number, device="cpu"),
         )
 
     def to(self, device: torch.device | str) -> Clip:
@@ -185,7 +185,7 @@ class Clips(Dataset[Clip]):
         for number, sequence in enumerate(self.sequences):
             seen = _Seen(sequence)
             found: dict[int, int] = {}
-            for start in torch.randperm(len(sequence), generator=generator).tolist():
+            for start in torch.randperm(len(sequence), generator=generator, device="cpu").tolist():
                 if len(found) == per_sequence:
                     break
                 stride = seen.stride(start, frames - 1, min_parallax, max_stride)
@@ -235,7 +235,7 @@ class Batches(Sampler[list[int]]):
 
     def __iter__(self) -> Iterator[list[int]]:
         """Iterate over batches from `first` on, without end."""
-        epoch, order = -1, torch.empty(0)
+        epoch, order = -1, torch.empty(0, dtype=torch.float32, device="cpu")
         for number in itertools.count(self.first):
             rows = []
             begin = (number * self.ranks + self.rank) * self.batch
@@ -243,7 +243,7 @@ class Batches(Sampler[list[int]]):
                 if place // self.length != epoch:
                     epoch = place // self.length
                     generator = torch.Generator().manual_seed(seed_of(self.seed, epoch))
-                    order = torch.randperm(self.length, generator=generator)
+                    order = torch.randperm(self.length, generator=generator, device="cpu")
                 rows.append(int(order[place % self.length]))
             yield rows
 

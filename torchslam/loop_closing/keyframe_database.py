@@ -79,14 +79,14 @@ def _nearest(descriptors: UInt8[Tensor, "N 32"], words: UInt8[Tensor, "W 32"]) -
 def _code_bits(device: torch.device) -> Int[Tensor, "64"]:
     """The bits of a descriptor that make its code."""
     generator = torch.Generator().manual_seed(_SEED)
-    return torch.randperm(BITS, generator=generator)[:CODE_BITS].to(device)
+    return torch.randperm(BITS, generator=generator, device="cpu")[:CODE_BITS].to(device)
 
 
 @lru_cache(maxsize=4)
 def _projections(size: int, device: torch.device) -> Float[Tensor, "{size} 256"]:
     """Random directions."""
     generator = torch.Generator().manual_seed(_SEED)
-    return torch.randn(size, BITS, generator=generator).to(device)
+    return torch.randn(size, BITS, generator=generator, dtype=torch.float32, device="cpu").to(device)
 
 
 def code_similarity(
@@ -100,7 +100,7 @@ def code_similarity(
 @lru_cache(maxsize=4)
 def _kernel(device: torch.device) -> Float[Tensor, "65"]:
     """Similarity by Hamming distance."""
-    distance = torch.arange(CODE_BITS + 1, dtype=torch.float64)
+    distance = torch.arange(CODE_BITS + 1, dtype=torch.float64, device="cpu")
     values = torch.exp(-((distance / _CODE_NOISE) ** 2)) * (distance <= _CODE_LIMIT)
     return values.float().to(device)
 
@@ -136,9 +136,11 @@ class KeyframeDatabase:
 
     def __init__(self, words: UInt8[Tensor, "W 32"] | None = None) -> None:
         self._words = words
-        self._keys = torch.zeros(0, dtype=torch.int64)  # (slots,) NO_KEY where the slot is free
-        self._codes = torch.zeros(0, 0, dtype=torch.int64)  # (W, slots), of each word in each keyframe
-        self._used = torch.zeros(0, 0)  # (W, slots) float32, 1 where the keyframe has the word, else 0
+        self._keys = torch.zeros(0, dtype=torch.int64, device="cpu")  # (slots,) NO_KEY where the slot is free
+        # (W, slots), of each word in each keyframe
+        self._codes = torch.zeros(0, 0, dtype=torch.int64, device="cpu")
+        # (W, slots), 1 where the keyframe has the word, else 0
+        self._used = torch.zeros(0, 0, dtype=torch.float32, device="cpu")
         self._slots: dict[int, int] = {}
 
     def __len__(self) -> int:
@@ -196,7 +198,7 @@ class KeyframeDatabase:
             Keys and scores in [0, 1], the best first, of equals the lower key first.
         """
         if not self._slots or self._words is None:
-            return self.keys, torch.zeros(len(self), device=self._keys.device)
+            return self.keys, torch.zeros(len(self), device=self._keys.device, dtype=torch.float32)
         return self._ranked(*quantize(_strongest(descriptors, mask), self._words))
 
     def query_by_key(self, key: int) -> tuple[Int[Tensor, " K"], Float[Tensor, " K"]]:
@@ -232,7 +234,7 @@ class KeyframeDatabase:
         """Set the vocabulary; the keyframes so far, which are empty, use no words."""
         self._words = words
         self._codes = torch.zeros(len(words), len(self._keys), dtype=torch.int64, device=words.device)
-        self._used = torch.zeros(len(words), len(self._keys), device=words.device)
+        self._used = torch.zeros(len(words), len(self._keys), device=words.device, dtype=torch.float32)
 
     def _free_slot(self, device: torch.device) -> int:
         """The lowest slot that no keyframe has, with nothing in it."""

@@ -272,7 +272,9 @@ def _first_guess(
         return None
     T_1, T_2 = map_1.T_cw[keyframe_1], map_2.T_cw[keyframe_2]
     # With this many samples, a similarity with at least _NEEDED inliers is found if there is one.
-    samples = samples_needed(torch.tensor([_NEEDED]), torch.tensor([len(rows_1)]), 3, _CONFIDENCE)
+    samples = samples_needed(
+        torch.tensor([_NEEDED], device="cpu"), torch.tensor([len(rows_1)], device="cpu"), 3, _CONFIDENCE
+    )
     found = estimate_similarity(
         transform(T_1, map_1.positions_w[points_1[rows_1]])[None],
         transform(T_2, map_2.positions_w[points_2[rows_2]])[None],

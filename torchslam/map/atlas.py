@@ -184,6 +184,11 @@ class Atlas:
         """Remove a submap that was discarded or merged into another one."""
         self._submaps = [other for other in self._submaps if other is not submap]
 
+    def revoke(self, submap: Submap) -> None:
+        """Remove the submap that was created last, as if it had never been created."""
+        self.remove(submap)
+        self.num_created = submap.number
+
     def main(self, session: int | None = None) -> Submap | None:
         """Return the main submap, see `main_submap`."""
         return main_submap(self._submaps, session)

@@ -364,7 +364,7 @@ def _check_numbers(name: str, rows: Tensor) -> None:
         raise ValueError(f"{name}: not finite")
     if name in _POSES:
         R, last = rows[:, :3, :3], rows.new_tensor([0.0, 0.0, 0.0, 1.0])
-        skew = (R.mT @ R - torch.eye(3, dtype=R.dtype)).abs()
+        skew = (R.mT @ R - torch.eye(3, dtype=R.dtype, device="cpu")).abs()
         if not bool((skew <= MAX_SKEW).all()) or not bool((rows[:, 3] == last).all()):
             raise ValueError(f"{name}: not rigid transforms")
     lengths = rows[:, :3, 3] if name in _POSES else rows

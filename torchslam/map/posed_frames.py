@@ -194,7 +194,7 @@ class PosedFrames:
             [self._agree(rows, T_cw, slam_map, camera, chi_square) for rows in every.split(_CHUNK)]
         )
         count = torch.bincount(seen_by, minlength=len(self))
-        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= least_ratio * count
+        is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= least_ratio * count.float()
         kept = agrees | ~is_right[seen_by]
         if not bool(kept.all()):
             self.observations.keep(torch.nonzero(kept)[:, 0])

@@ -140,7 +140,7 @@ class Mapper:
         recent = recent[points["is_valid"][recent]]
         age = keyframe - points["first_keyframe"][recent]
         least = self.config.mapping.min_found_ratio
-        is_rarely_found = points["times_found"][recent] < least * points["times_visible"][recent]
+        is_rarely_found = points["times_found"][recent] < least * points["times_visible"][recent].float()
         is_unconfirmed = (
             (age >= 2) & (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
         )

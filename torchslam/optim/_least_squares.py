@@ -13,9 +13,9 @@ from torch import Tensor
 from torch.func import grad, jvp, vmap
 
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel, robustify
+from torchslam.geometry.robust import Kernel, kernel_scale, robustify
 from torchslam.optim._core import tangent
-from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
+from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_options, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     MAX_ITERATIONS,
     Convergence,
@@ -197,7 +197,7 @@ def minimize(
             than its inputs, which would not receive any.
         ConvergenceError: with `strict`.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     unknowns = (start,) if isinstance(start, Tensor) else tuple(start)
     names = (manifolds,) * len(unknowns) if isinstance(manifolds, str) else tuple(manifolds)
     product = Product.of(names, unknowns)
@@ -250,7 +250,7 @@ def _checked(
     floats = {f"input {number}": x for number, x in enumerate(inputs) if x.is_floating_point()}
     starts = {f"unknown {number}": x for number, x in enumerate(unknowns)}
     check_dtypes(**starts, **floats, residual=value, weights=weights)
-    scale = torch.as_tensor(scale, dtype=like.dtype, device=like.device)
+    scale = kernel_scale(scale, like)
     return weights.expand(rows), counted.expand(rows), scale.expand(batch)
 
 

@@ -12,7 +12,7 @@ from torch.nn.functional import normalize
 
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
+from torchslam.optim._core.implicit import Backward, check_options, find_minimum
 from torchslam.optim._core.levenberg_marquardt import Convergence
 from torchslam.optim._positions import (
     PositionInputs,
@@ -107,7 +107,7 @@ def position_globally(
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     _check(view_index, point_index, rays_w, (num_views, num_points), weights, start)
     scale = torch.as_tensor(scale, dtype=torch.float64, device=rays_w.device)
     if not scale > 0:
@@ -175,10 +175,6 @@ def _check(
     """Raises ValueError where shapes, indices or types do not fit."""
     centers_w, points_w = (None, None) if start is None else start
     shapes = (
-        ("rays_w", rays_w, (len(rays_w), 3)),
-        ("view_index", view_index, (len(rays_w),)),
-        ("point_index", point_index, (len(rays_w),)),
-        ("weights", weights, (len(rays_w),)),
         ("start centers", centers_w, (counts[0], 3)),
         ("start points", points_w, (counts[1], 3)),
     )

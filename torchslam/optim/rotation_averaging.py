@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel, robustify
-from torchslam.optim._core.implicit import Backward, check_backward
+from torchslam.geometry.robust import Kernel, kernel_scale, robustify
+from torchslam.optim._core.implicit import Backward, check_options
 from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence
 from torchslam.optim._rotation_start import RotationEdges, robust_start, spanning_forest
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, is_similarity, pose_graph_optimize
@@ -87,11 +87,11 @@ def average_rotations(
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     _check(edges, R_ji, num_views, weights, start)
     if scale is None:
         scale = _SCALE_OF_UNKNOWN_NOISE if weights is None else _SCALE
-    scale = torch.as_tensor(scale, dtype=R_ji.dtype, device=R_ji.device)
+    scale = kernel_scale(scale, R_ji)
     weights = R_ji.new_ones(len(edges)) if weights is None else weights
     eye = torch.eye(3, dtype=R_ji.dtype, device=R_ji.device).expand(num_views, 3, 3)
     known = eye[:, 0, 0] > 0 if start is None else is_similarity(start)
@@ -145,8 +145,6 @@ class _Start(torch.autograd.Function):
     def forward(
         edges: RotationEdges, known: Tensor, given: Tensor, scale: Tensor, kernel: Kernel, on_forest: bool
     ) -> tuple[Tensor, Tensor, Tensor]:
-        if not scale > 0:
-            raise ValueError(f"scale must be positive, not {float(scale)}")
         rows = _canonical_rows(edges, known)
         counted, num_views = edges.select(rows), len(known)
         component = _components(counted, num_views)

@@ -74,7 +74,7 @@ class ObservationGraph:
     weights: Float[Tensor, " O"] | Float[Tensor, "O 2 2"]
     camera: Camera
     is_keyframe: Bool[Tensor, " K"]
-    submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
+    submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64, device="cpu"))
     calibration: CameraMeasurement | None = None
 
     _SCHEMA: ClassVar[Schema] = {

@@ -217,7 +217,7 @@ def unpack_frame(arrays: Arrays) -> Frame:
     return Frame(
         arrays["index"],
         arrays["timestamp"],
-        torch.zeros(1, 1, 0, 0),
+        torch.zeros(1, 1, 0, 0, dtype=torch.float32, device="cpu"),
         arrays["name"],
         None if truth is None else torch.from_numpy(truth),
         features=unpack_features(arrays["features"]),

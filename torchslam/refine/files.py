@@ -85,7 +85,7 @@ def _name(refined: RefinementResult, frame: int) -> str:
 def _write_covariances(path: Path, refined: RefinementResult) -> None:
     """Write a line per keyframe: image and upper triangle of the covariance of its pose, row by row."""
     keyframes = refined.run.map.keyframes
-    upper = torch.triu_indices(6, 6)
+    upper = torch.triu_indices(6, 6, device="cpu")
     lines = [
         "# image, and the 21 numbers of the upper triangle of the covariance (6, 6) of T_cw, row by row:\n"
         "# of its left perturbation, translation then rotation, relative to the first keyframe (zero)\n"

@@ -205,8 +205,10 @@ class _Refinement:
         if not self.used:
             self.failure = f"no map: no two of {len(self.views)} images overlap"
             return
-        self.T_cw = given_cw[torch.tensor([view.index for view in self.views])]
-        self.before = self._check(self.T_cw, torch.ones(len(self.views), dtype=torch.bool), mapper.camera)
+        self.T_cw = given_cw[torch.tensor([view.index for view in self.views], device="cpu")]
+        self.before = self._check(
+            self.T_cw, torch.ones(len(self.views), dtype=torch.bool, device="cpu"), mapper.camera
+        )
 
     @torch.no_grad()
     def map(self) -> str:
@@ -221,7 +223,7 @@ class _Refinement:
                 return made
             made = found
         rows, _, reconstruction = made
-        known = torch.zeros(len(self.views), dtype=torch.bool)
+        known = torch.zeros(len(self.views), dtype=torch.bool, device="cpu")
         known[rows.cpu()] = True
         self.after = self._check(reconstruction.T_cw, known, reconstruction.camera)
         self.run = self.mapper.finish(self.views, *made, self.frames, self._given())

@@ -174,7 +174,10 @@ def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], li
     """Results as columns, their reasons, and the names of their stages; NaN for what a frame does not have."""
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
     nan = float("nan")
-    no_pose, no_covariance = torch.full((4, 4), nan), torch.full((6, 6), nan)
+    no_pose, no_covariance = (
+        torch.full((4, 4), nan, dtype=torch.float32, device="cpu"),
+        torch.full((6, 6), nan, dtype=torch.float32, device="cpu"),
+    )
     poses = [no_pose if result.T_cw is None else result.T_cw for result in results]
     covariances = [no_covariance if result.covariance is None else result.covariance for result in results]
     counts = [
@@ -190,18 +193,20 @@ def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], li
     ]
     times = [[result.stage_ms.get(stage, nan) for stage in stages] for result in results]
     columns: dict[str, Any] = {
-        "run.counts": torch.tensor(counts, dtype=torch.int64).reshape(-1, 6),
-        "run.timestamps": torch.tensor([result.timestamp for result in results], dtype=torch.float64),
+        "run.counts": torch.tensor(counts, dtype=torch.int64, device="cpu").reshape(-1, 6),
+        "run.timestamps": torch.tensor(
+            [result.timestamp for result in results], dtype=torch.float64, device="cpu"
+        ),
         "run.T_cw": _stack(poses, 4),
         "run.covariances": _stack(covariances, 6),
-        "run.stage_ms": torch.tensor(times, dtype=torch.float64).reshape(-1, len(stages)),
+        "run.stage_ms": torch.tensor(times, dtype=torch.float64, device="cpu").reshape(-1, len(stages)),
     }
     return columns, [result.reason for result in results], stages
 
 
 def _stack(matrices: list[Tensor], size: int) -> Tensor:
     if not matrices:
-        return torch.zeros(0, size, size, dtype=torch.float64)
+        return torch.zeros(0, size, size, dtype=torch.float64, device="cpu")
     return torch.stack([matrix.detach().double().cpu() for matrix in matrices])
 
 

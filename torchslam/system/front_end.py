@@ -17,7 +17,7 @@ from torchslam.data.formats.text_file import MAX_SECONDS
 from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures
-from torchslam.features.contract import apply_mask, check_features
+from torchslam.features.contract import apply_mask, check_features, check_gray
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera
 from torchslam.plugins import load_front_end
@@ -107,7 +107,7 @@ def _enlarged(features: Features, ratio: tuple[float, float], factor: float) -> 
 
 
 def check_size(frame: Frame, camera: Camera) -> None:
-    """Check that image and mask have the size of the camera.
+    """Check that image and mask have the size of the camera, and that the image is gray in [0, 1].
 
     Raises:
         FrameError: otherwise.
@@ -117,8 +117,13 @@ def check_size(frame: Frame, camera: Camera) -> None:
         raise FrameError(
             f"{_name(frame)} has {width} x {height} pixels, the camera {camera.width} x {camera.height}"
         )
+    check_gray(frame.image, _name(frame))
     if frame.mask is not None and frame.mask.shape != frame.image.shape:
         raise FrameError(f"{_name(frame)} has a mask of another shape, {tuple(frame.mask.shape)}")
+    if frame.mask is not None and frame.mask.dtype != torch.bool:
+        raise FrameError(
+            f"{_name(frame)} has a mask of {frame.mask.dtype}, not torch.bool: compare it with 0"
+        )
 
 
 def check_order(frame: Frame, last: tuple[int, float] | None) -> None:

@@ -159,7 +159,9 @@ class BackwardTracking:
             earlier = [view for view in self.unposed if view.index < before]
             posed = track_back(context.tracker, backward, reversed(earlier), context.config, self)
             first = min([before, *(view.index for view in posed)])
-            key = int(key_of(torch.tensor(context.session.number), torch.tensor(first)))
+            key = int(
+                key_of(torch.tensor(context.session.number, device="cpu"), torch.tensor(first, device="cpu"))
+            )
             self.gap_link = track_into_earlier_keyframe(
                 context.tracker, backward, context.session.atlas, key, context.config
             )

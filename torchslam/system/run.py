@@ -145,7 +145,7 @@ class Run:
         if not given:
             return Trajectory.empty()
         T_cw = torch.stack([result.T_cw for result in given if result.T_cw is not None])
-        times = torch.tensor([result.timestamp for result in given], dtype=torch.float64)
+        times = torch.tensor([result.timestamp for result in given], dtype=torch.float64, device="cpu")
         return Trajectory(times, se3_inverse(T_cw))
 
     @property
@@ -346,7 +346,7 @@ class FinalAdjustment:
 def keyframe_rows(slam_map: Map, session: int) -> Int[Tensor, " K"]:
     """Rows of the keyframes of one session, in order of time."""
     if slam_map.num_keyframes == 0:
-        return torch.zeros(0, dtype=torch.int64)
+        return torch.zeros(0, dtype=torch.int64, device="cpu")
     rows = torch.nonzero(slam_map.keyframes["session"] == session)[:, 0]
     return rows[torch.argsort(slam_map.keyframes["timestamp"][rows], stable=True)]
 

@@ -23,7 +23,7 @@ from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.map.map import Map, feature_mismatch
+from torchslam.map.map import Map, feature_mismatch, key_of
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.mapper import Mapper
 from torchslam.parallel.workers import with_workers
@@ -63,7 +63,8 @@ class SLAM:
         matcher: Matcher | None = None,
     ) -> None:
         self.config = config or Config()
-        self.camera = camera.to(torch.float64)
+        # A copy: parameters may move in place while they learn.
+        self.camera = camera.with_params(camera.params.detach().to(torch.float64, copy=True))
         self.extractor = None  # where frames bring their features
         if extractor is not None or self.config.features.kind != "simulated":
             self.extractor = image_extractor(self.config, self.camera.params.device, extractor)
@@ -170,8 +171,32 @@ class SLAM:
         """Process one frame. A frame without a pose is no error: the result says why there is none.
 
         Raises:
-            FrameError: If the image has another size than the camera, or the frame does not come after the last one.
+            FrameError: If the image has another size than the camera, values other than gray in [0, 1], or the frame
+                does not come after the last one.
+
+        An exception of a front end or a matcher of one's own leaves the state of before, unless the frame has its
+        pose already; then it can be tried again.
         """
+        last = self.last_frame, self.last_features
+        try:
+            return self._step(frame)
+        except BaseException:
+            if not self._has_pose(frame):
+                self.last_frame, self.last_features = last
+            raise
+
+    def _has_pose(self, frame: Frame) -> bool:
+        """Whether a frame is among the posed ones, or among those that are held back."""
+        if any(view.index == frame.index for view in self._confirmation.views()):
+            return True
+        key = int(
+            key_of(torch.tensor(self.session.number, device="cpu"), torch.tensor(frame.index, device="cpu"))
+        )
+        return any(
+            len(each.posed_frames) > 0 and key in each.posed_frames.keys.tolist() for each in self.atlas
+        )
+
+    def _step(self, frame: Frame) -> StepResult:
         with self.clock.rest("rest"):
             self._check(frame)
             with self.clock("features"):
@@ -225,7 +250,9 @@ class SLAM:
             and not self.has_custom_components
         ):
             width, height = self.camera.size
-            self.extractor(Frame(-1, 0.0, torch.zeros(1, 1, height, width)))
+            self.extractor(
+                Frame(-1, 0.0, torch.zeros(1, 1, height, width, dtype=torch.float32, device="cpu"))
+            )
 
     @torch.inference_mode()
     def precompute_undistortion(self) -> None:

@@ -7,7 +7,7 @@ keyframe was adjusted -> `KeyframeActions`: detect and close loops, cull, compac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -128,7 +128,11 @@ class InitializationState:
     def _create(self, start: TwoViewMap, views: list[FrameFeatures]) -> Rejection | None:
         """Create a submap from two views, and discard a provisional one; return why it is rejected, or None."""
         submap = self.atlas.create()
-        rejection = self.map_initializer.build(submap, start, views)
+        try:
+            rejection = self.map_initializer.build(submap, start, views)
+        except BaseException:  # of a user's matcher, or from the keyboard
+            self.atlas.revoke(submap)
+            raise
         if rejection:
             self.atlas.remove(submap)
             return rejection
@@ -267,7 +271,28 @@ class LostState:
         self.num_frames = 0
 
     def step(self, view: FrameFeatures) -> FrameOutcome:
-        """Relocalize the frame, or initialize a new submap with it."""
+        """Relocalize the frame, or initialize a new submap with it; after an exception the state is that of before."""
+        restore = self._restorer()
+        try:
+            return self._step(view)
+        except BaseException:  # of a user's matcher, or from the keyboard
+            restore()
+            raise
+
+    def _restorer(self) -> Callable[[], None]:
+        """A function that restores what a frame changes before it has a pose."""
+        overlay, unposed = self.context.non_static_filter.static_overlay, self.backward.unposed
+        evidence, views, num_frames = overlay.evidence.clone(), list(unposed), self.num_frames
+        initializer = self.initialization.initializer.copy()
+
+        def restore() -> None:
+            overlay.restore(evidence)
+            unposed.restore(views)
+            self.num_frames, self.initialization.initializer = num_frames, initializer
+
+        return restore
+
+    def _step(self, view: FrameFeatures) -> FrameOutcome:
         context, has_submaps = self.context, len(self.context.session.atlas) > 0
         self.num_frames += 1
         if has_submaps:

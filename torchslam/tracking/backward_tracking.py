@@ -50,6 +50,10 @@ class UnposedFrames:
         posed = {view.index for view in views}
         self._set([view for view in self._views if view.index not in posed])
 
+    def restore(self, views: list[FrameFeatures]) -> None:
+        """Continue with the frames of an earlier time."""
+        self._set(views)
+
     def _set(self, views: list[FrameFeatures]) -> None:
         self._views.clear()
         self._views.extend(views)

@@ -197,7 +197,7 @@ def grid_weights(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[T
     """Weights of matches that limit the total weight of a crowded image cell."""
     cell = cell_numbers(pixels, size)
     crowd = torch.bincount(cell, minlength=GRID[0] * GRID[1])[cell]
-    return (MAX_CELL_WEIGHT / crowd).clamp(max=1.0)
+    return (MAX_CELL_WEIGHT / crowd.float()).clamp(max=1.0)
 
 
 def explained_ratio(view: FrameFeatures, keypoints: Int[Tensor, " M"], size: tuple[int, int]) -> float:

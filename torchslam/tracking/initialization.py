@@ -6,6 +6,7 @@ was initialized recently: later frames may contradict it.
 
 from __future__ import annotations
 
+import copy
 import math
 
 import torch
@@ -74,6 +75,12 @@ class Initializer:
         self.static_pixels: Float[Tensor, "N 2"] = camera.params.new_zeros(0, 2)
         self.num_planar_views = 0  # whose matches with the reference a homography explained
         self.planar_reason: Rejection | None = None  # of the last such view that was tested for a rotation
+
+    def copy(self) -> Initializer:
+        """The same state, which later frames do not change."""
+        copied = copy.copy(self)
+        copied.views = list(self.views)
+        return copied
 
     @property
     def reference(self) -> FrameFeatures:
@@ -214,7 +221,9 @@ class Initializer:
         if others.model[0] != "essential":
             return None if self._relative_pose(view, first, second).model[0] == "essential" else everything
         pixels_1, pixels_2 = self.reference.keypoints[first[still]], view.keypoints[second[still]]
-        across, along = epipolar_offsets(others.T_21[0], pixels_1, pixels_2, self.camera, self.camera)
+        across, along = epipolar_offsets(
+            others.T_21_essential[0], pixels_1, pixels_2, self.camera, self.camera
+        )
         threshold = self.config.initialization.threshold_px
         explained = (across.abs() < threshold) & (along > -threshold)
         if float(explained.double().mean()) >= MIN_EXPLAINED_RATIO:

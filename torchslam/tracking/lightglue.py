@@ -50,14 +50,16 @@ class LightGlue(nn.Module):
                 f"{self.size_in}; at most {MAX_LAYERS} of {MAX_WIDTH})"
             )
         self.with_angles = positions == 4
-        self.network = Network(
-            features=None,  # type: ignore[arg-type]  # a name would download
-            input_dim=self.size_in,
-            descriptor_dim=width,
-            n_layers=layers,
-            num_heads=max(1, width // 64 if width % 64 == 0 else 1),
-            add_scale_ori=self.with_angles,
-        )
+        with torch.device("cpu"):
+            network = Network(
+                features=None,  # type: ignore[arg-type]  # a name would download
+                input_dim=self.size_in,
+                descriptor_dim=width,
+                n_layers=layers,
+                num_heads=max(1, width // 64 if width % 64 == 0 else 1),
+                add_scale_ori=self.with_angles,
+            )
+        self.network = network.float()
         parameters = {name for name, _ in self.network.named_parameters()}
         try:
             missing = parameters & set(self.network.load_state_dict(state, strict=False).missing_keys)
@@ -89,7 +91,8 @@ class LightGlue(nn.Module):
             f"image{i}": self._data(view, at, size)
             for i, (view, at) in enumerate(zip((view_1, view_2), rows, strict=True))
         }
-        found = self.network(data)
+        with size.device:  # kornia makes tensors on the default device
+            found = self.network(data)
         first, second = found["matches"][0].unbind(-1)
         scores = found["scores"][0].double()
         good = scores > 0

@@ -49,16 +49,41 @@ def is_among(ids: Int[Tensor, " N"], others: Int[Tensor, " M"]) -> Bool[Tensor, 
 
 
 def row_mask(name: str, rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:
-    """Return a bool mask of the shape (B, N) of `like`; `rows` are a mask, (N,) or (B, N), or indices."""
+    """Return a bool mask of the shape (B, N) of `like`; `rows` are a mask, (N,) or (B, N), or indices.
+
+    Raises:
+        ValueError: They are neither, or rows are out of range or named twice, as in a mask of ones and zeros.
+    """
     batch, count = like.shape
     rows = torch.as_tensor(() if rows is None else rows, device=like.device)
     if rows.dtype == torch.bool:
         if rows.shape not in ((count,), (1, count), (batch, count)):
             raise ValueError(f"{name} as a mask must have shape ({count},), not {tuple(rows.shape)}")
         return rows.expand(batch, count)
-    mask = torch.zeros(count, dtype=torch.bool, device=like.device)
-    mask[rows.long()] = True
+    rows = row_numbers(name, rows, count)
+    mask = torch.zeros(count, dtype=torch.bool, device=like.device).index_fill_(0, rows, True)
+    if int(mask.sum()) < len(rows):
+        raise ValueError(f"{name} names a row twice: row numbers differ, and a mask must be bool")
     return mask.expand(batch, count)
+
+
+def row_numbers(name: str, rows: Tensor, count: int) -> Int[Tensor, " M"]:
+    """Return the row numbers of a table of `count` rows that numbers or a mask name; negative ones count from its end.
+
+    Raises:
+        ValueError: They are of another kind or shape, or out of range.
+    """
+    if rows.numel() == 0:
+        return rows.long()  # an empty tuple has no kind
+    if rows.dtype == torch.bool and rows.shape == (count,):
+        return rows.nonzero().flatten()
+    if rows.dtype not in (torch.int32, torch.int64) or rows.ndim != 1:
+        raise ValueError(
+            f"{name} must be a mask of bool, or row numbers (n,), int64, not {rows.dtype} {tuple(rows.shape)}"
+        )
+    if not -count <= int(rows.min()) <= int(rows.max()) < count:
+        raise ValueError(f"{name} must lie in 0 ... {count - 1}")
+    return torch.where(rows < 0, rows + count, rows).long()
 
 
 def _flags(ids: Int[Tensor, " N"]) -> tuple[int, Bool[Tensor, " R"]]:

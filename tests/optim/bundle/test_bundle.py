@@ -319,7 +319,7 @@ def test_invalid_input_is_rejected_by_name(bundle_scene):
     problem = bundle_scene().problem
     with pytest.raises(ValueError, match=r"frame_index must lie in 0 ... 4"):
         bundle_adjust(replace(problem, frame_index=problem.frame_index + 1))
-    with pytest.raises(ValueError, match="point_index must have one row per observation"):
+    with pytest.raises(ValueError, match=r"point_index must be \(..., O\), not \(140,\): O is 141"):
         bundle_adjust(replace(problem, point_index=problem.point_index[:-1]))
     with pytest.raises(ValueError, match=r"shape \(5,\)"):
         bundle_adjust(replace(problem, fixed_frames=torch.ones(4, dtype=torch.bool)))

@@ -142,7 +142,7 @@ def _by_time(times: Float[Tensor, " N"], frames: Float[Tensor, " F"]) -> Int[Ten
     """The nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn."""
     rows, distances = nearest(frames, times)
     back, _ = nearest(times, frames)
-    mutual = back[rows] == torch.arange(len(frames))
+    mutual = back[rows] == torch.arange(len(frames), device="cpu")
     return torch.where((distances <= GROUNDTRUTH_TOLERANCE) & mutual, rows, -1)
 
 
@@ -158,10 +158,12 @@ def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
             image_ends = [key(image)[-length:] for image in images]
             single, own = Counter(ends), Counter(image_ends)
             rows = {end: row for row, end in enumerate(ends) if single[end] == 1}
-            found = torch.tensor([rows.get(end, -1) if own[end] == 1 else -1 for end in image_ends])
+            found = torch.tensor(
+                [rows.get(end, -1) if own[end] == 1 else -1 for end in image_ends], device="cpu"
+            )
             if bool((found >= 0).any()):
                 return found
-    return torch.full((len(images),), -1)
+    return torch.full((len(images),), -1, device="cpu")
 
 
 # --- COLMAP --------------------------------------------------------------------------------------------------
@@ -173,7 +175,7 @@ def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
     images = sorted(read(folder / f"images.{'bin' if binary else 'txt'}"))
     if not images:
         raise TrajectoryError(f"{folder}: no images in the model")
-    table = torch.tensor([numbers for _, numbers in images], dtype=torch.float64)
+    table = torch.tensor([numbers for _, numbers in images], dtype=torch.float64, device="cpu")
     if not bool(table.isfinite().all()) or bool((table[:, :4].norm(dim=-1) - 1).abs().gt(0.05).any()):
         raise TrajectoryError(f"{folder}: a quaternion that does not have unit length, or no number")
     quaternions = table[:, :4].roll(-1, dims=-1) / table[:, :4].norm(dim=-1, keepdim=True)
@@ -254,13 +256,16 @@ def _read_transforms(path: Path) -> GivenPoses:
     try:
         content: Any = parse_json(read_text(path, TrajectoryError, JSON_BYTES))
         frames = [(str(frame["file_path"]), frame["transform_matrix"]) for frame in content["frames"]]
-        T_wc = torch.tensor([matrix for _, matrix in frames], dtype=torch.float64)
+        T_wc = torch.tensor([matrix for _, matrix in frames], dtype=torch.float64, device="cpu")
     except (ValueError, KeyError, TypeError, RuntimeError, OverflowError) as cause:
         raise TrajectoryError(f"{path}: not the frames of a transforms.json: {cause!r}") from cause
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
     R = T_wc[:, :3, :3]
-    if not bool(T_wc.isfinite().all() & ((R @ R.mT - torch.eye(3, dtype=R.dtype)).abs() < _ORTHOGONAL).all()):
+    if not bool(
+        T_wc.isfinite().all()
+        & ((R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs() < _ORTHOGONAL).all()
+    ):
         raise TrajectoryError(f"{path}: a transform_matrix is not a rigid transformation")
     T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
     is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it

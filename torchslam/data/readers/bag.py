@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import itertools
+import sys
 import weakref
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixel
 from torchslam.data.sequence import Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.files import check_regular
+from torchslam.utils.forks import forget_in_forks, never_release
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -88,7 +90,7 @@ class BagSequence(Sequence):
             for number, message in enumerate(order)
             if number == 0 or topic.times[message] > topic.times[order[number - 1]]
         ]
-        self._position = 0
+        self._position, self._is_inherited = 0, False
         self._stream: Iterator[Any] = iter(())
         self._rewind()
         self._bits, size = 8, None
@@ -103,7 +105,9 @@ class BagSequence(Sequence):
             path.stem,
             f"ROS bag, {topic.connection.topic}",
             None if camera is None else fit_camera(camera, size, str(path)),
-            torch.tensor([topic.times[message] for message in self._messages], dtype=torch.float64),
+            torch.tensor(
+                [topic.times[message] for message in self._messages], dtype=torch.float64, device="cpu"
+            ),
             size=size,
             guessed=is_guessed(camera),
             notes=[f"left out {left_out} images whose time repeats"] if left_out else [],
@@ -135,7 +139,16 @@ class BagSequence(Sequence):
     def image_name(self, index: int) -> str:
         return f"{self._path}{self._connection.topic}#{index}"
 
+    def forget_handle(self) -> None:
+        never_release(self._stream)
+        never_release(self._reader)
+        self._is_inherited, self._position = True, sys.maxsize  # so that the next image opens the file anew
+
     def _rewind(self) -> None:
+        if self._is_inherited:
+            self._reader, self._is_inherited = _open_reader(self._path), False
+            self._connection = _connection(self._reader, self._connection.topic)
+        forget_in_forks(self)
         self._stream, self._position = self._reader.messages([self._connection]), 0
 
     def _read(self, message: int) -> Shaped[np.ndarray, "H W"]:

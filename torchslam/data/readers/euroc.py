@@ -68,7 +68,7 @@ def _read_images(folder: Path) -> list[ImageEntry]:
 
 def _read_extrinsics(path: Path) -> Float[Tensor, "4 4"]:
     """T_bc: camera to body."""
-    return torch.tensor(read_matrix(path, "T_BS", 16), dtype=torch.float64).view(4, 4)
+    return torch.tensor(read_matrix(path, "T_BS", 16), dtype=torch.float64, device="cpu").view(4, 4)
 
 
 def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
@@ -88,10 +88,10 @@ def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
         rows.append(row[:7])
     if not rows:
         raise TrajectoryError(f"{path}: no poses")
-    table = torch.tensor(rows, dtype=torch.float64)
+    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
     T_wb = rigid(matrix_from_quaternion(table[:, [4, 5, 6, 3]]), table[:, :3])
     T_wc = checked_poses(T_wb @ T_bc, path)
-    return Trajectory(torch.tensor(times, dtype=torch.float64), T_wc)
+    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
 
 
 EUROC = Reader("mav0/cam0/data.csv (EuRoC)", _is_euroc, _open_euroc)

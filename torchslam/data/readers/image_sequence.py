@@ -98,7 +98,7 @@ class ImageSequence(Sequence):
             name,
             kind,
             None if camera is None else fit_camera(camera, size, name, entries[0].path),
-            torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64),
+            torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64, device="cpu"),
             groundtruth,
             size=size,
             guessed=is_guessed(camera),

@@ -62,7 +62,9 @@ def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> Im
             "images of --fps 10, with --camera"
         )
     listed, rows = base / "times.txt", _read_table(base / "times.txt", 1, SequenceError)[:, 0].tolist()
-    times = torch.tensor([in_seconds(time, str(listed), SequenceError) for time in rows], dtype=torch.float64)
+    times = torch.tensor(
+        [in_seconds(time, str(listed), SequenceError) for time in rows], dtype=torch.float64, device="cpu"
+    )
     found = find_frames(folder)
     images = found.frames
     if len(images) != len(times):
@@ -105,9 +107,9 @@ def _read_odometry_poses(path: Path, times: Float[Tensor, " N"], offset_x: float
     rows = _read_table(found, 12, TrajectoryError)
     if len(rows) != len(times):
         raise TrajectoryError(f"{found}: {len(rows)} poses for {len(times)} times")
-    T_w0 = torch.eye(4, dtype=torch.float64).repeat(len(rows), 1, 1)
+    T_w0 = torch.eye(4, dtype=torch.float64, device="cpu").repeat(len(rows), 1, 1)
     T_w0[:, :3] = rows.view(-1, 3, 4)
-    T_0c = torch.eye(4, dtype=torch.float64)
+    T_0c = torch.eye(4, dtype=torch.float64, device="cpu")
     T_0c[0, 3] = -offset_x
     return Trajectory(times, checked_poses(T_w0 @ T_0c, found))
 
@@ -122,7 +124,7 @@ def _read_table(path: Path, columns: int, error: type[TorchslamError]) -> Float[
         rows.append(row)
     if not rows:
         raise error(f"{path}: is empty")
-    return torch.tensor(rows, dtype=torch.float64)
+    return torch.tensor(rows, dtype=torch.float64, device="cpu")
 
 
 def _is_kitti_raw(path: str) -> bool:
@@ -220,20 +222,22 @@ def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajector
         return None
     rows = _read_rows(calibration)
     P = _row(rows, f"P_rect_{number}", 12, calibration)
-    T_rect = torch.eye(4, dtype=torch.float64)
-    T_rect[:3, :3] = torch.tensor(_row(rows, "R_rect_00", 9, calibration), dtype=torch.float64).view(3, 3)
+    T_rect = torch.eye(4, dtype=torch.float64, device="cpu")
+    T_rect[:3, :3] = torch.tensor(
+        _row(rows, "R_rect_00", 9, calibration), dtype=torch.float64, device="cpu"
+    ).view(3, 3)
     T_rect[0, 3] = P[3] / P[0]  # meters from camera 0 to this one
     T_ci = T_rect @ _read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo)
     times = _read_times(drive / "oxts" / "timestamps.txt", TrajectoryError)
     T_wi, kept = _read_packets(packets, times)
     T_wc = checked_poses(T_wi @ se3_inverse(T_ci), packets)
-    return Trajectory(torch.tensor(kept, dtype=torch.float64), T_wc)
+    return Trajectory(torch.tensor(kept, dtype=torch.float64, device="cpu"), T_wc)
 
 
 def _read_rigid(path: Path) -> Float[Tensor, "4 4"]:
     rows = _read_rows(path)
     R, t = (
-        torch.tensor(_row(rows, name, count, path), dtype=torch.float64)
+        torch.tensor(_row(rows, name, count, path), dtype=torch.float64, device="cpu")
         for name, count in (("R", 9), ("T", 3))
     )
     return rigid(R.view(3, 3), t)
@@ -257,14 +261,16 @@ def _read_packets(folder: Path, times: list[float]) -> tuple[Float[Tensor, "N 4 
         kept.append(times[index])
     if not rows:
         raise TrajectoryError(f"{folder}: no packets")
-    table = torch.tensor(rows, dtype=torch.float64)
+    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
     latitude, longitude = table[:, 0].deg2rad(), table[:, 1].deg2rad()
     scale = EARTH_RADIUS * math.cos(latitude[0])
     north = scale * (math.pi / 4 + latitude / 2).tan().log()
     positions = torch.stack((scale * longitude, north, table[:, 2]), dim=-1)
     roll, pitch, yaw = (
         so3_exp(angle[:, None] * axis)
-        for angle, axis in zip(table[:, 3:].unbind(-1), torch.eye(3, dtype=torch.float64), strict=True)
+        for angle, axis in zip(
+            table[:, 3:].unbind(-1), torch.eye(3, dtype=torch.float64, device="cpu"), strict=True
+        )
     )
     return rigid(yaw @ pitch @ roll, positions - positions[0]), kept
 

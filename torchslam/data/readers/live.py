@@ -24,6 +24,7 @@ from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
+from torchslam.utils.forks import forget_in_forks, never_release
 from torchslam.utils.text import without_credentials
 
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
@@ -86,8 +87,9 @@ class LiveSequence(Sequence):
         self._dropped = self._replaced = 0
         self._limit: int | None = None
         self._given, self._time = 0, 0.0
-        self._is_watched = False
+        self._is_watched = self._is_inherited = False
         _SOURCES.add(self)
+        forget_in_forks(self)
         self._thread = self._watch_until(lambda: bool(self._arrived or self._refusal))
         self._thread.join(patience)
         if not self._arrived:
@@ -102,7 +104,7 @@ class LiveSequence(Sequence):
             name,
             "live",
             None if camera is None else fit_camera(camera, size, name, pixel_aspect=aspect),
-            torch.zeros(0, dtype=torch.float64),
+            torch.zeros(0, dtype=torch.float64, device="cpu"),
             size=size,
             guessed=is_guessed(camera),
             pixel_aspect=aspect,
@@ -134,6 +136,8 @@ class LiveSequence(Sequence):
 
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         """The next frame. Raises EndOfSequence where the source has ended, FrameError for a frame that is gone."""
+        if self._is_inherited:
+            raise SequenceError(f"{self.name}: a live source can only be read by the process that opened it")
         if index < self._given:
             raise FrameError(
                 f"{self.image_name(index)}: is gone; a live source gives each frame once, in order"
@@ -167,6 +171,11 @@ class LiveSequence(Sequence):
             "size": self._describe_size(),
             "camera": self._describe_camera(),
         }
+
+    def forget_handle(self) -> None:
+        never_release(self._capture)
+        self._is_inherited = self._ended = True
+        self._fresh = threading.Condition()  # a thread that is not here may have the lock
 
     def close(self) -> None:
         """Stop watching and let the source go."""

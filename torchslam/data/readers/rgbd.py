@@ -108,7 +108,7 @@ def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) ->
         raise SequenceError(f"{unnumbered[0]}: frames of ICL-NUIM are named by their number")
     entries = [ImageEntry(int(file.stem) / rate, file, str(file)) for file in found.frames]
     numbered = read_trajectory(sorted(folder.glob(ICL_TRUTH))[0])
-    mirror = torch.diag(torch.tensor(ICL_MIRROR, dtype=torch.float64))
+    mirror = torch.diag(torch.tensor(ICL_MIRROR, dtype=torch.float64, device="cpu"))
     groundtruth = Trajectory(numbered.timestamps / rate, mirror @ numbered.T_wc @ mirror)
     camera = PRESETS["icl"] if camera is None else camera
     return ImageSequence(folder.name, "ICL-NUIM folder", entries, camera, groundtruth, found.notes)
@@ -138,7 +138,7 @@ def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None
             poses.append(T_wc)
     groundtruth = None
     if poses:
-        groundtruth = Trajectory(torch.tensor(times, dtype=torch.float64), torch.stack(poses))
+        groundtruth = Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), torch.stack(poses))
     camera = PRESETS["7-scenes"] if camera is None else camera
     name = f"{folder.resolve().parent.name}/{folder.name}" if folder.name.startswith("seq-") else folder.name
     return ImageSequence(name, "7-Scenes folder", entries, camera, groundtruth, found.notes)
@@ -153,9 +153,9 @@ def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:
         rows.append(parse_floats(line, f"{path}:{number}", TrajectoryError))
     if [len(row) for row in rows] != [4, 4, 4, 4]:
         raise TrajectoryError(f"{path}: expected four lines of four numbers")
-    T_wc = torch.tensor(rows, dtype=torch.float64)
+    T_wc = torch.tensor(rows, dtype=torch.float64, device="cpu")
     R = T_wc[:3, :3]
-    if (R @ R.mT - torch.eye(3, dtype=R.dtype)).abs().max() > ORTHOGONAL:
+    if (R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs().max() > ORTHOGONAL:
         return None
     # The nearest rotation: poses are printed with few digits.
     U, _, Vh = torch.linalg.svd(R)
@@ -201,11 +201,11 @@ def _read_tartanair_poses(path: Path, times: list[float]) -> Trajectory:
         rows.append(row)
     if len(rows) != len(times):
         raise TrajectoryError(f"{path}: {len(rows)} poses for {len(times)} images")
-    table = torch.tensor(rows, dtype=torch.float64)
+    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
     quaternions = table[:, 3:] / table[:, 3:].norm(dim=-1, keepdim=True)
-    R = matrix_from_quaternion(quaternions) @ torch.tensor(TARTANAIR_AXES, dtype=torch.float64)
+    R = matrix_from_quaternion(quaternions) @ torch.tensor(TARTANAIR_AXES, dtype=torch.float64, device="cpu")
     T_wc = checked_poses(rigid(R, table[:, :3]), path)
-    return Trajectory(torch.tensor(times, dtype=torch.float64), T_wc)
+    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
 
 
 TUM = Reader("rgb.txt (ETH3D, TUM)", _is_tum, _open_tum)

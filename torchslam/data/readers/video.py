@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 import struct
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
@@ -28,6 +29,7 @@ from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
 from torchslam.errors import FrameError, SequenceError, TorchslamError
 from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular
+from torchslam.utils.forks import forget_in_forks, never_release
 from torchslam.utils.text import printable
 
 SUFFIXES = frozenset(
@@ -99,7 +101,7 @@ class VideoSequence(Sequence):
             path.stem,
             "video",
             fitted,
-            torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64),
+            torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64, device="cpu"),
             size=size,
             guessed=is_guessed(camera),
             notes=notes,
@@ -122,7 +124,12 @@ class VideoSequence(Sequence):
     def image_name(self, index: int) -> str:
         return f"{self._path}#{index}"
 
+    def forget_handle(self) -> None:
+        never_release(self._capture)
+        self._position = sys.maxsize  # so that the next frame opens the file anew
+
     def _rewind(self) -> None:
+        forget_in_forks(self)
         # As an absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
         self._capture = open_capture(str(self._path.absolute()))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)

@@ -121,11 +121,11 @@ def round_the_storey(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
 
 def _walked(phase: Float[Tensor, " N"]) -> Float[Tensor, "3 N"]:
     """x, z and yaw of the body on `WALK`, eased by a Hann window over the time."""
-    ends = torch.tensor(WALK, dtype=torch.float64)
+    ends = torch.tensor(WALK, dtype=torch.float64, device="cpu")
     steps = ends.diff(dim=0)
     durations = steps[:, :2].norm(dim=-1) + QUARTER_TIME * steps[:, 2].abs()
     starts = torch.cat((durations.new_zeros(1), durations.cumsum(0)))
-    window = torch.linspace(-1, 1, 25, dtype=torch.float64)[1:-1]
+    window = torch.linspace(-1, 1, 25, dtype=torch.float64, device="cpu")[1:-1]
     weights = torch.cos(0.5 * math.pi * window) ** 2
     time = (phase[:, None] * (starts[-1] / (2 * math.pi)) + EASING * window) % starts[-1]
     row = (torch.searchsorted(starts, time, right=True) - 1).clamp(max=len(steps) - 1)
@@ -139,7 +139,7 @@ def _walked(phase: Float[Tensor, " N"]) -> Float[Tensor, "3 N"]:
 
 def phases(frames: int, frames_per_round: int) -> Float[Tensor, " N"]:
     """Return the phase of each frame, from 0."""
-    return torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames_per_round)
+    return torch.arange(frames, dtype=torch.float64, device="cpu") * (2 * math.pi / frames_per_round)
 
 
 def _poses(x: Tensor, y: Tensor, z: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:

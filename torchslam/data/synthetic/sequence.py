@@ -89,7 +89,7 @@ class SyntheticSequence(Sequence):
         path, frames_per_round = SCENES[scene].path, SCENES[scene].frames_per_round
         options = RenderOptions(SCENES[scene].frames) if options is None else options
         T_wc = path(paths.phases(options.frames, frames_per_round))
-        timestamps = torch.arange(options.frames, dtype=torch.float64) / FRAME_RATE
+        timestamps = torch.arange(options.frames, dtype=torch.float64, device="cpu") / FRAME_RATE
         center = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         camera = Camera.pinhole(FOCAL, FOCAL, *center, size=SIZE)
         super().__init__(scene, "rendered", camera, timestamps, Trajectory(timestamps, T_wc))
@@ -99,7 +99,7 @@ class SyntheticSequence(Sequence):
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         options = self._options
         if options.blank:
-            return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5)
+            return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5, dtype=torch.float32, device="cpu")
         image = _renderer(SCENES[self.name].build, options.seed).render(self._poses_cw[index])
         if options.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), options.blur)

@@ -18,7 +18,7 @@ from torchslam.features.matching.hamming import (
     nearest_by_cosine,
     nearest_by_hamming,
 )
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import check_positive, without_autocast
 from torchslam.types import Features, Matches
 from torchslam.utils.indexing import true_indices
 
@@ -26,7 +26,7 @@ SAME_SCALE = 0.05
 """Relative difference up to which two scales belong to one pyramid level."""
 
 
-@full_precision
+@without_autocast
 def match(
     features_1: Features,
     features_2: Features,
@@ -55,8 +55,10 @@ def match(
         Matches with M = N1 rows; row i is keypoint i of the first set.
 
     Raises:
-        ValueError: The descriptors of the two sets differ in type or length, or are not of unit length.
+        ValueError: The descriptors of the two sets differ in type or length, or are not of unit length, or an option is
+            not above zero.
     """
+    check_positive(ratio=ratio, temperature=temperature)
     descriptors_1, descriptors_2 = features_1.descriptors, features_2.descriptors
     check_descriptors(descriptors_1, descriptors_2)
     batch, rows, columns = len(descriptors_1), descriptors_1.shape[1], descriptors_2.shape[1]
@@ -85,7 +87,7 @@ def match(
     return to_matches(nearest.column, nearest.distance, mask, weights)
 
 
-@full_precision
+@without_autocast
 def match_pairs(
     descriptors_1: Shaped[Tensor, "N1 D"],
     descriptors_2: Shaped[Tensor, "N2 D"],

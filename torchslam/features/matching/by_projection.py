@@ -26,7 +26,7 @@ from torchslam.features.matching.brute_force import (
     to_matches,
 )
 from torchslam.features.matching.hamming import hamming_between
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import check_positive, without_autocast
 from torchslam.types import Features, Matches
 
 Array = NDArray[Any]
@@ -88,6 +88,7 @@ def pairs_within_radius(
     return row.index_select(0, near), column.index_select(0, near)
 
 
+@without_autocast
 def expand_runs(
     starts: Int[Tensor, " N"], ends: Int[Tensor, " N"]
 ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
@@ -278,7 +279,7 @@ SCALE_TOLERANCE = 1.5
 _MAX_PIXEL = 1e6  # points projected farther outside of the image do not match
 
 
-@full_precision
+@without_autocast
 def match_by_projection(
     descriptors: Shaped[Tensor, "B M D"],
     pixels: Float[Tensor, "B M 2"],
@@ -316,6 +317,7 @@ def match_by_projection(
     Raises:
         ValueError: The descriptors differ in type or length, or are not of unit length.
     """
+    check_positive(ratio=ratio, scale_tolerance=scale_tolerance, angle_tolerance=angle_tolerance)
     check_descriptors(descriptors, features.descriptors)
     batch, rows, columns = len(pixels), pixels.shape[1], features.keypoints.shape[1]
     if rows == 0 or columns == 0:

@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Num, Shaped, UInt8
 from torch import Tensor
 
+from torchslam.geometry.precision import without_autocast
 from torchslam.utils.indexing import true_indices
 
 # Product with this word moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
@@ -22,6 +23,7 @@ _CHUNK = 1 << 13  # pairs whose bits are counted at once: their words stay in th
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
 
+@without_autocast
 def pack_bits(bits: Shaped[Tensor, "*batch D"]) -> UInt8[Tensor, "*batch D//8"]:
     """Pack booleans into bytes, least significant bit first.
 
@@ -34,6 +36,7 @@ def pack_bits(bits: Shaped[Tensor, "*batch D"]) -> UInt8[Tensor, "*batch D//8"]:
     return ((words * _GATHER_BITS) >> 56).to(torch.uint8).view(*bits.shape[:-1], bits.shape[-1] // 8)
 
 
+@without_autocast
 def unpack_bits(descriptors: UInt8[Tensor, "*batch D"]) -> Bool[Tensor, "*batch 8*D"]:
     """Unpack descriptors to bits, the inverse of `pack_bits`."""
     return bit_table(0, 1, descriptors.device)[descriptors.long()].flatten(-2).to(torch.bool)
@@ -104,6 +107,7 @@ def _sum_of_bytes(counts: Any) -> Any:
     return ((pairs + (pairs >> 16)) & 0xFFFF).astype(np.int64)
 
 
+@without_autocast
 def hamming(
     descriptors_1: UInt8[Tensor, "*batch N1 D"], descriptors_2: UInt8[Tensor, "*batch N2 D"]
 ) -> Int[Tensor, "*batch N1 N2"]:

@@ -55,7 +55,9 @@ def enlarged(pinhole: Camera, camera: Camera) -> Camera:
     """The camera of a depth map, for images as large as those of the camera that it was made from."""
     factor = max(1.0, float(camera.params[0] / pinhole.params[0]))
     size = (round(factor * pinhole.width), round(factor * pinhole.height))
-    scale = torch.tensor(size).to(pinhole.params) / torch.tensor(pinhole.size).to(pinhole.params)
+    scale = torch.tensor(size, device="cpu").to(pinhole.params) / torch.tensor(pinhole.size, device="cpu").to(
+        pinhole.params
+    )
     center = (pinhole.params[2:] + 0.5) * scale - 0.5
     return Camera("pinhole", torch.cat((pinhole.params[:2] * scale, center)), size)
 

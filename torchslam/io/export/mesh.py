@@ -76,7 +76,7 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
         ResultsError: Open3D is missing, or no depth has enough confidence.
     """
     o3d = import_open3d()
-    turn = rigid(R_up.double(), torch.zeros(3, dtype=torch.float64))
+    turn = rigid(R_up.double(), torch.zeros(3, dtype=torch.float64, device="cpu"))
     middle = _median_depth(depths)
     voxel = _voxel(depths, middle)
     grid = o3d.t.geometry.VoxelBlockGrid(

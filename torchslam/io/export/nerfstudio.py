@@ -77,7 +77,12 @@ def write_nerfstudio(
         "frames": frames,
     }
     (folder / TRANSFORMS).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    write_ply(folder / POINT_CLOUD, upright.points_w, upright.colors, centers_w=torch.zeros(0, 3))
+    write_ply(
+        folder / POINT_CLOUD,
+        upright.points_w,
+        upright.colors,
+        centers_w=torch.zeros(0, 3, dtype=torch.float32, device="cpu"),
+    )
     if cloud is not None:
         write_cloud(folder / DENSE_CLOUD, cloud.thinned(MAX_POINTS), R_up)
 

@@ -40,7 +40,7 @@ def upright_from_map(slam_map: Map) -> Float[Tensor, "3 3"]:
 def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
     """Write the points of a map in the colors of the images, and the keyframes of a session in red, z up."""
     if slam_map.num_keyframes == 0:
-        nothing = torch.zeros(0, 3)
+        nothing = torch.zeros(0, 3, dtype=torch.float32, device="cpu")
         write_ply(path, nothing, nothing.byte(), nothing)
         return
     T_wc, points, alive = se3_inverse(slam_map.T_cw), slam_map.points, slam_map.valid_points()

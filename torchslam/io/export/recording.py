@@ -171,7 +171,7 @@ def _record_depths(
 ) -> None:
     frame_ids, camera = read_frames(depths)
     seconds = scene.of_frames(frame_ids).timestamps - scene.timestamps[0]
-    turn = torch.eye(4, dtype=torch.float64)
+    turn = torch.eye(4, dtype=torch.float64, device="cpu")
     turn[:3, :3] = R_up
     recorder.camera(DEPTH, camera)
     for maps, time in zip(depth_images(depths), seconds.tolist(), strict=True):

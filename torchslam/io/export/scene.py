@@ -75,7 +75,9 @@ class ExportedScene:
         if missing:
             raise ResultsError(f"frame {missing[0]} has no pose in this map")
         rows = torch.nonzero(torch.isin(self.frame_ids, frame_ids))[:, 0]
-        slot = torch.full((len(self.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
+        slot = torch.full((len(self.T_cw),), -1, device="cpu").index_copy(
+            0, rows, torch.arange(len(rows), device="cpu")
+        )
         is_kept = _of_tracks(slot[self.frame_index] >= 0, self.point_index, len(self.points_w))
         points, point_index = torch.unique(self.point_index[is_kept], return_inverse=True)
         return replace(
@@ -98,7 +100,7 @@ class ExportedScene:
 
     def point_errors(self) -> Float[Tensor, " N"]:
         """Return the mean error of each point; their mean is the reprojection error of COLMAP."""
-        total = torch.zeros(len(self.points_w), dtype=self.pixels.dtype)
+        total = torch.zeros(len(self.points_w), dtype=self.pixels.dtype, device="cpu")
         count = torch.bincount(self.point_index, minlength=len(total))
         return total.index_add(0, self.point_index, self.errors()) / count
 
@@ -119,7 +121,9 @@ def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool
             f"submap {submap.number} holds no frames of this run: it was only localized, or all of it is elsewhere"
         )
     rows = rows[torch.argsort(graph.timestamps[rows], stable=True)]
-    slot = torch.full((len(graph.T_cw),), -1).index_copy(0, rows, torch.arange(len(rows)))
+    slot = torch.full((len(graph.T_cw),), -1, device="cpu").index_copy(
+        0, rows, torch.arange(len(rows), device="cpu")
+    )
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])
     is_kept = (slot[graph.frame_index] >= 0) & camera.project(points_c[:, 0])[1]
     is_kept = _of_tracks(is_kept, graph.point_index, len(graph.points_w))
@@ -156,12 +160,12 @@ def pinhole_within(camera: Camera) -> Camera:
     """
     if camera.model == "pinhole":
         return camera
-    x, y = (torch.arange(size, dtype=camera.params.dtype) for size in camera.size)
+    x, y = (torch.arange(size, dtype=camera.params.dtype, device="cpu") for size in camera.size)
     left, right = (camera.normalize(_line(at, y))[:, 0] for at in (0, camera.width - 1))
     top, bottom = (camera.normalize(_line(at, x).flip(1))[:, 1] for at in (0, camera.height - 1))
     low, high = torch.stack((left.max(), top.max())), torch.stack((right.min(), bottom.min()))
     focal = camera.params[:2]
-    extent, size = (high - low) * focal, torch.tensor(camera.size)
+    extent, size = (high - low) * focal, torch.tensor(camera.size, device="cpu")
     if not bool((extent >= 1).all()):
         raise ResultsError("the field of view of the camera is too wide for an undistorted image")
     scale = (MAX_GROWTH * size / extent).min().clamp(max=1.0)
@@ -193,7 +197,9 @@ class Undistorter:
         pinhole = pinhole_within(camera) if pinhole is None else pinhole
         self._size = pinhole.size
         factor = max(1, int(camera.params[0] / pinhole.params[0] + 1e-6))
-        u, v = ((torch.arange(factor * side).double() + 0.5) / factor - 0.5 for side in pinhole.size)
+        u, v = (
+            (torch.arange(factor * side, device="cpu").double() + 0.5) / factor - 0.5 for side in pinhole.size
+        )
         grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
         rays = torch.nn.functional.pad(
             pinhole.to(torch.float64).normalize(grid.flatten(0, 1)), (0, 1), value=1.0

@@ -127,7 +127,7 @@ def tracked_pixels(slam: SLAM, index: int) -> Float[Tensor, "M 2"]:
     """Pixels at which a frame of this session observes map points; none while its pose is unreliable."""
     frames, seen = slam.posed_frames.frames, slam.posed_frames.observations
     if len(frames) == 0 or len(seen) == 0:
-        return torch.zeros(0, 2, dtype=torch.float64)
+        return torch.zeros(0, 2, dtype=torch.float64, device="cpu")
     is_it = (frames["frame_index"] == index) & (frames["session"] == slam.session.number)
     return seen["pixels"][torch.isin(seen["frame_row"], torch.nonzero(is_it)[:, 0])]
 

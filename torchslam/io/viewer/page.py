@@ -23,7 +23,7 @@ from torchslam.geometry import Camera, se3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
-from torchslam.io.results import Results, aligned
+from torchslam.io.results import Results, aligned, aligned_poses
 from torchslam.map.atlas import Submap
 from torchslam.system.run import keyframe_trajectory
 from torchslam.types import State, Trajectory
@@ -81,7 +81,7 @@ def page_data(results: Results) -> dict[str, Any]:
     """
     metrics = results.metrics
     frames = [results.frames[row] for row in thin(len(results.frames), MAX_FRAMES)]
-    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64)
+    times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64, device="cpu")
     reasons = list(dict.fromkeys(frame.reason for frame in frames))
     number_of = {reason: number for number, reason in enumerate(reasons)}
     paths = {metrics["submap"]: results.trajectory} | results.others
@@ -145,11 +145,14 @@ def _submap(
     is_main = submap.number == results.metrics["submap"]
     cloud = results.cloud if is_main else None
     evaluation = _evaluation(path, results)
-    S = torch.eye(4, dtype=torch.float64) if evaluation is None else evaluation.S_groundtruth_estimate.clone()
+    S = (
+        torch.eye(4, dtype=torch.float64, device="cpu")
+        if evaluation is None
+        else evaluation.S_groundtruth_estimate.clone()
+    )
     keyframes = keyframe_trajectory(submap.map, results.session)
-    up = torch.eye(4, dtype=torch.float64)
-    every_keyframe = Trajectory(submap.map.keyframes["timestamp"], se3_inverse(submap.map.T_cw))
-    up[:3, :3] = upright_rotation(aligned(every_keyframe, S).T_wc)
+    up = torch.eye(4, dtype=torch.float64, device="cpu")
+    up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
     S = up @ S
     points_w, colors = _points(submap)
     box = torch.from_numpy(
@@ -157,8 +160,8 @@ def _submap(
     )
     S[:3, 3] -= box.mean(dim=0)
     box = box - box.mean(dim=0)
-    errors = torch.full((len(path),), torch.nan, dtype=torch.float64)
-    truth = torch.zeros(0, 3, dtype=torch.float64)
+    errors = torch.full((len(path),), torch.nan, dtype=torch.float64, device="cpu")
+    truth = torch.zeros(0, 3, dtype=torch.float64, device="cpu")
     if evaluation is not None:
         errors[nearest(evaluation.matched.timestamps, path.timestamps)[0]] = evaluation.errors_m
         to_shown = S @ torch.linalg.inv(evaluation.S_groundtruth_estimate)
@@ -238,7 +241,9 @@ def _during(results: Results, path: Trajectory) -> Trajectory:
 def _points(submap: Submap) -> tuple[Float[Tensor, "N 3"], UInt8[Tensor, "N 3"]]:
     """Return positions and colors of the valid points."""
     if submap.map.num_points == 0:
-        return torch.zeros(0, 3, dtype=torch.float64), torch.zeros(0, 3, dtype=torch.uint8)
+        return torch.zeros(0, 3, dtype=torch.float64, device="cpu"), torch.zeros(
+            0, 3, dtype=torch.uint8, device="cpu"
+        )
     ids = submap.map.valid_points()
     positions_w = submap.map.positions_w[ids].double()
     finite = positions_w.isfinite().all(dim=-1)
@@ -250,7 +255,9 @@ def _shown_rows(
 ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Return the displayed frames that have a pose, ascending, and the rows of their poses."""
     if len(timestamps) == 0 or len(times) == 0:
-        return torch.zeros(0, dtype=torch.int64), torch.zeros(0, dtype=torch.int64)
+        return torch.zeros(0, dtype=torch.int64, device="cpu"), torch.zeros(
+            0, dtype=torch.int64, device="cpu"
+        )
     row, distance = nearest(times, timestamps)
     frame = torch.nonzero(distance < 1e-6)[:, 0]  # files keep nanoseconds
     return frame, row[frame]
@@ -259,7 +266,7 @@ def _shown_rows(
 def _corners(camera: Camera) -> Float[Tensor, "4 3"]:
     """Return rays of unit depth through the image corners, in order around the image."""
     fx, fy, cx, cy = camera.params.double()[:4]
-    x = (torch.tensor([0.0, 1, 1, 0]) * (camera.width - 1) - cx) / fx
-    y = (torch.tensor([0.0, 0, 1, 1]) * (camera.height - 1) - cy) / fy
+    x = (torch.tensor([0.0, 1, 1, 0], dtype=torch.float32, device="cpu") * (camera.width - 1) - cx) / fx
+    y = (torch.tensor([0.0, 0, 1, 1], dtype=torch.float32, device="cpu") * (camera.height - 1) - cy) / fy
     slopes = torch.stack((x, y), dim=-1).clamp(-MAX_SLOPE, MAX_SLOPE)
     return torch.nn.functional.pad(slopes, (0, 1), value=1.0)

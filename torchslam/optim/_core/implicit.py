@@ -11,7 +11,8 @@ networks", 2021.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Protocol, get_args
+from functools import wraps
+from typing import Any, Literal, ParamSpec, Protocol, TypeVar, get_args
 
 import torch
 from torch import Tensor
@@ -20,6 +21,9 @@ from torch._C._functorch import TransformType, get_interpreter_stack
 from torch.func import grad, vjp, vmap
 
 from torchslam.geometry.precision import full_precision
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 Backward = Literal["implicit", "unroll", "truncated", "detached"]
 """How gradients pass a minimization.
@@ -36,8 +40,25 @@ InDims = Sequence[int | None]
 """The mapped dimension of each tensor under `vmap`; None where all elements share the tensor."""
 
 
-def check_backward(backward: str) -> None:
-    """Raises ValueError unless `backward` is one of the modes."""
+def _alone(function: Callable[P, R]) -> Callable[P, R]:
+    """The function without anomaly detection inside, which `vmap` cannot do: autograd tests what it returns."""
+
+    @wraps(function)
+    def alone(*args: P.args, **kwargs: P.kwargs) -> R:
+        if not torch.is_anomaly_enabled():
+            return function(*args, **kwargs)
+        with torch.autograd.set_detect_anomaly(False):
+            return function(*args, **kwargs)
+
+    return alone
+
+
+def check_options(backward: str, iterations: int, tolerance: float) -> None:
+    """Raises ValueError for a mode that is unknown, and for numbers that no minimization can end by."""
+    if not iterations >= 0:
+        raise ValueError(f"iterations must not be below zero, got {iterations}")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must not be below zero, got {tolerance}")
     if backward not in get_args(Backward):
         raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(get_args(Backward))}")
 
@@ -87,6 +108,8 @@ def find_minimum(problem: Minimization, inputs: Sequence[Tensor], backward: Back
     With "implicit", theta has its implicit derivatives to the inputs, and the rest is detached. Raises RuntimeError for
     forward mode within forward mode, where PyTorch would silently drop a part.
     """
+    if not torch.is_inference_mode_enabled():  # what was made under it can be no part of a graph
+        inputs = [tensor.clone() if tensor.is_inference() else tensor for tensor in inputs]
     if backward == "unroll":
         return problem.minimize(tuple(inputs))
     if backward != "implicit":
@@ -103,6 +126,7 @@ class _Minimum(torch.autograd.Function):
     """inputs -> found."""
 
     @staticmethod
+    @_alone
     @full_precision
     def forward(problem: Minimization, *inputs: Tensor) -> Tensors:
         return tuple(tensor.detach() for tensor in problem.minimize(inputs))
@@ -116,6 +140,7 @@ class _Minimum(torch.autograd.Function):
         ctx.save_for_forward(*tensors, *output)
 
     @staticmethod
+    @_alone
     @full_precision
     def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
         problem, needed = ctx.problem, ctx.needs_input_grad[1:]
@@ -129,6 +154,7 @@ class _Minimum(torch.autograd.Function):
         return None, *_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)
 
     @staticmethod
+    @_alone
     @full_precision
     def jvp(ctx: Any, _: None, *changes: Tensor | None) -> tuple[Tensor | None, ...]:
         problem = ctx.problem
@@ -160,6 +186,7 @@ class _Solve(torch.autograd.Function):
     """right, found, inputs -> H^-1 right; `many` dimensions of right sides of the same H lead `right`."""
 
     @staticmethod
+    @_alone
     @full_precision
     def forward(problem: Minimization, many: int, num_found: int, *tensors: Tensor) -> Tensors:
         right, found, inputs = _parts(problem, num_found, tensors)
@@ -172,6 +199,7 @@ class _Solve(torch.autograd.Function):
         ctx.save_for_forward(*output, *tensors)
 
     @staticmethod
+    @_alone
     @full_precision
     def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
         problem, many = ctx.problem, ctx.many
@@ -189,6 +217,7 @@ class _Solve(torch.autograd.Function):
         return (None, None, None, *adjoint, *_gradient(curvature, (*found, *inputs), needed))
 
     @staticmethod
+    @_alone
     @full_precision
     def jvp(ctx: Any, _: None, __: None, ___: None, *changes: Tensor | None) -> Tensors:
         problem, many = ctx.problem, ctx.many

@@ -326,7 +326,7 @@ def variance_factor(
     redundant = (components > num_parameters) & (mean_slope > 0)
     mean_slope = torch.where(redundant, mean_slope, 1.0)
     spread = (across.square() + along.square()).sum(-1) / components / mean_slope.square() - 1
-    correction = 1 + num_parameters / components * spread
+    correction = 1 + num_parameters / components.float() * spread
     psi_squared = (linearization.weight.square() * squared * variance).sum(-1)
     psi_squared = psi_squared / torch.where(redundant, components - num_parameters, 1)
     mean_weight = 2 * across.sum(-1) / components

@@ -13,12 +13,13 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
+from torchslam.optim._core.implicit import Backward, check_options, find_minimum
 from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, Progress, check_minimum
 from torchslam.optim.bundle._factors import factor_kinds
 from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
 from torchslam.optim.bundle._schur import Marginals
+from torchslam.utils.indexing import row_numbers
 
 __all__ = ["BundleProblem", "BundleSolution", "bundle_adjust"]
 
@@ -77,12 +78,17 @@ class BundleSolution:
             (C P, C P) of several cameras.
         """
         marginals = self._covariance
-        rows = [
-            slice(None) if r is None else torch.as_tensor(r, device=self.T_cw.device)
-            for r in (frames, points)
-        ]
+
+        def some(name: str, rows: Tensor | Sequence[int] | None, of_all: Tensor) -> Tensor:
+            if rows is None:
+                return of_all
+            rows = torch.as_tensor(rows, device=of_all.device)
+            return of_all[..., row_numbers(name, rows, of_all.shape[-3]), :, :]
+
         return Marginals(
-            marginals.frames[..., rows[0], :, :], marginals.points[..., rows[1], :, :], marginals.camera
+            some("frames", frames, marginals.frames),
+            some("points", points, marginals.points),
+            marginals.camera,
         )
 
     def element(self, row: int, num_frames: int, num_points: int) -> BundleSolution:
@@ -152,7 +158,7 @@ def bundle_adjust(
         ValueError: a shape or an index does not fit, or a name is unknown.
         ConvergenceError: with `strict`.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     given = sanitized(problem, scale)
     minimization = BundleMinimization(
         problem.camera,

@@ -28,8 +28,8 @@ FrameError = Callable[[Tensor, Tensor, Tensor], Tensor]
 
 @full_precision
 def relative_pose_error(
-    T_1w: Float[Tensor, "*batch 4 4"], T_2w: Float[Tensor, "*batch 4 4"], T_21: Float[Tensor, "*batch 4 4"]
-) -> Float[Tensor, "*batch 6"]:
+    T_1w: Float[Tensor, "*#batch 4 4"], T_2w: Float[Tensor, "*#batch 4 4"], T_21: Float[Tensor, "*#batch 4 4"]
+) -> Float[Tensor, "*#batch 6"]:
     """Translation and rotation vector of T_2w @ T_1w^-1 @ T_21^-1."""
     E = T_2w @ se3_inverse(T_21 @ T_1w)
     return torch.cat((E[..., :3, 3], so3_log(E[..., :3, :3])), dim=-1)
@@ -37,8 +37,10 @@ def relative_pose_error(
 
 @full_precision
 def log_distance_error(
-    T_1w: Float[Tensor, "*batch 4 4"], T_2w: Float[Tensor, "*batch 4 4"], distances: Float[Tensor, "*batch"]
-) -> Float[Tensor, "*batch 1"]:
+    T_1w: Float[Tensor, "*#batch 4 4"],
+    T_2w: Float[Tensor, "*#batch 4 4"],
+    distances: Float[Tensor, "*#batch"],
+) -> Float[Tensor, "*#batch 1"]:
     """Logarithm of the distance between two camera centers over the measured one; the centers must differ."""
     between = se3_inverse(T_2w)[..., :3, 3] - se3_inverse(T_1w)[..., :3, 3]
     return (torch.linalg.vector_norm(between, dim=-1) / distances).log()[..., None]

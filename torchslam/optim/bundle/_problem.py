@@ -13,6 +13,7 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, transform
 from torchslam.geometry.precision import check_dtypes
+from torchslam.geometry.robust import kernel_scale
 from torchslam.optim._core.residuals import only, usable
 from torchslam.optim._core.tangent import CameraPrior, PosePrior, prior_expansion, prior_hessian, rotated
 from torchslam.optim.bundle._factors import (
@@ -278,7 +279,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         torch.where(counted[..., None], pixels, 0.0),
         only(counted, weights),
         params,
-        torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device).expand(batch),
+        kernel_scale(scale, T_cw).expand(batch),
         *priors,
         *usable_depths(depths, depth_information, counted),
         measured,
@@ -336,7 +337,8 @@ def usable_depths(depths: Tensor, information: Tensor, counted: Tensor) -> tuple
 
 def _cameras(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor]:
     """Parameters (B, C, P) and the camera of each frame (B, K)."""
-    params, index = problem.camera.params, problem.camera_index
+    # A copy: parameters may move in place before the covariance is asked for.
+    params, index = problem.camera.params.clone(), problem.camera_index
     if index is None:
         params = _over("camera.params", "(P,)", params, (len(T_cw), params.shape[-1]))
         return params[:, None], torch.zeros(T_cw.shape[:2], dtype=torch.int64, device=T_cw.device)

@@ -18,8 +18,8 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_backward, find_minimum
+from torchslam.geometry.robust import Kernel, kernel_scale
+from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_options, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     MAX_ITERATIONS,
     Convergence,
@@ -179,9 +179,11 @@ class PoseInputs:
         use = usable(pixels, points_w, weights)
         use = use if mask is None else use & mask
         rows = use[..., None]
-        scale = torch.as_tensor(scale, dtype=T_cw.dtype, device=T_cw.device)
+        scale = kernel_scale(scale, T_cw)
         if prior is not None:
             prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
+        # A copy, as of the others: parameters may move in place before the covariance is asked for.
+        camera = camera.with_params(camera.params.clone())
         observations = ReprojectionData(
             torch.where(rows, pixels, 0.0), only(use, weights), camera, kernel, scale[..., None]
         )
@@ -398,7 +400,7 @@ def refine_pose(
         ValueError: a shape does not fit, or a name is unknown.
         ConvergenceError: with `strict`.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
     minimization = PoseMinimization(inputs, iterations, tolerance)
     tensors = (T_cw, *inputs.tensors())

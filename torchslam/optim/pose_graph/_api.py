@@ -10,8 +10,8 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, check_backward, find_minimum
+from torchslam.geometry.robust import Kernel, kernel_scale
+from torchslam.optim._core.implicit import Backward, check_options, find_minimum
 from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, check_minimum
 from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
 from torchslam.utils.indexing import row_mask
@@ -105,7 +105,7 @@ def pose_graph_optimize(
         ValueError: a shape or an index does not fit, or a name is unknown.
         ConvergenceError: with `strict`.
     """
-    check_backward(backward)
+    check_options(backward, iterations, tolerance)
     counted, fixed, inputs = _sanitized(graph, scale)
     minimization = PoseGraphMinimization(inputs.information.shape[-1], kernel, iterations, tolerance)
     tensors = (*inputs, counted, fixed, graph.edges)
@@ -159,7 +159,7 @@ def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor,
         counted = counted & graph.mask
     fixed = row_mask("fixed", graph.fixed, nodes)
     eye = torch.eye(n, dtype=S_cw.dtype, device=S_cw.device)
-    scale = torch.as_tensor(scale, dtype=S_cw.dtype, device=S_cw.device)
+    scale = kernel_scale(scale, S_cw)
     rows = counted[..., None, None]
     return (
         counted,

@@ -243,7 +243,7 @@ class PoseGraphProblem:
         nodes = torch.where(moving[..., None], layout.by_node.sum(ends), 0.0)
         eye = torch.eye(self.group.dims, dtype=S_cw.dtype, device=S_cw.device)
         # Where an edge lost all its weight, its nodes stay solvable: their step is zero.
-        floor = torch.where(moving[..., None], diagonal_floor(S_cw.dtype), 1.0) * eye
+        floor = torch.where(moving[..., None], diagonal_floor(S_cw.dtype), 1.0).float() * eye
 
         linking = layout.linking
         both = (layout.moving[:, layout.i] & layout.moving[:, layout.j])[:, linking, None, None]

@@ -1,0 +1,274 @@
+"""Check of arguments against the shapes and kinds that the signature of a function states.
+
+A mask of shape (N, 1) would broadcast to a batch of N problems, ones and zeros of integers would be taken for row
+numbers, and half precision for single: results that look like any other.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from dataclasses import fields, is_dataclass
+from functools import cache
+from types import NoneType, UnionType
+from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import torch
+from jaxtyping import AbstractArray
+from torch import Tensor
+
+_FLOATS = (torch.float32, torch.float64)
+_KINDS: dict[str, tuple[tuple[torch.dtype, ...], str]] = {
+    "Float": (_FLOATS, "float32 or float64"),
+    "Bool": ((torch.bool,), "bool"),
+    "Int": ((torch.int64,), "int64"),
+    "UInt8": ((torch.uint8,), "uint8"),
+}
+
+
+class _Form(NamedTuple):
+    """One kind and shape that a tensor may have.
+
+    Attributes:
+        dtypes: that it may have; none: any.
+        kind: these in words.
+        before: dimensions in front of those of any number, each a size, a name, or None for any size.
+        variadic: name of the dimensions of any number; None: there are none.
+        after: the dimensions behind them.
+        broadcasts: whether the dimensions of any number broadcast.
+        text: the shape as messages show it.
+    """
+
+    dtypes: tuple[torch.dtype, ...]
+    kind: str
+    before: tuple[int | str | None, ...]
+    variadic: str | None
+    after: tuple[int | str | None, ...]
+    broadcasts: bool
+    text: str
+
+    @classmethod
+    def of(cls, annotation: Any) -> _Form:
+        tokens = annotation.dim_str.split()
+        place = next((i for i, token in enumerate(tokens) if "*" in token[:2] or token == "..."), None)
+        dims = [_dimension(token) for token in tokens]
+        shown = ["..." if i == place else token.strip("#") for i, token in enumerate(tokens)]
+        dtypes, kind = _KINDS.get(annotation.__name__.split("[")[0], ((), ""))
+        text = f"({', '.join(shown)}{',' * (len(shown) == 1)})"
+        if place is None:
+            return cls(dtypes, kind, tuple(dims), None, (), False, text)
+        name = tokens[place].strip("*#.")
+        return cls(
+            dtypes, kind, tuple(dims[:place]), name, tuple(dims[place + 1 :]), "#" in tokens[place], text
+        )
+
+
+def _dimension(token: str) -> int | str | None:
+    """A size, a name, or None for what a call does not know: a pattern, or the result of a computation."""
+    if token.isdigit():
+        return int(token)
+    name = token.strip("#")
+    return token if name.isidentifier() and name != "_" else None
+
+
+class _Argument(NamedTuple):
+    """What one argument may be.
+
+    Attributes:
+        name: of the argument.
+        forms: of a tensor.
+        classes: of an object with tensors.
+        holds: the fields of such an object.
+        is_open: whether it may be something else as well.
+    """
+
+    name: str
+    forms: tuple[_Form, ...]
+    classes: tuple[type, ...]
+    holds: tuple[tuple[str, _Argument], ...]
+    is_open: bool
+
+
+class _Call:
+    """The sizes and the dtype that the arguments of one call, or the fields of one object, agree on."""
+
+    def __init__(self, one_dtype: bool) -> None:
+        self.one_dtype = one_dtype
+        self.sizes: dict[str, tuple[int, str]] = {}
+        self.batches: dict[str, tuple[tuple[int, ...], str]] = {}
+        self.floats: tuple[torch.dtype, str] | None = None
+
+    def check(self, argument: _Argument, value: Any) -> None:
+        name = argument.name
+        if not isinstance(value, Tensor):
+            self._check_object(argument, value)
+            return
+        if not argument.forms:
+            raise TypeError(f"{name} must be {_listed(argument.classes)}, not a tensor")
+        fitting = [form for form in argument.forms if not form.dtypes or value.dtype in form.dtypes]
+        if not fitting:
+            kinds = " or ".join(dict.fromkeys(form.kind for form in argument.forms))
+            raise ValueError(f"{name} must be {kinds}, not {value.dtype}")
+        misfits = [self._misfit(form, name, tuple(value.shape)) for form in fitting]
+        if None not in misfits:
+            shapes = " or ".join(form.text + self._sizes_of(form) for form in fitting)
+            raise ValueError(f"{name} must be {shapes}, not {tuple(value.shape)}{misfits[0]}")
+        if (
+            fitting[0].dtypes and value.dtype in _FLOATS and value.ndim > 0
+        ):  # a number takes any dtype, as in PyTorch
+            self._agree_on_dtype(name, value.dtype)
+
+    def _check_object(self, argument: _Argument, value: Any) -> None:
+        name = argument.name
+        if isinstance(value, argument.classes):
+            inner = _Call(self.one_dtype)
+            inner.floats = self.floats
+            for field, each in argument.holds:
+                content = getattr(value, field)
+                if content is not None:
+                    inner.check(each, content)
+            self.floats = inner.floats
+            if "B" in self.sizes and "batch" in inner.batches:
+                (lead, field), (size, where) = inner.batches["batch"], self.sizes["B"]
+                if lead not in ((), (1,), (size,)):
+                    raise ValueError(
+                        f"{field} must lead with B = {size} of {where} or not at all, not with {lead}"
+                    )
+            elif "batch" in self.batches and "batch" in inner.batches:
+                (lead, field), (batch, where) = inner.batches["batch"], self.batches["batch"]
+                if _broadcast(lead, batch) is None:
+                    raise ValueError(f"{field} leads with {lead}, which does not go with {batch} of {where}")
+        elif not argument.is_open:
+            wanted = _listed(argument.classes) if argument.classes else "a tensor: see torch.as_tensor"
+            raise TypeError(f"{name} is of type {type(value).__name__}, but must be {wanted}")
+
+    def _agree_on_dtype(self, name: str, dtype: torch.dtype) -> None:
+        if self.floats is None:
+            self.floats = dtype, name
+        elif self.one_dtype and dtype != self.floats[0]:
+            raise ValueError(
+                f"{name} is {dtype}, but {self.floats[1]} is {self.floats[0]}: all must be the same"
+            )
+
+    def _sizes_of(self, form: _Form) -> str:
+        """The shape in numbers where the arguments before have determined all of it."""
+        names = [str(each).strip("#") for each in form.before]
+        sizes = [each if each.isdigit() else self.sizes.get(each, ("", ""))[0] for each in names]
+        if form.variadic is not None or "" in sizes or all(each.isdigit() for each in names):
+            return ""
+        return f" = ({', '.join(map(str, sizes))}{',' * (len(sizes) == 1)})"
+
+    def _misfit(self, form: _Form, name: str, shape: tuple[int, ...]) -> str | None:
+        """Why a shape does not fit; None where it fits, and then its sizes are those of the call."""
+        before, after = form.before, form.after
+        more = len(shape) - len(before) - len(after)
+        if more < 0 or (more > 0 and form.variadic is None):
+            return ""
+        found: dict[str, tuple[int, str]] = {}
+        for dimension, size in zip(
+            before + after, shape[: len(before)] + shape[len(before) + more :], strict=True
+        ):
+            if dimension is None or dimension == size:
+                continue
+            if isinstance(dimension, int):
+                return ""
+            if dimension[0] == "#":
+                if size == 1:
+                    continue
+                dimension = dimension[1:]
+            known = self.sizes.get(dimension) or found.get(dimension)
+            if known is None:
+                found[dimension] = size, name
+            elif known[0] != size:
+                return f": {dimension} is {known[0]} in {known[1]}" if form.variadic else ""
+        if form.variadic:
+            batch = shape[len(before) : len(before) + more]
+            known_batch = self.batches.get(form.variadic)
+            if known_batch is not None and known_batch[0] != batch:
+                both = _broadcast(known_batch[0], batch) if form.broadcasts else None
+                if both is None:
+                    return f": ... is {known_batch[0]} in {known_batch[1]}"
+                batch = both
+            self.batches[form.variadic] = batch, name
+        self.sizes.update(found)
+        return None
+
+
+def _broadcast(first: tuple[int, ...], second: tuple[int, ...]) -> tuple[int, ...] | None:
+    """The shape of both together; None where they do not fit, or where a column and a row would make a table."""
+    if len(first) < len(second):
+        first, second = second, first
+    if len(first) > len(second) > 0 and first[-1] == 1 and first[-2] == second[-1] > 1:
+        return None
+    length = len(first)
+    first, second = (1,) * (length - len(first)) + first, (1,) * (length - len(second)) + second
+    if any(a != b and a != 1 and b != 1 for a, b in zip(first, second, strict=True)):
+        return None
+    return tuple(b if a == 1 else a for a, b in zip(first, second, strict=True))
+
+
+def _alternatives(hint: Any) -> Iterator[Any]:
+    """The members of unions, flat."""
+    if get_origin(hint) in (Union, UnionType):
+        for part in get_args(hint):
+            yield from _alternatives(part)
+    else:
+        yield hint
+
+
+def _argument(name: str, hint: Any) -> _Argument | None:
+    """What a type hint says about tensors; None where it says nothing."""
+    options = [each for each in _alternatives(hint) if each is not NoneType]
+    arrays = [each for each in options if isinstance(each, type) and issubclass(each, AbstractArray)]
+    classes = tuple(each for each in options if isinstance(each, type) and is_dataclass(each))
+    holds = tuple(_fields(classes[0], name)) if classes else ()
+    if not (arrays or holds):
+        return None
+    is_open = len(options) > len(arrays) + len(classes)
+    return _Argument(name, tuple(_Form.of(each) for each in arrays), classes, holds, is_open)
+
+
+def _listed(classes: tuple[type, ...]) -> str:
+    return " or ".join(each.__name__ for each in classes)
+
+
+def _fields(cls: type, name: str) -> Iterator[tuple[str, _Argument]]:
+    hints = get_type_hints(cls)
+    for field in fields(cls):
+        argument = _argument(f"{name}.{field.name}", hints[field.name])
+        if argument is not None and not field.name.startswith("_"):
+            yield field.name, argument
+
+
+@cache
+def _arguments(function: Callable[..., Any]) -> tuple[list[_Argument | None], dict[str, _Argument]]:
+    """What the arguments of a function may be: by position, and by name."""
+    hints = get_type_hints(function)
+    names = list(inspect.signature(function).parameters)
+    by_position = [_argument(name, hints[name]) if name in hints else None for name in names]
+    return by_position, {each.name: each for each in by_position if each is not None}
+
+
+def check_arguments(
+    function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any], one_dtype: bool
+) -> None:
+    """Check the tensors of a call against the signature.
+
+    Args:
+        function: whose signature counts.
+        args: arguments by position.
+        kwargs: arguments by name.
+        one_dtype: whether all tensors of floats must have the same dtype.
+
+    Raises:
+        TypeError: An argument is no tensor.
+        ValueError: A dtype or a shape does not fit.
+    """
+    by_position, by_name = _arguments(function)
+    call = _Call(one_dtype)
+    for argument, value in zip(by_position, args, strict=False):
+        if argument is not None and value is not None:
+            call.check(argument, value)
+    for name, value in kwargs.items():
+        if value is not None and name in by_name:
+            call.check(by_name[name], value)
