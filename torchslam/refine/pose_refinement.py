@@ -60,6 +60,8 @@ FREE_STD = 1.0
 IMPROVED = 0.9
 """Distance of the matches of unused pairs from where the poses allow them, refined to given, up to which the images
 improve on the given poses; two maps of one recording by different features differ by 5 %."""
+MORE_AGREE = 0.05
+"""By how much the share of pairs that agree must grow to count as improved, whatever their distance."""
 
 
 class CameraChoice(Enum):
@@ -235,8 +237,10 @@ class _Refinement:
     @torch.no_grad()
     def keep_given_unless_improved(self, is_free: bool) -> bool:
         """Whether the given poses are kept, by pairs that mapping did not use; a better camera counts as improved."""
-        enough = self.before.pairs > 0 and self.before.used_agreeing >= GOOD_POSES and not is_free
-        if not enough or self.after.distance_px < IMPROVED * self.before.distance_px:
+        before, after = self.before, self.after
+        improved = after.distance_px < IMPROVED * before.distance_px
+        improved = improved or after.used_agreeing > before.used_agreeing + MORE_AGREE
+        if improved or is_free or before.pairs == 0:
             return False
         observed = self._tracks()
         found = observed.triangulate(self.T_cw, self.mapper.camera, GATE)
