@@ -131,7 +131,7 @@ def _put(
     camera: Camera,
 ) -> None:
     """Set single pixels where a point is the nearest so far."""
-    inside = camera.in_image(pixels)
+    inside = camera.in_image(pixels.to(camera.params.dtype))
     where = (pixels[:, 1] * camera.width + pixels[:, 0])[inside]
     depth, colors = depth[inside], colors[inside]
     nearest.scatter_reduce_(0, where, depth, "amin")

@@ -101,7 +101,7 @@ def room() -> Sequence:
     return open_sequence("synthetic:room", resize_to="320x240", stride=3, limit=24)
 
 
-@pytest.mark.parametrize(("supervised", "off"), [(True, 0.002), (False, 0.045)])
+@pytest.mark.parametrize(("supervised", "off"), [(True, 0.002), (False, 0.005)])
 def test_a_wrong_focal_length_moves_to_the_true_one(room: Sequence, supervised: bool, off: float) -> None:
     """From 5 % off: a few steps on a clip of a rendered room."""
     clips = Clips([room], per_sequence=1)
@@ -112,7 +112,7 @@ def test_a_wrong_focal_length_moves_to_the_true_one(room: Sequence, supervised: 
         if name == "loss":
             losses.append(value)
 
-    lens = learn(clips, start, supervised, ("focal",), steps=4, log=log)
+    lens = learn(clips, start, supervised, ("focal",), steps=8, log=log)
     found = lens.camera().focal.detach() / room.camera.focal - 1
     assert abs(float(found)) < off
     assert losses[-1] < losses[0]

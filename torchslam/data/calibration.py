@@ -75,7 +75,7 @@ class Calibration:
 
     def camera(self, size: Size) -> Camera:
         """Return the camera for images of `size`. Raises CalibrationError if it is for another size."""
-        if self.size is None:
+        if self.size is None and not self.guessed:
             self._check_center(size)
         if self.size not in (None, size):
             raise CalibrationError(

@@ -134,7 +134,7 @@ class _Call:
                     raise ValueError(
                         f"{field} must lead with B = {size} of {where} or not at all, not with {lead}"
                     )
-            elif "batch" in self.batches and "batch" in inner.batches:
+            elif "." not in name and "batch" in self.batches and "batch" in inner.batches:
                 (lead, field), (batch, where) = inner.batches["batch"], self.batches["batch"]
                 if _broadcast(lead, batch) is None:
                     raise ValueError(f"{field} leads with {lead}, which does not go with {batch} of {where}")

@@ -314,7 +314,8 @@ def open_images(
     try:
         camera = None
         if source.as_stored:  # the numbers are not used: the images may have another size
-            camera = Calibration("pinhole", (1.0, 1.0, 0.0, 0.0), source.path, as_stored=True)
+            numbers = (1.0, 1.0, 0.0, 0.0)
+            camera = Calibration("pinhole", numbers, source.path, guessed=True, as_stored=True)
         sequence = open_sequence(source.path, camera)
         if source.fps is not None and not set(times.values()) <= set(sequence.timestamps.tolist()):
             sequence = open_sequence(source.path, camera, fps=source.fps)
