@@ -112,7 +112,7 @@ def position_globally(
     scale = torch.as_tensor(scale, dtype=torch.float64, device=rays_w.device)
     if not scale > 0:
         raise ValueError(f"scale must be positive, not {float(scale)}")
-    dtype, rays_w, view, point = rays_w.dtype, rays_w.double(), view_index.long(), point_index.long()
+    dtype, rays_w, view, point = rays_w.dtype, rays_w.double(), view_index, point_index
     weights = rays_w.new_ones(len(rays_w)) if weights is None else weights.double()
     given = rays_w.new_zeros(num_views + num_points, 3)
     if start is not None:
