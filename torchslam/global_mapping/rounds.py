@@ -32,8 +32,8 @@ from torchslam.optim.run_graph import camera_prior
 from torchslam.types import FrameFeatures
 
 COARSE: tuple[tuple[Kernel, float], ...] = (("cauchy", 100.0), ("cauchy", 20.0), ("geman_mcclure", 6.0))
-"""Kernels and their scales, in standard deviations of a keypoint, while poses are pixels off. Without the first one the two
-sides of a weak link of office_loop stay apart; 400, and Huber at 3 and 20 with wider gates, end at the same minima."""
+"""Kernels and their scales, in standard deviations of a keypoint, while poses are pixels off. Without the first one
+both sides of a weak link of office_loop stay apart; Huber at 5 and 20 with wider gates ends at the same minima."""
 FINE: tuple[Kernel, float] = ("geman_mcclure", 5.0)
 """The same where poses are right to about a pixel. Tried 3 to 6, and Cauchy at 2, which is as good."""
 COARSE_TRACKS = 150

@@ -6,6 +6,8 @@ import torch
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, umeyama
 from torchslam.optim import bundle_adjust
 from torchslam.optim.bundle import _schur as schur
+from torchslam.optim.bundle import _sparse
+from torchslam.optim.bundle._sparse import SparseBundle
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -323,3 +325,38 @@ def test_invalid_input_is_rejected_by_name(bundle_scene):
         bundle_adjust(replace(problem, point_index=problem.point_index[:-1]))
     with pytest.raises(ValueError, match=r"shape \(5,\)"):
         bundle_adjust(replace(problem, fixed_frames=torch.ones(4, dtype=torch.bool)))
+
+
+def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
+    """Each lowers its own cost or stays, poses and camera stay, and together they come close to their minimum."""
+    monkeypatch.setattr(_sparse, "_INNER_FRAMES", 2)
+    settle, seen = SparseBundle._settled, []
+
+    def settled(self, estimate):
+        found = settle(self, estimate)
+        seen.append((self, estimate, found))
+        return found
+
+    monkeypatch.setattr(SparseBundle, "_settled", settled)
+    bundle_adjust(bundle_scene(frames=6, points=40, perturbation=0.05).problem, iterations=1)
+    (bundle, before, after), *_ = seen
+    assert torch.equal(before.T_cw, after.T_cw)
+    assert torch.equal(before.params, after.params)
+    costs, _, _ = bundle._of_points(before)
+    lower, gradient, hessian = bundle._of_points(after)
+    free = bundle.layout.free_points
+    assert bool((lower <= costs).all())
+    assert float(lower[free].sum()) < 0.999 * float(costs[free].sum())
+    left = torch.linalg.solve(hessian.movedim(-1, 0), gradient.mT[..., None])[..., 0]
+    assert float((left * gradient.mT)[free].sum()) < 1e-3 * float(
+        lower.sum()
+    )  # what one more step could gain
+
+
+def test_steps_of_points_lead_to_the_same_minimum(monkeypatch, bundle_scene):
+    problem = bundle_scene(frames=6, points=40, perturbation=0.05).problem
+    alone = bundle_adjust(problem, tolerance=1e-12)
+    monkeypatch.setattr(_sparse, "_INNER_FRAMES", 2)
+    settled = bundle_adjust(problem, tolerance=1e-12)
+    torch.testing.assert_close(settled.T_cw, alone.T_cw, rtol=0, atol=1e-7)
+    torch.testing.assert_close(settled.cost, alone.cost, rtol=1e-9, atol=0)

@@ -78,3 +78,26 @@ def test_progress_is_reported_before_each_iteration():
         Rosenbrock(3), STARTS, 60, tolerance=1e-14, progress=lambda *now: reported.append(now)
     )
     assert reported == [(iteration, 60) for iteration in range(int(report.iterations.max()))]
+
+
+class Uphill(Rosenbrock):
+    """Every step of some elements is too long, however much it is damped."""
+
+    def __init__(self, uphill: list[bool]) -> None:
+        super().__init__(len(uphill))
+        self.uphill = torch.tensor(uphill)
+
+    def step(self, model: Model, damping: Tensor) -> tuple[Tensor, Tensor]:
+        moved, predicted = super().step(model, damping)
+        return torch.where(self.uphill[:, None], model.x + 100, moved), predicted + self.uphill
+
+
+def test_an_element_without_a_step_that_is_short_enough_ends_alone_and_unconverged():
+    """After 13 rejected steps, from a damping of 1e-4 to 1e8; others go on."""
+    together, report = minimize_batch(Uphill([True, False, False]), STARTS, iterations=60, tolerance=1e-14)
+    alone, one = minimize_batch(Uphill([True]), STARTS[:1], iterations=60, tolerance=1e-14)
+    assert report.converged.tolist() == [False, True, True]
+    assert (int(report.iterations[0]), int(one.iterations[0]), one.converged.tolist()) == (13, 13, [False])
+    assert torch.equal(together.x[0], STARTS[0])
+    assert torch.equal(alone.x[0], STARTS[0])
+    torch.testing.assert_close(together.x[1:], torch.ones_like(STARTS[1:]))

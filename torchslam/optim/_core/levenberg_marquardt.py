@@ -167,7 +167,8 @@ def minimize_batch(
     """Minimize from `start`; returns the model at the last accepted estimate.
 
     An element has converged when the predicted reduction of its cost is below `tolerance` times the cost, or when its
-    residuals have vanished; it stays unchanged from then on. An exception of `progress` ends the minimization.
+    residuals have vanished; it stays unchanged from then on. So does one for which the shortest step is too long, which
+    has not converged. An exception of `progress` ends the minimization.
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
@@ -179,7 +180,7 @@ def minimize_batch(
     if isinstance(problem, Rounded):
         vanished = torch.maximum(vanished, problem.rounding())
     damping = torch.full_like(initial_cost, INITIAL_DAMPING)
-    steps = torch.zeros_like(active, dtype=torch.int64)
+    steps, given_up = torch.zeros_like(active, dtype=torch.int64), torch.zeros_like(active)
     rows, finished = torch.arange(len(active), device=active.device), []
     for iteration in range(iterations):
         if progress is not None:
@@ -191,16 +192,18 @@ def minimize_batch(
         steps = steps.index_add(0, rows, active.long())
         active = active & (relative_reduction > tolerance) & (model.cost.detach() > vanished)
         model = problem.select(accept, trial, model)
-        stuck = ~accept & (damping >= _DAMPING_RANGE[1])  # no shorter step is to be had
+        stuck = active & ~accept & (damping >= _DAMPING_RANGE[1])  # no shorter step is to be had
+        given_up = given_up.index_copy(0, rows, stuck)
+        active = active & ~stuck
         damping = torch.where(accept, damping * DAMPING_DOWN, damping * DAMPING_UP).clamp(*_DAMPING_RANGE)
-        if not (active & ~stuck).any():
+        if not active.any():
             break
         if isinstance(problem, Divisible) and not active.all():
             done, stay = (~active).nonzero().squeeze(-1), active.nonzero().squeeze(-1)
             finished.append((rows[done], index_tree(model, done)))
             problem, model = problem.part(stay), index_tree(model, stay)
             rows, active, damping, vanished = index_tree((rows, active, damping, vanished), stay)
-    converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active)
+    converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active) & ~given_up
     if finished:
         where, models = zip(*finished, (rows, model), strict=True)
         model = concat_tree(models, where)
