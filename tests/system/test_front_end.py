@@ -96,12 +96,12 @@ def test_every_stage_gets_the_scaled_configuration() -> None:
     slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
     scaled = Config().for_size((1280, 960))
     assert slam.config == Config()
-    initializer = slam._state_machine.initialization.initializer
+    initializer = slam._state_machine.map_start.initializer
     assert all(
-        one.config == scaled for one in (slam.mapper, slam.loop_closer, slam.non_static_filter, initializer)
+        one.config == scaled for one in (slam.mapper, slam.loop_closer, slam.scene_filter, initializer)
     )
     assert slam.tracker.settings == scaled.tracking
-    assert slam.non_static_filter.static_overlay.evidence.shape == (121, 161)
+    assert slam.scene_filter.static_overlay.evidence.shape == (121, 161)
 
 
 def run(size: str) -> Run:

@@ -66,7 +66,7 @@ def half(config: Config = CONFIG) -> tuple[SLAM, RunProgress]:
 def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("checkpoint") / "checkpoint.safetensors"
     slam, so_far = half()
-    slam.non_static_filter.static_overlay.evidence[3, 4] = 1  # too little to matter
+    slam.scene_filter.static_overlay.evidence[3, 4] = 1  # too little to matter
     slam.loop_closer.loop_closures.append(LoopClosureRecord(15, 3, 0, 0))
     write_checkpoint(path, slam, so_far, WALK)
     return path
@@ -103,7 +103,7 @@ def test_a_checkpoint_restores_the_state(checkpoint: Path) -> None:
         assert torch.equal(before, after) if isinstance(before, torch.Tensor) else before == after, (
             column.name
         )
-    assert torch.nonzero(resumed.non_static_filter.static_overlay.evidence).tolist() == [[3, 4]]
+    assert torch.nonzero(resumed.scene_filter.static_overlay.evidence).tolist() == [[3, 4]]
 
 
 def test_a_resumed_run_equals_an_uninterrupted_one(checkpoint: Path, tmp_path: Path) -> None:

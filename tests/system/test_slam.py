@@ -474,7 +474,7 @@ def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str
 
     def after(result: StepResult) -> None:
         assert not (slam.submap is None and slam.mapper.adjustment.is_pending)  # nothing is left behind
-        if slam.submap is not None and slam.provisional_map is None:
+        if slam.submap is not None and slam.mode not in YOUNG:
             old.append(result.index)
 
     slam.run(walk, after)

@@ -8,18 +8,11 @@ from dataclasses import replace
 import pytest
 import torch
 
-from tests.loop_closing.ring import END, KEYFRAMES, around, ring_submap
-from tests.scene import CAMERA
 from torchslam import evaluate
-from torchslam.config import Config, load_config
+from torchslam.config import load_config
 from torchslam.data import open_sequence
-from torchslam.geometry import se3_inverse
-from torchslam.loop_closing.loop_detector import LoopClosureRecord
-from torchslam.map.atlas import Atlas
 from torchslam.system.run import no_map_message
-from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
-from torchslam.tracking.backward_tracking import GapLink
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Reason, Rejection, State, StepResult
 
@@ -116,46 +109,3 @@ def test_frames_lost_before_the_last_relocalization_are_tracked_backward(
     assert set(range(32, 39)) <= set(submap.posed_frames.frames["frame_index"].tolist())
     errors = evaluate(slam.trajectory(), sequence.groundtruth)
     assert errors.ate_m < 0.02
-
-
-def test_a_gap_is_closed_once_both_sides_are_linked() -> None:
-    """A drifted round whose end is a neighbor of its start, by the motion over a gap."""
-    submap = ring_submap(scale=1.01, twist=0.002)
-    slam = SLAM(CAMERA, Config())
-    atlas = Atlas(CAMERA.params)
-    atlas._submaps = [submap]
-    submap.map.keyframes["frame_index"][0] = submap.posed_frames.frames["frame_index"][0] = KEYFRAMES + 5
-    slam.start_session(Session(CAMERA, atlas), submap, (KEYFRAMES + 5, KEYFRAMES + 5.0))
-    true = around()
-    T_ba = true[END] @ se3_inverse(true[0])
-    machine = slam._state_machine
-    off = float((submap.map.T_cw[END] @ se3_inverse(submap.map.T_cw[0]) - T_ba)[:3, 3].norm())
-    machine.backward.gap_link = GapLink(submap.map.key(END), submap.map.key(0), T_ba)
-    machine.keyframe_actions.close_gap()
-    assert slam.loop_closer.loop_closures == [LoopClosureRecord(END, KEYFRAMES + 5, 0, 0)]
-    after = float((submap.map.T_cw[END] @ se3_inverse(submap.map.T_cw[0]) - T_ba)[:3, 3].norm())
-    assert after < 0.1 * off
-    assert machine.backward.gap_link is None
-    assert submap.tracking.reference == 0  # of the newest frame
-    machine.keyframe_actions.close_gap()
-    assert len(slam.loop_closer.loop_closures) == 1
-
-
-@pytest.mark.parametrize("override", ["loop_closing.enabled=false", None])
-def test_a_gap_is_left_alone_without_loop_closing_and_without_mapping(override: str | None) -> None:
-    submap = ring_submap(scale=1.01, twist=0.002)
-    slam = SLAM(CAMERA, load_config(None, [override] if override else []))
-    atlas = Atlas(CAMERA.params)
-    atlas._submaps = [submap]
-    submap.map.keyframes["frame_index"][0] = submap.posed_frames.frames["frame_index"][0] = KEYFRAMES + 5
-    slam.start_session(
-        Session(CAMERA, atlas, mapping=override is not None), submap, (KEYFRAMES + 5, KEYFRAMES + 5.0)
-    )
-    true, before = around(), submap.map.T_cw.clone()
-    machine = slam._state_machine
-    machine.backward.gap_link = GapLink(
-        submap.map.key(END), submap.map.key(0), true[END] @ se3_inverse(true[0])
-    )
-    machine.keyframe_actions.close_gap()
-    assert torch.equal(submap.map.T_cw, before)
-    assert machine.backward.gap_link is None

@@ -134,7 +134,7 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(
     monkeypatch.setattr(following, "check_map_agreement", lambda *_: None)
     moving = replace(NO_MOVEMENT, rejection=Rejection(rejection, {"count": 30}))
     monkeypatch.setattr(
-        slam.non_static_filter,
+        slam.scene_filter,
         "detect_independent_motion",
         lambda *_: moving if slam.last_frame and slam.last_frame[0] in DOUBTED else NO_MOVEMENT,
     )

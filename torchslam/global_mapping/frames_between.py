@@ -16,7 +16,7 @@ from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.optim.run_graph import RunGraph
 from torchslam.tracking.data_association import match_keyframe
-from torchslam.tracking.pose_validation import validate_pose
+from torchslam.tracking.pose_validation import check_pose
 from torchslam.tracking.relocalization import single_frame_state
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate, State, StepResult
@@ -89,12 +89,13 @@ class FramePoser:
     def _track(self, submap: Submap, view: FrameFeatures) -> StepResult:
         """Track a frame from the last keyframe, or relocalize it by the keyframes nearest in time."""
         estimate = self.tracker.track(submap, view)
+        self.tracker.commit(submap, view, estimate)
         if estimate is None:
             estimate = self._find(submap, view)
         if estimate is None:
             return StepResult(view.index, view.timestamp, State.LOST, None, reason="not found in the map")
         state = single_frame_state(submap.tracking, estimate)
-        rejection = validate_pose(estimate, None, state, self.config.pose_validation)
+        rejection = check_pose(estimate, None, state, self.config.pose_validation).rejection
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
         return StepResult(
             view.index,

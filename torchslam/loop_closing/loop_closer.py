@@ -22,7 +22,6 @@ from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import match_in_keyframes, merge_points
 from torchslam.optim import PoseGraph, pose_graph_optimize
-from torchslam.tracking.backward_tracking import GapLink
 from torchslam.tracking.relocalization import Candidate
 from torchslam.types import FrameFeatures, Matcher
 
@@ -93,10 +92,6 @@ class LoopCloser:
             fuse_with_earlier_visits(submap, keyframe, self.camera, self.config)
         return found
 
-    def detect_at_gap(self, link: GapLink) -> LoopCandidate | None:
-        """Return the candidate of two keyframes with a gap of lost frames between them, or None."""
-        return self.loop_detector.detect_at_gap(link) if self.config.loop_closing.enabled else None
-
     def close(self, found: LoopCandidate) -> tuple[Submap, int]:
         """Close a loop or merge two submaps; return the submap and the row of the keyframe in it."""
         self.loop_closures.append(found.closure)
@@ -124,12 +119,8 @@ def essential_graph_solution(found: LoopCandidate) -> Float[Tensor, "K 4 4"]:
     # S_21 maps the frame of the keyframe to that of the matched one.
     T_wm = se3_inverse(T_cw[found.matched_keyframe])
     S_km = T_cw[found.keyframe] @ sim3_inverse(found.relation.S_21) @ T_wm
-    information = None
-    if found.relation.shared_points == 0:  # the scale of the loop is unknown
-        information = torch.eye(7, dtype=T_cw.dtype, device=T_cw.device).repeat(len(edges) + 1, 1, 1)
-        information[-1, 6, 6] = 0
     relations = torch.cat([measured, S_km[None]])
-    graph = PoseGraph(T_cw, torch.cat([edges, closing]), relations, information, fixed=(0,))
+    graph = PoseGraph(T_cw, torch.cat([edges, closing]), relations, fixed=(0,))
     return pose_graph_optimize(graph, backward="detached", iterations=_ITERATIONS).S_cw
 
 

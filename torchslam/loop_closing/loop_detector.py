@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Int
 from torch import Tensor
 
 from torchslam.config import Config, LoopClosingConfig
-from torchslam.geometry import Camera, se3_inverse, sim3_inverse, sim3_scale
+from torchslam.geometry import Camera, se3_inverse, sim3_scale
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.relative_sim3 import (
     RelativeSim3,
     estimate_relative_sim3,
-    inlier_matches,
     neighborhood,
-    relative_sim3_of_pose,
     verify_relative_sim3,
 )
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
-from torchslam.tracking.backward_tracking import GapLink
 from torchslam.types import Matcher
 
 _AROUND = 20  # keyframes that share most points with the new one: their places are known
@@ -106,43 +103,6 @@ class LoopDetector:
         if not found or any(not are_consistent(found[0], other) for other in found[1:]):
             return None
         return found[0]
-
-    def detect_at_gap(self, link: GapLink) -> LoopCandidate | None:
-        """Return the candidate of two keyframes with a gap of lost frames between them, if the map contradicts it.
-
-        The camera was found again in a known place, or in a new submap: the drift since then lies in the gap.
-        """
-        before, after = self.atlas.find(link.before), self.atlas.find(link.after)
-        if before is None or after is None:
-            return None
-        (earlier, keyframe), (later, matched_keyframe) = before, after
-        T_21 = link.T_ba @ later.map.T_cw[matched_keyframe]
-        relation = relative_sim3_of_pose(
-            T_21, earlier.map, keyframe, later.map, matched_keyframe, self.camera, self.config
-        )
-        if relation is None:
-            return None
-        if earlier is not later:
-            # Submaps stay apart unless the place is seen as well as in a loop: a wrong merger cannot be undone.
-            if relation.shared_points == 0 or relation.inliers_1 < self.config.loop_closing.min_matches:
-                return None
-            inverse = replace(relation, S_21=sim3_inverse(relation.S_21))
-            return LoopCandidate(later, matched_keyframe, earlier, keyframe, inverse)
-        if self._agrees(earlier.map, keyframe, matched_keyframe, relation):
-            return None
-        known = two_hop_covisible(later.map, matched_keyframe)
-        place = known[later.map.keys[known] < link.before]
-        start = int(place[later.map.keys[place].argmax()]) if len(place) else 0
-        if not is_plausible_drift(earlier, keyframe, start, relation, self.config.loop_closing):
-            return None
-        return LoopCandidate(earlier, keyframe, later, matched_keyframe, relation)
-
-    def _agrees(self, slam_map: Map, keyframe: int, matched_keyframe: int, relation: RelativeSim3) -> bool:
-        """Whether a keyframe observes the place of another one where the map as it is predicts it."""
-        points = slam_map.observed_points(neighborhood(slam_map, matched_keyframe))
-        T_cw = slam_map.T_cw[keyframe]
-        ids, _ = inlier_matches(slam_map, points, T_cw, slam_map, keyframe, self.camera, self.config)
-        return 2 * len(ids) >= relation.inliers_1
 
     def _candidates(self, submap: Submap, keyframe: int) -> Iterator[tuple[Submap, int]]:
         """Keyframes that look like this one but share no points with it, the most similar first, one of each place."""

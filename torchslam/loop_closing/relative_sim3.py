@@ -31,8 +31,6 @@ _RADIUS_PX = 8.0  # around the projection by a first similarity
 _AROUND = 10  # keyframes whose points are searched for in the other map
 _NEEDED = 12  # inliers of the first similarity
 _CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
-_SCALE_POINTS = 2  # fewest shared points that give a scale to a pose
-_SCALE_SPREAD = 1.2  # largest ratio of the quartiles of their depths
 _KERNEL_SCALE = 2.0
 _ITERATIONS = 20  # of the refined pose, which rarely needs ten
 _GATE_WIDENING = 2.0  # times the noise, as the Sim(3) has noise of its own
@@ -45,8 +43,8 @@ class RelativeSim3:
     Attributes:
         S_21: from the frame of map 1 to that of map 2.
         inliers_1: number of points of map 2 that keyframe 1 observes where the Sim(3) predicts them.
-        inliers_2: number of points of map 1 that keyframe 2 observes where the Sim(3) predicts them; 0 if not tested.
-        shared_points: number of points that keyframe 1 observes and that both maps have; 0 if the scale is unknown.
+        inliers_2: number of points of map 1 that keyframe 2 observes where the Sim(3) predicts them.
+        shared_points: number of points that keyframe 1 observes and that both maps have: they give the scale.
     """
 
     S_21: Float[Tensor, "4 4"]
@@ -82,50 +80,28 @@ def estimate_relative_sim3(
     if T_12 is None:
         return None
     settings = config.loop_closing
-    found = _observed(T_12, map_1, keyframe_1, map_2, keyframe_2, camera, config, settings.min_matches)
-    if found is None or len(found.depth_ratios) < settings.min_sim3_points:
+    points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
+    ids, keypoints = match_by_sim3_pose(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
+    if len(ids) < settings.min_matches:
         return None
-    relation = found.relation(map_1.T_cw[keyframe_1])
+    T_12, agrees = _refined(map_2, ids, T_12, map_1, keyframe_1, keypoints, camera)
+    ids, keypoints = ids[agrees], keypoints[agrees]
+    own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
+    is_shared = own >= 0
+    shared = int(is_shared.sum())
+    if len(ids) < settings.min_matches or shared < settings.min_sim3_points:
+        return None
+    # One pose has no scale, but the depths of points that both maps have do.
+    T_11 = map_1.T_cw[keyframe_1]
+    depth_1 = transform(T_11, map_1.positions_w[own[is_shared]])[:, 2]
+    depth_2 = transform(T_12, map_2.positions_w[ids[is_shared]])[:, 2]
+    S_21 = se3_inverse(T_12) @ scaling_sim3((depth_2 / depth_1).median()) @ T_11
     points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
-    T_21 = transfer_pose(map_2.T_cw[keyframe_2], relation.S_21)
+    T_21 = transfer_pose(map_2.T_cw[keyframe_2], S_21)
     back, _ = inlier_matches(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
     if len(back) < settings.min_matches // 2:
         return None
-    return replace(relation, inliers_2=len(back))
-
-
-def relative_sim3_of_pose(
-    T_12: Float[Tensor, "4 4"],
-    map_1: Map,
-    keyframe_1: int,
-    map_2: Map,
-    keyframe_2: int,
-    camera: Camera,
-    config: Config,
-) -> RelativeSim3 | None:
-    """Estimate the Sim(3) between two maps from the pose of a keyframe of map 1 in map 2; None if it is not certain.
-
-    Keyframes that are neighbors in time may have few points in common although they see the same place, as the camera
-    turned. With fewer than 2 of them, or where their depths disagree, the scale is 1, and `shared_points` is 0: it is
-    unknown.
-
-    Args:
-        T_12: The pose of keyframe 1 in map 2.
-        map_1: The first map.
-        keyframe_1: Row of its keyframe.
-        map_2: The second map.
-        keyframe_2: Row of its keyframe that sees the same place.
-        camera: Of both keyframes.
-        config: Thresholds, and the descriptor matcher of guided matching.
-    """
-    settings = config.loop_closing
-    found = _observed(T_12, map_1, keyframe_1, map_2, keyframe_2, camera, config, settings.min_matches // 2)
-    if found is None:
-        return None
-    ratios = found.depth_ratios
-    if len(ratios) < _SCALE_POINTS or float(ratios.quantile(0.75) / ratios.quantile(0.25)) > _SCALE_SPREAD:
-        found = replace(found, depth_ratios=ratios[:0])
-    return found.relation(map_1.T_cw[keyframe_1])
+    return RelativeSim3(S_21, len(ids), len(back), shared)
 
 
 def verify_relative_sim3(
@@ -200,53 +176,6 @@ def inlier_matches(
     errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
     good = passes_gate(errors, _GATE_WIDENING**2 * config.measurement.max_chi_square)
     return ids[good], keypoints[good]
-
-
-@dataclass(frozen=True)
-class _Observed:
-    """What keyframe 1 observes of map 2.
-
-    Attributes:
-        T_12: its pose in map 2.
-        inliers: number of points of map 2 that it observes.
-        depth_ratios: depths in map 2 of the points that both maps have, relative to those in map 1.
-    """
-
-    T_12: Float[Tensor, "4 4"]
-    inliers: int
-    depth_ratios: Float[Tensor, " P"]
-
-    def relation(self, T_11: Float[Tensor, "4 4"]) -> RelativeSim3:
-        """The Sim(3), given the pose in map 1. One pose has no scale, but depths have; it is 1 without them."""
-        shared = len(self.depth_ratios)
-        scale = self.depth_ratios.median() if shared else T_11.new_ones(())
-        return RelativeSim3(se3_inverse(self.T_12) @ scaling_sim3(scale) @ T_11, self.inliers, 0, shared)
-
-
-def _observed(
-    T_12: Float[Tensor, "4 4"],
-    map_1: Map,
-    keyframe_1: int,
-    map_2: Map,
-    keyframe_2: int,
-    camera: Camera,
-    config: Config,
-    needed: int,
-) -> _Observed | None:
-    """Match the points around keyframe 2 to keyframe 1, and refine its pose; None if it observes fewer than needed."""
-    points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
-    ids, keypoints = match_by_sim3_pose(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
-    if len(ids) < needed:
-        return None
-    T_12, agrees = _refined(map_2, ids, T_12, map_1, keyframe_1, keypoints, camera)
-    ids, keypoints = ids[agrees], keypoints[agrees]
-    if len(ids) < needed:
-        return None
-    own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
-    is_shared = own >= 0
-    depth_1 = transform(map_1.T_cw[keyframe_1], map_1.positions_w[own[is_shared]])[:, 2]
-    depth_2 = transform(T_12, map_2.positions_w[ids[is_shared]])[:, 2]
-    return _Observed(T_12, len(ids), depth_2 / depth_1)
 
 
 def _first_guess(

@@ -23,7 +23,11 @@ from torchslam.geometry.transforms import (
 )
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
-from torchslam.types import Trajectory
+from torchslam.types import PoseEstimate, Trajectory
+
+EMA_RATE = 0.1
+"""Weight of the newest frame in the moving averages of the tracking state: about the last ten frames count. Tried at
+this value only."""
 
 
 @dataclass
@@ -58,6 +62,15 @@ class TrackingState:
         none = torch.empty(0, dtype=torch.int64, device=like.device)
         eye = torch.eye(4, dtype=like.dtype, device=like.device)
         return cls(eye, -1, 0, None, none, none, none)
+
+    def averaged_with(self, estimate: PoseEstimate) -> TrackingState:
+        """The same state with the averages over the frames up to that of an estimate."""
+        return replace(
+            self,
+            error=self.error + EMA_RATE * (estimate.error - self.error),
+            explained_ratio=self.explained_ratio
+            + EMA_RATE * (estimate.explained_ratio - self.explained_ratio),
+        )
 
 
 @dataclass

@@ -192,6 +192,7 @@ class MapInitializer:
     def _explains(self, submap: Submap, view: FrameFeatures) -> bool:
         """Pose a frame from before the map was initialized; return whether most of its matches are inliers."""
         estimate = self.tracker.track(submap, view)
+        self.tracker.commit(submap, view, estimate)
         if estimate is None:
             return False
         self.tracker.count_found(submap.map, estimate)

@@ -1,9 +1,8 @@
 """Checkpoints: the state of a run between two frames in one file, from which the run can be resumed.
 
 A checkpoint is a map file with more in it: results so far, tracking state, evidence of static overlays. Frames that
-wait for a pose are left out and stay without one, and so are the frame that the next one would be compared with and a
-pending check of a map's start, which is left as it is. There is no provisional map and no held-back frame, since no
-checkpoint is written then (`SLAM.can_checkpoint`).
+wait for a pose are left out and stay without one, and so is the frame that the next one would be compared with. There
+is no provisional map and no held-back frame, since no checkpoint is written then (`SLAM.can_checkpoint`).
 """
 
 from __future__ import annotations
@@ -66,7 +65,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
     }
     write_tensors(
         path,
-        tensors | tracking | results | {"run.evidence": slam.non_static_filter.static_overlay.evidence},
+        tensors | tracking | results | {"run.evidence": slam.scene_filter.static_overlay.evidence},
         about,
     )
 
@@ -151,7 +150,7 @@ def _restore(
         [LoopClosureRecord(*closure) for closure in run["loop_closures"]],
         None if precheck is None else (int(precheck[0]), bool(precheck[1])),
     )
-    slam.non_static_filter.static_overlay.restore(tensors["run.evidence"])
+    slam.scene_filter.static_overlay.restore(tensors["run.evidence"])
     if run["adjustment"]:  # around the newest keyframe, where the map is as it was at the request
         due = None if run["due"] is None else int(run["due"])
         slam.mapper.adjustment.request(submap.map, submap.map.num_keyframes - 1, due)

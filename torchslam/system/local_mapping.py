@@ -1,28 +1,23 @@
-"""Mapping of posed frames: keyframes of confirmed poses, of tentative ones, and of frames tracked backward in time."""
+"""Tracking in a submap: frames with certain poses are mapped, doubtful ones are held back until others confirm them."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import torch
-
-from torchslam.map.atlas import Submap, TrackingState
-from torchslam.map.map import MapSnapshot, key_of
+from torchslam.map.atlas import Submap
 from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.mapping.mapper import keyframe_reason
+from torchslam.system.frame_log import HeldFrame
+from torchslam.system.savepoint import Savepoint
 from torchslam.system.session import SystemContext
-from torchslam.tracking.backward_tracking import (
-    GapLink,
-    UnposedFrames,
-    track_back,
-    track_into_earlier_keyframe,
-)
-from torchslam.tracking.pose_validation import PendingFrame
+from torchslam.tracking.pose_validation import Certainty, Verdict, check_pose
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate
+
+MAX_CONSECUTIVE_FAILURES = 5
+"""Frames in a row without a plausible pose that end backward tracking: as many as blur or a passer-by costs at 30 Hz.
+Tried at this value only."""
 
 
 class LocalMapping:
-    """Adds confirmed frames to a submap, inserts keyframes, and applies the local bundle adjustments around them."""
+    """Adds frames to a submap and inserts keyframes."""
 
     def __init__(self, context: SystemContext) -> None:
         self.context, self.adjustment = context, context.mapper.adjustment
@@ -34,15 +29,13 @@ class LocalMapping:
         estimate: PoseEstimate,
         apply_at: ApplyAt = ApplyAt.NOW,
     ) -> Explanation | None:
-        """Add a frame with a confirmed pose; return why it became a keyframe, or None.
+        """Add a frame with a certain pose; return why it became a keyframe, or None.
 
         While an adjustment is pending there is no other keyframe: it is applied after this frame instead.
         """
         context = self.context
         context.tracker.count_visible(submap.map, estimate)
-        reason = None
-        if context.session.mapping:
-            reason = keyframe_reason(view, estimate, submap, context.config.keyframes)
+        reason = self._keyframe_reason(submap, view, estimate)
         if reason and self.adjustment.is_pending:
             self.adjustment.set_deadline(view.index)
             reason = None
@@ -54,139 +47,122 @@ class LocalMapping:
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
         return reason
 
-    def add_pending_frames(self, submap: Submap, frames: list[PendingFrame]) -> None:
-        """Add frames whose poses were confirmed by later ones."""
-        for view, estimate, T_cr, reference in frames:
-            self.context.tracker.count_visible(submap.map, estimate)
-            self.context.tracker.count_found(submap.map, estimate)
-            submap.posed_frames.add(view, estimate, T_cr, reference)
+    def add_tentative_keyframe(
+        self, savepoint: Savepoint, view: FrameFeatures, estimate: PoseEstimate
+    ) -> None:
+        """Insert a frame with a doubtful pose as a keyframe, if one is due.
 
-    def start_adjustment(self) -> None:
-        """Start the pending adjustment: the frame that requested it took long enough without it."""
-        if self.adjustment.is_pending:
-            with self.context.clock("bundle"):
-                self.adjustment.start()
-
-    def apply_adjustment_before_frame(self, submap: Submap) -> bool:
-        """Apply an adjustment that is due before the next frame; return whether there was one."""
-        if not self.adjustment.is_due_before_next_frame:
-            return False
-        self.context.mapper.apply_adjustment(submap.map)
-        self.context.tracker.reset_to_keyframe(submap, submap.map.num_keyframes - 1)
-        return True
-
-    def apply_adjustment(self, submap: Submap, frame: int | None = None) -> bool:
-        """Apply the pending adjustment if it is due after a frame, or at once if `frame` is None; return whether."""
-        if not self.adjustment.is_pending or (frame is not None and not self.adjustment.is_due(frame)):
-            return False
-        self.context.mapper.apply_adjustment(submap.map)
-        return True
-
-
-class TentativeMapping:
-    """Inserts keyframes of frames with unconfirmed poses, so that the map can be rolled back if the camera is lost.
-
-    Without new points a moving camera would be lost before its pose is confirmed. Tentative keyframes are not in the
-    keyframe database, and their points are not culled.
-    """
-
-    def __init__(self, context: SystemContext, mapping: LocalMapping) -> None:
-        self.context, self.mapping = context, mapping
-        self._before: tuple[MapSnapshot, TrackingState] | None = None
-
-    @property
-    def has_keyframes(self) -> bool:
-        """Whether there are tentative keyframes."""
-        return self._before is not None
-
-    def add_keyframe(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
-        """Insert a frame as a tentative keyframe, if one is due."""
-        context = self.context
-        if not context.session.mapping or not keyframe_reason(
-            view, estimate, submap, context.config.keyframes
-        ):
+        Without new points a moving camera would be lost before its pose is confirmed. Tentative keyframes are not in
+        the keyframe database, and their points are not culled.
+        """
+        submap, mapper = savepoint.submap, self.context.mapper
+        if not self._keyframe_reason(submap, view, estimate):
             return
-        if self._before is None:
-            self.mapping.apply_adjustment(submap)
-            self._before = MapSnapshot.of(submap.map), replace(submap.tracking)
-        keyframe = context.mapper.insert(submap.map, view, estimate)
-        context.tracker.reset_to_keyframe(submap, keyframe)
+        if self.adjustment.is_pending:
+            mapper.apply_adjustment(submap.map)
+        savepoint.save_map()
+        self.context.tracker.reset_to_keyframe(submap, mapper.insert(submap.map, view, estimate))
 
-    def commit(self, submap: Submap) -> int:
-        """Keep the tentative keyframes and add them to the keyframe database; return their number."""
-        if self._before is None:
-            return 0
-        (before, _), self._before = self._before, None
-        for keyframe in range(before.num_keyframes, submap.map.num_keyframes):
-            self.context.loop_closer.add(submap.map, keyframe)
-        return submap.map.num_keyframes - before.num_keyframes
+    def commit(self, savepoint: Savepoint) -> list[HeldFrame]:
+        """Add the frames that were held back since a savepoint, and keep its tentative keyframes; return the frames."""
+        context, submap = self.context, savepoint.submap
+        for keyframe in savepoint.keyframes:
+            context.loop_closer.add(submap.map, keyframe)
+        frames = context.log.take_held(savepoint.frames)
+        for frame in frames:
+            context.tracker.count_visible(submap.map, frame.estimate)
+            context.tracker.count_found(submap.map, frame.estimate)
+            submap.posed_frames.add(frame.view, frame.estimate, frame.T_cr, frame.reference)
+        savepoint.commit()
+        return frames
 
-    def rollback(self, submap: Submap) -> None:
-        """Restore map and tracking state from before the first tentative keyframe."""
-        if self._before is not None:
-            (before, submap.tracking), self._before = self._before, None
-            before.restore(submap.map)
+    def _keyframe_reason(
+        self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate
+    ) -> Explanation | None:
+        if not self.context.session.mapping:
+            return None
+        return keyframe_reason(view, estimate, submap, self.context.config.keyframes)
+
+
+def locate(
+    context: SystemContext, submap: Submap, view: FrameFeatures, is_sure: bool
+) -> tuple[PoseEstimate, Verdict] | None:
+    """Track a frame in a submap and judge its pose; None if it has none.
+
+    Args:
+        context: The components of the session.
+        submap: The submap, with the tracking state after the frame before.
+        view: The frame.
+        is_sure: Whether the poses before are certain.
+    """
+    tracker, has_velocity = context.tracker, submap.tracking.velocity is not None
+    prior_T_cw = tracker.predict(submap)
+    estimate = tracker.track(submap, view, prior_T_cw, is_sure)
+    verdict = None
+    if estimate is not None:
+        expected_T_cw = prior_T_cw if has_velocity else None
+        averages = submap.tracking.averaged_with(estimate)
+        verdict = check_pose(estimate, expected_T_cw, averages, context.config.pose_validation)
+    tracker.commit(submap, view, estimate)
+    return None if estimate is None or verdict is None else (estimate, verdict)
+
+
+def hold(context: SystemContext, savepoint: Savepoint, view: FrameFeatures, estimate: PoseEstimate) -> None:
+    """Hold a frame back, with its pose relative to the map as it is now."""
+    savepoint.frames.append(view.index)
+    context.log.hold(HeldFrame.of(view, estimate, savepoint.submap.tracking))
 
 
 class BackwardTracking:
-    """Keeps frames without a pose, and poses them by tracking backward in time once there is a map.
-
-    Attributes:
-        gap_link: The motion between the earliest frame that was posed last and the keyframe before; None if unknown.
-    """
+    """Poses logged frames by tracking backward in time, once there is a map."""
 
     def __init__(self, context: SystemContext, mapping: LocalMapping) -> None:
         self.context, self.mapping = context, mapping
-        self.tentative = TentativeMapping(context, mapping)
-        self.unposed = UnposedFrames(context.config.initialization.max_unposed_frames)
-        self.gap_link: GapLink | None = None
 
-    def from_first_keyframe(self, submap: Submap) -> list[FrameFeatures]:
-        """Pose the frames from before the first keyframe of a submap; return those that got a pose."""
+    def from_first_keyframe(self, submap: Submap) -> None:
+        """Pose the frames from before the first keyframe of a submap."""
         backward = submap.fork()
         self.context.tracker.reset_to_keyframe(backward, 0)
-        return self._track(backward, before=int(submap.map.keyframes["frame_index"][0]))
+        self._track(backward, before=int(submap.map.keyframes["frame_index"][0]))
 
-    def from_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
+    def from_frame(self, submap: Submap, frame: HeldFrame) -> None:
         """Pose the frames from before a relocalized frame."""
         backward = submap.fork()
-        self.context.tracker.start_at_estimate(backward, view, estimate)
-        self._track(backward, before=view.index)
+        self.context.tracker.start_at_estimate(backward, frame.view, frame.estimate)
+        self._track(backward, before=frame.view.index)
 
-    def _track(self, backward: Submap, before: int) -> list[FrameFeatures]:
-        context = self.context
+    def _track(self, submap: Submap, before: int) -> None:
+        """Track the unposed frames from before a frame.
+
+        What is held back at the earliest frame is kept, as forward in time at the end of a run. Tracking ends after
+        `MAX_CONSECUTIVE_FAILURES`, and what is held back then is unposed again.
+        """
+        context, log = self.context, self.context.log
+        doubted: Savepoint | None = None
+        failures = 0
         with context.clock("backwards"):
-            earlier = [view for view in self.unposed if view.index < before]
-            posed = track_back(context.tracker, backward, reversed(earlier), context.config, self)
-            first = min([before, *(view.index for view in posed)])
-            key = int(
-                key_of(torch.tensor(context.session.number, device="cpu"), torch.tensor(first, device="cpu"))
-            )
-            self.gap_link = track_into_earlier_keyframe(
-                context.tracker, backward, context.session.atlas, key, context.config
-            )
-        self.unposed.remove(posed)
-        return posed
-
-    def pop_gap_link(self) -> GapLink | None:
-        """Return and forget the motion over the last gap."""
-        link, self.gap_link = self.gap_link, None
-        return link
-
-    def add_frame(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
-        """Add a frame with a confirmed pose."""
-        self.mapping.add_frame(submap, view, estimate)
-
-    def add_tentative(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> bool:
-        """Map a frame tentatively, if a keyframe is due; return whether there are tentative keyframes."""
-        self.tentative.add_keyframe(submap, view, estimate)
-        return self.tentative.has_keyframes
-
-    def commit(self, submap: Submap, frames: list[PendingFrame]) -> None:
-        """Keep the tentative keyframes, and add the frames that were held back."""
-        self.tentative.commit(submap)
-        self.mapping.add_pending_frames(submap, frames)
-
-    def rollback(self, submap: Submap) -> None:
-        """Discard the tentative keyframes."""
-        self.tentative.rollback(submap)
+            for view in reversed(log.unposed(before)):
+                found = locate(context, submap, view, is_sure=doubted is None)
+                if found is None or found[1].certainty is Certainty.WRONG or found[1].is_jump:
+                    failures += 1
+                    if failures == MAX_CONSECUTIVE_FAILURES:
+                        break
+                    continue
+                failures = 0
+                estimate, verdict = found
+                if verdict.rejection is None and doubted is None:
+                    self.mapping.add_frame(submap, view, estimate)
+                    log.forget([view.index])
+                    continue
+                doubted = doubted or Savepoint(submap, context.config.pose_validation.num_confirming_frames)
+                self.mapping.add_tentative_keyframe(doubted, view, estimate)
+                doubted.count(verdict.rejection)
+                hold(context, doubted, view, estimate)
+                if not doubted.is_open or doubted.is_full:
+                    self.mapping.commit(doubted)
+                doubted = doubted if doubted.is_open else None
+            if doubted is not None and failures < MAX_CONSECUTIVE_FAILURES:
+                self.mapping.commit(doubted)
+            elif doubted is not None:
+                doubted.rollback()
+                log.release(doubted.frames)

@@ -17,10 +17,12 @@ from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.mapping.mapper import Mapper
-from torchslam.tracking.non_static import NonStaticFilter
-from torchslam.tracking.pose_validation import PoseConfirmation
+from torchslam.system.frame_log import FrameLog
+from torchslam.system.modes import Mode
+from torchslam.system.savepoint import Savepoint
+from torchslam.tracking.non_static import SceneFilter
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Matcher, State
+from torchslam.types import Matcher
 from torchslam.utils.timing import Stopwatch
 
 
@@ -69,43 +71,35 @@ class Session:
         return self.number + int(self.mapping)
 
 
+@dataclass
 class ActiveMap:
-    """The submap in which the camera is tracked, if any, and the state of the system."""
+    """The active submap, and what a loss of the camera would take back.
 
-    def __init__(self, submap: Submap | None, state: State) -> None:
-        self._submap, self._state = submap, state
+    Attributes:
+        submap: The submap in which the camera is tracked; None while it is lost.
+        provisional: Savepoint from before the submap, which may be discarded; None once it is confirmed.
+        doubted: Savepoint from before the frames that are held back; None without such frames.
+    """
 
-    @property
-    def submap(self) -> Submap | None:
-        """The active submap; None while there is none."""
-        return self._submap
-
-    @property
-    def state(self) -> State:
-        """State after the last frame."""
-        return self._state
+    submap: Submap | None = None
+    provisional: Savepoint | None = None
+    doubted: Savepoint | None = None
 
     @property
     def current(self) -> Submap:
         """The active submap, where there must be one."""
-        assert self._submap is not None
-        return self._submap
+        assert self.submap is not None
+        return self.submap
 
-    def activate(self, submap: Submap, state: State) -> None:
-        """Track the camera in a submap from now on."""
-        self._submap, self._state = submap, state
-
-    def replace(self, submap: Submap) -> None:
-        """Go on in the submap that the active one was merged into."""
-        self._submap = submap
-
-    def set_state(self, state: State) -> None:
-        """Change the state alone."""
-        self._state = state
-
-    def deactivate(self, state: State) -> None:
-        """Stop tracking: the camera is lost, or its map was discarded."""
-        self._submap, self._state = None, state
+    def mode(self, num_submaps: int) -> Mode:
+        """The mode, given the number of submaps of the atlas."""
+        if self.submap is None:
+            return Mode.LOST if num_submaps else Mode.INITIALIZING
+        if self.provisional is not None:
+            return Mode.PROVISIONAL if self.doubted is None else Mode.PROVISIONAL_DOUBTED
+        if self.doubted is None:
+            return Mode.TRACKING
+        return Mode.RELOCALIZED if self.doubted.is_relocalized else Mode.DOUBTED
 
 
 @dataclass(frozen=True)
@@ -113,7 +107,9 @@ class SystemContext:
     """The components of one session.
 
     Attributes:
-        config: configuration for images of the camera's size, see `Config.for_size`
+        config: Configuration for images of the camera's size, see `Config.for_size`.
+        log: The frames whose poses are not final.
+        active_map: The active submap and the savepoints.
     """
 
     camera: Camera
@@ -124,6 +120,11 @@ class SystemContext:
     mapper: Mapper
     session: Session
     loop_closer: LoopCloser
-    non_static_filter: NonStaticFilter
-    confirmation: PoseConfirmation
+    scene_filter: SceneFilter
+    log: FrameLog
     active_map: ActiveMap
+
+    @property
+    def mode(self) -> Mode:
+        """The mode after the last frame."""
+        return self.active_map.mode(len(self.session.atlas))

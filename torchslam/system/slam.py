@@ -27,14 +27,14 @@ from torchslam.map.map import Map, feature_mismatch, key_of
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.mapper import Mapper
 from torchslam.parallel.workers import with_workers
+from torchslam.system.frame_log import FrameLog, FrameStatus
 from torchslam.system.front_end import FrontEnd, check_order, check_size, image_extractor, source
+from torchslam.system.modes import Mode
 from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import ActiveMap, Session, SystemContext
 from torchslam.system.state_machine import FrameOutcome, StateMachine
-from torchslam.tracking.initialization import ProvisionalMap
 from torchslam.tracking.matcher import make_matcher, prepare_view
-from torchslam.tracking.non_static import NonStaticFilter
-from torchslam.tracking.pose_validation import PoseConfirmation
+from torchslam.tracking.non_static import SceneFilter
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
 from torchslam.utils.timing import Stopwatch
@@ -120,49 +120,44 @@ class SLAM:
         self.session, self.atlas, self.mapping = session, session.atlas, session.mapping
         self.last_frame = last_frame
         self.last_features: FrameFeatures | None = None  # of the last frame, before masking
-        self.tracker.set_counting(session.mapping)
+        self.tracker = self.tracker.for_session(session.mapping)
         self.mapper.adjustment.drop()
         self.loop_closer = LoopCloser(self.camera, self.scaled_config, self.atlas, self.matcher)
-        self.non_static_filter = NonStaticFilter(self.camera, self.scaled_config)
-        state = State.LOST if len(self.atlas) else State.INITIALIZING
-        self._active_map = ActiveMap(submap, state if submap is None else State.TRACKING)
-        self._confirmation = PoseConfirmation(self.scaled_config)
-        self._state_machine = StateMachine(
-            SystemContext(
-                camera=self.camera,
-                config=self.scaled_config,
-                clock=self.clock,
-                matcher=self.matcher,
-                tracker=self.tracker,
-                mapper=self.mapper,
-                session=session,
-                loop_closer=self.loop_closer,
-                non_static_filter=self.non_static_filter,
-                confirmation=self._confirmation,
-                active_map=self._active_map,
-            )
+        self.scene_filter = SceneFilter(self.camera, self.scaled_config)
+        self._context = SystemContext(
+            camera=self.camera,
+            config=self.scaled_config,
+            clock=self.clock,
+            matcher=self.matcher,
+            tracker=self.tracker,
+            mapper=self.mapper,
+            session=session,
+            loop_closer=self.loop_closer,
+            scene_filter=self.scene_filter,
+            log=FrameLog(self.config.initialization),
+            active_map=ActiveMap(submap),
         )
+        self._state_machine = StateMachine(self._context)
 
     @property
     def submap(self) -> Submap | None:
         """The active submap; None while there is none."""
-        return self._active_map.submap
+        return self._context.active_map.submap
+
+    @property
+    def mode(self) -> Mode:
+        """What the system does with the next frame."""
+        return self._context.mode
 
     @property
     def state(self) -> State:
         """State after the last frame."""
-        return self._active_map.state
-
-    @property
-    def provisional_map(self) -> ProvisionalMap | None:
-        """The active submap while later frames may still show that it was initialized wrongly."""
-        return self._state_machine.initialization.provisional
+        return self.mode.state
 
     @property
     def can_checkpoint(self) -> bool:
         """Whether the active submap is confirmed, and no frame is held back."""
-        is_confirmed = self.submap is not None and self.provisional_map is None
-        return is_confirmed and not self._confirmation.is_holding
+        return self.mode is Mode.TRACKING
 
     # --- pipeline --------------------------------------------------------------------------------------------
 
@@ -187,7 +182,7 @@ class SLAM:
 
     def _has_pose(self, frame: Frame) -> bool:
         """Whether a frame is among the posed ones, or among those that are held back."""
-        if any(view.index == frame.index for view in self._confirmation.views()):
+        if self._context.log.status(frame.index) is FrameStatus.HELD:
             return True
         key = int(
             key_of(torch.tensor(self.session.number, device="cpu"), torch.tensor(frame.index, device="cpu"))
@@ -200,13 +195,9 @@ class SLAM:
         with self.clock.rest("rest"):
             self._check(frame)
             with self.clock("features"):
-                view = self._extract(frame)
-                view = self.non_static_filter.mask_out(view)
-            if self.submap is not None:
-                outcome = self._state_machine.track(view)  # pose, keyframe, mapping, loop closing
-            else:
-                outcome = self._state_machine.relocalize_or_initialize(view)
-        return self._result(view, outcome)
+                filtered = self.scene_filter.mask_out(self._extract(frame))
+            outcome = self._state_machine.step(filtered)
+        return self._result(filtered.view, outcome)
 
     def step_image(
         self, image: Shaped[np.ndarray, "H W *channels"], timestamp: float, channels: str = "rgb"
@@ -261,7 +252,7 @@ class SLAM:
 
     @torch.inference_mode()
     def confirm_map(self) -> None:
-        """Confirm a provisional map as it is: the frames from before its first keyframe get their poses."""
+        """Confirm a provisional map as it is, with the frames that are held back and those from before it."""
         self._state_machine.confirm_map()
 
     @torch.inference_mode()

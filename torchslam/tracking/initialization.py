@@ -1,12 +1,10 @@
-"""Two-view initialization of a map, and provisional maps.
+"""Two-view initialization of a map, and whether two frames contradict one.
 
-Initialization is relative pose, triangulation, refinement, and the checks of the result. A provisional map is one that
-was initialized recently: later frames may contradict it.
+Initialization is relative pose, triangulation, refinement, and the checks of the result.
 """
 
 from __future__ import annotations
 
-import copy
 import math
 
 import torch
@@ -54,8 +52,6 @@ Of rendered rotations it is 0.01 or less, with any guess of the focal length and
 sequences determine a map, it is 0.13 or more.
 """
 
-CHECK_INTERVAL = 5
-"""Frames between two checks; a turning camera soon no longer sees what the first frame saw."""
 MIN_SUPPORT_RATIO = 0.5
 """Minimum support of the map's motion, relative to that of the motion that two frames alone give.
 
@@ -70,30 +66,26 @@ class Initializer:
         self.camera = camera
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.config = config
-        self.views: list[FrameFeatures] = []  # the reference and the frames after it
+        self._reference: FrameFeatures | None = None
+        self.num_views = 0  # the reference and the frames after it
         # keypoints of the last view that do not belong to the scene
         self.static_pixels: Float[Tensor, "N 2"] = camera.params.new_zeros(0, 2)
         self.num_planar_views = 0  # whose matches with the reference a homography explained
         self.planar_reason: Rejection | None = None  # of the last such view that was tested for a rotation
 
-    def copy(self) -> Initializer:
-        """The same state, which later frames do not change."""
-        copied = copy.copy(self)
-        copied.views = list(self.views)
-        return copied
-
     @property
     def reference(self) -> FrameFeatures:
-        """The reference frame."""
-        return self.views[0]
+        """The reference frame, once there is one."""
+        assert self._reference is not None
+        return self._reference
 
     def step(self, view: FrameFeatures) -> TwoViewMap | Rejection:
         """Try to initialize a map with the next frame."""
         self.static_pixels = self.static_pixels[:0]
-        if not self.views or len(self.views) >= self.config.initialization.max_reference_age:
+        if self._reference is None or self.num_views >= self.config.initialization.max_reference_age:
             self._refer_to(view)
             return Rejection(Reason.NEW_REFERENCE)
-        self.views.append(view)
+        self.num_views += 1
         pairs = run_matcher(self.matcher, self.reference, view)
         first, second = pairs.first, pairs.second
         view = view.weighed(second, pairs.weights)
@@ -108,7 +100,7 @@ class Initializer:
 
     def _refer_to(self, view: FrameFeatures) -> None:
         """Start again with another reference frame."""
-        self.views = [view]
+        self._reference, self.num_views = view, 1
         self.num_planar_views = 0
         self.planar_reason = None
 
@@ -360,47 +352,42 @@ def refine_pair(
     return refined, points_w, passes_gate(errors).all(0)
 
 
-class ProvisionalMap:
-    """A recently initialized submap and the frames posed in it so far."""
+def contradicting_initialization(
+    submap: Submap,
+    first: FrameFeatures,
+    last: FrameFeatures,
+    camera: Camera,
+    config: Config,
+    matcher: Matcher | None = None,
+) -> TwoViewMap | None:
+    """Initialize from the first and the last frame alone; return the result if it contradicts the map.
 
-    def __init__(self, submap: Submap, views: list[FrameFeatures]) -> None:
-        self.submap = submap
-        self.views = views
-        self.age = 0  # frames since the initialization
+    The map's own observations agree with it by construction, so the two frames are matched again. The result
+    contradicts the map if the motion in the map explains its matches much worse.
 
-    def add_frame(self, view: FrameFeatures) -> None:
-        """Count another tracked frame."""
-        self.views.append(view)
-        self.age += 1
-
-    def find_contradicting_initialization(
-        self, camera: Camera, config: Config, matcher: Matcher | None = None
-    ) -> TwoViewMap | None:
-        """Initialize from the first and the last frame alone; return the result if it contradicts the map.
-
-        The map's own observations agree with it by construction, so the two frames are matched again. The result
-        contradicts the map if the motion in the map explains its matches much worse.
-        """
-        if self.age % CHECK_INTERVAL != 0:
-            return None
-        first, last = self.views[0], self.views[-1]
-        threshold_px = config.initialization.threshold_px
-        T_1w, T_2w = self.submap.posed_frames.T_cw(self.submap.map)[0], self.submap.T_cw
-        T_21 = T_2w @ se3_inverse(T_1w)
-        pairs = run_matcher(
-            make_matcher(config.matching, matcher, features=config.features.kind), first, last
-        )
-        pixels = first.keypoints[pairs.first], last.keypoints[pairs.second]
-        if support(*pixels, T_21, camera, threshold_px) >= MIN_SUPPORT_RATIO * len(pairs.first):
-            return None  # no motion can have twice the support
-        initializer = Initializer(camera, config, matcher)
-        initializer.step(first)
-        start = initializer.step(last)
-        if not isinstance(start, TwoViewMap):
-            return None
-        pixels = first.keypoints[start.keypoints_1], last.keypoints[start.keypoints_2]
-        own, by_map = (support(*pixels, T, camera, threshold_px) for T in (start.T_cw, T_21))
-        return start if by_map < MIN_SUPPORT_RATIO * own else None
+    Args:
+        submap: The submap, in which `last` is the last tracked frame.
+        first: The first frame that was posed in it.
+        last: The last one.
+        camera: The camera of both.
+        config: The configuration.
+        matcher: The matcher; the configured one if None.
+    """
+    threshold_px = config.initialization.threshold_px
+    T_1w, T_2w = submap.posed_frames.T_cw(submap.map)[0], submap.T_cw
+    T_21 = T_2w @ se3_inverse(T_1w)
+    pairs = run_matcher(make_matcher(config.matching, matcher, features=config.features.kind), first, last)
+    pixels = first.keypoints[pairs.first], last.keypoints[pairs.second]
+    if support(*pixels, T_21, camera, threshold_px) >= MIN_SUPPORT_RATIO * len(pairs.first):
+        return None  # no motion can have twice the support
+    initializer = Initializer(camera, config, matcher)
+    initializer.step(first)
+    start = initializer.step(last)
+    if not isinstance(start, TwoViewMap):
+        return None
+    pixels = first.keypoints[start.keypoints_1], last.keypoints[start.keypoints_2]
+    own, by_map = (support(*pixels, T, camera, threshold_px) for T in (start.T_cw, T_21))
+    return start if by_map < MIN_SUPPORT_RATIO * own else None
 
 
 def support(

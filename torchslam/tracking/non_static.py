@@ -269,7 +269,22 @@ class IndependentMotion:
         return reach & (2 * is_group.sum(-1) > k)
 
 
-class NonStaticFilter:
+@dataclass(frozen=True)
+class FilteredView:
+    """A frame, and what of it belongs to the static scene.
+
+    Attributes:
+        view: The frame without keypoints that are known not to belong to the scene.
+        without_overlays: The frame without those of static overlays only.
+        whole: The frame with all its keypoints.
+    """
+
+    view: FrameFeatures
+    without_overlays: FrameFeatures
+    whole: FrameFeatures
+
+
+class SceneFilter:
     """Masks out keypoints of static overlays and moving objects, as far as each is enabled."""
 
     def __init__(self, camera: Camera, config: Config) -> None:
@@ -277,23 +292,22 @@ class NonStaticFilter:
         self.static_overlay = StaticOverlayDetector(camera, config.static_overlay, config.matching)
         self.independent_motion = IndependentMotion(camera, config.independent_motion, config.matching)
 
-    def mask_out(self, view: FrameFeatures) -> FrameFeatures:
-        """The view without the keypoints known not to belong to the scene; call it once per frame, in order."""
-        self._view = view
-        self._without_overlays = self.static_overlay.mask_out(view)
-        return self.independent_motion.mask_out(self._without_overlays)
+    def mask_out(self, view: FrameFeatures) -> FilteredView:
+        """Mask out what is known not to belong to the scene; moving objects are followed from frame to frame."""
+        without_overlays = self.static_overlay.mask_out(view)
+        return FilteredView(self.independent_motion.mask_out(without_overlays), without_overlays, view)
 
-    def detect_independent_motion(self, estimate: PoseEstimate) -> Movement:
-        """Detect keypoints of the newest view that move against the scene, given the view's pose."""
+    def detect_independent_motion(self, filtered: FilteredView, estimate: PoseEstimate) -> Movement:
+        """Detect keypoints that move against the scene, given the frame's pose."""
         if not self.config.independent_motion.enabled:
             return NO_MOVEMENT
-        return self.independent_motion.observe(self._without_overlays, estimate)
+        return self.independent_motion.observe(filtered.without_overlays, estimate)
 
-    def update_overlay(self, T_cw: Float[Tensor, "4 4"], depth: float) -> bool:
-        """Update the overlays with the newest view and its pose; return whether there are new ones."""
+    def update_overlay(self, filtered: FilteredView, T_cw: Float[Tensor, "4 4"], depth: float) -> bool:
+        """Update the overlays with a frame and its pose; return whether there are new ones."""
         if not self.config.static_overlay.enabled:
             return False
-        return self.static_overlay.observe(self._view, T_cw, depth) > 0
+        return self.static_overlay.observe(filtered.whole, T_cw, depth) > 0
 
     def forget_last(self) -> None:
         """Compare the next frame with no earlier one: its pose is in another submap."""

@@ -11,7 +11,7 @@ from torchslam.config import Config
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
 from torchslam.tracking.data_association import match_keyframe
-from torchslam.tracking.pose_validation import validate_pose
+from torchslam.tracking.pose_validation import check_pose
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate
 
@@ -46,7 +46,7 @@ class Relocalizer:
             )
             if estimate is not None:
                 state = single_frame_state(submap.tracking, estimate)
-                if validate_pose(estimate, None, state, self.validation) is None:
+                if check_pose(estimate, None, state, self.validation).rejection is None:
                     return submap, estimate
             tried.append((submap, near))
         return None

@@ -1,7 +1,8 @@
-"""Frame-to-map tracking: predict the pose, match the local map, estimate the pose, update the tracking state."""
+"""Frame-to-map tracking: predict the pose, match the local map, estimate the pose; `commit` updates the state."""
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -19,26 +20,30 @@ from torchslam.tracking.localizer import Localizer, match_projected_points
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
 
-EMA_RATE = 0.1
-"""Weight of the newest frame in the moving averages of the tracking state."""
-
 
 class Tracker:
     """Tracks the camera against the local map: the keyframes covisible with the reference keyframe, and their points.
 
-    Stateless: the state is `Submap.tracking`.
+    Stateless: the state is `Submap.tracking`, which `track` reads and `commit` updates.
+
+    Args:
+        counts: Whether observations are counted in the map; without it, tracking does not change the map.
     """
 
-    def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
+    def __init__(
+        self, camera: Camera, config: Config, matcher: Matcher | None = None, counts: bool = True
+    ) -> None:
         self.localizer = Localizer(camera, config)
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.settings = config.tracking
         self.matching = config.matching
-        self.counts = True
-
-    def set_counting(self, counts: bool) -> None:
-        """Choose whether observations are counted in the map; without it, tracking does not change the map."""
         self.counts = counts
+
+    def for_session(self, mapping: bool) -> Tracker:
+        """The same tracker for a session that maps, or that only localizes."""
+        tracker = copy.copy(self)
+        tracker.counts = mapping
+        return tracker
 
     # --- tracking state -------------------------------------------------------------------------------------------
 
@@ -46,12 +51,19 @@ class Tracker:
         """Continue from a keyframe, as if the last frame had its pose."""
         T_cw = submap.map.T_cw[keyframe]
         seen = submap.map.keyframes["point_ids"][keyframe]
-        submap.tracking = replace(
+        tracking = replace(submap.tracking, last_inlier_points=seen[seen >= 0])
+        submap.tracking = self._moved_to(submap, keyframe, T_cw, tracking)
+
+    def _moved_to(
+        self, submap: Submap, keyframe: int, T_cw: Float[Tensor, "4 4"], tracking: TrackingState
+    ) -> TrackingState:
+        """The same state with another reference keyframe, and its local map."""
+        return replace(
             self._at_keyframe(submap.map, keyframe, T_cw),
-            velocity=submap.tracking.velocity,
-            last_inlier_points=seen[seen >= 0],
-            error=submap.tracking.error,
-            explained_ratio=submap.tracking.explained_ratio,
+            velocity=tracking.velocity,
+            last_inlier_points=tracking.last_inlier_points,
+            error=tracking.error,
+            explained_ratio=tracking.explained_ratio,
         )
 
     def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Float[Tensor, "4 4"]) -> TrackingState:
@@ -83,24 +95,25 @@ class Tracker:
 
     # --- one frame -------------------------------------------------------------------------------------------
 
-    def track(self, submap: Submap, view: FrameFeatures, is_sure: bool = True) -> PoseEstimate | None:
-        """Estimate the pose of the next frame and update the tracking state; None if it cannot be found.
+    def track(
+        self,
+        submap: Submap,
+        view: FrameFeatures,
+        prior_T_cw: Float[Tensor, "4 4"] | None = None,
+        is_sure: bool = True,
+    ) -> PoseEstimate | None:
+        """Estimate the pose of the next frame; None if it cannot be found. Nothing is changed.
 
         Args:
-            submap: the submap with the tracking state.
-            view: the frame.
+            submap: The submap with the tracking state.
+            view: The frame.
+            prior_T_cw: The pose around which matches are searched for; the predicted one if None.
             is_sure: True if the last poses are certain: a pose near the predicted one is tried first.
         """
-        expected = self.predict(submap)
-        candidates = self._candidates(submap, view, expected)
-        estimate = self.localizer.locate(
-            submap.map, view, candidates, submap.tracking.local_points, expected if is_sure else None
-        )
-        if estimate is None:
-            submap.tracking.velocity = None
-            return None
-        self.update(submap, view, estimate)
-        return estimate
+        prior_T_cw = self.predict(submap) if prior_T_cw is None else prior_T_cw
+        candidates = self._candidates(submap, view, prior_T_cw)
+        near = prior_T_cw if is_sure else None
+        return self.localizer.locate(submap.map, view, candidates, submap.tracking.local_points, near)
 
     def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
         """Sets of matches by ever wider search: near the predicted pixels, in a wider window, in the whole image."""
@@ -123,26 +136,28 @@ class Tracker:
             for keyframe in dict.fromkeys((tracking.reference, newest)):
                 yield match_keyframe(slam_map, keyframe, view, self.matcher)
 
-    def update(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
-        """Update the tracking state by a frame: velocity, averages, reference keyframe, `last_seen_frame`."""
-        slam_map, tracking = submap.map, submap.tracking
-        tracking.velocity = estimate.T_cw @ se3_inverse(submap.T_cw)
-        tracking.last_inlier_points = estimate.point_ids
-        tracking.error += EMA_RATE * (estimate.error - tracking.error)
-        tracking.explained_ratio += EMA_RATE * (estimate.explained_ratio - tracking.explained_ratio)
+    def commit(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate | None) -> None:
+        """Update the tracking state by a frame: velocity, averages, reference keyframe, `last_seen_frame`.
+
+        Without an estimate the velocity is unknown from here on.
+        """
+        if estimate is None:
+            submap.tracking.velocity = None
+            return
+        slam_map = submap.map
+        velocity = estimate.T_cw @ se3_inverse(submap.T_cw)
+        tracking = replace(
+            submap.tracking.averaged_with(estimate),
+            velocity=velocity,
+            last_inlier_points=estimate.point_ids,
+        )
         self._update_last_seen(slam_map, view, estimate)
         shared = slam_map.count_observed(estimate.point_ids, tracking.local_keyframes)
         best = int(tracking.local_keyframes[shared.argmax()])
         if best == tracking.reference:
-            tracking.T_cr = estimate.T_cw @ se3_inverse(slam_map.T_cw[best])
+            submap.tracking = replace(tracking, T_cr=estimate.T_cw @ se3_inverse(slam_map.T_cw[best]))
         else:
-            submap.tracking = replace(
-                self._at_keyframe(slam_map, best, estimate.T_cw),
-                velocity=tracking.velocity,
-                last_inlier_points=tracking.last_inlier_points,
-                error=tracking.error,
-                explained_ratio=tracking.explained_ratio,
-            )
+            submap.tracking = self._moved_to(submap, best, estimate.T_cw, tracking)
 
     def start_at_estimate(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Start the tracking state at a frame that was posed without one."""
