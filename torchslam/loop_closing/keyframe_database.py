@@ -18,10 +18,15 @@ from torch import Tensor
 
 from torchslam.features.matching.hamming import pack_bits, sign_products, spread_bits
 
-BITS = 256  # of a descriptor
-CODE_BITS = 64  # of a code: one machine word
-_CODE_NOISE = 9.0  # bits: the similarity of codes falls by exp(-(distance / _CODE_NOISE)^2)
-_CODE_LIMIT = 19  # bits: codes further apart mean different things
+BITS = 256
+"""Bits of a descriptor: ORB's, and of the random projections of floats."""
+CODE_BITS = 64
+"""Bits of a code: one machine word."""
+_CODE_NOISE = 9.0
+"""Bits by which codes of one place differ: their similarity falls by exp(-(distance / _CODE_NOISE)^2). By
+`experiments/places`."""
+_CODE_LIMIT = 19
+"""Bits by which codes differ that count as different: the similarity is 0.01 there."""
 # by experiments/places/train.py, from rendered images
 _WORDS_FILE = Path(__file__).parent / "words.safetensors"
 _SEED = 0  # of the choice of bits and of the projections of floats; part of what a saved state means
@@ -116,12 +121,16 @@ def _count_bits(words: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
     return words.bitwise_right_shift_(56)  # at most 64, so the sign bit stays clear
 
 
-MAX_DESCRIPTORS = 400  # per image, the strongest: nearly as good as all of them, at less than half the cost
+MAX_DESCRIPTORS = 400
+"""Descriptors of an image, the strongest: nearly as good as all of them, at less than half the cost."""
 NO_KEY = -1
-
-_CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
+"""Key of an empty slot; keys of keyframes are not negative."""
+_CHUNK = 1 << 17
+"""Pairs of codes that are compared at once: what a processor's cache holds."""
 _FIRST_CAPACITY = 64
-_MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a float front end
+"""Images for which a new database has room; it grows by a quarter."""
+_MIN_FLOAT_WORDS = 64
+"""Descriptors below which an image is too empty to give the words of floats. Tried at this value only."""
 
 
 class KeyframeDatabase:

@@ -25,10 +25,14 @@ from torchslam.optim import PoseGraph, pose_graph_optimize
 from torchslam.tracking.relocalization import Candidate
 from torchslam.types import FrameFeatures, Matcher
 
-MIN_ESSENTIAL_WEIGHT = 100  # shared points of two keyframes with an edge in addition to the spanning tree
-_MAX_STRONG_EDGES = 20  # of a keyframe
+MIN_ESSENTIAL_WEIGHT = 100
+"""Shared points of two keyframes with an edge in addition to the spanning tree. Mur-Artal et al., 2015, III.D."""
+_MAX_STRONG_EDGES = 20
+"""Such edges of a keyframe at most: the graph stays sparse where a camera stands. Tried at this value only."""
 _ITERATIONS = 20
-_VISIT_KEYFRAMES = 20  # on either side of the loop, in which the other side's points are searched for
+"""Iterations of the pose graph, as in ORB-SLAM."""
+_VISIT_KEYFRAMES = 20
+"""Keyframes on either side of the loop in which the other side's points are searched for. Tried at this value only."""
 
 
 class LoopCloser:

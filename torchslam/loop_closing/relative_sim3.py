@@ -23,17 +23,28 @@ from torchslam.geometry import (
 from torchslam.geometry.ransac import samples_needed
 from torchslam.map.map import Map
 from torchslam.optim import refine_pose
+from torchslam.tracking.data_association import GUIDED_RATIO
 from torchslam.tracking.localizer import match_projected_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher, run_matcher
 from torchslam.types import Matcher
 
-_RADIUS_PX = 8.0  # around the projection by a first similarity
-_AROUND = 10  # keyframes whose points are searched for in the other map
-_NEEDED = 12  # inliers of the first similarity
-_CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000  # in the search of the first similarity
+_RADIUS_PX = 8.0
+"""Search radius around the projection by a first similarity, pixels; ORB-SLAM's radius there is 7.5 to 10. Tried at
+this value only."""
+_AROUND = 10
+"""Covisible keyframes whose points are searched for in the other map, as many as ORB-SLAM3 takes. Tried at this value
+only."""
+_NEEDED = 12
+"""Inliers of the first similarity, three times its minimal sample and more. Tried at this value only."""
+_CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000
+"""Probability with which the search finds a similarity with `_NEEDED` inliers, and its bound: with 12 of 100 matches
+5,300 would be needed."""
 _KERNEL_SCALE = 2.0
-_ITERATIONS = 20  # of the refined pose, which rarely needs ten
-_GATE_WIDENING = 2.0  # times the noise, as the Sim(3) has noise of its own
+"""Scale of the Cauchy kernel of the refined pose, standard deviations of the noise. Tried at this value only."""
+_ITERATIONS = 20
+"""Iterations of the refined pose, which rarely needs ten."""
+_GATE_WIDENING = 2.0
+"""Factor on the noise in the gate of matches, as the Sim(3) has noise of its own. Tried at this value only."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +166,7 @@ def match_by_sim3_pose(
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
     pairs = match_projected_points(
-        slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9
+        slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=GUIDED_RATIO
     )
     return pairs.first, pairs.second
 

@@ -29,8 +29,8 @@ NUM_NEWEST_KEPT = 8
 """Newest keyframes, which are never culled: their points are recent, and tracking continues from them."""
 NUM_COVISIBLE = 20
 """Keyframes that are checked around each new one."""
-# Culling runs after this many new keyframes, or a sixteenth of the map: copying rows then costs O(1) per keyframe.
 _LEAST_BATCH, _BATCH_SHARE = 8, 16
+"""Culling runs after this many new keyframes, or this part of the map: copying rows then costs O(1) per keyframe."""
 
 
 def cull_keyframes(submap: Submap, settings: KeyframesConfig) -> RowRemap | None:

@@ -24,6 +24,8 @@ from torchslam.utils.timing import Stopwatch
 
 RECENT_KEYFRAMES = 3
 """Number of keyframes after its first one for which a point may be culled."""
+MIN_POSE_SUPPORT = 0.5
+"""Ratio of a frame's matches that must be inliers for the frame to support a new map: a majority."""
 LIVE_MIN_OVERLAP = 0.4
 """Overlap above which keyframes wait for as many frames as a live camera is ahead, since late frames are dropped.
 
@@ -197,7 +199,7 @@ class MapInitializer:
             return False
         self.tracker.count_found(submap.map, estimate)
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
-        return estimate.inliers > 0.5 * estimate.matches
+        return estimate.inliers > MIN_POSE_SUPPORT * estimate.matches
 
 
 def keyframe_reason(

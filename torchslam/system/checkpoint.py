@@ -30,8 +30,11 @@ from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult
 
 STATES = tuple(State)
+"""The order of states in a file."""
 TRACKING = "run.tracking."
+"""Prefix of the tensors of the tracking state."""
 UNKNOWN = "not a whole checkpoint"
+"""What errors say of a damaged file."""
 
 
 def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:

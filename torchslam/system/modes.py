@@ -33,6 +33,7 @@ _STATES = {
     Mode.DOUBTED: State.UNCERTAIN,
     Mode.RELOCALIZED: State.UNCERTAIN,
 }
+"""The state of each mode."""
 
 TRANSITIONS: dict[tuple[Mode, Mode], str] = {
     (Mode.INITIALIZING, Mode.PROVISIONAL): "two views give a map",

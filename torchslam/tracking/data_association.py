@@ -20,11 +20,23 @@ from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matc
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, MatchPrior
 from torchslam.utils.indexing import is_among
 
-GRID = (8, 6)  # columns and rows of the image cells
-MAX_MATCHES_PER_CELL = 5  # that RANSAC samples from
-MAX_CELL_WEIGHT = 8  # sum of the weights of the matches in a cell, at most
-MIN_COVERAGE_CELLS = 5  # cells with mature points for which a coverage ratio is computed
-MATURE_OBSERVATIONS = 10  # frames with certain poses that found a point, from which on it is mature
+GRID = (8, 6)
+"""Columns and rows of the image cells: squares at 4:3, 80 px wide at 640 x 480. Tried at this value only."""
+MAX_MATCHES_PER_CELL = 5
+"""Matches of a cell that RANSAC samples from: 240 in all, so that a textured corner does not decide. Tried at this
+value only."""
+MAX_CELL_WEIGHT = 8
+"""Largest sum of the weights of the matches in a cell, in weights of one match; for the same reason. Tried at this
+value only."""
+MIN_COVERAGE_CELLS = 5
+"""Cells with mature points, of 48, below which no coverage ratio is computed: it would be 0, 1 or near. Tried at this
+value only."""
+MATURE_OBSERVATIONS = 10
+"""Frames with certain poses that found a point, from which on it is mature: a third of a second at 30 Hz, by when
+it has passed the culling of recent points. Tried at this value only."""
+GUIDED_RATIO = 0.9
+"""Largest ratio of the best to the second descriptor distance of guided matches. Wider than Lowe's 0.8, since the
+window around a projection leaves few rivals; ORB-SLAM uses 0.9 there as well."""
 
 
 @dataclass(frozen=True)

@@ -22,11 +22,19 @@ from torchslam.tracking.matcher import max_distance
 from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_segments
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
 
-_DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)  # of the scene's median depth
-_NUM_NEIGHBORS = 3  # that vote on whether a keypoint belongs to the object
-_MOVING_PATIENCE = 10  # comparisons in which a keypoint that was seen to move may agree with the map
-_NEARBY_PATIENCE = 3  # the same, for a keypoint that is only near those
-_MAX_DISTANCE_RATIO = 0.06  # of the image's width, from a keypoint of the object to the nearest other one
+_DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)
+"""Depths between which a point of the scene projects to a polyline, relative to the scene's median depth: steps that
+are nearly even in the image, from what is close to the lens to infinity."""
+_NUM_NEIGHBORS = 3
+"""Nearest keypoints that vote on whether a keypoint belongs to the object; odd. Tried at this value only."""
+_MOVING_PATIENCE = 10
+"""Comparisons in which a keypoint that was seen to move may agree with the map: a pedestrian who stops stays masked for
+a few seconds. Tried at this value only."""
+_NEARBY_PATIENCE = 3
+"""The same for a keypoint that is only near those; shorter, since it may be of the scene. Tried at this value only."""
+_MAX_DISTANCE_RATIO = 0.06
+"""Largest distance from a keypoint of the object to the nearest other one, relative to the image's width: 38 px of 640.
+Tried at this value only."""
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,7 @@ class Movement:
 
 
 NO_MOVEMENT = Movement()
+"""Nothing moves, or it is not known."""
 
 
 class IndependentMotion:

@@ -19,9 +19,13 @@ from torchslam.tracking.data_association import image_cells
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures
 
-_DEPTHS = (0.3, 1.0, 3.0, 30.0)  # of the scene's median depth, the possible depths of a keypoint
-_STRIDE = 8  # stride of the keypoints in the first test whether the camera moved far enough
-_PAUSE = 4  # frames without a comparison after one that found no overlay
+_DEPTHS = (0.3, 1.0, 3.0, 30.0)
+"""Possible depths of a keypoint, relative to the scene's median depth; fewer than for moving objects, as only those
+keypoints count that move far whatever their depth. Tried at these values only."""
+_STRIDE = 8
+"""Every so many keypoints are in the first test whether the camera moved far enough; it saves time only."""
+_PAUSE = 4
+"""Frames without a comparison after one that found no overlay; it saves time only."""
 
 
 @dataclass(frozen=True)
