@@ -26,7 +26,8 @@ from torchslam.types import Matcher
 _AROUND = 20
 """Keyframes that share most points with the new one: their places are known. Tried at this value only."""
 _NUM_VERIFYING = 5
-"""Covisible keyframes that may verify a candidate, of which `loop_closing.min_confirming_keyframes` must. Tried at this value only."""
+"""Covisible keyframes that may verify a candidate; `loop_closing.min_confirming_keyframes` of them must. Tried at this
+value only."""
 _SAME_SCALE, _SAME_DEG, _SAME_SHARE = 1.2, 5.0, 0.1
 """Largest difference of two consistent relations: ratio of scales, degrees, and distance relative to the depth of the
 scene. Wide: lookalike places differ by meters and tens of degrees. Tried at these values only."""
