@@ -15,6 +15,7 @@ from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.map.atlas import Submap
 from torchslam.system import savepoint as savepoints
 from torchslam.system import state_machine
+from torchslam.system.frame_log import FrameStatus
 from torchslam.system.front_end import Simulated
 from torchslam.system.local_mapping import locate
 from torchslam.system.maintenance import Maintenance
@@ -105,3 +106,27 @@ class Drive:
         """Process frames until the mode is this one, as many as there are."""
         while self.step(judgment) is not mode:
             pass
+
+    def check(self) -> None:
+        """Every frame has a pose in one submap, or is in the log; the savepoints know theirs."""
+        active, log = self.slam._context.active_map, self.slam._context.log
+        count = len(self.results)
+        posed = [
+            index
+            for submap in self.slam.atlas
+            if len(submap.posed_frames)
+            for index in submap.posed_frames.frames["frame_index"].tolist()
+        ]
+        assert len(set(posed)) == len(posed)
+        waiting = {
+            index for index in range(count) if log.status(index) in (FrameStatus.UNPOSED, FrameStatus.HELD)
+        }
+        assert not waiting & set(posed)
+        assert waiting | set(posed) == set(range(count))
+        for savepoint, status in (
+            (active.doubted, FrameStatus.HELD),
+            (active.provisional, FrameStatus.POSED),
+        ):
+            logged = [] if savepoint is None else sorted(savepoint.frames)
+            assert logged == [index for index in range(count) if log.status(index) is status]
+            assert savepoint is None or savepoint.submap is active.submap
