@@ -5,6 +5,7 @@ Rows are shuffled wherever they can be, so that a keypoint's number, a point's r
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass, replace
 
 import torch
@@ -141,3 +142,22 @@ def camera_center(T_cw: Tensor) -> Tensor:
 
 def with_scales(view: FrameFeatures, scales: Tensor) -> FrameFeatures:
     return replace(view, scales=scales)
+
+
+def state_of(where: Submap) -> dict[str, object]:
+    """Copies of all columns of a map, and of the tracking state."""
+    state = {f"{name} of points": column.clone() for name, column in where.map.points.columns().items()}
+    state |= {
+        f"{name} of keyframes": column.clone() for name, column in where.map.keyframes.columns().items()
+    }
+    return state | copy.deepcopy(vars(where.tracking))
+
+
+def assert_same_state(one: dict[str, object], two: dict[str, object]) -> None:
+    assert one.keys() == two.keys()
+    for name, value in one.items():
+        if isinstance(value, Tensor):
+            assert isinstance(two[name], Tensor), name
+            assert torch.equal(value, two[name]), name
+        else:
+            assert value == two[name], name

@@ -9,10 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.loop_closing.ring import END, KEYFRAMES, around, ring_submap
+from tests.loop_closing.ring import END, KEYFRAMES, ring_submap
 from tests.scene import CAMERA, Scene, camera_center, pose, sideways, submap_of_scene
 from torchslam.config import Config, LoopClosingConfig, load_config
-from torchslam.geometry import se3_inverse, sim3_inverse, sim3_scale
+from torchslam.geometry import sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.loop_detector import (
     LoopCandidate,
@@ -24,8 +24,6 @@ from torchslam.loop_closing.loop_detector import (
 )
 from torchslam.loop_closing.relative_sim3 import RelativeSim3, scaling_sim3
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.map.map import Map
-from torchslam.tracking.backward_tracking import GapLink
 
 SCENE = Scene.of(300)
 SIDE = sideways(4)
@@ -113,78 +111,6 @@ def test_covisibility_reaches_two_steps() -> None:
     assert len(near) < KEYFRAMES
     assert torch.equal(near, torch.unique(near))
     assert 10 in near
-
-
-# --- gaps of lost frames ------------------------------------------------------------------------------------------
-
-
-def gap_link(before: Submap, row: int, after: Submap, other: int, T_ba: Tensor) -> GapLink:
-    return GapLink(before.map.key(row), after.map.key(other), T_ba)
-
-
-def test_both_sides_of_a_gap_in_a_drifted_map_are_joined() -> None:
-    """The camera was lost after keyframe 29 and found again at keyframe 0, which is a neighbor of it in truth."""
-    submap = ring_submap(scale=1.01, twist=0.002)
-    true = around()
-    T_ba = true[END] @ se3_inverse(true[0])
-    submap.map.keyframes["frame_index"][0] = KEYFRAMES + 5
-    found = loop_detector(submap).detect_at_gap(gap_link(submap, END, submap, 0, T_ba))
-    assert found is not None
-    assert (found.keyframe, found.matched_keyframe, found.is_loop) == (END, 0, True)
-    scale = float(found.relation.S_21[:3, :3].det()) ** (1 / 3)
-    assert scale == pytest.approx(1.01**END, rel=0.02)
-
-
-def test_a_gap_on_which_the_map_agrees_is_left_alone() -> None:
-    submap = ring_submap()
-    true = around()
-    link = gap_link(submap, END, submap, 0, true[END] @ se3_inverse(true[0]))
-    assert loop_detector(submap).detect_at_gap(link) is None
-
-
-def test_the_submaps_on_both_sides_of_a_gap_are_joined(S_21: Tensor) -> None:
-    one, other = two_submaps(S_21)
-    T_ba = SIDE[3] @ se3_inverse(OTHER[0])
-    T_ba[:3, 3] *= sim3_scale(S_21)  # in the unit of the other map
-    found = loop_detector(one, other).detect_at_gap(gap_link(one, 3, other, 0, T_ba))
-    assert found is not None
-    assert (found.submap, found.keyframe, found.matched_submap, found.matched_keyframe) == (other, 0, one, 3)
-    torch.testing.assert_close(found.relation.S_21, sim3_inverse(S_21), atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize(("needed", "is_found"), [(30, True), (31, False)])
-def test_submaps_are_joined_at_a_gap_by_as_many_matches_as_at_a_loop(
-    S_21: Tensor, needed: int, is_found: bool
-) -> None:
-    one, other = two_submaps(S_21)
-    T_ba = SIDE[3] @ se3_inverse(OTHER[0])
-    T_ba[:3, 3] *= sim3_scale(S_21)
-    both = (one.map.points["times_observed"] == 4) & (other.map.points["times_observed"] == 4)
-    other.map.remove_points(torch.nonzero(torch.cumsum(both, 0) * both - 1 >= 30)[:, 0])
-    other.map.remove_points(torch.nonzero(~both & other.map.points["is_valid"])[:, 0])
-    detector = loop_detector(one, other, overrides=(f"loop_closing.min_matches={needed}",))
-    found = detector.detect_at_gap(gap_link(one, 3, other, 0, T_ba))
-    assert (found is not None) is is_found
-
-
-def thinned_to(slam_map: Map, count: int) -> None:
-    """Leave the points that most keyframes observe."""
-    order = torch.argsort(slam_map.points["times_observed"], descending=True, stable=True)
-    slam_map.remove_points(order[count:])
-
-
-def test_submaps_without_shared_points_are_not_joined_at_a_gap(S_21: Tensor) -> None:
-    one, other = two_submaps(S_21)
-    T_ba = SIDE[3] @ se3_inverse(OTHER[0])
-    T_ba[:3, 3] *= sim3_scale(S_21)
-    thinned_to(one.map, 1)
-    assert loop_detector(one, other).detect_at_gap(gap_link(one, 3, other, 0, T_ba)) is None
-
-
-def test_a_gap_to_a_keyframe_that_was_culled_is_left_alone(S_21: Tensor) -> None:
-    one, other = two_submaps(S_21)
-    assert loop_detector(one, other).detect_at_gap(GapLink(77, other.map.key(0), pose())) is None
-    assert loop_detector(one, other).detect_at_gap(GapLink(one.map.key(3), 77, pose())) is None
 
 
 # --- how far a way may drift --------------------------------------------------------------------------------------

@@ -18,7 +18,6 @@ from torchslam.loop_closing.relative_sim3 import (
     inlier_matches,
     match_by_sim3_pose,
     neighborhood,
-    relative_sim3_of_pose,
     scaling_sim3,
     transfer_pose,
     verify_relative_sim3,
@@ -160,57 +159,6 @@ def test_the_scale_is_that_of_most_depths(S_21: Tensor) -> None:
     relation = related(map_1, map_2)
     assert relation is not None
     torch.testing.assert_close(relation.S_21, S_21, atol=1e-3, rtol=0)
-
-
-def related_by_pose(map_1: Map, map_2: Map, T_12: Tensor) -> RelativeSim3 | None:
-    return relative_sim3_of_pose(T_12, map_1, 2, map_2, 1, CAMERA, Config())
-
-
-def test_a_pose_in_the_other_map_and_shared_points_give_the_similarity(S_21: Tensor) -> None:
-    map_1, map_2 = maps(S_21)
-    nearby = pose(0.01, 0, 0, 0.002) @ moved(ONE[2], S_21)
-    relation = related_by_pose(map_1, map_2, nearby)
-    assert relation is not None
-    torch.testing.assert_close(relation.S_21, S_21, atol=1e-5, rtol=0)
-    assert relation.inliers_1 == relation.shared_points > 100
-
-
-@pytest.mark.parametrize(("count", "known"), [(2, True), (1, False)])
-def test_with_too_few_shared_points_the_scale_is_unknown(S_21: Tensor, count: int, known: bool) -> None:
-    map_1, map_2 = maps(S_21)
-    T_12 = moved(ONE[2], S_21)
-    relation = related_by_pose(thinned(map_1, in_both(map_1, map_2)[:count]), map_2, T_12)
-    assert relation is not None
-    assert relation.shared_points == (2 if known else 0)
-    assert relation.inliers_1 > 100
-    if not known:  # the pose is right all the same
-        torch.testing.assert_close(relation.S_21, se3_inverse(T_12) @ ONE[2], atol=1e-5, rtol=0)
-
-
-@pytest.mark.parametrize(("factor", "known"), [(1.19, 6), (1.21, 0)])
-def test_shared_points_whose_depths_disagree_give_no_scale(S_21: Tensor, factor: float, known: int) -> None:
-    map_1, map_2 = maps(S_21)
-    thinned(map_1, in_both(map_1, map_2)[:6])
-    T_cw, rows = map_1.T_cw[2], map_1.valid_points()
-    points_c = transform(T_cw, map_1.positions_w[rows])
-    points_c[::2] *= factor  # the same pixels
-    map_1.points["positions_w"][rows] = transform(se3_inverse(T_cw), points_c)
-    relation = related_by_pose(map_1, map_2, moved(ONE[2], S_21))
-    assert relation is not None
-    assert relation.shared_points == known
-
-
-@pytest.mark.parametrize(("count", "is_found"), [(20, True), (19, False)])
-def test_a_pose_needs_half_of_the_matches_of_a_loop(S_21: Tensor, count: int, is_found: bool) -> None:
-    map_1, map_2 = maps(S_21)
-    thinned(map_2, in_both(map_1, map_2)[:count])
-    relation = related_by_pose(map_1, map_2, moved(ONE[2], S_21))
-    assert (relation is not None) is is_found
-
-
-def test_a_wrong_pose_gives_no_similarity(S_21: Tensor) -> None:
-    map_1, map_2 = maps(S_21)
-    assert related_by_pose(map_1, map_2, pose(0, 0, 0, 0, 0.3) @ moved(ONE[2], S_21)) is None
 
 
 def test_a_neighbor_verifies_a_similarity_that_predicts_its_points(S_21: Tensor) -> None:

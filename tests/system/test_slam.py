@@ -34,6 +34,7 @@ from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import AsyncBundleAdjustment
 from torchslam.mapping.mapper import MapInitializer
 from torchslam.system.front_end import Simulated
+from torchslam.system.modes import Mode
 from torchslam.tracking.localizer import Localizer
 from torchslam.types import FrameFeatures, Reason, TwoViewMap
 
@@ -470,16 +471,16 @@ def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str
 
     monkeypatch.setattr(slam.mapper.adjustment, "request", asking)
     monkeypatch.setattr(slam.mapper.adjustment, "apply", taking_over)
-    old: list[int] = []  # frames in which the submap is no longer young
+    confirmed: list[int] = []  # frames in which the submap is confirmed
 
     def after(result: StepResult) -> None:
         assert not (slam.submap is None and slam.mapper.adjustment.is_pending)  # nothing is left behind
-        if slam.submap is not None and slam.mode not in YOUNG:
-            old.append(result.index)
+        if slam.submap is not None and slam.mode not in (Mode.PROVISIONAL, Mode.PROVISIONAL_DOUBTED):
+            confirmed.append(result.index)
 
     slam.run(walk, after)
     assert not slam.mapper.adjustment.is_pending
-    return [event for event in events if event[1] in old[1:]]
+    return [event for event in events if event[1] in confirmed[1:]]
 
 
 def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(

@@ -2,28 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Container
 from dataclasses import replace
 
 import pytest
 import torch
 from torch import Tensor
 
+from tests.system.judging import DOUBT, SIMULATED, WRONG, judge
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, evaluate, load_config
-from torchslam.system import state_machine as following
+from torchslam.system import local_mapping, state_machine
+from torchslam.system import savepoint as savepoints
 from torchslam.system.front_end import Simulated
-from torchslam.system.local_mapping import TentativeMapping
-from torchslam.tracking import backward_tracking as backwards
-from torchslam.tracking import pose_validation
+from torchslam.system.local_mapping import LocalMapping
+from torchslam.system.modes import Mode
 from torchslam.tracking.non_static import NO_MOVEMENT
 from torchslam.types import Reason, Rejection
 
-SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
-DOUBTED = range(22, 34)
+DOUBTFUL = range(22, 34)
 LATE = 15  # the first frame that may begin a submap, where one starts late
-ODD = Rejection(Reason.LOW_COVERAGE_RATIO, {"ratio": 0.1})
 SEEN = 46  # frames, until as many were certain as were doubtful
 
 
@@ -41,21 +40,10 @@ class Leaving(Walk):
         return frame if index < self.leaves else replace(frame, T_cw_groundtruth=away)
 
 
-def doubting(
-    monkeypatch: pytest.MonkeyPatch,
-    frames: Iterable[int],
-    judge: str = "check_map_agreement",
-    odd: Rejection = ODD,
-) -> SLAM:
-    """A system to which some frames seem strange."""
-    slam = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED))
-
-    def why(*_: object) -> Rejection | None:
-        assert slam.last_frame is not None
-        return odd if slam.last_frame[0] in frames else None
-
-    monkeypatch.setattr(following, judge, why)
-    return slam
+def doubting(monkeypatch: pytest.MonkeyPatch, frames: Container[int], doubt: Rejection = DOUBT) -> SLAM:
+    """A system that doubts the poses of some frames, and of no others, forward in time."""
+    judge(monkeypatch, state_machine, lambda index: doubt if index in frames else None)
+    return SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED))
 
 
 def shown(slam: SLAM, walk: Walk, each: Callable[[int], None] = lambda _: None) -> list[State]:
@@ -74,10 +62,10 @@ def tables(slam: SLAM) -> dict[str, Tensor]:
 
 
 def test_tentative_keyframes_are_committed_when_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
-    slam, walk = doubting(monkeypatch, DOUBTED), Walk(arc(60)[: SEEN + 4])
+    slam, walk = doubting(monkeypatch, DOUBTFUL), Walk(arc(60)[: SEEN + 4])
     keyframes: list[int] = []
     states = shown(slam, walk, lambda _: keyframes.append(slam.map.num_keyframes))
-    first, last = DOUBTED[0], DOUBTED[-1]
+    first, last = DOUBTFUL[0], DOUBTFUL[-1]
     assert keyframes[last] > keyframes[first - 1] + 1
     assert states[first : SEEN - 1] == [State.UNCERTAIN] * (SEEN - 1 - first)
     assert states[SEEN - 1 :] == [State.TRACKING] * 5  # as many certain frames as doubtful ones
@@ -90,15 +78,15 @@ def test_tentative_keyframes_are_committed_when_confirmed(monkeypatch: pytest.Mo
 def test_tentative_keyframes_are_rolled_back_when_the_camera_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two systems that see the same, but that one of them does not map what is doubtful."""
     walk = Leaving(arc(60)[:30], 27)
-    slam = doubting(monkeypatch, DOUBTED)
+    slam = doubting(monkeypatch, DOUBTFUL)
     grown: list[int] = []
     states = shown(slam, walk, lambda _: grown.append(slam.map.num_keyframes))
     assert states[-1] is State.LOST
-    assert max(grown) > grown[DOUBTED[0] - 1]
-    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes == grown[DOUBTED[0] - 1]
+    assert max(grown) > grown[DOUBTFUL[0] - 1]
+    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes == grown[DOUBTFUL[0] - 1]
 
-    cautious = doubting(monkeypatch, DOUBTED)
-    monkeypatch.setattr(TentativeMapping, "add_keyframe", lambda *_: None)
+    cautious = doubting(monkeypatch, DOUBTFUL)
+    monkeypatch.setattr(LocalMapping, "add_tentative_keyframe", lambda *_: None)
     assert shown(cautious, walk) == states
     assert tables(slam).keys() == tables(cautious).keys()
     for name, column in tables(slam).items():
@@ -115,12 +103,11 @@ def test_a_pose_that_disagrees_with_its_matches_is_not_mapped(
 ) -> None:
     """One that disagrees with the motion model alone is: where views are far apart, the model is wrong."""
     values = {"ratio": 0.1, "matches": 9, "std": 0.1, "translation": 0.1, "degrees": 30.0}
-    odd = Rejection(rejection, values)
-    slam = doubting(monkeypatch, DOUBTED, "check_pose_quality", odd)
+    slam = doubting(monkeypatch, DOUBTFUL, Rejection(rejection, values))
     grown: list[int] = []
     states = shown(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
-    assert (len(set(grown[DOUBTED[0] - 1 : DOUBTED[-1] + 1])) > 1) is is_mapped
+    assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
 
 @pytest.mark.parametrize(
@@ -130,18 +117,17 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(
     rejection: Reason, is_mapped: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without new points a moving camera would be lost before it is clear what moves; most of the image may not."""
-    slam = doubting(monkeypatch, DOUBTED, "check_map_agreement")
-    monkeypatch.setattr(following, "check_map_agreement", lambda *_: None)
+    slam = doubting(monkeypatch, ())
     moving = replace(NO_MOVEMENT, rejection=Rejection(rejection, {"count": 30}))
     monkeypatch.setattr(
         slam.scene_filter,
         "detect_independent_motion",
-        lambda *_: moving if slam.last_frame and slam.last_frame[0] in DOUBTED else NO_MOVEMENT,
+        lambda *_: moving if slam.last_frame and slam.last_frame[0] in DOUBTFUL else NO_MOVEMENT,
     )
     grown: list[int] = []
     states = shown(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
-    assert (len(set(grown[DOUBTED[0] - 1 : DOUBTED[-1] + 1])) > 1) is is_mapped
+    assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
 
 def test_many_frames_that_are_held_back_are_kept_when_the_camera_is_lost(
@@ -170,9 +156,9 @@ def test_tentative_frames_at_the_end_keep_their_poses(monkeypatch: pytest.Monkey
 
 def starting_late(monkeypatch: pytest.MonkeyPatch, slam: SLAM) -> None:
     """No submap may begin before frame `LATE`: what comes before waits for the way back."""
-    beginning = slam._state_machine.initialization
-    step = beginning.step
-    monkeypatch.setattr(beginning, "step", lambda view: ODD if view.index < LATE else step(view))
+    map_start = slam._state_machine.map_start
+    step = map_start.step
+    monkeypatch.setattr(map_start, "step", lambda view: DOUBT if view.index < LATE else step(view))
 
 
 def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_committed(
@@ -180,7 +166,7 @@ def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_commit
 ) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
-    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD)
+    judge(monkeypatch, local_mapping, lambda _: DOUBT)
     shown(slam, walk)
     assert len(slam.trajectory()) == len(walk)
     assert int(slam.map.keyframes["frame_index"].min()) < LATE
@@ -192,14 +178,13 @@ def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_commit
 def test_unconfirmed_backward_tracking_is_rolled_back(monkeypatch: pytest.MonkeyPatch) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
-    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD)
     grown: list[int] = []
 
-    def check_pose_quality(*_: object) -> Rejection | None:
+    def rejection_of(index: int) -> Rejection:
         grown.append(slam.map.num_keyframes)
-        return ODD if len(grown) > LATE // 2 else None
+        return WRONG if len(grown) > LATE // 2 else DOUBT
 
-    monkeypatch.setattr(backwards, "check_pose_quality", check_pose_quality)
+    judge(monkeypatch, local_mapping, rejection_of)
     shown(slam, walk)
     assert grown[-1] > grown[0]
     first = int(slam.map.keyframes["frame_index"][0])
@@ -209,26 +194,26 @@ def test_unconfirmed_backward_tracking_is_rolled_back(monkeypatch: pytest.Monkey
     assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
 
 
-@pytest.mark.parametrize(("end", "posed"), [(SLAM.finalize, 36), (SLAM.confirm_map, 22)])
+@pytest.mark.parametrize("end", [SLAM.finalize, SLAM.confirm_map])
 def test_a_provisional_map_that_ends_uncertain_is_tracked_backward(
-    end: Callable[[SLAM], None], posed: int, monkeypatch: pytest.MonkeyPatch
+    end: Callable[[SLAM], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was mapped on trial is kept before the way back adds to the map."""
     walk = Walk(arc(60)[:36])
     slam = doubting(monkeypatch, range(22, 60))
     starting_late(monkeypatch, slam)
     shown(slam, walk)
-    assert slam.provisional_map is not None
+    assert slam.mode is Mode.PROVISIONAL_DOUBTED
     assert slam.map.num_keyframes > len(slam.loop_closer.keyframe_database)
     end(slam)
-    assert len(slam.trajectory()) == posed
+    assert len(slam.trajectory()) == len(walk)
     assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
     assert int(slam.map.keyframes["frame_index"].min()) < LATE
 
 
 def test_the_number_of_tentative_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest keep their poses for good, even if the camera is lost then; later ones wait again."""
-    monkeypatch.setattr(pose_validation, "MAX_PENDING_FRAMES", 5)
+    monkeypatch.setattr(savepoints, "MAX_HELD_FRAMES", 5)
     walk = Leaving(arc(60)[:40], 34)
     slam = doubting(monkeypatch, range(22, 60))
     states = shown(slam, walk)
@@ -257,8 +242,8 @@ def test_a_loop_precheck_applies_to_its_own_keyframe_only(monkeypatch: pytest.Mo
     loop_detector, submap = slam.loop_closer.loop_detector, slam.submap
     assert submap is not None
     monkeypatch.setattr(loop_detector, "detect", lambda _, keyframe: queried.append(keyframe))
-    slam._state_machine.keyframe_actions.detect_and_close()
+    slam._state_machine.maintenance.close_loops()
     assert not queried  # the answer is known already
     slam.loop_closer.loop_precheck = -1, False
-    slam._state_machine.keyframe_actions.detect_and_close()
+    slam._state_machine.maintenance.close_loops()
     assert queried == [newest]

@@ -62,7 +62,7 @@ def test_the_default_matcher_as_a_plugin_gives_the_same_bytes() -> None:
         assert all(torch.equal(rows, getattr(other.map, table)[name]) for name, rows in columns.items())
 
 
-CONTRADICTION = "find_contradicting_initialization"  # of provisional maps
+CONTRADICTION = "contradicting_initialization"  # of provisional maps
 
 
 class Counting(Wrapped):
@@ -78,7 +78,6 @@ class Counting(Wrapped):
         # The relocalizer matches through the tracker.
         stages = (
             CONTRADICTION,
-            "start_check",
             "relative_sim3",
             "initialization",
             "new_points",
@@ -102,7 +101,7 @@ def test_a_matcher_is_called_in_all_stages() -> None:
     assert states[-1] is State.TRACKING
     assert len(run.submaps) == 1
     calls = matcher.calls_by
-    stages = {CONTRADICTION, "start_check", "initialization", "tracker", "new_points", "relocalization"}
+    stages = {CONTRADICTION, "initialization", "tracker", "new_points", "relocalization"}
     assert set(calls) - {"relative_sim3"} == stages  # whether a loop is looked for depends on the walk
     assert calls["tracker"] >= 20  # near the prediction, in every tracked frame
     assert calls["new_points"] >= run.map.num_keyframes - 2  # of every keyframe after the first map

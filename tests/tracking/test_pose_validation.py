@@ -14,8 +14,8 @@ from tests.scene import pose
 from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_exp
 from torchslam.map.atlas import TrackingState
-from torchslam.tracking.pose_validation import SURE_INLIERS, deviations, jump, validate_pose
-from torchslam.types import PoseEstimate
+from torchslam.tracking.pose_validation import SURE_INLIERS, Certainty, Verdict, check_pose, deviations, jump
+from torchslam.types import PoseEstimate, Reason, Rejection
 
 SETTINGS = PoseValidationConfig()
 HERE = pose(0.3, -0.2, 0.1, 0.2, 0.1, -0.3)
@@ -25,11 +25,15 @@ def seen(inliers: int = 60, matches: int = 60, **values: float | Tensor) -> Pose
     return estimate_at(HERE, torch.arange(inliers), torch.arange(inliers), matches=matches, **values)
 
 
-def doubt(
+def verdict(
     estimate: PoseEstimate, expected: Tensor | None = None, error: float = 0.9, explained_ratio: float = 1.0
-) -> str:
-    tracking = replace(TrackingState.empty(HERE), error=error, explained_ratio=explained_ratio)
-    return str(validate_pose(estimate, expected, tracking, SETTINGS) or "")
+) -> Verdict:
+    averages = replace(TrackingState.empty(HERE), error=error, explained_ratio=explained_ratio)
+    return check_pose(estimate, expected, averages, SETTINGS)
+
+
+def doubt(estimate: PoseEstimate, expected: Tensor | None = None, **averages: float) -> str:
+    return str(verdict(estimate, expected, **averages).rejection or "")
 
 
 def test_a_certain_pose_is_accepted() -> None:
@@ -116,3 +120,43 @@ def test_a_jump_is_measured_in_its_camera_frame() -> None:
 
 def test_a_scene_without_depth_is_uncertain() -> None:
     assert doubt(replace(seen(), depth=0.0)).startswith("the position")
+
+
+# --- what a pose is good for ------------------------------------------------------------------------------------
+
+TURNED = pose(0, 0, 0, 1.01 * math.radians(SETTINGS.max_turn_deg)) @ HERE
+FAR = pose(2.01) @ HERE  # more than half the depth
+
+
+@pytest.mark.parametrize(
+    ("found", "reason", "certainty"),
+    [
+        (verdict(seen()), None, Certainty.CERTAIN),
+        (verdict(seen(29)), Reason.LOW_INLIER_RATIO, Certainty.WRONG),
+        (verdict(seen(covariance=covariance(1.0))), Reason.UNCERTAIN_POSITION, Certainty.WRONG),
+        (verdict(seen(covariance=covariance(rotation=1.0))), Reason.UNCERTAIN_ROTATION, Certainty.WRONG),
+        (verdict(seen(), FAR), Reason.JUMP, Certainty.DOUBTFUL),
+        (verdict(seen(SURE_INLIERS - 1, SURE_INLIERS - 1), TURNED), Reason.JUMP, Certainty.DOUBTFUL),
+        (verdict(seen(), error=9.0), Reason.LARGE_ERRORS, Certainty.DOUBTFUL),
+        (verdict(seen(), explained_ratio=0.0), Reason.LOW_EXPLAINED_RATIO, Certainty.DOUBTFUL),
+        (verdict(seen(coverage_ratio=0.0)), Reason.LOW_COVERAGE_RATIO, Certainty.DOUBTFUL),
+        (Verdict(Rejection.of(Reason.MOVING_MAJORITY)), Reason.MOVING_MAJORITY, Certainty.WRONG),
+        (
+            Verdict(Rejection.of(Reason.MOVING_REMAINDER, count=30)),
+            Reason.MOVING_REMAINDER,
+            Certainty.DOUBTFUL,
+        ),
+    ],
+)
+def test_every_reason_has_its_certainty(found: Verdict, reason: Reason | None, certainty: Certainty) -> None:
+    assert (None if found.rejection is None else found.rejection.reason) is reason
+    assert found.certainty is certainty
+    assert found.is_jump is (reason is Reason.JUMP)
+
+
+def test_a_pose_that_is_wrong_by_itself_is_not_compared_with_the_map() -> None:
+    """Of several reasons the first counts: it decides whether the map may be extended."""
+    found = verdict(seen(29, coverage_ratio=0.0), FAR, error=9.0, explained_ratio=0.0)
+    assert found.rejection is not None
+    assert found.rejection.reason is Reason.LOW_INLIER_RATIO
+    assert verdict(seen(coverage_ratio=0.0), FAR, error=9.0).is_jump

@@ -9,10 +9,21 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, camera_center, moved, pose, rows_of, sideways, submap_of_scene
+from tests.scene import (
+    CAMERA,
+    Scene,
+    assert_same_state,
+    camera_center,
+    moved,
+    pose,
+    rows_of,
+    sideways,
+    state_of,
+    submap_of_scene,
+)
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp, se3_inverse, transform
-from torchslam.map.atlas import Submap
+from torchslam.map.atlas import EMA_RATE, Submap
 from torchslam.tracking.data_association import (
     GRID,
     MATURE_OBSERVATIONS,
@@ -26,7 +37,7 @@ from torchslam.tracking.data_association import (
     subsample_per_cell,
 )
 from torchslam.tracking.localizer import Projected, project_points
-from torchslam.tracking.tracker import EMA_RATE, Tracker, well_observed
+from torchslam.tracking.tracker import Tracker, well_observed
 from torchslam.types import FrameFeatures, PoseEstimate
 
 SCENE = Scene.of(300)
@@ -44,8 +55,10 @@ def submap(count: int = 4, **options: float) -> Submap:
 
 
 def followed(where: Submap, view: FrameFeatures, by: Tracker | None = None) -> PoseEstimate:
-    estimate = (by or tracker()).track(where, view)
+    by = by or tracker()
+    estimate = by.track(where, view)
     assert estimate is not None
+    by.commit(where, view, estimate)
     return estimate
 
 
@@ -108,10 +121,41 @@ def test_a_prediction_repeats_the_last_motion() -> None:
 def test_a_lost_frame_resets_the_motion_model() -> None:
     here = submap()
     here.tracking.velocity = pose(0.1)
-    before = here.T_cw.clone()
-    assert tracker().track(here, SCENE.view(50, AWAY)) is None
-    assert here.tracking.velocity is None
-    assert torch.equal(here.T_cw, before)
+    before, view, follower = state_of(here), SCENE.view(50, AWAY), tracker()
+    assert follower.track(here, view) is None
+    follower.commit(here, view, None)
+    assert_same_state(state_of(here), before | {"velocity": None})
+
+
+@pytest.mark.parametrize("T_cw", [se3_exp(3 * STEP), AWAY], ids=["found", "lost"])
+@pytest.mark.parametrize("is_sure", [True, False])
+def test_estimating_a_pose_changes_neither_map_nor_tracking_state(T_cw: Tensor, is_sure: bool) -> None:
+    here, view, follower = submap(), SCENE.view(50, T_cw, noise=0.5), tracker()
+    here.tracking.velocity = se3_exp(STEP)
+    before, posed = state_of(here), len(here.posed_frames)
+    estimate = follower.track(here, view, is_sure=is_sure)
+    assert (estimate is None) is (T_cw is AWAY)
+    assert_same_state(state_of(here), before)
+    assert len(here.posed_frames) == posed
+    again = follower.track(here, view, is_sure=is_sure)
+    assert (again is None) is (estimate is None)
+    if estimate is not None and again is not None:
+        assert torch.equal(estimate.T_cw, again.T_cw)
+        follower.commit(here, view, estimate)
+        with pytest.raises(AssertionError):
+            assert_same_state(state_of(here), before)
+
+
+def test_matches_are_searched_around_the_prior_pose_if_there_is_one() -> None:
+    here, follower = submap(3), tracker("matching.max_ratio=1e-9")  # which no match without a place passes
+    T_cw = sideways(1, start=0.2)[0]
+    view = SCENE.view(50, T_cw)
+    view = replace(view, descriptors=view.descriptors ^ torch.eye(32, dtype=torch.uint8)[0] * 255)
+    here.tracking.T_cr, here.tracking.velocity = AWAY, None
+    assert follower.track(here, view) is None
+    estimate = follower.track(here, view, prior_T_cw=T_cw)
+    assert estimate is not None
+    torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
 
 
 def test_the_reference_keyframe_shares_the_most_points() -> None:
@@ -447,5 +491,5 @@ def test_after_uncertain_frames_the_pose_search_starts_from_scratch(
     )  # and RANSAC finds it
     for is_sure, wanted in ((False, []), (True, [True])):
         aside = here.fork()
-        assert follower.track(aside, view, is_sure) is not None
+        assert follower.track(aside, view, is_sure=is_sure) is not None
         assert calls == wanted

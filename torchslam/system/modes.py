@@ -46,6 +46,7 @@ TRANSITIONS: dict[tuple[Mode, Mode], str] = {
     (Mode.PROVISIONAL, Mode.LOST): "no pose: the map is discarded unless it has grown",
     (Mode.PROVISIONAL_DOUBTED, Mode.PROVISIONAL): "enough certain frames in a row",
     (Mode.PROVISIONAL_DOUBTED, Mode.TRACKING): "enough certain frames in a row, and a known map agrees",
+    (Mode.PROVISIONAL_DOUBTED, Mode.DOUBTED): "no more frames can be held back, and a known map agrees",
     (Mode.PROVISIONAL_DOUBTED, Mode.INITIALIZING): "no pose: the map is discarded",
     (Mode.PROVISIONAL_DOUBTED, Mode.LOST): "no pose: the map is discarded unless it has grown",
     (Mode.TRACKING, Mode.DOUBTED): "a doubtful pose",

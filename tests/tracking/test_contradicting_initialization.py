@@ -1,4 +1,4 @@
-"""When two frames contradict a provisional map."""
+"""When two frames contradict a map that was initialized recently."""
 
 from __future__ import annotations
 
@@ -12,10 +12,9 @@ from tests.scene import CAMERA, Scene, pose, submap_of_scene
 from torchslam.config import Config
 from torchslam.geometry import epipolar_offsets, se3_inverse, so3_exp
 from torchslam.tracking.initialization import (
-    CHECK_INTERVAL,
     MIN_SUPPORT_RATIO,
     Initializer,
-    ProvisionalMap,
+    contradicting_initialization,
     support,
 )
 from torchslam.types import FrameFeatures, TwoViewMap
@@ -33,15 +32,16 @@ def swung(degrees: float) -> Tensor:
     return T_cw
 
 
-def young(T_cw: Tensor, age: int = CHECK_INTERVAL) -> ProvisionalMap:
-    """A submap with a frame at the origin and one at SIDE that the map has at T_cw, in its own frame."""
+def contradiction(T_cw: Tensor, last: FrameFeatures | None = None) -> TwoViewMap | None:
+    """What two frames say to a map that has one of them at the origin and the other, at SIDE, at T_cw.
+
+    The map has a frame of its own. The last frame may be another one.
+    """
     submap = submap_of_scene(SCENE, torch.stack([pose(), SIDE]))
     own = pose(0.3, -0.2, 1.0, 0.5, 0.1, -0.4)
     submap.map.keyframes["T_cw"][:] = torch.stack([own, T_cw @ own])
-    provisional = ProvisionalMap(submap, [SCENE.view(0, pose())])
-    provisional.add_frame(SCENE.view(1, SIDE))
-    provisional.age = age
-    return provisional
+    first, last = SCENE.view(0, pose()), last or SCENE.view(1, SIDE)
+    return contradicting_initialization(submap, first, last, CAMERA, Config())
 
 
 def two_views() -> TwoViewMap:
@@ -58,17 +58,17 @@ def supported(start: TwoViewMap, T_21: Tensor) -> float:
 
 
 def test_a_consistent_map_has_no_contradicting_initialization(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert young(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
+    assert contradiction(SIDE) is None
     looked: list[FrameFeatures] = []
     monkeypatch.setattr(Initializer, "step", lambda _, view: looked.append(view))
-    assert young(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
+    assert contradiction(SIDE) is None
     assert not looked  # it explains more than half of the matches: no motion can have twice as much support
-    assert young(swung(60)).find_contradicting_initialization(CAMERA, Config()) is None
+    assert contradiction(swung(60)) is None
     assert len(looked) == 2
 
 
 def test_the_initialization_that_contradicts_a_wrong_map_has_the_true_motion() -> None:
-    start = young(swung(60)).find_contradicting_initialization(CAMERA, Config())
+    start = contradiction(swung(60))
     assert start is not None
     wanted = SIDE.clone()
     wanted[:3, 3] /= SIDE[:3, 3].norm()
@@ -76,17 +76,9 @@ def test_the_initialization_that_contradicts_a_wrong_map_has_the_true_motion() -
     assert (start.reference.index, start.view.index) == (0, 1)
 
 
-@pytest.mark.parametrize("age", range(1, 2 * CHECK_INTERVAL + 1))
-def test_every_few_frames_are_checked(age: int) -> None:
-    assert (young(swung(60), age).find_contradicting_initialization(CAMERA, Config()) is not None) is (
-        age % CHECK_INTERVAL == 0
-    )
-
-
 def test_frames_without_initialization_contradict_nothing() -> None:
-    provisional = young(swung(60))
-    provisional.views[1] = SCENE.view(1, pose())
-    assert provisional.find_contradicting_initialization(CAMERA, Config()) is None
+    assert contradiction(swung(60)) is not None
+    assert contradiction(swung(60), last=SCENE.view(1, pose())) is None
 
 
 def test_a_map_with_less_than_half_of_the_support_is_contradicted() -> None:
@@ -94,7 +86,7 @@ def test_a_map_with_less_than_half_of_the_support_is_contradicted() -> None:
     for degrees in torch.linspace(2.5, 4.5, 21).tolist():
         T_21 = swung(degrees)
         share = supported(start, T_21) / supported(start, start.T_cw)
-        contradicted = young(T_21).find_contradicting_initialization(CAMERA, Config()) is not None
+        contradicted = contradiction(T_21) is not None
         assert contradicted is (share < MIN_SUPPORT_RATIO)
         if abs(share - 0.5) < 0.1:
             decided.add(contradicted)
