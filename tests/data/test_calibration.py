@@ -61,6 +61,24 @@ def test_bad_numbers(tmp_path: Path, text: str, message: str) -> None:
         read_calibration(file)
 
 
+@pytest.mark.parametrize(
+    ("suffix", "text"),
+    [
+        ("txt", "1 PINHOLE 64 0 500 500 32 24\n"),
+        ("json", '{"w": 0, "h": 48, "fl_x": 500, "fl_y": 500, "cx": 32, "cy": 24, "frames": []}'),
+        (
+            "yaml",
+            "image_width: -64\nimage_height: 48\ncamera_matrix: {data: [500, 0, 32, 0, 500, 24, 0, 0, 1]}\n",
+        ),
+    ],
+)
+def test_a_stated_size_must_be_positive(tmp_path: Path, suffix: str, text: str) -> None:
+    file = tmp_path / f"calibration.{suffix}"
+    file.write_text(text)
+    with pytest.raises(CalibrationError, match="the size of the images must be positive"):
+        read_calibration(file)
+
+
 def test_distortion_in_a_file_next_to_the_calibration(tmp_path: Path) -> None:
     (tmp_path / "calibration.txt").write_text("500 501 320 240\n")
     (tmp_path / "distortion.txt").write_text("# k1 k2 p1 p2 k3\n-0.28 0.07 0.0002 1.7e-05 0.0\n")

@@ -54,7 +54,8 @@ class Calibration:
     ) -> Calibration:
         """Build a calibration from numbers; without `model`, their count determines it.
 
-        Raises CalibrationError for a wrong count, a number that is not finite or a focal length that is not positive.
+        Raises CalibrationError for a wrong count, a number that is not finite, and a focal length or a size that is not
+        positive.
         """
         counts = COUNTS[model] if model else (4, 8, 9)
         if len(numbers) not in counts:
@@ -65,6 +66,8 @@ class Calibration:
             raise CalibrationError(
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"
             )
+        if size is not None and min(size) <= 0:
+            raise CalibrationError(f"{source}: the size of the images must be positive, got {size_text(size)}")
         if model is None and any(numbers[4:]):
             model = "radial_tangential"
         elif model is None:

@@ -154,14 +154,23 @@ class Keys:
         return numbers[0] if numbers else None
 
     def size(self, *prefixes: str) -> Size | None:
-        """The size of the images, if it is there."""
+        """The size of the images, if it is there; zeros stand for an unknown one, as in ROS.
+
+        Raises CalibrationError if only one side is there, or not positive.
+        """
         both = self.numbers(*SIZE) or []
         sides = [
             self.number(*(prefix + key for prefix in prefixes or ("",) for key in keys))
             for keys in (WIDTH, HEIGHT)
         ]
         width, height = both if len(both) == 2 else (side or 0.0 for side in sides)
-        return (int(width), int(height)) if min(width, height) >= 1 else None
+        if width == height == 0:
+            return None
+        if min(width, height) < 1:
+            raise CalibrationError(
+                f"{self._source}: the size of the images must be positive, got {width:g}x{height:g}"
+            )
+        return int(width), int(height)
 
     def check_unused(self) -> None:
         """Raise CalibrationError for a key that looks like distortion and was not used."""
