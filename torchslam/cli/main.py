@@ -81,7 +81,7 @@ def console() -> NoReturn:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Expected errors become one line on stderr."""
-    # Before NumPy is imported: its idle threads would prevent forking.
+    # Before NumPy is imported: its threads would compete with those of the other processes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
@@ -130,7 +130,7 @@ class Version(argparse.Action):
 def _compute_in_one_thread() -> None:
     """Use one thread unless OMP_NUM_THREADS is set: the tensors of a frame are too small for more.
 
-    A thread of OpenCV would also keep the process from being forked, and would still run while it exits.
+    A thread of OpenCV would also still run while the process exits.
     """
     import cv2  # both after the arguments were checked
     import torch

@@ -86,10 +86,6 @@ class StopSignals:
         raise SystemExit(STATUS[signal.Signals(number)])
 
 
-# Without the monitor thread of tqdm, this process can be forked.
-tqdm.monitor_interval = 0
-
-
 class ProgressBar:
     """Progress line on stderr with frame, rate, state and map points; warnings are printed above it.
 
