@@ -6,7 +6,7 @@ LIST is a text file with one path per line (`#` for comments), or a CSV file wit
 LIST are relative to its folder.
 
 DIR receives: runs/NAME/ with the results of each sequence, as of `torchslam run`, but with the times in times.json;
-errors/NAME.json for sequences that failed; table.csv, table.parquet (if pyarrow is installed), times.csv and table.png.
+errors/NAME.json for sequences that failed; table.csv, table.parquet (if pyarrow is installed) and times.csv.
 Each sequence runs on one thread. Apart from the times, the results do not depend on the number of processes or on
 interruptions. Existing results are reused if the settings, the version, and the names, sizes and modification times of
 the input files are the same. Failed sequences are retried by the next call.
