@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 import torchslam
 from torchslam.errors import TorchslamError
-from torchslam.utils.console import with_install_hint
+from torchslam.utils.console import say, with_install_hint
 from torchslam.utils.text import printable, without_credentials
 
 ERROR = 2
@@ -90,15 +90,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _compute_in_one_thread()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
-        print(f"torchslam: error: {printable(without_credentials(str(error)))}", file=sys.stderr)
+        say(f"error: {printable(without_credentials(str(error)))}")
         return ERROR
     except ModuleNotFoundError as error:
         if (reason := with_install_hint(error)) is error:
             raise
-        print(f"torchslam: error: {reason}", file=sys.stderr)
+        say(f"error: {reason}")
         return ERROR
     except KeyboardInterrupt:
-        print("torchslam: interrupted", file=sys.stderr)
+        say("interrupted")
         return INTERRUPTED
 
 
