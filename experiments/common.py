@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+import experiments.storey  # noqa: F401  it adds a scene
 from torchslam.batch import ERROR, Columns, Engine, Row, Task, run_batch
 from torchslam.batch.engines import ENGINES
 from torchslam.batch.result_store import RUNS, hash_files, hash_json, program_hash, run_or_reuse

@@ -12,6 +12,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+import experiments.storey  # noqa: F401  it adds a scene
 from experiments.dense.truth import Sensor, rendered_depth
 from torchslam.data import open_sequence
 from torchslam.data.synthetic.sequence import SyntheticSequence

@@ -83,7 +83,7 @@ def test_corrupt_images_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("setting", ["features.weights", "matching.weights"])
-def test_the_fingerprint_depends_on_the_content_of_the_weights(
+def test_the_fingerprint_depends_on_the_weights(
     setting: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.batch.task._run", lambda todo, folder: {"status": "done"})
@@ -91,7 +91,7 @@ def test_the_fingerprint_depends_on_the_content_of_the_weights(
     row = Row("mine", "synthetic:room", overrides=(f'{setting}="{weights}"',))
     todo = Task(row, str(tmp_path / "batch"), plots=False)
     statuses = []
-    for content in (None, b"first", b"first", b"other"):
+    for content in (None, b"first", b"first", b"another"):
         if content is not None:
             weights.write_bytes(content)
             os.utime(weights, ns=(1, 1))

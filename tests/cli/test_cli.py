@@ -57,9 +57,7 @@ def write_tum_folder(folder: Path, frames: int = 6) -> Path:
 
 def test_run_writes_all_results(finished: Path) -> None:
     names = {path.relative_to(finished).as_posix() for path in finished.rglob("*") if path.is_file()}
-    pictures = {
-        f"plots/{name}.png" for name in ("scene", "top_view", "errors", "features", "stages", "tracking")
-    }
+    pictures = {f"plots/{name}.png" for name in ("scene", "top_view", "errors", "features", "tracking")}
     files = {
         "trajectory.txt",
         "online.txt",

@@ -48,22 +48,11 @@ def figures(
         "top_view": lambda: plots.plot_top_view(trajectory, points_w, trajectory, unit="m"),
         "errors": lambda: plots.plot_errors(trajectory.timestamps, errors, 0.1 * errors, results),
         "tracking": lambda: plots.plot_tracking(results),
-        "stages": lambda: plots.plot_stage_times(results),
         "features": lambda: features_figure(torch.Generator().manual_seed(0)),
-        "few": lambda: batch_figure(7),
-        "many": lambda: batch_figure(100),
     }
 
 
-def batch_figure(count: int) -> Figure:
-    """Every third one without a map, the others the better the later they come."""
-    statuses = ["no map" if row % 3 == 2 else "done" for row in range(count)]
-    posed = [None if status == "no map" else 1 - 1 / (2 + row) for row, status in enumerate(statuses)]
-    errors = [None if share is None else (1 - share) / 20 for share in posed]
-    return plots.plot_batch([f"walk {row}" for row in range(count)], statuses, posed, errors, "Walks")
-
-
-NAMES = ["scene", "top_view", "errors", "tracking", "stages", "features", "few", "many"]
+NAMES = ["scene", "top_view", "errors", "tracking", "features"]
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -79,25 +68,11 @@ def test_plots_are_drawn_deterministically(
     assert 0.01 < (picture < 200).any(axis=2).mean() < 0.9  # neither blank nor black
 
 
-@pytest.mark.parametrize("name", ["top_view", "errors", "tracking", "stages", "features"])
+@pytest.mark.parametrize("name", ["top_view", "errors", "tracking", "features"])
 def test_axes_are_labeled_with_units(name: str, figures: dict[str, Callable[[], Figure]]) -> None:
     axes = figures[name]().axes
     assert any("(" in panel.get_xlabel() or panel.get_xlabel() == "frame" for panel in axes)
     assert any(panel.get_ylabel() for panel in axes)
-
-
-def test_few_sequences_are_shown_by_name_and_many_by_their_distribution() -> None:
-    posed, error = batch_figure(7).axes
-    assert [label.get_text() for label in posed.get_yticklabels()] == [f"walk {row}" for row in range(7)]
-    assert [text.get_text() for text in posed.texts] == ["no map", "no map"]
-    np.testing.assert_allclose(error.lines[0].get_xdata(), [100 / 20 / (2 + row) for row in (0, 1, 3, 4, 6)])
-    assert error.get_xlim() == (0.1, 10.0)
-    posed, error = batch_figure(100).axes
-    assert posed.get_ylabel() == "of 100 sequences (%)"
-    assert error.get_ylabel() == "of 67 sequences (%)"
-    assert posed.lines[0].get_ydata()[-1] == 100.0
-    for count in (0, 1):
-        plots.png(plots.plot_batch(["a"] * count, ["open"] * count, [None] * count, [None] * count))
 
 
 def test_far_points_do_not_stretch_the_picture(trajectory: Trajectory, points_w: torch.Tensor) -> None:
@@ -177,13 +152,6 @@ def test_error_picture_states_the_rmse(results: list[StepResult]) -> None:
     assert [text.get_text() for text in figure.axes[0].texts] == [f"{(0.25 / 3) ** 0.5:.3g}"]
 
 
-def test_stage_bars_show_means_over_the_frames_that_ran(results: list[StepResult]) -> None:
-    bars = plots.plot_stage_times(results).axes[1]
-    assert [label.get_text() for label in bars.get_yticklabels()] == ["features", "tracking", "mapping"]
-    assert [bar.get_width() for bar in bars.patches][1:] == [pytest.approx(5.0), pytest.approx(12.0)]
-    assert "% of frames" in bars.texts[2].get_text()
-
-
 def test_empty_plots_are_drawn(tmp_path: Path, generator: torch.Generator) -> None:
     pose = Trajectory(torch.zeros(1, dtype=torch.float64), torch.eye(4, dtype=torch.float64)[None])
     empty = [
@@ -191,7 +159,6 @@ def test_empty_plots_are_drawn(tmp_path: Path, generator: torch.Generator) -> No
         plots.plot_top_view(pose, torch.zeros(0, 3)),
         plots.plot_errors(torch.zeros(1), torch.zeros(1)),
         plots.plot_tracking([]),
-        plots.plot_stage_times([]),
         features_figure(generator, matched=0),
     ]
     for index, figure in enumerate(empty):

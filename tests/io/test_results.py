@@ -139,7 +139,7 @@ def test_a_localization_run_is_plotted(tmp_path: Path, run: Run, submap: Submap)
     assert len(results.keyframes) == 0
     assert len(results.trajectory) == 23
     names = {path.stem for path in draw(results, tmp_path)}
-    assert names == {"tracking", "stages", "scene", "top_view"}
+    assert names == {"tracking", "scene", "top_view"}
 
 
 def test_ellipses_are_drawn_at_the_keyframes(

@@ -6,23 +6,26 @@ import os
 import signal
 import time
 from collections.abc import Iterator
+from functools import partial
 
 import numpy as np
 import pytest
 import torch
 
-from tests.parallel.test_prefetch import PATIENCE, SIZE, picture
+from tests.parallel.test_pool import PATIENCE, wait_until_ready
+from tests.parallel.test_prefetch import SIZE, picture
 from torchslam import Features, Frame, load_config
 from torchslam.data.readers.live import LiveSequence
 from torchslam.data.sequence import EndOfSequence
 from torchslam.errors import FrameError
 from torchslam.geometry import Camera
 from torchslam.parallel.prefetch import LivePrefetcher
-from torchslam.system.front_end import image_extractor
+from torchslam.system.front_end import checked_extractor, image_extractor
 from torchslam.utils.timing import Stopwatch
 
 CONFIG = load_config(None, ["features.kind=opencv-orb", "features.num_keypoints=300"])
 CAMERA = Camera.pinhole(100.0, 100.0, 79.5, 59.5, size=SIZE)
+EXTRACTOR = partial(checked_extractor, CONFIG, CAMERA)
 SMALL = 3  # a frame of another size
 
 
@@ -60,8 +63,8 @@ def live(frames: int, pause: float = 0.0) -> LiveSequence:
 @pytest.fixture
 def reader() -> Iterator[LivePrefetcher]:
     clock = Stopwatch()
-    with LivePrefetcher(live(8), CAMERA, CONFIG, clock) as frames:
-        assert frames._worker._ours.poll(PATIENCE)
+    with LivePrefetcher(live(8), EXTRACTOR, clock) as frames:
+        wait_until_ready(frames)
         yield frames
 
 
@@ -95,21 +98,20 @@ def test_a_queued_frame_is_extracted_by_the_worker_with_the_same_result(reader: 
 
 def test_a_frame_that_has_not_arrived_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.data.readers.live.STALE", PATIENCE)
-    with LivePrefetcher(live(4, pause=0.05), CAMERA, CONFIG, Stopwatch()) as frames:
-        assert frames._worker._ours.poll(PATIENCE)
+    with LivePrefetcher(live(4, pause=0.05), EXTRACTOR, Stopwatch()) as frames:
+        wait_until_ready(frames)
         frames[0], frames[1]
         deadline = time.monotonic() + 10
         while frames._sequence.backlog == 0 and time.monotonic() < deadline:
             time.sleep(0.01)
-        assert frames._next is None or frames._is_sent  # nothing was taken that is not looked at
+        assert frames._next is None or frames._call is not None  # nothing was taken that is not looked at
         assert frames[2].index == 2
 
 
 def test_the_source_continues_without_the_worker(reader: LivePrefetcher) -> None:
     reader[0], reader[1]
-    os.kill(reader._worker._process.pid or 0, signal.SIGKILL)
-    reader._worker._process.join()
-    reader._worker._ours.close()  # what it may have answered before
+    reader._call = reader.submit(reader._next)  # not answered yet
+    os.kill(reader._processes[0].pid or 0, signal.SIGKILL)
     with pytest.warns(UserWarning, match="has ended"):
         frame = reader[2]
     assert frame.index == 2

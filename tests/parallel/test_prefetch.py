@@ -11,6 +11,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -20,13 +21,14 @@ import torch
 
 from tests.cli.test_cli import write_tum_folder
 from tests.data.mp4 import write_mp4
+from tests.parallel.test_pool import PATIENCE, wait_until_ready
 from torchslam import Features, Frame, load_config
 from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError
 from torchslam.parallel.prefetch import FeaturePrefetcher
-from torchslam.system.front_end import image_extractor
+from torchslam.system.front_end import checked_extractor, image_extractor
 from torchslam.utils.timing import Stopwatch
 
 SETTINGS = ["features.kind=opencv-orb", "features.num_keypoints=300"]
@@ -35,7 +37,6 @@ SET = [part for setting in SETTINGS for part in ("--set", setting)]
 SIZE = (160, 120)
 FRAMES = 14
 BAD, SMALL = 6, 9
-PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with nothing else to do
 
 
 @pytest.fixture
@@ -53,18 +54,14 @@ def sequence(tmp_path: Path) -> Sequence:
     return open_sequence(folder, "100,100,79.5,59.5", mask=tmp_path / "mask.png")
 
 
-@pytest.fixture(params=["copied", "begun anew"])
-def patient(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wait for the processes, however they start, so that a short sequence is theirs."""
-    is_copied = request.param == "copied"
-    if is_copied and sys.platform != "linux":
-        pytest.skip("processes are copied on Linux alone")
-    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: is_copied)
+@pytest.fixture
+def patient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wait for the processes, so that a short sequence is theirs."""
     enter = FeaturePrefetcher.__enter__
 
     def wait(self: FeaturePrefetcher) -> FeaturePrefetcher:
         enter(self)
-        assert all(worker._ours.poll(PATIENCE) for worker in self._workers)
+        wait_until_ready(self)
         return self
 
     monkeypatch.setattr(FeaturePrefetcher, "__enter__", wait)
@@ -106,7 +103,8 @@ def check_same(frames: FeaturePrefetcher, sequence: Sequence, index: int) -> boo
 
 
 def ahead(sequence: Sequence, clock: Stopwatch | None = None, processes: int = 1) -> FeaturePrefetcher:
-    return FeaturePrefetcher(sequence, sequence.camera, CONFIG, clock or Stopwatch(), processes)
+    extractor = partial(checked_extractor, CONFIG, sequence.camera)
+    return FeaturePrefetcher(sequence, extractor, clock or Stopwatch(), processes)
 
 
 @pytest.mark.usefixtures("patient")
@@ -131,34 +129,12 @@ def test_few_frames_are_requested_ahead() -> None:
         assert sorted(frames._requested) == [*range(12, 20)]
 
 
-@pytest.mark.usefixtures("patient")
-def test_the_second_frame_is_prefetched_during_setup() -> None:
-    with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
-        frames.begin(5)
-        assert sorted(frames._requested) == [*range(6, 14)]
-        assert frames[5].features is None
-        assert sorted(frames._requested) == [*range(6, 14)]
-        assert frames[6].features is not None
-
-
-def test_a_worker_that_has_not_started_gets_no_requests(
-    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
-    with ahead(sequence) as frames:
-        frames.begin(0)
-        assert frames._requested == {}
-        assert frames._next is None  # so that it still may be
-
-
-def test_a_worker_that_has_not_started_is_not_waited_for(
-    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
+def test_a_worker_that_has_not_started_is_not_waited_for(sequence: Sequence) -> None:
     with ahead(sequence) as frames:
         start = time.monotonic()
         assert not check_same(frames, sequence, 0)
         assert time.monotonic() - start < 1  # torch alone takes longer to import
+        assert frames._requested == {}
     assert multiprocessing.active_children() == []
 
 
@@ -167,9 +143,9 @@ def test_the_run_continues_without_a_killed_worker(sequence: Sequence) -> None:
     with ahead(sequence) as frames:
         check_same(frames, sequence, 0)
         assert check_same(frames, sequence, 1)
-        os.kill(frames._workers[0]._process.pid or 0, signal.SIGKILL)
-        frames._workers[0]._process.join()
-        with pytest.warns(UserWarning, match=r"has ended \(-9\): going on without it"):
+        os.kill(frames._processes[0].pid or 0, signal.SIGKILL)
+        frames._processes[0].join()
+        with pytest.warns(UserWarning, match="has ended: going on without it"):
             theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
     assert not all(theirs[4:])
 
@@ -193,7 +169,7 @@ def test_errors_are_raised_at_their_frame_and_the_worker_ends(sequence: Sequence
         assert [frames[index].index for index in range(2)] == [0, 1]
         with pytest.raises(ZeroDivisionError) as raised:
             frames[2]
-    assert "in the process that reads ahead" in raised.value.__notes__[0]
+    assert "in image" in str(raised.value.__cause__)
     assert multiprocessing.active_children() == []
 
 
@@ -228,12 +204,13 @@ def test_videos_and_archives_can_be_sent_to_workers(tmp_path: Path, sequence: Se
 
 ORPHAN = """
 import os, signal
-from tests.parallel.test_prefetch import PATIENCE, ahead
+from tests.parallel.test_pool import wait_until_ready
+from tests.parallel.test_prefetch import ahead
 from torchslam.data import open_sequence
 
 if __name__ == "__main__":
     with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
-        assert frames._workers[0]._ours.poll(PATIENCE)
+        wait_until_ready(frames)
         frames[0], frames[1]
         os.kill(os.getpid(), signal.SIGKILL)
 """

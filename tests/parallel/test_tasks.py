@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.parallel.test_pool import wait_until_ready
 from torchslam.errors import FrameError
 from torchslam.parallel.tasks import SharedTasks
 
@@ -35,23 +36,11 @@ def fail_elsewhere(folder: Path, main: int, number: int) -> None:
     note(folder, number)
 
 
-@pytest.fixture(params=[True, False], ids=["copied", "spawned"])
-def starts(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: request.param)
-
-
-def wait_for_workers(shared: SharedTasks) -> None:
-    end = time.monotonic() + 120
-    while not all(worker.is_there() for worker in shared._pending):
-        assert time.monotonic() < end
-        time.sleep(0.01)
-
-
 @pytest.mark.parametrize("processes", [1, 2, 3])
-@pytest.mark.usefixtures("starts")
 def test_each_task_is_done_once_by_all_processes(tmp_path: Path, processes: int) -> None:
     with SharedTasks(note, (tmp_path,), processes) as shared:
-        wait_for_workers(shared)
+        if processes > 1:
+            wait_until_ready(shared)
         assert sum(1 for _ in shared.run(TASKS)) == len(TASKS)
         assert list(shared.run([])) == []
     by = {path.name: path.read_text() for path in tmp_path.iterdir()}
@@ -62,7 +51,7 @@ def test_each_task_is_done_once_by_all_processes(tmp_path: Path, processes: int)
 
 def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
     with SharedTasks(die_elsewhere, (tmp_path, os.getpid()), 3) as shared:
-        wait_for_workers(shared)
+        wait_until_ready(shared)
         with pytest.warns(UserWarning, match="going on without it"):
             assert sum(1 for _ in shared.run(TASKS)) == len(TASKS)
     assert {path.read_text() for path in tmp_path.iterdir()} == {str(os.getpid())}
@@ -71,6 +60,6 @@ def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
 
 def test_an_error_of_a_worker_is_raised_here(tmp_path: Path) -> None:
     with SharedTasks(fail_elsewhere, (tmp_path, os.getpid()), 2) as shared:
-        wait_for_workers(shared)
+        wait_until_ready(shared)
         with warnings.catch_warnings(), pytest.raises(FrameError, match="task"):
             list(shared.run(TASKS))

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -18,7 +15,6 @@ from torchslam.mapping.local_bundle import solve_here
 from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
 from torchslam.parallel.workers import (
     WORTH,
-    WORTH_AT_ONCE,
     BundleWorker,
     best_number,
     busy_elsewhere,
@@ -41,7 +37,6 @@ def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     for kind in (FeaturePrefetcher, LivePrefetcher, BundleWorker):
         monkeypatch.setattr(kind, "__enter__", lambda self: self)
         monkeypatch.setattr(kind, "__exit__", lambda self, *error: None)
-    monkeypatch.setattr(FeaturePrefetcher, "begin", lambda self, start: None)
 
 
 def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> tuple[str, bool]:
@@ -63,7 +58,7 @@ def test_work_is_assigned_to_workers(capsys: pytest.CaptureFixture[str]) -> None
     for processes, readers in ((2, 1), (3, 1), (4, 2), (6, 4)):
         with with_workers(sequence, slam, processes) as frames:
             assert isinstance(frames, FeaturePrefetcher)
-            assert frames._count == readers
+            assert frames.count == readers
     slam.mapping = False
     assert who(sequence, slam, 3) == ("FeaturePrefetcher", False)
     assert capsys.readouterr().err == ""
@@ -98,16 +93,12 @@ def test_accelerators_use_no_workers(capsys: pytest.CaptureFixture[str]) -> None
 
 def test_the_default_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     long, short = room(WORTH), room(WORTH - 1)
-    few = WORTH - 1 - WORTH_AT_ONCE  # frames that are done
     monkeypatch.setattr("torchslam.parallel.workers.busy_elsewhere", lambda: 0)
     for count, several in ((1, 1), (2, 3), (8, 3)):
         monkeypatch.setattr("torchslam.parallel.workers.processors", lambda known=count: known)
-        for at_once in (False, True):
-            monkeypatch.setattr("torchslam.parallel.workers.starts_at_once", lambda is_copy=at_once: is_copy)
-            assert best_number(long, 0) == several
-            assert best_number(short, 0) == (several if at_once else 1)
-            assert best_number(short, few) == (several if at_once else 1)
-            assert best_number(short, few + 1) == 1
+        assert best_number(long, 0) == several
+        assert best_number(long, 1) == 1
+        assert best_number(short, 0) == 1
     assert processors() >= 1
 
 
@@ -121,20 +112,6 @@ def test_one_process_where_others_compute(monkeypatch: pytest.MonkeyPatch, tmp_p
         load.write_text(f"0.00 0.00 0.00 {running}/345 6789\n")
         assert busy_elsewhere() == running - 1
         assert best_number(sequence, 0) == expected
-
-
-def test_workers_are_forked_only_from_a_single_threaded_process() -> None:
-    code = (
-        "import threading; from torchslam.parallel.worker import starts_at_once; alone = starts_at_once(); "
-        "wait = threading.Event(); threading.Thread(target=wait.wait).start(); "
-        "print(alone, starts_at_once()); wait.set()"
-    )
-    one_thread = os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-    done = subprocess.run(
-        [sys.executable, "-c", code], env=one_thread, capture_output=True, text=True, check=True
-    )
-    assert done.stdout.split() == [str(sys.platform == "linux"), "False"]
-    assert torch.get_num_threads() == 1
 
 
 @pytest.mark.usefixtures("no_processes")

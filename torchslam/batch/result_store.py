@@ -1,7 +1,7 @@
 """Results that are complete or absent, each with a fingerprint of what it depends on.
 
 In the folder of a batch, `runs/NAME/` has what a run wrote, with its record; `errors/NAME.json` has the error instead.
-A fingerprint hashes the settings, the program, the files that were read and the weights.
+A fingerprint hashes the settings, the program, and the files that were read.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import glob
 import hashlib
 import json
 import os
-import stat
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
@@ -110,17 +109,29 @@ def read_record(path: Path) -> Columns | None:
     Raises:
         ResultsError: The file is not a record, or not readable.
     """
+    record = read_object(path)
+    if record is not None and not isinstance(record.get("status"), str):
+        raise ResultsError(f"{path}: not the record of a row")
+    return record
+
+
+def read_object(path: Path) -> Columns | None:
+    """Read a JSON object; None if there is no file.
+
+    Raises:
+        ResultsError: The file is something else, or not readable.
+    """
     try:
-        record = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
+        found = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
     except (FileNotFoundError, NotADirectoryError):
         return None
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
     except ValueError as error:
         raise ResultsError(f"{path}: not valid JSON: {error}") from None
-    if not isinstance(record, dict) or not isinstance(record.get("status"), str):
-        raise ResultsError(f"{path}: not the record of a row")
-    return record
+    if not isinstance(found, dict):
+        raise ResultsError(f"{path}: not a JSON object")
+    return found
 
 
 def _write(path: Path, columns: Columns) -> None:
@@ -168,51 +179,32 @@ def hash_files(paths: list[str]) -> str:
 
     Raises:
         SequenceError: There are more than `MAX_FILES` files.
-        OSError: A folder cannot be listed.
+        OSError: A file cannot be looked at.
     """
     found = hashlib.sha256()
     for path in paths:
         if is_synthetic(path):
             found.update(path.encode() + b"\0")
             continue
-        for name, status in _files(path):
+        for file in _files(path):
+            name, status = os.path.relpath(file, Path(path).parent), file.stat()
             found.update(f"{name}\0{status.st_size} {status.st_mtime_ns}\0".encode(errors="surrogateescape"))
         found.update(b"\1")
     return found.hexdigest()[:DIGITS]
 
 
-def hash_content(path: str) -> str:
-    """Hash the content of a file, for example of weights, whose size and time may be the same as the last one's.
-
-    Anything but a file counts as in `hash_files`.
-
-    Raises:
-        OSError: The file cannot be read.
-    """
-    if not os.path.isfile(path):
-        return hash_files([path])
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()[:DIGITS]
-
-
-def _files(path: str) -> Iterator[tuple[str, os.stat_result]]:
-    """Files by their names below a path, sorted."""
+def _files(path: str) -> Iterator[Path]:
+    """The files below a folder or of a pattern, in an order that does not depend on the system."""
     if not os.path.isdir(path):
-        for name in [path] if os.path.exists(path) else sorted(glob.glob(path)):
-            yield os.path.basename(name), os.stat(name)
+        yield from map(Path, [path] if os.path.exists(path) else sorted(glob.glob(path)))
         return
-    count, pending = 0, [""]
-    while pending:
-        folder = pending.pop()
-        with os.scandir(os.path.join(path, folder)) as entries:
-            for entry in sorted(entries, key=lambda entry: entry.name):
-                name = os.path.join(folder, entry.name)
-                count += 1
-                if count > MAX_FILES:
-                    raise SequenceError(f"{path}: more than {MAX_FILES} files: not a sequence")
-                if entry.is_dir(follow_symlinks=False):
-                    pending.append(name)
-                elif os.path.exists(entry.path):  # skip dangling links
-                    status = entry.stat()
-                    if stat.S_ISREG(status.st_mode):
-                        yield name, status
+    count = 0
+    for folder, folders, names in os.walk(path):
+        folders.sort()
+        count += len(folders) + len(names)
+        if count > MAX_FILES:
+            raise SequenceError(f"{path}: more than {MAX_FILES} files: not a sequence")
+        for name in sorted(names):
+            file = Path(folder, name)
+            if file.is_file():  # not a dangling link
+                yield file

@@ -1,28 +1,23 @@
-"""The table of a batch as CSV, as a plot, and as Parquet if pyarrow is installed."""
+"""The table of a batch as CSV, and as Parquet if pyarrow is installed."""
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import importlib
 import io
-import json
-import os
-import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from uuid import uuid4
 
-from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, read_stored
+from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, read_object, read_stored
 from torchslam.batch.task import TIMES, Task, configuration
 from torchslam.errors import ResultsError, TorchslamError
-from torchslam.io import plots
-from torchslam.utils.files import JSON_BYTES, parse_json, read_text
+from torchslam.utils.files import write_whole
 from torchslam.utils.text import without_credentials
 
 CSV = "table.csv"
 PARQUET = "table.parquet"
-PICTURE = "table.png"
 TIMES_CSV = "times.csv"
 
 # Columns and their types, the same for every batch.
@@ -46,7 +41,7 @@ TIME_COLUMNS: dict[str, type] = {"name": str, **dict.fromkeys(("cpu_s", "fps", "
 
 
 def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
-    """Write table and plot of all rows of the list, those of other shards included; return the rows.
+    """Write the table of all rows of the list, those of other shards included; return the rows.
 
     Unfinished rows have the status `open`. Each process reads all results again after writing, so the table is complete
     in the end whichever process writes last.
@@ -63,7 +58,6 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
         _put(output / TIMES_CSV, _csv(_times(rows, output), TIME_COLUMNS).encode())
         if (content := _parquet(rows)) is not None:
             _put(output / PARQUET, content)
-        _put(output / PICTURE, _picture(rows))
     return found
 
 
@@ -116,21 +110,8 @@ def _times(rows: Sequence[Columns], output: Path) -> list[Columns]:
 
 
 def read_times(folder: Path) -> Columns:
-    """Read times.json; empty if there is none.
-
-    Raises:
-        ResultsError: It is not readable.
-    """
-    path = folder / TIMES
-    try:
-        times = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
-    except FileNotFoundError:
-        return {}
-    except (OSError, ValueError) as error:
-        raise ResultsError(f"{path}: cannot be read: {error}") from None
-    if not isinstance(times, dict):
-        raise ResultsError(f"{path}: not the times of a run: {json.dumps(times)[:100]}")
-    return times
+    """Read times.json; empty if there is none. Raises ResultsError if it is not readable."""
+    return read_object(folder / TIMES) or {}
 
 
 def _csv(rows: Sequence[Columns], columns: Mapping[str, type]) -> str:
@@ -160,40 +141,9 @@ def _parquet(rows: Sequence[Columns]) -> bytes | None:
     return buffer.getvalue()
 
 
-def _picture(rows: Sequence[Columns]) -> bytes:
-    shares = [row["posed"] / row["frames"] if row["frames"] else None for row in rows]
-    errors = [
-        row["ate_m"] / row["path_length_m"] if row["ate_m"] is not None and row["path_length_m"] else None
-        for row in rows
-    ]
-    figure = plots.plot_batch(
-        [row["name"] for row in rows],
-        [row["status"] for row in rows],
-        shares,
-        errors,
-        f"{len(rows)} sequences: {describe_statuses(rows)}",
-    )
-    return plots.png(figure)
-
-
 def _put(path: Path, content: bytes) -> None:
     """Write a file atomically, also if other processes write it at the same time."""
-    with _part(path) as part:
-        part.write_bytes(content)
-        part.replace(path)
-
-
-@contextlib.contextmanager
-def _part(path: Path) -> Iterator[Path]:
-    """A temporary file with a unique name in the same folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    number, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(number)
-    part = Path(name)
-    mask = os.umask(0)
-    os.umask(mask)
-    part.chmod(0o666 & ~mask)  # mkstemp restricts access to the owner
-    try:
-        yield part
-    finally:
-        part.unlink(missing_ok=True)
+    own = path.with_name(f".{path.name}.{uuid4().hex}")
+    write_whole(own, content)
+    own.replace(path)

@@ -17,7 +17,6 @@ from torchslam.batch.result_store import (
     DONE,
     NO_MAP,
     Columns,
-    hash_content,
     hash_files,
     hash_json,
     program_hash,
@@ -131,9 +130,8 @@ def _input(task: Task) -> str:
     """Hash the files that the row reads."""
     row, settings = task.row, settings_of(task.row)
     names = [row.sequence, row.groundtruth, row.mask, row.camera]
-    files = hash_files([row.resolve(name) for name in names if name])
     weights = [settings.features.weights, settings.matching.weights]
-    return hash_json({"files": files, "weights": [hash_content(name) for name in weights if name]})
+    return hash_files([*(row.resolve(name) for name in names if name), *filter(None, weights)])
 
 
 def open_row(row: Row) -> Sequence:

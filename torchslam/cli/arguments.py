@@ -6,10 +6,11 @@ torch is imported only where a sequence is opened or a device is named, so that 
 from __future__ import annotations
 
 import argparse
-import sys
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchslam.config import CHOICES, Config, builtin_names, load_config
+from torchslam.utils.console import say
 
 if TYPE_CHECKING:
     import torch
@@ -63,6 +64,18 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def add_output(parser: argparse.ArgumentParser, content: str = "the results") -> None:
+    """Add the argument for the folder that a command writes."""
+    parser.add_argument(
+        "--output", "-o", type=Path, required=True, metavar="DIR", help=f"folder for {content}"
+    )
+
+
+def add_directory(parser: argparse.ArgumentParser) -> None:
+    """Add the argument for a folder of results."""
+    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+
+
 def sequence(options: argparse.Namespace, camera: Calibration | None = None) -> Sequence:
     """Open the sequence given by the arguments of `add_sequence`; print its notes to stderr.
 
@@ -84,7 +97,7 @@ def sequence(options: argparse.Namespace, camera: Calibration | None = None) -> 
         mask=options.mask,
     )
     for note in found.notes:
-        print(f"torchslam: {found.name}: {note}", file=sys.stderr)
+        say(f"{found.name}: {note}")
     return found
 
 

@@ -6,7 +6,7 @@ LIST is a text file with one path per line (`#` for comments), or a CSV file wit
 LIST are relative to its folder.
 
 DIR receives: runs/NAME/ with the results of each sequence, as of `torchslam run`, but with the times in times.json;
-errors/NAME.json for sequences that failed; table.csv, table.parquet (if pyarrow is installed), times.csv and table.png.
+errors/NAME.json for sequences that failed; table.csv, table.parquet (if pyarrow is installed) and times.csv.
 Each sequence runs on one thread. Apart from the times, the results do not depend on the number of processes or on
 interruptions. Existing results are reused if the settings, the version, and the names, sizes and modification times of
 the input files are the same. Failed sequences are retried by the next call.
@@ -25,7 +25,6 @@ from __future__ import annotations
 
 import argparse
 import signal
-import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,6 +36,7 @@ from torchslam.batch.engines import ENGINES, parse_shard
 from torchslam.batch.results_table import CSV, describe_statuses
 from torchslam.cli import arguments
 from torchslam.cli.progress import SIGNALS, STATUS
+from torchslam.utils.console import say
 
 ERRORS = 4
 READING = ("camera", "start", "stop", "stride", "fps", "limit", "resize", "mask")
@@ -45,9 +45,7 @@ READING = ("camera", "start", "stop", "stride", "fps", "limit", "resize", "mask"
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam batch`."""
     parser.add_argument("list", type=Path, metavar="LIST", help="list of sequences: a text or CSV file")
-    parser.add_argument(
-        "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for all results"
-    )
+    arguments.add_output(parser, "all results")
     parser.add_argument(
         "--overwrite",
         action="store_true",
@@ -89,7 +87,7 @@ def execute(options: argparse.Namespace) -> int:
     tasks = [Task(row, output, str(device), options.overwrite, not options.no_plots) for row in rows]
     engine = Engine(options.engine, options.workers, options.address, int(device.type == "cuda"))
     shard = None if options.shard is None else parse_shard(options.shard)
-    with _stopping():
+    with _ended_by_signals():
         progress = _Progress(len(tasks) if shard is None else len(tasks[shard.index :: shard.count]))
         found = run_batch(tasks, engine, shard, progress.report)
     new = sum(columns["is_new"] for columns in found)
@@ -125,19 +123,15 @@ class _Progress:
         elif columns["error"]:
             words += f": {columns['error']}"
         before = "" if columns["is_new"] else " (already existed)"
-        print(
-            f"torchslam: {self._done}/{self._count} {columns['name']}: {words}{before}",
-            file=sys.stderr,
-            flush=True,
-        )
+        say(f"{self._done}/{self._count} {columns['name']}: {words}{before}")
 
 
 @contextmanager
-def _stopping() -> Iterator[None]:
+def _ended_by_signals() -> Iterator[None]:
     """Context in which Ctrl-C and SIGTERM exit at once, deleting incomplete results and keeping complete ones."""
 
     def end(number: int, frame: FrameType | None) -> None:
-        print("torchslam: stopped; run the same command to continue", file=sys.stderr)
+        say("stopped; run the same command to continue")
         raise SystemExit(STATUS[signal.Signals(number)])
 
     before = {number: signal.signal(number, end) for number in SIGNALS}

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import argparse
 import json
-import sys
 from pathlib import Path
 
 from torchslam.cli import arguments
-from torchslam.utils.console import table
+from torchslam.utils.console import say, table
 
 DEMO_SEQUENCE = "synthetic:room"
 
@@ -32,12 +31,15 @@ def add_arguments_demo(parser: argparse.ArgumentParser) -> None:
 
 def execute_demo(options: argparse.Namespace) -> int:
     """Run SLAM on a rendered room, evaluate and plot it: the whole system without any data."""
-    from torchslam.cli.run import RunPlan, run
+    from torchslam.cli import run
     from torchslam.data import open_sequence
 
+    parser = argparse.ArgumentParser()
+    run.add_arguments(parser)
     # The results can be reproduced, so overwriting loses nothing.
-    plan = RunPlan(DEMO_SEQUENCE, options.output, options.device, overwrite=True)
-    return run(open_sequence(DEMO_SEQUENCE), arguments.config(options), plan)
+    defaults = parser.parse_args([DEMO_SEQUENCE, "--output", "", "--overwrite"])
+    whole = argparse.Namespace(**vars(defaults) | vars(options))
+    return run.run(open_sequence(DEMO_SEQUENCE), arguments.config(options), whole)
 
 
 def add_arguments_eval(parser: argparse.ArgumentParser) -> None:
@@ -69,7 +71,7 @@ def execute_eval(options: argparse.Namespace) -> int:
 
 def add_arguments_plot(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam plot`."""
-    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+    arguments.add_directory(parser)
 
 
 def execute_plot(options: argparse.Namespace) -> int:
@@ -142,12 +144,9 @@ def execute_download(options: argparse.Namespace) -> int:
 
     if options.name in PUBLISHED:
         found = PUBLISHED[options.name]
-        print(f"torchslam: {found.about}, licensed under {found.package.license}", file=sys.stderr)
+        say(f"{found.about}, licensed under {found.package.license}")
         print(download_weights(options.name, options.to, options.url))
     else:
-        print(
-            download(
-                options.name, options.to or Path("data"), options.url or ETH3D_URL, sha256=options.sha256
-            )
-        )
+        to, url = options.to or Path("data"), options.url or ETH3D_URL
+        print(download(options.name, to, url, sha256=options.sha256))
     return 0

@@ -18,7 +18,6 @@ import warnings
 from pathlib import Path
 from typing import Any
 
-import torch
 from tqdm import tqdm
 
 from torchslam.cli import arguments
@@ -57,7 +56,7 @@ SMALLEST = 64
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam densify`."""
-    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+    arguments.add_directory(parser)
     add_options(parser)
     parser.add_argument(
         "--images", metavar="PATH", help="the images of the run, if they are not where the run read them"
@@ -78,7 +77,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of dense depth that `torchslam run` has as well."""
+    """Add the arguments of dense depth that `torchslam run` has as well; it has no others."""
+    parser.set_defaults(images=None, aggregation=None)
     parser.add_argument(
         "--resolution",
         default=str(LONG_SIDE),
@@ -98,63 +98,36 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def execute(options: argparse.Namespace) -> int:
     """Execute `torchslam densify`; returns the exit status."""
-    print(
-        table(
-            densify_results(
-                options.directory,
-                options.resolution,
-                options.every,
-                options.device,
-                options.images,
-                options.mesh,
-                options.processes,
-                options.aggregation,
-            )
-        )
-    )
+    print(table(densify_results(options.directory, options)))
     return 0
 
 
-def densify_results(
-    directory: Path,
-    resolution: str,
-    every: int | None,
-    device: torch.device | str,
-    images: str | None = None,
-    mesh: bool = False,
-    processes: int | None = None,
-    aggregation: str | None = None,
-) -> dict[str, str]:
+def densify_results(directory: Path, options: argparse.Namespace) -> dict[str, str]:
     """Compute dense depth of a results folder and add it to the folder; return rows for `table`.
 
     Args:
         directory: the results folder.
-        resolution: of the depth maps, `640x480` or the longer side.
-        every: every N-th posed frame; None: the keyframes.
-        device: to compute on.
-        images: where the images are; None: where the run read them.
-        mesh: also write a mesh; one of other depth maps is deleted.
-        processes: number of processes; None: one per processor, at most MAX_PROCESSES.
-        aggregation: `dense.aggregation`; None: that of the configuration in the folder.
+        options: those of `torchslam densify`, or of `torchslam run --dense`, which has some of them.
     """
-    if mesh:
+    device, every = options.device, options.every
+    if options.mesh:
         import_open3d()
     started = _cpu_seconds()
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
     metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
     config = load_config(directory / CONFIG if (directory / CONFIG).is_file() else None)
-    aggregation = aggregation or config.dense.aggregation
+    aggregation = options.aggregation or config.dense.aggregation
     submap = next((each for each in saved.atlas if each.number == metrics["submap"]), None)
     if submap is None:
         raise ResultsError(f"{directory / MAP}: no map to get depth for")
-    source = read_image_source(directory, metrics, saved.atlas, images)
+    source = read_image_source(directory, metrics, saved.atlas, options.images)
     if source is None:
         raise ResultsError(
             f"{directory / METRICS}: does not say where the images are; give them with --images"
         )
     scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=every is None)
-    size = map_size(resolution, pinhole_within(scene.camera).size)
+    size = map_size(options.resolution, pinhole_within(scene.camera).size)
     views = views_of(scene, size, every)
     elsewhere = "use --images for its new location"
     opened = open_images(source, scene, views.camera, elsewhere)
@@ -170,12 +143,10 @@ def densify_results(
             bar.update(done - bar.n)
 
         with shown_warnings():
-            count = min(processors(), MAX_PROCESSES) if processes is None else processes
-            if (processes or 1) > 1 and torch.device(device).type != "cpu":
+            count = options.processes or min(processors(), MAX_PROCESSES)
+            if (options.processes or 1) > 1 and device.type != "cpu":
                 warnings.warn("--processes is for the CPU: a GPU computes in one process", stacklevel=2)
-            found = densify(
-                views, opened, folder, torch.device(device), on_progress, count, aggregation == "learned"
-            )
+            found = densify(views, opened, folder, device, on_progress, count, aggregation == "learned")
     write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map))
     about = {"dense": _figures(found, size, aggregation, _cpu_seconds() - started)}
     write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
@@ -188,7 +159,7 @@ def densify_results(
         "points": f"{len(found.cloud)}, voxels of {found.voxel:.4g} map units",
         "dense": f"{directory / DENSE_CLOUD}, {folder}",
     }
-    if mesh:
+    if options.mesh:
         made = write_mesh(directory / MESH, directory / DEPTHS, upright_from_map(submap.map), opened)
         rows["mesh"] = f"{directory / MESH}, {made.triangles} triangles, voxels of {made.voxel:.4g} map units"
     return rows

@@ -169,7 +169,7 @@ class Target:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam export`."""
-    parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
+    arguments.add_directory(parser)
     parser.add_argument("--to", choices=TARGETS, required=True, help="export format")
     parser.add_argument(
         "--output",

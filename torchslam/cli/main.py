@@ -16,7 +16,7 @@ from typing import Any, NoReturn
 
 import torchslam
 from torchslam.errors import TorchslamError
-from torchslam.utils.console import with_install_hint
+from torchslam.utils.console import say, with_install_hint
 from torchslam.utils.text import printable, without_credentials
 
 ERROR = 2
@@ -81,7 +81,7 @@ def console() -> NoReturn:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit status. Expected errors become one line on stderr."""
-    # Before NumPy is imported: its idle threads would prevent forking.
+    # Before NumPy is imported: its threads would compete with those of the other processes.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
@@ -90,15 +90,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _compute_in_one_thread()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
-        print(f"torchslam: error: {printable(without_credentials(str(error)))}", file=sys.stderr)
+        say(f"error: {printable(without_credentials(str(error)))}")
         return ERROR
     except ModuleNotFoundError as error:
         if (reason := with_install_hint(error)) is error:
             raise
-        print(f"torchslam: error: {reason}", file=sys.stderr)
+        say(f"error: {reason}")
         return ERROR
     except KeyboardInterrupt:
-        print("torchslam: interrupted", file=sys.stderr)
+        say("interrupted")
         return INTERRUPTED
 
 
@@ -130,7 +130,7 @@ class Version(argparse.Action):
 def _compute_in_one_thread() -> None:
     """Use one thread unless OMP_NUM_THREADS is set: the tensors of a frame are too small for more.
 
-    A thread of OpenCV would also keep the process from being forked, and would still run while it exits.
+    A thread of OpenCV would also still run while the process exits.
     """
     import cv2  # both after the arguments were checked
     import torch

@@ -12,7 +12,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType, TracebackType
-from typing import Any
+from typing import Any, Self
 
 from tqdm import tqdm
 
@@ -86,109 +86,44 @@ class StopSignals:
         raise SystemExit(STATUS[signal.Signals(number)])
 
 
-# Without the monitor thread of tqdm, this process can be forked.
+# The monitor thread of tqdm would still run while the interpreter exits.
 tqdm.monitor_interval = 0
 
 
-class ProgressBar:
-    """Progress line on stderr with frame, rate, state and map points; warnings are printed above it.
+class _Bar:
+    """A progress line on stderr, with warnings above it while this is entered.
 
-    A signal takes effect after the current frame or iteration, when the map is consistent.
-
-    Args:
-        frames: number of frames; None if unknown.
-        count_points: returns the number of map points.
-        stopping: the signal handler.
-        done: number of frames that a resumed run had processed.
-    """
-
-    def __init__(
-        self, frames: int | None, count_points: Callable[[], int], stop_signals: StopSignals, done: int = 0
-    ) -> None:
-        self._count_points = count_points
-        self._stopping = stop_signals
-        self._bar = tqdm(
-            total=frames,
-            initial=done,
-            unit=" frames",
-            **tqdm_options(),
-            bar_format="{n_fmt} frames, {rate_noinv_fmt}{postfix}"
-            if frames is None
-            else "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}",
-        )
-        self._adjusting: tqdm | None = None
-        self._warnings = shown_warnings()
-
-    def update(self, result: StepResult) -> None:
-        """Advance to the frame of a result. Raises KeyboardInterrupt after a signal."""
-        self._bar.set_postfix_str(f"{result.state.value}, {self._count_points()} points", refresh=False)
-        self._bar.update(result.index + 1 - self._bar.n)
-        self._stopping.check()
-
-    def adjusting(self, iteration: int, iterations: int) -> None:
-        """Advance to an iteration of the final adjustment. Raises KeyboardInterrupt after a signal."""
-        if self._adjusting is None:
-            self._stopping.begin("the adjustment after this iteration")
-            self._bar.close()
-            self._adjusting = tqdm(
-                total=iterations,
-                **tqdm_options(),
-                bar_format="adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}",
-            )
-        self._adjusting.total = iterations
-        self._adjusting.update(iteration + 1 - self._adjusting.n)  # submaps begin anew
-        self._stopping.check()
-
-    def __enter__(self) -> ProgressBar:
-        self._warnings.__enter__()
-        self._stopping.begin("after this frame")
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._warnings.__exit__(kind, error, trace)
-        self._bar.close()
-        if self._adjusting is not None:
-            self._adjusting.close()
-
-
-class StageBar:
-    """Progress line on stderr of stages that follow one another, with the time left of the present one.
+    A signal takes effect after the current step, when the map is consistent.
 
     Args:
         stop_signals: the signal handler.
+        phase: tells the user when the run will stop.
     """
 
-    def __init__(self, stop_signals: StopSignals) -> None:
-        self._stopping = stop_signals
-        self._warnings = shown_warnings()
-        self._stage = ""
+    def __init__(self, stop_signals: StopSignals, phase: str) -> None:
+        self._stopping, self._phase = stop_signals, phase
         self._bar: tqdm | None = None
+        self._warnings = shown_warnings()
 
-    def update(self, stage: str, done: int, most: int) -> None:
-        """Advance to a step of a stage. Raises KeyboardInterrupt after a signal."""
-        if stage != self._stage or self._bar is None:
-            self._close()
-            self._stage = stage
-            self._bar = tqdm(
-                total=most,
-                desc=stage,
-                **tqdm_options(),
-                bar_format="{desc} |{bar:24}| {n_fmt}/{total_fmt}, {remaining} left",
-            )
-        self._bar.total = most
+    def _show(self, layout: str, total: int | None, **options: Any) -> None:
+        """Show another bar."""
+        self._close()
+        self._bar = tqdm(total=total, bar_format=layout, **tqdm_options(), **options)
+
+    def _advance(self, done: int, total: int | None) -> None:
+        """Advance the bar to a step. Raises KeyboardInterrupt after a signal."""
+        assert self._bar is not None
+        self._bar.total = total
         self._bar.update(done - self._bar.n)
         self._stopping.check()
 
     def _close(self) -> None:
         if self._bar is not None:
             self._bar.close()
-            self._bar = None
 
-    def __enter__(self) -> StageBar:
+    def __enter__(self) -> Self:
         self._warnings.__enter__()
-        self._stopping.begin("and keeping the run as it is, after this step")
+        self._stopping.begin(self._phase)
         return self
 
     def __exit__(
@@ -196,3 +131,53 @@ class StageBar:
     ) -> None:
         self._warnings.__exit__(kind, error, trace)
         self._close()
+
+
+class ProgressBar(_Bar):
+    """Progress line with frame, rate, state and map points, then with the iterations of the final adjustment.
+
+    Args:
+        frames: number of frames; None if unknown.
+        count_points: returns the number of map points.
+        stop_signals: the signal handler.
+        done: number of frames that a resumed run had processed.
+    """
+
+    def __init__(
+        self, frames: int | None, count_points: Callable[[], int], stop_signals: StopSignals, done: int = 0
+    ) -> None:
+        super().__init__(stop_signals, "after this frame")
+        self._frames, self._count_points, self._is_adjusting = frames, count_points, False
+        bar = "{n_fmt} frames, {rate_noinv_fmt}{postfix}"
+        if frames is not None:
+            bar = "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}"
+        self._show(bar, frames, initial=done, unit=" frames")
+
+    def update(self, result: StepResult) -> None:
+        """Advance to the frame of a result. Raises KeyboardInterrupt after a signal."""
+        assert self._bar is not None
+        self._bar.set_postfix_str(f"{result.state.value}, {self._count_points()} points", refresh=False)
+        self._advance(result.index + 1, self._frames)
+
+    def adjusting(self, iteration: int, iterations: int) -> None:
+        """Advance to an iteration of the final adjustment. Raises KeyboardInterrupt after a signal."""
+        if not self._is_adjusting:
+            self._is_adjusting = True
+            self._stopping.begin("the adjustment after this iteration")
+            self._show("adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}", iterations)
+        self._advance(iteration + 1, iterations)  # submaps begin anew
+
+
+class StageBar(_Bar):
+    """Progress line of stages that follow one another, with the time left of the present one."""
+
+    def __init__(self, stop_signals: StopSignals) -> None:
+        super().__init__(stop_signals, "and keeping the run as it is, after this step")
+        self._stage = ""
+
+    def update(self, stage: str, done: int, most: int) -> None:
+        """Advance to a step of a stage. Raises KeyboardInterrupt after a signal."""
+        if stage != self._stage:
+            self._stage = stage
+            self._show("{desc} |{bar:24}| {n_fmt}/{total_fmt}, {remaining} left", most, desc=stage)
+        self._advance(done, most)

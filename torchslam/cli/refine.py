@@ -11,20 +11,16 @@ Exit status: 0 done, 2 an error, 3 no map could be built from the images.
 from __future__ import annotations
 
 import argparse
-import sys
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 
 from torchslam.calibration.find_camera import contradiction
 from torchslam.cli import arguments
-from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found, write_calibration
 from torchslam.data.camera_argument import fit_camera, unknown_camera
-from torchslam.data.formats.given_poses import GivenPoses, read_poses
+from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.sequence import Calibrated
 from torchslam.data.synthetic.sequence import is_synthetic
 from torchslam.errors import ConfigError, SequenceError, TrajectoryError
@@ -35,24 +31,11 @@ from torchslam.io.write_run import write_run
 from torchslam.refine import CameraChoice, RefinementResult, refine_poses
 from torchslam.refine.files import write_refined
 from torchslam.types import Trajectory
-from torchslam.utils.console import table
+from torchslam.utils.console import say, table, warn
 
 DONE, NO_MAP = 0, 3
 RADIAL = 2  # coefficients of the distortion that may be found
 REFINED = "refined"  # folder in the results
-
-
-@dataclass(frozen=True)
-class RefinePlan:
-    """source, fps: what the sequence was opened from; choice, radial: as in `refine`"""
-
-    source: str
-    fps: float | None
-    output: Path
-    device: torch.device
-    overwrite: bool
-    choice: CameraChoice
-    radial: int
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -65,9 +48,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="TUM trajectory, COLMAP model (folder with images.bin or images.txt), or transforms.json. Its camera is "
         "used unless --camera is given",
     )
-    parser.add_argument(
-        "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
-    )
+    arguments.add_output(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace the results in the folder")
     camera = parser.add_mutually_exclusive_group()
     camera.add_argument(
@@ -98,40 +79,24 @@ def execute(options: argparse.Namespace) -> int:
     sequence = _with_camera(sequence)
     is_guess = sequence.calibrated is Calibrated.GUESSED
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.IF_CONTRADICTED
-    plan = RefinePlan(
-        options.path,
-        options.fps,
-        options.output,
-        options.device,
-        options.overwrite,
-        CameraChoice.FIXED if options.fix_camera else choice,
-        RADIAL if options.refine_distortion or (is_guess and not options.fix_camera) else 0,
+    if options.fix_camera:
+        choice = CameraChoice.FIXED
+    radial = RADIAL if options.refine_distortion or (is_guess and not options.fix_camera) else 0
+    config = arguments.config(options)
+    prepare(options.output, options.overwrite, resume=False)
+    check_replaceable(options.output / CALIBRATION)
+    refined = refine_poses(sequence, given, config, choice, radial, options.device, on_progress=say)
+    metrics = _write(refined, sequence, options)
+    written = (
+        {} if refined.run.failure else {"refined": str(write_refined(options.output / REFINED, refined))}
     )
-    return run(sequence, given, arguments.config(options), plan)
-
-
-def run(sequence: Sequence, given: GivenPoses, config: Config, plan: RefinePlan) -> int:
-    """Refine, evaluate, write, draw, report; returns the exit status."""
-    prepare(plan.output, plan.overwrite, resume=False)
-    check_replaceable(plan.output / CALIBRATION)
-    refined = refine_poses(
-        sequence,
-        given,
-        config,
-        plan.choice,
-        plan.radial,
-        plan.device,
-        on_progress=lambda words: print(f"torchslam: {words}", file=sys.stderr),
-    )
-    metrics = _write(refined, sequence, plan)
-    written = {} if refined.run.failure else {"refined": str(write_refined(plan.output / REFINED, refined))}
-    rows = _describe_poses(refined, sequence) | summary(metrics) | written | {"results": str(plan.output)}
+    rows = _describe_poses(refined, sequence) | summary(metrics) | written | {"results": str(options.output)}
     rows.pop("speed", None)  # frames are not processed one by one
     if "online ATE" in rows:
         rows["ATE as given"] = rows.pop("online ATE")
     print(f"\n{sequence.name}\n{table(rows)}")
     if refined.run.failure:
-        print(f"torchslam: {refined.run.failure}", file=sys.stderr)
+        say(refined.run.failure)
         return NO_MAP
     return DONE
 
@@ -141,12 +106,12 @@ def _with_camera(sequence: Sequence) -> Sequence:
     if sequence.known_length is None:
         raise SequenceError(f"{sequence.name}: a live source has no poses to refine")
     if sequence.calibrated is Calibrated.MISSING:
-        print("torchslam: no calibration found; estimating intrinsics from the images", file=sys.stderr)
+        say("no calibration found; estimating intrinsics from the images")
         return sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
     return sequence
 
 
-def _write(refined: RefinementResult, sequence: Sequence, plan: RefinePlan) -> dict[str, Any]:
+def _write(refined: RefinementResult, sequence: Sequence, options: argparse.Namespace) -> dict[str, Any]:
     """Evaluate and write the refined run; returns the metrics."""
     finished = refined.run
     before = Trajectory.empty() if finished.failure else finished.online
@@ -159,13 +124,13 @@ def _write(refined: RefinementResult, sequence: Sequence, plan: RefinePlan) -> d
         "without_image": refined.without_image,
         "rounds": refined.rounds,
         "dropped": sequence.dropped,
-    } | source_of(plan.source, plan.fps, sequence)
-    path = plan.output / CALIBRATION
+    } | source_of(options.path, options.fps, sequence)
+    path = options.output / CALIBRATION
     if not torch.equal(finished.camera.params.cpu(), sequence.camera.params):
         write_calibration(path, finished.camera, [metrics["camera"]])
     elif is_found(path):
         path.unlink()
-    write_run(finished, sequence, metrics, plan.output, viewer=False)
+    write_run(finished, sequence, metrics, options.output, viewer=False)
     return metrics
 
 
@@ -176,7 +141,7 @@ def _errors(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
     try:
         return evaluate(trajectory, sequence.groundtruth)
     except TrajectoryError as error:
-        print(f"torchslam: warning: no evaluation: {error}", file=sys.stderr)
+        warn(f"no evaluation: {error}")
         return None
 
 

@@ -15,7 +15,6 @@ Ctrl-C and by SIGTERM (the results so far are written, and --resume continues fr
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -49,47 +48,13 @@ from torchslam.system.front_end import source
 from torchslam.system.run import Run, RunProgress, run_sequence
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
-from torchslam.utils.console import table
+from torchslam.utils.console import say, table, warn
 
 DONE = 0
 NO_MAP = 3
 CHECKPOINT_EVERY = 20  # keyframes
 GROWTH = 0.05
 """Minimum ratio of new keyframes between two checkpoints, so that all checkpoints together cost O(n)."""
-
-
-@dataclass(frozen=True)
-class RunPlan:
-    """Inputs, outputs and options of a run.
-
-    Attributes:
-        source, fps: path and frame rate with which the sequence was opened, for exports that read it again.
-        output: results folder; `overwrite` it, or `resume` from its checkpoint.
-        map: saved map to continue; without `mapping` only to localize in it.
-        checkpoint: keyframes between two checkpoints; 0: none.
-        refine: take the given camera for a rough guess, which the adjustments correct.
-        processes: number of processes; None: chosen automatically.
-        view: show the run live in rerun; `video`: write a video of the tracked frames.
-        camera_std: stated relative standard deviation of the focal length; None: that of the calibration file, or of
-            the configuration.
-        mapping_mode: whether the recording is mapped as a whole as well; None: it is no whole recording.
-    """
-
-    source: str
-    output: Path
-    device: torch.device
-    overwrite: bool = False
-    resume: bool = False
-    map: Path | None = None
-    mapping: bool = True
-    checkpoint: int = CHECKPOINT_EVERY
-    refine: bool = False
-    processes: int | None = None
-    view: bool = False
-    video: bool = False
-    fps: float | None = None
-    camera_std: float | None = None
-    mapping_mode: Mapping | None = Mapping.AUTO
 
 
 class Checkpoints:
@@ -122,9 +87,7 @@ class Checkpoints:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam run`."""
     arguments.add_sequence(parser)
-    parser.add_argument(
-        "--output", "-o", type=Path, required=True, metavar="DIR", help="folder for the results"
-    )
+    arguments.add_output(parser)
     existing = parser.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the results in the folder")
     existing.add_argument(
@@ -187,46 +150,25 @@ def execute(options: argparse.Namespace) -> int:
         import_open3d()
     if options.view:
         import_rerun()
-    saved = options.map
-    if saved is not None and saved.is_dir():
-        own = saved / CONFIG
+    if options.map is not None and options.map.is_dir():
+        own = options.map / CONFIG
         options.config = options.config or (own if own.is_file() else None)
-        saved = saved / MAP
-    plan = RunPlan(
-        source=options.path,
-        output=options.output,
-        device=options.device,
-        overwrite=options.overwrite,
-        resume=options.resume,
-        map=saved,
-        mapping=not options.localize,
-        checkpoint=options.checkpoint,
-        refine=options.refine_camera,
-        processes=options.processes,
-        view=options.view,
-        video=options.video,
-        fps=options.fps,
-        camera_std=options.camera_std,
-    )
+        options.map = options.map / MAP
     opened, config = _sequence(options), arguments.config(options)
     if options.dense:
         map_size(options.resolution, opened.size)  # raises now rather than after the run
-    is_recorded = not opened.is_live and saved is None
-    if not is_recorded and options.mapping == Mapping.GLOBAL.value:
+    if options.mapping == Mapping.GLOBAL.value and _mode(opened, options) is None:
         raise ConfigError("--mapping global needs a recording, and no --map")
-    mode = Mapping(options.mapping) if is_recorded else None
-    status = run(opened, config, replace(plan, mapping_mode=mode))
+    status = run(opened, config, options)
     if options.dense and status == DONE:
-        dense = densify_results(
-            options.output,
-            options.resolution,
-            options.every,
-            options.device,
-            mesh=options.mesh,
-            processes=options.processes,
-        )
+        dense = densify_results(options.output, options)
         print(f"\n{table(dense)}")
     return status
+
+
+def _mode(sequence: Sequence, options: argparse.Namespace) -> Mapping | None:
+    """Whether a recording is mapped as a whole as well; None if it is no whole recording."""
+    return None if sequence.is_live or options.map is not None else Mapping(options.mapping)
 
 
 def _sequence(options: argparse.Namespace) -> Sequence:
@@ -234,10 +176,7 @@ def _sequence(options: argparse.Namespace) -> Sequence:
     found = arguments.sequence(options)
     if found.calibrated is not Calibrated.MISSING or found.is_live:
         return found
-    print(
-        "torchslam: no calibration found; estimating intrinsics from the images (--camera auto)",
-        file=sys.stderr,
-    )
+    say("no calibration found; estimating intrinsics from the images (--camera auto)")
     return found.with_camera(unknown_camera(found), Calibrated.GUESSED)
 
 
@@ -262,48 +201,53 @@ class Attempt:
     mapped: MappedRecording | None = None
 
 
-def run(sequence: Sequence, config: Config, plan: RunPlan) -> int:
+def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
-    prepare(plan.output, plan.overwrite, plan.resume)
-    check_replaceable(plan.output / CALIBRATION)
+    prepare(options.output, options.overwrite, options.resume)
+    mode = _mode(sequence, options)
+    check_replaceable(options.output / CALIBRATION)
     with StopSignals() as stop_signals, ExitStack() as viewers:
-        attempt = _attempt(sequence, config, plan, stop_signals, viewers)
-        if plan.mapping_mode is not None and not attempt.finished.interrupted:
-            attempt = _map_recording(attempt, plan.mapping_mode, plan.device, stop_signals)
+        attempt = _attempt(sequence, config, options, stop_signals, viewers)
+        if mode is not None and not attempt.finished.interrupted:
+            attempt = _map_recording(attempt, mode, options.device, stop_signals)
         stop_signals.begin("when the results are written")
-        metrics = _write(attempt, plan)
+        metrics = _write(attempt, options)
         attempt.watching.end(attempt.finished)
     finished = attempt.finished
-    written = {"results": plan.output, "view": plan.output / VIEW}
-    written |= {"video": plan.output / VIDEO} if plan.video else {}
+    written = {"results": options.output, "view": options.output / VIEW}
+    written |= {"video": options.output / VIDEO} if options.video else {}
     words = summary(metrics) | {label: str(path) for label, path in written.items()}
     print(f"\n{sequence.name}\n{table(words)}")
     for warning in result_warnings(metrics):
-        print(f"torchslam: warning: {warning}", file=sys.stderr)
+        warn(warning)
     if finished.interrupted:
-        print("torchslam: interrupted; the results so far were written", file=sys.stderr)
+        say("interrupted; the results so far were written")
         return stop_signals.status
-    (plan.output / CHECKPOINT).unlink(missing_ok=True)
+    (options.output / CHECKPOINT).unlink(missing_ok=True)
     if finished.failure:
-        print(f"torchslam: {finished.failure}", file=sys.stderr)
+        say(finished.failure)
         return NO_MAP
     return DONE
 
 
 def _attempt(
-    sequence: Sequence, config: Config, plan: RunPlan, stop_signals: StopSignals, viewers: ExitStack
+    sequence: Sequence,
+    config: Config,
+    options: argparse.Namespace,
+    stop_signals: StopSignals,
+    viewers: ExitStack,
 ) -> Attempt:
     """Find the camera, if it is not given, and run."""
-    sequence, found = _with_camera(sequence, config, plan)
-    if plan.camera_std is None:
+    sequence, found = _with_camera(sequence, config, options)
+    if options.camera_std is None:
         config = with_stated_std(config, sequence)
-    slam, so_far = _begin(sequence, config, plan)
+    slam, so_far = _begin(sequence, config, options)
     sequence = source(sequence, config, slam.camera)
-    checkpoints = Checkpoints(plan.output, plan.checkpoint, slam, so_far, sequence)
+    checkpoints = Checkpoints(options.output, options.checkpoint, slam, so_far, sequence)
     processes = (
-        1 if plan.view or plan.video else plan.processes
+        1 if options.view or options.video else options.processes
     )  # the viewers need the images in this process
-    watching = viewers.enter_context(_watching(slam, sequence, plan))
+    watching = viewers.enter_context(_watching(slam, sequence, options))
     latencies: list[float] = []
     bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
     with bar as progress:
@@ -333,57 +277,58 @@ def _map_recording(
     except KeyboardInterrupt:
         return replace(attempt, finished=replace(online, interrupted=True))
     if mapped.why:
-        print(f"torchslam: mapped as a whole, since {mapped.why}; kept: {mapped.kept}", file=sys.stderr)
+        say(f"mapped as a whole, since {mapped.why}; kept: {mapped.kept}")
     return replace(attempt, finished=mapped.run, mapped=mapped)
 
 
-def _with_camera(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[Sequence, str]:
+def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[Sequence, str]:
     """Return the sequence with the camera of the run, and a remark on the camera if it was estimated."""
     is_guess = sequence.calibrated is Calibrated.GUESSED and not sequence.is_live
-    if plan.map is not None or not (plan.refine or is_guess):
-        if not plan.resume and is_found(plan.output / CALIBRATION):
-            (plan.output / CALIBRATION).unlink()
+    if options.map is not None or not (options.refine_camera or is_guess):
+        if not options.resume and is_found(options.output / CALIBRATION):
+            (options.output / CALIBRATION).unlink()
         return sequence, ""
     if not is_guess:
         return sequence.with_camera(sequence.camera, std=ROUGH_STD), ""
-    goes_on = plan.resume and (plan.output / CHECKPOINT).exists()
+    goes_on = options.resume and (options.output / CHECKPOINT).exists()
     return find_camera(
         sequence,
         config,
-        plan.output,
-        plan.device,
+        options.output,
+        options.device,
         goes_on,
-        lambda words: print(f"torchslam: camera: {words}", file=sys.stderr),
+        lambda words: say(f"camera: {words}"),
     )
 
 
-def _begin(sequence: Sequence, config: Config, plan: RunPlan) -> tuple[SLAM, RunProgress]:
+def _begin(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[SLAM, RunProgress]:
     """Return a new system, or one restored from a checkpoint or a saved map, with its progress."""
-    checkpoint = plan.output / CHECKPOINT
-    if plan.resume and checkpoint.exists():
-        slam, so_far = read_checkpoint(checkpoint, sequence, config, plan.device)
-        print(f"torchslam: resuming at frame {so_far.next} of {sequence.known_length}", file=sys.stderr)
+    checkpoint = options.output / CHECKPOINT
+    if options.resume and checkpoint.exists():
+        slam, so_far = read_checkpoint(checkpoint, sequence, config, options.device)
+        say(f"resuming at frame {so_far.next} of {sequence.known_length}")
         return slam, so_far
-    if plan.resume:
-        print("torchslam: no checkpoint to resume from; starting with the first frame", file=sys.stderr)
-    if plan.map is None:
-        return SLAM(sequence.camera.to(plan.device), config), RunProgress()
-    slam = SLAM.load(plan.map, config, mapping=plan.mapping, device=plan.device)
+    if options.resume:
+        say("no checkpoint to resume from; starting with the first frame")
+    if options.map is None:
+        return SLAM(sequence.camera.to(options.device), config), RunProgress()
+    slam = SLAM.load(options.map, config, mapping=not options.localize, device=options.device)
     known, mine = slam.camera.to("cpu"), sequence.camera.to(torch.float64)
     is_given = sequence.calibrated is Calibrated.GIVEN  # else the map's is the camera
     if known.size != mine.size or (is_given and not may_be_same(known, mine, config.camera.std)):
         raise ResultsError(
-            f"{plan.map}: the map was built with the camera {_describe(known)}, but the sequence has {_describe(mine)}"
+            f"{options.map}: the map was built with the camera {_describe(known)}, but the sequence has "
+            f"{_describe(mine)}"
         )
     return slam, RunProgress()
 
 
-def _watching(slam: SLAM, sequence: Sequence, plan: RunPlan) -> FrameViewers:
+def _watching(slam: SLAM, sequence: Sequence, options: argparse.Namespace) -> FrameViewers:
     """Return the viewers of the run; delete the video of an earlier run."""
-    (plan.output / VIDEO).unlink(missing_ok=True)
-    screens: list[FrameViewer] = [LiveView.spawn(slam)] if plan.view else []
-    if plan.video:
-        screens.append(film_of(sequence, plan.output))
+    (options.output / VIDEO).unlink(missing_ok=True)
+    screens: list[FrameViewer] = [LiveView.spawn(slam)] if options.view else []
+    if options.video:
+        screens.append(film_of(sequence, options.output))
     return FrameViewers(slam, sequence, screens)
 
 
@@ -392,14 +337,14 @@ def _describe(camera: Camera) -> str:
     return f"{camera.model} {numbers} of {camera.width} x {camera.height} pixels"
 
 
-def _write(attempt: Attempt, plan: RunPlan) -> dict[str, object]:
+def _write(attempt: Attempt, options: argparse.Namespace) -> dict[str, object]:
     """Evaluate and write the run; returns the metrics."""
     finished, sequence, latencies = attempt.finished, attempt.sequence, attempt.latencies
     metrics = compute_metrics(
         finished,
         sequence,
         attempt.found,
-        lambda words: print(f"torchslam: warning: {words}", file=sys.stderr),
+        warn,
         attempt.mapped,
     )
     if latencies:
@@ -409,6 +354,6 @@ def _write(attempt: Attempt, plan: RunPlan) -> dict[str, object]:
             .tolist()
         )
         metrics["latency_ms"] = {"median": median, "p95": p95}
-    metrics |= source_of(plan.source, plan.fps, sequence)
-    write_run(finished, sequence, metrics, plan.output)
+    metrics |= source_of(options.path, options.fps, sequence)
+    write_run(finished, sequence, metrics, options.output)
     return metrics

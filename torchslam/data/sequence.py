@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float, UInt8
@@ -289,6 +289,13 @@ class Sequence(ABC):
         numbers = " ".join(f"{number:.6g}" for number in self._camera.params.tolist())
         guessed = " (guessed)" if self.calibrated is Calibrated.GUESSED else ""
         return f"{self._camera.model} {numbers}{guessed}"
+
+
+class Frames(Protocol):
+    """The frames of a run, each read once and in order: a sequence, or one that workers read ahead."""
+
+    def __getitem__(self, index: int) -> Frame:
+        """The frame of an index."""
 
 
 class Transformed(Sequence):

@@ -104,8 +104,6 @@ def draw(results: Results, directory: Path) -> list[Path]:
 def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
     if results.frames:
         yield "tracking", figures.plot_tracking(results.frames)
-    if any(result.stage_ms for result in results.frames):
-        yield "stages", figures.plot_stage_times(results.frames)
     if not len(results.trajectory):
         return
     yield from _scenes(results)

@@ -8,48 +8,32 @@ results.
 from __future__ import annotations
 
 import os
-import pickle
 import statistics
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
-from multiprocessing.connection import Connection
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
-
-import numpy as np
-import torch
+from typing import Protocol
 
 from torchslam.config import Config
-from torchslam.data.sequence import Sequence
+from torchslam.data.sequence import Frames, Sequence
 from torchslam.geometry import Camera
 from torchslam.mapping.local_bundle import BundleResult, PendingResult, solve_local
 from torchslam.mapping.mapper import Mapper
-from torchslam.optim import BundleProblem, Marginals
-from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
-from torchslam.parallel.worker import (
-    WithWorker,
-    pack_task,
-    requests,
-    send_result,
-    starts_at_once,
-    try_call,
-    unwrap,
-)
-from torchslam.system.run import Frames
+from torchslam.optim import BundleProblem
+from torchslam.parallel.pool import WorkerLostError, WorkerPool
+from torchslam.parallel.prefetch import Extractor, FeaturePrefetcher, LivePrefetcher
 from torchslam.utils.timing import Stopwatch
 
-WORTH, WORTH_AT_ONCE = 100, 10
-"""Frames of a run for which other processes are worth their start: one that has to import everything costs as much as
-some 40 frames; a copy of this process starts at once."""
+WORTH = 100
+"""Frames of a run for which other processes are worth their start: its imports cost as much as some 40 frames."""
 LEAST_FREE = 2
 """Processors that must be free for three processes, which wait for each other: where one waits for its turn, all do."""
 LOAD = Path("/proc/loadavg")  # on Linux
 SAMPLES, SAMPLING_S = 5, 0.01
 """Looks at the load, and seconds between them: a median does not count what wakes up for a moment."""
-SENT = ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "fixed_frames")
-"""The fields of a problem that differ between problems of one run."""
 
 
 class _System(Protocol):
@@ -60,6 +44,7 @@ class _System(Protocol):
     clock: Stopwatch
     mapper: Mapper
     has_custom_components: bool
+    make_extractor: Callable[[], Extractor]
 
     @property
     def mapping(self) -> bool:
@@ -95,11 +80,7 @@ def best_number(sequence: Sequence, start: int) -> int:
     """Best number of processes for a sequence from frame `start` on, beside what else the machine does now."""
     length = sequence.known_length
     frames = WORTH if length is None else length - start
-    if processors() - busy_elsewhere() < LEAST_FREE or frames < (
-        WORTH_AT_ONCE if starts_at_once() else WORTH
-    ):
-        return 1
-    return 3
+    return 3 if frames >= WORTH and processors() - busy_elsewhere() >= LEAST_FREE else 1
 
 
 @contextmanager
@@ -129,11 +110,9 @@ def with_workers(
             others.enter_context(ahead)
             frames = ahead
         if slam.mapping and wanted > (1 if ahead is None else 2):
-            worker = others.enter_context(BundleWorker(slam.camera))
+            worker = others.enter_context(BundleWorker())
             others.enter_context(slam.mapper.adjustment.solved_by(worker))
-        if isinstance(ahead, FeaturePrefetcher):
-            ahead.begin(start)
-        slam.precompute_undistortion()  # while the workers read
+        slam.precompute_undistortion()  # while the workers start
         yield frames
 
 
@@ -147,8 +126,8 @@ def reader(
             print(f"torchslam: frames are read in the main process: {obstacle}", file=sys.stderr)
         return None
     if sequence.is_live:
-        return LivePrefetcher(sequence, slam.camera, slam.config, slam.clock)
-    return FeaturePrefetcher(sequence, slam.camera, slam.config, slam.clock, max(1, processes - 2))
+        return LivePrefetcher(sequence, slam.make_extractor, slam.clock)
+    return FeaturePrefetcher(sequence, slam.make_extractor, slam.clock, max(1, processes - 2))
 
 
 def prefetch_obstacle(sequence: Sequence, slam: _System) -> str:
@@ -162,64 +141,23 @@ def prefetch_obstacle(sequence: Sequence, slam: _System) -> str:
     return ""
 
 
-class BundleWorker(WithWorker):
+class BundleWorker(WorkerPool):
     """A `mapping.local_bundle.Solver` that uses a worker, which runs while this is entered.
 
     Problems are solved in this process until the worker has started, and after it was killed.
     """
 
-    def __init__(self, camera: Camera) -> None:
-        super().__init__(_work)
-        self._camera = camera
-        self._has_task = False
-        self._number = 0  # of the last problem that was sent
+    def __init__(self) -> None:
+        super().__init__(1, partial, solve_local)
 
     def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
-        number = self._send(problem, iterations, covariances)
+        call = self.submit(problem, iterations, covariances)
 
         def answer() -> BundleResult:
-            found = None if number is None else self._receive(number)
-            return solve_local(problem, iterations, covariances) if found is None else found
+            if call is not None:
+                with suppress(WorkerLostError):
+                    found: BundleResult = self.result(call)
+                    return found
+            return solve_local(problem, iterations, covariances)
 
         return answer
-
-    def _send(self, problem: BundleProblem, iterations: int, covariances: bool) -> int | None:
-        """Send a problem; return its number, or None without a worker."""
-        if not self._worker.is_there():
-            return None
-        if not self._has_task:
-            self._has_task = self._worker.send(pack_task(self._camera))
-        self._number += 1
-        arrays = {name: getattr(problem, name).numpy() for name in SENT}
-        message = pickle.dumps((self._number, arrays, iterations, covariances))
-        return self._number if self._worker.send(message) else None
-
-    def _receive(self, number: int) -> BundleResult | None:
-        """Wait for the result of a problem, and skip those of dropped ones; None without a worker."""
-        while (answer := self._worker.receive()) is not None:
-            answered, found = answer
-            if answered == number:
-                return _adjusted(unwrap(found))
-        return None
-
-
-def _adjusted(arrays: list[np.ndarray]) -> BundleResult:
-    """Unpack the result of `_arrays`."""
-    T_cw, points_w, *covariances = (torch.from_numpy(each) for each in arrays)
-    return BundleResult(T_cw, points_w, Marginals(*covariances) if covariances else None)
-
-
-def _arrays(adjusted: BundleResult) -> list[np.ndarray]:
-    """Pack a result as arrays, since tensors are slow to pickle."""
-    return [each.numpy() for each in (adjusted.T_cw, adjusted.points_w, *(adjusted.marginals or ()))]
-
-
-def _work(connection: Connection, camera: Camera) -> None:
-    """Solve one numbered problem after the other."""
-
-    def solve(arrays: dict[str, np.ndarray], iterations: int, covariances: bool) -> list[np.ndarray]:
-        columns: dict[str, Any] = {name: torch.from_numpy(each) for name, each in arrays.items()}
-        return _arrays(solve_local(BundleProblem(camera=camera, **columns), iterations, covariances))
-
-    for number, *problem in requests(connection):
-        send_result(connection, (number, try_call("adjusts", solve, *problem)))

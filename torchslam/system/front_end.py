@@ -70,6 +70,17 @@ def image_extractor(
     return extract
 
 
+def checked_extractor(config: Config, camera: Camera) -> Extractor:
+    """Create the configured extractor, for frames that `check_size` accepts."""
+    extract = image_extractor(config)
+
+    def check_and_extract(frame: Frame) -> Features:
+        check_size(frame, camera)
+        return extract(frame)
+
+    return check_and_extract
+
+
 def _takes_two(front_end: FrontEnd) -> bool:
     """Whether a front end takes a mask as second argument."""
     called = front_end.forward if isinstance(front_end, nn.Module) else front_end

@@ -13,7 +13,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.data.sequence import EndOfSequence, Sequence
+from torchslam.data.sequence import EndOfSequence, Frames, Sequence
 from torchslam.errors import FrameError, InitializationError, TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import CameraMeasurement
@@ -54,13 +54,6 @@ class _System(Protocol):
 
     def adopt_camera(self, camera: Camera) -> None:
         """Save the maps with a camera that was found."""
-
-
-class Frames(Protocol):
-    """The frames of a run, each read once and in order: a sequence or a `FeaturePrefetcher`."""
-
-    def __getitem__(self, index: int) -> Frame:
-        """The frame of an index."""
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,15 @@ from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.mapper import Mapper
 from torchslam.parallel.workers import with_workers
 from torchslam.system.frame_log import FrameLog, FrameStatus
-from torchslam.system.front_end import FrontEnd, check_order, check_size, image_extractor, source
+from torchslam.system.front_end import (
+    Extractor,
+    FrontEnd,
+    check_order,
+    check_size,
+    checked_extractor,
+    image_extractor,
+    source,
+)
 from torchslam.system.modes import Mode
 from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import ActiveMap, Session, SystemContext
@@ -71,6 +80,7 @@ class SLAM:
         self.has_custom_components = (
             extractor is not None or matcher is not None
         )  # unknown to worker processes
+        self.make_extractor: Callable[[], Extractor] = partial(checked_extractor, self.config, self.camera)
         self.clock = Stopwatch()
         scaled = self.scaled_config = self.config.for_size(camera.size)
         self.matcher = make_matcher(scaled.matching, matcher, camera.size, scaled.features.kind)

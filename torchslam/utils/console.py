@@ -1,4 +1,4 @@
-"""Terminal output: tables, progress bars, and the message for a missing OpenCV. Imports no torch."""
+"""Terminal output: tables, lines, progress bars, and the message for a missing OpenCV. Imports no torch."""
 
 from __future__ import annotations
 
@@ -11,6 +11,16 @@ def table(rows: Mapping[str, str]) -> str:
     """Format rows as two columns: label and value."""
     width = max(map(len, rows), default=0)
     return "\n".join(f"  {label:<{width}}   {value}" for label, value in rows.items())
+
+
+def say(words: object) -> None:
+    """Print a line to stderr."""
+    print(f"torchslam: {words}", file=sys.stderr, flush=True)
+
+
+def warn(words: object) -> None:
+    """Print a warning to stderr."""
+    say(f"warning: {words}")
 
 
 INTERVAL = 5.0

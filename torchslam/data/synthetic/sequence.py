@@ -17,7 +17,7 @@ from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.sequence import Calibrated, Reader, Sequence
 from torchslam.data.synthetic import paths
-from torchslam.data.synthetic.buildings import corridors, rooms, storey
+from torchslam.data.synthetic.buildings import corridors, rooms
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Rectangle, room, wall
 from torchslam.errors import CalibrationError, SequenceError
@@ -56,8 +56,6 @@ SCENES = {
     "loop": Scene(rooms, paths.round_the_core, 670, 720),
     # Ends before the start comes into sight: what looks like a return is none. With 720 frames it returns.
     "corridors": Scene(corridors, paths.round_the_core, 670, 560),
-    # A corridor all around with a room on the way, and 100 frames on, over the start.
-    "storey": Scene(storey, paths.round_the_storey, 1160, 1260),
 }
 
 
@@ -86,9 +84,9 @@ class SyntheticSequence(Sequence):
     """Sequence whose frames are rendered on access; deterministic for a given name."""
 
     def __init__(self, scene: str, options: RenderOptions | None = None) -> None:
-        path, frames_per_round = SCENES[scene].path, SCENES[scene].frames_per_round
-        options = RenderOptions(SCENES[scene].frames) if options is None else options
-        T_wc = path(paths.phases(options.frames, frames_per_round))
+        self._scene = SCENES[scene]
+        options = RenderOptions(self._scene.frames) if options is None else options
+        T_wc = self._scene.path(paths.phases(options.frames, self._scene.frames_per_round))
         timestamps = torch.arange(options.frames, dtype=torch.float64, device="cpu") / FRAME_RATE
         center = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         camera = Camera.pinhole(FOCAL, FOCAL, *center, size=SIZE)
@@ -100,7 +98,7 @@ class SyntheticSequence(Sequence):
         options = self._options
         if options.blank:
             return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5, dtype=torch.float32, device="cpu")
-        image = _renderer(SCENES[self.name].build, options.seed).render(self._poses_cw[index])
+        image = _renderer(self._scene.build, options.seed).render(self._poses_cw[index])
         if options.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), options.blur)
         image *= 1.0 + options.exposure * np.sin(0.1 * index)

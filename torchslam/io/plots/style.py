@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -23,7 +22,6 @@ UNCERTAIN = "#e2d2ec"
 INITIALIZING = "#f1ecdf"
 MUTED = "#7a7a7a"
 AXES_RGB = ("#d5493f", "#57a145", "#3f8fe8")  # the camera's x, y, z
-STAGES = ("#264653", "#2a9d8f", "#8ab17d", "#e9c46a", "#f4a261", "#e76f51", "#9d4e6c", "#6d6875", "#a3a3a3")
 
 _RC: dict[Any, Any] = {
     "font.size": 9.0,
@@ -66,15 +64,8 @@ def new_figure(width: float, height: float) -> Figure:
 def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG; the same figure gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(png(figure))
-
-
-def png(figure: Figure) -> bytes:
-    """A figure as PNG; the same figure gives the same bytes."""
-    buffer = io.BytesIO()
     with house_style():
-        figure.savefig(buffer, format="png", metadata={"Software": None})
-    return buffer.getvalue()
+        figure.savefig(path, format="png", metadata={"Software": None})
 
 
 def to_numpy(values: Shaped[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:

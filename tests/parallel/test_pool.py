@@ -1,0 +1,138 @@
+"""Worker processes answer calls, and are done without when they end."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from functools import partial
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchslam.errors import FrameError
+from torchslam.parallel.pool import WorkerLostError, WorkerPool
+
+PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with nothing else to do
+
+
+def wait_until_ready(pool: WorkerPool) -> None:
+    """Wait for all workers, which a run does not."""
+    for started in pool._ready:
+        started.result(PATIENCE)
+    assert pool.is_ready
+
+
+def multiplier(factor: Tensor) -> Callable[..., object]:
+    """Answers with a multiple and with what is set for the process; an empty call ends it as if it had been killed."""
+
+    def answer(number: Tensor | None) -> tuple[Tensor, int, bool, int]:
+        if number is None:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return factor * number, torch.get_num_threads(), torch.is_inference_mode_enabled(), os.nice(0)
+
+    return answer
+
+
+def fail(error: Exception) -> None:
+    raise error
+
+
+@pytest.fixture
+def pool() -> Iterator[WorkerPool]:
+    with WorkerPool(1, multiplier, torch.tensor([2.0, 3.0]), niceness=3) as found:
+        yield found
+
+
+def ask(pool: WorkerPool, *question: object) -> object:
+    call = pool.submit(*question)
+    assert call is not None
+    return pool.result(call)
+
+
+def test_calls_are_answered_by_a_process_with_the_settings_of_this_one(pool: WorkerPool) -> None:
+    wait_until_ready(pool)
+    for number in (torch.eye(2), torch.ones(2, 2).T):
+        product, *settings = ask(pool, number)
+        assert torch.equal(product, torch.tensor([2.0, 3.0]) * number)
+        assert settings == [torch.get_num_threads(), True, min(os.nice(0) + 3, 19)]
+    pool.__exit__(None, None, None)
+    assert multiprocessing.active_children() == []
+    assert pool.submit(torch.eye(2)) is None
+
+
+def test_no_call_is_accepted_before_a_worker_has_started() -> None:
+    begun = time.monotonic()
+    with WorkerPool(2, multiplier, torch.ones(1)) as pool:
+        assert not pool.is_ready
+        assert pool.submit(torch.eye(2)) is None
+    assert time.monotonic() - begun < 1  # torch alone takes longer to import
+    assert multiprocessing.active_children() == []
+    with WorkerPool(0, multiplier, torch.ones(1)) as pool:
+        assert pool.submit(torch.eye(2)) is None
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("what is this?"), FrameError("frame 3 is damaged")])
+def test_an_error_is_raised_by_the_caller_with_its_traceback(error: Exception) -> None:
+    with WorkerPool(1, partial, fail, error) as pool:
+        wait_until_ready(pool)
+        with pytest.raises(type(error), match=str(error)[:5]) as raised:
+            ask(pool)
+    assert "in fail" in str(raised.value.__cause__)
+
+
+def test_a_killed_worker_is_reported_once(pool: WorkerPool) -> None:
+    wait_until_ready(pool)
+    calls = [pool.submit(None), pool.submit(torch.eye(2))]
+    with pytest.warns(UserWarning, match="has ended: going on without it"), pytest.raises(WorkerLostError):
+        pool.result(calls[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(WorkerLostError):
+            pool.result(calls[1])
+        assert not pool.is_ready
+        assert pool.submit(torch.eye(2)) is None
+
+
+def test_a_worker_that_cannot_start_is_reported() -> None:
+    with WorkerPool(1, fail, FrameError("it has no task")) as pool:
+        until = time.monotonic() + PATIENCE
+        while not pool.is_ready:
+            assert time.monotonic() < until
+            time.sleep(0.01)
+        with pytest.warns(UserWarning, match="has ended: going on without it"):
+            assert pool.submit() is None
+
+
+needs_stop = pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="processes cannot be stopped here")
+
+
+@needs_stop
+def test_a_stopped_worker_is_given_up(pool: WorkerPool, monkeypatch: pytest.MonkeyPatch) -> None:
+    wait_until_ready(pool)
+    (process,) = multiprocessing.active_children()
+    os.kill(process.pid or 0, signal.SIGSTOP)
+    call = pool.submit(torch.eye(2))
+    assert call is not None
+    monkeypatch.setattr("torchslam.parallel.pool.RESPONSE_TIMEOUT_S", 0.2)
+    with (
+        pytest.warns(UserWarning, match="does not answer: going on without it"),
+        pytest.raises(WorkerLostError),
+    ):
+        pool.result(call)
+    assert pool.submit(torch.eye(2)) is None
+
+
+@needs_stop
+def test_a_stopped_worker_with_calls_larger_than_a_pipe_can_be_ended(pool: WorkerPool) -> None:
+    wait_until_ready(pool)
+    (process,) = multiprocessing.active_children()
+    os.kill(process.pid or 0, signal.SIGSTOP)
+    for _ in range(4):
+        assert pool.submit(torch.zeros(10_000_000)) is not None
+    pool.__exit__(None, None, None)
+    assert multiprocessing.active_children() == []

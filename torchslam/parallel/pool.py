@@ -1,0 +1,171 @@
+"""A pool of worker processes: calls are submitted now, and their results are used later.
+
+A worker is a new interpreter, which takes seconds to import everything. Calls are answered in this process until a
+worker is ready, and after one was killed or stopped.
+"""
+
+from __future__ import annotations
+
+import io
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from multiprocessing import connection, resource_tracker
+from types import TracebackType
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+RESPONSE_TIMEOUT_S = 60.0
+"""A worker that was stopped is given up after this time; a frame or a local adjustment takes less than a second."""
+
+_answer: Callable[..., object]
+"""Answers the calls, in a worker."""
+
+
+class WorkerLostError(Exception):
+    """A worker was killed or does not answer: whoever needs its result computes it."""
+
+
+class WorkerPool:
+    """Worker processes that answer calls while this is entered.
+
+    Args:
+        count: Number of processes; with 0 no call is accepted.
+        make: Called with the parts in each worker once, it returns the function that answers calls.
+        parts: Arguments of `make`, pickled as it is.
+        niceness: Of the workers, relative to this process.
+    """
+
+    def __init__(
+        self, count: int, make: Callable[..., Callable[..., object]], *parts: object, niceness: int = 0
+    ) -> None:
+        self.count = count
+        self._task = _pack((torch.get_num_threads(), niceness, make, parts))
+        self._executor: ProcessPoolExecutor | None = None
+        self._ready: list[Future[int]] = []
+
+    def __enter__(self) -> Self:
+        if self.count > 0:
+            spawn = multiprocessing.get_context("spawn")
+            self._executor = ProcessPoolExecutor(self.count, spawn, _begin, (self._task,))
+            before = multiprocessing.active_children()
+            with _without_interrupts():
+                self._ready = [self._executor.submit(os.getpid) for _ in range(self.count)]
+            self._processes = [each for each in multiprocessing.active_children() if each not in before]
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._executor is not None:
+            self._kill()
+            self._executor.shutdown()
+            self._executor = None
+
+    @property
+    def is_ready(self) -> bool:
+        """Whether calls are accepted: a worker has started, and none is lost."""
+        return self._executor is not None and any(each.done() for each in self._ready)
+
+    def submit(self, *question: object) -> Future[bytes] | None:
+        """Begin a call; None if calls are not accepted."""
+        if self._executor is None or not self.is_ready:
+            return None
+        try:
+            return self._executor.submit(_call, _pack(question))
+        except BrokenProcessPool:
+            self._lose("has ended")
+            return None
+
+    def result(self, call: Future[bytes]) -> Any:
+        """Wait for the result of a call.
+
+        Raises:
+            WorkerLostError: If there will be none.
+            Exception: What the call raised, with its traceback as the cause.
+        """
+        if not wait([call], RESPONSE_TIMEOUT_S).done:
+            self._kill()
+            self._lose("does not answer")
+            raise WorkerLostError
+        try:
+            return pickle.loads(call.result())
+        except BrokenProcessPool:
+            self._lose("has ended")
+            raise WorkerLostError from None
+
+    def _lose(self, reason: str) -> None:
+        """Accept no further call, and warn once."""
+        if self._ready:
+            warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=3)
+        self._ready = []
+
+    def _kill(self) -> None:
+        """End the workers at once, also those that are still starting or were stopped."""
+        for process in self._processes:
+            process.kill()
+
+
+@contextmanager
+def _without_interrupts() -> Iterator[None]:
+    """Start processes that ignore Ctrl-C, which this process handles."""
+    if not hasattr(signal, "pthread_sigmask"):  # not on Windows
+        yield
+        return
+    resource_tracker.ensure_running()  # its start would let signals through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+class _Pickler(pickle.Pickler):
+    """Pickles tensors as arrays, which is faster, and does not move them to shared memory as multiprocessing would."""
+
+    def reducer_override(self, value: object) -> Any:
+        if type(value) is Tensor and value.device.type == "cpu" and not value.requires_grad:
+            return torch.from_numpy, (value.numpy(),)
+        return NotImplemented
+
+
+def _pack(value: object) -> bytes:
+    packed = io.BytesIO()
+    _Pickler(packed).dump(value)
+    return packed.getvalue()
+
+
+# --- in a worker -----------------------------------------------------------------------------------------------
+
+
+def _begin(task: bytes) -> None:
+    """Make the function that answers calls."""
+    global _answer
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threads, niceness, make, parts = pickle.loads(task)
+    torch.set_num_threads(threads)
+    if hasattr(os, "nice"):  # not on Windows
+        os.nice(niceness)
+    _answer = make(*parts)
+
+
+def _end_with_parent() -> None:
+    """End when the parent was killed: it left calls that nobody waits for, and workers would wait for more."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    connection.wait([parent.sentinel])
+    os._exit(1)
+
+
+def _call(question: bytes) -> bytes:
+    with torch.inference_mode():
+        return _pack(_answer(*pickle.loads(question)))
