@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import to_toml
-from torchslam.data.calibration import write_calibration
+from torchslam.data.calibration import CALIBRATION, write_calibration
 from torchslam.data.formats.image_file import read_gray
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
@@ -39,7 +39,6 @@ OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number
 ONLINE = "online.txt"
 KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
-CALIBRATION = "calibration.txt"  # where the intrinsics were estimated from the images
 MAP = "map.safetensors"
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
 POINT_CLOUD = "map.ply"

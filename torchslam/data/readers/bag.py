@@ -21,8 +21,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.calibration_files import checked
 from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, gray_to_tensor
 from torchslam.data.sequence import Reader, Sequence
@@ -99,17 +98,15 @@ class BagSequence(Sequence):
             self._bits = max(self._bits, bit_depth([image]))
             size = size or (image.shape[1], image.shape[0])
         assert size is not None  # a topic has images
-        camera = topic.calibration if camera is None else camera
         left_out = len(order) - len(self._messages)
         super().__init__(
             path.stem,
             f"ROS bag, {topic.connection.topic}",
-            None if camera is None else fit_camera(camera, size, str(path)),
+            topic.calibration if camera is None else camera,
             torch.tensor(
                 [topic.times[message] for message in self._messages], dtype=torch.float64, device="cpu"
             ),
             size=size,
-            guessed=is_guessed(camera),
             notes=[f"left out {left_out} images whose time repeats"] if left_out else [],
         )
 

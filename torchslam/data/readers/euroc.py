@@ -11,7 +11,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.calibration_files import read_calibration, read_matrix
 from torchslam.data.formats.text_file import check_later, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence

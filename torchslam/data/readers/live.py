@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.readers.video import SUFFIXES
@@ -103,10 +103,9 @@ class LiveSequence(Sequence):
         super().__init__(
             name,
             "live",
-            None if camera is None else fit_camera(camera, size, name, pixel_aspect=aspect),
+            camera,
             torch.zeros(0, dtype=torch.float64, device="cpu"),
             size=size,
-            guessed=is_guessed(camera),
             pixel_aspect=aspect,
         )
 

@@ -19,8 +19,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.calibration import PRESETS
-from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.calibration import PRESETS, GivenCamera
 from torchslam.data.formats.frame_names import find_frames, match_pattern
 from torchslam.data.formats.text_file import in_seconds, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import (

@@ -22,7 +22,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
 from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
@@ -91,22 +91,22 @@ class VideoSequence(Sequence):
             notes.append(f"{len(times)} frames can be decoded; the file declares {promised}")
         size = (first.shape[1], first.shape[0])
         aspect = pixel_aspect(self._capture, str(path))
-        fitted = None if camera is None else fit_camera(camera, size, str(path), pixel_aspect=aspect)
-        if fitted is not None and abs(float(fitted.fy / fitted.fx) / aspect - 1) > MAX_ASPECT_ERROR:
-            notes.append(
-                f"the file says that its pixels are {aspect_text(aspect)}, wide to high, so fy should be "
-                f"{aspect:.4g} fx; the given camera has {float(fitted.fy / fitted.fx):.4g}"
-            )
         super().__init__(
             path.stem,
             "video",
-            fitted,
+            camera,
             torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64, device="cpu"),
             size=size,
-            guessed=is_guessed(camera),
             notes=notes,
             pixel_aspect=aspect,
         )
+        ratio = aspect if self._camera is None else float(self._camera.fy / self._camera.fx)
+        if abs(ratio / aspect - 1) > MAX_ASPECT_ERROR:
+            contradiction = (
+                f"the file says that its pixels are {aspect_text(aspect)}, wide to high, so fy should be "
+                f"{aspect:.4g} fx; the given camera has {ratio:.4g}"
+            )
+            self.notes = (*self.notes, contradiction)
 
     def __getstate__(self) -> dict[str, Any]:
         return super().__getstate__() | {"_capture": None, "_retriever": None}
