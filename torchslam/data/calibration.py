@@ -9,7 +9,7 @@ from pathlib import Path
 
 import torch
 
-from torchslam.data.formats.text_file import numbered_lines, parse_floats
+from torchslam.data.text_file import numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
 from torchslam.utils.files import write_whole

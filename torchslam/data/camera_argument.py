@@ -24,7 +24,7 @@ from torchslam.data.calibration import (
 )
 from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.data.formats.image_file import MAX_BYTES
-from torchslam.data.formats.text_file import parse_floats
+from torchslam.data.text_file import parse_floats
 from torchslam.errors import CalibrationError
 from torchslam.geometry.camera import Camera
 from torchslam.utils.files import read_bytes

@@ -13,8 +13,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchslam.config import Config
-from torchslam.data.formats.text_file import MAX_SECONDS
 from torchslam.data.sequence import Sequence, Transformed
+from torchslam.data.text_file import MAX_SECONDS
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures
 from torchslam.features.contract import apply_mask, check_features, check_gray

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.calibration_files import read_calibration, read_matrix
-from torchslam.data.formats.text_file import check_later, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
+from torchslam.data.text_file import check_later, numbered_lines, parse_count, parse_floats
 from torchslam.data.trajectories import checked_poses
 from torchslam.errors import SequenceError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid

@@ -40,8 +40,8 @@ from torchslam.data.formats.image_file import (
     read_gray,
     read_pixels,
 )
-from torchslam.data.formats.text_file import check_later
 from torchslam.data.sequence import Reader, Sequence
+from torchslam.data.text_file import check_later
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 from torchslam.utils.text import printable

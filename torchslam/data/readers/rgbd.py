@@ -21,7 +21,6 @@ from torch import Tensor
 
 from torchslam.data.calibration import PRESETS, GivenCamera
 from torchslam.data.formats.frame_names import find_frames, match_pattern
-from torchslam.data.formats.text_file import in_seconds, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import (
     DEFAULT_RATE,
     ImageEntry,
@@ -30,6 +29,7 @@ from torchslam.data.readers.image_sequence import (
     find_calibration,
 )
 from torchslam.data.sequence import Reader
+from torchslam.data.text_file import in_seconds, numbered_lines, parse_count, parse_floats
 from torchslam.data.trajectories import checked_poses, read_trajectory
 from torchslam.errors import SequenceError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
