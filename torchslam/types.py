@@ -124,7 +124,7 @@ class FrameFeatures:
         mask: as in `Features`.
         T_cw_groundtruth: as in `Frame`.
         session: number of the run over the same map, from 0.
-        information: as in `KeypointNoise`, of the keypoints; (N, 0) if the front end gives none.
+        information: as in `KeypointNoise`, of the keypoints; (N, 0) if the feature extractor gives none.
         image: gray, if the matcher wants it.
         backlog: as in `Frame`.
     """

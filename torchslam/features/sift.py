@@ -1,4 +1,4 @@
-"""SIFT of OpenCV behind the interface of `ORB`: a front end with descriptors of floats that needs no weights.
+"""SIFT of OpenCV behind the interface of `ORB`: a feature extractor with descriptors of floats that needs no weights.
 
 Lowe: Distinctive image features from scale-invariant keypoints (IJCV 2004). Descriptors are root-normalized:
 Arandjelovic and Zisserman: Three things everyone should know to improve object retrieval (CVPR 2012).

@@ -121,7 +121,7 @@ NO_KEY = -1
 
 _CHUNK = 1 << 17  # pairs of codes that are compared at once: what a processor's cache holds
 _FIRST_CAPACITY = 64
-_MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a float front end
+_MIN_FLOAT_WORDS = 64  # below, an image is too empty to name the words of a float feature extractor
 
 
 class KeyframeDatabase:

@@ -40,7 +40,7 @@ class Map:
         keyframes: One row per keyframe, see `table.KEYFRAMES`.
         images: Of the keyframes, by key, if the matcher needs them; not saved.
         version: Changes when rows are renumbered.
-        noise_variance: Of keypoints, at least 1, in units of what the front end states; poses are judged by it.
+        noise_variance: Of keypoints, at least 1, in units of what the feature extractor states; poses are judged by it.
     """
 
     def __init__(self) -> None:
@@ -362,7 +362,7 @@ class Map:
         """Update the variance of keypoints by the squared errors of an adjustment, in units of the stated noise.
 
         A moving average of medians: a tenth of outliers does not matter. The first adjustments weigh more; the prior,
-        that the front end states the truth, counts as much as `_PRIOR_ADJUSTMENTS` of them.
+        that the feature extractor states the truth, counts as much as `_PRIOR_ADJUSTMENTS` of them.
         """
         if len(squared_errors) == 0:
             return

@@ -204,7 +204,7 @@ class RunGraph(ObservationGraph):
         frame_ids: index of each frame in the sequence of its session.
         sessions: session of each frame.
         point_ids: row of each point in the submap's map.
-        keypoint_index: row of each observation among the frame's features, to read its pixels anew from a front end.
+        keypoint_index: row of each observation among the frame's features, to read its pixels anew from an extractor.
     """
 
     frame_ids: Int[Tensor, " K"]

@@ -275,7 +275,7 @@ def nearest_by_cosine(
 
 
 def _used(mask: Bool[Tensor, "B N"]) -> int:
-    """Number of rows up to the last one that some element uses, at least one: front ends pad at the end."""
+    """Number of rows up to the last one that some element uses, at least one: feature extractors pad at the end."""
     used = torch.nonzero(mask.any(0))
     return int(used[-1]) + 1 if len(used) else 1
 
