@@ -84,7 +84,7 @@ def test_a_third_session_relocalizes_in_both_earlier_ones(
     slam.save(tmp_path / "grown")
     third = SLAM.load(tmp_path / "grown", config_of(), mapping=False)
     assert len(third.loop_closer.keyframe_database) == slam.map.num_keyframes
-    assert third.step(SEEN[45]).reason == "found again"
+    assert third.step(SEEN[45]).reason == "relocalized"
 
 
 def columns_of(slam: SLAM) -> list[tuple[str, str, torch.Tensor]]:

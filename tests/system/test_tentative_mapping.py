@@ -12,11 +12,10 @@ from torch import Tensor
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, evaluate, load_config
-from torchslam.system import state_machine as following
+from torchslam.system import state_machine
 from torchslam.system.front_end import Simulated
 from torchslam.system.local_mapping import TentativeMapping
-from torchslam.tracking import backward_tracking as backwards
-from torchslam.tracking import pose_validation
+from torchslam.tracking import backward_tracking, pose_validation
 from torchslam.tracking.non_static import NO_MOVEMENT
 from torchslam.types import Reason, Rejection
 
@@ -54,7 +53,7 @@ def doubting(
         assert slam.last_frame is not None
         return odd if slam.last_frame[0] in frames else None
 
-    monkeypatch.setattr(following, judge, why)
+    monkeypatch.setattr(state_machine, judge, why)
     return slam
 
 
@@ -131,7 +130,7 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(
 ) -> None:
     """Without new points a moving camera would be lost before it is clear what moves; most of the image may not."""
     slam = doubting(monkeypatch, DOUBTED, "check_map_agreement")
-    monkeypatch.setattr(following, "check_map_agreement", lambda *_: None)
+    monkeypatch.setattr(state_machine, "check_map_agreement", lambda *_: None)
     moving = replace(NO_MOVEMENT, rejection=Rejection(rejection, {"count": 30}))
     monkeypatch.setattr(
         slam.non_static_filter,
@@ -180,7 +179,7 @@ def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_commit
 ) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
-    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD)
+    monkeypatch.setattr(backward_tracking, "check_map_agreement", lambda *_: ODD)
     shown(slam, walk)
     assert len(slam.trajectory()) == len(walk)
     assert int(slam.map.keyframes["frame_index"].min()) < LATE
@@ -192,14 +191,14 @@ def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_commit
 def test_unconfirmed_backward_tracking_is_rolled_back(monkeypatch: pytest.MonkeyPatch) -> None:
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
-    monkeypatch.setattr(backwards, "check_map_agreement", lambda *_: ODD)
+    monkeypatch.setattr(backward_tracking, "check_map_agreement", lambda *_: ODD)
     grown: list[int] = []
 
     def check_pose_quality(*_: object) -> Rejection | None:
         grown.append(slam.map.num_keyframes)
         return ODD if len(grown) > LATE // 2 else None
 
-    monkeypatch.setattr(backwards, "check_pose_quality", check_pose_quality)
+    monkeypatch.setattr(backward_tracking, "check_pose_quality", check_pose_quality)
     shown(slam, walk)
     assert grown[-1] > grown[0]
     first = int(slam.map.keyframes["frame_index"][0])

@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
 from torchslam.config import Config, PoseValidationConfig
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.tracking import backward_tracking as backwards
+from torchslam.tracking import backward_tracking
 from torchslam.tracking.backward_tracking import (
     MAX_CONSECUTIVE_FAILURES,
     GapLink,
@@ -79,7 +79,7 @@ def doubting(monkeypatch: pytest.MonkeyPatch, doubtful: Container[int]) -> None:
     """The frames that come as these to be judged, from the first on, seem strange."""
     confirming = count()
     monkeypatch.setattr(
-        backwards, "check_map_agreement", lambda *_: ODD if next(confirming) in doubtful else None
+        backward_tracking, "check_map_agreement", lambda *_: ODD if next(confirming) in doubtful else None
     )
 
 

@@ -33,7 +33,7 @@ def swung(degrees: float) -> Tensor:
     return T_cw
 
 
-def young(T_cw: Tensor, age: int = CHECK_INTERVAL) -> ProvisionalMap:
+def provisional_map(T_cw: Tensor, age: int = CHECK_INTERVAL) -> ProvisionalMap:
     """A submap with a frame at the origin and one at SIDE that the map has at T_cw, in its own frame."""
     submap = submap_of_scene(SCENE, torch.stack([pose(), SIDE]))
     own = pose(0.3, -0.2, 1.0, 0.5, 0.1, -0.4)
@@ -58,17 +58,17 @@ def supported(start: TwoViewMap, T_21: Tensor) -> float:
 
 
 def test_a_consistent_map_has_no_contradicting_initialization(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert young(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
+    assert provisional_map(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
     looked: list[FrameFeatures] = []
     monkeypatch.setattr(Initializer, "step", lambda _, view: looked.append(view))
-    assert young(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
+    assert provisional_map(SIDE).find_contradicting_initialization(CAMERA, Config()) is None
     assert not looked  # it explains more than half of the matches: no motion can have twice as much support
-    assert young(swung(60)).find_contradicting_initialization(CAMERA, Config()) is None
+    assert provisional_map(swung(60)).find_contradicting_initialization(CAMERA, Config()) is None
     assert len(looked) == 2
 
 
 def test_the_initialization_that_contradicts_a_wrong_map_has_the_true_motion() -> None:
-    start = young(swung(60)).find_contradicting_initialization(CAMERA, Config())
+    start = provisional_map(swung(60)).find_contradicting_initialization(CAMERA, Config())
     assert start is not None
     wanted = SIDE.clone()
     wanted[:3, 3] /= SIDE[:3, 3].norm()
@@ -78,13 +78,13 @@ def test_the_initialization_that_contradicts_a_wrong_map_has_the_true_motion() -
 
 @pytest.mark.parametrize("age", range(1, 2 * CHECK_INTERVAL + 1))
 def test_every_few_frames_are_checked(age: int) -> None:
-    assert (young(swung(60), age).find_contradicting_initialization(CAMERA, Config()) is not None) is (
-        age % CHECK_INTERVAL == 0
-    )
+    assert (
+        provisional_map(swung(60), age).find_contradicting_initialization(CAMERA, Config()) is not None
+    ) is (age % CHECK_INTERVAL == 0)
 
 
 def test_frames_without_initialization_contradict_nothing() -> None:
-    provisional = young(swung(60))
+    provisional = provisional_map(swung(60))
     provisional.views[1] = SCENE.view(1, pose())
     assert provisional.find_contradicting_initialization(CAMERA, Config()) is None
 
@@ -94,7 +94,7 @@ def test_a_map_with_less_than_half_of_the_support_is_contradicted() -> None:
     for degrees in torch.linspace(2.5, 4.5, 21).tolist():
         T_21 = swung(degrees)
         share = supported(start, T_21) / supported(start, start.T_cw)
-        contradicted = young(T_21).find_contradicting_initialization(CAMERA, Config()) is not None
+        contradicted = provisional_map(T_21).find_contradicting_initialization(CAMERA, Config()) is not None
         assert contradicted is (share < MIN_SUPPORT_RATIO)
         if abs(share - 0.5) < 0.1:
             decided.add(contradicted)

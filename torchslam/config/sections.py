@@ -29,7 +29,7 @@ REDUCTION_TOLERANCE = 1.6
 
 @dataclass(frozen=True)
 class CameraConfig(Settings, section="camera"):
-    """The given camera, which the final bundle adjustment takes for a measurement."""
+    """The given camera, which the final bundle adjustment uses as a prior."""
 
     std: float = setting(
         0.02,

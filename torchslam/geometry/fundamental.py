@@ -25,7 +25,7 @@ _LEAST_NOISE = (
 )
 _MAD = 0.6745  # median of the absolute value of a standard normal variable
 _FREEDOMS = 7
-# Added to the information, relative to its mean: of a plane or a turning camera, two directions have none, and their
+# Added to the information, relative to its mean: of a plane or a rotating camera, two directions have none, and their
 # covariance shall be large, not infinite.
 _LEAST_INFORMATION = 1e-12
 # Of a homography: random samples of four matches, so that of matches half of which lie on the plane 98 % have a good

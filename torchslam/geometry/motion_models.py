@@ -40,10 +40,10 @@ _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for
 # an essential matrix finds many by accident.
 _HOPELESS, _MANY = 0.25, 50
 _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
-# How far the matches have to lean towards their epipolar lines: by so many deviations, two more than a direction needs
-# that was not chosen to fit; and on average as where the variance along the lines is twice that across, since the noise
-# of keypoints on edges has a direction of its own.
-_CERTAIN, _NOTABLE = 4.0, 1 / 3
+# Alignment of the errors with the epipolar lines: by so many deviations, two more than a direction needs that was not
+# chosen to fit; and on average as where the variance along the lines is twice that across, since the noise of keypoints
+# on edges has a direction of its own.
+_MIN_LEAN_SIGMAS, _MIN_LEAN = 4.0, 1 / 3
 # Squared deviations by which the five parameters of an essential matrix, fitted, beat the true one in one case of a
 # hundred (chi-square).
 _GAIN_OF_A_FIT = 15.09
@@ -117,7 +117,7 @@ def fit_models(
     fits = replace(rough, H=H, R_only=R_only).with_mappings(views)
     if not bool(hopeless.any()):
         return fits
-    # As alone, whoever else is in the batch.
+    # Independent of the other elements of the batch.
     row = hopeless[:, None, None]
     H, R_only = torch.where(row, rough.H, fits.H), torch.where(row, rough.R_only, fits.R_only)
     return Fits(R, t, H, R_only, torch.where(hopeless[:, None], rough.squared, fits.squared))
@@ -183,7 +183,7 @@ def _leans(
     lean = torch.where(near, weight * cosine, 0.0).sum(-1)
     # One more, that matches far below the noise, whose errors are rounding, are not enough.
     deviation = (0.5 * weight.square().sum(-1) + 1).sqrt()
-    return (lean > _NOTABLE * weight.sum(-1)) & (lean > _CERTAIN * deviation)
+    return (lean > _MIN_LEAN * weight.sum(-1)) & (lean > _MIN_LEAN_SIGMAS * deviation)
 
 
 def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:

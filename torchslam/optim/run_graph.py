@@ -1,4 +1,4 @@
-"""What a run leaves behind, as one differentiable problem: the answer is differentiated, not the path to it.
+"""The observation graph of a run as one differentiable least-squares problem: its minimum is differentiated.
 
 The trajectory of a finished run minimizes the reprojection errors of its observation graph. However many frames
 and discrete choices led there, its gradient with respect to every pixel, weight and camera parameter is that of the
@@ -95,7 +95,7 @@ class ObservationGraph:
 
     @property
     def submaps(self) -> list[int]:
-        """The submaps that there are, ascending."""
+        """The numbers of the submaps, ascending."""
         return [
             int(submap) for submap in torch.unique(self.submap)
         ]  # `tolist` fails in transforms of torch 2.5
@@ -156,7 +156,7 @@ class ObservationGraph:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
 
     def _check(self) -> None:
-        """Raises ValueError where a column does not fit the others, or names rows that there are not."""
+        """Raises ValueError where a column does not fit the others, or has indices out of range."""
         rows = {"K": len(self.T_cw), "N": len(self.points_w), "O": len(self.pixels)}
         for name, (owner, shape, kind) in self._SCHEMA.items():
             column = getattr(self, name)
@@ -178,7 +178,7 @@ class ObservationGraph:
         params = self.camera.params
         check_dtypes(camera=params)
         if params.ndim != 1 or not bool(params.isfinite().all()) or not bool((params[:2] > 0).all()):
-            raise ValueError("the camera's parameters are none")
+            raise ValueError("the camera's parameters are invalid")
         if self.calibration is not None:
             given = self.calibration.camera.params, self.calibration.directions
             check_dtypes(camera=params, calibration=given[0], directions=given[1])

@@ -315,7 +315,7 @@ class LostState:
         context.tracker.start_at_estimate(submap, view, estimate)
         context.active_map.activate(submap, State.UNCERTAIN)
         context.confirmation.start_after_relocalization(view, estimate, submap.tracking)
-        return FrameOutcome([Reason.FOUND_AGAIN], submap, estimate)
+        return FrameOutcome([Reason.RELOCALIZED], submap, estimate)
 
 
 class StateMachine:

@@ -256,7 +256,7 @@ atexit.register(close_sources)
 class CaptureClock:
     """Capture times on our clock: by the source's own clock, from the first frame on, as long as that runs with ours.
 
-    A frame's arrival wavers with the network and with what else the machine does; the source's clock does not.
+    Arrival times jitter with the network and the load of the machine; the source's clock does not.
     """
 
     def __init__(self) -> None:

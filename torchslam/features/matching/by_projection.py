@@ -140,7 +140,7 @@ def nearest_per_row(
         found = _nearest_of_pairs_numpy(*pairs, scales.detach().numpy(), ratio, limit)
         return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2]).float()
     columns = len(scales)
-    # One number for distance and column: the least is the nearest, of equals that of the lowest column.
+    # One number for distance and column: the least is the nearest; ties go to the lowest column.
     keys = distance * columns + column
     unset = (int(limit) + 1) * columns
     best = row.new_full((rows,), unset).scatter_reduce_(0, row, keys, "amin")
@@ -254,7 +254,7 @@ def _nearest_of_pairs_numpy(
     is_first[0], is_first[1:] = True, row[1:] != row[:-1]
     starts = np.flatnonzero(is_first)
     columns = len(scales)
-    # One number for distance and column: the least is the nearest, of equals that of the lowest column.
+    # One number for distance and column: the least is the nearest; ties go to the lowest column.
     keys = distance * columns + column
     best = np.minimum.reduceat(keys, starts)
     nearest, chosen = np.divmod(best, columns)
