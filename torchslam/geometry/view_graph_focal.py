@@ -45,8 +45,8 @@ _MAX_STD = 0.1  # relative; as in `calibration.intrinsics`, beyond it a focal le
 _RISE = 9.0  # of the cost, three deviations, that any focal length further away than three times `_MAX_STD` must have
 _MIN_MATCHES = 20  # of a pair: the noise of fewer cannot be told
 # Of the matches, that one homography explains: pairs beyond it have no information, however certain their matrix seems.
-# Planes and rotating cameras with simulated noise have 0.92 to 1; 90 % of the pairs of each of nine recordings have less
-# than 0.75, most half of that.
+# Planes and rotating cameras with simulated noise have 0.92 to 1. Of the pairs of each of nine recordings, 90 % have
+# less than 0.75, most half of that.
 _MAX_HOMOGRAPHY_SHARE = 0.8
 
 
