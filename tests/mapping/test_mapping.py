@@ -86,7 +86,7 @@ def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     near = project_points(
         slam.map, slam.map.valid_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
     )
-    pairs = match_projected_points(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching), ratio=0.9)
+    pairs = match_projected_points(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching))
     ids, keypoints = pairs.first, pairs.second
     assert len(ids) > 150
     assert len(torch.unique(keypoints)) == len(keypoints)

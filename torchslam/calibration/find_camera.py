@@ -135,6 +135,7 @@ def describe_calibration(found: CameraMeasurement) -> str:
 # ratio with a relative cost decrease.
 MIN_SIGMAS, MIN_RATIO = 3.0, 0.01
 LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02
+"""As `MIN_RATIO`, and the ratio by which the cost must fall then. Tried at these values only."""
 REMEDY = "--refine-camera looks for a better one"
 CONSEQUENCE = "poses and map may be badly wrong with it"
 DEGENERATE = "pure rotation, straight motion and planes do not determine it"

@@ -29,9 +29,11 @@ PLACES = 20
 OFFSETS = 0, 2, 5, 12, 30
 """Images of a place, in frames from its first: some pairs have a parallax at any speed and frame rate."""
 NUM_KEYPOINTS = 1500
+"""SIFT keypoints of an image, for matches between images 30 frames apart. Tried at this value only."""
 THRESHOLD_PX = 1.0
 """Distance from the epipolar line; as fundamental matrices of SIFT are usually estimated."""
 CONFIDENCE, MAX_SAMPLES = 0.9999, 2000
+"""Of MAGSAC, and its largest number of samples. Tried at these values only."""
 MIN_MATCHES = 40
 """Matches that agree with a fundamental matrix: its noise is known then."""
 MAX_PAIRS = 100

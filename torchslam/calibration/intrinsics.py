@@ -187,6 +187,7 @@ def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
 
 KERNEL_SCALE = 2.45  # as in `solve_graph`: ends the quadratic part at 95 % of a Gaussian
 TOLERANCE = 1e-6
+"""Relative reduction of the cost at which the adjustment stops; far below `MIN_COST_DECREASE`."""
 ITERATIONS = 400  # 200 are needed if all depths change with a focal length that is far off
 MIN_FRAMES = 24  # frames of the problem, if available
 

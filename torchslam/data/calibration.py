@@ -15,6 +15,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.utils.files import write_whole
 
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
+"""Numbers of parameters that a text may have, by camera model."""
 NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
 
 Size = tuple[int, int]
@@ -191,6 +192,7 @@ def _first_line(path: Path) -> tuple[int, str]:
 
 
 VGA = (640, 480)
+"""Image size of several datasets, pixels."""
 
 
 def _published(size: Size, *numbers: float) -> Calibration:

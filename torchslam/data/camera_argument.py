@@ -30,7 +30,9 @@ from torchslam.geometry.camera import Camera
 from torchslam.utils.files import read_bytes
 
 EXIF_BLOCK = 0x8769
+"""Tag of the block of camera data (EXIF 2.32)."""
 FOCAL_LENGTH_35MM = 0xA405
+"""Tag of the focal length of a 35 mm film camera with the same diagonal field of view, mm (EXIF 2.32)."""
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # millimeters
 
 

@@ -174,6 +174,7 @@ MAX_ENTRIES = 10_000
 MAX_FOLDERS = 200
 """Maximum number of subfolders searched for suggestions."""
 SHOWN = 6
+"""Names in a message, which stays short."""
 
 
 def _not_found_message(path: str) -> str:

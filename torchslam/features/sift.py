@@ -44,6 +44,7 @@ By the median residuals of runs over shelf_bin, fr2_desk_20, redkitchen, machine
 0.5 px up to size 8, and 0.03 to 0.06 of the size beyond. With 1.0, gates are so narrow that shelf_bin is soon lost."""
 
 DESCRIPTOR_FLOATS = 128
+"""Numbers of a descriptor: 4 x 4 cells of 8 directions (Lowe, 2004)."""
 
 Array = NDArray[Any]
 

@@ -28,10 +28,13 @@ from torchslam.geometry.two_view import (
 
 MODELS = ("essential", "homography", "rotation")
 ESSENTIAL, HOMOGRAPHY, ROTATION = range(3)
+"""Rows of the models, in the order of `MODELS`."""
 
 FINAL_ITERATIONS = 12
+"""Of Levenberg-Marquardt, for the model that is chosen. Tried at this value only."""
 FINAL_WIDTH = 2.0  # thresholds; the refinement uses the tail of the noise too
 _HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
+"""Minimal samples of a homography and of a rotation. Tried at these values only."""
 _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line

@@ -43,6 +43,7 @@ Model = Literal["auto", "essential"]
 
 KERNEL_WIDTH = 1.5  # deviations of the noise, which for keypoints has a long tail, at which the kernel begins
 _KERNEL_ITERATIONS = 20
+"""Of Levenberg-Marquardt with the robust kernel. Tried at this value only."""
 _LEAST_NOISE = 1 / 64  # thresholds; of exact matches
 
 

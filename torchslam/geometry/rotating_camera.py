@@ -21,6 +21,7 @@ from torchslam.geometry.robust import robustify
 
 _STARTS = 3  # focal lengths, over twice the standard deviation to both sides; the best result counts
 _ITERATIONS = 10
+"""Of Levenberg-Marquardt from each start. Tried at this value only."""
 _KERNEL_SCALE = 2.0  # thresholds at which the Huber kernel becomes linear
 _BEHIND = 1e3  # squared thresholds: the cost of a match that turns behind the camera
 

@@ -47,6 +47,7 @@ MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
 DEPTHS = Path("dense") / "depths.safetensors"  # of keyframes of the main submap
 PICTURES = Path("dense") / "pictures"
 PICTURE_NAMES = "[0-9]" * 6 + ".png"
+"""Pattern of the names of depth pictures: six digits of the frame."""
 CONFIG = "config.toml"
 METRICS = "metrics.json"
 FRAMES = "frames.csv"

@@ -178,9 +178,7 @@ def match_by_sim3_pose(
     view = other.frame_features(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
-    pairs = match_projected_points(
-        slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=0.9
-    )
+    pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching))
     return pairs.first, pairs.second
 
 

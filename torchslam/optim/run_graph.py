@@ -38,7 +38,9 @@ POSE_ITERATIONS = 30
 """Enough where no gradient is wanted: poses settle long before the choice of outliers that gradients depend on."""
 
 _FRAMES_AT_ONCE = 64
+"""Frames whose poses are refined in one batch, which bounds the memory."""
 _MAX_BYTES = 1 << 34
+"""Largest file that is read."""
 _MAX_SIDE = 1 << 26  # of an image, pixels
 # Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
 _MAX_SIZE_RATIO = 2.0

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchslam.config import MatchingConfig
 from torchslam.features import match
+from torchslam.features.matching.by_projection import PROJECTION_RATIO
 from torchslam.geometry import Camera, transform
 from torchslam.map.map import Map
 from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
@@ -99,7 +100,6 @@ def match_projected_points(
     view: FrameFeatures,
     radius_px: float,
     matcher: Matcher,
-    ratio: float | None,
 ) -> MatchIndices:
     """Point ids and keypoints that match within a radius around the projection, one to one.
 
@@ -108,7 +108,7 @@ def match_projected_points(
     if len(projected.ids) == 0:
         return MatchIndices(projected.ids, projected.ids)
     expected = expected_view(slam_map, projected, view)
-    pairs = run_matcher(matcher, expected, view, MatchPrior(radius_px * projected.scales, ratio))
+    pairs = run_matcher(matcher, expected, view, MatchPrior(radius_px * projected.scales, PROJECTION_RATIO))
     return replace(pairs, first=projected.ids[pairs.first])
 
 

@@ -108,12 +108,10 @@ class Tracker:
         if settings.guided_matching:
             alive = tracking.last_inlier_points[slam_map.points["is_valid"][tracking.last_inlier_points]]
             near = self.localizer.project(slam_map, alive, T_cw, view)
-            yield match_projected_points(
-                slam_map, near, view, settings.search_radius_px, self.matcher, ratio=0.9
-            )
+            yield match_projected_points(slam_map, near, view, settings.search_radius_px, self.matcher)
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
             wide = settings.search_radius_px * settings.wide_radius_factor
-            yield match_projected_points(slam_map, local, view, wide, self.matcher, ratio=0.9)
+            yield match_projected_points(slam_map, local, view, wide, self.matcher)
         else:
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)

@@ -23,6 +23,7 @@ from torchslam.geometry.transforms import HALF_PIXEL
 from torchslam.utils.files import JSON_BYTES
 
 MAX_BYTES = 1 << 18
+"""Largest file that is read; those of calibration programs have kilobytes."""
 LARGEST = 1e12  # JSON numbers may have any number of digits
 FISHEYES = (
     *("equidistant", "fisheye", "opencv_fisheye"),

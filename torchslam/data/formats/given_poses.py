@@ -41,6 +41,7 @@ MODEL_NAMES = {
     9: "RADIAL_FISHEYE",
 }
 _MAX_BYTES = 1 << 30
+"""Largest model that is read; a frame with 10,000 keypoints takes 240 kB of it."""
 _POINT_BYTES = 24  # of an observation in images.bin
 _ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 

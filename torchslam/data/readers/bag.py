@@ -36,9 +36,11 @@ SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 MAX_MESSAGES = 2_000_000
+"""Largest number of images: more than a day at 20 Hz."""
 MAX_RECORDING, MAX_METADATA = 1 << 44, 1 << 22
 """Bytes of a recording, and of the text that describes it."""
 MAX_FILES = 10_000
+"""Files of a recording that are looked at: six days, one each minute."""
 SAMPLES = 20
 """Images in which the brightest pixel is looked for, where they have 16 bits."""
 

@@ -22,6 +22,7 @@ from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.types import Trajectory
 
 NANOSECONDS = 1_000_000_000
+"""Unit of the times in the files, per second."""
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 

@@ -37,6 +37,7 @@ SUFFIXES = frozenset(
 )
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
 MAX_BYTES = 1 << 40
+"""Largest file that is read."""
 MAX_FRAMES = 2_000_000
 """Maximum number of frames: 18 hours at 30 frames per second."""
 QUIET = 2.0
@@ -238,9 +239,12 @@ def _rising(times: Iterable[float]) -> Iterator[int]:
 
 CONTAINERS = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 HEADER, LARGE_HEADER = 8, 16
+"""Bytes of the header of a box, with a size of 32 and of 64 bits (ISO/IEC 14496-12, 4.2)."""
 DEPTH = 8  # moov, trak, mdia, minf, stbl are five
 MAX_BOXES = 1_000_000
+"""Boxes that are looked at, which bounds the time for a damaged file."""
 RUNS_AT_ONCE = 1 << 16
+"""Runs of equal durations that are read at once, 8 bytes each."""
 
 
 def claimed_samples(path: Path) -> int:

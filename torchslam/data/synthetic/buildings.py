@@ -28,7 +28,9 @@ import numpy as np
 from torchslam.data.synthetic.scene import Painter, Rectangle, Vector, X, Y, Z
 
 HEIGHT = 2.8
+"""Meters from floor to ceiling."""
 FLOOR = HEIGHT / 2
+"""y of the floor, meters; y points down, and the camera moves at half the height."""
 TOP = np.array((0.0, -HEIGHT / 2, 0.0))
 """y points down, and is 0 half-way up."""
 PARTITION = 0.1
@@ -43,6 +45,7 @@ ROOMS_CORE = 1.3
 ROOMS_DOOR = (-3.4, -1.95)
 """Begin and end of the door along x."""
 ROOMS_DOOR_TOP = -0.7
+"""y of the upper edge of the doors, meters."""
 SIZE_SPREAD = 0.12
 """Furniture is up to that share larger or smaller ..."""
 TURN_SPREAD = 0.15
@@ -75,6 +78,7 @@ STOREY_ROOM = (0.4, 4.1, -2.4, 2.4)
 STOREY_DOOR = (-0.6, 0.6)
 """Begin and end of the door along z."""
 STOREY_DOOR_TOP = -0.75
+"""y of the upper edge of the doors, meters."""
 PLAIN = 0.03
 """Coverage of a wall of the corridor by the largest shapes: an eighth of that of other surfaces."""
 BOARD_EVERY = 3.2
@@ -82,6 +86,7 @@ BOARD_EVERY = 3.2
 BOARD = (0.6, 0.9, 0.03)
 """Width, height and depth of one: up to that share larger or smaller by `SPREAD`."""
 SPREAD = 0.3
+"""Meters along the wall, and ratio of the size, by which a notice board differs from the regular one."""
 
 STOREY_FURNITURE = (
     (
