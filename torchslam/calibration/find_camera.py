@@ -132,10 +132,9 @@ def describe_calibration(found: CameraMeasurement) -> str:
 
 
 # The images contradict a given focal length if it is off by this many standard errors and this ratio, or by a larger
-# ratio with a relative cost decrease.
+# ratio with a relative cost decrease. Tried at these values only.
 MIN_SIGMAS, MIN_RATIO = 3.0, 0.01
-LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02
-"""As `MIN_RATIO`, and the ratio by which the cost must fall then. Tried at these values only."""
+LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02  # the larger ratio and the decrease
 REMEDY = "--refine-camera looks for a better one"
 CONSEQUENCE = "poses and map may be badly wrong with it"
 DEGENERATE = "pure rotation, straight motion and planes do not determine it"

@@ -51,6 +51,10 @@ _MIN_LEAN_SIGMAS, _MIN_LEAN = 4.0, 1 / 3
 # hundred (chi-square).
 _GAIN_OF_A_FIT = 15.09
 _PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
+# Ratio of the support of the second motion before a plane to that of the first, above which either may be the right
+# one; and entries of two rotations that differ by less are those of one motion, to 0.06 degrees. Tried at these values
+# only.
+_MAX_SECOND_SUPPORT, _SAME_ROTATION = 0.8, 1e-3
 _TELLS_MOTIONS = 3.0  # deviations by which one of two motions before a plane has to explain more
 # Of the matches on a plane, which noise may turn over where it is seen edge on; and of those with parallax.
 _IN_FRONT = 0.9
@@ -279,14 +283,14 @@ def pose_of(
     of_match = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0)
     support = torch.where(possible, of_match.sum(-1), -1.0)
     (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
-    ambiguous = second > 0.8 * first.clamp_min(0.0)
+    ambiguous = second > _MAX_SECOND_SUPPORT * first.clamp_min(0.0)
     index = torch.arange(len(model), device=model.device)
     if by_noise:
         deviation = (of_match[index, order[0]] - of_match[index, order[1]]).norm(dim=-1)
         ambiguous |= (second >= 0) & (first - second < _TELLS_MOTIONS * deviation)
     best = order[0]
     flat = model == HOMOGRAPHY
-    apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > 1e-3
+    apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > _SAME_ROTATION
     R = torch.where(flat[:, None, None], R_H[index, best], R_E)
     t = torch.where(flat[:, None], direction[index, best], t_E)
     still = model == ROTATION
