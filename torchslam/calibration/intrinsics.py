@@ -39,7 +39,7 @@ MIN_COST_DECREASE = 0.02
 # of a lens without visible distortion. Tried at these values only.
 PRINCIPAL_POINT_STD, K1_STD = 0.01, 0.05
 NUM_PARTS, PART_KEYFRAMES = 4, 6
-"""Parts of the trajectory, and minimum keyframes of each: fewer hardly determine a focal length. Tried at these only."""
+"""Parts of the trajectory, and minimum keyframes of each: fewer hardly determine a focal length. Tried only so."""
 UNCHECKED_FACTOR = 2.0
 """On the formal error of a trajectory too short to be split: the least by which parts of real sequences disagree."""
 BOUNDS = 0.3, 5.0
