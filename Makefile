@@ -50,9 +50,10 @@ fuzz: $(INSTALLED_DEV)  ## feed tens of thousands of invalid inputs to every rea
 mutation: $(INSTALLED_MUTATION)  ## mutation testing of the system layer: how many mutants do the tests detect?
 	$(BIN)/python -m tests.mutation --sample $(SAMPLE) --seed $(SEED)
 
-lint: $(INSTALLED_DEV) types  ## ruff and mypy
+lint: $(INSTALLED_DEV) types  ## ruff, mypy and the layers of pyproject.toml
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports --no-cache
 
 types: $(INSTALLED_DEV)  ## mypy alone
 	$(BIN)/mypy

@@ -1,4 +1,4 @@
-"""A custom front end and matcher:
+"""A custom feature extractor and matcher:
 
 torchslam run IMAGES -o results --features examples.own_front_end:Patches --matcher examples.own_front_end:nearest
 """

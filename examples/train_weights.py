@@ -110,7 +110,7 @@ def is_main() -> bool:
 
 
 class Data:
-    """The clips that find a map, and their graphs by the front end before the training."""
+    """The clips that find a map, and their graphs by the feature extractor before the training."""
 
     def __init__(self, clips: Clips, clip_slam: ClipSLAM) -> None:
         self.graphs = GraphCache(clip_slam)
@@ -135,17 +135,17 @@ def train(
     save_every: int = 10,
     log: Log | None = None,
 ) -> Training:
-    """Train from the checkpoint, if there is one, on all processes of the group; the module is the front end.
+    """Train from the checkpoint, if there is one, on all processes of the group; the module is the feature extractor.
 
     held_back: clips whose mean loss is logged, too, at the start and with every checkpoint
     """
     rank, ranks = (dist.get_rank(), dist.get_world_size()) if dist.is_initialized() else (0, 1)
     torch.manual_seed(0)
-    front_end = Weighed()
-    clip_slam = ClipSLAM(front_end)
+    extractor = Weighed()
+    clip_slam = ClipSLAM(extractor)
     data, other = Data(clips, clip_slam), None if held_back is None else Data(held_back, clip_slam)
     loss = Loss(clip_slam, supervised)
-    training = Training(front_end, torch.optim.Adam(front_end.parameters(), 3e-3), steps, log=log)
+    training = Training(extractor, torch.optim.Adam(extractor.parameters(), 3e-3), steps, log=log)
     training.resume(checkpoint)
     module = DistributedDataParallel(loss) if ranks > 1 else loss
     batches = Batches(len(data.usable), batch // ranks, first=training.step, rank=rank, ranks=ranks)

@@ -1,4 +1,4 @@
-"""Front ends with features cached on disk, for many runs over the same images.
+"""Feature extractors with features cached on disk, for many runs over the same images.
 
 torchslam run IMAGES -o results --features experiments.cached_features:XFeat --weights xfeat.safetensors
 """
@@ -20,7 +20,7 @@ FOLDER = Path(os.environ.get("TORCHSLAM_CACHED_FEATURES", "results/cached_featur
 
 
 class Cached(nn.Module):
-    """A front end of torchslam that reads cached features of known images.
+    """A feature extractor of torchslam that reads cached features of known images.
 
     Floating-point descriptors are stored in half precision, everything else exactly.
     """
@@ -29,13 +29,13 @@ class Cached(nn.Module):
 
     def __init__(self, num_keypoints: int = 1000, weights: str | None = None) -> None:
         super().__init__()
-        self.front_end = extractor(self.kind, num_keypoints, weights)
+        self.extractor = extractor(self.kind, num_keypoints, weights)
         self.key = repr((self.kind, num_keypoints, Path(weights or "").name)).encode()
 
     def forward(self, images: Tensor, mask: Tensor | None = None) -> Features:
         """(B, 1, H, W) to features; with a mask nothing is cached."""
         if mask is not None:
-            return self.front_end(images, mask)
+            return self.extractor(images, mask)
         return Features.cat([self._of(image[None]) for image in images])
 
     def _of(self, image: Tensor) -> Features:
@@ -43,7 +43,7 @@ class Cached(nn.Module):
         name = hashlib.sha256(content).hexdigest()[:32]
         path = FOLDER / name[:2] / f"{name}.pt"
         if not path.exists():
-            found = self.front_end(image)
+            found = self.extractor(image)
             stored = found.descriptors.half() if found.descriptors.is_floating_point() else found.descriptors
             path.parent.mkdir(parents=True, exist_ok=True)
             writing = path.with_suffix(f".{os.getpid()}")  # other processes may write the same

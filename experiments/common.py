@@ -34,7 +34,7 @@ DRONE_CAMERA, DRONE_TRUTH = "553,553,319.5,179.5", "drone_colmap.txt"
 """Of drone.mp4, which comes without: as COLMAP found them."""
 WEIGHTS_DIR = DATA_DIR.parent / "weights"
 LEARNED_FEATURES = {"xfeat": "xfeat.safetensors", "aliked": "aliked-t16.safetensors"}
-"""Files of the learned front ends in the folder of `add_weights`."""
+"""Files of the learned feature extractors in the folder of `add_weights`."""
 CONTROL = "synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3"
 """A rendered room that nothing is trained on: with other textures, noise and exposure, and exact poses."""
 
@@ -109,12 +109,12 @@ def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
 
 
 def add_weights(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the folder of the weights of learned front ends."""
+    """Add the option for the folder of the weights of learned feature extractors."""
     parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR, help="folder of the weights")
 
 
 def weights_of(name: str, folder: Path) -> Path | None:
-    """The weights of a learned front end; None, with a message, if they are not in the folder."""
+    """The weights of a learned feature extractor; None, with a message, if they are not in the folder."""
     weights = (folder / LEARNED_FEATURES[name]).absolute()
     if not weights.is_file():
         print(f"{name}: no {weights}, left out")

@@ -47,10 +47,10 @@ def test_a_run_its_gradient_and_its_covariances(device: torch.device) -> None:
         torch.testing.assert_close(found, expected[name], **TOLERANCE)
 
 
-@pytest.mark.parametrize("front_end", ["orb", "opencv-orb"])
-def test_images(device: torch.device, front_end: str) -> None:
+@pytest.mark.parametrize("kind", ["orb", "opencv-orb"])
+def test_images(device: torch.device, kind: str) -> None:
     sequence = open_sequence("synthetic:room").part(0, 12, 2)
-    config = load_config(None, [f"features.kind={front_end}", "features.num_keypoints=300"])
+    config = load_config(None, [f"features.kind={kind}", "features.num_keypoints=300"])
     expected, found = (SLAM(sequence.camera.to(d), config).run(sequence).trajectory for d in (CPU, device))
     assert len(expected) == 6
     torch.testing.assert_close(found.T_wc.cpu(), expected.T_wc, rtol=1e-2, atol=1e-2)

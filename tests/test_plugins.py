@@ -36,7 +36,7 @@ def answer(images: Tensor) -> Features:
 
 
 class Broken:
-    """A front end with configured outputs."""
+    """A feature extractor with configured outputs."""
 
     changes: dict[str, Any] = {}  # noqa: RUF012 - set by a test
 
@@ -72,12 +72,12 @@ def test_the_example_is_short_and_runs(tmp_path: Path) -> None:
 
 def test_the_same_object_serves_slam_and_clips() -> None:
     room = open_sequence(ROOM)
-    front_end = ORB(500)
-    run = SLAM(room.camera, extractor=front_end).run(room)
+    extractor = ORB(500)
+    run = SLAM(room.camera, extractor=extractor).run(room)
     own = SLAM(room.camera, load_config(None, ["features.num_keypoints=500"])).run(room)
     assert torch.equal(run.trajectory.T_wc, own.trajectory.T_wc)
     images = torch.cat([room.image(index) for index in range(0, 14, 2)])
-    assert int(ClipSLAM(front_end)(images, room.camera).posed.sum()) == 7
+    assert int(ClipSLAM(extractor)(images, room.camera).posed.sum()) == 7
 
 
 @pytest.mark.parametrize(
@@ -144,17 +144,17 @@ rows = torch.ones(1, 20)
     ],
 )
 @pytest.mark.usefixtures("without_shape_checks")
-def test_an_invalid_output_of_a_front_end_is_named(changes: dict[str, Any], words: str) -> None:
+def test_an_invalid_output_of_a_feature_extractor_is_named(changes: dict[str, Any], words: str) -> None:
     Broken.changes = changes
     extract = image_extractor(load_config(None, [f"features.kind={HERE}:Broken"]))
-    with pytest.raises(ConfigError, match=f"front end {HERE}:Broken: {words}"):
+    with pytest.raises(ConfigError, match=f"feature extractor {HERE}:Broken: {words}"):
         extract(Frame(0, 0.0, torch.zeros(1, 1, 100, 100)))
 
 
 def test_a_registered_plugin_is_found_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    mine = EntryPoint("mine", f"{HERE}:answer", plugins.FRONT_ENDS)
+    mine = EntryPoint("mine", f"{HERE}:answer", plugins.FEATURE_EXTRACTORS)
     monkeypatch.setattr(
-        plugins, "registered", lambda group: {"mine": mine} if group == plugins.FRONT_ENDS else {}
+        plugins, "registered", lambda group: {"mine": mine} if group == plugins.FEATURE_EXTRACTORS else {}
     )
     config = load_config(None, ["features.kind=mine"])
     assert image_extractor(config)(Frame(0, 0.0, torch.zeros(1, 1, 100, 100))).mask.sum() == 20
@@ -170,7 +170,7 @@ def test_information_is_scaled_with_reduced_images() -> None:
     def says(images: Tensor) -> Features:
         return Features(**{**vars(answer(images)), "information": torch.full((1, 20), 4.0)})
 
-    found = image_extractor(Config(), front_end=says)(Frame(0, 0.0, torch.zeros(1, 1, 960, 1280)))
+    found = image_extractor(Config(), extractor=says)(Frame(0, 0.0, torch.zeros(1, 1, 960, 1280)))
     assert found.information is not None
     torch.testing.assert_close(found.information, torch.full((1, 20), 1.0))
 

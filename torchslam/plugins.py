@@ -22,7 +22,7 @@ from typing import Any
 
 from torchslam.errors import ConfigError
 
-FRONT_ENDS = "torchslam.front_ends"
+FEATURE_EXTRACTORS = "torchslam.front_ends"
 MATCHERS = "torchslam.matchers"
 KORNIA, KORNIA_FEATURES = "kornia:", "kornia.feature:"
 """kornia:DISK is kornia.feature.DISK."""
@@ -100,17 +100,17 @@ def load(
     return called
 
 
-def load_front_end(name: str, num_keypoints: int, weights: str | None) -> Callable[..., Any]:
-    """Return the front end of a name: one of torchslam's own, one of kornia's (`kornia:DISK`), or a plugin."""
+def load_feature_extractor(name: str, num_keypoints: int, weights: str | None) -> Callable[..., Any]:
+    """Return the feature extractor of a name: one of torchslam's own, one of kornia's (`kornia:DISK`), or a plugin."""
     from torchslam.features import EXTRACTORS, extractor
-    from torchslam.features.kornia_modules import is_kornia_module, make_kornia_front_end
+    from torchslam.features.kornia_modules import is_kornia_module, make_kornia_extractor
 
     def make(kind: type, **arguments: Any) -> Any:
-        return (make_kornia_front_end if is_kornia_module(kind) else instantiate)(kind, **arguments)
+        return (make_kornia_extractor if is_kornia_module(kind) else instantiate)(kind, **arguments)
 
-    if name in EXTRACTORS or not is_known(FRONT_ENDS, name):
+    if name in EXTRACTORS or not is_known(FEATURE_EXTRACTORS, name):
         return extractor(name, num_keypoints, weights)
-    return load(FRONT_ENDS, name, make, num_keypoints=num_keypoints, weights=weights)
+    return load(FEATURE_EXTRACTORS, name, make, num_keypoints=num_keypoints, weights=weights)
 
 
 def _taken(kind: type, arguments: dict[str, object]) -> dict[str, object]:

@@ -124,7 +124,7 @@ class FrameFeatures:
         mask: as in `Features`.
         T_cw_groundtruth: as in `Frame`.
         session: number of the run over the same map, from 0.
-        information: as in `KeypointNoise`, of the keypoints; (N, 0) if the front end gives none.
+        information: as in `KeypointNoise`, of the keypoints; (N, 0) if the feature extractor gives none.
         image: gray, if the matcher wants it.
         backlog: as in `Frame`.
     """
@@ -393,13 +393,13 @@ class Reason(StrEnum):
     """
 
     NEW_REFERENCE = "took a reference frame"
-    STARTED = "started the map"
-    STARTED_ANEW = "later frames contradict the start: started the map anew"
-    FOUND_AGAIN = "found again"
+    STARTED = "map initialized"
+    STARTED_ANEW = "later frames contradict the start: map initialized anew"
+    RELOCALIZED = "relocalized"
     LOST = "lost"
     LOST_AT_START = "lost right after the start: starting anew"
-    STATIC_OVERLAY = "some of the image does not move with the scene and is left out"
-    INDEPENDENT_MOTION = "{count} keypoints move by themselves and are left out"
+    STATIC_OVERLAY = "static overlay masked out"
+    INDEPENDENT_MOTION = "{count} independently moving keypoints masked out"
     UNCONFIRMED = "to be confirmed by {count} more frames"
 
     # keyframes
@@ -416,9 +416,9 @@ class Reason(StrEnum):
     )
     STATIC_AMBIGUOUS = "some of the image stays in place, and it is not clear what moves"
     STATIC_REMAINDER = "what still matches stays in place, the rest has gone: took a new reference frame"
-    STANDSTILL = "the camera stands still: the image moved by {pixels:.1f} px"
-    STANDSTILL_IN_PART = "{ratio:.0%} of the image stands still, and of the rest: {rejection}"
-    MOVING_OBJECT = "something may move before a camera that stands still: a {model} explains it"
+    STATIONARY = "the camera stands still: the image moved by {pixels:.1f} px"
+    STATIONARY_IN_PART = "{ratio:.0%} of the image stands still, and of the rest: {rejection}"
+    MOVING_OBJECT = "possible moving object in front of a stationary camera: a {model} explains it"
     PURE_ROTATION = "the camera only turns: a rotation explains the matches"
     PURE_ROTATION_OTHER_FOCAL = (
         "the camera only turns: a rotation with a focal length of about {focal:.0f} px "

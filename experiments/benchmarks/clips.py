@@ -40,7 +40,7 @@ class Step(NamedTuple):
 
 
 class PreparedClip(NamedTuple):
-    """A clip with its graph, and the CPU milliseconds of front end and graph."""
+    """A clip with its graph, and the CPU milliseconds of feature extractor and graph."""
 
     clip: Clip
     features: Features
@@ -147,14 +147,14 @@ def main() -> None:
         )
         print(rows[-1], flush=True)
     header = (
-        "sequence | clips with a map | keyframes, observations | front end, ms | build_graph"
+        "sequence | clips with a map | keyframes, observations | feature extractor, ms | build_graph"
         " | pose | backward | step | slowest step | step, all clips in one call | times faster"
         " | gradients differ by"
     )
     text = (
         "# Training through clips\n\nClips of 8 frames, 1000 ORB keypoints each, moved by half a pixel before every "
         "step; gradients of the ATE to keypoints, weights and camera. Medians of the CPU time of one thread, in "
-        "milliseconds per clip; a step is pose and backward, without the front end and `build_graph`. The "
+        "milliseconds per clip; a step is pose and backward, without the feature extractor and `build_graph`. The "
         "columns after them pose all clips of a row in one call, each with its own camera, alternating with one call "
         "each, and give the relative difference of the camera gradient between the two: median, "
         "maximum.\n\n"

@@ -31,7 +31,7 @@ HERE = Path(__file__).parent
 SIZES, NEXT = (200, 1000, 5000), 31
 CAMERA = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))
 STEP, SPACING, DEPTH = 0.4, 0.008, 4.0  # meters from keyframe to keyframe, from point to point, to the wall
-KEYPOINTS = 1000  # of a keyframe, as the default front end finds
+KEYPOINTS = 1000  # of a keyframe, as the default feature extractor finds
 LEVELS, NOISE_PX = 4, 0.5
 UNMAPPED = 3  # every so many points of the wall are not in the map: the new keyframes triangulate them
 

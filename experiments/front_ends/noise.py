@@ -1,4 +1,4 @@
-"""Keypoint noise of a front end, from the residuals of whole runs. See README.md.
+"""Keypoint noise of a feature extractor, from the residuals of whole runs. See README.md.
 
     python -m experiments.front_ends.noise shelf_bin fr2_desk_20 --front-ends orb xfeat aliked
 
@@ -64,7 +64,7 @@ def main() -> None:
                 px, in_scales = noise_px(graph, scales)
                 rows.append([name, kind, str(len(run.trajectory)), f"{px:.2f}", f"{in_scales:.2f}"])
                 print(*rows[-1], sep="\t", flush=True)
-    print(table(["sequence", "front end", "posed", "noise (px)", "noise (scales)"], rows))
+    print(table(["sequence", "feature extractor", "posed", "noise (px)", "noise (scales)"], rows))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Which front end is best? See README.md."""
+"""Which feature extractor is best? See README.md."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def main() -> None:
     }
     cases = [(name, kind) for name in available(arguments.names) for kind in settings]
     runs = [row_of(name, kind, overrides=settings[kind]) for name, kind in cases]
-    header = "sequence | front end | posed | ATE (m) | features (ms) | frames/s"
+    header = "sequence | feature extractor | posed | ATE (m) | features (ms) | frames/s"
     tabulate_runs(runs, arguments, header, lambda number, found: [*cases[number], *cells(found)], __file__)
 
 
 def overrides(kind: str, folder: Path) -> list[str] | None:
-    """The settings of a front end; None, with a message, if its weights are not in the folder."""
+    """The settings of a feature extractor; None, with a message, if its weights are not in the folder."""
     if kind not in LEARNED_FEATURES:
         return [f"features.kind={kind}"]
     weights = weights_of(kind, folder)

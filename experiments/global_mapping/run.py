@@ -29,7 +29,6 @@ from torchslam.batch.rows import short_name
 from torchslam.calibration.find_camera import find_camera, with_stated_std
 from torchslam.config import Config
 from torchslam.data import open_sequence, read_trajectory
-from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import nearest, write_trajectory
 from torchslam.errors import TrajectoryError
@@ -115,11 +114,11 @@ def mapped(case: Columns, folder: Path) -> list[Columns]:
     """Run online, then map as a whole; writes the trajectories and returns the outcome of either mapping."""
     device = torch.device("cpu")
     start = time.process_time()
-    sequence = open_sequence(place_of(case["sequence"]), limit=case["limit"])
-    if case["unknown"] or sequence.calibrated is Calibrated.MISSING:
-        sequence = sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
+    sequence = open_sequence(
+        place_of(case["sequence"]), "auto" if case["unknown"] else None, limit=case["limit"]
+    )
     config = Config()
-    if sequence.calibrated is Calibrated.GUESSED:
+    if sequence.calibrated is not Calibrated.GIVEN:
         sequence, _ = find_camera(sequence, config, folder, device)
     config = with_stated_std(config, sequence)
     online = SLAM(sequence.camera, config).run(sequence)

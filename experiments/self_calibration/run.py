@@ -22,15 +22,15 @@ from experiments.common import (
 )
 from torchslam.batch import DONE, Columns
 from torchslam.batch.result_store import RECORD, RUNS, read_record
-from torchslam.calibration import FocalSearch, search_focal
+from torchslam.calibration import search_focal
 from torchslam.calibration.find_camera import GUESS_STD, LEAST_STD, STD_FACTOR, camera_remark, with_stated_std
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
-from torchslam.data.camera_argument import unknown_camera
-from torchslam.data.sequence import Calibrated, Sequence
+from torchslam.data.sequence import Sequence
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.geometry.view_graph_focal import ViewGraphFocal
 from torchslam.global_mapping.recording import map_recording
 from torchslam.system.front_end import Simulated, true_poses
 from torchslam.system.run import Run
@@ -91,7 +91,6 @@ def open_case(case: Case) -> tuple[Sequence, Sequence | None, Config]:
     config = load_config(None, case.overrides)
     path = place_of(case.name)
     unknown = open_sequence(path, "auto", limit=case.frames)
-    unknown = unknown.with_camera(unknown_camera(unknown), Calibrated.GUESSED)
     if case.simulated:
         known: Sequence | None = open_sequence(path, limit=case.frames)
         assert known is not None
@@ -118,7 +117,7 @@ def found(label: str, case: Case) -> list[str]:
         describe_search(search),
         describe_run(run.calibration),
         f"{reference:.1f}",
-        "" if not search.is_determined else off(sequence.camera, reference),
+        "" if search is None or not search.success else off(sequence.camera, reference),
         "" if run.calibration is None else off(run.calibration.camera, reference),
         f"{len(run.trajectory)} of {len(unknown)}",
         error_of(run, unknown),
@@ -129,14 +128,14 @@ def found(label: str, case: Case) -> list[str]:
     return row
 
 
-def with_found(unknown: Sequence, search: FocalSearch) -> Sequence:
+def with_found(unknown: Sequence, search: ViewGraphFocal | None) -> Sequence:
     """The sequence with the camera that pairs gave, and the error that a run states for it; else with the guess."""
-    if search.found is None or not search.is_determined:
+    if search is None or not search.success:
         return unknown.with_camera(unknown.camera, std=GUESS_STD)
     params = unknown.camera.params
-    focal = search.found.focal.to(params).expand(2)
+    focal = search.focal.to(params).expand(2)
     camera = unknown.camera.with_params(torch.cat([focal, params[2:]]))
-    return unknown.with_camera(camera, std=max(LEAST_STD, STD_FACTOR * float(search.found.std)))
+    return unknown.with_camera(camera, std=max(LEAST_STD, STD_FACTOR * float(search.std)))
 
 
 def recorded(sequence: Sequence, config: Config) -> Run:
@@ -146,12 +145,12 @@ def recorded(sequence: Sequence, config: Config) -> Run:
     return map_recording(sequence, online, config, sequence.camera).run
 
 
-def describe_search(search: FocalSearch) -> str:
+def describe_search(search: ViewGraphFocal | None) -> str:
     """The focal length by pairs with its standard error."""
-    if search.found is None or not search.is_determined:
-        return f"not determined by {search.pairs} pairs"
-    focal = float(search.found.focal)
-    return f"{focal:.1f} ± {focal * float(search.found.std):.1f} ({search.pairs})"
+    if search is None or not search.success:
+        return f"not determined by {0 if search is None else len(search.errors)} pairs"
+    focal = float(search.focal)
+    return f"{focal:.1f} ± {focal * float(search.std):.1f} ({len(search.errors)})"
 
 
 def describe_run(found: CameraMeasurement | None) -> str:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from tests.walks import Walk, turn
-from torchslam.calibration import FocalSearch, IntrinsicsEstimate, from_pairs, search_focal
+from torchslam.calibration import IntrinsicsEstimate, from_pairs, search_focal
 from torchslam.calibration.find_camera import (
     GUESS_STD,
     LEAST_STD,
@@ -24,6 +24,7 @@ from torchslam.data.calibration import read_numbers
 from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
+from torchslam.geometry.view_graph_focal import ViewGraphFocal
 from torchslam.system.front_end import Simulated, true_poses
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
@@ -38,8 +39,10 @@ def room() -> Sequence:
 
 
 @pytest.fixture(scope="module")
-def searched(room: Sequence) -> FocalSearch:
-    return search_focal(room, Config())
+def searched(room: Sequence) -> ViewGraphFocal:
+    found = search_focal(room, Config())
+    assert found is not None
+    return found
 
 
 def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config]:
@@ -52,27 +55,24 @@ def walk(poses: torch.Tensor, share: float = 0.85) -> tuple[Sequence, Config]:
     return unknown, config
 
 
-def test_pairs_of_images_give_the_focal_length(searched: FocalSearch) -> None:
-    assert searched.is_determined
-    assert searched.found is not None
-    assert float(searched.found.focal) == pytest.approx(500.0, rel=0.05)
-    assert abs(float(searched.found.focal) - 500.0) < 4 * float(searched.found.std) * 500.0
-    assert from_pairs.PLACES < searched.pairs <= from_pairs.MAX_PAIRS
-    assert searched.images <= from_pairs.PLACES * len(from_pairs.OFFSETS)
+def test_pairs_of_images_give_the_focal_length(searched: ViewGraphFocal) -> None:
+    assert searched.success
+    assert float(searched.focal) == pytest.approx(500.0, rel=0.05)
+    assert abs(float(searched.focal) - 500.0) < 4 * float(searched.std) * 500.0
+    assert from_pairs.PLACES < len(searched.errors) <= from_pairs.MAX_PAIRS
 
 
 def test_the_camera_is_written_with_its_error_and_read_again(
-    room: Sequence, searched: FocalSearch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    room: Sequence, searched: ViewGraphFocal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.calibration.find_camera.search_focal", lambda *_: searched)
     said: list[str] = []
     found, words = find_camera(room, Config(), tmp_path, CPU, on_progress=said.append)
-    assert searched.found is not None
     assert said == [words]
     assert words == describe_search(searched, found.camera)
-    assert float(found.camera.focal) == pytest.approx(float(searched.found.focal))
+    assert float(found.camera.focal) == pytest.approx(float(searched.focal))
     assert found.camera.params[2:].tolist() == room.camera.params[2:].tolist()
-    assert found.camera_std == max(LEAST_STD, 2 * float(searched.found.std))
+    assert found.camera_std == max(LEAST_STD, 2 * float(searched.std))
     assert read_numbers(tmp_path / "calibration.txt").std == pytest.approx(found.camera_std)
     again, words = find_camera(room, Config(), tmp_path, CPU, resume=True)
     assert words == f"from {tmp_path / 'calibration.txt'}"
@@ -80,26 +80,24 @@ def test_the_camera_is_written_with_its_error_and_read_again(
 
 
 def test_the_ratio_of_the_focal_lengths_is_kept(
-    room: Sequence, searched: FocalSearch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    room: Sequence, searched: ViewGraphFocal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """As of a video whose pixels are 4:3."""
     params = room.camera.params * torch.tensor([1.0, 4 / 3, 1.0, 1.0], dtype=torch.float64)
     squeezed = room.with_camera(room.camera.with_params(params), Calibrated.GUESSED)
     monkeypatch.setattr("torchslam.calibration.find_camera.search_focal", lambda *_: searched)
     found, _ = find_camera(squeezed, Config(), tmp_path, CPU)
-    assert searched.found is not None
-    focal = float(searched.found.focal)
+    focal = float(searched.focal)
     expected = [focal, 4 / 3 * focal, *room.camera.params[2:].tolist()]
     assert found.camera.params.tolist() == pytest.approx(expected)
     assert read_numbers(tmp_path / "calibration.txt").params == pytest.approx(expected)
 
 
 def test_undetermined_focal_lengths_stay_a_guess(
-    room: Sequence, searched: FocalSearch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    room: Sequence, searched: ViewGraphFocal, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert searched.found is not None
-    vague = replace(searched, found=replace(searched.found, success=torch.tensor(False)))
-    for search, word in ((vague, "do not determine it"), (FocalSearch(None, 0, 2), "no two images")):
+    vague = replace(searched, success=torch.tensor(False))
+    for search, word in ((vague, "do not determine it"), (None, "no two images")):
         monkeypatch.setattr("torchslam.calibration.find_camera.search_focal", lambda *_, s=search: s)
         found, words = find_camera(room, Config(), tmp_path, CPU)
         assert word in words
@@ -109,7 +107,8 @@ def test_undetermined_focal_lengths_stay_a_guess(
 
 def test_a_camera_that_only_turns_gives_no_focal_length() -> None:
     unknown, config = walk(turn(14))
-    assert not search_focal(unknown, config).is_determined
+    found = search_focal(unknown, config)
+    assert found is None or not found.success
 
 
 def test_simulated_features_cannot_say_the_camera(tmp_path: Path) -> None:

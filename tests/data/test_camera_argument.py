@@ -68,7 +68,7 @@ def test_wrong_arguments(text: str, message: str) -> None:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_presets(name: str) -> None:
-    for calibration in PRESETS[name].cameras:
+    for calibration in (PRESETS[name], *PRESETS[name].others):
         camera = parse_camera(name, calibration.size)
         center = torch.tensor([(camera.width - 1) / 2, (camera.height - 1) / 2], dtype=torch.float64)
         assert (camera.params[2:4] - center).abs().max() < 20

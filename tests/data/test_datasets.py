@@ -191,5 +191,7 @@ def test_kitti_raw_with_missing_or_wrong_files(kitti_raw: Callable[..., Path]) -
 def test_camera_of_a_tum_archive_by_its_name(tum_folder: Callable[..., Path]) -> None:
     folder = tum_folder(calibration=None)
     renamed = folder.rename(folder.with_name("rgbd_dataset_freiburg2_desk"))
-    with pytest.raises(CalibrationError, match="`tum-fr2`: it is for images of 640x480, these are 64x48"):
+    with pytest.raises(
+        CalibrationError, match="`tum-fr2`: the camera is for images of 640x480, these are 64x48"
+    ):
         open_sequence(renamed)

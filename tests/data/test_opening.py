@@ -305,7 +305,7 @@ def test_every_read_is_bounded(tmp_path: Path, write_picture: Write, monkeypatch
     with pytest.raises(FrameError, match="more than the 100 of an image"):
         image_files.read_gray(tmp_path / "0.png", "here")
     (tmp_path / "calibration.txt").write_text("60 60 32 24\n" * 20)
-    monkeypatch.setattr("torchslam.data.formats.text_file.MAX_BYTES", 100)
+    monkeypatch.setattr("torchslam.data.text_file.MAX_BYTES", 100)
     with pytest.raises(CalibrationError, match="more than the 100 of a text"):
         open_sequence(tmp_path)
 

@@ -40,7 +40,7 @@ CPU = torch.device("cpu")
 
 
 class PairEyes(nn.Module):
-    """Features of a pair of a walk, from a front end that knows the scene."""
+    """Features of a pair of a walk, from a feature extractor that knows the scene."""
 
     def __init__(self, eyes: nn.Module, rows: list[int]) -> None:
         super().__init__()
@@ -98,16 +98,16 @@ def test_patches_between_pixels_are_interpolated() -> None:
 
 def test_offsets_start_at_zero_and_are_bounded() -> None:
     images = noise_images()
-    front_end = SubPixel(ORB(100))
-    plain, moved = front_end.front_end(images), front_end(images)
+    extractor = SubPixel(ORB(100))
+    plain, moved = extractor.extractor(images), extractor(images)
     assert torch.equal(plain.keypoints, moved.keypoints)
-    nn.init.normal_(front_end.network[-1].weight, std=10.0, generator=torch.Generator().manual_seed(0))
+    nn.init.normal_(extractor.network[-1].weight, std=10.0, generator=torch.Generator().manual_seed(0))
     with torch.no_grad():
-        distance = (front_end(images).keypoints - plain.keypoints).abs()
+        distance = (extractor(images).keypoints - plain.keypoints).abs()
     assert 0 < float(distance.max()) <= REACH + 1e-4
 
 
-def test_a_caching_front_end_extracts_an_image_once() -> None:
+def test_a_caching_feature_extractor_extracts_an_image_once() -> None:
     prepared: list[Tensor] = []
 
     class Counting(ORB):
@@ -115,16 +115,16 @@ def test_a_caching_front_end_extracts_an_image_once() -> None:
             prepared.append(images)
             return super().forward(images)
 
-    front_end = Remembering(Counting(50))
+    extractor = Remembering(Counting(50))
     first, second = noise_images(0), noise_images(1)
-    found = front_end(first)
-    assert front_end(first) is found
-    front_end(second)
-    assert torch.equal(front_end(first).keypoints, found.keypoints)
+    found = extractor(first)
+    assert extractor(first) is found
+    extractor(second)
+    assert torch.equal(extractor(first).keypoints, found.keypoints)
     assert len(prepared) == 3
 
 
-def test_an_exact_front_end_makes_no_error() -> None:
+def test_an_exact_feature_extractor_makes_no_error() -> None:
     walk = Walk(arc(10, length=1.0))
     pair = Pair.of(walk, 2, CPU)
     eyes = PairEyes(BentEyes(walk, bend=0.0, noise_px=0.0), [2, 2 + frames_in(APART_S, walk)])

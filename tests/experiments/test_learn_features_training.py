@@ -27,7 +27,7 @@ KINDS = 4
 
 
 class WalkEyes(nn.Module):
-    """What a front end that knows the scene sees of a walk, frame after frame."""
+    """What a feature extractor that knows the scene sees of a walk, frame after frame."""
 
     def __init__(self, walk: Walk) -> None:
         super().__init__()
@@ -59,7 +59,7 @@ def tracks() -> Tracks:
     return exact_tracks()
 
 
-def test_tracks_of_an_exact_front_end_meet_in_points(tracks: Tracks) -> None:
+def test_tracks_of_an_exact_feature_extractor_meet_in_points(tracks: Tracks) -> None:
     assert len(tracks) == 16 - 8  # all views of a problem lie in the part
     assert tracks.frames.shape == (8, len(VIEWS_S))
     assert int(tracks.seen.any(-1).sum(-1).min()) > 50
@@ -78,15 +78,15 @@ def test_sampled_points_are_visible_in_the_localized_frame(tracks: Tracks) -> No
 
 
 def test_exact_tracks_have_no_pose_error_and_disturbed_ones_a_gradient(tracks: Tracks) -> None:
-    front_end = SubPixel(nn.Identity())
+    extractor = SubPixel(nn.Identity())
     drawn = draw(tracks, Settings(problems=4), torch.Generator().manual_seed(0))
-    errors, success = localization_errors(front_end, tracks, drawn)
+    errors, success = localization_errors(extractor, tracks, drawn)
     assert bool(success.all())
     assert float(errors.detach().max()) < 1e-5
-    errors, success = localization_errors(front_end, disturbed(tracks), drawn)
+    errors, success = localization_errors(extractor, disturbed(tracks), drawn)
     assert float(errors.detach().min()) > 1e-4
     errors[success].log1p().sum().backward()
-    gradient = front_end.network[-1].weight.grad
+    gradient = extractor.network[-1].weight.grad
     assert gradient is not None
     assert bool(torch.isfinite(gradient).all())
     assert float(gradient.abs().max()) > 0
@@ -94,11 +94,11 @@ def test_exact_tracks_have_no_pose_error_and_disturbed_ones_a_gradient(tracks: T
 
 def test_training_through_poses_lowers_the_pose_errors(tracks: Tracks) -> None:
     wrong = disturbed(tracks)
-    front_end = SubPixel(nn.Identity(), width=16)
+    extractor = SubPixel(nn.Identity(), width=16)
     fixed = draw(wrong, Settings(problems=8), torch.Generator().manual_seed(5))
-    before = float(pose_loss(front_end, wrong, fixed).detach())
-    losses = train(front_end, wrong, Settings(steps=120, problems=8, learning_rate=1e-2))
-    after = float(pose_loss(front_end, wrong, fixed).detach())
+    before = float(pose_loss(extractor, wrong, fixed).detach())
+    losses = train(extractor, wrong, Settings(steps=120, problems=8, learning_rate=1e-2))
+    after = float(pose_loss(extractor, wrong, fixed).detach())
     assert len(losses) == 120
     assert sum(losses[-20:]) < 0.5 * sum(losses[:20])
     assert after < 0.5 * before

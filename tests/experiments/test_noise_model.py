@@ -186,7 +186,9 @@ def test_keyframes_of_the_largest_submap_are_extracted() -> None:
 
 
 @pytest.mark.parametrize("kind", ["constant", "isotropic", "directed"])
-def test_the_front_end_carries_the_models_information(image: Tensor, tmp_path: Path, kind: str) -> None:
+def test_the_feature_extractor_carries_the_models_information(
+    image: Tensor, tmp_path: Path, kind: str
+) -> None:
     model = NoiseModel(kind, seed=3)
     torch.nn.init.constant_(model.level, math.log(8.0))
     torch.nn.init.constant_(model.line, 0.1)

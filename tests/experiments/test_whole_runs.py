@@ -51,14 +51,14 @@ def test_the_bootstrap_resamples_recordings_of_the_same_images_together() -> Non
     assert report(alone, ["default", "other"]).splitlines()[-1].endswith("| **0.80** |")
 
 
-def test_cached_features_equal_those_of_the_front_end(
+def test_cached_features_equal_those_of_the_feature_extractor(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(cached_features, "FOLDER", tmp_path)
     image = open_sequence(ROOM).image(0)
     cached_run, own = cached_features.ORB(200), ORB(200)(image)
     first = cached_run(image)
-    monkeypatch.setattr(cached_run, "front_end", None)  # it is not called again
+    monkeypatch.setattr(cached_run, "extractor", None)  # it is not called again
     for found in (first, cached_run(image)):
         for name, values in vars(own).items():
             assert values is None or torch.equal(getattr(found, name), values), name

@@ -25,23 +25,23 @@ def image() -> torch.Tensor:
 
 @pytest.mark.parametrize("kind", ["orb", "opencv-orb"])
 def test_masked_areas_have_no_keypoints_and_the_budget_goes_elsewhere(image: torch.Tensor, kind: str) -> None:
-    front_end, mask = extractor(kind, 300), LEFT.expand(image.shape)
-    free, masked = front_end(image), front_end(image, mask)
+    extract, mask = extractor(kind, 300), LEFT.expand(image.shape)
+    free, masked = extract(image), extract(image, mask)
     assert bool((free.keypoints[free.mask][:, 0] > 330).any())
     assert float(masked.keypoints[masked.mask][:, 0].max()) < 321
     left = int((free.keypoints[free.mask][:, 0] < 320).sum())
     assert int(masked.mask.sum()) > 1.3 * left
-    everything = front_end(image, torch.ones_like(mask))
+    everything = extract(image, torch.ones_like(mask))
     for name in ("keypoints", "descriptors", "mask"):
         assert torch.equal(getattr(everything, name), getattr(free, name))
 
 
 def test_each_image_of_a_batch_has_its_own_mask(image: torch.Tensor) -> None:
-    front_end = ORB(200)
+    extract = ORB(200)
     mask = torch.stack([LEFT.expand(image.shape)[0], ~LEFT.expand(image.shape)[0]])
-    both = front_end(image.expand(2, -1, -1, -1), mask)
+    both = extract(image.expand(2, -1, -1, -1), mask)
     for row in range(2):
-        alone = front_end(image, mask[row : row + 1])
+        alone = extract(image, mask[row : row + 1])
         assert torch.equal(both.keypoints[row], alone.keypoints[0])
         assert torch.equal(both.descriptors[row], alone.descriptors[0])
 
@@ -51,7 +51,7 @@ def test_a_mask_that_excludes_everything_gives_no_keypoints(image: torch.Tensor)
 
 
 @pytest.mark.usefixtures("without_shape_checks")
-def test_front_end_passes_the_mask_on(image: torch.Tensor) -> None:
+def test_feature_extractor_passes_the_mask_on(image: torch.Tensor) -> None:
     frame = open_sequence("synthetic:room?frames=2")[0]
     mask = LEFT.expand(image.shape)
     found = image_extractor(Config())(replace(frame, mask=mask))

@@ -115,7 +115,7 @@ def test_covariance_has_no_gradient() -> None:
 
 
 @pytest.mark.parametrize("noise", [0.3, 1.0])
-def test_planes_and_turning_cameras_are_told_from_scenes(noise: float) -> None:
+def test_planes_and_rotating_cameras_are_told_from_scenes(noise: float) -> None:
     def share(x_1: Tensor, x_2: Tensor, mask: Tensor) -> Tensor:
         return homography_share(x_1, x_2, mask, torch.full((len(x_1),), noise * PIXEL, dtype=x_1.dtype))
 

@@ -69,7 +69,7 @@ def moving(omega: Tensor, t: Tensor, noise: float = 0.5, seed: int = 0) -> Match
         pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
         for pixels in (pixels_1, pixels_2)
     )
-    # A turning camera has no direction; that of its matrix is arbitrary.
+    # A rotating camera has no direction; that of its matrix is arbitrary.
     t = torch.where((t == 0).all(-1, keepdim=True), random(M, 3) - 0.5, t)
     inverse = torch.linalg.inv(K)
     return inverse.mT @ skew(t) @ R @ inverse, pixels_1, pixels_2, mask

@@ -43,7 +43,7 @@ def moved(observed: ObservedTracks, row: int, pixels: float) -> ObservedTracks:
 
 
 def test_observations_have_the_pixels_and_the_noise_of_their_keypoints() -> None:
-    """A keypoint is precise to half of its scale, or as its front end says."""
+    """A keypoint is precise to half of its scale, or as its feature extractor says."""
     scales = [torch.linspace(1, 3, 100, dtype=torch.float64) + row for row in range(3)]
     views = [replace(view, scales=scale) for view, scale in zip(SCENE.views, scales, strict=False)]
     tracks = Tracks(torch.tensor([0, 0, 1, 1]), torch.tensor([0, 2, 1, 2]), torch.tensor([5, 7, 99, 0]))

@@ -158,8 +158,8 @@ def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
     eyes, idle = BentEyes(walk, bend=0.0), BentEyes(Walk(still(FRAMES)), bend=0.0)
     bent = Camera.radial_tangential(401.0, 402.0, 159.5, 119.5, 1e-3, 0.0, 0.0, 0.0, size=(320, 240))
     looked = [
-        ClipSLAM(front_end).build_graph(images, camera)
-        for front_end, camera in ((eyes, walk.camera), (idle, walk.camera), (eyes, bent), (eyes, walk.camera))
+        ClipSLAM(extractor).build_graph(images, camera)
+        for extractor, camera in ((eyes, walk.camera), (idle, walk.camera), (eyes, bent), (eyes, walk.camera))
     ]
     clip_slam = ClipSLAM(eyes, keypoint_weight=lambda features: features.scores)
     seen = eyes(images)
@@ -186,7 +186,7 @@ def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
 
 
 class SortedEyes(BentEyes):
-    """A front end whose rows are in the order of scores that it learns, as those of a network are."""
+    """A feature extractor whose rows are in the order of scores that it learns, as those of a network are."""
 
     def __init__(self, walk: Walk) -> None:
         super().__init__(walk, bend=0.01)

@@ -1,4 +1,4 @@
-"""Training through short clips: right gradients to the front end, and an ordinary loop that learns."""
+"""Training through short clips: right gradients to the feature extractor, and an ordinary loop that learns."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ CONFIG = load_config(None, ["bundle_adjustment.global_iterations=30"])
 
 
 class BentEyes(nn.Module):
-    """A front end that knows the scene, and sees it through a lens it does not know: a bend of 0 would be right."""
+    """An extractor that knows the scene, and sees it through a lens it does not know: a bend of 0 would be right."""
 
     def __init__(self, walk: Walk, bend: float, noise_px: float = 0.2) -> None:
         super().__init__()
@@ -57,7 +57,7 @@ def derivative(loss: object, value: float, h: float) -> float:
         return float(loss(value + h) - loss(value - h)) / (2 * h)
 
 
-def test_the_gradient_to_a_front_end_agrees_with_finite_differences() -> None:
+def test_the_gradient_to_a_feature_extractor_agrees_with_finite_differences() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
     eyes = BentEyes(walk, bend=0.01)

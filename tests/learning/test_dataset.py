@@ -54,7 +54,7 @@ class WalkWithTruth(Walk):
 
 
 class Knowing(nn.Module):
-    """A front end that reads the frame off the image and knows what is seen there."""
+    """A feature extractor that reads the frame off the image and knows what is seen there."""
 
     walk: Walk
 

@@ -83,7 +83,7 @@ def test_the_grid_moves_keypoints_near_its_nodes() -> None:
     torch.testing.assert_close(lens.straightened(at) - at, torch.tensor([[[2.0, -1.0], [0.0, 0.0]]]).double())
 
 
-def test_a_front_end_reads_the_learned_grid(tmp_path: Path) -> None:
+def test_a_feature_extractor_reads_the_learned_grid(tmp_path: Path) -> None:
     lens = bent_lens(0)
     save_file(lens.weights(), tmp_path / "camera.safetensors")
     image = torch.rand(1, 1, *reversed(SIZE), generator=torch.Generator().manual_seed(0))

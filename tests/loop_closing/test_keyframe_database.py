@@ -183,7 +183,7 @@ def test_a_duplicate_key_is_an_error(key: int) -> None:
         places_of(0).add(key, *image(1))
 
 
-# --- other front ends and devices ----------------------------------------------------------------------------
+# --- other feature extractors and devices ----------------------------------------------------------------------------
 
 
 def test_float_descriptors_fix_their_words_once(generator: torch.Generator) -> None:

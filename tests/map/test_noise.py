@@ -20,7 +20,7 @@ def adjusted(slam_map: Map, factor: float, times: int) -> float:
     return slam_map.noise_variance
 
 
-def test_the_prior_is_that_the_front_end_states_the_truth() -> None:
+def test_the_prior_is_that_the_feature_extractor_states_the_truth() -> None:
     slam_map = Map()
     assert slam_map.noise_variance == 1.0
     slam_map.update_noise(torch.zeros(0))

@@ -156,21 +156,22 @@ def test_corrected_covariances_keep_their_size_in_pixels(submap: Submap) -> None
     before = copy.deepcopy(submap)
     S_cw = corrections(submap)
     submap.apply_sim3_correction(S_cw)
-    born = submap.map.points["first_keyframe"]
-    scale = sim3_scale(S_cw)[born][:, None, None]
+    first_keyframe = submap.map.points["first_keyframe"]
+    scale = sim3_scale(S_cw)[first_keyframe][:, None, None]
 
     def in_camera(of: Submap) -> Tensor:
-        R_cw = of.map.T_cw[born][:, :3, :3]
+        R_cw = of.map.T_cw[first_keyframe][:, :3, :3]
         return R_cw @ of.map.points["covariances_w"] @ R_cw.mT
 
     torch.testing.assert_close(in_camera(submap) * scale**2, in_camera(before))
     normals = [
-        (of.map.T_cw[born][:, :3, :3] @ of.map.points["view_directions_w"][..., None])[..., 0]
+        (of.map.T_cw[first_keyframe][:, :3, :3] @ of.map.points["view_directions_w"][..., None])[..., 0]
         for of in (submap, before)
     ]
     torch.testing.assert_close(*normals)
     torch.testing.assert_close(
-        submap.map.points["scale_distance"] * sim3_scale(S_cw)[born], before.map.points["scale_distance"]
+        submap.map.points["scale_distance"] * sim3_scale(S_cw)[first_keyframe],
+        before.map.points["scale_distance"],
     )
 
 

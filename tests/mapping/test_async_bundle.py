@@ -24,7 +24,7 @@ ROWS = rows_of(SCENE)
 SETTINGS = load_config(None, ["bundle_adjustment.local_window=3"]).bundle_adjustment
 
 
-def shaken(seed: int = 0) -> Map:
+def perturbed_map(seed: int = 0) -> Map:
     """A row of keyframes, the last ones not where they should be."""
     slam_map = submap_of_scene(SCENE, sideways(5)).map
     generator = torch.Generator().manual_seed(seed)
@@ -49,13 +49,13 @@ def check_same(mine: Map, other: Map) -> None:
 
 def adjusted(seed: int = 0) -> Map:
     """What it should come to."""
-    slam_map = shaken(seed)
+    slam_map = perturbed_map(seed)
     adjust_local(slam_map, 4, CAMERA, SETTINGS, covariances=True)
     return slam_map
 
 
 def test_the_map_does_not_change_before_the_result_is_applied() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     assert not adjusting.is_pending
     assert adjusting.due is None
     assert not adjusting.is_due(100)
@@ -63,7 +63,7 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
     assert adjusting.is_pending
     assert adjusting.due == 12
     assert [adjusting.is_due(frame) for frame in (11, 12, 13)] == [False, True, True]
-    check_same(slam_map, shaken())
+    check_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
     check_same(slam_map, adjusted())
     assert not adjusting.is_pending
@@ -72,7 +72,7 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
 
 
 def test_a_request_is_started_once() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     begun: list[BundleProblem] = []
 
     def solver(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
@@ -86,7 +86,7 @@ def test_a_request_is_started_once() -> None:
     adjusting.start()
     adjusting.start()
     assert len(begun) == 1
-    check_same(slam_map, shaken())
+    check_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
     check_same(slam_map, adjusted())
     adjusting.start()
@@ -103,7 +103,7 @@ def test_a_request_is_started_once() -> None:
 
 
 def test_a_request_can_be_hurried_or_dropped() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     adjusting.set_deadline(3)
     assert not adjusting.is_pending
     adjusting.request(slam_map, 4, due=12)
@@ -111,11 +111,11 @@ def test_a_request_can_be_hurried_or_dropped() -> None:
     assert adjusting.due == 9
     adjusting.drop()
     adjusting.apply(slam_map)
-    check_same(slam_map, shaken())
+    check_same(slam_map, perturbed_map())
 
 
 def test_a_request_may_be_due_before_the_next_frame() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     assert not adjusting.is_due_before_next_frame
     adjusting.request(slam_map, 4, due=12)
     assert not adjusting.is_due_before_next_frame
@@ -125,14 +125,14 @@ def test_a_request_may_be_due_before_the_next_frame() -> None:
     assert adjusting.is_due_before_next_frame
     assert adjusting.due is None
     assert adjusting.is_due(0)  # after whatever frame, at the latest
-    check_same(slam_map, shaken())
+    check_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
     check_same(slam_map, adjusted())
     assert not adjusting.is_due_before_next_frame
 
 
 def test_an_empty_request_is_due_as_well() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     slam_map.keyframes["point_ids"][:] = -1
     adjusting.request(slam_map, 4, due=12)
     assert adjusting.is_due(12)
@@ -158,13 +158,13 @@ def test_another_process_computes_the_same_result(
     adjusting.solver = worker
     for seed in (0, 1):
         expected = adjusted(seed)
-        slam_map = shaken(seed)
+        slam_map = perturbed_map(seed)
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
         check_same(slam_map, expected)
-    adjusting.request(shaken(2), 4, due=12)
+    adjusting.request(perturbed_map(2), 4, due=12)
     adjusting.drop()  # its answer comes all the same, and is not mistaken for the next one
-    slam_map = shaken(3)
+    slam_map = perturbed_map(3)
     adjusting.request(slam_map, 4, due=12)
     adjusting.apply(slam_map)
     check_same(slam_map, adjusted(3))
@@ -173,8 +173,8 @@ def test_another_process_computes_the_same_result(
 def test_a_worker_computes_no_covariances_unless_requested(worker: BundleWorker) -> None:
     adjusting, slam_map, expected = (
         AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False),
-        shaken(),
-        shaken(),
+        perturbed_map(),
+        perturbed_map(),
     )
     adjusting.solver = worker
     adjusting.request(slam_map, 4, due=12)
@@ -184,7 +184,7 @@ def test_a_worker_computes_no_covariances_unless_requested(worker: BundleWorker)
 
 
 def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
-    slam_map = shaken()
+    slam_map = perturbed_map()
     adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False)
 
     def wrong(problem: BundleProblem, iterations: int, covariances: bool):  # type: ignore[no-untyped-def]
@@ -199,7 +199,7 @@ def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
 
 
 def test_the_run_continues_without_a_killed_worker() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     with BundleWorker() as solver:
         wait_until_ready(solver)
         adjusting.solver = solver
@@ -209,7 +209,7 @@ def test_the_run_continues_without_a_killed_worker() -> None:
         with pytest.warns(UserWarning, match="has ended"):
             adjusting.apply(slam_map)
         check_same(slam_map, adjusted())
-        slam_map = shaken(1)
+        slam_map = perturbed_map(1)
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
         check_same(slam_map, adjusted(1))
@@ -218,7 +218,7 @@ def test_the_run_continues_without_a_killed_worker() -> None:
 def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     with BundleWorker() as solver:
         monkeypatch.setattr(solver, "result", None)
-        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)

@@ -1,4 +1,4 @@
-"""What a start and a keyframe leave in the map, and which young points do not prove themselves."""
+"""What a start and a keyframe leave in the map, and which new points are culled."""
 
 from __future__ import annotations
 

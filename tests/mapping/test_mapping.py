@@ -86,7 +86,7 @@ def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     near = project_points(
         slam.map, slam.map.valid_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
     )
-    pairs = match_projected_points(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching), ratio=0.9)
+    pairs = match_projected_points(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching))
     ids, keypoints = pairs.first, pairs.second
     assert len(ids) > 150
     assert len(torch.unique(keypoints)) == len(keypoints)
@@ -186,13 +186,13 @@ def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
 
 def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
     newest = slam.map.num_keyframes - 1
-    born = torch.nonzero((slam.map.points["first_keyframe"] >= newest - 2) & slam.map.points["is_valid"])[
-        :3, 0
-    ]
-    assert len(born) > 0
-    slam.map.points["times_visible"][born] += 1000
+    new_points = torch.nonzero(
+        (slam.map.points["first_keyframe"] >= newest - 2) & slam.map.points["is_valid"]
+    )[:3, 0]
+    assert len(new_points) > 0
+    slam.map.points["times_visible"][new_points] += 1000
     slam.mapper.cull_recent_points(slam.map, newest)
-    assert not slam.map.points["is_valid"][born].any()
+    assert not slam.map.points["is_valid"][new_points].any()
 
 
 def test_epipolar_matches_are_correct(slam: SLAM) -> None:

@@ -1,4 +1,4 @@
-"""What a front end says of its keypoints' errors, through whole runs, their files and their gradients."""
+"""What a feature extractor says of its keypoints' errors, through whole runs, their files and their gradients."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_information_downweights_inaccurate_keypoints() -> None:
 
 
 class Doubtful(nn.Module):
-    """A front end that knows the scene, and believes the more in a keypoint the nearer it is to a place to learn."""
+    """An extractor that knows the scene, and believes the more in a keypoint the nearer it is to a place to learn."""
 
     def __init__(self, walk: Walk, kind: str) -> None:
         super().__init__()

@@ -55,7 +55,7 @@ def start_another_map(drive: Drive) -> None:
 def relocalize(drive: Drive) -> None:
     until_lost(drive)
     drive.step()
-    assert drive.results[-1].reason == Reason.FOUND_AGAIN
+    assert drive.results[-1].reason == Reason.RELOCALIZED
 
 
 def confirm_by_frames(drive: Drive) -> None:

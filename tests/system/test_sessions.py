@@ -84,7 +84,7 @@ def test_a_third_session_relocalizes_in_both_earlier_ones(
     slam.save(tmp_path / "grown")
     third = SLAM.load(tmp_path / "grown", config_of(), mapping=False)
     assert len(third.loop_closer.keyframe_database) == slam.map.num_keyframes
-    assert third.step(SEEN[45]).reason == "found again"
+    assert third.step(SEEN[45]).reason == "relocalized"
 
 
 def columns_of(slam: SLAM) -> list[tuple[str, str, torch.Tensor]]:
@@ -123,7 +123,7 @@ def test_localization_needs_a_map(tmp_path: Path) -> None:
     assert len(slam.run(SEEN.part(0, 12)).trajectory) == 12
 
 
-def test_another_front_end_is_refused(first: tuple[SLAM, Run, Path]) -> None:
+def test_another_feature_extractor_is_refused(first: tuple[SLAM, Run, Path]) -> None:
     def with_floats(frame: Frame) -> Features:
         seen = eyes()(frame)
         return replace(seen, descriptors=seen.descriptors.float())
@@ -133,7 +133,7 @@ def test_another_front_end_is_refused(first: tuple[SLAM, Run, Path]) -> None:
         return seen.rows(slice(200))
 
     for other in (with_floats, with_fewer):
-        with pytest.raises(ConfigError, match="made with another front end"):
+        with pytest.raises(ConfigError, match="made with another feature extractor"):
             SLAM.load(first[2], config_of()).step(WithFeatures(WALK, other)[0])
     assert (
         SLAM.load(first[2], config_of(), mapping=False).step(WithFeatures(WALK, with_fewer)[0]).T_cw

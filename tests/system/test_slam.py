@@ -73,8 +73,8 @@ def test_the_scale_can_be_that_of_ground_truth() -> None:
 def test_unit_scale_sets_the_initial_median_depth_to_one() -> None:
     walk = Walk(arc(12))
     run = run_walk(walk, "bundle_adjustment.local=false", "mapping.cull=false")
-    born = run.map.points["first_keyframe"] == 1
-    assert float(run.map.positions_w[born, 2].median()) == pytest.approx(1.0, rel=0.2)
+    initial = run.map.points["first_keyframe"] == 1
+    assert float(run.map.positions_w[initial, 2].median()) == pytest.approx(1.0, rel=0.2)
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_loss_is_reported_and_tracking_recovers() -> None:
     assert all(r.T_cw is None for r in run.results[35:40])
     confirmed = 40 + Config().relocalization.num_confirming_frames
     assert states[40:confirmed] == [State.UNCERTAIN] * (confirmed - 40)
-    assert run.results[40].reason == Reason.FOUND_AGAIN
+    assert run.results[40].reason == Reason.RELOCALIZED
     assert not any(r.is_keyframe for r in run.results[35 : confirmed + 1])
     assert states[confirmed:] == [State.TRACKING] * (60 - confirmed)
     assert len(run.submaps) == 1
@@ -165,7 +165,7 @@ def test_an_unconfirmed_relocalization_leaves_no_trace() -> None:
     run = run_walk(FrameSnapshot(arc(34)))
     states = [r.state for r in run.results]
     assert states[25:] == [State.LOST] * 3 + [State.UNCERTAIN] + [State.LOST] * 5
-    assert run.results[28].reason == Reason.FOUND_AGAIN
+    assert run.results[28].reason == Reason.RELOCALIZED
     assert len(run.trajectory) == 25
     assert int(run.map.keyframes["frame_index"].max()) < 25
     assert int(run.posed_frames.frames["frame_index"].max()) < 25

@@ -80,7 +80,7 @@ def test_a_camera_without_view_is_lost_and_relocalized(slam: SLAM) -> None:
     lost = [each for each in results if each.state is State.LOST]
     assert lost
     assert {each.reason for each in lost} == {Reason.LOST}
-    again = [each for each in results if each.reason == Reason.FOUND_AGAIN]
+    again = [each for each in results if each.reason == Reason.RELOCALIZED]
     assert len(again) == 1
     assert again[0].state is State.UNCERTAIN
     assert slam.state is State.TRACKING

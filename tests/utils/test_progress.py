@@ -6,7 +6,7 @@ import sys
 import pytest
 from tqdm import tqdm
 
-from torchslam.utils import console as progress_line
+from torchslam.utils import console
 from torchslam.utils.console import tqdm_options
 
 
@@ -29,7 +29,7 @@ def test_a_log_has_few_progress_lines(monkeypatch: pytest.MonkeyPatch) -> None:
     first, last = text.splitlines()
     assert "0/50" in first
     assert "50/50" in last
-    monkeypatch.setattr(progress_line, "INTERVAL", 0.0)
+    monkeypatch.setattr(console, "INTERVAL", 0.0)
     assert len(shown(monkeypatch, io.StringIO()).splitlines()) > 40
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from torchslam.utils import timing as stopwatch
+from torchslam.utils import timing
 from torchslam.utils.timing import Stopwatch
 
 
@@ -12,7 +12,7 @@ from torchslam.utils.timing import Stopwatch
 def wait(monkeypatch: pytest.MonkeyPatch):
     """Lets milliseconds pass."""
     now = [0.0]
-    monkeypatch.setattr(stopwatch.time, "perf_counter", lambda: now[0])
+    monkeypatch.setattr(timing.time, "perf_counter", lambda: now[0])
 
     def passes(milliseconds: float) -> None:
         now[0] += milliseconds / 1e3

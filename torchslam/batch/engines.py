@@ -15,7 +15,7 @@ from typing import Any
 from torchslam.batch.result_store import Columns, store_failure
 from torchslam.batch.results_table import write_table
 from torchslam.batch.task import Task, configuration, run_row
-from torchslam.data.formats.text_file import parse_count
+from torchslam.data.text_file import parse_count
 from torchslam.errors import ConfigError
 
 Work = Callable[[Columns], Columns]

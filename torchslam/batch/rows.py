@@ -15,8 +15,8 @@ from typing import Any
 
 from torchslam.config import Config
 from torchslam.config.schema import check_override_in_file
-from torchslam.data.formats.text_file import MAX_LINE, numbered_lines, parse_count, read_text
 from torchslam.data.synthetic import is_synthetic
+from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, read_text
 from torchslam.errors import ConfigError, SequenceError
 from torchslam.utils.text import without_credentials
 

@@ -26,7 +26,6 @@ from torchslam.batch.rows import Row
 from torchslam.calibration.find_camera import find_camera, with_stated_std
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
-from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
@@ -168,9 +167,7 @@ def _run(task: Task, folder: Path) -> Columns:
     config, sequence = settings_of(row), open_row(row)
     camera = ""
     start = time.process_time()
-    if sequence.calibrated is Calibrated.MISSING:
-        sequence = sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
-    if sequence.calibrated is Calibrated.GUESSED:
+    if sequence.calibrated is not Calibrated.GIVEN:
         sequence, camera = find_camera(sequence, config, folder, device)
     config = with_stated_std(config, sequence)
     finished = SLAM(sequence.camera.to(device), config).run(sequence)

@@ -1,6 +1,6 @@
 """The camera from images: its focal length from pairs of them, its intrinsics from the graph of a run."""
 
-from torchslam.calibration.from_pairs import FocalSearch, search_focal
+from torchslam.calibration.from_pairs import search_focal
 from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
 
-__all__ = ["FocalSearch", "IntrinsicsEstimate", "estimate_intrinsics", "search_focal"]
+__all__ = ["IntrinsicsEstimate", "estimate_intrinsics", "search_focal"]

@@ -9,16 +9,16 @@ from pathlib import Path
 
 import torch
 
-from torchslam.calibration.from_pairs import FocalSearch, search_focal
+from torchslam.calibration.from_pairs import search_focal
 from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
 from torchslam.config import CameraConfig, Config
 from torchslam.data import Sequence
-from torchslam.data.calibration import check_replaceable, read_numbers, write_calibration
+from torchslam.data.calibration import CALIBRATION, check_replaceable, read_numbers, write_calibration
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
-from torchslam.io.results import CALIBRATION
+from torchslam.geometry.view_graph_focal import ViewGraphFocal
 from torchslam.system.run import Run
 
 LEAST_STD = 0.05
@@ -42,7 +42,7 @@ def find_camera(
     """Find the focal length of an unknown camera from pairs of images, and write the calibration file.
 
     Args:
-        sequence: With a guessed camera to start from.
+        sequence: With a guessed camera to start from, or none.
         config: Of the run.
         output: Folder of the calibration file.
         device: Of torch.
@@ -59,30 +59,32 @@ def find_camera(
     if resume and path.exists():
         known = read_numbers(path)
         return sequence.with_camera(known.camera(sequence.size), std=known.std), f"from {path}"
+    sequence = sequence.with_guess()
     search = search_focal(sequence, config, device)
     camera, std = sequence.camera, GUESS_STD
-    if search.found is not None and search.is_determined:
-        ratio = search.found.focal.detach().to(camera.params) / camera.fx
+    if search is not None and search.success:
+        ratio = search.focal.detach().to(camera.params) / camera.fx
         camera = camera.with_params(torch.cat([ratio * camera.params[:2], camera.params[2:]]))
-        std = max(LEAST_STD, STD_FACTOR * float(search.found.std))
+        std = max(LEAST_STD, STD_FACTOR * float(search.std))
     description = describe_search(search, camera)
     write_calibration(path, camera, [description], std)
     on_progress(description)
     return sequence.with_camera(camera, std=std), description
 
 
-def describe_search(search: FocalSearch, camera: Camera) -> str:
+def describe_search(search: ViewGraphFocal | None, camera: Camera) -> str:
     """Describe the camera that pairs of images gave, or say that they do not determine it."""
     focal = float(camera.focal)
-    if search.found is not None and search.is_determined:
-        return f"focal length {_with_error(focal, focal * float(search.found.std))} px by {search.pairs} image pairs"
-    if search.pairs == 0:
+    if search is None:
         return (
             f"unknown: no two images could be matched; the focal length of {focal:.0f} px is a guess, which may be "
             "wrong by a factor of two"
         )
+    pairs = len(search.errors)
+    if search.success:
+        return f"focal length {_with_error(focal, focal * float(search.std))} px by {pairs} image pairs"
     return (
-        f"{search.pairs} image pairs do not determine it ({DEGENERATE}): "
+        f"{pairs} image pairs do not determine it ({DEGENERATE}): "
         f"the focal length of {focal:.0f} px is a guess to start with"
     )
 
@@ -130,9 +132,9 @@ def describe_calibration(found: CameraMeasurement) -> str:
 
 
 # The images contradict a given focal length if it is off by this many standard errors and this ratio, or by a larger
-# ratio with a relative cost decrease.
+# ratio with a relative cost decrease. Tried at these values only.
 MIN_SIGMAS, MIN_RATIO = 3.0, 0.01
-LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02
+LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02  # the larger ratio and the decrease
 REMEDY = "--refine-camera looks for a better one"
 CONSEQUENCE = "poses and map may be badly wrong with it"
 DEGENERATE = "pure rotation, straight motion and planes do not determine it"

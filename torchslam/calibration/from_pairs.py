@@ -7,7 +7,7 @@ the focal length is the one that makes essential matrices of them (`geometry.vie
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations
 
 import cv2
@@ -29,33 +29,15 @@ PLACES = 20
 OFFSETS = 0, 2, 5, 12, 30
 """Images of a place, in frames from its first: some pairs have a parallax at any speed and frame rate."""
 NUM_KEYPOINTS = 1500
+"""SIFT keypoints of an image, for matches between images 30 frames apart. Tried at this value only."""
 THRESHOLD_PX = 1.0
 """Distance from the epipolar line; as fundamental matrices of SIFT are usually estimated."""
 CONFIDENCE, MAX_SAMPLES = 0.9999, 2000
+"""Of MAGSAC, and its largest number of samples. Tried at these values only."""
 MIN_MATCHES = 40
 """Matches that agree with a fundamental matrix: its noise is known then."""
 MAX_PAIRS = 100
 """Pairs that are used, those furthest apart in time first: they have most parallax."""
-
-
-@dataclass(frozen=True)
-class FocalSearch:
-    """What pairs of images say of an unknown camera.
-
-    Attributes:
-        found: fx with its standard error; None with too few pairs.
-        pairs: number of pairs.
-        images: number of images.
-    """
-
-    found: ViewGraphFocal | None
-    pairs: int
-    images: int
-
-    @property
-    def is_determined(self) -> bool:
-        """Whether the pairs determine the focal length."""
-        return self.found is not None and bool(self.found.success)
 
 
 def search_focal(
@@ -63,7 +45,7 @@ def search_focal(
     config: Config,
     device: torch.device | str = "cpu",
     progress: Callable[[int, int], None] = lambda done, most: None,
-) -> FocalSearch:
+) -> ViewGraphFocal | None:
     """Find the focal length by pairs of images; unreadable images are left out, the run itself reports them.
 
     Args:
@@ -71,6 +53,9 @@ def search_focal(
         config: of the run.
         device: of torch.
         progress: called with the number of images done, and of all.
+
+    Returns:
+        fx with its standard error, and `success` if the pairs determine it; None if no two images could be matched.
     """
     settings = replace(config.features, kind="sift", num_keypoints=NUM_KEYPOINTS)
     config = replace(config, features=settings)
@@ -102,9 +87,7 @@ def search_focal(
                     matched[one, other] = pair
     widest = sorted(matched, key=lambda pair: pair[0] - pair[1])[:MAX_PAIRS]
     chosen = [matched[pair] for pair in widest]
-    if not chosen:
-        return FocalSearch(None, 0, len(views))
-    return FocalSearch(_solve(chosen, sequence.camera, scale), len(chosen), len(views))
+    return _solve(chosen, sequence.camera, scale) if chosen else None
 
 
 def _fundamental(

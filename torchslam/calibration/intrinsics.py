@@ -33,14 +33,17 @@ from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
 from torchslam.optim.run_graph import ObservationGraph
 
 # A distortion coefficient must lower the cost by this ratio; a smaller gain may also come from an error of the focal
-# length or the map.
+# length or the map. Tried at this value only.
 MIN_COST_DECREASE = 0.02
 # Prior standard deviations of what is not calibrated: the principal point from the image center, in widths, and k1
-# of a lens without visible distortion.
+# of a lens without visible distortion. Tried at these values only.
 PRINCIPAL_POINT_STD, K1_STD = 0.01, 0.05
-NUM_PARTS, PART_KEYFRAMES = 4, 6  # parts of the trajectory, and minimum keyframes of each
-UNCHECKED_FACTOR = 2.0  # on the formal error of a trajectory too short to be split
-BOUNDS = 0.3, 5.0  # of the focal length in widths
+NUM_PARTS, PART_KEYFRAMES = 4, 6
+"""Parts of the trajectory, and minimum keyframes of each: fewer hardly determine a focal length. Tried only so."""
+UNCHECKED_FACTOR = 2.0
+"""On the formal error of a trajectory too short to be split: the least by which parts of real sequences disagree."""
+BOUNDS = 0.3, 5.0
+"""Of the focal length in widths: fields of view of 118 to 11 degrees. Tried at these values only."""
 MAX_DETERMINED_STD = 0.1  # relative error above which a focal length counts as unknown
 
 
@@ -187,6 +190,7 @@ def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
 
 KERNEL_SCALE = 2.45  # as in `solve_graph`: ends the quadratic part at 95 % of a Gaussian
 TOLERANCE = 1e-6
+"""Relative reduction of the cost at which the adjustment stops; far below `MIN_COST_DECREASE`."""
 ITERATIONS = 400  # 200 are needed if all depths change with a focal length that is far off
 MIN_FRAMES = 24  # frames of the problem, if available
 

@@ -19,7 +19,6 @@ from torchslam.calibration.find_camera import contradiction
 from torchslam.cli import arguments
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found, write_calibration
-from torchslam.data.camera_argument import fit_camera, unknown_camera
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.sequence import Calibrated
 from torchslam.data.synthetic.sequence import is_synthetic
@@ -73,7 +72,7 @@ def execute(options: argparse.Namespace) -> int:
     if is_synthetic(options.path):  # which is opened with a camera of its own alone
         sequence = arguments.sequence(options)
         if calibration is not None:
-            sequence = sequence.with_camera(fit_camera(calibration, sequence.size, options.poses))
+            sequence = sequence.with_camera(calibration.camera(sequence.size))
     else:
         sequence = arguments.sequence(options, calibration)
     sequence = _with_camera(sequence)
@@ -107,8 +106,7 @@ def _with_camera(sequence: Sequence) -> Sequence:
         raise SequenceError(f"{sequence.name}: a live source has no poses to refine")
     if sequence.calibrated is Calibrated.MISSING:
         say("no calibration found; estimating intrinsics from the images")
-        return sequence.with_camera(unknown_camera(sequence), Calibrated.GUESSED)
-    return sequence
+    return sequence.with_guess()
 
 
 def _write(refined: RefinementResult, sequence: Sequence, options: argparse.Namespace) -> dict[str, Any]:

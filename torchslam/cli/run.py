@@ -29,7 +29,6 @@ from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
 from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found
-from torchslam.data.camera_argument import unknown_camera
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
@@ -177,7 +176,7 @@ def _sequence(options: argparse.Namespace) -> Sequence:
     if found.calibrated is not Calibrated.MISSING or found.is_live:
         return found
     say("no calibration found; estimating intrinsics from the images (--camera auto)")
-    return found.with_camera(unknown_camera(found), Calibrated.GUESSED)
+    return found.with_guess()
 
 
 @dataclass(frozen=True)

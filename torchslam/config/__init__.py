@@ -102,6 +102,7 @@ CHOICES = choices(Config)
 
 
 _PACKAGE = Path(__file__).parents[1]
+"""Folder of the package."""
 FOLDER = _PACKAGE / "configs" if (_PACKAGE / "configs").is_dir() else _PACKAGE.parent / "configs"
 """Folder of the built-in configurations: in the package of a wheel (`setup.py`), in the root of a checkout."""
 

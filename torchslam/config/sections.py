@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from torchslam.config.schema import Settings, setting
-from torchslam.plugins import FRONT_ENDS, MATCHERS
+from torchslam.plugins import FEATURE_EXTRACTORS, MATCHERS
 
 MAX_COUNT = 1_000_000
 """Upper bound of every count: frames, keyframes, points or matches."""
@@ -29,7 +29,7 @@ REDUCTION_TOLERANCE = 1.6
 
 @dataclass(frozen=True)
 class CameraConfig(Settings, section="camera"):
-    """The given camera, which the final bundle adjustment takes for a measurement."""
+    """The given camera, which the final bundle adjustment uses as a prior."""
 
     std: float = setting(
         0.02,
@@ -51,7 +51,7 @@ class FeaturesConfig(Settings, section="features"):
         "orb",
         "Feature extractor that detects and describes keypoints.",
         choices=("orb", "opencv-orb", "sift", "simulated", "xfeat", "aliked"),
-        group=FRONT_ENDS,
+        group=FEATURE_EXTRACTORS,
     )
     num_keypoints: int = setting(1000, "Maximum number of keypoints per image.", low=1, high=MAX_KEYPOINTS)
     max_image_pixels: int = setting(

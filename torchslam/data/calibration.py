@@ -1,4 +1,4 @@
-"""Cameras before the image size is known: calibrations, focal-length guesses, dataset presets, and calibration.txt."""
+"""What is known of a camera before its images: numbers, guessed focal lengths, dataset presets, and calibration.txt."""
 
 from __future__ import annotations
 
@@ -9,12 +9,13 @@ from pathlib import Path
 
 import torch
 
-from torchslam.data.formats.text_file import numbered_lines, parse_floats
+from torchslam.data.text_file import numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
 from torchslam.utils.files import write_whole
 
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
+"""Numbers of parameters that a text may have, by camera model."""
 NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
 
 Size = tuple[int, int]
@@ -32,12 +33,15 @@ class Calibration:
 
     Attributes:
         model: "pinhole", "radial_tangential" or "fisheye".
-        params: fx fy cx cy in pixels, and all distortion coefficients of the model.
+        params: fx fy cx cy in pixels, and all distortion coefficients of the model. A guess has fx alone, in `unit`:
+            no distortion, centered principal point. That of EXIF has nothing before the first image is known.
         source: origin of the numbers, for messages.
         size: (width, height) of the images, if known.
         guessed: True if only approximate.
         std: relative standard deviation of the focal length, if the source says so.
         as_stored: True if it is of a program that ignores the orientation in the EXIF block of images.
+        unit: of a guess: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
+        others: the cameras of the same source for images of other sizes.
     """
 
     model: str
@@ -47,6 +51,8 @@ class Calibration:
     guessed: bool = False
     std: float | None = None
     as_stored: bool = False
+    unit: str = "px"
+    others: tuple[Calibration, ...] = ()
 
     @staticmethod
     def from_numbers(
@@ -67,7 +73,9 @@ class Calibration:
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"
             )
         if size is not None and min(size) <= 0:
-            raise CalibrationError(f"{source}: the size of the images must be positive, got {size_text(size)}")
+            raise CalibrationError(
+                f"{source}: the size of the images must be positive, got {size_text(size)}"
+            )
         if model is None and any(numbers[4:]):
             model = "radial_tangential"
         elif model is None:
@@ -76,16 +84,37 @@ class Calibration:
             numbers = [*numbers, 0.0][:9]
         return Calibration(model, tuple(numbers), source, size)
 
-    def camera(self, size: Size) -> Camera:
-        """Return the camera for images of `size`. Raises CalibrationError if it is for another size."""
+    @staticmethod
+    def guess(focal: float, unit: str, source: str) -> Calibration:
+        """A guessed focal length, in units of `unit`."""
+        return Calibration("pinhole", (focal,), source, guessed=True, unit=unit)
+
+    def camera(self, size: Size, pixel_aspect: float = 1.0) -> Camera:
+        """Return the camera for images of `size`.
+
+        Args:
+            size: (width, height), pixels.
+            pixel_aspect: width to height of a pixel; the fy / fx of a guess.
+
+        Raises:
+            CalibrationError: if it is for another size, or that of EXIF, which needs an image.
+        """
+        if not self.params:
+            raise CalibrationError(f"{self.source}: only image files have an EXIF block")
+        if len(self.params) == 1:
+            width, height = size
+            unit = {"px": 1.0, "w": float(width), "diagonal": math.hypot(width, height / pixel_aspect)}
+            focal = self.params[0] * unit[self.unit]
+            return Camera.pinhole(focal, focal * pixel_aspect, (width - 1) / 2, (height - 1) / 2, size=size)
         if self.size is None and not self.guessed:
             self._check_center(size)
-        if self.size not in (None, size):
-            raise CalibrationError(
-                f"{self.source}: the camera is for images of {size_text(self.size or size)}, "
-                f"these are {size_text(size)}"
-            )
-        return Camera(self.model, torch.tensor(self.params, dtype=torch.float64, device="cpu"), size)
+        for each in (self, *self.others):
+            if each.size in (None, size):
+                return Camera(each.model, torch.tensor(each.params, dtype=torch.float64, device="cpu"), size)
+        sizes = " or ".join(size_text(each.size) for each in (self, *self.others) if each.size)
+        raise CalibrationError(
+            f"{self.source}: the camera is for images of {sizes}, these are {size_text(size)}"
+        )
 
     def _check_center(self, size: Size) -> None:
         """Raise CalibrationError if the principal point says that the camera is for another size."""
@@ -101,49 +130,16 @@ class Calibration:
         )
 
 
-@dataclass(frozen=True)
-class FocalGuess:
-    """A guessed focal length: no distortion, centered principal point.
+AUTO = "auto"
+EXIF = "exif"
 
-    Attributes:
-        focal: fx in units of `unit`: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
-        source: origin of the guess, for messages.
-    """
+UNKNOWN = Calibration.guess(0.85, "w", AUTO)
+"""An unknown camera; the focal lengths of phones and webcams are 0.7 to 1 image widths."""
+FROM_EXIF = Calibration("pinhole", (), "--camera exif", guessed=True)
+"""The focal length is in the EXIF block of the first image."""
 
-    focal: float
-    unit: str
-    source: str
-    guessed: bool = True
-
-    def camera(self, size: Size, pixel_aspect: float = 1.0) -> Camera:
-        """The camera for images of `size`, with pixels of that ratio of width to height."""
-        width, height = size
-        unit = {"px": 1.0, "w": float(width), "diagonal": math.hypot(width, height / pixel_aspect)}[self.unit]
-        focal = self.focal * unit
-        return Camera.pinhole(focal, focal * pixel_aspect, (width - 1) / 2, (height - 1) / 2, size=size)
-
-
-@dataclass(frozen=True)
-class Preset:
-    """Published cameras of a dataset, selected by the image size."""
-
-    name: str
-    cameras: tuple[Calibration, ...]
-
-    @property
-    def guessed(self) -> bool:
-        """True if a camera is only approximate."""
-        return any(camera.guessed for camera in self.cameras)
-
-    def camera(self, size: Size) -> Camera:
-        """Return the camera for images of `size`. Raises CalibrationError if there is none."""
-        for calibration in self.cameras:
-            if calibration.size == size:
-                return calibration.camera(size)
-        sizes = " or ".join(size_text(each.size) for each in self.cameras if each.size)
-        raise CalibrationError(
-            f"camera `{self.name}`: it is for images of {sizes}, these are {size_text(size)}"
-        )
+GivenCamera = Camera | Calibration
+"""Camera argument of the readers: complete, or to be completed with the image size."""
 
 
 def parse_numbers(text: str, source: str) -> Calibration:
@@ -201,6 +197,7 @@ def _first_line(path: Path) -> tuple[int, str]:
 
 
 VGA = (640, 480)
+"""Image size of several datasets, pixels."""
 
 
 def _published(size: Size, *numbers: float) -> Calibration:
@@ -238,8 +235,14 @@ _CAMERAS: dict[str, tuple[Calibration, ...]] = {
     "icl": (_published(VGA, 481.2, 480.0, 319.5, 239.5),),
 }
 
-PRESETS = {name: Preset(name, cameras) for name, cameras in _CAMERAS.items()}
+PRESETS = {
+    name: replace(first, source=f"preset `{name}`", others=tuple(others))
+    for name, (first, *others) in _CAMERAS.items()
+}
+"""Published cameras of datasets, by name."""
 
+CALIBRATION = "calibration.txt"
+"""Name of the file, also in the folder of a run that estimated the camera from the images."""
 ESTIMATED_HEADER = "# torchslam: camera estimated from the images"
 IMAGE_SIZE = "size of the images"
 FOCAL_STD = "relative standard error of the focal length"

@@ -31,6 +31,7 @@ from torchslam.utils.files import check_regular, write_whole
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
 CHUNK = 1 << 20
+"""Bytes that are read at once: progress is shown, and the memory stays small."""
 TIMEOUT = 60.0
 """Seconds without a byte before a transfer is given up."""
 ATTEMPTS = 5
@@ -45,6 +46,7 @@ SLOWEST = 4096
 MARGIN = 1 << 30
 """Bytes that unpacking leaves free on the disk."""
 SMALL = 1 << 28
+"""Bytes that an archive may unpack to at any ratio: they do no harm."""
 MAX_RATIO = 100
 """Maximum ratio of unpacked to packed bytes, above `SMALL` bytes: images hardly shrink, zeros 1000 times."""
 

@@ -11,8 +11,8 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
-from torchslam.data.calibration import Calibration
-from torchslam.data.camera_argument import GivenCamera, parse_calibration
+from torchslam.data.calibration import GivenCamera
+from torchslam.data.camera_argument import parse_calibration
 from torchslam.data.download import unpack
 from torchslam.data.formats.frame_names import FOLDERS, folder_kind, is_pattern, other_kind, subfolder
 from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
@@ -28,7 +28,6 @@ from torchslam.data.sequence import Need, Reader, Sequence, exhaust
 from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
 from torchslam.data.transforms import Masked, cut, need, reduce_rate, resize
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
-from torchslam.geometry.camera import Camera
 from torchslam.utils.text import without_credentials
 
 # The first match is used: readers of specific layouts precede those of plain images.
@@ -41,7 +40,7 @@ READERS = (
 
 def open_sequence(
     path: str | Path,
-    camera: Camera | Calibration | str | Path | None = None,
+    camera: GivenCamera | str | Path | None = None,
     fps: float | None = None,
     limit: int | None = None,
     stride: int = 1,
@@ -76,8 +75,6 @@ def open_sequence(
         # A folder of masks may be matched by the number of all frames.
         is_whole = mask is not None and Path(mask).is_dir()
         sequence = _open(str(path), given, fps, exhaust if is_whole else need(start, stop, fps, most))
-        if isinstance(given, Calibration):
-            sequence.camera_std = given.std
         if mask is not None:
             sequence = Masked(sequence, mask)
     except OSError as cause:  # an unreadable folder, or a name that is too long
@@ -177,6 +174,7 @@ MAX_ENTRIES = 10_000
 MAX_FOLDERS = 200
 """Maximum number of subfolders searched for suggestions."""
 SHOWN = 6
+"""Names in a message, which stays short."""
 
 
 def _not_found_message(path: str) -> str:

@@ -7,21 +7,19 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 from enum import Enum
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float, UInt8
 from torch import Tensor
 
+from torchslam.data.calibration import UNKNOWN, Calibration, GivenCamera, size_text
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Features, Frame, Trajectory
 from torchslam.utils.text import printable, without_credentials
-
-if TYPE_CHECKING:
-    from torchslam.data.camera_argument import GivenCamera
 
 MAX_ASPECT_TERM = 100
 """Largest number in the ratio of the sides of a pixel, as it is shown."""
@@ -75,7 +73,7 @@ class Sequence(ABC):
         self,
         name: str,
         kind: str,
-        camera: Camera | None,
+        camera: GivenCamera | None,
         timestamps: Float[Tensor, " N"],
         groundtruth: Trajectory | None = None,
         *,
@@ -84,22 +82,28 @@ class Sequence(ABC):
         notes: Iterable[str] = (),
         pixel_aspect: float = 1.0,
     ) -> None:
-        """Take the size of the images (required without a camera); `guessed`: the camera is approximate."""
+        """Take the size of the images (required without a Camera); `guessed`: the Camera is approximate.
+
+        Raises CalibrationError for a camera of another size.
+        """
         self.name = printable(without_credentials(name))
         self.kind = printable(kind)
-        known = size if camera is None else camera.size
+        known = camera.size if size is None and camera is not None else size
         if known is None:
             raise ValueError("a sequence without a camera needs the size of its images")
         self.size = known
         self.pixel_aspect = pixel_aspect
-        self._camera = camera
+        self.camera_std: float | None = None
+        if isinstance(camera, Calibration):
+            guessed, self.camera_std = camera.guessed, camera.std
+            camera = camera.camera(known, pixel_aspect)
+        self._camera = None if camera is None else self._checked(camera)
         self.calibrated = Calibrated.GUESSED if guessed else Calibrated.GIVEN
         if camera is None:
             self.calibrated = Calibrated.MISSING
         self.timestamps = timestamps
         self.groundtruth = groundtruth
         self.notes = tuple(map(printable, notes))
-        self.camera_std: float | None = None
         self.as_stored = False
         self.counted_until: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
@@ -127,11 +131,14 @@ class Sequence(ABC):
     @camera.setter
     def camera(self, camera: Camera) -> None:
         """Another one, or one that was found out. Raises CalibrationError for another size than the images have."""
+        self._camera, self.calibrated, self.camera_std = self._checked(camera), Calibrated.GIVEN, None
+
+    def _checked(self, camera: Camera) -> Camera:
         if camera.size != self.size:
             raise CalibrationError(
-                f"{self.name}: a camera for images of {camera.size}, these are {self.size}"
+                f"{self.name}: the camera is for images of {size_text(camera.size)}, these are {size_text(self.size)}"
             )
-        self._camera, self.calibrated, self.camera_std = camera, Calibrated.GIVEN, None
+        return camera
 
     @property
     def known_length(self) -> int | None:
@@ -250,6 +257,12 @@ class Sequence(ABC):
         same = Transformed(self)
         same.camera, same.calibrated, same.camera_std = camera, calibrated, std
         return same
+
+    def with_guess(self) -> Sequence:
+        """Return the sequence with a guess of its camera if that is missing."""
+        if self.calibrated is not Calibrated.MISSING:
+            return self
+        return self.with_camera(UNKNOWN.camera(self.size, self.pixel_aspect), Calibrated.GUESSED)
 
     @property
     def frame_rate(self) -> float:

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.data.formats.text_file import check_later, in_seconds, numbered_lines, parse_floats
+from torchslam.data.text_file import check_later, in_seconds, numbered_lines, parse_floats
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid, se3_interpolate
 from torchslam.types import Trajectory

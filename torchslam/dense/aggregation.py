@@ -18,8 +18,12 @@ Aggregation = Callable[[Tensor, Tensor], Tensor]
 """From costs (*batch, D, H, W) and the gray image (*batch, H, W) to aggregated costs of the same shape."""
 
 SMALL_STEP = 0.1
+"""Cost of a change by one hypothesis, in units of the matching cost. Tried 0.025 to 0.1: 63.5 to 67.9 % of the pixels
+are within 5 % (experiments/dense)."""
 JUMP = 1.2
+"""Cost of any larger change. Tried 0.3 to 1.2, in proportion to `SMALL_STEP`."""
 LEAST_JUMP = 0.1
+"""Cost of a jump at the strongest edge: that of a small step."""
 EDGE = 10 / 255
 """Difference of gray values of two pixels at which a jump costs half of JUMP."""
 

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torch import Tensor
 
 THINNING_SEED = 0
+"""Of the choice of points, so that the same cloud is thinned to the same bytes."""
 SPACING_SAMPLE = 200  # points whose distance to their neighbors is measured
 SPACING_RANK = 3  # the neighbor at that distance: on a surface, a circle of that radius holds as many points
 

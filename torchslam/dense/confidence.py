@@ -20,6 +20,7 @@ TOGETHER = (1.15, -0.66, -0.45, 0.40, 0.68)
 """Weights of the logarithm of the support, of the relative spread in percent, of the conflicts and of the view's own
 log-odds where it agrees, and the constant."""
 LEAST_SUPPORT = 1e-3
+"""Least support that counts, as `LEAST_ALONE`."""
 LEAST_ALONE = 1e-4
 """Below these, evidence does not count any further."""
 LEAST_KEPT = 0.72

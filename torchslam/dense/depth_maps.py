@@ -23,6 +23,7 @@ from torchslam.geometry import Camera
 from torchslam.utils.files import check_regular, parse_json, write_whole
 
 FORMAT = 1
+"""Number of the file format."""
 MAX_BYTES = 1 << 40  # of depth maps of 170,000 keyframes of 640 x 480 pixels
 UNIT_TOLERANCE = 1e-3
 """Largest difference of the length of a normal from 1."""

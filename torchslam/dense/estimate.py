@@ -20,6 +20,7 @@ from torchslam.geometry import Camera
 from torchslam.geometry.precision import without_autocast
 
 PLANES = 64
+"""Hypotheses at half size. Tried 64 to 128: 64.1 to 64.8 % of the pixels are within 5 % (experiments/dense)."""
 STEPS = 4
 """Hypotheses at full size on either side of the surface found at half size."""
 REFINEMENT = 0.5

@@ -40,6 +40,7 @@ from torchslam.utils.files import parse_json, read_text, write_whole
 PARTS = "parts"
 JOB = "job.json"
 MAX_JOB_BYTES = 1 << 16
+"""Largest description of a job that is read; it has a few kilobytes."""
 FORMAT = 1
 """Of the parts: those of another version are computed again."""
 

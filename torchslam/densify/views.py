@@ -27,6 +27,7 @@ LEAST_NEIGHBORS = 2
 LEAST_POINTS = 10
 """Points of a view that its range of depth is taken from."""
 QUANTILES = (0.02, 0.98)
+"""Of the depth of the points of a view: a few points are outliers."""
 NEARER, FARTHER = 0.75, 1.35
 """The range of depth reaches that much beyond the quantiles of the view's points."""
 CACHED = 2 * NEIGHBORS

@@ -81,7 +81,9 @@ PATTERN: tuple[tuple[int, int, int, int], ...] = (
 
 
 RADIUS = 15
+"""Of the disk for the orientation, and of the sampling pattern, pixels (Rublee et al.: ORB, 2011)."""
 BLUR_RADIUS = 3
+"""Of the Gaussian filter before the tests, pixels: 7 x 7 as in the ORB of OpenCV."""
 ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle stays below 0.2 px
 
 

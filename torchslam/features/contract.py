@@ -1,4 +1,4 @@
-"""The contract of front ends: checks of the features that they return, and masks."""
+"""The contract of feature extractors: checks of the features that they return, and masks."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ NORMALIZE = "torch.nn.functional.normalize(descriptors, dim=-1) makes them so"
 
 @runtime_checkable
 class FixedKeypoints(Protocol):
-    """A front end that can describe given keypoints again, after its parameters have changed: `XFeat`, `ALIKED`.
+    """An extractor that can describe given keypoints again, after its parameters have changed: `XFeat`, `ALIKED`.
 
     Otherwise a row of its features may be another keypoint after every step of a training, since rows are sorted.
     """
@@ -75,19 +75,19 @@ def are_unit_or_zero(descriptors: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*b
 
 
 def check_features(found: object, images: Shaped[Tensor, "B 1 H W"], name: str) -> None:
-    """Check that what a front end returned for a batch of images keeps the contract of `Features`.
+    """Check that what a feature extractor returned for a batch of images keeps the contract of `Features`.
 
     Args:
-        found: what the front end returned.
+        found: what the feature extractor returned.
         images: its input.
-        name: of the front end, for messages.
+        name: of the feature extractor, for messages.
 
     Raises:
         ConfigError: A field has a wrong shape, type or value.
     """
 
     def refuse(what: str) -> None:
-        raise ConfigError(f"front end {name}: {what}")
+        raise ConfigError(f"feature extractor {name}: {what}")
 
     if not isinstance(found, Features):
         refuse(f"must return torchslam.Features, not {type(found).__name__}")

@@ -196,7 +196,9 @@ def _chunk_peaks(scores: Any, floor: Any, stride: int, start: int, count: int) -
 
 
 HARRIS_WINDOW = 7
+"""Side of the window, pixels; as in the ORB of OpenCV."""
 HARRIS_K = 0.04
+"""Weight of the squared trace in the response; as in the ORB of OpenCV."""
 
 
 def gather_patches(

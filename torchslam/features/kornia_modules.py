@@ -1,4 +1,4 @@
-"""Front ends of kornia as they are: any `LocalFeature`, DISK, and modules that return keypoints like theirs.
+"""Feature extractors of kornia as they are: any `LocalFeature`, DISK, and modules that return keypoints like theirs.
 
 A module finds keypoints and descriptors; this turns them into `Features`: rows in order of falling score, padded to one
 number, descriptors of unit length.
@@ -30,13 +30,13 @@ _NEEDED = "keypoints", "descriptors"
 
 
 def is_kornia_module(part: object) -> bool:
-    """Whether a front end is a module, or the class of a module, that kornia defines."""
+    """Whether a feature extractor is a module, or the class of a module, that kornia defines."""
     kind = part if isinstance(part, type) else type(part)
     return issubclass(kind, nn.Module) and kind.__module__.partition(".")[0] == PACKAGE
 
 
-def make_kornia_front_end(kind: type[nn.Module], num_keypoints: int, weights: str | None) -> KorniaFeatures:
-    """Make the front end of a class: with weights from a file, or those that kornia downloads for it.
+def make_kornia_extractor(kind: type[nn.Module], num_keypoints: int, weights: str | None) -> KorniaFeatures:
+    """Make the feature extractor of a class: with weights from a file, or those that kornia downloads for it.
 
     Raises:
         ConfigError: The weights do not fit.
@@ -54,7 +54,7 @@ def make_kornia_front_end(kind: type[nn.Module], num_keypoints: int, weights: st
 
 
 class KorniaFeatures(nn.Module):
-    """A front end of kornia behind torchslam's interface.
+    """A feature extractor of kornia behind torchslam's interface.
 
     Args:
         module: a `kornia.feature.LocalFeature`, or a module that returns, for each image, an object with keypoints
@@ -90,13 +90,13 @@ class KorniaFeatures(nn.Module):
         name = type(self.module).__name__
         if not isinstance(found, list | tuple) or len(found) != len(images):
             raise ConfigError(
-                f"front end {name}: must return one object per image, not {type(found).__name__}"
+                f"feature extractor {name}: must return one object per image, not {type(found).__name__}"
             )
         for each in found:
             missing = [field for field in _NEEDED if not hasattr(each, field)]
             if missing or _scores(each) is None:
                 raise ConfigError(
-                    f"front end {name}: returns {type(each).__name__} without keypoints, descriptors and scores"
+                    f"feature extractor {name}: returns {type(each).__name__} without keypoints, descriptors and scores"
                 )
         return list(found)
 

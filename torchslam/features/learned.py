@@ -24,6 +24,8 @@ from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features
 
 _SCALE = 2.0
+"""Scale of all keypoints of a network, which finds none, pixels; the noise is in `information`.
+Tried at this value only."""
 _XFEAT_PREFIX = re.compile(r"^(extractor\.model\.)?(net\.)?")  # published files have none, one or both
 XFEAT_NOISE, ALIKED_NOISE = 1.0, 0.7
 """Standard deviations of keypoints, in pixels of the network's input, measured in whole runs on real sequences: XFeat

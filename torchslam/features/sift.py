@@ -1,4 +1,4 @@
-"""SIFT of OpenCV behind the interface of `ORB`: a front end with descriptors of floats that needs no weights.
+"""SIFT of OpenCV behind the interface of `ORB`: a feature extractor with descriptors of floats that needs no weights.
 
 Lowe: Distinctive image features from scale-invariant keypoints (IJCV 2004). Descriptors are root-normalized:
 Arandjelovic and Zisserman: Three things everyone should know to improve object retrieval (CVPR 2012).
@@ -44,6 +44,7 @@ By the median residuals of runs over shelf_bin, fr2_desk_20, redkitchen, machine
 0.5 px up to size 8, and 0.03 to 0.06 of the size beyond. With 1.0, gates are so narrow that shelf_bin is soon lost."""
 
 DESCRIPTOR_FLOATS = 128
+"""Numbers of a descriptor: 4 x 4 cells of 8 directions (Lowe, 2004)."""
 
 Array = NDArray[Any]
 

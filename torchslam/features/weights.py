@@ -1,4 +1,4 @@
-"""Weights of learned front ends and matchers by name: where they lie on this machine, and where they are published.
+"""Weights of learned extractors and matchers by name: where they lie on this machine, and where they are published.
 
 A name such as `xfeat` is looked up in the folder `TORCHSLAM_WEIGHTS`, then among the downloads (`downloads`). Nothing
 is fetched unasked: `torchslam download xfeat` does it.

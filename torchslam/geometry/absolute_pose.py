@@ -47,6 +47,7 @@ from torchslam.geometry.undistorted import UndistortedKeypoints
 FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
 CANDIDATES = 2  # hypotheses of each round that are optimized
 LOCAL_ITERATIONS, FINAL_ITERATIONS = 1, 10
+"""Of a hypothesis within the search, which only ranks it, and of the final refinement. Tried at these values only."""
 FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without this refinement more runs are lost
 _ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no more than rounding
 

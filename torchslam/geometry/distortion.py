@@ -20,6 +20,7 @@ from torch._C import _are_functorch_transforms_active
 from torchslam.geometry.estimate_gradients import needs_gradient
 
 _NEWTON_STEPS = 12
+"""Of the inverse map; more are needed close to the limit of the model. Tried at this value only."""
 _GRAPH_STEPS = 2
 """Newton steps from the solution on that gradients pass: one gives the first derivative, two give three."""
 
@@ -281,3 +282,4 @@ MODELS = {
         torch.atan,
     ),
 }
+"""The camera models by name."""

@@ -1,6 +1,6 @@
 """First derivatives of what an estimator found, by the implicit function theorem where it is a minimizer.
 
-Those of any order, of minima of least squares: `solvers.implicit`.
+Those of any order, of minima of least squares: `optim._core.implicit`.
 """
 
 from __future__ import annotations

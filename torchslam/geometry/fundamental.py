@@ -20,12 +20,14 @@ from torchslam.geometry.robust import robustify
 from torchslam.geometry.two_view import TwoViews, fit_homography, propose_homography, transfer_squared
 
 _ITERATIONS = 15
+"""Of Levenberg-Marquardt, for the matrix and for the homography. Tried at this value only."""
 _LEAST_NOISE = (
     0.1  # thresholds: SIFT keypoints that are exact to a tenth of a pixel are an accident of few matches
 )
 _MAD = 0.6745  # median of the absolute value of a standard normal variable
 _FREEDOMS = 7
-# Added to the information, relative to its mean: of a plane or a turning camera, two directions have none, and their
+"""Degrees of freedom of a fundamental matrix: nine numbers less the scale and the rank."""
+# Added to the information, relative to its mean: of a plane or a rotating camera, two directions have none, and their
 # covariance shall be large, not infinite.
 _LEAST_INFORMATION = 1e-12
 # Of a homography: random samples of four matches, so that of matches half of which lie on the plane 98 % have a good

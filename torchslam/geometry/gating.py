@@ -62,7 +62,7 @@ CHI_SQUARE_95 = 5.991
 
 
 GATE_FACTOR = 2.0
-"""Inflation of the standard deviations that a front end provides when a keypoint is gated against the map, which has
+"""Inflation of the standard deviations that an extractor provides when a keypoint is gated against the map, which has
 errors of its own. Scales, where no information is provided, include that factor: ORB is precise to half its scale."""
 
 
@@ -72,7 +72,7 @@ class KeypointNoise:
 
     Attributes:
         scales: pixels, the sizes of their pyramid levels.
-        information: px^-2, as a front end provides it. I = 0: none, the scale in each direction is the standard
+        information: px^-2, as a feature extractor provides it. I = 0: none, the scale in each direction is the standard
             deviation times `GATE_FACTOR`; I = 1: inverse variance in each direction; I = 3: xx, xy, yy of the inverse
             covariance.
     """

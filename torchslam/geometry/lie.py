@@ -21,6 +21,7 @@ from torchslam.geometry.precision import full_precision
 # Below this squared angle the coefficients come from their series, (-1)^k / (2k + n)! for n = 1, 2, 3, 4.
 _SERIES_LIMIT = 0.25
 _SERIES = tuple(tuple((-1.0) ** k / math.factorial(2 * k + n) for n in (1, 2, 3, 4)) for k in range(7))
+"""Seven terms: the next one is below the rounding of float64 at the limit."""
 
 
 def _rodrigues(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -226,7 +227,7 @@ def _integration_matrix(nodes: np.ndarray) -> np.ndarray:
 # Gauss-Legendre nodes and weights on [0, 1]; 16 of them integrate the scaled rotation below to 1e-15.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
 _PARTIAL_WEIGHTS = _integration_matrix(_NODES).tolist()
-_NODES, _WEIGHTS = (0.5 * (_NODES + 1)).tolist(), (0.5 * _WEIGHTS).tolist()
+_NODES, _WEIGHTS = (0.5 * (_NODES + 1)).tolist(), (0.5 * _WEIGHTS).tolist()  # from [-1, 1] to [0, 1]
 
 
 def _sim3_translation_matrix(

@@ -28,10 +28,13 @@ from torchslam.geometry.two_view import (
 
 MODELS = ("essential", "homography", "rotation")
 ESSENTIAL, HOMOGRAPHY, ROTATION = range(3)
+"""Rows of the models, in the order of `MODELS`."""
 
 FINAL_ITERATIONS = 12
+"""Of Levenberg-Marquardt, for the model that is chosen. Tried at this value only."""
 FINAL_WIDTH = 2.0  # thresholds; the refinement uses the tail of the noise too
 _HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
+"""Minimal samples of a homography and of a rotation. Tried at these values only."""
 _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
@@ -40,14 +43,18 @@ _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for
 # an essential matrix finds many by accident.
 _HOPELESS, _MANY = 0.25, 50
 _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
-# How far the matches have to lean towards their epipolar lines: by so many deviations, two more than a direction needs
-# that was not chosen to fit; and on average as where the variance along the lines is twice that across, since the noise
-# of keypoints on edges has a direction of its own.
-_CERTAIN, _NOTABLE = 4.0, 1 / 3
+# Alignment of the errors with the epipolar lines: by so many deviations, two more than a direction needs that was not
+# chosen to fit; and on average as where the variance along the lines is twice that across, since the noise of keypoints
+# on edges has a direction of its own.
+_MIN_LEAN_SIGMAS, _MIN_LEAN = 4.0, 1 / 3
 # Squared deviations by which the five parameters of an essential matrix, fitted, beat the true one in one case of a
 # hundred (chi-square).
 _GAIN_OF_A_FIT = 15.09
 _PLANE_MEDIAN = 0.6745**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
+# Ratio of the support of the second motion before a plane to that of the first, above which either may be the right
+# one; and entries of two rotations that differ by less are those of one motion, to 0.06 degrees. Tried at these values
+# only.
+_MAX_SECOND_SUPPORT, _SAME_ROTATION = 0.8, 1e-3
 _TELLS_MOTIONS = 3.0  # deviations by which one of two motions before a plane has to explain more
 # Of the matches on a plane, which noise may turn over where it is seen edge on; and of those with parallax.
 _IN_FRONT = 0.9
@@ -117,7 +124,7 @@ def fit_models(
     fits = replace(rough, H=H, R_only=R_only).with_mappings(views)
     if not bool(hopeless.any()):
         return fits
-    # As alone, whoever else is in the batch.
+    # Independent of the other elements of the batch.
     row = hopeless[:, None, None]
     H, R_only = torch.where(row, rough.H, fits.H), torch.where(row, rough.R_only, fits.R_only)
     return Fits(R, t, H, R_only, torch.where(hopeless[:, None], rough.squared, fits.squared))
@@ -183,7 +190,7 @@ def _leans(
     lean = torch.where(near, weight * cosine, 0.0).sum(-1)
     # One more, that matches far below the noise, whose errors are rounding, are not enough.
     deviation = (0.5 * weight.square().sum(-1) + 1).sqrt()
-    return (lean > _NOTABLE * weight.sum(-1)) & (lean > _CERTAIN * deviation)
+    return (lean > _MIN_LEAN * weight.sum(-1)) & (lean > _MIN_LEAN_SIGMAS * deviation)
 
 
 def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
@@ -276,14 +283,14 @@ def pose_of(
     of_match = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0)
     support = torch.where(possible, of_match.sum(-1), -1.0)
     (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
-    ambiguous = second > 0.8 * first.clamp_min(0.0)
+    ambiguous = second > _MAX_SECOND_SUPPORT * first.clamp_min(0.0)
     index = torch.arange(len(model), device=model.device)
     if by_noise:
         deviation = (of_match[index, order[0]] - of_match[index, order[1]]).norm(dim=-1)
         ambiguous |= (second >= 0) & (first - second < _TELLS_MOTIONS * deviation)
     best = order[0]
     flat = model == HOMOGRAPHY
-    apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > 1e-3
+    apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > _SAME_ROTATION
     R = torch.where(flat[:, None, None], R_H[index, best], R_E)
     t = torch.where(flat[:, None], direction[index, best], t_E)
     still = model == ROTATION

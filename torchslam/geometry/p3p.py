@@ -76,6 +76,7 @@ _CONIC_TABLE = [
     for terms in _CONICS
     for entry in range(6)
 ]
+"""`_CONICS` as a table by entry: factors of the products of distance and cosine."""
 
 
 @lru_cache(maxsize=4)

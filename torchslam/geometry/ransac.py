@@ -19,6 +19,7 @@ from torchslam.geometry.precision import check_positive
 ModelState = tuple[Tensor, ...]
 
 _MAX_VALUES_AT_ONCE = 300_000
+"""Residuals that are in memory at once, which bounds it. Tried at this value only."""
 _MIN_ITERATIONS = 2  # before it may stop
 
 
@@ -106,6 +107,7 @@ def retract_pose(pose: ModelState, step: Float[Tensor, "B 6"]) -> ModelState:
 # Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
 SUPPORT_WIDTH = 2.0
 _SAMPLES_AT_ONCE = 1024
+"""Minimal samples that are solved at once, which bounds the memory. Tried at this value only."""
 # From this many residuals on, models are compared on some rows first, and some models then on all.
 _PREVIEW_FROM, _PREVIEW_ROWS, _PREVIEW_MODELS = 100_000, 80, 32
 

@@ -43,6 +43,7 @@ Model = Literal["auto", "essential"]
 
 KERNEL_WIDTH = 1.5  # deviations of the noise, which for keypoints has a long tail, at which the kernel begins
 _KERNEL_ITERATIONS = 20
+"""Of Levenberg-Marquardt with the robust kernel. Tried at this value only."""
 _LEAST_NOISE = 1 / 64  # thresholds; of exact matches
 
 
@@ -176,7 +177,7 @@ def _choose(
         rough, fits = fits.squared, fits.finished(views, _width(by_noise))
         plane = PlaneMotions.of(views, fits)
         if by_noise:
-            # As alone, whoever else is in the batch.
+            # Independent of the other elements of the batch.
             fits = replace(fits, squared=torch.where(simple[:, None], fits.squared, rough))
 
             def is_certain(model: Int[Tensor, " B"]) -> Bool[Tensor, " B"]:
@@ -196,7 +197,7 @@ def _choose(
         return _Chosen(R_E, t_E, zero, model, torch.zeros_like(mask[:, 0]), R_E, t_E, fits.squared)
     plane = PlaneMotions.of(views, fits) if plane is None else plane
     R, t, normal, ambiguous = pose_of(views, fits, model, plane, by_noise)
-    if by_noise:  # as alone, whoever else is in the batch
+    if by_noise:  # independent of the other elements of the batch
         is_essential = (model == ESSENTIAL)[:, None]
         R, t = torch.where(is_essential[..., None], R_E, R), torch.where(is_essential, t_E, t)
     return _Chosen(R, t, normal, model, ambiguous, R_E, t_E, fits.squared)
@@ -232,7 +233,7 @@ def _fit_motion(
 def _rotations(R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
     """The rotations closest to matrices.
 
-    Where the root of E was not found exactly, R is a rotation only to a ten thousandth; the others stay to the bit.
+    Where the root of E was not found exactly, R is a rotation only to 1e-4; the others keep their bits.
     """
     eye, rounding = torch.eye(3, dtype=R.dtype, device=R.device), torch.finfo(R.dtype).eps ** 0.6
     good = ((R.mT @ R - eye).abs() < rounding).all(-1).all(-1)

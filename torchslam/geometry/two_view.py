@@ -138,7 +138,7 @@ _MORE_CANDIDATES = 8  # if matches have to be in front of the cameras,
 _CHECKED_CANDIDATES = 24  # of so many
 _ITERATIONS = 4  # of their local optimization
 # Deviations of the noise at which a match supports a candidate half, and thresholds between which that is: a threshold
-# far from the noise ranks the samples all the same, but tells less between those that come close.
+# far from the noise still ranks the samples, but discriminates poorly between the best ones.
 _SUPPORT_DEVIATIONS, _LEAST_UNIT, _LARGEST_UNIT = 1.5, 1 / 16, 4.0
 NOISE_WIDTH = 4.0  # thresholds within which the noise is estimated
 

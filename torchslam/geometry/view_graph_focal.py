@@ -3,7 +3,7 @@
 With the right focal length f and K = diag(f, f, 1), E = K^T F K has two equal singular values: in the planes
 perpendicular to its null vectors it is a rotation, or a reflection. These are two equations for each pair, linear in F,
 and their noise follows from that of F. A focal length is judged by what they are worth in units of that noise, so that
-pairs that tell nothing about it, whose equations hold or are uncertain with any, do not count.
+pairs without information about it, whose equations hold or are uncertain with any, do not count.
 
 Sources: Sweeney et al., "Optimizing the viewing graph for structure-from-motion", 2015; Fetzer et al., "Stable
 intrinsic auto-calibration from fundamental matrices of devices with uncorrelated camera parameters", 2020; Pan et al.,
@@ -44,9 +44,9 @@ _ROUNDING = 1e-12  # of the cost and of its minimum: what Newton's method cannot
 _MAX_STD = 0.1  # relative; as in `calibration.intrinsics`, beyond it a focal length counts as unknown
 _RISE = 9.0  # of the cost, three deviations, that any focal length further away than three times `_MAX_STD` must have
 _MIN_MATCHES = 20  # of a pair: the noise of fewer cannot be told
-# Of the matches, that one homography explains: pairs beyond it tell nothing, however certain their matrix seems. Planes
-# and turning cameras with simulated noise have 0.92 to 1; 90 % of the pairs of each of nine recordings have less than
-# 0.75, most half of that.
+# Of the matches, that one homography explains: pairs beyond it have no information, however certain their matrix seems.
+# Planes and rotating cameras with simulated noise have 0.92 to 1. Of the pairs of each of nine recordings, 90 % have
+# less than 0.75, most half of that.
 _MAX_HOMOGRAPHY_SHARE = 0.8
 
 
@@ -83,9 +83,9 @@ def focal_from_fundamentals(
     """Find the focal length of a camera without distortion from the fundamental matrices of pairs of its images.
 
     All nine numbers of a matrix count as equally uncertain. Matrices of a plane or of a camera that only turned are
-    arbitrary: leave them out, or use `focal_from_pairs`, which sees that they tell nothing. Pure forward motion tells
-    nothing either, nor do optical axes that meet at the same distance from both views, as those of a camera that
-    circles what it looks at: then there is no `success`.
+    arbitrary: leave them out, or use `focal_from_pairs`, which sees that they have no information. Pure forward
+    motion has none either, nor have optical axes that meet at the same distance from both views, as those of a camera
+    that circles what it looks at: then there is no `success`.
 
     Args:
         F_21: in pixels, x_2^T F_21 x_1 = 0, of any scale and of rank two; one that is not finite is left out.
@@ -125,7 +125,7 @@ def focal_from_pairs(
 
     Refines the fundamental matrices on the matches, and uses how uncertain each is and how distortion would change
     it. Pairs whose matches a homography explains, those of a plane or of a camera that only turned, are left out;
-    without others there is no `success`. The same motions as for `focal_from_fundamentals` tell nothing.
+    without others there is no `success`. The same motions as for `focal_from_fundamentals` have no information.
 
     Args:
         F_21: in pixels, x_2^T F_21 x_1 = 0, such as from RANSAC: where the refinement starts.

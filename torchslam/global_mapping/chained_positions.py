@@ -33,6 +33,7 @@ DIRECTION_STD = 0.05
 WIDTHS = 20.0, 6.0, 3.0
 """Scales of the Cauchy kernel, in standard deviations, each for `STEPS` steps from the last."""
 STEPS = 10
+"""Steps of reweighting with each width. Tried at this value only."""
 FEEBLE = 1e-6
 """Relative weight that ties every node to zero: parts that nothing connects stay solvable."""
 

@@ -31,7 +31,7 @@ Right maps have below 1 px, maps with a loop closed wrongly tens."""
 NEAREST = 0.05
 """Depth, as a ratio of the median, from which on matches may lie: the epipolar line ends there."""
 MAX_RATIO_STD = 0.04
-"""Standard error of the logarithm of a ratio of scales above which a triplet tells nothing."""
+"""Standard error of the logarithm of a ratio of scales above which a triplet counts as inconclusive."""
 MAX_SCALE_ERROR = math.log(1.08)
 """Largest departure of a ratio of scales from one, besides two standard errors. Tried on maps bent by hand, by 10, 20
 and 50 %: 20 % is found, and right maps depart by 1 to 3 %."""

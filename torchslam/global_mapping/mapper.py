@@ -29,7 +29,7 @@ from torchslam.global_mapping.view_graph import (
 )
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.optim.rotation_averaging import average_rotations
-from torchslam.system.front_end import Extractor, FrontEnd, check_size, image_extractor, source
+from torchslam.system.front_end import Extractor, FeatureExtractor, check_size, image_extractor, source
 from torchslam.system.run import FinalAdjustment, Run
 from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult
@@ -115,7 +115,7 @@ class GlobalMapper:
         config: the configuration of the run.
         given: the camera with its error; None: it is exact.
         device: of torch.
-        extractor: front end; the configured one if None.
+        extractor: feature extractor; the configured one if None.
         matcher: of two views; the configured one if None.
         progress: receives stages.
     """
@@ -127,7 +127,7 @@ class GlobalMapper:
         config: Config,
         given: CameraMeasurement | None,
         device: torch.device | str = "cpu",
-        extractor: FrontEnd | None = None,
+        extractor: FeatureExtractor | None = None,
         matcher: Matcher | None = None,
         progress: Progress = lambda stage, done, most: None,
     ) -> None:

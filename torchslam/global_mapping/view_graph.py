@@ -35,6 +35,8 @@ MIN_RATIO = 0.25
 THRESHOLD_PX = 1.5
 """Distance from the epipolar line, at the size at which features are found: twice the noise of SIFT. Tried 1 to 3."""
 _PAIRS_AT_ONCE, _MIN_SAMPLES, _MAX_SAMPLES = 32, 64, 500
+"""Pairs that are verified in one batch, which bounds the memory; least and largest number of samples of each.
+Tried at these values only."""
 
 
 class Relation(Enum):

@@ -17,7 +17,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import to_toml
-from torchslam.data.calibration import write_calibration
+from torchslam.data.calibration import CALIBRATION, write_calibration
 from torchslam.data.formats.image_file import read_gray
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
@@ -39,7 +39,6 @@ OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number
 ONLINE = "online.txt"
 KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
-CALIBRATION = "calibration.txt"  # where the intrinsics were estimated from the images
 MAP = "map.safetensors"
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
 POINT_CLOUD = "map.ply"
@@ -48,6 +47,7 @@ MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
 DEPTHS = Path("dense") / "depths.safetensors"  # of keyframes of the main submap
 PICTURES = Path("dense") / "pictures"
 PICTURE_NAMES = "[0-9]" * 6 + ".png"
+"""Pattern of the names of depth pictures: six digits of the frame."""
 CONFIG = "config.toml"
 METRICS = "metrics.json"
 FRAMES = "frames.csv"

@@ -1,4 +1,4 @@
-"""SLAM of short clips as a trainable module: images in, poses out, gradients back into the front end.
+"""SLAM of short clips as a trainable module: images in, poses out, gradients back into the feature extractor.
 
 The system makes the discrete decisions (which keypoints match, which frames are keyframes) once, without gradient. The
 result is a graph: a least-squares problem whose pixels are read from the features, with their gradients, in every step.
@@ -141,7 +141,7 @@ def clip_loss(
 
 
 def clip_mean(poses: ClipPoses, errors: Float[Tensor, "*batch"], on_failure: OnFailure = "raise") -> ClipLoss:
-    """Average errors over the clips; a failed clip never counts as error zero, since a front end could learn to fail.
+    """Average errors over the clips; a failed clip never counts as error zero, since an extractor could learn to fail.
 
     Args:
         poses: Of a clip, or of B clips.
@@ -196,9 +196,9 @@ def clip_halves(
 
 
 class ClipSLAM(nn.Module):
-    """Poses of clips, differentiable with respect to images, camera and the parameters of the front end.
+    """Poses of clips, differentiable with respect to images, camera and the parameters of the feature extractor.
 
-    Train a front end:
+    Train a feature extractor:
 
         clip_slam = ClipSLAM(XFeat("xfeat.safetensors"))
         optimizer = torch.optim.Adam(clip_slam.parameters(), 1e-4)
@@ -209,7 +209,7 @@ class ClipSLAM(nn.Module):
             optimizer.step()
 
     A call builds the graph and solves it for the poses. If training only moves or reweights keypoints, build the graph
-    once and reuse it; a step then takes about 0.1 s plus the front end:
+    once and reuse it; a step then takes about 0.1 s plus the feature extractor:
 
         graph = clip_slam.build_graph(images, camera)
         ...
@@ -231,7 +231,7 @@ class ClipSLAM(nn.Module):
         keypoint_weight: Callable[[Features], Float[Tensor, "T N"]] | None = None,
         config: Config | None = None,
     ) -> None:
-        """Create a module with the parameters of the front end."""
+        """Create a module with the parameters of the feature extractor."""
         super().__init__()
         self.extractor = KorniaFeatures(extractor) if is_kornia_module(extractor) else extractor
         self.keypoint_weight = keypoint_weight
@@ -242,7 +242,7 @@ class ClipSLAM(nn.Module):
     ) -> ClipPoses:
         """Estimate the poses of a clip, or of each of several clips.
 
-        The front end runs on the device of the images, the rest on that of the camera. World frame and unit are
+        The feature extractor runs on the device of the images, the rest on that of the camera. World frame and unit are
         arbitrary and have no gradient: use a loss that does not depend on them, such as `clip_loss`. A failed clip has
         no posed frame and a gradient of zero; see `success` and `reasons`.
 
@@ -266,8 +266,8 @@ class ClipSLAM(nn.Module):
 
         Args:
             images: As in `forward`.
-            graph: Of these images: a front end with `read` (`features.contract.FixedKeypoints`) describes the keypoints
-                of the graph, in their rows, whatever it would detect now.
+            graph: Of these images: an extractor with `read` (`features.contract.FixedKeypoints`) describes the
+                keypoints of the graph, in their rows, whatever it would detect now.
 
         Raises:
             ValueError: Images of another shape.
@@ -301,7 +301,7 @@ class ClipSLAM(nn.Module):
             features: Results of `extract`, if already computed.
 
         Raises:
-            ConfigError: Invalid features of the front end, see `features.contract`.
+            ConfigError: Invalid features of the feature extractor, see `features.contract`.
         """
         seen = _per_clip(self.extract(images) if features is None else features)
         clips, batched = (images, True) if images.ndim == 5 else (images[None], False)
@@ -415,7 +415,7 @@ def _as_seen(
     if jumped:
         raise ValueError(
             f"{jumped} of {len(moved)} keypoints are up to {float(moved.max()):.0f} px from where the graph has them: "
-            "their rows hold other keypoints now. Use features of `extract(images, graph)`, of a front end with "
+            "their rows hold other keypoints now. Use features of `extract(images, graph)`, of an extractor with "
             "`read`, or build the graph anew"
         )
     return replace(run, pixels=pixels, weights=weights, camera=camera)

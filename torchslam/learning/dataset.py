@@ -249,13 +249,13 @@ class Batches(Sampler[list[int]]):
 
 
 class GraphCache:
-    """Graphs of the clips of a data set, each built once, by a copy of the initial front end.
+    """Graphs of the clips of a data set, each built once, by a copy of the initial feature extractor.
 
     The graph of a clip therefore does not depend on when it first occurs, and resumed training sees the same graphs.
     """
 
     def __init__(self, clip_slam: ClipSLAM) -> None:
-        """Copy the front end and the configuration of a module."""
+        """Copy the feature extractor and the configuration of a module."""
         self._clip_slam = ClipSLAM(copy.deepcopy(clip_slam.extractor), config=clip_slam.config)
         self._graphs: dict[int, ClipGraph] = {}
 

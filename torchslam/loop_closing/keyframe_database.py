@@ -130,7 +130,8 @@ _CHUNK = 1 << 17
 _FIRST_CAPACITY = 64
 """Images for which a new database has room; it grows by a quarter."""
 _MIN_FLOAT_WORDS = 64
-"""Descriptors below which an image is too empty to give the words of floats. Tried at this value only."""
+"""Descriptors below which an image is too empty to give the words of a float feature extractor. Tried at this value
+only."""
 
 
 class KeyframeDatabase:

@@ -23,7 +23,6 @@ from torchslam.geometry import (
 from torchslam.geometry.ransac import samples_needed
 from torchslam.map.map import Map
 from torchslam.optim import refine_pose
-from torchslam.tracking.data_association import GUIDED_RATIO
 from torchslam.tracking.localizer import match_projected_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher, run_matcher
 from torchslam.types import Matcher
@@ -165,9 +164,7 @@ def match_by_sim3_pose(
     view = other.frame_features(keyframe)
     angle = config.tracking.max_view_angle_deg
     near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
-    pairs = match_projected_points(
-        slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching), ratio=GUIDED_RATIO
-    )
+    pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching))
     return pairs.first, pairs.second
 
 

@@ -26,6 +26,7 @@ from torchslam.map.table import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema,
 from torchslam.utils.files import check_regular, parse_json, write_whole
 
 FORMAT = 1
+"""Number of the file format; docs/versions.md says which version reads which."""
 TABLES: dict[str, Schema] = {
     "points": POINTS,
     "keyframes": KEYFRAMES,

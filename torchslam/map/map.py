@@ -20,6 +20,7 @@ from torchslam.types import Features, FrameFeatures, Observations
 from torchslam.utils.indexing import distinct, ranks_among
 
 NO_POINT = -1
+"""Instead of the row of a point: a keypoint that observes none, or a point that is not replaced."""
 MIN_SHARED = 15  # points that two keyframes share, to count as covisible
 # Median of squared errors after an adjustment, in units of the stated noise, where that is right: points are fitted to
 # the pixels, and ORB is precise to half its scale. 0.05 to 0.26 with ORB on real sequences, 0.4 to 0.6 with XFeat,
@@ -27,6 +28,7 @@ MIN_SHARED = 15  # points that two keyframes share, to count as covisible
 _ADJUSTED_SQUARED_ERROR = 0.2
 _MAX_NOISE_VARIANCE = 4.0  # beyond it, errors are not noise
 _PRIOR_ADJUSTMENTS, _REMEMBERED_ADJUSTMENTS = 3, 20
+"""Adjustments as which the prior counts, and over which the moving average reaches. Tried at these values only."""
 SESSION_BITS = 40  # of a key, below the number of the session: more frames than a session has
 
 
@@ -40,7 +42,7 @@ class Map:
         keyframes: One row per keyframe, see `table.KEYFRAMES`.
         images: Of the keyframes, by key, if the matcher needs them; not saved.
         version: Changes when rows are renumbered.
-        noise_variance: Of keypoints, at least 1, in units of what the front end states; poses are judged by it.
+        noise_variance: Of keypoints, at least 1, in units of what the feature extractor states; poses are judged by it.
     """
 
     def __init__(self) -> None:
@@ -362,7 +364,7 @@ class Map:
         """Update the variance of keypoints by the squared errors of an adjustment, in units of the stated noise.
 
         A moving average of medians: a tenth of outliers does not matter. The first adjustments weigh more; the prior,
-        that the front end states the truth, counts as much as `_PRIOR_ADJUSTMENTS` of them.
+        that the feature extractor states the truth, counts as much as `_PRIOR_ADJUSTMENTS` of them.
         """
         if len(squared_errors) == 0:
             return

@@ -11,7 +11,9 @@ from jaxtyping import Bool, Int, Shaped
 from torch import Tensor
 
 NO_SLOT = -1
+"""Instead of a slot: fills the rows of points with fewer observations."""
 _LEAST_ROWS, _LEAST_WIDTH = 64, 4
+"""Rows and columns of a new index; both double when they are full."""
 
 
 class ObservationIndex:

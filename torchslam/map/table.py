@@ -72,6 +72,7 @@ POINTS: Schema = {
     "is_valid": Column((), "bool", "false for removed points, whose rows stay until the submap is compacted"),
     "replaced_by": Column((), "int", "row of the point that this one was merged into, or -1"),
 }
+"""Columns of the points."""
 
 KEYFRAMES: Schema = {
     "T_cw": Column((4, 4), "float", "pose, world to camera"),
@@ -91,6 +92,7 @@ KEYFRAMES: Schema = {
     ),
     "point_ids": Column(("N",), "int", "row of the point that each keypoint observes, or -1"),
 }
+"""Columns of the keyframes."""
 
 FRAMES: Schema = {
     "frame_index": Column((), "int", "index in the sequence of its session"),
@@ -99,6 +101,7 @@ FRAMES: Schema = {
     "T_cr": Column((4, 4), "float", "pose relative to the reference keyframe, in map units"),
     "reference_keyframe": Column((), "int", "row of the reference keyframe"),
 }
+"""Columns of the frames between keyframes."""
 
 OBSERVATIONS: Schema = {
     "frame_row": Column((), "int", "row of the frame"),
@@ -108,6 +111,7 @@ OBSERVATIONS: Schema = {
     "scales": Column((), "float", "pixels"),
     "information": Column(("I",), "float", "px^-2, as for the keypoints"),
 }
+"""Columns of the observations of frames."""
 
 
 class Table:

@@ -50,6 +50,7 @@ _MATRICES = {
     "se3": _Moves(6, tangent.retract, tangent.push, tangent.pull_back),
     "sim3": _Moves(7, tangent.retract_sim3, tangent.push_sim3, tangent.pull_back_sim3),
 }
+"""The manifolds of matrices by name, with the dimension of their steps."""
 
 
 @dataclass(frozen=True)

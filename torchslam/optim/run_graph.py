@@ -1,4 +1,4 @@
-"""What a run leaves behind, as one differentiable problem: the answer is differentiated, not the path to it.
+"""The observation graph of a run as one differentiable least-squares problem: its minimum is differentiated.
 
 The trajectory of a finished run minimizes the reprojection errors of its observation graph. However many frames
 and discrete choices led there, its gradient with respect to every pixel, weight and camera parameter is that of the
@@ -38,7 +38,9 @@ POSE_ITERATIONS = 30
 """Enough where no gradient is wanted: poses settle long before the choice of outliers that gradients depend on."""
 
 _FRAMES_AT_ONCE = 64
+"""Frames whose poses are refined in one batch, which bounds the memory."""
 _MAX_BYTES = 1 << 34
+"""Largest file that is read."""
 _MAX_SIDE = 1 << 26  # of an image, pixels
 # Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
 _MAX_SIZE_RATIO = 2.0
@@ -95,7 +97,7 @@ class ObservationGraph:
 
     @property
     def submaps(self) -> list[int]:
-        """The submaps that there are, ascending."""
+        """The numbers of the submaps, ascending."""
         return [
             int(submap) for submap in torch.unique(self.submap)
         ]  # `tolist` fails in transforms of torch 2.5
@@ -156,7 +158,7 @@ class ObservationGraph:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
 
     def _check(self) -> None:
-        """Raises ValueError where a column does not fit the others, or names rows that there are not."""
+        """Raises ValueError where a column does not fit the others, or has indices out of range."""
         rows = {"K": len(self.T_cw), "N": len(self.points_w), "O": len(self.pixels)}
         for name, (owner, shape, kind) in self._SCHEMA.items():
             column = getattr(self, name)
@@ -178,7 +180,7 @@ class ObservationGraph:
         params = self.camera.params
         check_dtypes(camera=params)
         if params.ndim != 1 or not bool(params.isfinite().all()) or not bool((params[:2] > 0).all()):
-            raise ValueError("the camera's parameters are none")
+            raise ValueError("the camera's parameters are invalid")
         if self.calibration is not None:
             given = self.calibration.camera.params, self.calibration.directions
             check_dtypes(camera=params, calibration=given[0], directions=given[1])
@@ -204,7 +206,7 @@ class RunGraph(ObservationGraph):
         frame_ids: index of each frame in the sequence of its session.
         sessions: session of each frame.
         point_ids: row of each point in the submap's map.
-        keypoint_index: row of each observation among the frame's features, to read its pixels anew from a front end.
+        keypoint_index: row of each observation among the frame's features, to read its pixels anew from an extractor.
     """
 
     frame_ids: Int[Tensor, " K"]

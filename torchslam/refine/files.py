@@ -12,7 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.data.formats.given_poses import COLMAP, NERFSTUDIO
-from torchslam.data.formats.text_file import read_text
+from torchslam.data.text_file import read_text
 from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.geometry import se3_inverse

@@ -49,7 +49,7 @@ from torchslam.global_mapping.view_graph import (
     build_view_graph,
     connected_views,
 )
-from torchslam.system.front_end import FrontEnd
+from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.run import Run
 from torchslam.types import State, StepResult, Trajectory
 
@@ -117,7 +117,7 @@ def refine_poses(
     choice: CameraChoice = CameraChoice.IF_CONTRADICTED,
     radial: int = 0,
     device: torch.device | str = "cpu",
-    extractor: FrontEnd | None = None,
+    extractor: FeatureExtractor | None = None,
     on_progress: Callable[[str], None] | None = None,
 ) -> RefinementResult:
     """Refine given poses of the images of a sequence.
@@ -131,7 +131,7 @@ def refine_poses(
         choice: How the given camera is treated.
         radial: Maximum number of distortion coefficients that may be estimated.
         device: Of torch.
-        extractor: Front end; SIFT if None and the configured one is the default.
+        extractor: Feature extractor; SIFT if None and the configured one is the default.
         on_progress: Receives messages.
 
     Returns:

@@ -23,7 +23,7 @@ from torchslam.errors import ResultsError
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import TrackingState
 from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_submaps, write_tensors
-from torchslam.system.front_end import FrontEnd
+from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
@@ -78,7 +78,7 @@ def read_checkpoint(
     sequence: Sequence,
     config: Config,
     device: torch.device | str = "cpu",
-    extractor: FrontEnd | None = None,
+    extractor: FeatureExtractor | None = None,
 ) -> tuple[SLAM, RunProgress]:
     """Read the system and the progress of its run from a checkpoint.
 

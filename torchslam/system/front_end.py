@@ -1,4 +1,4 @@
-"""Feature extraction: from a frame to its features, by a front end or by a simulation; checks of frames."""
+"""From a frame to its features, by a feature extractor or by a simulation; checks of frames."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from torchslam.config import Config
-from torchslam.data.formats.text_file import MAX_SECONDS
 from torchslam.data.sequence import Sequence, Transformed
+from torchslam.data.text_file import MAX_SECONDS
 from torchslam.errors import ConfigError, FrameError
 from torchslam.features import SimulatedFeatures
 from torchslam.features.contract import apply_mask, check_features, check_gray
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera
-from torchslam.plugins import load_front_end
+from torchslam.plugins import load_feature_extractor
 from torchslam.types import Features, Frame
 
-FrontEnd = Callable[..., Features]
+FeatureExtractor = Callable[..., Features]
 """Extracts features of images (B, 1, H, W), floats in [0, 1]: `ORB()`, `XFeat(weights)`, any module or function.
 
 It may take a second argument: (B, 1, H, W) bool, where keypoints may lie. The same object serves `SLAM`, `ClipSLAM`
@@ -35,23 +35,23 @@ Extractor = Callable[[Frame], Features]
 
 
 def image_extractor(
-    config: Config, device: torch.device | str = "cpu", front_end: FrontEnd | None = None
+    config: Config, device: torch.device | str = "cpu", extractor: FeatureExtractor | None = None
 ) -> Extractor:
-    """Create the feature extractor of a system from a front end, the configured one if None.
+    """Create the function from a frame to its features from an extractor of images, the configured one if None.
 
     It finds nothing under a frame's mask. Images that are larger than configured are reduced first, and keypoints and
     scales are given in pixels of the full image. The features are checked, see `check_features`.
     """
     settings = config.features
-    if front_end is None:
-        front_end = load_front_end(settings.kind, settings.num_keypoints, settings.weights or None)
-    if is_kornia_module(front_end):
-        assert isinstance(front_end, nn.Module)
-        front_end = KorniaFeatures(front_end, settings.num_keypoints)
-    name = settings.kind if ":" in settings.kind else type(front_end).__name__
-    if isinstance(front_end, nn.Module):
-        front_end = front_end.to(device)
-    takes_mask = _takes_two(front_end)
+    if extractor is None:
+        extractor = load_feature_extractor(settings.kind, settings.num_keypoints, settings.weights or None)
+    if is_kornia_module(extractor):
+        assert isinstance(extractor, nn.Module)
+        extractor = KorniaFeatures(extractor, settings.num_keypoints)
+    name = settings.kind if ":" in settings.kind else type(extractor).__name__
+    if isinstance(extractor, nn.Module):
+        extractor = extractor.to(device)
+    takes_mask = _takes_two(extractor)
 
     def extract(frame: Frame) -> Features:
         image = frame.image.to(device)
@@ -59,7 +59,7 @@ def image_extractor(
         height, width = image.shape[-2:]
         factor = settings.reduction((width, height))
         small, small_mask = reduced(image, mask, factor)
-        features = front_end(small, small_mask) if takes_mask else front_end(small)
+        features = extractor(small, small_mask) if takes_mask else extractor(small)
         check_features(features, small, name)
         if factor > 1:
             ratio = width / small.shape[-1], height / small.shape[-2]
@@ -81,9 +81,9 @@ def checked_extractor(config: Config, camera: Camera) -> Extractor:
     return check_and_extract
 
 
-def _takes_two(front_end: FrontEnd) -> bool:
-    """Whether a front end takes a mask as second argument."""
-    called = front_end.forward if isinstance(front_end, nn.Module) else front_end
+def _takes_two(extractor: FeatureExtractor) -> bool:
+    """Whether a feature extractor takes a mask as second argument."""
+    called = extractor.forward if isinstance(extractor, nn.Module) else extractor
     try:
         signature(called).bind(None, None)
     except TypeError:
@@ -201,7 +201,7 @@ class Simulated:
 class WithFeatures(Transformed):
     """A sequence whose frames bring features, extracted when they are read.
 
-    The features have no gradient: who keeps them would keep all activations of a learned front end.
+    The features have no gradient: who keeps them would keep all activations of a learned feature extractor.
 
     Args:
         extract: function from a frame to its features

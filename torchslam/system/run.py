@@ -261,7 +261,7 @@ def finish(
 
 
 FINAL_CHI_SQUARE = 1.5**2
-"""Squared error, in units of the noise that the front end states, from which on an observation leaves the final map.
+"""Squared error, in units of the noise that the extractor states, from which on an observation leaves the final map.
 Where poses are right keypoints are more exact than stated: the median squared error is .07 to .39 of it on five
 recordings. From 1.2 to 2.4 deviations, their ATE changes by up to 6 % without order; with 1.7 and more, over 2 % of
 redkitchen's errors stay above 4 px."""

@@ -31,7 +31,7 @@ from torchslam.parallel.workers import with_workers
 from torchslam.system.frame_log import FrameLog, FrameStatus
 from torchslam.system.front_end import (
     Extractor,
-    FrontEnd,
+    FeatureExtractor,
     check_order,
     check_size,
     checked_extractor,
@@ -59,7 +59,7 @@ class SLAM:
         camera: The camera of all frames.
         config: The configuration; the default one if None. Settings in pixels are those of images as
             `features.max_image_pixels` reduces them, and are scaled for larger ones.
-        extractor: The front end, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
+        extractor: The extractor, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
             bring their own features, as those of `front_end.Simulated`, are not passed to it.
         matcher: The matcher of two views, see `types.Matcher`, or one of kornia; the configured one if None.
     """
@@ -68,7 +68,7 @@ class SLAM:
         self,
         camera: Camera,
         config: Config | None = None,
-        extractor: FrontEnd | None = None,
+        extractor: FeatureExtractor | None = None,
         matcher: Matcher | None = None,
     ) -> None:
         self.config = config or Config()
@@ -98,7 +98,7 @@ class SLAM:
         cls,
         path: str | Path,
         config: Config | None = None,
-        extractor: FrontEnd | None = None,
+        extractor: FeatureExtractor | None = None,
         mapping: bool = True,
         device: torch.device | str = "cpu",
         matcher: Matcher | None = None,
@@ -179,7 +179,7 @@ class SLAM:
             FrameError: If the image has another size than the camera, values other than gray in [0, 1], or the frame
                 does not come after the last one.
 
-        An exception of a front end or a matcher of one's own leaves the state of before, unless the frame has its
+        An exception of an extractor or a matcher of one's own leaves the state of before, unless the frame has its
         pose already; then it can be tried again.
         """
         last = self.last_frame, self.last_features
@@ -317,11 +317,11 @@ class SLAM:
         return view
 
     def _check_feature_kind(self, view: FrameFeatures) -> None:
-        """Raise ConfigError if the submaps were made with another front end."""
+        """Raise ConfigError if the submaps were made with another feature extractor."""
         for submap in self.atlas:
             wrong = feature_mismatch(submap.map, view, to_map=self.mapping)
             if wrong:
-                raise ConfigError(f"the map was made with another front end: {wrong}")
+                raise ConfigError(f"the map was made with another feature extractor: {wrong}")
 
     @torch.inference_mode(False)  # poses that leave may become part of a graph
     def _result(self, view: FrameFeatures, outcome: FrameOutcome) -> StepResult:

@@ -230,7 +230,7 @@ class StateMachine:
         doubted = Savepoint(submap, needed, is_relocalized=True)
         hold(context, doubted, view, estimate)
         self.active_map.submap, self.active_map.doubted = submap, doubted
-        return FrameOutcome([Reason.FOUND_AGAIN], submap, estimate)
+        return FrameOutcome([Reason.RELOCALIZED], submap, estimate)
 
 
 def _may_extend(doubted: Savepoint, estimate: PoseEstimate, verdict: Verdict) -> bool:

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchslam.config import MatchingConfig
 from torchslam.features import match
+from torchslam.features.matching.by_projection import PROJECTION_RATIO
 from torchslam.geometry import Camera, transform
 from torchslam.map.map import Map
 from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
@@ -34,9 +35,6 @@ value only."""
 MATURE_OBSERVATIONS = 10
 """Frames with certain poses that found a point, from which on it is mature: a third of a second at 30 Hz, by when
 it has passed the culling of recent points. Tried at this value only."""
-GUIDED_RATIO = 0.9
-"""Largest ratio of the best to the second descriptor distance of guided matches. Wider than Lowe's 0.8, since the
-window around a projection leaves few rivals; ORB-SLAM uses 0.9 there as well."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +109,6 @@ def match_projected_points(
     view: FrameFeatures,
     radius_px: float,
     matcher: Matcher,
-    ratio: float | None,
 ) -> MatchIndices:
     """Point ids and keypoints that match within a radius around the projection, one to one.
 
@@ -120,7 +117,7 @@ def match_projected_points(
     if len(projected.ids) == 0:
         return MatchIndices(projected.ids, projected.ids)
     expected = expected_view(slam_map, projected, view)
-    pairs = run_matcher(matcher, expected, view, MatchPrior(radius_px * projected.scales, ratio))
+    pairs = run_matcher(matcher, expected, view, MatchPrior(radius_px * projected.scales, PROJECTION_RATIO))
     return replace(pairs, first=projected.ids[pairs.first])
 
 

@@ -24,7 +24,7 @@ from torchslam.geometry import (
     transform,
     triangulate,
 )
-from torchslam.geometry.turning_camera import fit_turning_camera
+from torchslam.geometry.rotating_camera import fit_rotating_camera
 from torchslam.geometry.two_view import TRANSFER_WIDTH
 from torchslam.map.atlas import Submap
 from torchslam.optim import BundleProblem, bundle_adjust
@@ -121,12 +121,12 @@ class Initializer:
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
         moving = motion >= settings.min_motion_px
         if int(moving.sum()) < settings.min_matches:
-            return Rejection.of(Reason.STANDSTILL, pixels=moved)
+            return Rejection.of(Reason.STATIONARY, pixels=moved)
         result = self._relate_moving(view, first[moving], second[moving], scene_only=True)
         if isinstance(result, TwoViewMap):
             return result
         ratio = 1 - float(moving.double().mean())
-        return Rejection.of(Reason.STANDSTILL_IN_PART, ratio=ratio, rejection=result)
+        return Rejection.of(Reason.STATIONARY_IN_PART, ratio=ratio, rejection=result)
 
     def _relate_moving(
         self, view: FrameFeatures, first: Tensor, second: Tensor, scene_only: bool
@@ -173,7 +173,7 @@ class Initializer:
         largest = MAX_LOG_FOCAL if camera.guessed else min(MAX_FOCAL_SIGMAS * camera.std, MAX_LOG_FOCAL)
         if largest == 0 or not bool(relative.inliers.any()):
             return None
-        turning = fit_turning_camera(
+        rotating = fit_rotating_camera(
             self.reference.keypoints[first][None],
             view.keypoints[second][None],
             self.camera,
@@ -181,14 +181,14 @@ class Initializer:
             threshold,
             relative.inliers,
         )
-        if float(turning.departure) > MAX_FOCAL_SIGMAS:
+        if float(rotating.departure) > MAX_FOCAL_SIGMAS:
             return None
         # Errors in two dimensions, with the noise of both views.
         limit = math.sqrt(2) * TRANSFER_WIDTH * threshold
-        off = turning.errors_px[relative.inliers] > limit
+        off = rotating.errors_px[relative.inliers] > limit
         if float(off.double().mean()) > MAX_CONTRADICTING_RATIO:
             return None
-        return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(turning.camera.focal))
+        return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(rotating.camera.focal))
 
     def _scene(
         self,

@@ -11,8 +11,8 @@ from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
 from torchslam.features.kornia_modules import BLOB_RADIUS
+from torchslam.features.matching.brute_force import best_of_each
 from torchslam.features.matching.hamming import spread_bits
-from torchslam.tracking.matcher import best_of_each
 from torchslam.types import FrameFeatures, Matches, MatchPrior
 
 MIN_KEYPOINTS = 2

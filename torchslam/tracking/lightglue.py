@@ -20,7 +20,7 @@ MAX_WIDTH, MAX_LAYERS = 1024, 32
 
 
 class LightGlue(nn.Module):
-    """Matches float descriptors of the front end that its weights were trained for; weights are its confidences.
+    """Matches float descriptors of the extractor that its weights were trained for; weights are its confidences.
 
     Args:
         weights: file of weights, or their name; the shapes determine the variant.

@@ -23,7 +23,6 @@ from torchslam.geometry import (
 from torchslam.map.map import Map
 from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel, nearby_pose
 from torchslam.tracking.data_association import (
-    GUIDED_RATIO,
     MATURE_OBSERVATIONS,
     Projected,
     coverage_ratio,
@@ -103,9 +102,7 @@ class Localizer:
             return None
         candidates = self._local_points_with(slam_map, point_ids, local_points)
         near = self.project(slam_map, candidates, T_cw, view)
-        guided = match_projected_points(
-            slam_map, near, view, settings.refine_radius_px, self.guided_matcher, ratio=GUIDED_RATIO
-        )
+        guided = match_projected_points(slam_map, near, view, settings.refine_radius_px, self.guided_matcher)
         ids, at, noise = guided.first, guided.second, view.noise[guided.second]
         if len(ids) < settings.min_inliers:
             return None

@@ -13,6 +13,7 @@ from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
 from torchslam.features import match, match_by_projection
 from torchslam.features.kornia_modules import is_kornia_module
+from torchslam.features.matching.brute_force import best_of_each
 from torchslam.features.weights import MATCHER_OF
 from torchslam.plugins import MATCHERS, instantiate, load
 from torchslam.tracking.epipolar import match_free
@@ -165,13 +166,6 @@ def check_matches(found: Any, view_1: FrameFeatures, view_2: FrameFeatures, matc
         wrong = tuple(found.weights.shape) != shape or not found.weights.is_floating_point()
         if wrong or not bool((found.weights[found.mask] > 0).all()):
             refuse(f"weights must be positive floats {shape}")
-
-
-def best_of_each(rows: Int[Tensor, " M"], distances: Float[Tensor, " M"], count: int) -> Bool[Tensor, " M"]:
-    """Which matches are the nearest of those with the same row, of `count` rows; the first one of equal ones."""
-    rank = torch.argsort(torch.argsort(distances, stable=True))
-    first = torch.full((count,), len(rows), dtype=torch.int64, device=rows.device)
-    return first.scatter_reduce(0, rows, rank, "amin")[rows] == rank
 
 
 def nearest_keypoints(

@@ -15,7 +15,7 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.tracking.data_association import GUIDED_RATIO, match_keyframe, match_points
+from torchslam.tracking.data_association import match_keyframe, match_points
 from torchslam.tracking.localizer import Localizer, match_projected_points
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
@@ -121,12 +121,10 @@ class Tracker:
         if settings.guided_matching:
             alive = tracking.last_inlier_points[slam_map.points["is_valid"][tracking.last_inlier_points]]
             near = self.localizer.project(slam_map, alive, T_cw, view)
-            yield match_projected_points(
-                slam_map, near, view, settings.search_radius_px, self.matcher, ratio=GUIDED_RATIO
-            )
+            yield match_projected_points(slam_map, near, view, settings.search_radius_px, self.matcher)
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
             wide = settings.search_radius_px * settings.wide_radius_factor
-            yield match_projected_points(slam_map, local, view, wide, self.matcher, ratio=GUIDED_RATIO)
+            yield match_projected_points(slam_map, local, view, wide, self.matcher)
         else:
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 CHUNK = 1 << 20
+"""Bytes that are read at once."""
 JSON_BYTES = 1 << 25
 """Size limit of JSON files; the Python objects take about twenty times as much."""
 PART = ".part"  # suffix of a file that is being written; leftovers of a killed program are overwritten

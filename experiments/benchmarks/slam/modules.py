@@ -46,8 +46,8 @@ def main() -> None:
             features = {name for name in modules if name.startswith("torchslam.features.")}
             counts[len(modules - features), len(features)] += 1
             everything |= modules
-    for (others, front_end), frames in counts.most_common(5):
-        print(f"{frames} frames: {others} modules and {front_end} of the front end")
+    for (others, extractor), frames in counts.most_common(5):
+        print(f"{frames} frames: {others} modules and {extractor} of the feature extractor")
     print("\n".join(sorted(everything)))
 
 

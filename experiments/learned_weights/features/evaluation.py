@@ -1,4 +1,4 @@
-"""Errors of a front end: of the relative poses of pairs of views, and of the poses of clips."""
+"""Errors of a feature extractor: of the relative poses of pairs of views, and of the poses of clips."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is trained: a small network that moves keypoints by up to a few pixels, behind a front end that stays."""
+"""What is trained: a small network that moves keypoints by up to a few pixels, behind an extractor that stays."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ NOISE = 0.02  # gray value below which contrast is not amplified
 
 
 class SubPixel(nn.Module):
-    """Features of a front end, their keypoints moved by what the image patches around them suggest.
+    """Features of a feature extractor, their keypoints moved by what the image patches around them suggest.
 
-    front_end: module from images (B, 1, H, W) to Features; it gets no gradient
+    extractor: module from images (B, 1, H, W) to Features; it gets no gradient
     width:     of the hidden layers
     reach:     pixels
     seed:      of the weights; without training nothing moves
     """
 
-    def __init__(self, front_end: nn.Module, width: int = 64, reach: float = REACH, seed: int = 0) -> None:
+    def __init__(self, extractor: nn.Module, width: int = 64, reach: float = REACH, seed: int = 0) -> None:
         super().__init__()
-        self.front_end = front_end.requires_grad_(False)
+        self.extractor = extractor.requires_grad_(False)
         self.reach = reach
         layers = [nn.Linear(NUM_INPUTS, width), nn.Linear(width, width), nn.Linear(width, 2)]
         generator = torch.Generator().manual_seed(seed)
@@ -38,7 +38,7 @@ class SubPixel(nn.Module):
         self.network = nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU(), layers[2])
 
     def forward(self, images: Tensor) -> Features:
-        features = self.front_end(images)
+        features = self.extractor(images)
         moves = self.moves(patches(images, features.keypoints))
         return replace(features, keypoints=features.keypoints + moves)
 
@@ -48,16 +48,16 @@ class SubPixel(nn.Module):
 
 
 class Remembering(nn.Module):
-    """A front end that caches the features of its last images."""
+    """A feature extractor that caches the features of its last images."""
 
-    def __init__(self, front_end: nn.Module) -> None:
+    def __init__(self, extractor: nn.Module) -> None:
         super().__init__()
-        self.front_end = front_end
+        self.extractor = extractor
         self._last: tuple[Tensor, Features] | None = None
 
     def forward(self, images: Tensor) -> Features:
         if self._last is None or self._last[0] is not images:
-            self._last = images, self.front_end(images)
+            self._last = images, self.extractor(images)
         return self._last[1]
 
 

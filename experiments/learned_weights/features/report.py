@@ -18,7 +18,7 @@ ERRORS = ("rotation error", "direction error", "rotation between halves", "direc
 
 @dataclass(frozen=True)
 class Result:
-    """The errors of a front end on one part of a sequence.
+    """The errors of a feature extractor on one part of a sequence.
 
     pairs:     errors of pairs
     positions: (C,) ATE of clips as a share of the path, NaN where too few frames are posed
@@ -28,11 +28,11 @@ class Result:
     positions: Tensor
 
 
-Results = dict[str, dict[str, Result]]  # by front end and part
+Results = dict[str, dict[str, Result]]  # by feature extractor and part
 
 
 def medians(results: Results) -> str:
-    """A table by part and front end."""
+    """A table by part and feature extractor."""
     rows = []
     for name in next(iter(results.values())):
         for label, parts in results.items():
@@ -54,7 +54,7 @@ def medians(results: Results) -> str:
                     f"{100 * float(positions.nanmedian()):.2f} %" if posed else "",
                 ]
             )
-    header = ["unseen", "front end", "inliers a pair", "rotation error (mrad)", "direction error (°)"]
+    header = ["unseen", "feature extractor", "inliers a pair", "rotation error (mrad)", "direction error (°)"]
     halves = ["halves: rotation (mrad)", "direction (°)"]
     return table([*header, *halves, "clips posed", "ATE / path"], rows)
 

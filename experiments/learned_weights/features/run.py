@@ -1,4 +1,4 @@
-"""Train a front end by the errors of the poses it leads to, and compare it with the untrained one. See README.md.
+"""Train an extractor by the errors of the poses it leads to, and compare it with the untrained one. See README.md.
 
 python -m experiments.learned_weights.features.run --weights xfeat.safetensors
 """
@@ -74,11 +74,11 @@ def measure(candidates: Mapping[str, nn.Module], parts: dict[str, Part], device:
         rows: dict[str, list[PairErrors]] = {label: [] for label in candidates}
         for start in part.pairs:
             pair = Pair.of(part.sequence, start, device)
-            for label, front_end in candidates.items():
-                rows[label].append(pair_errors(front_end(pair.images).to("cpu"), pair))
+            for label, extractor in candidates.items():
+                rows[label].append(pair_errors(extractor(pair.images).to("cpu"), pair))
         clips = [clip_from(part.sequence, start, device) for start in part.clips]
-        for label, front_end in candidates.items():
-            found = [position_error(ClipSLAM(front_end), clip) for clip in clips]
+        for label, extractor in candidates.items():
+            found = [position_error(ClipSLAM(extractor), clip) for clip in clips]
             results[label][name] = Result(PairErrors.cat(rows[label]), torch.tensor(found))
         print(f"measured {name}", flush=True)
     return results

@@ -1,6 +1,6 @@
 """Localization problems whose matches are chosen once: keypoints followed through views around a base frame.
 
-The front end stays as it is and matching is discrete, so both are done before the training. What is left of an image
+The extractor stays as it is and matching is discrete, so both are done before the training. What is left of an image
 are its keypoints and the patches around them.
 """
 
@@ -47,7 +47,7 @@ class Tracks:
 
     @classmethod
     @torch.no_grad()
-    def of(cls, front_end: nn.Module, sequence: Sequence, part: range, device: torch.device) -> Tracks:
+    def of(cls, extractor: nn.Module, sequence: Sequence, part: range, device: torch.device) -> Tracks:
         """All problems with their frames in a part of a sequence; every image is read once."""
         poses = [sequence.pose(index) for index in part]
         if any(pose is None for pose in poses):
@@ -56,7 +56,7 @@ class Tracks:
         features, around = [], []
         for index in part:
             image = sequence.image(index).to(device)
-            found = front_end(image)
+            found = extractor(image)
             around.append(patches(image, found.keypoints)[0].cpu())
             features.append(found.to("cpu"))
         keypoints = torch.stack([one.keypoints[0].double() for one in features])

@@ -61,21 +61,21 @@ def draw(tracks: Tracks, settings: Settings, generator: torch.Generator) -> Draw
     )
 
 
-def drawn_pixels(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Camera]:
+def drawn_pixels(extractor: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Camera]:
     """(B, K, V, 2) where the network has the drawn tracks, as a pinhole camera sees them, and that camera."""
     frames = drawn.frames[:, None].expand_as(drawn.indices)
-    device = next(front_end.parameters()).device
-    moves = front_end.moves(tracks.patches[frames, drawn.indices].to(device)).cpu()
+    device = next(extractor.parameters()).device
+    moves = extractor.moves(tracks.patches[frames, drawn.indices].to(device)).cpu()
     return straightened(tracks.keypoints[frames, drawn.indices] + moves, tracks.camera)
 
 
-def localization_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
+def localization_errors(extractor: SubPixel, tracks: Tracks, drawn: Draw) -> tuple[Tensor, Tensor]:
     """Errors (B, 2) of position, as a share of the median depth, and rotation, radians; (B,) whether there is a pose.
 
     Points are triangulated with the true poses of the other views; the world is the true camera of the localized one,
     where its refinement starts as well.
     """
-    pixels, pinhole = drawn_pixels(front_end, tracks, drawn)
+    pixels, pinhole = drawn_pixels(extractor, tracks, drawn)
     others = [view for view in range(pixels.shape[2]) if view != drawn.query]
     T_cw = tracks.T_cw[drawn.frames]
     T_vq = T_cw[:, others] @ se3_inverse(T_cw[:, drawn.query])[:, None]
@@ -98,19 +98,19 @@ def localization_errors(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> tup
     return pose_errors(refined.T_cw, start) / scales, success
 
 
-def pose_loss(front_end: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
+def pose_loss(extractor: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:
     """() the mean over problems of what grows like the logarithm of both errors, so that a few hopeless do not rule."""
-    errors, success = localization_errors(front_end, tracks, drawn)
+    errors, success = localization_errors(extractor, tracks, drawn)
     each = (errors / UNIT).log1p().sum(-1)
     return torch.where(success, each, 0.0).sum() / success.sum().clamp_min(1)
 
 
-def train(front_end: SubPixel, tracks: Tracks, settings: Settings, seed: int = 0) -> list[float]:
+def train(extractor: SubPixel, tracks: Tracks, settings: Settings, seed: int = 0) -> list[float]:
     """Train on new samples in every step; return the loss of each."""
-    optimizer = torch.optim.Adam(front_end.network.parameters(), settings.learning_rate)
-    training = Training(front_end.network, optimizer, settings.steps, seed)
+    optimizer = torch.optim.Adam(extractor.network.parameters(), settings.learning_rate)
+    training = Training(extractor.network, optimizer, settings.steps, seed)
     for _ in training:
-        training.descend(pose_loss(front_end, tracks, draw(tracks, settings, training.generator)))
+        training.descend(pose_loss(extractor, tracks, draw(tracks, settings, training.generator)))
         if training.step % 250 == 0:
             mean = sum(training.losses[-250:]) / 250
             print(f"{training.step:5d}  mean loss of the last 250 {mean:.3f}", flush=True)

@@ -127,7 +127,7 @@ class _Watching:
 def _cues(sequence: Sequence, config: Config, graph: RunGraph) -> Cues:
     """The cues of a graph's observations; those of keypoint k of a frame are in row k."""
     watching = _Watching(config.features.num_keypoints)
-    look = image_extractor(config, front_end=watching)
+    look = image_extractor(config, extractor=watching)
     columns: list[tuple[Tensor, Tensor, Tensor]] = []
     for frame in range(len(graph.T_cw)):
         rows = (graph.frame_index == frame).nonzero().squeeze(-1)

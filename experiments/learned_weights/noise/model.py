@@ -1,4 +1,4 @@
-"""A model from cues to the information of a keypoint, and a front end with it."""
+"""A model from cues to the information of a keypoint, and a feature extractor with it."""
 
 from __future__ import annotations
 

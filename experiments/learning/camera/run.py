@@ -48,12 +48,12 @@ def error(sequence: Frames, camera: Camera, lens: LearnedCamera | None = None, i
     Raises SystemExit if a frame has no pose.
     """
     config = load_config(None, ["camera.std=0"] if is_held else [])
-    front_end = None
+    extractor = None
     if lens is not None:
-        front_end = Straightened(config.features.num_keypoints)
-        front_end.load_state_dict(lens.weights())
+        extractor = Straightened(config.features.num_keypoints)
+        extractor.load_state_dict(lens.weights())
     with torch.no_grad():
-        run = SLAM(camera, config, front_end).run(sequence)
+        run = SLAM(camera, config, extractor).run(sequence)
     assert sequence.groundtruth is not None
     if len(run.trajectory) < len(sequence):
         raise SystemExit(f"{sequence.name}: {len(sequence) - len(run.trajectory)} frames without a pose")

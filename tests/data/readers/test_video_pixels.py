@@ -17,7 +17,7 @@ import torch
 from tests.data.interlaced import set_interlaced, set_wide, write_mpeg2
 from tests.data.mp4 import write_mp4
 from torchslam.data import Calibrated, Sequence, open_sequence
-from torchslam.data.camera_argument import parse_calibration, unknown_camera
+from torchslam.data.camera_argument import parse_calibration
 from torchslam.data.readers.capture import pixel_aspect
 from torchslam.data.readers.live import LIVE
 from torchslam.errors import FrameError, SequenceError
@@ -150,7 +150,7 @@ def test_pixels_that_are_not_square(clip: Path) -> None:
     unknown = open_sequence(clip)
     assert unknown.pixel_aspect == pytest.approx(4 / 3)
     assert unknown.describe()["size"] == "64x48, pixels of 4:3, wide to high"
-    assert unknown_camera(unknown).params.tolist() == pytest.approx([54.4, 54.4 * 4 / 3, 31.5, 23.5])
+    assert unknown.with_guess().camera.params.tolist() == pytest.approx([54.4, 54.4 * 4 / 3, 31.5, 23.5])
     guessed = open_sequence(clip, "fov=90")
     assert guessed.calibrated is Calibrated.GUESSED
     assert guessed.camera.params.tolist() == pytest.approx([32, 32 * 4 / 3, 31.5, 23.5])
@@ -191,7 +191,7 @@ def test_a_given_camera_that_contradicts_the_pixels_is_kept_and_named(clip: Path
 def test_resizing_to_another_shape_makes_pixels_that_are_not_square(clip: Path) -> None:
     squeezed = open_sequence(clip, resize_to="32x48")
     assert squeezed.pixel_aspect == 2.0
-    assert unknown_camera(squeezed).params.tolist() == pytest.approx([27.2, 54.4, 15.5, 23.5])
+    assert squeezed.with_guess().camera.params.tolist() == pytest.approx([27.2, 54.4, 15.5, 23.5])
     assert open_sequence(clip, resize_to="0.75").pixel_aspect == 1.0
     assert open_sequence(clip, stride=2).pixel_aspect == 1.0
 

@@ -26,7 +26,7 @@ def both(
     return bundle_adjust_numpy(problem, SCALE, iterations, tolerance), wanted
 
 
-def astray(problem: BundleProblem, every: int = 9) -> BundleProblem:
+def with_outliers(problem: BundleProblem, every: int = 9) -> BundleProblem:
     """With observations that are far off."""
     off = torch.arange(len(problem.pixels)) % every == 0
     pixels = problem.pixels + 30 * off[:, None] * torch.tensor([1.0, -0.7]).double()
@@ -57,7 +57,7 @@ def test_both_backends_of_the_dense_formulation_agree(
     bundle_scene, frames, points, fixed, iterations
 ) -> None:
     """A batch of two for PyTorch, one after the other for NumPy: after two steps, and at the minimum."""
-    first = astray(bundle_scene(frames, points, fixed_frames=fixed).problem)
+    first = with_outliers(bundle_scene(frames, points, fixed_frames=fixed).problem)
     first = replace(first, weights=weights_of(first, "numbers"))
     noise = torch.randn(first.pixels.shape, generator=torch.Generator().manual_seed(1)).double()
     problems = [first, replace(first, pixels=first.pixels + 0.3 * noise)]
@@ -77,7 +77,7 @@ def test_both_backends_of_the_dense_formulation_agree(
 @pytest.mark.parametrize("fixed", [(0, 1), (0,), (3, 1), ()])
 def test_it_reaches_the_solution_of_bundle_adjust(bundle_scene, fixed, weights) -> None:
     """Whatever is fixed: what that leaves open stays where it is, in the same sense."""
-    problem = astray(bundle_scene(frames=6, points=60, fixed_frames=fixed).problem)
+    problem = with_outliers(bundle_scene(frames=6, points=60, fixed_frames=fixed).problem)
     problem = replace(problem, weights=weights_of(problem, weights))
     found, wanted = both(problem)
     assert bool(wanted.success)
@@ -88,14 +88,14 @@ def test_it_reaches_the_solution_of_bundle_adjust(bundle_scene, fixed, weights) 
 @pytest.mark.parametrize("iterations", [1, 2, 4])
 def test_its_steps_equal_those_of_bundle_adjust(bundle_scene, iterations) -> None:
     """One by one, without a kernel's curvature at first and then with it."""
-    problem = astray(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
+    problem = with_outliers(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
     found, wanted = both(problem, iterations, 1e-14)
     assert int(wanted.convergence.iterations) == iterations
     assert_same(found, wanted, atol=1e-9)
 
 
 def test_it_stops_when_the_predicted_decrease_is_small(bundle_scene) -> None:
-    problem = astray(bundle_scene(frames=6, points=60).problem)
+    problem = with_outliers(bundle_scene(frames=6, points=60).problem)
     found, wanted = both(problem, 30, 1e-3)
     exact, _ = both(problem)
     assert_same(found, wanted, atol=1e-9)
@@ -104,7 +104,7 @@ def test_it_stops_when_the_predicted_decrease_is_small(bundle_scene) -> None:
 
 def test_the_predicted_decrease_equals_that_of_bundle_adjust(bundle_scene) -> None:
     """So that both stop together, whatever the tolerance."""
-    problem = astray(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
+    problem = with_outliers(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
     costs = set()
     for power in range(30):
         found, wanted = both(problem, 30, 0.3 * 0.64**power)
@@ -155,7 +155,7 @@ def test_points_alone_can_be_adjusted(bundle_scene) -> None:
 
 
 def test_the_order_of_the_inputs_does_not_matter(bundle_scene) -> None:
-    problem = astray(bundle_scene(frames=6, points=60).problem)
+    problem = with_outliers(bundle_scene(frames=6, points=60).problem)
     order = torch.randperm(len(problem.pixels), generator=torch.Generator().manual_seed(0))
     shuffled = replace(
         problem,

@@ -17,12 +17,13 @@ from typing import Any
 
 from torchslam.data.calibration import Calibration, Size, read_numbers
 from torchslam.data.formats.key_files import MAX_DEPTH, Tree, merged, read_tree
-from torchslam.data.formats.text_file import numbered_lines, parse_floats, read_text
+from torchslam.data.text_file import numbered_lines, parse_floats, read_text
 from torchslam.errors import CalibrationError
 from torchslam.geometry.transforms import HALF_PIXEL
 from torchslam.utils.files import JSON_BYTES
 
 MAX_BYTES = 1 << 18
+"""Largest file that is read; those of calibration programs have kilobytes."""
 LARGEST = 1e12  # JSON numbers may have any number of digits
 FISHEYES = (
     *("equidistant", "fisheye", "opencv_fisheye"),

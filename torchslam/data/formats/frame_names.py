@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
-from torchslam.data.formats.text_file import UNIX_UNITS
+from torchslam.data.text_file import UNIX_UNITS
 from torchslam.errors import SequenceError
 
 MAX_FILES = 1_000_000

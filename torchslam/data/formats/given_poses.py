@@ -18,8 +18,8 @@ from torch import Tensor
 
 from torchslam.data.calibration import Calibration
 from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
-from torchslam.data.formats.text_file import parse_floats, read_text
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
+from torchslam.data.text_file import parse_floats, read_text
 from torchslam.data.trajectories import nearest, read_trajectory
 from torchslam.errors import CalibrationError, FrameError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
@@ -41,6 +41,7 @@ MODEL_NAMES = {
     9: "RADIAL_FISHEYE",
 }
 _MAX_BYTES = 1 << 30
+"""Largest model that is read; a frame with 10,000 keypoints takes 240 kB of it."""
 _POINT_BYTES = 24  # of an observation in images.bin
 _ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 

@@ -251,6 +251,7 @@ def image_tensor(
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_HEADER_BYTES = (13).to_bytes(4, "big")
+"""Length of the first chunk of a PNG file, IHDR, as it stands in the file."""
 PNG_CHUNK_FRAME = 12
 """Bytes of a chunk around its content: length, name, sum."""
 PNG_MAX_CHUNKS = 1 << 17

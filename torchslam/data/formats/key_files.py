@@ -15,6 +15,7 @@ from torchslam.utils.files import parse_json
 Tree = dict[str, Any]
 """Keys to text, lists or trees."""
 MAX_DEPTH = 20
+"""Levels of nesting that are read, which bounds the recursion."""
 KEY = re.compile(r"""("[^"]*"|'[^']*'|[^\s:"'\[\]{},][^:\[\]{}]*):((?:[ ].*|[^/\s].*)?)""")
 TAGS = re.compile(r"^(?:[!&]\S*(?:\s+|$))+")
 FLOW = re.compile(r""""(?:[^"\\]|\\.)*"|'[^']*'|[\[\]{},]|[^\[\]{},"']+|["']""")

@@ -21,8 +21,7 @@ import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.calibration_files import checked
 from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, gray_to_tensor
 from torchslam.data.sequence import Reader, Sequence
@@ -37,9 +36,11 @@ SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 MAX_MESSAGES = 2_000_000
+"""Largest number of images: more than a day at 20 Hz."""
 MAX_RECORDING, MAX_METADATA = 1 << 44, 1 << 22
 """Bytes of a recording, and of the text that describes it."""
 MAX_FILES = 10_000
+"""Files of a recording that are looked at: six days, one each minute."""
 SAMPLES = 20
 """Images in which the brightest pixel is looked for, where they have 16 bits."""
 
@@ -99,17 +100,15 @@ class BagSequence(Sequence):
             self._bits = max(self._bits, bit_depth([image]))
             size = size or (image.shape[1], image.shape[0])
         assert size is not None  # a topic has images
-        camera = topic.calibration if camera is None else camera
         left_out = len(order) - len(self._messages)
         super().__init__(
             path.stem,
             f"ROS bag, {topic.connection.topic}",
-            None if camera is None else fit_camera(camera, size, str(path)),
+            topic.calibration if camera is None else camera,
             torch.tensor(
                 [topic.times[message] for message in self._messages], dtype=torch.float64, device="cpu"
             ),
             size=size,
-            guessed=is_guessed(camera),
             notes=[f"left out {left_out} images whose time repeats"] if left_out else [],
         )
 

@@ -20,6 +20,7 @@ from jaxtyping import UInt8
 from torchslam.errors import FrameError, SequenceError
 
 STDERR = 2
+"""File descriptor to which FFmpeg writes its log."""
 SAMPLED = 16
 """Every so many rows are compared with the frame before."""
 FAILURE = re.compile(rb"(Cannot convert interlaced)|: fmt:\S+ csp:")

@@ -11,17 +11,18 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.calibration_files import read_calibration, read_matrix
-from torchslam.data.formats.text_file import check_later, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
+from torchslam.data.text_file import check_later, numbered_lines, parse_count, parse_floats
 from torchslam.data.trajectories import checked_poses
 from torchslam.errors import SequenceError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.types import Trajectory
 
 NANOSECONDS = 1_000_000_000
+"""Unit of the times in the files, per second."""
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 

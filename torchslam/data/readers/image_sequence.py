@@ -18,8 +18,8 @@ import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration, size_text
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import CALIBRATION, FROM_EXIF, Calibration, GivenCamera, size_text
+from torchslam.data.camera_argument import read_focal
 from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.data.formats.frame_names import (
     FOLDERS,
@@ -40,15 +40,15 @@ from torchslam.data.formats.image_file import (
     read_gray,
     read_pixels,
 )
-from torchslam.data.formats.text_file import check_later
 from torchslam.data.sequence import Reader, Sequence
+from torchslam.data.text_file import check_later
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 from torchslam.utils.text import printable
 
 DEFAULT_RATE = 30.0
 """Frame rate of images without timestamps."""
-CALIBRATION_FILES = ("calibration.txt", "calib.txt")
+CALIBRATION_FILES = (CALIBRATION, "calib.txt")
 SHORTEST, LONGEST = 2e-4, 1e4
 """Seconds from image to image, beyond which times are taken to have another unit: microseconds read as nanoseconds, or
 nanoseconds since the system was started as seconds."""
@@ -97,11 +97,10 @@ class ImageSequence(Sequence):
         super().__init__(
             name,
             kind,
-            None if camera is None else fit_camera(camera, size, name, entries[0].path),
+            read_focal(entries[0].path) if camera == FROM_EXIF else camera,
             torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64, device="cpu"),
             groundtruth,
             size=size,
-            guessed=is_guessed(camera),
             notes=notes,
         )
         self._entries = entries

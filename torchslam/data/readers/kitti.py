@@ -16,12 +16,11 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.calibration import Calibration
-from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.frame_names import find_frames
-from torchslam.data.formats.text_file import check_later, in_seconds, numbered_lines, parse_floats, read_text
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
+from torchslam.data.text_file import check_later, in_seconds, numbered_lines, parse_floats, read_text
 from torchslam.data.trajectories import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TorchslamError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp

@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.readers.video import SUFFIXES
@@ -103,10 +103,9 @@ class LiveSequence(Sequence):
         super().__init__(
             name,
             "live",
-            None if camera is None else fit_camera(camera, size, name, pixel_aspect=aspect),
+            camera,
             torch.zeros(0, dtype=torch.float64, device="cpu"),
             size=size,
-            guessed=is_guessed(camera),
             pixel_aspect=aspect,
         )
 
@@ -257,7 +256,7 @@ atexit.register(close_sources)
 class CaptureClock:
     """Capture times on our clock: by the source's own clock, from the first frame on, as long as that runs with ours.
 
-    A frame's arrival wavers with the network and with what else the machine does; the source's clock does not.
+    Arrival times jitter with the network and the load of the machine; the source's clock does not.
     """
 
     def __init__(self) -> None:

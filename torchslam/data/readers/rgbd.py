@@ -19,10 +19,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.calibration import PRESETS
-from torchslam.data.camera_argument import GivenCamera
+from torchslam.data.calibration import PRESETS, GivenCamera
 from torchslam.data.formats.frame_names import find_frames, match_pattern
-from torchslam.data.formats.text_file import in_seconds, numbered_lines, parse_count, parse_floats
 from torchslam.data.readers.image_sequence import (
     DEFAULT_RATE,
     ImageEntry,
@@ -31,6 +29,7 @@ from torchslam.data.readers.image_sequence import (
     find_calibration,
 )
 from torchslam.data.sequence import Reader
+from torchslam.data.text_file import in_seconds, numbered_lines, parse_count, parse_floats
 from torchslam.data.trajectories import checked_poses, read_trajectory
 from torchslam.errors import SequenceError, TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, rigid

@@ -22,7 +22,7 @@ from jaxtyping import Float, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
 from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
@@ -37,6 +37,7 @@ SUFFIXES = frozenset(
 )
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
 MAX_BYTES = 1 << 40
+"""Largest file that is read."""
 MAX_FRAMES = 2_000_000
 """Maximum number of frames: 18 hours at 30 frames per second."""
 QUIET = 2.0
@@ -85,22 +86,22 @@ class VideoSequence(Sequence):
             notes.append(f"{len(times)} frames can be decoded; the file declares {promised}")
         size = (first.shape[1], first.shape[0])
         aspect = pixel_aspect(self._capture, str(path))
-        fitted = None if camera is None else fit_camera(camera, size, str(path), pixel_aspect=aspect)
-        if fitted is not None and abs(float(fitted.fy / fitted.fx) / aspect - 1) > MAX_ASPECT_ERROR:
-            notes.append(
-                f"the file says that its pixels are {aspect_text(aspect)}, wide to high, so fy should be "
-                f"{aspect:.4g} fx; the given camera has {float(fitted.fy / fitted.fx):.4g}"
-            )
         super().__init__(
             path.stem,
             "video",
-            fitted,
+            camera,
             torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64, device="cpu"),
             size=size,
-            guessed=is_guessed(camera),
             notes=notes,
             pixel_aspect=aspect,
         )
+        ratio = aspect if self._camera is None else float(self._camera.fy / self._camera.fx)
+        if abs(ratio / aspect - 1) > MAX_ASPECT_ERROR:
+            contradiction = (
+                f"the file says that its pixels are {aspect_text(aspect)}, wide to high, so fy should be "
+                f"{aspect:.4g} fx; the given camera has {ratio:.4g}"
+            )
+            self.notes = (*self.notes, contradiction)
 
     def __getstate__(self) -> dict[str, Any]:
         return super().__getstate__() | {"_capture": None, "_retriever": None}
@@ -232,9 +233,12 @@ def _rising(times: Iterable[float]) -> Iterator[int]:
 
 CONTAINERS = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 HEADER, LARGE_HEADER = 8, 16
+"""Bytes of the header of a box, with a size of 32 and of 64 bits (ISO/IEC 14496-12, 4.2)."""
 DEPTH = 8  # moov, trak, mdia, minf, stbl are five
 MAX_BOXES = 1_000_000
+"""Boxes that are looked at, which bounds the time for a damaged file."""
 RUNS_AT_ONCE = 1 << 16
+"""Runs of equal durations that are read at once, 8 bytes each."""
 
 
 def claimed_samples(path: Path) -> int:

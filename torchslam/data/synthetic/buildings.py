@@ -12,6 +12,7 @@ import numpy as np
 from torchslam.data.synthetic.scene import Painter, Rectangle, X, Y, Z
 
 HEIGHT = 2.8
+"""Meters from floor to ceiling."""
 FLOOR = HEIGHT / 2
 """y points down, and is 0 half-way up."""
 PARTITION = 0.1
@@ -26,6 +27,7 @@ ROOMS_CORE = 1.3
 ROOMS_DOOR = (-3.4, -1.95)
 """Begin and end of the door along x."""
 ROOMS_DOOR_TOP = -0.7
+"""y of the upper edge of the doors, meters."""
 SIZE_SPREAD = 0.12
 """Furniture is up to that share larger or smaller ..."""
 TURN_SPREAD = 0.15

@@ -14,6 +14,7 @@ from torchslam.data.synthetic.scene import MIP_LEVELS, Rectangle
 NEAR = 0.05
 """Meters: what is nearer to the camera is not drawn."""
 PADDING = 2
+"""Texels that repeat the border of a texture, so that interpolation does not reach the next one."""
 SHARPNESS = 0.7
 """Choice of the mip level: 1 takes one texel per pixel; less is sharper, with some aliasing."""
 

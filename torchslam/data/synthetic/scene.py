@@ -113,6 +113,7 @@ def _fill(
 
 Vector = tuple[float, float, float]
 X, Y, Z = np.eye(3)
+"""Axes of the world: right, down, forward."""
 TEXEL = 0.003
 """Meters: finer than a pixel sees from a meter away."""
 MIP_LEVELS = 6

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.camera_argument import GivenCamera, fit_camera, is_guessed
+from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.sequence import Calibrated, Reader, Sequence
 from torchslam.data.synthetic import paths
@@ -26,8 +26,11 @@ from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Trajectory
 
 FRAME_RATE = 20.0
+"""Frames per second."""
 SIZE = (640, 480)
+"""Width and height of the images, pixels."""
 FOCAL = 500.0
+"""Focal length, pixels: 65 degrees over the width."""
 
 
 @dataclass(frozen=True)
@@ -124,9 +127,9 @@ def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence
     sequence = open_synthetic(path)
     if camera is None:
         return sequence
-    if not is_guessed(camera):
+    if not (isinstance(camera, Calibration) and camera.guessed):
         raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
-    return sequence.with_camera(fit_camera(camera, sequence.size, path), Calibrated.GUESSED)
+    return sequence.with_camera(camera.camera(sequence.size), Calibrated.GUESSED)
 
 
 def open_synthetic(name: str) -> SyntheticSequence:

@@ -140,7 +140,7 @@ def nearest_per_row(
         found = _nearest_of_pairs_numpy(*pairs, scales.detach().numpy(), ratio, limit)
         return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2]).float()
     columns = len(scales)
-    # One number for distance and column: the least is the nearest, of equals that of the lowest column.
+    # One number for distance and column: the least is the nearest; ties go to the lowest column.
     keys = distance * columns + column
     unset = (int(limit) + 1) * columns
     best = row.new_full((rows,), unset).scatter_reduce_(0, row, keys, "amin")
@@ -254,7 +254,7 @@ def _nearest_of_pairs_numpy(
     is_first[0], is_first[1:] = True, row[1:] != row[:-1]
     starts = np.flatnonzero(is_first)
     columns = len(scales)
-    # One number for distance and column: the least is the nearest, of equals that of the lowest column.
+    # One number for distance and column: the least is the nearest; ties go to the lowest column.
     keys = distance * columns + column
     best = np.minimum.reduceat(keys, starts)
     nearest, chosen = np.divmod(best, columns)
@@ -274,6 +274,9 @@ def _nearest_of_pairs_numpy(
     return first[kept], partner[kept], nearest[kept]
 
 
+PROJECTION_RATIO = 0.9
+"""Largest ratio of the best to the second best distance near a prediction, where few other keypoints compete: as in
+ORB-SLAM2's search by projection. Tried at this value only."""
 SCALE_TOLERANCE = 1.5
 """Largest factor between the predicted and the found scale of a keypoint."""
 _MAX_PIXEL = 1e6  # points projected farther outside of the image do not match
@@ -288,7 +291,7 @@ def match_by_projection(
     mask: Bool[Tensor, "B M"] | None = None,
     scales: Float[Tensor, "B M"] | None = None,
     angles: Float[Tensor, "B M"] | None = None,
-    ratio: float | None = 0.9,
+    ratio: float | None = PROJECTION_RATIO,
     max_distance: float | None = 64,
     scale_tolerance: float = SCALE_TOLERANCE,
     angle_tolerance: float = math.pi / 6,

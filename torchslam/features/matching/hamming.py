@@ -19,6 +19,7 @@ _GATHER_BITS = sum(1 << (56 - 7 * i) for i in range(8))
 # Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
 _AMPLITUDE = 64
 _INDEX_BITS = 13
+"""Bits of an index: the products above are multiples of 2^13."""
 _CHUNK = 1 << 13  # pairs whose bits are counted at once: their words stay in the cache
 _MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
@@ -275,7 +276,7 @@ def nearest_by_cosine(
 
 
 def _used(mask: Bool[Tensor, "B N"]) -> int:
-    """Number of rows up to the last one that some element uses, at least one: front ends pad at the end."""
+    """Number of rows up to the last one that some element uses, at least one: feature extractors pad at the end."""
     used = torch.nonzero(mask.any(0))
     return int(used[-1]) + 1 if len(used) else 1
 

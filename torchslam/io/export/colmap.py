@@ -18,7 +18,9 @@ from torchslam.geometry.transforms import corner_camera, corner_pixels, quaterni
 from torchslam.io.export.scene import ExportedScene
 
 CAMERA_ID = 1
+"""Number of the one camera; COLMAP counts from 1."""
 MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
+"""COLMAP's numbers of camera models (src/colmap/sensor/models.h)."""
 POINT_IN_IMAGE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
 TRACK = np.dtype([("image", "<u4"), ("index", "<u4")])  # which image, and the how many-th of its points
 

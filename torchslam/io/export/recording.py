@@ -22,6 +22,7 @@ from torchslam.io.export.scene import ExportedScene, Images
 
 APPLICATION = "torchslam"
 JPEG_QUALITY = 90
+"""Of images in the recording, percent. Tried at this value only."""
 CAMERA = "world/camera"
 KEYFRAME = "world/keyframe"
 DEPTH = "world/depth"

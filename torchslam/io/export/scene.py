@@ -26,6 +26,7 @@ from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors,
 from torchslam.map.atlas import Submap
 
 SAME_PX = 0.01
+"""Difference of two parameters of a camera, in pixels, below which images need no undistortion."""
 MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees from the axis
 
 

@@ -22,10 +22,13 @@ if TYPE_CHECKING:
 
 
 MAX_POINTS = 25_000
+"""Points that are drawn; more hide each other."""
 MAX_CAMERAS = 30
+"""Cameras that are drawn, evenly chosen; more hide each other."""
 MAX_ELLIPSES = 1500  # of points; more hide the picture
 POINT_ELLIPSE = "#cdc6c9"
 TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
+"""Style of the true trajectory."""
 
 
 @dataclass(frozen=True)
@@ -270,6 +273,7 @@ def _title(title: str, scene: _Scene, box: np.ndarray) -> str:
 
 
 SIGMAS = 3.0
+"""Size of an ellipsoid in standard deviations."""
 _SIZE = 0.06  # of the largest ellipse in the picture, when magnified
 
 

@@ -43,6 +43,7 @@ _RC: dict[Any, Any] = {
     "figure.facecolor": "white",
     "savefig.dpi": 150,
 }
+"""Settings of matplotlib for all pictures."""
 
 
 @contextmanager

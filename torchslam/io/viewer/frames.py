@@ -37,6 +37,7 @@ COLORS = {  # blue, green, red
     State.LOST: (61, 85, 200),
 }
 UNMATCHED = (150, 150, 150)
+"""Red, green, blue of keypoints without a map point."""
 FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 
 

@@ -21,8 +21,11 @@ from torch.utils._pytree import tree_map
 from torchslam.errors import ConvergenceError
 
 INITIAL_DAMPING = 1e-4
+"""Relative to the diagonal of the Hessian: nearly a step of Gauss and Newton at first. Tried at this value only."""
 DAMPING_DOWN, DAMPING_UP = 0.1, 10.0
+"""Factors on the damping after a step that lowers the cost, and after one that does not (Marquardt, 1963)."""
 _DAMPING_RANGE = (1e-10, 1e8)
+"""Below, a step is that of Gauss and Newton; above, it is too short to matter, and the element gives up."""
 _NAMED = 10  # rows that an error lists
 CURVATURE_BELOW = 1e-2
 """Predicted relative reduction of the cost below which the kernel's curvature is used."""

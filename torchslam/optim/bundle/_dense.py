@@ -150,6 +150,7 @@ def _spread(layout: DenseLayout, values: Tensor) -> Tensor:
 # eps_ijk of the cross product: (a x b)_i = eps_ijk a_j b_k.
 _AXES = torch.eye(3, dtype=torch.float64, device="cpu")
 _CROSS = torch.linalg.cross(_AXES[:, None].expand(3, 3, 3), _AXES.expand(3, 3, 3))
+"""The tensor eps_ijk."""
 
 
 class DenseExpansion(NamedTuple):

@@ -1,4 +1,4 @@
-"""Factors beside the reprojection errors: depths of observed points, and errors of one's own between two frames.
+"""Additional factors: priors of the depth of observed points, and user-defined errors between two frames.
 
 They cost half of e^T information e, as priors do, without a robust kernel. A depth adds one row to its observation. An
 error between frames adds blocks to the reduced system, which the elimination of the points leaves as it is: neither

@@ -163,7 +163,9 @@ class BundleEstimate(NamedTuple):
 
 
 _MIN_POINTS_PER_FRAME = 3
+"""Points that determine a pose, by two equations each for six unknowns."""
 _MIN_FRAMES_PER_POINT = 2
+"""Views that determine a point, by two equations each for three unknowns."""
 
 
 class MovingParts(NamedTuple):

@@ -28,6 +28,7 @@ from torchslam.optim.bundle._factors import FrameBlocks
 # frames see a place again and again, a tile has a column for each of them: fewer points share them better.
 _TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 64
 _MANY_FRAMES = 64
+"""Frames from which on the tiles are smaller."""
 
 
 class Columns(NamedTuple):

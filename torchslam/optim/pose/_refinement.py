@@ -130,6 +130,7 @@ class PoseObservations:
 
 
 _MIN_POINTS = 3
+"""Points that determine a pose, by two equations each for six unknowns."""
 
 
 @dataclass(frozen=True)

@@ -34,6 +34,7 @@ MIN_AGREEING = 0.75
 """Fraction of the matches that must agree in `nearby_pose`: another pose with as many would share at least half."""
 
 _ITERATIONS = 10
+"""Largest number of steps. The tracker starts close. Tried at this value only."""
 _TOLERANCE = 1e-4  # relative to the cost: a smaller reduction moves the pose by hundredths of its noise
 
 

@@ -1,4 +1,4 @@
-"""A camera that only turns, whose focal length and distortion are uncertain.
+"""A camera that only rotates, whose focal length and distortion are uncertain.
 
 With a wrong camera, no rotation explains the matches of a camera that turned, and a translation or a plane may seem to.
 A rotation with another camera then explains them as well.
@@ -21,12 +21,13 @@ from torchslam.geometry.robust import robustify
 
 _STARTS = 3  # focal lengths, over twice the standard deviation to both sides; the best result counts
 _ITERATIONS = 10
+"""Of Levenberg-Marquardt from each start. Tried at this value only."""
 _KERNEL_SCALE = 2.0  # thresholds at which the Huber kernel becomes linear
 _BEHIND = 1e3  # squared thresholds: the cost of a match that turns behind the camera
 
 
 @dataclass(frozen=True)
-class TurningCamera:
+class RotatingCamera:
     """Cameras that turned between two views.
 
     Attributes:
@@ -43,14 +44,14 @@ class TurningCamera:
 
 
 @full_precision
-def fit_turning_camera(
+def fit_rotating_camera(
     pixels_1: Float[Tensor, "B N 2"],
     pixels_2: Float[Tensor, "B N 2"],
     camera: Camera,
     std: float,
     threshold: float,
     mask: Bool[Tensor, "B N"],
-) -> TurningCamera:
+) -> RotatingCamera:
     """Fit a rotation, a focal length and k1 to the matches of two views, few of which may be wrong.
 
     Minimizes the Huber cost of the errors in view 2 and of the departure from the given camera, by Levenberg-Marquardt
@@ -114,7 +115,7 @@ def fit_turning_camera(
         at = changed(change)
         pixels, valid = at.project(_turned(R, at, pixels_1[::_STARTS])[1])
         errors = torch.where(valid, (pixels - pixels_2[::_STARTS]).norm(dim=-1), torch.inf)
-        return TurningCamera(R, at, change.abs().amax(-1), errors)
+        return RotatingCamera(R, at, change.abs().amax(-1), errors)
 
 
 def _turned(

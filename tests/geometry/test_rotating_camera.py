@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchslam.geometry import Camera, so3_exp
 from torchslam.geometry.camera_measurement import with_radial_terms
-from torchslam.geometry.turning_camera import fit_turning_camera
+from torchslam.geometry.rotating_camera import fit_rotating_camera
 
 TRUE = Camera.pinhole(500.0, 500.0, 319.5, 239.5, size=(640, 480))
 BENT = Camera.radial_tangential(500.0, 500.0, 319.5, 239.5, -0.15, 0.0, 0.0, 0.0, size=(640, 480))
@@ -57,7 +57,7 @@ def test_any_rotation_is_found_with_any_guess_of_the_focal_length(
 ) -> None:
     omega = (angle * math.cos(axis), angle * math.sin(axis), roll)
     pixels_1, pixels_2, R_21 = turned(TRUE, omega, noise=0.3)
-    found = fit_turning_camera(pixels_1, pixels_2, scaled(TRUE, factor), GUESS, 1.5, everything(pixels_1))
+    found = fit_rotating_camera(pixels_1, pixels_2, scaled(TRUE, factor), GUESS, 1.5, everything(pixels_1))
     assert float(found.camera.focal) == pytest.approx(500.0, rel=0.05)
     assert rotation_error(found.R_21, R_21) < 1.0
     assert float(found.departure) < 3
@@ -67,7 +67,7 @@ def test_any_rotation_is_found_with_any_guess_of_the_focal_length(
 @pytest.mark.parametrize("camera", [TRUE, BENT, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
 def test_exact_matches_give_the_rotation_and_the_camera(camera: Camera) -> None:
     pixels_1, pixels_2, R_21 = turned(camera, (0.1, 0.25, 0.1))
-    found = fit_turning_camera(pixels_1, pixels_2, camera, 0.02, 1.5, everything(pixels_1))
+    found = fit_rotating_camera(pixels_1, pixels_2, camera, 0.02, 1.5, everything(pixels_1))
     torch.testing.assert_close(found.R_21, R_21, atol=1e-9, rtol=0)
     torch.testing.assert_close(found.camera.params[0], with_radial_terms(camera).params, atol=1e-5, rtol=1e-7)
     assert float(found.departure) < 1e-5
@@ -76,7 +76,7 @@ def test_exact_matches_give_the_rotation_and_the_camera(camera: Camera) -> None:
 
 def test_distortion_that_is_not_known_of_is_found_too() -> None:
     pixels_1, pixels_2, _ = turned(BENT, (0.1, 0.3, 0.1), noise=0.3)
-    found = fit_turning_camera(pixels_1, pixels_2, scaled(TRUE, 0.7), GUESS, 1.5, everything(pixels_1))
+    found = fit_rotating_camera(pixels_1, pixels_2, scaled(TRUE, 0.7), GUESS, 1.5, everything(pixels_1))
     assert float(found.camera.params[0, 4]) == pytest.approx(-0.15, abs=0.03)
     assert float(found.camera.focal) == pytest.approx(500.0, rel=0.03)
 
@@ -84,15 +84,15 @@ def test_distortion_that_is_not_known_of_is_found_too() -> None:
 def test_little_is_allowed_of_a_camera_with_a_small_error() -> None:
     pixels_1, pixels_2, _ = turned(TRUE, (0.1, 0.3, 0.1), noise=0.3)
     mask = everything(pixels_1)
-    near = fit_turning_camera(pixels_1, pixels_2, scaled(TRUE, 1.03), 0.02, 1.5, mask)
-    far = fit_turning_camera(pixels_1, pixels_2, scaled(TRUE, 1.3), 0.02, 1.5, mask)
+    near = fit_rotating_camera(pixels_1, pixels_2, scaled(TRUE, 1.03), 0.02, 1.5, mask)
+    far = fit_rotating_camera(pixels_1, pixels_2, scaled(TRUE, 1.3), 0.02, 1.5, mask)
     assert float(near.departure) < 3 < float(far.departure)
 
 
 def test_no_focal_length_turns_translation_into_rotation() -> None:
     for seed in range(8):
         scene = two_views(seed, outliers=0.0)
-        found = fit_turning_camera(scene.pixels_1, scene.pixels_2, TRUE, GUESS, 1.5, scene.mask)
+        found = fit_rotating_camera(scene.pixels_1, scene.pixels_2, TRUE, GUESS, 1.5, scene.mask)
         assert float((found.errors_px > 2.12).double().mean()) > 0.2
 
 
@@ -101,10 +101,10 @@ def test_wrong_matches_weigh_little_and_masked_ones_nothing() -> None:
     used = everything(pixels_1)
     used[:, ::4] = False
     wrong = torch.where(used[..., None], pixels_2, pixels_1.flip(1))
-    masked = fit_turning_camera(pixels_1, wrong, scaled(TRUE, 0.8), GUESS, 1.5, used)
+    masked = fit_rotating_camera(pixels_1, wrong, scaled(TRUE, 0.8), GUESS, 1.5, used)
     torch.testing.assert_close(masked.R_21, R_21, atol=1e-4, rtol=0)
     pixels_2[:, ::10] += 40.0
-    robust = fit_turning_camera(pixels_1, pixels_2, scaled(TRUE, 0.8), GUESS, 1.5, everything(pixels_1))
+    robust = fit_rotating_camera(pixels_1, pixels_2, scaled(TRUE, 0.8), GUESS, 1.5, everything(pixels_1))
     assert rotation_error(robust.R_21, R_21) < 1.0
     assert float((robust.errors_px < 2.12).double().mean()) == pytest.approx(0.9, abs=0.01)
 
@@ -114,9 +114,9 @@ def test_a_batch_is_the_same_as_each_alone() -> None:
     pixels_1, pixels_2 = (
         torch.cat([getattr(each, name) for each in scenes]) for name in ("pixels_1", "pixels_2")
     )
-    together = fit_turning_camera(pixels_1, pixels_2, TRUE, GUESS, 1.5, everything(pixels_1))
+    together = fit_rotating_camera(pixels_1, pixels_2, TRUE, GUESS, 1.5, everything(pixels_1))
     for row, scene in enumerate(scenes):
-        alone = fit_turning_camera(scene.pixels_1, scene.pixels_2, TRUE, GUESS, 1.5, scene.mask)
+        alone = fit_rotating_camera(scene.pixels_1, scene.pixels_2, TRUE, GUESS, 1.5, scene.mask)
         torch.testing.assert_close(together.R_21[row], alone.R_21[0], atol=1e-6, rtol=0)
         torch.testing.assert_close(together.errors_px[row], alone.errors_px[0], atol=1e-3, rtol=1e-3)
 
@@ -126,10 +126,10 @@ def test_it_works_on_the_device_in_the_dtype_and_without_matches(
 ) -> None:
     pixels_1, pixels_2, R_21 = (x.to(device, dtype) for x in turned(TRUE, (0.1, 0.25, 0.1), noise=0.3))
     camera = scaled(TRUE, 0.8).to(device, dtype)
-    found = fit_turning_camera(pixels_1, pixels_2, camera, GUESS, 1.5, everything(pixels_1))
+    found = fit_rotating_camera(pixels_1, pixels_2, camera, GUESS, 1.5, everything(pixels_1))
     assert found.R_21.dtype == found.errors_px.dtype == dtype
     assert found.R_21.device.type == device.type
     assert rotation_error(found.R_21.double().cpu(), R_21.double().cpu()) < 1.0
-    nothing = fit_turning_camera(pixels_1, pixels_2, camera, GUESS, 1.5, ~everything(pixels_1))
+    nothing = fit_rotating_camera(pixels_1, pixels_2, camera, GUESS, 1.5, ~everything(pixels_1))
     assert torch.isfinite(nothing.R_21).all()
     torch.testing.assert_close(nothing.camera.params[0, :1], camera.params[:1])
