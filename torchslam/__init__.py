@@ -13,6 +13,17 @@ from typing import TYPE_CHECKING, Any
 from torchslam.utils.console import with_install_hint
 
 if TYPE_CHECKING:
+    from torchslam import calibration as calibration
+    from torchslam import data as data
+    from torchslam import dense as dense
+    from torchslam import errors as errors
+    from torchslam import evaluation as evaluation
+    from torchslam import features as features
+    from torchslam import geometry as geometry
+    from torchslam import learning as learning
+    from torchslam import optim as optim
+    from torchslam import refine as refine
+    from torchslam import types as types
     from torchslam.config import Config, load_config
     from torchslam.data import open_sequence
     from torchslam.errors import TorchslamError
@@ -73,7 +84,7 @@ __all__ = [
     "umeyama",
 ]
 
-HOMES = {
+_HOMES = {
     "torchslam.config": "Config load_config",
     "torchslam.data": "open_sequence",
     "torchslam.errors": "TorchslamError",
@@ -87,20 +98,37 @@ HOMES = {
     "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve_graph",
     "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }
+"""Public names by the module that has them."""
+
+_SUBPACKAGES = (
+    "calibration",
+    "data",
+    "dense",
+    "errors",
+    "evaluation",
+    "features",
+    "geometry",
+    "learning",
+    "optim",
+    "refine",
+    "types",
+)
+"""Public packages and modules."""
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for: torch alone takes a second or two."""
+    """A public name or package, imported when it is first asked for: torch alone takes a second or two."""
     if name == "__version__":
         return _version()
-    for home, names in HOMES.items():
-        if name in names.split():
-            try:
-                value = globals()[name] = getattr(import_module(home), name)
-            except ModuleNotFoundError as error:
-                raise with_install_hint(error) from error
-            return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = next((home for home, names in _HOMES.items() if name in names.split()), None)
+    if home is None and name not in _SUBPACKAGES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = import_module(home or f"{__name__}.{name}")
+    except ModuleNotFoundError as error:
+        raise with_install_hint(error) from error
+    value = globals()[name] = getattr(module, name) if home else module
+    return value
 
 
 def _version() -> str:
@@ -114,4 +142,4 @@ def _version() -> str:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "__version__"})
+    return sorted([*__all__, *_SUBPACKAGES, "__version__"])
