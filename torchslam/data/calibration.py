@@ -14,8 +14,8 @@ from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
 from torchslam.utils.files import write_whole
 
-COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
-NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
+COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "rational": (12,), "fisheye": (8,)}
+NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
 
 Size = tuple[int, int]
 
@@ -31,7 +31,7 @@ class Calibration:
     """A camera whose image size may not be known yet.
 
     Attributes:
-        model: "pinhole", "radial_tangential" or "fisheye".
+        model: "pinhole", "radial_tangential", "rational" or "fisheye".
         params: fx fy cx cy in pixels, and all distortion coefficients of the model.
         source: origin of the numbers, for messages.
         size: (width, height) of the images, if known.
@@ -56,16 +56,18 @@ class Calibration:
 
         Raises CalibrationError for a wrong count, a number that is not finite or a focal length that is not positive.
         """
-        counts = COUNTS[model] if model else (4, 8, 9)
+        counts = COUNTS[model] if model else (4, 8, 9, 12)
         if len(numbers) not in counts:
             raise CalibrationError(f"{source}: expected {NUMBERS}, got {len(numbers)} numbers")
         if not all(map(math.isfinite, numbers)):
-            raise CalibrationError(f"{source}: the parameters must be finite, got {numbers[:9]}")
+            raise CalibrationError(f"{source}: the parameters must be finite, got {numbers[:12]}")
         if numbers[0] <= 0 or numbers[1] <= 0:
             raise CalibrationError(
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"
             )
-        if model is None and any(numbers[4:]):
+        if model is None and any(numbers[9:]):
+            model = "rational"
+        elif model is None and any(numbers[4:]):
             model = "radial_tangential"
         elif model is None:
             model, numbers = "pinhole", numbers[:4]
@@ -144,7 +146,7 @@ class Preset:
 
 
 def parse_numbers(text: str, source: str) -> Calibration:
-    """Parse `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]` or `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`.
+    """Parse `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]` or `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`.
 
     Raises CalibrationError naming `source`.
     """
@@ -175,8 +177,8 @@ def read_numbers(path: Path) -> Calibration:
     number, line = _first_line(distortion)
     where = f"{distortion}:{number}"
     numbers = parse_floats(line, where, CalibrationError)
-    if len(numbers) not in (4, 5):
-        raise CalibrationError(f"{where}: expected k1 k2 p1 p2 [k3], got {len(numbers)} numbers")
+    if len(numbers) not in (4, 5, 8):
+        raise CalibrationError(f"{where}: expected k1 k2 p1 p2 [k3 [k4 k5 k6]], got {len(numbers)} numbers")
     whole = Calibration.from_numbers([*calibration.params, *numbers], calibration.source)
     return replace(whole, size=calibration.size, std=calibration.std)
 
@@ -243,6 +245,7 @@ FOCAL_STD = "relative standard error of the focal length"
 PARAMETER_NAMES = {
     "pinhole": "fx fy cx cy",
     "radial_tangential": "fx fy cx cy k1 k2 p1 p2 k3",
+    "rational": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
     "fisheye": "fx fy cx cy k1 k2 k3 k4",
 }
 

@@ -119,18 +119,17 @@ def collate(clips: Several[Clip]) -> Clip:
 
 
 def stack_cameras(cameras: Several[Camera]) -> Camera:
-    """Stack B cameras of one size into one with params (B, P); pinholes are padded where others are distorted.
+    """Stack B cameras of one size into one with params (B, P); parameters are padded where others have more.
 
     Raises:
         ValueError: Different sizes, or models that cannot be mixed.
     """
-    models = {camera.model for camera in cameras}
-    if models == {"pinhole", "radial_tangential"}:
+    nested = ("pinhole", "radial_tangential", "rational")  # each is the next one with zeros at the end
+    if all(camera.model in nested for camera in cameras):
+        model = max((camera.model for camera in cameras), key=nested.index)
         width = max(camera.params.shape[-1] for camera in cameras)
         padded = [torch.nn.functional.pad(c.params, (0, width - c.params.shape[-1])) for c in cameras]
-        cameras = [
-            Camera("radial_tangential", params, c.size) for c, params in zip(cameras, padded, strict=True)
-        ]
+        cameras = [Camera(model, params, c.size) for c, params in zip(cameras, padded, strict=True)]
     return Camera.stack(cameras)
 
 
