@@ -37,7 +37,7 @@ if TYPE_CHECKING:
         umeyama,
     )
     from torchslam.learning.clip_slam import ClipGraph, ClipPoses, ClipSLAM, clip_loss
-    from torchslam.optim import BundleProblem, bundle_adjust, minimize, refine_pose
+    from torchslam.optim import BundleProblem, SolverOptions, solve_bundle, solve_least_squares, solve_pose
     from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
     from torchslam.system.run import Run
     from torchslam.system.slam import SLAM
@@ -63,12 +63,12 @@ __all__ = [
     "ObservationGraph",
     "OpenCVORB",
     "Run",
+    "SolverOptions",
     "State",
     "StepResult",
     "TorchslamError",
     "Trajectory",
     "XFeat",
-    "bundle_adjust",
     "clip_loss",
     "estimate_absolute_pose",
     "estimate_relative_pose",
@@ -76,10 +76,11 @@ __all__ = [
     "load_config",
     "match",
     "match_by_projection",
-    "minimize",
     "open_sequence",
-    "refine_pose",
+    "solve_bundle",
     "solve_graph",
+    "solve_least_squares",
+    "solve_pose",
     "triangulate",
     "umeyama",
 ]
@@ -94,7 +95,8 @@ _HOMES = {
     "torchslam.learning.clip_slam": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.system.run": "Run",
     "torchslam.system.slam": "SLAM",
-    "torchslam.optim": "BundleProblem bundle_adjust minimize refine_pose",
+    "torchslam.optim": "BundleProblem SolverOptions solve_bundle solve_least_squares solve_pose",
+    "torchslam.optim._old_names": "bundle_adjust minimize refine_pose",
     "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve_graph",
     "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }

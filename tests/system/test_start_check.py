@@ -12,7 +12,7 @@ from torchslam import SLAM, evaluate, open_sequence
 from torchslam.config import Config
 from torchslam.geometry import Camera, transform
 from torchslam.map.atlas import Submap
-from torchslam.optim import refine_pose
+from torchslam.optim import POSE_OPTIONS, solve_pose
 from torchslam.system.start_check import KeyframePair, StartCheck
 from torchslam.system.state_machine import InitializationState
 from torchslam.types import FrameFeatures, Rejection, TwoViewMap
@@ -26,8 +26,12 @@ def bent(start: TwoViewMap, camera: Camera) -> TwoViewMap:
     depths = start.points_w[:, 2]
     points_w = start.points_w * (depths.median() / depths)[:, None]
     pixels = start.view.keypoints[start.keypoints_2]
-    T_cw = refine_pose(
-        start.T_cw[None], points_w[None], pixels[None], camera, kernel="cauchy", backward="detached"
+    T_cw = solve_pose(
+        points_w[None],
+        pixels[None],
+        T_cw=start.T_cw[None],
+        camera=camera,
+        options=POSE_OPTIONS.replace(kernel="cauchy", backward="detached"),
     ).T_cw[0]
     errors = torch.linalg.vector_norm(camera.project(transform(T_cw, points_w))[0] - pixels, dim=-1)
     kept = torch.nonzero(errors < 3.0)[:, 0]

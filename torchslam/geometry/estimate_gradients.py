@@ -35,7 +35,7 @@ def refuse_transforms(name: str) -> None:
     if in_transform():
         raise RuntimeError(
             f"{name} chooses among random samples, which torch.func cannot transform: call it outside, on a batch in "
-            "place of vmap, and differentiate with backward; refine_pose and bundle_adjust can be transformed"
+            "place of vmap, and differentiate with backward; solve_pose and solve_bundle can be transformed"
         )
 
 

@@ -322,7 +322,7 @@ def parallax(
     pixels_1 = first.keypoints[0, matches.indices_1[0, rows]].to(camera.params.dtype)
     pixels_2 = second.keypoints[0, matches.indices_2[0, rows]].to(camera.params.dtype)
     if R_21 is None:
-        motion = estimate_relative_pose(pixels_1[None], pixels_2[None], camera, camera)
+        motion = estimate_relative_pose(pixels_1[None], pixels_2[None], camera_1=camera, camera_2=camera)
         if not motion.success[0]:
             return 0.0
         R_21 = motion.T_21[0, :3, :3]

@@ -28,7 +28,7 @@ from torchslam.system.front_end import FrontEnd
 from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
-from torchslam.types import State, StepResult
+from torchslam.types import Explanation, State, StepResult
 
 STATES = tuple(State)
 TRACKING = "run.tracking."
@@ -228,7 +228,7 @@ def _results(tensors: dict[str, Tensor], run: dict[str, Any], device: torch.devi
                 is_keyframe=bool(is_keyframe),
                 matches=matches,
                 inliers=inliers,
-                reason=run["reasons"][row],
+                reasons=Explanation.parsed(run["reasons"][row]),
                 stage_ms={
                     stage: time
                     for stage, time in zip(stages, times[row], strict=True)

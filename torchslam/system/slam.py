@@ -36,7 +36,7 @@ from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.tracking.non_static import NonStaticFilter
 from torchslam.tracking.pose_validation import PoseConfirmation
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
+from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
 from torchslam.utils.timing import Stopwatch
 
 
@@ -335,6 +335,8 @@ class SLAM:
             is_keyframe=outcome.is_keyframe,
             matches=estimate.matches if estimate else 0,
             inliers=estimate.inliers if estimate else 0,
-            reason="; ".join(map(str, outcome.reasons)),
+            reasons=tuple(
+                each if isinstance(each, Explanation) else Explanation(each) for each in outcome.reasons
+            ),
             stage_ms=self.clock.take(),
         )

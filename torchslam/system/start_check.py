@@ -154,8 +154,8 @@ class StartCheck:
         found = estimate_relative_pose(
             pixels_1[None],
             pixels_2[None],
-            camera,
-            camera,
+            camera_1=camera,
+            camera_2=camera,
             threshold=threshold,
             seed=config.seed,
             kernel="truncated",

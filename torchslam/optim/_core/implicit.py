@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Any, Literal, ParamSpec, Protocol, TypeVar, get_args
+from typing import Any, Literal, ParamSpec, Protocol, TypeVar
 
 import torch
 from torch import Tensor
@@ -50,16 +50,6 @@ def _alone(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return alone
-
-
-def check_options(backward: str, iterations: int, tolerance: float) -> None:
-    """Raises ValueError for a mode that is unknown, and for numbers that no minimization can end by."""
-    if not iterations >= 0:
-        raise ValueError(f"iterations must not be below zero, got {iterations}")
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance must not be below zero, got {tolerance}")
-    if backward not in get_args(Backward):
-        raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(get_args(Backward))}")
 
 
 class Minimization(Protocol):
