@@ -82,10 +82,10 @@ def mean_of(values: Float[Tensor, "B N C"], found: Bool[Tensor, "B N 1"]) -> Flo
 
 
 def error(
-    T_cw: Float[Tensor, "B T 4 4"], T_cw_other: Float[Tensor, "B T 4 4"], mask: Bool[Tensor, "B T"]
+    T_cw: Float[Tensor, "B T 4 4"], T_cw_groundtruth: Float[Tensor, "B T 4 4"], mask: Bool[Tensor, "B T"]
 ) -> Float[Tensor, " B"]:
     """Robust ATE relative to the path."""
-    return (relative_ate(T_cw, T_cw_other, mask) / ERROR_UNIT).log1p()
+    return (relative_ate(T_cw=T_cw, T_cw_groundtruth=T_cw_groundtruth, mask=mask) / ERROR_UNIT).log1p()
 
 
 class Loss(nn.Module):
@@ -99,7 +99,7 @@ class Loss(nn.Module):
         features = self.clip_slam.extract(clip.images, graph)
         if self.supervised:
             poses = self.clip_slam.pose(graph, features, clip.camera)
-            return clip_loss(poses, clip.T_cw, error, on_failure=FAILED)
+            return clip_loss(poses, T_cw_groundtruth=clip.T_cw, error=error, on_failure=FAILED)
         even, odd = (self.clip_slam.pose(half, features, clip.camera) for half in graph.halves())
         return clip_halves(even, odd, error, on_failure=FAILED)
 

@@ -14,7 +14,7 @@ from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
 from torchslam.system.run import Run
-from torchslam.types import FrameFeatures, PoseEstimate, State, StepResult, Trajectory
+from torchslam.types import Explanation, FrameFeatures, PoseEstimate, State, StepResult, Trajectory
 
 KEYPOINTS = 40
 FRAMES = 30
@@ -117,6 +117,6 @@ def _result(index: int, state: State) -> StepResult:
         is_keyframe=is_keyframe,
         matches=100 + index if is_tracking else 8,
         inliers=90 + index if is_tracking else 0,
-        reason="" if is_tracking else 'few matches: 8, "20" are needed',
+        reasons=() if is_tracking else Explanation.parsed('few matches: 8, "20" are needed'),
         stage_ms=stage_ms | {"total": sum(stage_ms.values())},
     )

@@ -32,7 +32,7 @@ def gradients(walk: Walk, device: torch.device) -> dict[str, Tensor]:
     pixels = graph.pixels.clone().requires_grad_()
     camera = graph.camera.with_params(graph.camera.params.clone().requires_grad_())
     solution = solve_graph(replace(graph, pixels=pixels, camera=camera))
-    ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids.cpu()].to(device)).backward()
+    ate(T_cw=solution.T_cw, T_cw_groundtruth=true_T_cw(walk)[graph.frame_ids.cpu()].to(device)).backward()
     assert pixels.grad is not None
     assert camera.params.grad is not None
     covariances = solution.keyframes[0].covariance().frames

@@ -72,7 +72,7 @@ def test_errors_have_known_values() -> None:
     turning = se3_inverse(rigid(so3_exp(angles), still))
     straight = se3_inverse(rigid(torch.eye(3, dtype=torch.float64).expand(10, 3, 3), still))
     for delta in (1, 3):
-        _, rotation = rpe(turning, straight, delta=delta)
+        _, rotation = rpe(T_cw=turning, T_cw_groundtruth=straight, delta=delta)
         assert math.degrees(float(rotation)) == pytest.approx(2.0 * delta)
 
 
@@ -149,17 +149,25 @@ def test_errors_are_differentiable(generator: torch.Generator) -> None:
     xi = torch.zeros(8, 6, dtype=torch.float64, requires_grad=True)
     for with_scale in (True, False):
         assert torch.autograd.gradcheck(
-            lambda xi, s=with_scale: ate(se3_exp(xi) @ T_cw, truth, mask, s), xi, atol=1e-6
+            lambda xi, s=with_scale: ate(
+                T_cw=se3_exp(xi) @ T_cw, T_cw_groundtruth=truth, mask=mask, with_scale=s
+            ),
+            xi,
+            atol=1e-6,
         )
         assert torch.autograd.gradcheck(
-            lambda xi, s=with_scale: rpe(se3_exp(xi) @ T_cw, truth, 2, mask, s), xi, atol=1e-6
+            lambda xi, s=with_scale: rpe(
+                T_cw=se3_exp(xi) @ T_cw, T_cw_groundtruth=truth, delta=2, mask=mask, with_scale=s
+            ),
+            xi,
+            atol=1e-6,
         )
 
 
 def test_gradient_on_exact_data_is_zero(generator: torch.Generator, dtype: torch.dtype) -> None:
     truth = _poses(generator, 8, dtype)
     T_cw = truth.clone().requires_grad_()
-    (ate(T_cw, truth) + sum(rpe(T_cw, truth))).backward()
+    (ate(T_cw=T_cw, T_cw_groundtruth=truth) + sum(rpe(T_cw=T_cw, T_cw_groundtruth=truth))).backward()
     assert T_cw.grad is not None
     assert T_cw.grad.isfinite().all()
 
@@ -170,26 +178,34 @@ def test_masked_rows_do_not_matter(generator: torch.Generator) -> None:
     mask[-2:] = False
     broken = T_cw.clone()
     broken[-2:] = torch.nan
-    torch.testing.assert_close(ate(broken, truth, mask), ate(T_cw[:7], truth[:7]))
-    torch.testing.assert_close(rpe(broken, truth, 1, mask), rpe(T_cw[:7], truth[:7], 1))
+    torch.testing.assert_close(
+        ate(T_cw=broken, T_cw_groundtruth=truth, mask=mask), ate(T_cw=T_cw[:7], T_cw_groundtruth=truth[:7])
+    )
+    torch.testing.assert_close(
+        rpe(T_cw=broken, T_cw_groundtruth=truth, delta=1, mask=mask),
+        rpe(T_cw=T_cw[:7], T_cw_groundtruth=truth[:7], delta=1),
+    )
 
 
 def test_a_batch_equals_a_loop(generator: torch.Generator, device: torch.device, dtype: torch.dtype) -> None:
     T_cw = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
     truth = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
-    errors, (translation, rotation) = ate(T_cw, truth), rpe(T_cw, truth)
+    errors, (translation, rotation) = (
+        ate(T_cw=T_cw, T_cw_groundtruth=truth),
+        rpe(T_cw=T_cw, T_cw_groundtruth=truth),
+    )
     assert errors.shape == translation.shape == rotation.shape == (3,)
     assert (errors.dtype, errors.device.type) == (dtype, device.type)
     for row in range(3):
-        torch.testing.assert_close(errors[row], ate(T_cw[row], truth[row]))
-        torch.testing.assert_close(translation[row], rpe(T_cw[row], truth[row])[0])
+        torch.testing.assert_close(errors[row], ate(T_cw=T_cw[row], T_cw_groundtruth=truth[row]))
+        torch.testing.assert_close(translation[row], rpe(T_cw=T_cw[row], T_cw_groundtruth=truth[row])[0])
 
 
 def test_delta_out_of_range(generator: torch.Generator) -> None:
     T_cw = _poses(generator, 4)
     for delta in (0, 4):
         with pytest.raises(ValueError, match="delta must be between 1 and 3"):
-            rpe(T_cw, T_cw, delta=delta)
+            rpe(T_cw=T_cw, T_cw_groundtruth=T_cw, delta=delta)
 
 
 def _evo_figures(estimate: Trajectory, groundtruth: Trajectory, interpolate: bool) -> dict[str, float]:
@@ -276,22 +292,35 @@ def test_too_few_poses_have_no_error(generator: torch.Generator) -> None:
     truth = _poses(generator, 4)
     for count in range(5):
         mask = torch.arange(4) < count
-        errors = torch.stack((ate(poses, truth, mask), *rpe(poses, truth, mask=mask)))
+        errors = torch.stack(
+            (
+                ate(T_cw=poses, T_cw_groundtruth=truth, mask=mask),
+                *rpe(T_cw=poses, T_cw_groundtruth=truth, mask=mask),
+            )
+        )
         assert errors.isnan().all() == (count < 3)
         (gradient,) = torch.autograd.grad(errors.sum(), poses)
         assert gradient.isfinite().all()
         assert (gradient != 0).any() == (count >= 3)
-    alone = rpe(poses, truth, delta=2, mask=torch.tensor([True, True, False, False]), with_scale=False)
+    alone = rpe(
+        T_cw=poses,
+        T_cw_groundtruth=truth,
+        delta=2,
+        mask=torch.tensor([True, True, False, False]),
+        with_scale=False,
+    )
     assert torch.stack(alone).isnan().all()
 
 
 def test_the_error_has_first_derivatives_in_both_modes(generator: torch.Generator) -> None:
     poses, truth = _poses(generator, 5), _poses(generator, 5)
-    reverse, forward = (transform(lambda x: ate(x, truth))(poses) for transform in (jacrev, jacfwd))
+    reverse, forward = (
+        transform(lambda x: ate(T_cw=x, T_cw_groundtruth=truth))(poses) for transform in (jacrev, jacfwd)
+    )
     torch.testing.assert_close(forward, reverse, rtol=0, atol=1e-12)
     assert (reverse != 0).any()
     leaf = poses.clone().requires_grad_()
-    (gradient,) = torch.autograd.grad(ate(leaf, truth), leaf, create_graph=True)
+    (gradient,) = torch.autograd.grad(ate(T_cw=leaf, T_cw_groundtruth=truth), leaf, create_graph=True)
     with pytest.raises(RuntimeError, match="second derivative"):
         gradient.square().sum().backward()
 
@@ -309,8 +338,15 @@ def test_a_pose_that_is_not_finite_fails_its_element_alone(
     broken[1, 2] = bad
     broken.requires_grad_()
     for found, expected in (
-        (ate(broken, truth, mask), ate(estimate, truth, mask)),
-        *zip(rpe(broken, truth, 1, mask), rpe(estimate, truth, 1, mask), strict=True),
+        (
+            ate(T_cw=broken, T_cw_groundtruth=truth, mask=mask),
+            ate(T_cw=estimate, T_cw_groundtruth=truth, mask=mask),
+        ),
+        *zip(
+            rpe(T_cw=broken, T_cw_groundtruth=truth, delta=1, mask=mask),
+            rpe(T_cw=estimate, T_cw_groundtruth=truth, delta=1, mask=mask),
+            strict=True,
+        ),
     ):
         if bad == 0:  # no rotation, but finite: the numbers say so
             assert found.isfinite().all()
@@ -371,8 +407,8 @@ def test_a_truth_without_extent_has_no_ate(generator: torch.Generator) -> None:
     """A similarity would shrink any estimate to that place: an error of zero."""
     estimate = _poses(generator, 9).requires_grad_()
     still = _poses(generator, 1).expand(9, 4, 4)
-    error = ate(estimate, still)
+    error = ate(T_cw=estimate, T_cw_groundtruth=still)
     (gradient,) = torch.autograd.grad(error, estimate)
     assert error.isnan()
     assert not gradient.any()
-    assert ate(estimate, still, with_scale=False) > 0.1
+    assert ate(T_cw=estimate, T_cw_groundtruth=still, with_scale=False) > 0.1

@@ -13,6 +13,17 @@ from typing import TYPE_CHECKING, Any
 from torchslam.utils.console import with_install_hint
 
 if TYPE_CHECKING:
+    from torchslam import calibration as calibration
+    from torchslam import data as data
+    from torchslam import dense as dense
+    from torchslam import errors as errors
+    from torchslam import evaluation as evaluation
+    from torchslam import features as features
+    from torchslam import geometry as geometry
+    from torchslam import learning as learning
+    from torchslam import optim as optim
+    from torchslam import refine as refine
+    from torchslam import types as types
     from torchslam.config import Config, load_config
     from torchslam.data import open_sequence
     from torchslam.errors import TorchslamError
@@ -26,7 +37,7 @@ if TYPE_CHECKING:
         umeyama,
     )
     from torchslam.learning.clip_slam import ClipGraph, ClipPoses, ClipSLAM, clip_loss
-    from torchslam.optim import BundleProblem, bundle_adjust, minimize, refine_pose
+    from torchslam.optim import BundleProblem, SolverOptions, solve_bundle, solve_least_squares, solve_pose
     from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
     from torchslam.system.run import Run
     from torchslam.system.slam import SLAM
@@ -52,12 +63,12 @@ __all__ = [
     "ObservationGraph",
     "OpenCVORB",
     "Run",
+    "SolverOptions",
     "State",
     "StepResult",
     "TorchslamError",
     "Trajectory",
     "XFeat",
-    "bundle_adjust",
     "clip_loss",
     "estimate_absolute_pose",
     "estimate_relative_pose",
@@ -65,15 +76,16 @@ __all__ = [
     "load_config",
     "match",
     "match_by_projection",
-    "minimize",
     "open_sequence",
-    "refine_pose",
+    "solve_bundle",
     "solve_graph",
+    "solve_least_squares",
+    "solve_pose",
     "triangulate",
     "umeyama",
 ]
 
-HOMES = {
+_HOMES = {
     "torchslam.config": "Config load_config",
     "torchslam.data": "open_sequence",
     "torchslam.errors": "TorchslamError",
@@ -83,24 +95,42 @@ HOMES = {
     "torchslam.learning.clip_slam": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.system.run": "Run",
     "torchslam.system.slam": "SLAM",
-    "torchslam.optim": "BundleProblem bundle_adjust minimize refine_pose",
+    "torchslam.optim": "BundleProblem SolverOptions solve_bundle solve_least_squares solve_pose",
+    "torchslam.optim._old_names": "bundle_adjust minimize refine_pose",
     "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve_graph",
     "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }
+"""Public names by the module that has them."""
+
+_SUBPACKAGES = (
+    "calibration",
+    "data",
+    "dense",
+    "errors",
+    "evaluation",
+    "features",
+    "geometry",
+    "learning",
+    "optim",
+    "refine",
+    "types",
+)
+"""Public packages and modules."""
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is first asked for: torch alone takes a second or two."""
+    """A public name or package, imported when it is first asked for: torch alone takes a second or two."""
     if name == "__version__":
         return _version()
-    for home, names in HOMES.items():
-        if name in names.split():
-            try:
-                value = globals()[name] = getattr(import_module(home), name)
-            except ModuleNotFoundError as error:
-                raise with_install_hint(error) from error
-            return value
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    home = next((home for home, names in _HOMES.items() if name in names.split()), None)
+    if home is None and name not in _SUBPACKAGES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    try:
+        module = import_module(home or f"{__name__}.{name}")
+    except ModuleNotFoundError as error:
+        raise with_install_hint(error) from error
+    value = globals()[name] = getattr(module, name) if home else module
+    return value
 
 
 def _version() -> str:
@@ -114,4 +144,4 @@ def _version() -> str:
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__, "__version__"})
+    return sorted([*__all__, *_SUBPACKAGES, "__version__"])

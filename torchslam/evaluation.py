@@ -21,6 +21,7 @@ from torchslam.geometry.lie import rigid, se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.similarity import umeyama
 from torchslam.types import Trajectory, check_ascending
+from torchslam.utils.deprecation import OldCall
 
 Association = Literal["interpolate", "nearest"]
 
@@ -134,12 +135,12 @@ def evaluate(
     errors = (aligned.positions_w[valid] - reference[:, :3, 3]).norm(dim=-1)
     T_ew, T_gw = se3_inverse(matched), se3_inverse(reference)
     delta = min(delta, compared - 1)
-    rpe_translation, rpe_rotation = rpe(T_ew, T_gw, delta)
+    rpe_translation, rpe_rotation = rpe(T_cw=T_ew, T_cw_groundtruth=T_gw, delta=delta)
     S = torch.eye(4, dtype=torch.float64, device=device)
     S[:3, :3], S[:3, 3] = s * R, t
     return Evaluation(
         ate_m=float(_rms(errors.square())),
-        ate_se3_m=float(ate(T_ew, T_gw, with_scale=False)),
+        ate_se3_m=float(ate(T_cw=T_ew, T_cw_groundtruth=T_gw, with_scale=False)),
         rpe_translation_m=float(rpe_translation),
         rpe_rotation_deg=math.degrees(float(rpe_rotation)),
         rpe_delta=delta,
@@ -182,8 +183,10 @@ def _compared(estimate: Trajectory, groundtruth: Trajectory) -> int:
     return int(_associate(truth, times, "interpolate", TOLERANCE)[1].sum())
 
 
+@OldCall("T_cw T_cw_groundtruth mask with_scale").accepted
 @full_precision
 def ate(
+    *,
     T_cw: Float[Tensor, "*batch N 4 4"],
     T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
     mask: Bool[Tensor, "*batch N"] | None = None,
@@ -194,7 +197,7 @@ def ate(
     Differentiable, with a gradient of zero on exact data.
 
     Args:
-        T_cw: estimated poses.
+        T_cw: estimated poses, world to camera; a `Trajectory` has the inverses.
         T_cw_groundtruth: true poses at the same times.
         mask: rows that count.
         with_scale: align by a similarity; False: by a rigid transform.
@@ -214,8 +217,10 @@ def ate(
     return torch.where(known, error, torch.nan)
 
 
+@OldCall("T_cw T_cw_groundtruth delta mask with_scale").accepted
 @full_precision
 def rpe(
+    *,
     T_cw: Float[Tensor, "*batch N 4 4"],
     T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
     delta: int = 1,
@@ -227,7 +232,7 @@ def rpe(
     Differentiable.
 
     Args:
-        T_cw: estimated poses.
+        T_cw: estimated poses, world to camera; a `Trajectory` has the inverses.
         T_cw_groundtruth: true poses at the same times.
         delta: number of rows.
         mask: rows that count.

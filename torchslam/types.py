@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum, StrEnum
+from functools import cache
+from string import Formatter
 from typing import Any, Self
 
 import torch
@@ -387,7 +390,7 @@ def check_ascending(times: Float[Tensor, " N"], wrong: Bool[Tensor, " M"]) -> No
 
 
 class Reason(StrEnum):
-    """Why a frame has no pose, an uncertain one or became a keyframe: the text of `StepResult.reason`.
+    """Why a frame has no pose, an uncertain one or became a keyframe: the kinds of `StepResult.reasons`.
 
     Texts with fields in braces belong to an `Explanation`, which has the numbers.
     """
@@ -445,10 +448,19 @@ class Reason(StrEnum):
     WEAK_LINK = "nothing ties this part to the rest of the map, or the check contradicts the tie"
     MOVING_REMAINDER = "{count} matches in the rest of the image move against the map"
 
+    # without an online map
+    NOT_FOUND = "not found in the map"
+    OTHER = "{text}"
+
 
 @dataclass(frozen=True)
 class Explanation:
-    """A reason with the values of the fields of its text; `str` gives the text."""
+    """A reason with the values of the fields of its text; `str` gives the text.
+
+    Attributes:
+        reason: the kind.
+        values: numbers and words by the name of their field.
+    """
 
     reason: Reason
     values: dict[str, float | str | Explanation] = field(default_factory=dict)
@@ -458,8 +470,46 @@ class Explanation:
         """A reason with the values of the fields of its text."""
         return cls(reason, values)
 
+    @staticmethod
+    def parsed(text: str) -> tuple[Explanation, ...]:
+        """The explanations that a file has as text, with values as rounded there; text of none of them is `OTHER`."""
+        found = []
+        while text:
+            fitting = ((reason, match) for reason in Reason if (match := _pattern(reason).match(text)))
+            reason, match = next(fitting, (Reason.OTHER, None))
+            values = {"text": text} if match is None else match.groupdict()
+            found.append(Explanation(reason, {name: _value(name, given) for name, given in values.items()}))
+            text = "" if match is None else text[match.end() :].removeprefix("; ")
+        return tuple(found)
+
     def __str__(self) -> str:
         return self.reason.value.format(**self.values)
+
+
+_NUMBER = r"-?(?:\d{1,18}(?:\.\d{1,18})?|nan|inf)"
+
+
+@cache
+def _pattern(reason: Reason) -> re.Pattern[str]:
+    """Of the text of a reason, up to the next one; the fields are groups."""
+    pattern = ""
+    for literal, name, form, _ in Formatter().parse(reason.value):
+        pattern += re.escape(literal)
+        if name == "rejection":  # goes on to the end
+            pattern += f"(?P<{name}>.+)"
+        elif name:
+            pattern += f"(?P<{name}>{_NUMBER + '%' * form.endswith('%') if form else '(?:(?!; ).)+?'})"
+    return re.compile(pattern + r"(?=; |\Z)", re.DOTALL)
+
+
+def _value(name: str, text: str) -> float | str | Explanation:
+    """The value of a field from its text."""
+    if name == "rejection":
+        return Explanation.parsed(text)[0]
+    if not re.fullmatch(_NUMBER + "%?", text):
+        return text
+    number = float(text.removesuffix("%"))
+    return number / 100 if text.endswith("%") else int(text) if text.lstrip("-").isdigit() else number
 
 
 class Rejection(Explanation):
@@ -493,7 +543,7 @@ class StepResult:
         is_keyframe: True if the frame became a keyframe.
         matches: number of map points matched in this frame.
         inliers: number of these that agree with the pose.
-        reason: text: why there is no pose, or why the frame is a keyframe; empty otherwise.
+        reasons: why there is no pose, or an uncertain one, or why the frame is a keyframe.
         stage_ms: milliseconds per stage.
     """
 
@@ -506,5 +556,10 @@ class StepResult:
     is_keyframe: bool = False
     matches: int = 0
     inliers: int = 0
-    reason: str = ""
+    reasons: tuple[Explanation, ...] = ()
     stage_ms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def reason(self) -> str:
+        """The text of the reasons; empty where there are none."""
+        return "; ".join(map(str, self.reasons))

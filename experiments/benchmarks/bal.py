@@ -27,7 +27,7 @@ from torchslam import SLAM
 from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.geometry import Camera, rigid, se3_exp, so3_exp, so3_log, transform
-from torchslam.optim import BundleProblem, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.optim.run_graph import ObservationGraph
 
 HERE = Path(__file__).parent
@@ -135,12 +135,12 @@ def ours(problem: BundleProblem, iterations: int, gradient: bool, free: bool) ->
     """A row of the table: cost and seconds after so many iterations, with the gradient to all pixels or without."""
     pixels = problem.pixels.clone().requires_grad_(gradient)
     began = time.process_time()
-    solution = bundle_adjust(
+    solution = solve_bundle(
         replace(problem, pixels=pixels),
-        "none",
         free_camera=FREE if free else False,
-        backward="implicit" if gradient else "detached",
-        iterations=iterations,
+        options=BUNDLE_OPTIONS.replace(
+            kernel="none", iterations=iterations, backward="implicit" if gradient else "detached"
+        ),
     )
     solved = time.process_time()
     if gradient:

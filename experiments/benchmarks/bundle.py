@@ -22,7 +22,7 @@ from torch import Tensor
 from experiments.benchmarks.solvers import camera, colmap_solve, gradient_error, rmse
 from experiments.common import milliseconds, parser_of, table
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, transform
-from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, solve_bundle
 
 HERE = Path(__file__).parent
 NOISE_PX = 0.5
@@ -112,22 +112,28 @@ def large() -> list[str]:
     pixels = problem.pixels.clone().requires_grad_()
 
     def backward() -> float:
-        loss = loss_of(bundle_adjust(replace(problem, pixels=pixels), "none"))
+        loss = loss_of(
+            solve_bundle(replace(problem, pixels=pixels), options=BUNDLE_OPTIONS.replace(kernel="none"))
+        )
         begin = time.process_time()
         loss.backward()
         return 1e3 * (time.process_time() - begin)
 
     ours, ceres, back = milliseconds(
-        lambda: bundle_adjust(problem, "none", backward="detached"),
+        lambda: solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none", backward="detached")),
         lambda: colmap_solve(problem).solve_ms,
         backward,
         repeats=5,
     )
-    solution = bundle_adjust(problem, "none", backward="detached")
+    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none", backward="detached"))
     reached = rmse(replace(problem, T_cw=solution.T_cw, points_w=solution.points_w))
     iterations = int(solution.convergence.iterations)
     error = gradient_error(
-        lambda pixels, **options: loss_of(bundle_adjust(replace(problem, pixels=pixels), "none", **options)),
+        lambda pixels, **options: loss_of(
+            solve_bundle(
+                replace(problem, pixels=pixels), options=BUNDLE_OPTIONS.replace(kernel="none", **options)
+            )
+        ),
         {"pixels": problem.pixels},
         {"pixels": 1e-4},
         {"iterations": 40, "tolerance": 1e-28},
@@ -158,11 +164,13 @@ def windows() -> list[str]:
     batch = batch_of(problems)
 
     def solve(problem: BundleProblem) -> Callable[[], Any]:
-        return lambda: bundle_adjust(problem, scale=2.45, backward="detached")
+        return lambda: solve_bundle(problem, options=BUNDLE_OPTIONS.replace(scale=2.45, backward="detached"))
 
     def step(problem: BundleProblem) -> None:
         pixels = problem.pixels.clone().requires_grad_()
-        loss_of(bundle_adjust(replace(problem, pixels=pixels), scale=2.45)).backward()
+        loss_of(
+            solve_bundle(replace(problem, pixels=pixels), options=BUNDLE_OPTIONS.replace(scale=2.45))
+        ).backward()
 
     def each(task: Callable[[BundleProblem], Any]) -> None:
         for problem in problems:
@@ -183,8 +191,10 @@ def windows() -> list[str]:
             ("solve and gradient to all pixels", step_loop, step_together),
         )
     ]
-    found = bundle_adjust(batch, scale=2.45)
-    alone = torch.stack([bundle_adjust(problem, scale=2.45).T_cw for problem in problems])
+    found = solve_bundle(batch, options=BUNDLE_OPTIONS.replace(scale=2.45))
+    alone = torch.stack(
+        [solve_bundle(problem, options=BUNDLE_OPTIONS.replace(scale=2.45)).T_cw for problem in problems]
+    )
     said = (
         f"Windows of {FRAMES} frames and {POINTS} points, {len(batch.pixels[0])} observations at most; the largest "
         f"difference of a pose to that found alone: {float((found.T_cw - alone).detach().abs().max()):.0e}."

@@ -75,11 +75,13 @@ def step(clip_slam: ClipSLAM, prepared: Sequence[PreparedClip], together: bool, 
     def forward() -> Tensor:
         if together:
             poses = clip_slam.pose(ClipGraph.stack([each.graph for each in prepared]), moved, camera)
-            return clip_loss(poses, truths, relative_ate, on_failure=1.0).loss
+            return clip_loss(poses, T_cw_groundtruth=truths, error=relative_ate, on_failure=1.0).loss
         losses = []
         for row, each in enumerate(prepared):
             poses = clip_slam.pose(each.graph, moved[row], camera[row])
-            losses.append(clip_loss(poses, truths[row], relative_ate, on_failure=1.0).loss)
+            losses.append(
+                clip_loss(poses, T_cw_groundtruth=truths[row], error=relative_ate, on_failure=1.0).loss
+            )
         return torch.stack(losses).mean()
 
     loss, ahead = timed(forward)

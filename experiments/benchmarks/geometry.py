@@ -59,7 +59,14 @@ def relative(problems: ModuleType, outliers: float, count: int) -> tuple[list[Er
         )
         one, two = batch_of_one(x_1, x_2)
         found, ms = timed(
-            partial(estimate_relative_pose, one, two, CAMERA, CAMERA, threshold=RELATIVE_THRESHOLD)
+            partial(
+                estimate_relative_pose,
+                one,
+                two,
+                camera_1=CAMERA,
+                camera_2=CAMERA,
+                threshold=RELATIVE_THRESHOLD,
+            )
         )
         T_21 = found.T_21[0].numpy()
         rotation, direction = T_21[:3, :3], T_21[:3, 3]
@@ -80,7 +87,9 @@ def absolute(problems: ModuleType, outliers: float, count: int) -> tuple[list[Er
         )
         theirs.append(Errors(ms, problems.rot_err_deg(R, pose.R), float(np.linalg.norm(t - pose.t))))
         one, two = batch_of_one(points, pixels)
-        found, ms = timed(partial(estimate_absolute_pose, one, two, CAMERA, threshold=ABSOLUTE_THRESHOLD))
+        found, ms = timed(
+            partial(estimate_absolute_pose, one, two, camera=CAMERA, threshold=ABSOLUTE_THRESHOLD)
+        )
         T_cw = found.T_cw[0].numpy()
         ours.append(Errors(ms, problems.rot_err_deg(R, T_cw[:3, :3]), float(np.linalg.norm(t - T_cw[:3, 3]))))
     return ours, theirs
@@ -119,7 +128,9 @@ def models(problems: ModuleType, baseline: float, expected: str, count: int = 50
     for seed in range(count):
         x_1, x_2, _, t = plane(problems, seed, baseline)
         one, two = batch_of_one(x_1, x_2)
-        found = estimate_relative_pose(one, two, CAMERA, CAMERA, RELATIVE_THRESHOLD)
+        found = estimate_relative_pose(
+            one, two, camera_1=CAMERA, camera_2=CAMERA, threshold=RELATIVE_THRESHOLD
+        )
         seen[found.model[0]] += 1
         ambiguous += int(found.ambiguous.item())
         if found.success.item():
@@ -149,10 +160,12 @@ def speedup(what: str, estimate: Callable[..., Any], cases: list[tuple[NDArray, 
 
 def throughput(problems: ModuleType) -> list[list[str]]:
     def absolute_of(points: Tensor, pixels: Tensor) -> Any:
-        return estimate_absolute_pose(points, pixels, CAMERA, ABSOLUTE_THRESHOLD)
+        return estimate_absolute_pose(points, pixels, camera=CAMERA, threshold=ABSOLUTE_THRESHOLD)
 
     def relative_of(pixels_1: Tensor, pixels_2: Tensor) -> Any:
-        return estimate_relative_pose(pixels_1, pixels_2, CAMERA, CAMERA, RELATIVE_THRESHOLD)
+        return estimate_relative_pose(
+            pixels_1, pixels_2, camera_1=CAMERA, camera_2=CAMERA, threshold=RELATIVE_THRESHOLD
+        )
 
     seeds = range(BATCH)
     return [

@@ -21,7 +21,7 @@ from torch import Tensor
 from experiments.benchmarks.solvers import gradient_error
 from experiments.common import milliseconds, parser_of, table
 from torchslam.geometry import rigid, sim3_exp, sim3_inverse, sim3_log, sim3_scale, so3_exp
-from torchslam.optim import PoseGraph, pose_graph_optimize
+from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
 
 HERE = Path(__file__).parent
 RADIUS = 20.0
@@ -115,18 +115,25 @@ def row(nodes: int, neighbors: int, repeats: int) -> list[str]:
     S_ji = graph.S_ji.clone().requires_grad_()
 
     def backward() -> float:
-        loss = pose_graph_optimize(replace(graph, S_ji=S_ji), kernel="none").S_cw.sum()
+        loss = solve_pose_graph(
+            replace(graph, S_ji=S_ji), options=POSE_GRAPH_OPTIONS.replace(kernel="none")
+        ).S_cw.sum()
         begin = time.process_time()
         loss.backward()
         return 1e3 * (time.process_time() - begin)
 
     tasks: list[Callable[[], Any]] = [
-        lambda: pose_graph_optimize(graph, kernel="none", backward="detached"),
+        lambda: solve_pose_graph(
+            graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none", backward="detached")
+        ),
         lambda: gtsam_solve(graph).solve_ms,
         backward,
     ]
     ours_ms, peer_ms, backward_ms = milliseconds(*tasks, repeats=repeats)
-    ours, peer = pose_graph_optimize(graph, kernel="none"), gtsam_solve(graph)
+    ours, peer = (
+        solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none")),
+        gtsam_solve(graph),
+    )
     return [
         f"{nodes}, {len(graph.edges)}",
         f"{drift(problem, graph.S_cw):.2f}",
@@ -150,7 +157,8 @@ def gradient() -> float:
 
     def loss(twist: Tensor, weights: Tensor, **options: Any) -> Tensor:
         moved = replace(graph, S_ji=sim3_exp(twist) @ graph.S_ji, information=weights)
-        S_cw = pose_graph_optimize(moved, kernel="cauchy", scale=3.0, **options).S_cw[:, :3].flatten()
+        robust = POSE_GRAPH_OPTIONS.replace(kernel="cauchy", scale=3.0, **options)
+        S_cw = solve_pose_graph(moved, options=robust).S_cw[:, :3].flatten()
         return S_cw @ torch.linspace(-1, 1, len(S_cw), dtype=torch.float64)
 
     return gradient_error(loss, inputs, {"twist": 1e-7, "weights": 1e-1}, EXACTLY)

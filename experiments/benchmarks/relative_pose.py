@@ -121,9 +121,9 @@ def by_torchslam(pair: Pair, threshold: float, seed: int, model: Model, always: 
     found = estimate_relative_pose(
         pair.pixels_1[None],
         pair.pixels_2[None],
-        pair.camera,
-        pair.camera,
-        threshold,
+        camera_1=pair.camera,
+        camera_2=pair.camera,
+        threshold=threshold,
         seed=seed,
         confidence=CONFIDENCE,
         model=model,
@@ -147,7 +147,13 @@ def batched_ms(pairs: list[Pair], threshold: float, model: Model) -> float:
         camera = members[0].camera
         begin = time.thread_time()
         estimate_relative_pose(
-            pixels_1, pixels_2, camera, camera, threshold, confidence=CONFIDENCE, model=model
+            pixels_1,
+            pixels_2,
+            camera_1=camera,
+            camera_2=camera,
+            threshold=threshold,
+            confidence=CONFIDENCE,
+            model=model,
         )
         spent += time.thread_time() - begin
     return 1e3 * spent / len(pairs)

@@ -22,7 +22,7 @@ from experiments.benchmarks.problems import PEERS, load_problems
 from experiments.common import milliseconds, parser_of, table
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.geometry.robust import Kernel
-from torchslam.optim import BundleProblem, bundle_adjust, refine_pose
+from torchslam.optim import BUNDLE_OPTIONS, POSE_OPTIONS, BundleProblem, solve_bundle, solve_pose
 
 HERE = Path(__file__).parent
 FOCAL, CENTER, SIZE = 525.0, (319.5, 239.5), (640, 480)
@@ -102,15 +102,13 @@ def pose_inputs(problems: ModuleType, batch: int) -> tuple[Tensor, dict[str, Ten
 
 
 def pose_loss(start: Tensor, points_w, pixels, weights, params, scale, **options) -> Tensor:  # type: ignore[no-untyped-def]
-    refined = refine_pose(
-        start,
+    refined = solve_pose(
         points_w,
         pixels,
-        camera().with_params(params),
-        weights,
-        kernel="cauchy",
-        scale=scale,
-        **options,
+        T_cw=start,
+        camera=camera().with_params(params),
+        weights=weights,
+        options=POSE_OPTIONS.replace(scale=scale, **options),
     )
     return (refined.T_cw[:, :3].flatten(1) @ torch.linspace(-1, 1, 12, dtype=torch.float64)).sum()
 
@@ -149,12 +147,12 @@ def benchmark_pose(problems: ModuleType) -> list[Row]:
         {"points_w": 1e-6, "pixels": 1e-4, "weights": 1e-5, "params": 1e-4, "scale": 1e-5},
         {"iterations": 100, "tolerance": 0.0},
     )
-    iterations = refine_pose(
-        start, inputs["points_w"], inputs["pixels"], camera(), inputs["weights"]
+    iterations = solve_pose(
+        inputs["points_w"], inputs["pixels"], T_cw=start, camera=camera(), weights=inputs["weights"]
     ).convergence.iterations.item()
     return [
         Row(
-            f"`refine_pose`, 300 points, 20 % outliers, cauchy: forward ({iterations} iterations)",
+            f"`solve_pose`, 300 points, 20 % outliers, cauchy: forward ({iterations} iterations)",
             f"{forward_ms:.1f} ms",
             "4 ms",
         ),
@@ -204,7 +202,7 @@ def bundle_loss(
     problem: BundleProblem, pixels: Tensor, weights: Tensor, params: Tensor, **options: Any
 ) -> Tensor:
     problem = replace(problem, pixels=pixels, weights=weights, camera=problem.camera.with_params(params))
-    solution = bundle_adjust(problem, **options)
+    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(**options))
     poses, points = solution.T_cw[:, :3].flatten(), solution.points_w.flatten()
     return sum(x @ torch.linspace(-1, 1, len(x), dtype=torch.float64) for x in (poses, points))  # type: ignore[return-value]
 
@@ -221,7 +219,7 @@ def benchmark_bundle(problems: ModuleType) -> list[Row]:
 
     def solve() -> None:
         with torch.no_grad():
-            bundle_adjust(problem, kernel="none")
+            solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none"))
 
     def backward(kernel: Kernel) -> float:
         loss = bundle_loss(problem, **leaves, kernel=kernel, scale=2.0)
@@ -235,7 +233,7 @@ def benchmark_bundle(problems: ModuleType) -> list[Row]:
         lambda: backward("none"),
     )
     with torch.no_grad():
-        solution = bundle_adjust(problem, kernel="none")
+        solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none"))
     reached = rmse(replace(problem, T_cw=solution.T_cw, points_w=solution.points_w))
     steps = {"pixels": 1e-4, "weights": 1e-5, "params": 1e-4}
     errors = {
@@ -249,7 +247,7 @@ def benchmark_bundle(problems: ModuleType) -> list[Row]:
     }
     return [
         Row(
-            "`bundle_adjust`, 10 cameras, 1940 points, 11120 observations: RMSE at the optimum",
+            "`solve_bundle`, 10 cameras, 1940 points, 11120 observations: RMSE at the optimum",
             f"{reached:.4f} px",
             f"{colmap_solve(problem).rmse:.4f} px (pycolmap)",
         ),

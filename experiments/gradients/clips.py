@@ -89,11 +89,11 @@ class Moved:
         if together:
             stacked = ClipGraph.stack([each.graph for each in self.prepared])
             poses = clip_slam.pose(stacked, self.features, camera)
-            return relative_ate(poses.T_cw, truths, poses.posed), poses
+            return relative_ate(T_cw=poses.T_cw, T_cw_groundtruth=truths, mask=poses.posed), poses
         losses = []
         for row, (each, features) in enumerate(zip(self.prepared, self.features, strict=True)):
             poses = clip_slam.pose(each.graph, features, camera[row])
-            losses.append(relative_ate(poses.T_cw, truths[row], poses.posed))
+            losses.append(relative_ate(T_cw=poses.T_cw, T_cw_groundtruth=truths[row], mask=poses.posed))
         return torch.stack(losses), poses
 
     def pose(self, clip_slam: ClipSLAM, limits: tuple[int, float], together: bool) -> Posed:

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from experiments.common import parser_of, table
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
-from torchslam.optim import Backward, RefinedPose, refine_pose
+from torchslam.optim import POSE_OPTIONS, Backward, RefinedPose, solve_pose
 
 HERE = Path(__file__).parent
 MODES: tuple[tuple[Backward, int], ...] = (("implicit", 20), ("unroll", 20), ("unroll", 5), ("truncated", 20))
@@ -37,10 +37,17 @@ class Problem:
         self, inputs: dict[str, Tensor], mode: Backward, iterations: int, tolerance: float
     ) -> RefinedPose:
         camera = Camera("pinhole", inputs["params"], (640, 480))
-        return refine_pose(
-            self.start, inputs["points_w"], inputs["pixels"], camera, inputs["weights"], kernel="cauchy",
-            scale=inputs["scale"], backward=mode, iterations=iterations, tolerance=tolerance,
-        )  # fmt: skip
+        options = POSE_OPTIONS.replace(
+            scale=inputs["scale"], iterations=iterations, tolerance=tolerance, backward=mode
+        )
+        return solve_pose(
+            inputs["points_w"],
+            inputs["pixels"],
+            T_cw=self.start,
+            camera=camera,
+            weights=inputs["weights"],
+            options=options,
+        )
 
     def loss(self, inputs: dict[str, Tensor], mode: Backward, iterations: int, tolerance: float) -> Tensor:
         T_cw = self.refine(inputs, mode, iterations, tolerance).T_cw

@@ -161,7 +161,12 @@ def inliers_of_pairs(features: Features) -> Tensor:
         if len(pixels_1) < MIN_MATCHES:
             continue
         pose = estimate_relative_pose(
-            pixels_1[None], pixels_2[None], camera, camera, THRESHOLD, max_samples=MAX_SAMPLES
+            pixels_1[None],
+            pixels_2[None],
+            camera_1=camera,
+            camera_2=camera,
+            threshold=THRESHOLD,
+            max_samples=MAX_SAMPLES,
         )
         inliers[later, earlier] = int(pose.inliers.sum())
     return inliers

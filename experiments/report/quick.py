@@ -16,7 +16,7 @@ from experiments.benchmarks.pose_graph import drift, loop
 from experiments.common import milliseconds
 from torchslam.data import open_sequence
 from torchslam.features import ORB, match
-from torchslam.optim import bundle_adjust, pose_graph_optimize
+from torchslam.optim import BUNDLE_OPTIONS, POSE_GRAPH_OPTIONS, solve_bundle, solve_pose_graph
 
 ROUNDS = 5
 
@@ -29,11 +29,14 @@ def spent(task: Callable[[], Any], rounds: int = ROUNDS) -> float:
 def bundle() -> dict[str, float]:
     """100 cameras, 3500 points, 43,000 observations."""
     problem = ring()
-    solution = bundle_adjust(problem, "none", backward="detached")
+    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none", backward="detached"))
     reached = rmse(replace(problem, T_cw=solution.T_cw, points_w=solution.points_w))
     return {
         "error": round(reached, 6),
-        "ms": spent(lambda: bundle_adjust(problem, "none", backward="detached"), 3),
+        "ms": spent(
+            lambda: solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none", backward="detached")),
+            3,
+        ),
     }
 
 
@@ -41,21 +44,32 @@ def bundle_gradient() -> dict[str, float]:
     """The gradient of that problem to all pixels."""
     problem = ring()
     pixels = problem.pixels.clone().requires_grad_()
-    loss = loss_of(bundle_adjust(replace(problem, pixels=pixels), "none"))
+    loss = loss_of(
+        solve_bundle(replace(problem, pixels=pixels), options=BUNDLE_OPTIONS.replace(kernel="none"))
+    )
     return {"ms": spent(lambda: loss.backward(retain_graph=True), 3)}
 
 
 def windows() -> dict[str, float]:
     """64 windows of 8 frames and 200 points in one call."""
     batch = batch_of([window(seed) for seed in range(WINDOWS)])
-    return {"ms": spent(lambda: bundle_adjust(batch, scale=2.45, backward="detached"), 3)}
+    return {
+        "ms": spent(
+            lambda: solve_bundle(batch, options=BUNDLE_OPTIONS.replace(scale=2.45, backward="detached")), 3
+        )
+    }
 
 
 def pose_graph() -> dict[str, float]:
     """A loop of 1000 nodes, each joined with the next three, that loses half of its scale."""
     problem = loop(1000, 3)
-    solved = pose_graph_optimize(problem.graph, kernel="none")
-    ms = spent(lambda: pose_graph_optimize(problem.graph, kernel="none", backward="detached"), 3)
+    solved = solve_pose_graph(problem.graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none"))
+    ms = spent(
+        lambda: solve_pose_graph(
+            problem.graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none", backward="detached")
+        ),
+        3,
+    )
     return {"error": round(drift(problem, solved.S_cw), 6), "ms": ms}
 
 

@@ -20,6 +20,7 @@ from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.evaluation import ate
 from torchslam.geometry import se3_exp, se3_inverse
+from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
 from torchslam.system.slam import SLAM
 
@@ -76,19 +77,22 @@ def measure(name: str, sequence: Sequence) -> dict[str, float]:
     before = _peak_mib()
     start = time.process_time()
     if name != "adjust and differentiate":
-        solution = solve_graph(disturbed(graph) if "disturbed" in name else graph, backward="detached")
+        solution = solve_graph(
+            disturbed(graph) if "disturbed" in name else graph,
+            options=GRAPH_OPTIONS.replace(backward="detached"),
+        )
         seconds = {"adjust": time.process_time() - start}
     else:
         leaves, _, _ = with_leaves(graph)
         solution = solve_graph(leaves)
-        loss = ate(solution.T_cw[known], T_cw[known])
+        loss = ate(T_cw=solution.T_cw[known], T_cw_groundtruth=T_cw[known])
         middle = time.process_time()
         loss.backward()
         seconds = {"adjust": middle - start, "backward": time.process_time() - middle}
     return seconds | {
         "mib": _peak_mib() - before,
         "iterations": int(solution.keyframes[0].convergence.iterations),
-        "ate_m": ate(solution.T_cw[known], T_cw[known]).item(),
+        "ate_m": ate(T_cw=solution.T_cw[known], T_cw_groundtruth=T_cw[known]).item(),
     }
 
 
@@ -122,7 +126,7 @@ def differentiate(
     """Solve the graph; return the solution, its ATE, and the gradients of that to pixels and camera parameters."""
     leaves, pixels, params = with_leaves(graph)
     solution = solve_graph(leaves)
-    loss = ate(solution.T_cw[known], T_cw[known])
+    loss = ate(T_cw=solution.T_cw[known], T_cw_groundtruth=T_cw[known])
     loss.backward()
     assert pixels.grad is not None
     assert params.grad is not None
@@ -145,8 +149,10 @@ def check(
             pixels=graph.pixels + step_pixels,
             camera=graph.camera.with_params(graph.camera.params + step_params),
         )
-        solution = solve_graph(moved, backward="detached", iterations=12, tolerance=0.0)
-        return float(ate(solution.T_cw[known], T_cw[known]))
+        solution = solve_graph(
+            moved, options=GRAPH_OPTIONS.replace(iterations=12, tolerance=0.0, backward="detached")
+        )
+        return float(ate(T_cw=solution.T_cw[known], T_cw_groundtruth=T_cw[known]))
 
     rows = []
     for name, along_pixels, along_params, step in along:

@@ -24,6 +24,7 @@ from torchslam.calibration.rolling_shutter import (
 )
 from torchslam.data import open_sequence
 from torchslam.geometry import Camera, se3_exp, transform
+from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs, solve_graph
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
@@ -79,7 +80,7 @@ def estimated(graph: ObservationGraph) -> RollingShutter:
 
 def adjusted(graph: ObservationGraph) -> ObservationGraph:
     """As a run leaves it: poses and points have absorbed what they can."""
-    solution = solve_graph(graph, backward="detached")
+    solution = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached"))
     return replace(graph, T_cw=solution.T_cw, points_w=solution.points_w)
 
 

@@ -102,6 +102,7 @@ def test_conflicting_options_are_refused(
         Camera.pinhole(1.5, 2.25, 3.0, 4.0, size=(8, 6)),
         Camera.radial_tangential(1.5, 2.25, 3.0, 4.0, -0.1, 0.25, 0.0, 1e-3, size=(8, 6)),
         Camera.fisheye(1.5, 2.25, 3.0, 4.0, -0.1, 0.25, 0.0, 1e-3, size=(8, 6)),
+        Camera("rational", torch.tensor([1.5, 2.25, 3.0, 4.0, *8 * [0.125]], dtype=torch.float64), (8, 6)),
     ],
 )
 def test_the_calibration_file_round_trips(camera: Camera, tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ from torchslam.dense.cost_volume import (
 from torchslam.dense.estimate import estimate_depth, halved, refine_depth
 from torchslam.dense.minimum import STD_FACTOR, find_minimum, position_std
 from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
-from torchslam.dense.normals import normals
+from torchslam.dense.normals import depth_normals
 from torchslam.geometry import Camera, se3_inverse
 
 WIDTH, HEIGHT = 192, 144
@@ -250,7 +250,7 @@ def test_normals_of_a_plane(device: torch.device) -> None:
     camera = a_camera(WIDTH, HEIGHT)
     depth = depth_of(torch.eye(4, dtype=torch.float64)[None], camera)
     depth[:, 20:30, 20:30] = 0
-    found = normals(depth.to(device), camera.to(device)).cpu()
+    found = depth_normals(depth.to(device), camera.to(device)).cpu()
     expected = torch.nn.functional.normalize(torch.tensor(NORMAL, dtype=torch.float64), dim=0)
     assert not found[:, :, 20:30, 20:30].any()
     is_known = (found != 0).any(1)
@@ -262,7 +262,7 @@ def test_normals_do_not_bend_at_an_edge() -> None:
     camera = a_camera(WIDTH, HEIGHT)
     depth = torch.full((1, HEIGHT, WIDTH), 1.0, dtype=torch.float64)
     depth[..., WIDTH // 2 :] = 2.0
-    found = normals(depth, camera)
+    found = depth_normals(depth, camera)
     expected = torch.tensor([0.0, 0, -1], dtype=torch.float64)
     torch.testing.assert_close(found.movedim(1, -1), expected.expand(1, HEIGHT, WIDTH, 3))
 
@@ -272,7 +272,9 @@ def test_gradients_of_normals() -> None:
     depth = depth_of(torch.eye(4, dtype=torch.float64)[None], camera)
     noise = 1 + 1e-3 * torch.rand(depth.shape, dtype=depth.dtype, generator=torch.Generator().manual_seed(0))
     inputs = ((depth * noise).requires_grad_(), camera.params.clone().requires_grad_())
-    assert torch.autograd.gradcheck(lambda d, p: normals(d, camera.with_params(p)), inputs, fast_mode=True)
+    assert torch.autograd.gradcheck(
+        lambda d, p: depth_normals(d, camera.with_params(p)), inputs, fast_mode=True
+    )
 
 
 def test_rendered_depth_is_that_of_the_other_view(device: torch.device) -> None:

@@ -62,7 +62,7 @@ def test_the_error_of_a_clip_is_relative_to_its_path_and_nan_without_poses() -> 
     assert torch.equal(clip.T_cw, T_cw(walk)[2:18:2])
     eyes = PairEyes(BentEyes(walk, bend=0.01), list(range(2, 18, 2)))
     poses = ClipSLAM(eyes)(clip.images, clip.camera)
-    expected = ate(poses.T_cw, clip.T_cw) / path_length(clip.T_cw)
+    expected = ate(T_cw=poses.T_cw, T_cw_groundtruth=clip.T_cw) / path_length(clip.T_cw)
     assert position_error(ClipSLAM(eyes), clip) == pytest.approx(float(expected.detach()))
     blind = PairEyes(BentEyes(standing, bend=0.0), list(range(8)))
     assert math.isnan(position_error(ClipSLAM(blind), clip_from(standing, 0, CPU)))

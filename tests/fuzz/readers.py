@@ -44,6 +44,7 @@ from torchslam.io.viewer.page import page, page_data
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.posed_frames import RunGraph
+from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import solve_graph
 from torchslam.system.checkpoint import read_checkpoint
 from torchslam.system.front_end import Simulated
@@ -287,7 +288,7 @@ def _checkpoint(root: Path) -> None:
 
 def _graph(root: Path) -> object:
     graph = RunGraph.load(root / "graph.safetensors")
-    return solve_graph(graph, iterations=1)
+    return solve_graph(graph, options=GRAPH_OPTIONS.replace(iterations=1))
 
 
 def _results(root: Path) -> str:

@@ -30,7 +30,7 @@ FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001,
 def test_finds_the_pose_among_wrong_pairs(camera: Camera, outliers: float) -> None:
     for seed in range(5):
         points_w, pixels, T_cw = points_and_pixels(seed, outliers=outliers, camera=camera)
-        result = estimate_absolute_pose(points_w, pixels, camera)
+        result = estimate_absolute_pose(points_w, pixels, camera=camera)
         assert result.success.all()
         assert rotation_error(result.T_cw[:, :3, :3], T_cw[:, :3, :3]) < 0.2
         assert float((result.T_cw - T_cw)[:, :3, 3].norm()) < 0.03
@@ -43,7 +43,7 @@ def test_the_pose_is_as_accurate_as_that_of_poselib() -> None:
     model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
     for seed in range(12):
         points_w, pixels, T_cw = points_and_pixels(seed, count=200, outliers=0.4, noise=1.0)
-        result = estimate_absolute_pose(points_w, pixels, CAMERA)
+        result = estimate_absolute_pose(points_w, pixels, camera=CAMERA)
         pose, _ = poselib.estimate_absolute_pose(
             pixels[0].numpy(), points_w[0].numpy(), model, {"max_reproj_error": 2.0}, {}
         )
@@ -56,7 +56,7 @@ def test_exact_data_give_the_exact_pose() -> None:
     for camera in (CAMERA, RADIAL):
         points_w, pixels, T_cw = points_and_pixels(0, outliers=0.2, noise=0.0, camera=camera)
         torch.testing.assert_close(
-            estimate_absolute_pose(points_w, pixels, camera).T_cw, T_cw, atol=1e-8, rtol=0
+            estimate_absolute_pose(points_w, pixels, camera=camera).T_cw, T_cw, atol=1e-8, rtol=0
         )
 
 
@@ -75,7 +75,7 @@ def test_a_batch_holds_independent_problems() -> None:
     pixels[5] = CAMERA.project(transform(T_cw[5], points_w[5]))[0]
     pixels[6] = torch.rand(150, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 480
     mask[7] = False
-    result = estimate_absolute_pose(points_w, pixels, CAMERA, mask=mask)
+    result = estimate_absolute_pose(points_w, pixels, camera=CAMERA, mask=mask)
     assert result.success.tolist() == [True, True, True, True, False, False, False, False]
     assert torch.isfinite(result.T_cw).all()
     assert torch.isfinite(result.score).all()
@@ -90,7 +90,7 @@ def test_planar_points() -> None:
     points_w = points_w * torch.tensor((1.0, 1.0, 0.0))
     T_cw = se3_exp(torch.tensor(((0.2, -0.1, 6.0, 0.3, -0.2, 0.5),), dtype=torch.float64))
     pixels, valid = CAMERA.project(transform(T_cw, points_w))
-    result = estimate_absolute_pose(points_w, pixels, CAMERA, mask=valid)
+    result = estimate_absolute_pose(points_w, pixels, camera=CAMERA, mask=valid)
     assert result.success.all()
     torch.testing.assert_close(result.T_cw, T_cw, atol=1e-7, rtol=0)
 
@@ -99,13 +99,13 @@ def test_pure_noise_is_never_a_success() -> None:
     generator = torch.Generator().manual_seed(0)
     points_w = torch.randn(20, 200, 3, generator=generator, dtype=torch.float64)
     pixels = torch.rand(20, 200, 2, generator=generator, dtype=torch.float64) * torch.tensor((640.0, 480.0))
-    assert not estimate_absolute_pose(points_w, pixels, CAMERA, max_samples=500).success.any()
+    assert not estimate_absolute_pose(points_w, pixels, camera=CAMERA, max_samples=500).success.any()
 
 
 def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
     problems = [points_and_pixels(seed) for seed in range(4)]
     points_w, pixels = (torch.cat([problem[i] for problem in problems]) for i in (0, 1))
-    batch, again = (estimate_absolute_pose(points_w, pixels, CAMERA, seed=7) for _ in range(2))
+    batch, again = (estimate_absolute_pose(points_w, pixels, camera=CAMERA, seed=7) for _ in range(2))
     assert torch.equal(batch.T_cw, again.T_cw)
     single = torch.cat([estimate_absolute_pose(*problem[:2], CAMERA).T_cw for problem in problems])
     torch.testing.assert_close(
@@ -124,7 +124,7 @@ def test_the_gradient_is_that_of_the_estimate(camera: Camera) -> None:
     }
 
     def estimate(points_w: Tensor, pixels: Tensor, params: Tensor) -> Tensor:
-        return estimate_absolute_pose(points_w, pixels, camera.with_params(params), threshold=3.0).T_cw
+        return estimate_absolute_pose(points_w, pixels, camera=camera.with_params(params), threshold=3.0).T_cw
 
     leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
     T_cw = estimate(**leaves)
@@ -144,7 +144,7 @@ def test_gradients_are_finite_in_float32_where_there_is_no_pose() -> None:
     points_w, pixels, _ = (x.float().repeat(2, *(x.dim() - 1) * (1,)) for x in points_and_pixels(1))
     points_w[1, 1:] = torch.nan
     points_w, pixels = points_w.requires_grad_(), pixels.requires_grad_()
-    result = estimate_absolute_pose(points_w, pixels, CAMERA.to(torch.float32))
+    result = estimate_absolute_pose(points_w, pixels, camera=CAMERA.to(torch.float32))
     assert result.success.tolist() == [True, False]
     result.T_cw.square().sum().backward()
     assert torch.isfinite(points_w.grad).all()
@@ -154,7 +154,7 @@ def test_gradients_are_finite_in_float32_where_there_is_no_pose() -> None:
 
 def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
     points_w, pixels, T_cw = (x.to(device, dtype) for x in points_and_pixels(4))
-    result = estimate_absolute_pose(points_w, pixels, CAMERA.to(device).to(dtype))
+    result = estimate_absolute_pose(points_w, pixels, camera=CAMERA.to(device).to(dtype))
     assert (result.T_cw.dtype, result.T_cw.device.type) == (dtype, device.type)
     assert rotation_error(result.T_cw[:, :3, :3].double(), T_cw[:, :3, :3].double()) < 0.2
     assert direction_error(result.T_cw[:, :3, 3], T_cw[:, :3, 3]) < 1
@@ -165,17 +165,17 @@ def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
 @pytest.mark.usefixtures("without_shape_checks")
 def test_wrong_shapes_are_named() -> None:
     with pytest.raises(ValueError, match=r"points_w must be \(B, N, 3\), not \(5, 3\)"):
-        estimate_absolute_pose(torch.zeros(5, 3), torch.zeros(5, 2), CAMERA)
+        estimate_absolute_pose(torch.zeros(5, 3), torch.zeros(5, 2), camera=CAMERA)
 
 
 def test_an_empty_batch_or_no_points() -> None:
     camera = CAMERA.to(torch.float32)
-    assert estimate_absolute_pose(torch.zeros(0, 10, 3), torch.zeros(0, 10, 2), camera).T_cw.shape == (
+    assert estimate_absolute_pose(torch.zeros(0, 10, 3), torch.zeros(0, 10, 2), camera=camera).T_cw.shape == (
         0,
         4,
         4,
     )
-    assert not estimate_absolute_pose(torch.zeros(2, 0, 3), torch.zeros(2, 0, 2), camera).success.any()
+    assert not estimate_absolute_pose(torch.zeros(2, 0, 3), torch.zeros(2, 0, 2), camera=camera).success.any()
 
 
 DISTORTED = Camera.radial_tangential(
@@ -204,7 +204,7 @@ def test_the_start_pose_has_as_many_inliers_as_the_full_estimator() -> None:
     counts = []
     for seed in range(5):
         points_w, pixels, _ = points_and_pixels(seed, 150, 0.5)
-        wanted = estimate_absolute_pose(points_w, pixels, CAMERA, 3.0)
+        wanted = estimate_absolute_pose(points_w, pixels, camera=CAMERA, threshold=3.0)
         T_cw = start_pose(points_w[0], UndistortedKeypoints.of(pixels[0], CAMERA), CAMERA.size, 3.0)
         assert T_cw is not None
         projected, valid = CAMERA.project(points_w[0] @ T_cw[:3, :3].mT + T_cw[:3, 3])
@@ -221,7 +221,7 @@ def test_the_start_pose_is_exact_on_exact_data(camera: Camera) -> None:
         points_w, pixels, truth = points_and_pixels(0, 150, 0.2, noise, camera)
         T_cw = start_pose(points_w[0], UndistortedKeypoints.of(pixels[0], camera), camera.size, 2.0)
         assert T_cw is not None
-        best = estimate_absolute_pose(points_w, pixels, camera).T_cw[0] if noise else truth[0]
+        best = estimate_absolute_pose(points_w, pixels, camera=camera).T_cw[0] if noise else truth[0]
         apart.append(float(se3_log(T_cw @ se3_inverse(best)).norm()))
     assert apart[0] < 1e-8
     assert 1e-6 < apart[1] < 0.01
@@ -249,7 +249,7 @@ def test_points_on_a_line_give_no_pose() -> None:
 def test_too_few_points_give_a_gradient_of_zero() -> None:
     for count in (0, 2):
         points = torch.rand(2, count, 3, dtype=torch.float64).requires_grad_()
-        found = estimate_absolute_pose(points, torch.rand(2, count, 2, dtype=torch.float64), CAMERA)
+        found = estimate_absolute_pose(points, torch.rand(2, count, 2, dtype=torch.float64), camera=CAMERA)
         (gradient,) = torch.autograd.grad(found.T_cw.sum(), points)
         assert not found.success.any()
         assert not gradient.any()

@@ -25,6 +25,11 @@ CAMERAS = {
         500.0, 510.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=SIZE
     ),
     "barrel": Camera.radial_tangential(500.0, 510.0, 320.0, 240.0, -0.3, 0.0, 0.0, 0.0, size=SIZE),
+    "rational": Camera.from_opencv(
+        np.array([[500.0, 0.0, 320.0], [0.0, 510.0, 240.0], [0.0, 0.0, 1.0]]),
+        (0.5, -0.3, 1e-3, -5e-4, 0.05, 0.8, -0.1, 0.02),
+        SIZE,
+    ),
     "fisheye": Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=SIZE),
 }
 
@@ -290,6 +295,7 @@ def _inverse_by_bisection(camera: Camera, pixel: Tensor) -> Tensor:
 
 
 DISTORTED = {
+    "rational": CAMERAS["rational"],
     "radial_tangential": Camera.radial_tangential(
         458.0, 457.0, 367.0, 248.0, -0.28, 0.07, 2e-4, 2e-5, size=(752, 480)
     ),
@@ -366,3 +372,78 @@ def test_the_limit_follows_parameters_that_an_optimizer_moves(ways: str) -> None
     points = torch.tensor([[0.9, 0.0, 1.0], [1.5, 0.0, 1.0]], dtype=torch.float64)
     assert camera.project(points)[1].tolist() == [True, False]
     assert camera.with_params(torch.stack((params, moved)))[0].limit == fresh.limit
+
+
+KINECT = (0.46, -2.45, 6e-4, -2e-4, 1.42, 0.34, -2.28, 1.35)
+"""k1 k2 p1 p2 k3 k4 k5 k6 of a depth camera's color lens: numerator and denominator nearly cancel."""
+
+
+@pytest.mark.parametrize("count", [0, 4, 5, 8, 12, 14])
+@pytest.mark.parametrize("shape", [(-1,), (1, -1), (-1, 1)])
+def test_coefficients_of_opencv_project_and_undistort_as_there(count: int, shape: tuple[int, ...]) -> None:
+    coefficients = np.array([*KINECT, *6 * [0.0]])[:count].reshape(shape)
+    K = np.array([[607.0, 0.0, 638.5], [0.0, 606.5, 367.0], [0.0, 0.0, 1.0]])
+    camera = Camera.from_opencv(K, coefficients if count else None, (1280, 720))
+    assert camera.params.dtype == torch.float64
+    model = {0: "pinhole", 4: "radial_tangential", 5: "radial_tangential"}.get(count, "rational")
+    assert camera.model == model
+    cloud, zero = points()[0].numpy(), np.zeros(3)
+    expected = cv2.projectPoints(cloud, zero, zero, K, coefficients if count else None)[0]
+    pixels, valid = camera.project(torch.from_numpy(cloud))
+    assert valid.all()
+    torch.testing.assert_close(pixels, torch.from_numpy(expected).squeeze(1), atol=1e-9, rtol=0)
+    criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-14)
+    undistort = getattr(cv2, "undistortPointsIter", cv2.undistortPoints)  # of one name from OpenCV 5 on
+    undistorted = undistort(expected, K, coefficients if count else None, R=None, P=None, criteria=criteria)
+    torch.testing.assert_close(
+        camera.normalize(pixels), torch.from_numpy(undistorted).squeeze(1), atol=1e-8, rtol=0
+    )
+
+
+def test_a_fisheye_of_opencv() -> None:
+    K, coefficients = np.diag((300.0, 305.0, 1.0)), np.array([[0.02], [-0.01], [0.003], [-0.001]])
+    camera = Camera.from_opencv(K, coefficients, SIZE, fisheye=True)
+    assert camera.model == "fisheye"
+    assert camera.params.tolist() == [300, 305, 0, 0, 0.02, -0.01, 0.003, -0.001]
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_matrices_of_many_cameras_keep_dtype_and_gradient(dtype: torch.dtype) -> None:
+    params = torch.stack([CAMERAS["rational"].params, CAMERAS["rational"].params * 1.1]).to(dtype)
+    cameras = CAMERAS["rational"].with_params(params.requires_grad_())
+    again = Camera.from_opencv(cameras.K, params[:, 4:], SIZE)
+    assert torch.equal(again.params, params)
+    again.params.sum().backward()
+    assert (params.grad == 1).all()
+
+
+@pytest.mark.parametrize(
+    ("K", "dist", "fisheye", "message"),
+    [
+        (np.eye(2), None, False, r"K must be \(..., 3, 3\), not \(2, 2\)"),
+        (np.eye(3) + np.eye(3, k=1), None, False, "a skew"),
+        (2 * np.eye(3), None, False, "last row of K must be 0, 0, 1"),
+        (np.eye(3), [0.1, 0.2, 0.3], False, "0, 4, 5, 8, 12, 14 coefficients, not 3"),
+        (np.eye(3), 5 * [0.1], True, "fisheye distortion has 0, 4 coefficients, not 5"),
+        (np.eye(3), 12 * [0.1], False, "from the ninth on, of a thin prism"),
+    ],
+)
+def test_what_no_model_holds_is_refused(K: np.ndarray, dist: list[float] | None, fisheye: bool, message: str):
+    with pytest.raises(ValueError, match=message):
+        Camera.from_opencv(K, dist, SIZE, fisheye=fisheye)
+
+
+def test_a_rational_model_ends_where_it_turns_and_where_its_denominator_vanishes() -> None:
+    def limit(*k: float) -> float:
+        camera = Camera.from_opencv(np.eye(3), [*k[:2], 0.0, 0.0, *k[2:]], SIZE)
+        return float(camera.limit)
+
+    r = torch.linspace(1e-3, 5, 100_000, dtype=torch.float64)
+
+    def turning(k1: float, k4: float, k5: float) -> float:
+        grown = (r * (1 + k1 * r**2) / (1 + k4 * r**2 + k5 * r**4)).diff() > 0
+        return float(r[int((~grown).nonzero()[0])])
+
+    assert limit(-0.2, 0.0, 0.0, 0.1, 0.05, 0.0) == pytest.approx(turning(-0.2, 0.1, 0.05), abs=1e-3)
+    assert limit(0.0, 0.0, 0.0, -0.25, 0.0, 0.0) == pytest.approx(2.0)  # grows to infinity there
+    assert math.isinf(limit(0.1, 0.0, 0.0, 0.05, 0.0, 0.0))

@@ -177,8 +177,12 @@ def test_torch_func_is_refused_in_words(transform_of: Callable[..., Any]) -> Non
     scene = two_views(0, count=30)
     others = scene.points_1, scene.pixels_1, scene.pixels_2, CAMERA, CAMERA
     for name, estimate, given in (
-        ("absolute_pose", lambda x: estimate_absolute_pose(points_w, x, CAMERA).T_cw, pixels),
-        ("relative_pose", lambda x: estimate_relative_pose(x, scene.pixels_2, CAMERA, CAMERA).T_21, pixels),
+        ("absolute_pose", lambda x: estimate_absolute_pose(points_w, x, camera=CAMERA).T_cw, pixels),
+        (
+            "relative_pose",
+            lambda x: estimate_relative_pose(x, scene.pixels_2, camera_1=CAMERA, camera_2=CAMERA).T_21,
+            pixels,
+        ),
         ("similarity", lambda x: estimate_similarity(x, *others).S_21, scene.points_1),
     ):
         given = given[None] if transform_of is torch.func.vmap else given

@@ -14,7 +14,7 @@ FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001,
 
 
 def estimate(scene: Scene, camera: Camera = CAMERA, **options: float) -> RelativePose:
-    return estimate_relative_pose(scene.pixels_1, scene.pixels_2, camera, camera, **options)
+    return estimate_relative_pose(scene.pixels_1, scene.pixels_2, camera_1=camera, camera_2=camera, **options)
 
 
 @pytest.mark.parametrize("camera", [CAMERA, RADIAL, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
@@ -125,7 +125,7 @@ def test_a_batch_holds_independent_problems() -> None:
     pixels_2[6] = torch.rand(200, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64) * 480
     pixels_1[7], pixels_2[7] = 100.0, 120.0
     pixels_1[8, :, 1], pixels_2[8, :, 1] = 200.0, 210.0
-    result = estimate_relative_pose(pixels_1, pixels_2, CAMERA, CAMERA, mask=mask)
+    result = estimate_relative_pose(pixels_1, pixels_2, camera_1=CAMERA, camera_2=CAMERA, mask=mask)
     assert result.success.tolist() == [True, True, True, True, False, False, False, False, False]
     assert all(
         torch.isfinite(x).all() for x in (result.T_21, result.score_essential, result.score_homography)
@@ -140,13 +140,17 @@ def test_pure_noise_is_never_a_success(count: int, threshold: float) -> None:
     generator = torch.Generator().manual_seed(0)
     size = torch.tensor((640.0, 480.0), dtype=torch.float64)
     pixels = torch.rand(2, 8, count, 2, generator=generator, dtype=torch.float64) * size
-    assert not estimate_relative_pose(*pixels, CAMERA, CAMERA, threshold, max_samples=500).success.any()
+    assert not estimate_relative_pose(
+        *pixels, camera_1=CAMERA, camera_2=CAMERA, threshold=threshold, max_samples=500
+    ).success.any()
 
 
 def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
     scenes = [two_views(seed, outliers=0.2) for seed in range(3)]
     pixels_1, pixels_2 = (torch.cat([getattr(s, name) for s in scenes]) for name in ("pixels_1", "pixels_2"))
-    batch, again = (estimate_relative_pose(pixels_1, pixels_2, CAMERA, CAMERA, seed=3) for _ in range(2))
+    batch, again = (
+        estimate_relative_pose(pixels_1, pixels_2, camera_1=CAMERA, camera_2=CAMERA, seed=3) for _ in range(2)
+    )
     assert torch.equal(batch.T_21, again.T_21)
     single = torch.cat([estimate(scene).T_21 for scene in scenes])
     torch.testing.assert_close(
@@ -171,7 +175,7 @@ def test_the_gradient_is_that_of_the_estimate(camera: Camera, kind: str) -> None
 
     def run(pixels_1: Tensor, pixels_2: Tensor, params: Tensor) -> Tensor:
         one = camera.with_params(params)
-        result = estimate_relative_pose(pixels_1, pixels_2, one, one, threshold=2.0)
+        result = estimate_relative_pose(pixels_1, pixels_2, camera_1=one, camera_2=one, threshold=2.0)
         assert result.model == (kind,)
         return result.T_21
 
@@ -196,7 +200,7 @@ def test_gradients_are_finite_in_float32_also_of_exact_data_and_failures() -> No
     pixels_1[2, 3:] = torch.nan
     pixels_1, pixels_2 = pixels_1.requires_grad_(), pixels_2.requires_grad_()
     camera = CAMERA.to(torch.float32)
-    result = estimate_relative_pose(pixels_1, pixels_2, camera, camera)
+    result = estimate_relative_pose(pixels_1, pixels_2, camera_1=camera, camera_2=camera)
     assert result.success.tolist() == [True, True, False]
     result.T_21.square().sum().backward()
     assert torch.isfinite(pixels_1.grad).all()
@@ -207,7 +211,7 @@ def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
     scene = two_views(2)
     camera = CAMERA.to(device).to(dtype)
     pixels_1, pixels_2 = (x.to(device, dtype) for x in (scene.pixels_1, scene.pixels_2))
-    result = estimate_relative_pose(pixels_1, pixels_2, camera, camera)
+    result = estimate_relative_pose(pixels_1, pixels_2, camera_1=camera, camera_2=camera)
     assert (result.T_21.dtype, result.T_21.device.type) == (dtype, device.type)
     assert rotation_error(result.T_21[:, :3, :3].double().cpu(), scene.T_21[:, :3, :3]) < 1
 
@@ -215,10 +219,10 @@ def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
 @pytest.mark.usefixtures("without_shape_checks")
 def test_wrong_shapes_and_empty_input() -> None:
     with pytest.raises(ValueError, match=r"\(B, N, 2\)"):
-        estimate_relative_pose(torch.zeros(5, 2), torch.zeros(5, 2), CAMERA, CAMERA)
+        estimate_relative_pose(torch.zeros(5, 2), torch.zeros(5, 2), camera_1=CAMERA, camera_2=CAMERA)
     for shape in ((0, 10, 2), (2, 0, 2), (2, 4, 2)):
         pixels = torch.zeros(shape, dtype=torch.float64)
-        result = estimate_relative_pose(pixels, pixels, CAMERA, CAMERA)
+        result = estimate_relative_pose(pixels, pixels, camera_1=CAMERA, camera_2=CAMERA)
         assert result.T_21.shape == (shape[0], 4, 4)
         assert not result.success.any()
 
@@ -226,7 +230,7 @@ def test_wrong_shapes_and_empty_input() -> None:
 def gradients(scene: Scene) -> tuple[RelativePose, Tensor]:
     """The relative pose, and the gradient of all its numbers to the pixels of the first view."""
     pixels = scene.pixels_1.clone().requires_grad_()
-    found = estimate_relative_pose(pixels, scene.pixels_2, CAMERA, CAMERA)
+    found = estimate_relative_pose(pixels, scene.pixels_2, camera_1=CAMERA, camera_2=CAMERA)
     (gradient,) = torch.autograd.grad((found.T_21 * torch.arange(16.0).double().view(4, 4)).sum(), pixels)
     return found, gradient
 

@@ -25,7 +25,9 @@ THRESHOLDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 
 
 def estimate(scene: Scene, threshold: float = 1.0, **options: object) -> RelativePose:
-    return estimate_relative_pose(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, threshold, **options)
+    return estimate_relative_pose(
+        scene.pixels_1, scene.pixels_2, camera_1=CAMERA, camera_2=CAMERA, threshold=threshold, **options
+    )
 
 
 def errors(result: RelativePose, scene: Scene) -> tuple[float, float]:
@@ -239,7 +241,9 @@ def test_the_other_elements_of_a_batch_do_not_matter() -> None:
     def estimate_in_batch(other: Scene) -> RelativePose:
         sides = [(two_views(0).pixels_1, other.pixels_1), (two_views(0).pixels_2, other.pixels_2)]
         pixels = [torch.cat(side) for side in sides]
-        return estimate_relative_pose(*pixels, CAMERA, CAMERA, min_samples=512, max_samples=512)
+        return estimate_relative_pose(
+            *pixels, camera_1=CAMERA, camera_2=CAMERA, min_samples=512, max_samples=512
+        )
 
     plane, depth = estimate_in_batch(two_views(1, plane=True)), estimate_in_batch(two_views(3))
     assert plane.model == ("essential", "homography")
@@ -336,7 +340,13 @@ def test_gradient_in_pixels_and_weights(kernel: Kernel) -> None:
 
     def run(pixels_1: Tensor, weights: Tensor) -> Tensor:
         pose = estimate_relative_pose(
-            pixels_1, scene.pixels_2, CAMERA, CAMERA, 2.0, weights=weights, kernel=kernel
+            pixels_1,
+            scene.pixels_2,
+            camera_1=CAMERA,
+            camera_2=CAMERA,
+            threshold=2.0,
+            weights=weights,
+            kernel=kernel,
         )
         return pose.T_21[0, :3]
 
@@ -360,8 +370,8 @@ def test_a_batch_equals_a_loop_where_the_samples_do() -> None:
     three = estimate_relative_pose(
         scene.pixels_1.repeat(3, 1, 1),
         scene.pixels_2.repeat(3, 1, 1),
-        CAMERA,
-        CAMERA,
+        camera_1=CAMERA,
+        camera_2=CAMERA,
         weights=weights.repeat(3, 1),
     )
     torch.testing.assert_close(three.T_21, one.T_21.expand(3, 4, 4), atol=1e-5, rtol=0)

@@ -299,7 +299,7 @@ def test_a_batch_holds_independent_problems() -> None:
     sigmas[6] = -1.0
     mask[7] = False
     result = estimate_similarity(
-        points_1, points_2, pixels_1, pixels_2, CAMERA, CAMERA, sigmas_1=sigmas, mask=mask
+        points_1, points_2, pixels_1, pixels_2, camera_1=CAMERA, camera_2=CAMERA, sigmas_1=sigmas, mask=mask
     )
     assert result.success.tolist() == [True] * 3 + [False] * 5
     for tensor in (result.S_21, result.score):
@@ -357,13 +357,13 @@ def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
 def test_wrong_shapes_are_named() -> None:
     points, pixels = torch.zeros(1, 5, 3).double(), torch.zeros(1, 5, 2).double()
     with pytest.raises(ValueError, match=r"pixels_2 must be \(B, N, 2\) = \(1, 5, 2\), not \(1, 4, 2\)"):
-        estimate_similarity(points, points, pixels, pixels[:, 1:], CAMERA, CAMERA)
+        estimate_similarity(points, points, pixels, pixels[:, 1:], camera_1=CAMERA, camera_2=CAMERA)
 
 
 def test_an_empty_batch_or_no_points() -> None:
     for batch, count in ((0, 10), (2, 0), (2, 2)):
         points, pixels = torch.zeros(batch, count, 3).double(), torch.zeros(batch, count, 2).double()
-        result = estimate_similarity(points, points, pixels, pixels, CAMERA, CAMERA)
+        result = estimate_similarity(points, points, pixels, pixels, camera_1=CAMERA, camera_2=CAMERA)
         assert result.S_21.shape == (batch, 4, 4)
         assert result.inliers.shape == (batch, count)
         assert not result.success.any()

@@ -44,8 +44,10 @@ def views(
 @pytest.mark.parametrize("camera", [CAMERA, RADIAL, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
 def test_exact_matches_recover_the_points(camera: Camera) -> None:
     T_cw, pixels, points_w = views(camera, extra=2)
-    two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], camera, camera)
-    many = triangulate_many(T_cw, pixels, camera)
+    two = triangulate(
+        pixels[:, 0], pixels[:, 1], T_1w=T_cw[0], T_2w=T_cw[1], camera_1=camera, camera_2=camera
+    )
+    many = triangulate_many(pixels, T_cw=T_cw, camera=camera)
     centers = se3_inverse(T_cw)[:, :3, 3]
     rays = points_w - centers[0], points_w - centers[1]
     angles = torch.acos(torch.nn.functional.cosine_similarity(*rays, dim=-1))
@@ -61,8 +63,10 @@ def test_exact_matches_recover_the_points(camera: Camera) -> None:
 
 def test_two_views_reach_the_least_reprojection_error() -> None:
     T_cw, pixels, _ = views(noise=1.0)
-    two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], CAMERA, CAMERA)
-    many = triangulate_many(T_cw, pixels, CAMERA, iterations=10)
+    two = triangulate(
+        pixels[:, 0], pixels[:, 1], T_1w=T_cw[0], T_2w=T_cw[1], camera_1=CAMERA, camera_2=CAMERA
+    )
+    many = triangulate_many(pixels, T_cw=T_cw, camera=CAMERA, iterations=10)
     cost = two.errors_1.square() + two.errors_2.square()
     torch.testing.assert_close(cost, many.errors.square().sum(-1), rtol=1e-6, atol=1e-9)
 
@@ -84,11 +88,13 @@ def test_gradients(camera: Camera, noise: float) -> None:
 
     def two(T_cw: Tensor, pixels: Tensor, params: Tensor) -> tuple[Tensor, ...]:
         one = camera.with_params(params)
-        result = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], one, one)
+        result = triangulate(
+            pixels[:, 0], pixels[:, 1], T_1w=T_cw[0], T_2w=T_cw[1], camera_1=one, camera_2=one
+        )
         return result.points_w, result.angles, *((result.errors_1,) if noise else ())
 
     def many(T_cw: Tensor, pixels: Tensor, params: Tensor) -> tuple[Tensor, ...]:
-        result = triangulate_many(T_cw, pixels, camera.with_params(params))
+        result = triangulate_many(pixels, T_cw=T_cw, camera=camera.with_params(params))
         return result.points_w, result.angles, *((result.errors,) if noise else ())
 
     assert gradcheck(two, inputs)
@@ -105,8 +111,10 @@ def test_bad_rows_are_masked_and_finite(dtype: torch.dtype) -> None:
     given[4] = False
     T_cw, pixels = T_cw.requires_grad_(), pixels.requires_grad_()
     camera = CAMERA.to(dtype)
-    two = triangulate(T_cw[0], T_cw[1], pixels[:, 0], pixels[:, 1], camera, camera, given)
-    many = triangulate_many(T_cw, pixels, camera, given[:, None].expand(-1, 2))
+    two = triangulate(
+        pixels[:, 0], pixels[:, 1], T_1w=T_cw[0], T_2w=T_cw[1], camera_1=camera, camera_2=camera, mask=given
+    )
+    many = triangulate_many(pixels, T_cw=T_cw, camera=camera, mask=given[:, None].expand(-1, 2))
     assert not two.mask[[0, 1, 4]].any()
     assert not many.mask[[0, 1, 4]].any()
     assert torch.isinf(two.errors_1[[0, 1, 4]]).all()
@@ -121,18 +129,24 @@ def test_bad_rows_are_masked_and_finite(dtype: torch.dtype) -> None:
 
 def test_zero_baseline_or_parallel_rays_give_no_point() -> None:
     T_cw, pixels, _ = views()
-    same = triangulate(T_cw[0], T_cw[0], pixels[:, 0], pixels[:, 0], CAMERA, CAMERA)
+    same = triangulate(
+        pixels[:, 0], pixels[:, 0], T_1w=T_cw[0], T_2w=T_cw[0], camera_1=CAMERA, camera_2=CAMERA
+    )
     assert not same.mask.any()
     assert torch.isfinite(same.points_w).all()
-    one_view = triangulate_many(T_cw, pixels, CAMERA, torch.tensor((True, False)).expand(len(pixels), 2))
+    one_view = triangulate_many(
+        pixels, T_cw=T_cw, camera=CAMERA, mask=torch.tensor((True, False)).expand(len(pixels), 2)
+    )
     assert not one_view.mask.any()
 
 
 def test_batch_equals_loop_and_device(device: torch.device) -> None:
     T_cw, pixels, _ = (x.to(device) for x in views(noise=0.5, extra=1))
     camera = CAMERA.to(device)
-    batch = triangulate_many(torch.stack((T_cw, T_cw)), torch.stack((pixels, pixels.flip(0))), camera)
-    single = triangulate_many(T_cw, pixels, camera)
+    batch = triangulate_many(
+        torch.stack((pixels, pixels.flip(0))), T_cw=torch.stack((T_cw, T_cw)), camera=camera
+    )
+    single = triangulate_many(pixels, T_cw=T_cw, camera=camera)
     torch.testing.assert_close(batch.points_w[0], single.points_w)
     torch.testing.assert_close(batch.points_w[1], single.points_w.flip(0))
 
@@ -143,7 +157,7 @@ def test_covariance_is_that_of_noisy_triangulations() -> None:
     covariances = triangulation_covariance(T_cw[0], T_cw[1], points_w, sigmas, sigmas, RADIAL, RADIAL)
     generator = torch.Generator().manual_seed(1)
     noise = 0.3 * torch.randn(200, *pixels.shape, generator=generator, dtype=torch.float64)
-    errors = triangulate_many(T_cw, pixels + noise, RADIAL).points_w - points_w
+    errors = triangulate_many(pixels + noise, T_cw=T_cw, camera=RADIAL).points_w - points_w
     squared = (errors * torch.linalg.solve(covariances, errors[..., None]).squeeze(-1)).sum(-1)
     assert 0.9 < float(squared.mean()) / 3 < 1.1
     half = triangulation_covariance(T_cw[0], T_cw[1], points_w, sigmas / 2, sigmas / 2, RADIAL, RADIAL)
@@ -164,7 +178,10 @@ def test_undistorted_coordinates_give_the_same_points() -> None:
     T_cw, pixels, _ = views(RADIAL, noise=1.0)
     seen = pixels[:, 0], pixels[:, 1]
     known = RADIAL.normalize(seen[0]), RADIAL.normalize(seen[1])
-    one, two = (triangulate(*T_cw, *seen, RADIAL, RADIAL, normalized=x) for x in (None, known))
+    one, two = (
+        triangulate(*seen, T_1w=T_cw[0], T_2w=T_cw[1], camera_1=RADIAL, camera_2=RADIAL, normalized=x)
+        for x in (None, known)
+    )
     assert all(torch.equal(part, vars(two)[name]) for name, part in vars(one).items())
 
 
@@ -179,10 +196,12 @@ def test_a_pixel_that_is_not_finite_leaves_the_gradient_of_the_others(camera: Ca
         params = camera.params.clone().requires_grad_()
         own = camera.with_params(params)
         if many:
-            found = triangulate_many(T_cw, pixels, own, mask[:, None].expand(-1, 2))
+            found = triangulate_many(pixels, T_cw=T_cw, camera=own, mask=mask[:, None].expand(-1, 2))
             errors = found.errors.sum(-1)
         else:
-            found = triangulate(*T_cw, *pixels.unbind(1), own, own, mask)
+            found = triangulate(
+                *pixels.unbind(1), T_1w=T_cw[0], T_2w=T_cw[1], camera_1=own, camera_2=own, mask=mask
+            )
             errors = found.errors_1 + found.errors_2
         (of_params,) = torch.autograd.grad(
             torch.where(found.mask[..., None], found.points_w, 0.0).sum()
@@ -207,9 +226,11 @@ def test_the_hessian_through_a_distortion_agrees_with_differences_of_the_gradien
 
     def loss(pixels: Tensor) -> Tensor:
         if many:
-            points = triangulate_many(T_cw, pixels.transpose(0, 1), camera).points_w
+            points = triangulate_many(pixels.transpose(0, 1), T_cw=T_cw, camera=camera).points_w
         else:
-            points = triangulate(*T_cw, *pixels, camera, camera).points_w
+            points = triangulate(
+                *pixels, T_1w=T_cw[0], T_2w=T_cw[1], camera_1=camera, camera_2=camera
+            ).points_w
         return (points**3).sum()
 
     hessian = torch.func.hessian(loss)(pixels)

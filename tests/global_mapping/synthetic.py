@@ -168,4 +168,4 @@ def apart(T_cw: Tensor, truth: Tensor) -> tuple[float, float]:
     """How far poses are from true ones: the ATE up to a similarity, the largest error of a rotation in degrees."""
     R, true = T_cw[:, :3, :3], truth[:, :3, :3]
     turns = degrees_between(R @ R[:1].mT, true @ true[:1].mT)
-    return float(ate(T_cw, truth)), float(turns.max())
+    return float(ate(T_cw=T_cw, T_cw_groundtruth=truth)), float(turns.max())

@@ -27,7 +27,7 @@ def error(recording: Recording, pairs: list[ViewPair]) -> float:
     R_cw = recording.T_cw[:, :3, :3]
     centers_w = chained_positions(pairs, R_cw, recording.views, CAMERA)
     T_cw = rigid(R_cw, -(R_cw @ centers_w[..., None])[..., 0])
-    return float(ate(T_cw, recording.T_cw))
+    return float(ate(T_cw=T_cw, T_cw_groundtruth=recording.T_cw))
 
 
 def baselines(recording: Recording, pairs: list[ViewPair]) -> Tensor:

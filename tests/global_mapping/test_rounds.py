@@ -294,13 +294,13 @@ def test_only_observations_that_agree_are_adjusted() -> None:
 def test_the_problem_has_the_noise_the_kernel_and_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each observation its own weight; the camera is free along the directions of its error, with its prior."""
     calls: list[tuple[BundleProblem, tuple[Any, ...]]] = []
-    solve = rounds.bundle_adjust
+    solve = rounds.solve_bundle
 
     def spy(problem: BundleProblem, *options: Any, **more: Any) -> Any:
         calls.append((problem, options))
         return solve(problem, *options, **more)
 
-    monkeypatch.setattr(rounds, "bundle_adjust", spy)
+    monkeypatch.setattr(rounds, "solve_bundle", spy)
     scales = 1 + torch.arange(100, dtype=torch.float64) / 100
     observed = ObservedTracks.of(SCENE.tracks, [replace(view, scales=scales) for view in SCENE.views])
     found = replace(exact(SCENE), agrees=torch.arange(len(observed.tracks)) % 3 > 0)

@@ -48,7 +48,7 @@ def test_a_call_equals_extraction_and_solution(walk: Walk) -> None:
     for way in (of_call, in_two, with_graph):
         eyes.bend.grad = None
         poses = way()
-        ate(poses.T_cw, truth, poses.posed).backward()
+        ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed).backward()
         results.append((poses.T_cw.detach(), poses.posed, eyes.bend.grad))
     assert results[0][1].all()
     for other in results[1:]:
@@ -79,7 +79,7 @@ def test_the_gradient_through_a_stored_graph_agrees_with_finite_differences(walk
         with torch.no_grad():
             eyes.bend.fill_(bend)
         poses = clip_slam.pose(graph, clip_slam.extract(images), camera_with(focal))
-        return ate(poses.T_cw, truth, poses.posed)
+        return ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
 
     focal = torch.tensor(405.0, dtype=torch.float64, requires_grad=True)
     loss(0.03, focal).backward()  # far from where it was looked
@@ -97,7 +97,7 @@ def test_clips_of_a_batch_have_their_own_cameras(walk: Walk) -> None:
     alone = [clip_slam(images, camera_with(focal)) for focal in (400.0, 410.0)]
     torch.testing.assert_close(poses.T_cw, torch.stack([each.T_cw for each in alone]), atol=1e-9, rtol=0)
     assert not torch.equal(poses.T_cw[0], poses.T_cw[1])
-    ate(poses.T_cw, truth.expand(2, -1, -1, -1), poses.posed)[1].backward()
+    ate(T_cw=poses.T_cw, T_cw_groundtruth=truth.expand(2, -1, -1, -1), mask=poses.posed)[1].backward()
     assert params.grad is not None
     assert (params.grad[0] == 0).all()
     assert (params.grad[1] != 0).all()
@@ -178,8 +178,8 @@ def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
     assert torch.equal(together.posed, torch.stack([each.posed for each in alone]))
     T_cw = torch.stack([each.T_cw for each in alone])
     torch.testing.assert_close(together.T_cw, T_cw, atol=1e-9, rtol=0)
-    losses = [clip_loss(together, truth.expand(4, -1, -1, -1), on_failure=2.0).loss]
-    losses.append(sum(clip_loss(each, truth, on_failure=2.0).loss for each in alone) / 4)
+    losses = [clip_loss(together, T_cw_groundtruth=truth.expand(4, -1, -1, -1), on_failure=2.0).loss]
+    losses.append(sum(clip_loss(each, T_cw_groundtruth=truth, on_failure=2.0).loss for each in alone) / 4)
     found, expected = (torch.autograd.grad(loss, (keypoints, scores), retain_graph=True) for loss in losses)
     for gradient, other in zip(found, expected, strict=True):
         torch.testing.assert_close(gradient, other, rtol=1e-7, atol=1e-9 * float(other.abs().max()))
@@ -216,7 +216,9 @@ def test_keypoints_that_jump_to_other_rows_are_refused_and_fixed_ones_read_again
         eyes.order = torch.cat((eyes.order[:100].flip(0), eyes.order[100:]))
         if isinstance(eyes, FixedEyes):
             after = clip_slam(images, walk.camera, graph)
-            losses = [ate(poses.T_cw, truth, poses.posed) for poses in (before, after)]
+            losses = [
+                ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed) for poses in (before, after)
+            ]
             continue
         with pytest.raises(ValueError, match=r"keypoints are up to \d+ px from where the graph has them"):
             clip_slam(images, walk.camera, graph)

@@ -67,7 +67,10 @@ def test_the_gradient_to_a_feature_extractor_agrees_with_finite_differences() ->
         with torch.no_grad():
             eyes.bend.fill_(bend)
         poses = clip_slam(images, walk.camera)
-        return ate(poses.T_cw, truth, poses.posed) + rpe(poses.T_cw, truth, mask=poses.posed)[1]
+        return (
+            ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
+            + rpe(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)[1]
+        )
 
     loss(0.01).backward()
     assert eyes.bend.grad is not None
@@ -86,7 +89,7 @@ def test_the_gradient_to_weights_and_camera_agrees_with_finite_differences() -> 
 
         camera = Camera.pinhole(focal, focal, 159.5, 119.5, size=(320, 240))
         poses = ClipSLAM(eyes, keypoint_weight, CONFIG)(images, camera)
-        return ate(poses.T_cw, truth, poses.posed)
+        return ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
 
     falloff = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
     focal = torch.tensor(400.0, dtype=torch.float64, requires_grad=True)
@@ -108,7 +111,7 @@ def test_a_training_loop_estimates_the_distortion() -> None:
         optimizer.zero_grad()
         poses = clip_slam(images, walk.camera)
         assert poses.posed.all()
-        loss = ate(poses.T_cw, truth, poses.posed)
+        loss = ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
         loss.backward()
         optimizer.step()
         losses.append(float(loss.detach()))
@@ -122,7 +125,7 @@ def test_the_gradient_reaches_the_images() -> None:
     truth = torch.stack([pose for index in range(len(room)) if (pose := room.pose(index)) is not None])
     poses = ClipSLAM(ORB(400, differentiable=True))(images, room.camera)
     assert poses.posed.all()
-    error = ate(poses.T_cw, truth, poses.posed)
+    error = ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
     assert float(error.detach()) < 0.05 * float((truth[1:] - truth[:-1])[:, :3, 3].norm(dim=-1).sum())
     error.backward()
     assert images.grad is not None
@@ -144,13 +147,13 @@ def test_a_clip_without_a_map_has_no_pose_and_zero_gradient() -> None:
     assert poses.failure_rate == 1.0
     assert poses.graphs == poses.solutions == (None,)
     assert torch.equal(poses.T_cw, torch.eye(4, dtype=torch.float64).expand(4, 4, 4))
-    assert ate(poses.T_cw, truth, poses.posed).isnan()
+    assert ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed).isnan()
     for choice in ("raise", "skip"):
         with pytest.raises(
             ClipError, match="1 of 1 clips failed; clip 0: no map was initialized in 4 frames"
         ):
-            clip_loss(poses, truth, on_failure=choice)
-    loss, failure_rate = clip_loss(poses, truth, on_failure=2.5)
+            clip_loss(poses, T_cw_groundtruth=truth, on_failure=choice)
+    loss, failure_rate = clip_loss(poses, T_cw_groundtruth=truth, on_failure=2.5)
     assert (float(loss.detach()), failure_rate) == (2.5, 1.0)
     loss.backward()
     assert eyes.bend.grad == 0
@@ -164,18 +167,20 @@ def test_a_failed_clip_does_not_count_as_zero_error() -> None:
     posed[1] = False
     success, reason = torch.tensor([True, False, True]), ("", "no map started", "")
     poses = ClipPoses(T_cw, posed, success, reason, (None,) * 3, (None,) * 3)
-    errors = ate(T_cw, truth, posed)[[0, 2]]
-    loss, failure_rate = clip_loss(poses, truth, on_failure="skip")
+    errors = ate(T_cw=T_cw, T_cw_groundtruth=truth, mask=posed)[[0, 2]]
+    loss, failure_rate = clip_loss(poses, T_cw_groundtruth=truth, on_failure="skip")
     torch.testing.assert_close(loss, errors.mean())
     assert failure_rate == pytest.approx(1 / 3)
-    torch.testing.assert_close(clip_loss(poses, truth, on_failure=3.0).loss, (errors.sum() + 3) / 3)
+    torch.testing.assert_close(
+        clip_loss(poses, T_cw_groundtruth=truth, on_failure=3.0).loss, (errors.sum() + 3) / 3
+    )
     (gradient,) = torch.autograd.grad(loss, T_cw)
     assert gradient.isfinite().all()
     assert (gradient[1] == 0).all()
     with pytest.raises(ClipError, match="1 of 3 clips failed; clip 1: no map started"):
-        clip_loss(poses, truth)
+        clip_loss(poses, T_cw_groundtruth=truth)
     with pytest.raises(ValueError, match="'ignore'"):
-        clip_loss(poses, truth, on_failure="ignore")  # type: ignore[arg-type]
+        clip_loss(poses, T_cw_groundtruth=truth, on_failure="ignore")  # type: ignore[arg-type]
 
 
 def test_a_batch_equals_its_clips() -> None:
@@ -212,7 +217,7 @@ def test_a_split_clip_has_the_poses_of_its_main_submap() -> None:
     )
     poses_found = ClipSLAM(BentEyes(walk, bend=0.0), config=config)(images, walk.camera)
     assert poses_found.posed.tolist() == [True] * 22 + [False] * 10
-    assert float(ate(poses_found.T_cw, truth, poses_found.posed).detach()) < 0.01
+    assert float(ate(T_cw=poses_found.T_cw, T_cw_groundtruth=truth, mask=poses_found.posed).detach()) < 0.01
 
 
 def test_a_short_clip_of_a_wall_starts() -> None:
@@ -224,7 +229,7 @@ def test_a_short_clip_of_a_wall_starts() -> None:
     assert poses.posed.all()
     truth = torch.stack([sequence.pose(index) for index in range(8)])
     path = (truth[-1, :3, 3] - truth[0, :3, 3]).norm()
-    assert ate(poses.T_cw, truth, poses.posed) < 0.05 * path
+    assert ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed) < 0.05 * path
 
 
 def test_the_gradient_is_the_same_under_detect_anomaly() -> None:
@@ -234,7 +239,7 @@ def test_the_gradient_is_the_same_under_detect_anomaly() -> None:
         eyes = BentEyes(walk, bend=0.02)
         camera = walk.camera.with_params(walk.camera.params.clone().requires_grad_())
         with torch.autograd.set_detect_anomaly(is_detected):
-            ate(ClipSLAM(eyes, config=CONFIG)(images, camera).T_cw, truth).backward()
+            ate(T_cw=ClipSLAM(eyes, config=CONFIG)(images, camera).T_cw, T_cw_groundtruth=truth).backward()
         gradients.append((eyes.bend.grad, camera.params.grad))
     torch.testing.assert_close(*gradients)
     assert float(gradients[1][0]) != 0

@@ -40,7 +40,7 @@ class Seen:
         return self.clip_slam.pose(self.graph, features)
 
     def loss(self, features: Features) -> Tensor:
-        return clip_loss(self.pose(features), self.truth, relative_ate).loss
+        return clip_loss(self.pose(features), T_cw_groundtruth=self.truth, error=relative_ate).loss
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,7 @@ def test_gradients_do_not_depend_on_batching(seen: Seen) -> None:
     features = [seen.moved(seed) for seed in (FEW, MANY)]
     truths = torch.stack([seen.truth, seen.truth])
     together = seen.clip_slam.pose(ClipGraph.stack([seen.graph, seen.graph]), features)
-    clip_loss(together, truths, relative_ate).loss.backward()
+    clip_loss(together, T_cw_groundtruth=truths, error=relative_ate).loss.backward()
     for each in features:
         (alone,) = torch.autograd.grad(seen.loss(each) / 2, each.keypoints)
         assert each.keypoints.grad is not None
@@ -78,7 +78,7 @@ def test_unconverged_problems_are_reported_as_failed(seen: Seen, monkeypatch: py
     assert poses.posed.all()  # there are poses, and nearly the right ones
     assert poses.reasons == ("", "its poses did not converge in 40 iterations: their gradient would be wrong")
     truths = torch.stack([seen.truth, seen.truth])
-    loss, failure_rate = clip_loss(poses, truths, relative_ate, on_failure=1.0)
+    loss, failure_rate = clip_loss(poses, T_cw_groundtruth=truths, error=relative_ate, on_failure=1.0)
     assert failure_rate == 0.5
     loss.backward()
     assert (features[0].keypoints.grad != 0).any()

@@ -65,21 +65,26 @@ def test_scale_free_losses_do_not_depend_on_the_frame(scale: float, seed: int) -
     S = sim3_exp(torch.cat([normal(6, seed=seed + 7), torch.tensor([math.log(scale)]).double()]))
     T_wc = S @ se3_inverse(T_cw)
     moved = se3_inverse(rigid(T_wc[:, :3, :3] / scale, T_wc[:, :3, 3]))
-    for loss in (ate, relative_ate, lambda *pair: torch.stack(rpe(*pair))):
-        torch.testing.assert_close(loss(moved, truth), loss(T_cw, truth))
+    for loss in (ate, relative_ate, lambda **pair: torch.stack(rpe(**pair))):
+        expected = loss(T_cw=T_cw, T_cw_groundtruth=truth)
+        torch.testing.assert_close(loss(T_cw=moved, T_cw_groundtruth=truth), expected)
     longer = rigid(truth[:, :3, :3], scale * truth[:, :3, 3])
-    torch.testing.assert_close(relative_ate(T_cw, longer), relative_ate(T_cw, truth))
+    torch.testing.assert_close(
+        relative_ate(T_cw=T_cw, T_cw_groundtruth=longer), relative_ate(T_cw=T_cw, T_cw_groundtruth=truth)
+    )
 
 
 def test_the_relative_error_is_the_ate_over_the_path_length() -> None:
     T_cw, truth = poses(2, 6), poses(2, 6, seed=1)
     mask = torch.tensor([[True] * 6, [True] * 2 + [False] * 4])
-    shares = relative_ate(T_cw, truth, mask)
-    torch.testing.assert_close(shares[0] * path_length(truth[0]), ate(T_cw[0], truth[0]))
+    shares = relative_ate(T_cw=T_cw, T_cw_groundtruth=truth, mask=mask)
+    torch.testing.assert_close(
+        shares[0] * path_length(truth[0]), ate(T_cw=T_cw[0], T_cw_groundtruth=truth[0])
+    )
     assert shares[1].isnan()
     standing = torch.eye(4, dtype=torch.float64).expand(2, 6, 4, 4)
     T_cw.requires_grad_()
-    shares = relative_ate(T_cw, standing)
+    shares = relative_ate(T_cw=T_cw, T_cw_groundtruth=standing)
     assert shares.isnan().all()
     (gradient,) = torch.autograd.grad(shares.sum(), T_cw)
     assert (gradient == 0).all()
@@ -89,10 +94,14 @@ def test_pose_errors_are_distance_and_angle() -> None:
     truth = poses(5)
     turned = se3_exp(torch.tensor([0, 0, 0, 0, 0.3, 0]).double()) @ truth
     moved = truth @ se3_exp(torch.tensor([0, 0.2, 0, 0, 0, 0]).double())
-    torch.testing.assert_close(pose_errors(turned, truth)[:, 1], torch.full((5,), 0.3).double())
-    torch.testing.assert_close(pose_errors(moved, truth)[:, 0], torch.full((5,), 0.2).double())
+    torch.testing.assert_close(
+        pose_errors(T_cw=turned, T_cw_groundtruth=truth)[:, 1], torch.full((5,), 0.3).double()
+    )
+    torch.testing.assert_close(
+        pose_errors(T_cw=moved, T_cw_groundtruth=truth)[:, 0], torch.full((5,), 0.2).double()
+    )
     exact = truth.clone().requires_grad_()
-    pose_errors(exact, truth).sum().backward()
+    pose_errors(T_cw=exact, T_cw_groundtruth=truth).sum().backward()
     assert exact.grad is not None
     assert exact.grad.isfinite().all()
 
@@ -118,16 +127,20 @@ def test_the_likelihood_is_that_of_a_gaussian() -> None:
         for x, S in zip(xi, covariance, strict=True)
     ]
     truth = se3_exp(xi) @ T_cw
-    torch.testing.assert_close(pose_nll(T_cw, truth, covariance), torch.stack(expected).mean())
+    torch.testing.assert_close(
+        pose_nll(T_cw=T_cw, T_cw_groundtruth=truth, covariance=covariance), torch.stack(expected).mean()
+    )
     covariance[1], covariance[2] = 0.0, torch.nan
     mask = torch.tensor([True, True, True, False])
     covariance.requires_grad_()
-    loss = pose_nll(T_cw, truth, covariance, mask)
+    loss = pose_nll(T_cw=T_cw, T_cw_groundtruth=truth, covariance=covariance, mask=mask)
     torch.testing.assert_close(loss, expected[0])
     (gradient,) = torch.autograd.grad(loss, covariance)
     assert (gradient[1:] == 0).all()
     assert (gradient[0] != 0).all()
-    assert pose_nll(T_cw, truth, covariance, ~mask & (mask > mask)).isnan()
+    assert pose_nll(
+        T_cw=T_cw, T_cw_groundtruth=truth, covariance=covariance, mask=~mask & (mask > mask)
+    ).isnan()
 
 
 def test_the_likelihood_is_highest_at_the_true_covariance() -> None:
@@ -136,7 +149,11 @@ def test_the_likelihood_is_highest_at_the_true_covariance() -> None:
     sigmas = torch.tensor([0.005, 0.0095, 0.01, 0.0105, 0.02]).double()
     losses = torch.stack(
         [
-            pose_nll(T_cw, se3_exp(xi), (sigma**2 * torch.eye(6).double()).expand(4000, 6, 6))
+            pose_nll(
+                T_cw=T_cw,
+                T_cw_groundtruth=se3_exp(xi),
+                covariance=(sigma**2 * torch.eye(6).double()).expand(4000, 6, 6),
+            )
             for sigma in sigmas
         ]
     )
@@ -209,10 +226,15 @@ def test_tracks_are_charged_their_smallest_errors() -> None:
 @pytest.mark.parametrize(
     "loss",
     [
-        lambda T: relative_ate(T, poses(2, 4, seed=1), torch.tensor([[True] * 4, [True] * 3 + [False]])),
-        lambda T: pose_errors(T, poses(2, 4, seed=1)),
+        lambda T: relative_ate(
+            T_cw=T,
+            T_cw_groundtruth=poses(2, 4, seed=1),
+            mask=torch.tensor([[True] * 4, [True] * 3 + [False]]),
+        ),
+        lambda T: pose_errors(T_cw=T, T_cw_groundtruth=poses(2, 4, seed=1)),
         lambda T: pose_errors(
-            T, se3_exp(torch.tensor([0, 0.1, 0, math.pi - 0.01, 0, 0]).double()) @ poses(2, 4)
+            T_cw=T,
+            T_cw_groundtruth=se3_exp(torch.tensor([0, 0.1, 0, math.pi - 0.01, 0, 0]).double()) @ poses(2, 4),
         ),
         lambda T: motion_difference(T, poses(2, 4, seed=1)),
     ],
@@ -231,7 +253,9 @@ def test_gradients_of_the_likelihood(exact: bool) -> None:
     xi = torch.zeros(2, 3, 6, dtype=torch.float64, requires_grad=True)
 
     def loss(xi: Tensor, A: Tensor) -> Tensor:
-        return pose_nll(se3_exp(xi) @ T_cw, truth, A @ A.mT + torch.eye(6), mask)
+        return pose_nll(
+            T_cw=se3_exp(xi) @ T_cw, T_cw_groundtruth=truth, covariance=A @ A.mT + torch.eye(6), mask=mask
+        )
 
     assert gradcheck(loss, (xi, A.requires_grad_()))
 
@@ -267,8 +291,14 @@ def test_a_batch_equals_its_elements() -> None:
             reprojection_loss(T_cw, pixels, CAMERA),
             [reprojection_loss(T_cw[b], pixels[b], CAMERA) for b in range(2)],
         ),
-        (pose_nll(T_cw, truth, covariance), [pose_nll(T_cw[b], truth[b], covariance[b]) for b in range(2)]),
-        (relative_ate(T_cw, truth), [relative_ate(T_cw[b], truth[b]) for b in range(2)]),
+        (
+            pose_nll(T_cw=T_cw, T_cw_groundtruth=truth, covariance=covariance),
+            [pose_nll(T_cw=T_cw[b], T_cw_groundtruth=truth[b], covariance=covariance[b]) for b in range(2)],
+        ),
+        (
+            relative_ate(T_cw=T_cw, T_cw_groundtruth=truth),
+            [relative_ate(T_cw=T_cw[b], T_cw_groundtruth=truth[b]) for b in range(2)],
+        ),
     ):
         torch.testing.assert_close(together, torch.stack(alone))
 
@@ -330,8 +360,8 @@ def test_clips_have_separate_losses_and_failures_a_penalty() -> None:
     assert (float(loss.detach()), failure_rate) == (3.0, 1.0)
     loss.backward()
     truth = clip_of(walk)[1][None]
-    whole = clip_loss(good, truth, relative_ate)
-    torch.testing.assert_close(whole.loss, relative_ate(good.T_cw, truth)[0])
+    whole = clip_loss(good, T_cw_groundtruth=truth, error=relative_ate)
+    torch.testing.assert_close(whole.loss, relative_ate(T_cw=good.T_cw, T_cw_groundtruth=truth)[0])
 
 
 def every_loss(like: Tensor) -> dict[str, Tensor]:
@@ -344,10 +374,10 @@ def every_loss(like: Tensor) -> dict[str, Tensor]:
     T_21 = T_cw[:, 1] @ se3_inverse(T_cw[:, 0])
     return {
         "path_length": path_length(T_cw),
-        "relative_ate": relative_ate(T_cw, truth),
-        "pose_errors": pose_errors(T_cw, truth),
+        "relative_ate": relative_ate(T_cw=T_cw, T_cw_groundtruth=truth),
+        "pose_errors": pose_errors(T_cw=T_cw, T_cw_groundtruth=truth),
         "motion_difference": motion_difference(T_21, truth[:, 1]),
-        "pose_nll": pose_nll(T_cw, truth, 0.1 * covariance),
+        "pose_nll": pose_nll(T_cw=T_cw, T_cw_groundtruth=truth, covariance=0.1 * covariance),
         "epipolar_loss": epipolar_loss(T_21, *pixels[..., :2, :].unbind(-2), camera, camera),
         "reprojection_loss": reprojection_loss(T_cw, pixels, camera),
     }
@@ -369,10 +399,10 @@ def test_autocast_does_not_change_results() -> None:
     def losses() -> list[Tensor]:
         return [
             path_length(T_cw),
-            relative_ate(T_cw, truth),
-            pose_errors(T_cw, truth),
+            relative_ate(T_cw=T_cw, T_cw_groundtruth=truth),
+            pose_errors(T_cw=T_cw, T_cw_groundtruth=truth),
             motion_difference(T_cw, truth),
-            pose_nll(T_cw, truth, covariance),
+            pose_nll(T_cw=T_cw, T_cw_groundtruth=truth, covariance=covariance),
             epipolar_loss(truth[:, 0], *pixels[..., :2, :].unbind(-2), camera, camera),
             reprojection_loss(T_cw, pixels, camera),
         ]

@@ -12,6 +12,7 @@ from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.geometry import se3_inverse
 from torchslam.map.atlas import Submap
 from torchslam.map.posed_frames import PosedFrames
+from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import solve_graph
 
 SCENE = Scene.of(150)
@@ -75,7 +76,7 @@ def test_the_run_graph_holds_all_observations() -> None:
 def test_map_and_frames_apply_the_solution_of_their_graph() -> None:
     submap = walked(noise=0.5)
     graph = submap.posed_frames.graph(submap.map, CAMERA)
-    solution = solve_graph(graph, backward="detached")
+    solution = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached"))
     submap.posed_frames.apply_solution(solution, graph, submap.map)
     torch.testing.assert_close(submap.map.T_cw, solution.T_cw[:2])
     torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), solution.T_cw)
@@ -97,7 +98,9 @@ def test_frames_apply_a_solution_in_any_order() -> None:
     ]
     for one in (submap, shuffled):
         graph = one.posed_frames.graph(one.map, CAMERA)
-        one.posed_frames.apply_solution(solve_graph(graph, backward="detached"), graph, one.map)
+        one.posed_frames.apply_solution(
+            solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached")), graph, one.map
+        )
     torch.testing.assert_close(
         shuffled.posed_frames.T_cw(shuffled.map),
         submap.posed_frames.T_cw(submap.map)[order],
@@ -181,7 +184,7 @@ def test_an_outlier_does_not_move_its_frame() -> None:
     def off() -> float:
         graph = submap.posed_frames.graph(submap.map, CAMERA)
         row = int(torch.nonzero(graph.frame_ids == 11)[0])
-        T_cw = solve_graph(graph, backward="detached").T_cw[row]
+        T_cw = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached")).T_cw[row]
         return float((T_cw @ se3_inverse(truth))[:3, 3].norm())
 
     assert off() > 1e-3

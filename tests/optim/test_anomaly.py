@@ -11,21 +11,29 @@ from torch import Tensor
 from tests.sweep.calls import bundle, calls
 from torchslam.geometry import se3_inverse
 from torchslam.optim import (
+    BUNDLE_OPTIONS,
+    LEAST_SQUARES_OPTIONS,
+    POSE_GRAPH_OPTIONS,
+    POSE_OPTIONS,
+    ROTATION_OPTIONS,
     FrameFactors,
     PosePrior,
-    average_rotations,
-    bundle_adjust,
-    minimize,
-    pose_graph_optimize,
+    solve_bundle,
+    solve_least_squares,
+    solve_pose,
+    solve_pose_graph,
+    solve_rotations,
 )
-from torchslam.optim import refine_pose as refine
 from torchslam.optim._core.implicit import Backward
 
 MODES = ("implicit", "unroll", "truncated")
 
 
 def refined(mode: Backward, leaf: Tensor) -> tuple[Tensor, Tensor]:
-    found = refine(**{**calls()["refine_pose"].arguments, "pixels": leaf}, kernel="cauchy", backward=mode)
+    found = solve_pose(
+        **{**calls()["solve_pose"].arguments, "pixels": leaf},
+        options=POSE_OPTIONS.replace(kernel="cauchy", backward=mode),
+    )
     return found.T_cw, found.covariance
 
 
@@ -42,34 +50,43 @@ def adjusted(mode: Backward, leaf: Tensor) -> tuple[Tensor, Tensor]:
         pose_prior=PosePrior(T_cw, 0.1 * eye.repeat(3, 1, 1)),
     )
     steps = 4 if mode == "unroll" else 50
-    found = bundle_adjust(problem, backward=mode, free_camera=True, iterations=steps)
+    found = solve_bundle(
+        problem, free_camera=True, options=BUNDLE_OPTIONS.replace(iterations=steps, backward=mode)
+    )
     return found.T_cw, found.covariance().frames
 
 
 def averaged(mode: Backward, leaf: Tensor) -> tuple[Tensor, Tensor]:
-    found = average_rotations(**{**calls()["average_rotations"].arguments, "R_ji": leaf}, backward=mode)
+    found = solve_rotations(
+        **{**calls()["solve_rotations"].arguments, "R_ji": leaf},
+        options=ROTATION_OPTIONS.replace(backward=mode),
+    )
     return found.R_cw, found.angles
 
 
 def optimized(mode: Backward, leaf: Tensor) -> tuple[Tensor, Tensor]:
-    found = pose_graph_optimize(
-        replace(calls()["pose_graph_optimize"].arguments["graph"], S_ji=leaf), backward=mode
+    found = solve_pose_graph(
+        replace(calls()["solve_pose_graph"].arguments["graph"], S_ji=leaf),
+        options=POSE_GRAPH_OPTIONS.replace(backward=mode),
     )
     return found.S_cw, found.cost
 
 
 def fitted(mode: Backward, leaf: Tensor) -> tuple[Tensor, Tensor]:
-    arguments = calls()["minimize"].arguments
-    found = minimize(**{**arguments, "inputs": (leaf, arguments["inputs"][1])}, backward=mode)
+    arguments = calls()["solve_least_squares"].arguments
+    found = solve_least_squares(
+        **{**arguments, "inputs": (leaf, arguments["inputs"][1])},
+        options=LEAST_SQUARES_OPTIONS.replace(backward=mode),
+    )
     return found.unknowns[0], found.cost
 
 
 SOLVERS = {
-    "refine_pose": (refined, calls()["refine_pose"].arguments["pixels"]),
-    "bundle_adjust": (adjusted, bundle().pixels),
-    "average_rotations": (averaged, calls()["average_rotations"].arguments["R_ji"]),
-    "pose_graph_optimize": (optimized, calls()["pose_graph_optimize"].arguments["graph"].S_ji),
-    "minimize": (fitted, calls()["minimize"].arguments["inputs"][0]),
+    "solve_pose": (refined, calls()["solve_pose"].arguments["pixels"]),
+    "solve_bundle": (adjusted, bundle().pixels),
+    "solve_rotations": (averaged, calls()["solve_rotations"].arguments["R_ji"]),
+    "solve_pose_graph": (optimized, calls()["solve_pose_graph"].arguments["graph"].S_ji),
+    "solve_least_squares": (fitted, calls()["solve_least_squares"].arguments["inputs"][0]),
 }
 
 
@@ -95,7 +112,7 @@ def test_gradients_and_covariances_are_the_same(name: str, mode: Backward) -> No
 
 @pytest.mark.filterwarnings("ignore:Error detected")
 def test_an_anomaly_in_the_loss_is_still_found() -> None:
-    leaf = SOLVERS["refine_pose"][1].clone().requires_grad_()
+    leaf = SOLVERS["solve_pose"][1].clone().requires_grad_()
     with torch.autograd.set_detect_anomaly(True):
         found, _ = refined("implicit", leaf)
         zero = (found - found.detach()).sum()

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.func import vmap
 
 from torchslam.geometry import se3_exp
-from torchslam.optim import BundleProblem, CameraPrior, PosePrior, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, CameraPrior, PosePrior, solve_bundle
 from torchslam.optim.bundle import _minimization as minimization
 from torchslam.optim.bundle._dense import DenseBundle
 from torchslam.optim.bundle._problem import sanitized, select_moving
@@ -60,11 +60,14 @@ def as_mask(rows: Sequence[int] | None, size: int) -> Tensor:
     return mask
 
 
-def assert_as_alone(batch: BundleProblem, problems: Sequence[BundleProblem], *arguments, **options) -> None:
-    together = bundle_adjust(batch, *arguments, **options)
+def assert_as_alone(
+    batch: BundleProblem, problems: Sequence[BundleProblem], free_camera=False, **options
+) -> None:
+    settings = {"free_camera": free_camera, "options": BUNDLE_OPTIONS.replace(**options)}
+    together = solve_bundle(batch, **settings)
     covariance = together.covariance()
     for row, problem in enumerate(problems):
-        alone = bundle_adjust(problem, *arguments, **options)
+        alone = solve_bundle(problem, **settings)
         frames, points = len(problem.T_cw), len(problem.points_w)
         torch.testing.assert_close(together.T_cw[row, :frames], alone.T_cw, **EQUAL)
         torch.testing.assert_close(together.points_w[row, :points], alone.points_w, **EQUAL)
@@ -97,15 +100,15 @@ def test_a_batch_equals_a_loop_over_its_elements(bundle_scene, model, grids, mon
     if not grids:
         monkeypatch.setattr(minimization, "suits_dense", lambda *_: False)
     problems = mixed(bundle_scene, model=model)
-    assert_as_alone(batch_of(problems), problems, "cauchy", 2.0)
+    assert_as_alone(batch_of(problems), problems, kernel="cauchy", scale=2.0)
 
 
 def test_exact_data_are_solved_to_rounding(bundle_scene, model):
     """Alone and in a batch; steps after that would only shuffle it."""
     problems = [bundle_scene(noise=0.0, frames=f, seed=f, model=model).problem for f in (4, 5)]
-    together = bundle_adjust(batch_of(problems), iterations=100, tolerance=0.0)
+    together = solve_bundle(batch_of(problems), options=BUNDLE_OPTIONS.replace(iterations=100, tolerance=0.0))
     for row, problem in enumerate(problems):
-        alone = bundle_adjust(problem, iterations=100, tolerance=0.0)
+        alone = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(iterations=100, tolerance=0.0))
         assert alone.convergence.converged
         assert together.convergence.converged[row]
         assert max(int(alone.convergence.iterations), int(together.convergence.iterations[row])) < 20
@@ -155,7 +158,7 @@ def test_every_problem_estimates_its_several_cameras(bundle_scene, cameras, grid
         )
         for row, problem in enumerate(alone)
     ]
-    assert_as_alone(batch, alone, "cauchy", 2.0, free_camera=True, iterations=40)
+    assert_as_alone(batch, alone, kernel="cauchy", scale=2.0, free_camera=True, iterations=40)
 
 
 def test_splitting_a_large_batch_does_not_change_the_result(bundle_scene, monkeypatch):
@@ -163,7 +166,11 @@ def test_splitting_a_large_batch_does_not_change_the_result(bundle_scene, monkey
     monkeypatch.setattr(minimization, "_MAX_CELLS_CPU", 400)
     reported = []
     batch = batch_of(problems)
-    bundle_adjust(batch, iterations=20, progress=lambda now, most: reported.append((now, most)))
+    solve_bundle(
+        batch,
+        progress=lambda now, most: reported.append((now, most)),
+        options=BUNDLE_OPTIONS.replace(iterations=20),
+    )
     given = sanitized(batch, 1.0)
     assert len(minimization._parts(given, select_moving(given))) == 2
     assert reported == sorted(reported)
@@ -174,14 +181,14 @@ def test_splitting_a_large_batch_does_not_change_the_result(bundle_scene, monkey
 def test_converged_problems_are_not_iterated_further(bundle_scene, monkeypatch):
     """An element that starts at its minimum leaves after the first step; what is left is evaluated alone."""
     problems = [bundle_scene(seed=seed, noise=0.5).problem for seed in range(3)]
-    done = bundle_adjust(problems[1], tolerance=1e-14, iterations=50)
+    done = solve_bundle(problems[1], options=BUNDLE_OPTIONS.replace(iterations=50, tolerance=1e-14))
     problems[1] = replace(problems[1], T_cw=done.T_cw, points_w=done.points_w)
     sizes = []
     evaluate = DenseBundle.evaluate
     monkeypatch.setattr(
         DenseBundle, "evaluate", lambda self, at, near: sizes.append(len(near)) or evaluate(self, at, near)
     )
-    solution = bundle_adjust(batch_of(problems), tolerance=1e-8)
+    solution = solve_bundle(batch_of(problems), options=BUNDLE_OPTIONS.replace(tolerance=1e-8))
     iterations = solution.convergence.iterations
     assert iterations[1] == 1
     assert solution.convergence.converged.all()
@@ -200,16 +207,16 @@ def test_a_failed_problem_does_not_affect_the_others(bundle_scene):
     problems[2] = replace(problems[2], **{name: getattr(problems[2], name)[apart] for name in names})
     batch = batch_of(problems)
     pixels = batch.pixels.clone().requires_grad_()
-    solution = bundle_adjust(replace(batch, pixels=pixels))
+    solution = solve_bundle(replace(batch, pixels=pixels))
     assert solution.success.tolist() == [True, False, False]
-    assert bundle_adjust(batch, check=False).success.tolist() == [True, False, True]
+    assert solve_bundle(batch, check=False).success.tolist() == [True, False, True]
     assert solution.T_cw.isfinite().all()
     assert solution.points_w.isfinite().all()
     (solution.T_cw.sum() + solution.points_w.sum()).backward()
     assert pixels.grad.isfinite().all()
     assert (pixels.grad[1:] == 0).all()
     expected = problems[0].pixels.clone().requires_grad_()
-    alone = bundle_adjust(replace(problems[0], pixels=expected))
+    alone = solve_bundle(replace(problems[0], pixels=expected))
     (alone.T_cw.sum() + alone.points_w.sum()).backward()
     torch.testing.assert_close(pixels.grad[0, : len(expected)], expected.grad, **EQUAL)
 
@@ -235,7 +242,10 @@ def test_gradients_of_a_batch_equal_those_of_a_loop(bundle_scene, backward):
 
     def gradient(problem: BundleProblem) -> Tensor:
         pixels = problem.pixels.clone().requires_grad_()
-        solution = bundle_adjust(replace(problem, pixels=pixels), "cauchy", 2.0, backward=backward)
+        solution = solve_bundle(
+            replace(problem, pixels=pixels),
+            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, backward=backward),
+        )
         loss = (solution.points_w * torch.tensor([0.3, -0.5, 0.7], dtype=torch.float64)).nansum()
         (loss + solution.T_cw[..., :3, :].nansum()).backward()
         return pixels.grad
@@ -279,7 +289,11 @@ def test_gradients_of_a_batch_by_gradcheck(bundle_scene, generator, free_camera)
             pose_prior=PosePrior(T_cw, 0.5 * (information + information.mT)),
             camera_prior=CameraPrior(mean, 0.5 * (tight + tight.mT)),
         )
-        solution = bundle_adjust(moved, "cauchy", scale, free_camera, **CONVERGED)
+        solution = solve_bundle(
+            moved,
+            free_camera=free_camera,
+            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=scale, **CONVERGED),
+        )
         return solution.T_cw[..., :3, :], solution.points_w, solution.camera.params
 
     pixels = torch.where(batch.pixels.isnan(), 7.0, batch.pixels)
@@ -287,7 +301,7 @@ def test_gradients_of_a_batch_by_gradcheck(bundle_scene, generator, free_camera)
     leaves = [x.clone().requires_grad_(not (free_camera and index == 2)) for index, x in enumerate(inputs)]
     assert torch.autograd.gradcheck(solve, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
     if not free_camera:
-        solution = bundle_adjust(replace(batch, pixels=leaves[0]))
+        solution = solve_bundle(replace(batch, pixels=leaves[0]))
         solution.points_w.sum().backward()
         assert (leaves[0].grad[~batch.mask] == 0).all()
 
@@ -298,7 +312,7 @@ def test_dtype_and_device_of_a_batch(bundle_scene, dtype, device):
     moved = {name: getattr(batch, name).to(device, dtype) for name in ("T_cw", "points_w", "pixels")}
     kept = ("frame_index", "point_index", "mask", "fixed_frames", "fixed_points")
     moved |= {name: getattr(batch, name).to(device) for name in kept}
-    solution = bundle_adjust(replace(batch, **moved, camera=batch.camera.to(device).to(dtype)))
+    solution = solve_bundle(replace(batch, **moved, camera=batch.camera.to(device).to(dtype)))
     assert solution.success.all()
     for tensor in (solution.T_cw, solution.points_w, solution.cost, solution.covariance().points):
         assert tensor.dtype == dtype
@@ -312,13 +326,13 @@ def test_an_invalid_batch_is_rejected_by_name(bundle_scene):
     problems = [bundle_scene(seed=seed).problem for seed in (0, 1)]
     batch = batch_of(problems)
     with pytest.raises(ValueError, match=r"mask must be \(..., O\), not \(2, 140\): O is 141"):
-        bundle_adjust(replace(batch, mask=batch.mask[:, :-1]))
+        solve_bundle(replace(batch, mask=batch.mask[:, :-1]))
     with pytest.raises(ValueError, match=r"camera.params must be \(P,\) = \(4,\), not \(3, 4\)"):
-        bundle_adjust(replace(batch, camera=batch.camera.with_params(torch.ones(3, 4).double())))
+        solve_bundle(replace(batch, camera=batch.camera.with_params(torch.ones(3, 4).double())))
     with pytest.raises(ValueError, match=r"camera_index must be \(..., K\), not \(4,\): K is 5"):
-        bundle_adjust(replace(problems[0], camera_index=torch.zeros(4, dtype=torch.int64)))
+        solve_bundle(replace(problems[0], camera_index=torch.zeros(4, dtype=torch.int64)))
     with pytest.raises(ValueError, match=r"points_w must be .*: ... is \(0,\) in problem.T_cw"):
-        bundle_adjust(replace(batch, T_cw=batch.T_cw[:0]))
+        solve_bundle(replace(batch, T_cw=batch.T_cw[:0]))
 
 
 def test_vmap_over_batches(bundle_scene):
@@ -326,7 +340,7 @@ def test_vmap_over_batches(bundle_scene):
     pixels = torch.stack([batch.pixels, batch.pixels + 0.3])
 
     def points(pixels: Tensor) -> Tensor:
-        return bundle_adjust(replace(batch, pixels=pixels)).points_w
+        return solve_bundle(replace(batch, pixels=pixels)).points_w
 
     expected = torch.stack([points(pixels[0]), points(pixels[1])])
     torch.testing.assert_close(vmap(points)(pixels), expected, **EQUAL)
@@ -338,7 +352,7 @@ def test_autocast_does_not_change_a_batch(bundle_scene):
         batch, points_w=batch.points_w.float(), T_cw=batch.T_cw.float(), pixels=batch.pixels.float()
     )
     batch = replace(batch, camera=batch.camera.to(torch.float32))
-    expected = bundle_adjust(batch)
+    expected = solve_bundle(batch)
     with torch.autocast("cpu", dtype=torch.bfloat16):
-        found = bundle_adjust(batch)
+        found = solve_bundle(batch)
     assert torch.equal(found.points_w, expected.points_w)

@@ -14,7 +14,16 @@ from torch.func import jacfwd, jacrev, jvp, vmap
 from tests.optim.pose_graph.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
-from torchslam.optim import PosePrior, bundle_adjust, pose_graph_optimize, refine_pose
+from torchslam.optim import (
+    BUNDLE_OPTIONS,
+    GRAPH_OPTIONS,
+    POSE_GRAPH_OPTIONS,
+    POSE_OPTIONS,
+    PosePrior,
+    solve_bundle,
+    solve_pose,
+    solve_pose_graph,
+)
 from torchslam.optim.run_graph import solve_graph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
@@ -35,8 +44,14 @@ def pose_problem(pose_scene, model="pinhole", with_prior=False) -> Problem:
         prior = None
         if with_prior:
             prior = PosePrior(se3_exp(0.01 * x[:6]) @ scene.start, (1 + x[0]).square() * 400 * eye)
-        return refine_pose(
-            scene.start, points, pixels, camera, weights, scale=2 + x[7], prior=prior, **CONVERGED
+        return solve_pose(
+            points,
+            pixels,
+            T_cw=scene.start,
+            camera=camera,
+            weights=weights,
+            prior=prior,
+            options=POSE_OPTIONS.replace(scale=2 + x[7], **CONVERGED),
         ).T_cw[:, :3]
 
     return poses, torch.linspace(-0.5, 0.5, 8, dtype=torch.float64)
@@ -47,7 +62,7 @@ def bundle_problem(bundle_scene, free_camera=False, **options) -> Problem:
 
     def estimate(x: Tensor) -> Tensor:
         ramp = torch.linspace(-1, 1, len(problem.pixels), dtype=torch.float64)[:, None]
-        solution = bundle_adjust(
+        solution = solve_bundle(
             replace(
                 problem,
                 T_cw=se3_exp(torch.nn.functional.pad(0.01 * x[:1], (0, 5))) @ problem.T_cw,
@@ -55,10 +70,8 @@ def bundle_problem(bundle_scene, free_camera=False, **options) -> Problem:
                 weights=1 + x[2] * ramp[:, 0].square(),
                 camera=problem.camera.with_params(problem.camera.params * (1 + 0.01 * x[3])),
             ),
-            "cauchy",
-            3 + x[4],
-            free_camera,
-            **CONVERGED,
+            free_camera=free_camera,
+            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=3 + x[4], **CONVERGED),
         )
         parts = solution.T_cw[:, :3], solution.points_w, 1e-3 * solution.camera.params
         return torch.cat([part.flatten() for part in parts])
@@ -77,7 +90,7 @@ def graph_problem() -> Problem:
             weights=graph.weights * (1 + x[2] * ramp[:, 0].square()),
             camera=graph.camera.with_params(graph.camera.params * (1 + 0.01 * x[3])),
         )
-        T_cw = solve_graph(moved, "cauchy", 3.0, **CONVERGED).T_cw
+        T_cw = solve_graph(moved, options=GRAPH_OPTIONS.replace(kernel="cauchy", scale=3.0, **CONVERGED)).T_cw
         centers = se3_inverse(T_cw)[:, :3, 3] - se3_inverse(T_cw)[:1, :3, 3]  # of any scale
         return torch.cat((T_cw[:, :3, :3].flatten(), (centers / centers.norm()).flatten()))
 
@@ -97,9 +110,12 @@ def pose_graph_problem(with_scale=True) -> Problem:
             S_ji=sim3_exp(twist) @ graph.S_ji,
             information=graph.information * (1 + x[3].square()),
         )
-        return pose_graph_optimize(moved, "cauchy", 3 + x[4], iterations=100, tolerance=1e-26).S_cw[
-            ..., :3, :
-        ]
+        return solve_pose_graph(
+            moved,
+            options=POSE_GRAPH_OPTIONS.replace(
+                kernel="cauchy", scale=3 + x[4], iterations=100, tolerance=1e-26
+            ),
+        ).S_cw[..., :3, :]
 
     return nodes, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
 
@@ -115,7 +131,12 @@ def rotation_graph_problem() -> Problem:
             S_ji=so3_exp(0.1 * x[:3] * ramp) @ graph.S_ji[..., :3, :3],
             information=4e4 * (1 + x[3] * ramp.squeeze(-1)),
         )
-        return pose_graph_optimize(moved, "cauchy", 3 + x[4], iterations=100, tolerance=1e-26).S_cw
+        return solve_pose_graph(
+            moved,
+            options=POSE_GRAPH_OPTIONS.replace(
+                kernel="cauchy", scale=3 + x[4], iterations=100, tolerance=1e-26
+            ),
+        ).S_cw
 
     return nodes, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
 
@@ -232,7 +253,9 @@ def test_vmap_over_every_input_of_a_pose(pose_scene):
 
     def refine(start, points, pixels, mask, scale, params):
         camera = scene.camera.with_params(params)
-        refined = refine_pose(start, points, pixels, camera, mask=mask, scale=scale)
+        refined = solve_pose(
+            points, pixels, T_cw=start, camera=camera, mask=mask, options=POSE_OPTIONS.replace(scale=scale)
+        )
         return refined.T_cw, refined.success, refined.cost, refined.convergence.iterations
 
     arguments = (*inputs, mask, scale, params)
@@ -254,7 +277,7 @@ def test_failures_have_no_derivative_under_any_transform(pose_scene):
     mask[1, 2:] = False
 
     def poses(pixels):
-        refined = refine_pose(start, scene.points_w, pixels, scene.camera, mask=mask)
+        refined = solve_pose(scene.points_w, pixels, T_cw=start, camera=scene.camera, mask=mask)
         return refined.T_cw, refined.success
 
     T_cw, success = poses(scene.pixels)
@@ -268,7 +291,7 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
     problem = bundle_scene().problem
     T_cw = problem.T_cw.clone()
     T_cw[3, 0, 3] = torch.nan
-    solution = bundle_adjust(replace(problem, T_cw=T_cw))
+    solution = solve_bundle(replace(problem, T_cw=T_cw))
     assert not solution.success
     assert solution.T_cw.isfinite().all()
     _, graph = simulated()
@@ -282,16 +305,22 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
 def test_inconsistent_batch_inputs_are_rejected_by_name(pose_scene, bundle_scene):
     scene = pose_scene()
     with pytest.raises(ValueError, match=r"pixels is torch.float32, but T_cw is torch.float64"):
-        refine_pose(scene.start, scene.points_w, scene.pixels.float(), scene.camera)
+        solve_pose(scene.points_w, scene.pixels.float(), T_cw=scene.start, camera=scene.camera)
     with pytest.raises(ValueError, match=r"T_cw must be float32 or float64, not torch.bfloat16"):
-        refine_pose(scene.start.bfloat16(), scene.points_w, scene.pixels, scene.camera)
+        solve_pose(scene.points_w, scene.pixels, T_cw=scene.start.bfloat16(), camera=scene.camera)
     with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or .*, not \(40,\)"):
-        refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, torch.ones(40).double())
+        solve_pose(
+            scene.points_w,
+            scene.pixels,
+            T_cw=scene.start,
+            camera=scene.camera,
+            weights=torch.ones(40).double(),
+        )
     problem = bundle_scene().problem
     with pytest.raises(ValueError, match=r"camera.params is torch.float32"):
-        bundle_adjust(replace(problem, camera=problem.camera.to(torch.float32)))
+        solve_bundle(replace(problem, camera=problem.camera.to(torch.float32)))
     with pytest.raises(ValueError, match=r"weights must be \(..., O\) or \(..., O, 2, 2\), not \(3,\)"):
-        bundle_adjust(replace(problem, weights=torch.ones(3, dtype=torch.float64)))
+        solve_bundle(replace(problem, weights=torch.ones(3, dtype=torch.float64)))
     graph = make_scene().graph
     with pytest.raises(ValueError, match=r"S_ji is torch.float32"):
-        pose_graph_optimize(replace(graph, S_ji=graph.S_ji.float()))
+        solve_pose_graph(replace(graph, S_ji=graph.S_ji.float()))

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchslam.optim import GlobalPositions, position_globally
+from torchslam.optim import POSITION_OPTIONS, GlobalPositions, solve_positions
 
 CONVERGED = {"iterations": 300, "tolerance": 1e-26}
 
@@ -28,10 +28,20 @@ class Recording:
     rays_w: Tensor
     is_wrong: Tensor
 
-    def positions(self, rays_w: Tensor | None = None, **options: Any) -> GlobalPositions:
+    def positions(
+        self,
+        rays_w: Tensor | None = None,
+        weights: Any = None,
+        start: Any = None,
+        seed: int = 0,
+        **options: Any,
+    ) -> GlobalPositions:
         rays_w = self.rays_w if rays_w is None else rays_w
         counts = len(self.centers_w), len(self.points_w)
-        return position_globally(self.view, self.point, rays_w, *counts, **options)
+        options = POSITION_OPTIONS.replace(**options)
+        return solve_positions(
+            self.view, self.point, rays_w, *counts, weights, start, seed=seed, options=options
+        )
 
 
 def record(
@@ -237,8 +247,8 @@ def test_order_of_rays_does_not_change_a_bit() -> None:
     rays_w[-3:] += 0.01 * draw(4, 3, 3)
     order = torch.randperm(len(twice), generator=torch.Generator().manual_seed(3))
     counts = len(truth.centers_w), len(truth.points_w)
-    plain = position_globally(truth.view[twice], truth.point[twice], rays_w, *counts)
-    other = position_globally(truth.view[twice][order], truth.point[twice][order], rays_w[order], *counts)
+    plain = solve_positions(truth.view[twice], truth.point[twice], rays_w, *counts)
+    other = solve_positions(truth.view[twice][order], truth.point[twice][order], rays_w[order], *counts)
     assert torch.equal(other.centers_w, plain.centers_w)
     assert torch.equal(other.points_w, plain.points_w)
     assert torch.equal(other.angles, plain.angles[order])
@@ -259,7 +269,7 @@ def test_only_the_largest_component_is_positioned() -> None:
     view = torch.cat((small.view, large.view + 5, torch.tensor([35])))
     point = torch.cat((small.point, large.point + 50, torch.tensor([50 + int(large.point[0])])))
     rays_w = torch.cat((small.rays_w, large.rays_w, draw(0, 1, 3))).requires_grad_()
-    found = position_globally(view, point, rays_w, 37, 250)
+    found = solve_positions(view, point, rays_w, 37, 250)
     assert found.success
     assert found.component.tolist() == [0] * 5 + [5] * 31 + [36]
     assert found.determined.tolist() == [False] * 5 + [True] * 30 + [False] * 2
@@ -309,7 +319,7 @@ def test_what_rays_do_not_determine_is_flagged_and_stays(make: Any, has_start: b
 def test_no_rays_determine_nothing(backward: str) -> None:
     none = torch.zeros(0, dtype=torch.int64)
     rays_w = torch.zeros(0, 3, dtype=torch.float64, requires_grad=True)
-    found = position_globally(none, none, rays_w, 2, 3, backward=backward)
+    found = solve_positions(none, none, rays_w, 2, 3, options=POSITION_OPTIONS.replace(backward=backward))
     assert torch.equal(found.centers_w, torch.zeros(2, 3, dtype=torch.float64))
     assert found.component.tolist() == [0, 1]
     assert not found.success
@@ -323,7 +333,7 @@ def test_rays_that_do_not_count_change_nothing() -> None:
     rays_w = torch.cat((truth.rays_w, bad)).requires_grad_()
     weights = torch.ones(len(rays_w), dtype=torch.float64)
     weights[-2:] = torch.tensor([0.0, torch.inf])
-    found = position_globally(
+    found = solve_positions(
         torch.cat((truth.view, torch.zeros(4).long())),
         torch.cat((truth.point, torch.zeros(4).long())),
         rays_w,
@@ -354,7 +364,7 @@ def test_dtype_and_device_come_from_the_inputs(dtype: torch.dtype, device: torch
     """The result for the rays of float32 is that of float64."""
     truth = make_recording(noise=1e-3, wrong=0.1)
     rays_w, counts = truth.rays_w.to(device, dtype), (30, 200)
-    found = position_globally(truth.view.to(device), truth.point.to(device), rays_w, *counts)
+    found = solve_positions(truth.view.to(device), truth.point.to(device), rays_w, *counts)
     for tensor in (found.centers_w, found.points_w, found.angles):
         assert tensor.dtype == dtype
         assert tensor.device.type == device.type
@@ -369,11 +379,11 @@ def test_invalid_input_is_rejected_by_name() -> None:
     view, point, rays_w, counts = truth.view, truth.point, truth.rays_w, (5, 16)
     start = truth.centers_w, truth.points_w
     with pytest.raises(ValueError, match=r"^rays_w must be \(O, 3\)"):
-        position_globally(view, point, rays_w[:, :2], *counts)
+        solve_positions(view, point, rays_w[:, :2], *counts)
     with pytest.raises(ValueError, match=r"_index must be \(O,\)"):
-        position_globally(view[1:], point, rays_w, *counts)
+        solve_positions(view[1:], point, rays_w, *counts)
     with pytest.raises(ValueError, match=r"^point_index must be"):
-        position_globally(view, point[:, None], rays_w, *counts)
+        solve_positions(view, point[:, None], rays_w, *counts)
     with pytest.raises(ValueError, match=r"^weights must be"):
         truth.positions(weights=torch.ones(3).double())
     with pytest.raises(ValueError, match=r"^start centers must be"):
@@ -381,11 +391,11 @@ def test_invalid_input_is_rejected_by_name() -> None:
     with pytest.raises(ValueError, match=r"^start points must be"):
         truth.positions(start=(start[0], start[1][1:]))
     with pytest.raises(ValueError, match=r"^view_index must lie in 0 \.\.\. 3$"):
-        position_globally(view, point, rays_w, 4, 16)
+        solve_positions(view, point, rays_w, 4, 16)
     with pytest.raises(ValueError, match=r"^point_index must lie in 0 \.\.\. 15$"):
-        position_globally(view, point - 1, rays_w, *counts)
+        solve_positions(view, point - 1, rays_w, *counts)
     with pytest.raises(ValueError, match=r"^num_points must be positive"):
-        position_globally(view[:0], point[:0], rays_w[:0], 5, 0)
+        solve_positions(view[:0], point[:0], rays_w[:0], 5, 0)
     with pytest.raises(ValueError, match="float32"):
         truth.positions(weights=torch.ones(len(view)))
     with pytest.raises(ValueError, match=r"^scale must be positive"):

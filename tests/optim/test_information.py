@@ -9,7 +9,7 @@ import torch
 
 from tests.optim.test_run_graph import aligned_error, simulated
 from torchslam.errors import TorchslamError
-from torchslam.optim import bundle_adjust, refine_pose
+from torchslam.optim import BUNDLE_OPTIONS, GRAPH_OPTIONS, POSE_OPTIONS, solve_bundle, solve_pose
 from torchslam.optim.run_graph import ObservationGraph, solve_graph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
@@ -30,8 +30,13 @@ def test_a_weight_as_a_matrix_equals_the_scalar_weight(pose_scene, bundle_scene,
     scene = pose_scene(outliers=0.1, model=model)
     weights = 0.5 + torch.rand(scene.pixels.shape[:2], generator=generator, dtype=torch.float64)
     one, other = (
-        refine_pose(
-            scene.start, scene.points_w, scene.pixels, scene.camera, w, kernel=kernel, scale=2.0, **CONVERGED
+        solve_pose(
+            scene.points_w,
+            scene.pixels,
+            T_cw=scene.start,
+            camera=scene.camera,
+            weights=w,
+            options=POSE_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED),
         )
         for w in (weights, isotropic(weights))
     )
@@ -41,7 +46,9 @@ def test_a_weight_as_a_matrix_equals_the_scalar_weight(pose_scene, bundle_scene,
     problem = bundle_scene(noise=1.0, model=model).problem
     weights = 0.5 + torch.rand(len(problem.pixels), generator=generator, dtype=torch.float64)
     one, other = (
-        bundle_adjust(replace(problem, weights=w), kernel, 2.0, **CONVERGED)
+        solve_bundle(
+            replace(problem, weights=w), options=BUNDLE_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED)
+        )
         for w in (weights, isotropic(weights))
     )
     torch.testing.assert_close(one.T_cw, other.T_cw, atol=1e-7, rtol=0)
@@ -55,8 +62,13 @@ def test_the_cost_sums_whitened_errors(pose_scene, generator):
     weights = matrices(generator, *scene.pixels.shape[:2])
     weights[:, 5] = 0.0
     weights[:, 6] = torch.tensor([[1.0, 2.0], [2.0, 1.0]])  # not definite
-    refined = refine_pose(
-        scene.start, scene.points_w, scene.pixels, scene.camera, weights, scale=2.0, **CONVERGED
+    refined = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        weights=weights,
+        options=POSE_OPTIONS.replace(scale=2.0, **CONVERGED),
     )
     T_cw = refined.T_cw.clone().requires_grad_()
     points_c = scene.points_w @ T_cw[:, :3, :3].mT + T_cw[:, None, :3, 3]
@@ -74,8 +86,9 @@ def test_gradients_reach_the_matrices(pose_scene, bundle_scene, generator):
     weights = matrices(generator, 1, 12).requires_grad_()
 
     def refined(pixels, weights):
-        args = scene.points_w, pixels, scene.camera, weights
-        return refine_pose(scene.start, *args, kernel="cauchy", scale=2.0, **CONVERGED).T_cw[:, :3]
+        options = POSE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
+        given = {"T_cw": scene.start, "camera": scene.camera, "weights": weights}
+        return solve_pose(scene.points_w, pixels, **given, options=options).T_cw[:, :3]
 
     pixels = scene.pixels.clone().requires_grad_()
     assert torch.autograd.gradcheck(
@@ -86,7 +99,9 @@ def test_gradients_reach_the_matrices(pose_scene, bundle_scene, generator):
 
     def adjusted(pixels, weights, params):
         moved = replace(problem, pixels=pixels, weights=weights, camera=problem.camera.with_params(params))
-        solution = bundle_adjust(moved, "cauchy", 2.0, **CONVERGED)
+        solution = solve_bundle(
+            moved, options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
+        )
         return solution.T_cw[:, :3], solution.points_w
 
     leaves = (
@@ -100,11 +115,14 @@ def test_gradients_reach_the_matrices(pose_scene, bundle_scene, generator):
 def test_a_batch_of_problems_with_matrices_is_the_same_as_a_loop(bundle_scene, generator):
     problem = bundle_scene(frames=4, points=20, noise=1.0).problem
     weights = matrices(generator, 3, len(problem.pixels))
-    together = bundle_adjust(
-        replace(problem, T_cw=problem.T_cw.expand(3, -1, -1, -1), weights=weights), "huber", 2.0
+    together = solve_bundle(
+        replace(problem, T_cw=problem.T_cw.expand(3, -1, -1, -1), weights=weights),
+        options=BUNDLE_OPTIONS.replace(kernel="huber", scale=2.0),
     )
     for row in range(3):
-        alone = bundle_adjust(replace(problem, weights=weights[row]), "huber", 2.0)
+        alone = solve_bundle(
+            replace(problem, weights=weights[row]), options=BUNDLE_OPTIONS.replace(kernel="huber", scale=2.0)
+        )
         torch.testing.assert_close(alone.T_cw, together.T_cw[row], atol=1e-9, rtol=0)
 
 
@@ -113,7 +131,9 @@ def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
     weights = matrices(generator, 3, 2, 15)
 
     def refined(weights):
-        return refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, weights).T_cw
+        return solve_pose(
+            scene.points_w, scene.pixels, T_cw=scene.start, camera=scene.camera, weights=weights
+        ).T_cw
 
     wanted = torch.stack([refined(each) for each in weights])
     torch.testing.assert_close(torch.func.vmap(refined)(weights), wanted, atol=1e-10, rtol=0)
@@ -124,10 +144,16 @@ def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
 def test_wrong_shapes_are_named(pose_scene, bundle_scene, shape):
     scene = pose_scene()
     with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or \(B, N, 2, 2\).*, not"):
-        refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, torch.ones(shape).double())
+        solve_pose(
+            scene.points_w,
+            scene.pixels,
+            T_cw=scene.start,
+            camera=scene.camera,
+            weights=torch.ones(shape).double(),
+        )
     problem = bundle_scene().problem
     with pytest.raises(ValueError, match=r"weights must be \(..., O\) or \(..., O, 2, 2\), not"):
-        bundle_adjust(replace(problem, weights=torch.ones(len(problem.pixels), 3, 3).double()))
+        solve_bundle(replace(problem, weights=torch.ones(len(problem.pixels), 3, 3).double()))
 
 
 def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, generator):
@@ -138,7 +164,13 @@ def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, gene
     assert torch.equal(loaded.weights, graph.weights)
 
     def loss(weights):
-        return aligned_error(solve_graph(replace(graph, weights=weights), "cauchy", 2.0, **CONVERGED), truth)
+        return aligned_error(
+            solve_graph(
+                replace(graph, weights=weights),
+                options=GRAPH_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED),
+            ),
+            truth,
+        )
 
     leaf = graph.weights.clone().requires_grad_()
     loss(leaf).backward()
@@ -159,12 +191,14 @@ def test_a_covariance_is_that_of_the_solution_whatever_moves_in_place_later(pose
         if solver == "pose":
             scene = pose_scene()
             given = scene.points_w.clone(), scene.pixels.clone(), scene.camera.params.clone()
-            solution = refine_pose(scene.start, given[0], given[1], scene.camera.with_params(given[2]))
+            solution = solve_pose(
+                given[0], given[1], T_cw=scene.start, camera=scene.camera.with_params(given[2])
+            )
         else:
             problem = bundle_scene().problem
             given = problem.points_w.clone(), problem.pixels.clone(), problem.camera.params.clone()
             camera = problem.camera.with_params(given[2])
-            solution = bundle_adjust(replace(problem, points_w=given[0], pixels=given[1], camera=camera))
+            solution = solve_bundle(replace(problem, points_w=given[0], pixels=given[1], camera=camera))
         if moves:
             for tensor in given:
                 tensor.mul_(1.3)

@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.func import jacfwd, jacrev, vmap
 
 from torchslam.geometry import se3_exp, sim3_exp, sim3_scale, transform, umeyama
-from torchslam.optim import minimize, refine_pose
+from torchslam.optim import LEAST_SQUARES_OPTIONS, POSE_OPTIONS, solve_least_squares, solve_pose
 
 CONVERGED = {"iterations": 60, "tolerance": 0.0}
 
@@ -33,7 +33,7 @@ def reprojection(camera):
 def test_a_fitted_line_solves_the_normal_equations():
     x, y, weights = normal(3, 9), normal(3, 9, seed=1), normal(3, 9, seed=2).square()
     mask = normal(3, 9, seed=3) > -1
-    solution = minimize(line, torch.zeros(3, 2).double(), (x, y), weights=weights, mask=mask)
+    solution = solve_least_squares(line, torch.zeros(3, 2).double(), (x, y), weights=weights, mask=mask)
     A, w = torch.stack((torch.ones_like(x), x), -1), weights * mask
     expected = torch.linalg.solve(A.mT @ (w[..., None] * A), A.mT @ (w * y)[..., None]).squeeze(-1)
     torch.testing.assert_close(solution.unknowns[0], expected)
@@ -53,11 +53,21 @@ def test_a_pose_equals_that_of_refine_pose(pose_scene, kernel, model):
         if general:
             inputs = (points, pixels)
             residual = reprojection(scene.camera)
-            solution = minimize(residual, scene.start, inputs, "se3", kernel=kernel, scale=2.0, **CONVERGED)
+            solution = solve_least_squares(
+                residual,
+                scene.start,
+                inputs,
+                "se3",
+                options=LEAST_SQUARES_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED),
+            )
             T_cw = solution.unknowns[0]
         else:
-            solution = refine_pose(
-                scene.start, points, pixels, scene.camera, kernel=kernel, scale=2.0, **CONVERGED
+            solution = solve_pose(
+                points,
+                pixels,
+                T_cw=scene.start,
+                camera=scene.camera,
+                options=POSE_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED),
             )
             T_cw = solution.T_cw
         (T_cw[:, :3] * normal(3, 3, 4, seed=5)).sum().backward()
@@ -72,7 +82,13 @@ def test_a_similarity_equals_that_of_umeyama():
     b = transform(S_ba.double(), a) + 0.05 * normal(2, 20, 3, seed=1)
     start = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     start[1, :2, :2] *= -1  # half a turn
-    solution = minimize(lambda S, a, b: transform(S, a) - b, start, (a, b), "sim3", **CONVERGED)
+    solution = solve_least_squares(
+        lambda S, a, b: transform(S, a) - b,
+        start,
+        (a, b),
+        "sim3",
+        options=LEAST_SQUARES_OPTIONS.replace(**CONVERGED),
+    )
     assert solution.success.all()
     for row in range(2):
         s, R, t = umeyama(a[row], b[row])
@@ -116,7 +132,12 @@ def test_flow_from_two_images_and_its_gradient_to_every_pixel():
 
     def flow(first: Tensor, second: Tensor) -> Tensor:
         zero = torch.zeros(2, 2, dtype=torch.float64)
-        return minimize(residual, zero, (first, second), kernel="cauchy", scale=0.1, **CONVERGED).unknowns[0]
+        return solve_least_squares(
+            residual,
+            zero,
+            (first, second),
+            options=LEAST_SQUARES_OPTIONS.replace(kernel="cauchy", scale=0.1, **CONVERGED),
+        ).unknowns[0]
 
     torch.testing.assert_close(flow(first, second), shifts, atol=0.04, rtol=0)
     images = [image.clone().requires_grad_() for image in (first, second)]
@@ -144,17 +165,16 @@ def problem():
     drift, spread = 0.05 * normal(2, 6, 3, seed=3), normal(2, 6, seed=4).square()
 
     def solve(p: Tensor) -> Tensor:
-        solution = minimize(
+        solution = solve_least_squares(
             residual,
             (T, torch.ones(2, 3, dtype=torch.float64)),
             (x + p[0] * drift, y + 0.1 * p[1] * x.square()),
             ("se3", "euclidean"),
-            weights=1 + p[2] * spread,
-            mask=torch.tensor([[True] * 6, [True] * 5 + [False]]),
-            kernel="cauchy",
-            scale=1 + p[3],
-            iterations=25,
-            tolerance=0.0,
+            1 + p[2] * spread,
+            torch.tensor([[True] * 6, [True] * 5 + [False]]),
+            options=LEAST_SQUARES_OPTIONS.replace(
+                kernel="cauchy", scale=1 + p[3], iterations=25, tolerance=0.0
+            ),
         )
         T_found, scale_found = solution.unknowns
         return torch.cat((T_found[:, :3].flatten(1), scale_found), dim=1)
@@ -180,7 +200,9 @@ def test_vmap_equals_a_batch():
     x, y = normal(4, 3, 9), normal(4, 3, 9, seed=1)
 
     def fit(x: Tensor, y: Tensor) -> Tensor:
-        return minimize(line, torch.zeros(3, 2).double(), (x, y), kernel="huber").unknowns[0]
+        return solve_least_squares(
+            line, torch.zeros(3, 2).double(), (x, y), options=LEAST_SQUARES_OPTIONS.replace(kernel="huber")
+        ).unknowns[0]
 
     expected = torch.stack([fit(*row) for row in zip(x, y, strict=True)])
     torch.testing.assert_close(vmap(fit)(x, y), expected, rtol=1e-10, atol=1e-12)
@@ -192,11 +214,13 @@ def test_vmap_equals_a_batch():
 def test_a_batch_equals_a_loop_over_its_elements(pose_scene):
     scene = pose_scene(batch=5, outliers=0.2)
     residual = reprojection(scene.camera)
-    options = {"manifolds": "se3", "kernel": "cauchy"}
-    together = minimize(residual, scene.start, (scene.points_w, scene.pixels), **options)
+    options = {"manifolds": "se3", "options": LEAST_SQUARES_OPTIONS.replace(kernel="cauchy")}
+    together = solve_least_squares(residual, scene.start, (scene.points_w, scene.pixels), **options)
     for row in range(5):
         rows = slice(row, row + 1)
-        alone = minimize(residual, scene.start[rows], (scene.points_w[rows], scene.pixels[rows]), **options)
+        alone = solve_least_squares(
+            residual, scene.start[rows], (scene.points_w[rows], scene.pixels[rows]), **options
+        )
         torch.testing.assert_close(together.unknowns[0][rows], alone.unknowns[0], rtol=0, atol=1e-12)
         assert together.convergence.iterations[row] == alone.convergence.iterations[0]
 
@@ -206,8 +230,11 @@ def test_backward_modes_agree_where_they_should():
     gradients = {}
     for backward in ("implicit", "unroll", "truncated", "detached"):
         leaf = y.clone().requires_grad_()
-        solution = minimize(
-            line, torch.zeros(2, 2).double(), (x, leaf), kernel="cauchy", backward=backward, **CONVERGED
+        solution = solve_least_squares(
+            line,
+            torch.zeros(2, 2).double(),
+            (x, leaf),
+            options=LEAST_SQUARES_OPTIONS.replace(kernel="cauchy", backward=backward, **CONVERGED),
         )
         (coefficients,) = solution.unknowns
         if backward == "detached":
@@ -228,7 +255,9 @@ def test_a_failure_does_not_affect_the_other_elements(pose_scene):
     start[2, 0, 0] = torch.nan
     pixels[3, 4] = torch.inf
     pixels.requires_grad_()
-    solution = minimize(reprojection(scene.camera), start, (scene.points_w, pixels), "se3", mask=mask)
+    solution = solve_least_squares(
+        reprojection(scene.camera), start, (scene.points_w, pixels), "se3", mask=mask
+    )
     assert solution.success.tolist() == [True, False, False, False]
     (T_cw,) = solution.unknowns
     assert T_cw.isfinite().all()
@@ -244,7 +273,7 @@ def test_dtype_and_device(dtype, device):
         pytest.skip("torch.func's wrappers do not reach a device written in Python")
     x, y = (normal(2, 9, seed=seed).to(device, dtype) for seed in (0, 1))
     start = torch.zeros(2, 2, dtype=dtype, device=device)
-    solution = minimize(line, start, (x, y), kernel="huber")
+    solution = solve_least_squares(line, start, (x, y), options=LEAST_SQUARES_OPTIONS.replace(kernel="huber"))
     assert solution.success.all()
     assert solution.unknowns[0].dtype == dtype
     assert solution.unknowns[0].device.type == device.type
@@ -256,16 +285,16 @@ def test_inconsistent_inputs_are_rejected_by_name():
     start = torch.zeros(2, 2, dtype=torch.float64)
     leaf = y.clone().requires_grad_()
     with pytest.raises(ValueError, match="with gradient that is not among its inputs"):
-        minimize(lambda c, x: line(c, x, leaf), start, (x,))
+        solve_least_squares(lambda c, x: line(c, x, leaf), start, (x,))
     with pytest.raises(ValueError, match=r"input 1 must lead with the batch of 2, not have shape \(9,\)"):
-        minimize(line, start, (x, y[0]))
+        solve_least_squares(line, start, (x, y[0]))
     with pytest.raises(ValueError, match=r"weights must be \(B, N\), not \(9,\)"):
-        minimize(line, start, (x, y), weights=torch.ones(9).double())
+        solve_least_squares(line, start, (x, y), weights=torch.ones(9).double())
     with pytest.raises(ValueError, match=r"input 0 is torch.float32, but unknown 0 is torch.float64"):
-        minimize(line, start, (x.float(), y))
+        solve_least_squares(line, start, (x.float(), y))
     with pytest.raises(ValueError, match="unknown manifold 'so3'"):
-        minimize(line, start, (x, y), "so3")
+        solve_least_squares(line, start, (x, y), "so3")
     with pytest.raises(ValueError, match=r"an unknown on se3 must be \(B, ..., 4, 4\), not \(2, 2\)"):
-        minimize(line, start, (x, y), "se3")
+        solve_least_squares(line, start, (x, y), "se3")
     with pytest.raises(ValueError, match=r"residual must be \(B, N\)"):
-        minimize(lambda c, x, y: line(c, x, y).sum(1), start, (x, y))
+        solve_least_squares(lambda c, x, y: line(c, x, y).sum(1), start, (x, y))

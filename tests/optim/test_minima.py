@@ -10,12 +10,17 @@ from tests.optim.conftest import camera_of
 from torchslam.errors import ConvergenceError
 from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.optim import (
+    BUNDLE_OPTIONS,
+    LEAST_SQUARES_OPTIONS,
+    POSE_GRAPH_OPTIONS,
+    POSE_OPTIONS,
     BundleProblem,
     PoseGraph,
-    bundle_adjust,
-    minimize,
-    pose_graph_optimize,
-    refine_pose,
+    SolverReason,
+    solve_bundle,
+    solve_least_squares,
+    solve_pose,
+    solve_pose_graph,
 )
 
 
@@ -25,7 +30,12 @@ def line_residual(slope: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 def fit_line(batch: int = 3, **options):
     x = torch.linspace(0, 1, 10, dtype=torch.float64).expand(batch, 10)
-    return minimize(line_residual, torch.zeros(batch, 1).double(), (x, torch.exp(0.8 * x)), **options)
+    return solve_least_squares(
+        line_residual,
+        torch.zeros(batch, 1).double(),
+        (x, torch.exp(0.8 * x)),
+        options=LEAST_SQUARES_OPTIONS.replace(**options),
+    )
 
 
 def square_of_poses(**options) -> PoseGraph:
@@ -41,11 +51,19 @@ def solvers(pose_scene, bundle_scene):
     """Each solver, on a problem that it solves."""
     pose, bundle, graph = pose_scene(), bundle_scene().problem, square_of_poses()
     return {
-        "poses": lambda **options: refine_pose(
-            pose.start, pose.points_w, pose.pixels, pose.camera, **options
+        "poses": lambda **options: solve_pose(
+            pose.points_w,
+            pose.pixels,
+            T_cw=pose.start,
+            camera=pose.camera,
+            options=POSE_OPTIONS.replace(**options),
         ),
-        "bundle adjustments": lambda **options: bundle_adjust(bundle, **options),
-        "pose graphs": lambda **options: pose_graph_optimize(graph, **options),
+        "bundle adjustments": lambda **options: solve_bundle(
+            bundle, options=BUNDLE_OPTIONS.replace(**options)
+        ),
+        "pose graphs": lambda **options: solve_pose_graph(
+            graph, options=POSE_GRAPH_OPTIONS.replace(**options)
+        ),
         "elements": fit_line,
     }
 
@@ -66,9 +84,11 @@ def test_strict_names_the_elements(pose_scene):
     scene = pose_scene(batch=4)
     mask = torch.ones(4, 40, dtype=torch.bool)
     mask[[1, 3], 2:] = False
-    observed = scene.start, scene.points_w, scene.pixels, scene.camera
+    strict = POSE_OPTIONS.replace(strict=True)
     with pytest.raises(ConvergenceError, match=r"of 4 poses: 2 not determined \(1, 3\)$"):
-        refine_pose(*observed, mask=mask, strict=True)
+        solve_pose(
+            scene.points_w, scene.pixels, T_cw=scene.start, camera=scene.camera, mask=mask, options=strict
+        )
     with pytest.raises(ConvergenceError, match=r"of 50 elements: 50 not converged.* \(0, 1, .*9, \.\.\.\)"):
         fit_line(50, iterations=1, strict=True)
 
@@ -76,7 +96,7 @@ def test_strict_names_the_elements(pose_scene):
 @pytest.mark.parametrize("perturbation", [0.01, 0.04])
 def test_bundle_adjust_converges_at_its_defaults_with_a_fifth_of_outliers(bundle_scene, perturbation):
     def distances(problem, **options):
-        solution = bundle_adjust(problem, **options)
+        solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(**options))
         centers = se3_inverse(solution.T_cw)[:, :3, 3]
         lengths = (centers[1:] - centers[:1]).norm(dim=-1)
         return solution, (lengths / lengths.sum()).square().sum()
@@ -105,7 +125,7 @@ def test_pose_graph_without_a_fixed_node_has_the_gradient_of_one_with_it(parts):
         one = square_of_poses()
         S_cw = torch.cat([one.S_cw] * parts)
         edges = torch.cat([one.edges + 4 * part for part in range(parts)])
-        solution = pose_graph_optimize(PoseGraph(S_cw, edges, S_ji, fixed=fixed, with_scale=False))
+        solution = solve_pose_graph(PoseGraph(S_cw, edges, S_ji, fixed=fixed, with_scale=False))
         assert solution.success
         between = solution.S_cw[1::4] @ se3_inverse(solution.S_cw[2::4])
         (found,) = torch.autograd.grad(between[:, 0, 3].sum(), S_ji)
@@ -132,7 +152,7 @@ def test_a_window_without_parallax_is_no_success(motion, determined, batched):
     problem = BundleProblem(T_cw, points_w, frame_index, point_index, pixels, camera_of())
     if batched:
         problem = replace(problem, T_cw=T_cw.repeat(2, 1, 1, 1))
-    solution = bundle_adjust(problem, iterations=10)
+    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(iterations=10))
     assert (solution.success == determined).all()
     (gradient,) = torch.autograd.grad(solution.points_w.square().sum() + solution.T_cw.sum(), pixels)
     assert (gradient.abs().max() > 0) == determined
@@ -150,9 +170,37 @@ def test_a_point_without_parallax_has_no_gradient_and_leaves_the_others_theirs(b
     pixels = scene.problem.pixels.clone()
     pixels[seen] = exact[0]
     pixels.requires_grad_()
-    solution = bundle_adjust(replace(scene.problem, pixels=pixels))
+    solution = solve_bundle(replace(scene.problem, pixels=pixels))
     assert solution.success
     (through_far,) = torch.autograd.grad(solution.points_w[5].sum(), pixels, retain_graph=True)
     assert (through_far == 0).all()
     (gradient,) = torch.autograd.grad(solution.points_w.sum(), pixels)
     assert 0 < gradient.abs().max() < 1
+
+
+@pytest.mark.parametrize("what", ["poses", "bundle adjustments", "pose graphs", "elements"])
+def test_a_solution_says_how_its_search_ended(solvers, what):
+    solve = solvers[what]
+    assert {*solve().reasons} == {SolverReason.CONVERGED}
+    assert {*solve(iterations=1).reasons} == {SolverReason.ITERATION_LIMIT}
+    assert len(solve().reasons) == solve().success.numel()
+
+
+def test_poses_that_are_not_determined_say_so(pose_scene):
+    scene = pose_scene(batch=4)
+    mask = torch.ones(4, 40, dtype=torch.bool)
+    mask[[1, 3], 2:] = False
+    found = solve_pose(scene.points_w, scene.pixels, T_cw=scene.start, camera=scene.camera, mask=mask)
+    lost, right = SolverReason.UNDETERMINED, SolverReason.CONVERGED
+    assert found.reasons == [right, lost, right, lost]
+    assert str(lost).startswith("not determined: too few observations")
+
+
+def test_a_search_that_no_step_helps_has_given_up():
+    """The residual is right at the start alone: every step makes it worse."""
+
+    def residual(x, start):
+        return torch.where(x == start, x, 10 + x.abs())
+
+    start = torch.ones(1, 1).double()
+    assert solve_least_squares(residual, start, (start,)).reasons == [SolverReason.GAVE_UP]

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import pytest
 import torch
@@ -11,7 +12,7 @@ from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, vmap
 
 from torchslam.geometry import matrix_from_quaternion, so3_exp, so3_log
-from torchslam.optim import RotationAverage, average_rotations
+from torchslam.optim import ROTATION_OPTIONS, UNWEIGHTED_ROTATION_OPTIONS, RotationAverage, solve_rotations
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-26}
 NOISE = math.radians(1.0)
@@ -59,10 +60,11 @@ def scattered(count: int, degree: int, seed: int = 0) -> list[tuple[int, int]]:
     return sorted({pairs[k] for k in order[: count * degree // 2]} | set(chain(count, 1)))
 
 
-def average(views: Views, **options: object) -> RotationAverage:
-    return average_rotations(
-        views.edges, views.R_ji, len(views.R_cw), **({"weights": views.weights} | options)
-    )
+def average(views: Views, **options: Any) -> RotationAverage:
+    weights, start = options.pop("weights", views.weights), options.pop("start", None)
+    given = UNWEIGHTED_ROTATION_OPTIONS if weights is None else ROTATION_OPTIONS
+    options = given.replace(**options)
+    return solve_rotations(views.edges, views.R_ji, len(views.R_cw), weights, start, options=options)
 
 
 def errors(R_cw: Tensor, expected: Tensor) -> Tensor:
@@ -91,13 +93,12 @@ def test_the_error_of_a_loop_is_shared_by_variance(
     """0.3 radians about one axis around three views."""
     around = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     R_ji = so3_exp(torch.tensor([0.3, 0.0, 0.0], dtype=torch.float64)[:, None] * around)
-    solution = average_rotations(
+    solution = solve_rotations(
         torch.tensor([(0, 1), (1, 2), (2, 0)]),
         R_ji,
         3,
         torch.tensor(weights).double(),
-        kernel="none",
-        **CONVERGED,
+        options=ROTATION_OPTIONS.replace(kernel="none", **CONVERGED),
     )
     expected = torch.stack((0 * around, (0.3 - shares[0]) * around, shares[2] * around))
     torch.testing.assert_close(so3_log(solution.R_cw), expected, rtol=0, atol=1e-9)
@@ -185,7 +186,7 @@ def test_parts_that_no_edge_joins_are_averaged_on_their_own() -> None:
     weights = torch.cat((even.weights, odd.weights, torch.tensor([1e4, 0.0, torch.nan], dtype=torch.float64)))
     R_ji = torch.cat((even.R_ji, odd.R_ji, useless)).requires_grad_()
     weights.requires_grad_()
-    solution = average_rotations(edges, R_ji, 25, weights, **CONVERGED)
+    solution = solve_rotations(edges, R_ji, 25, weights, options=ROTATION_OPTIONS.replace(**CONVERGED))
     assert solution.component.tolist() == [0, 1] * 12 + [24]
     assert solution.success.all()
     assert torch.isinf(solution.angles).tolist() == [False] * (len(edges) - 3) + [True] * 3
@@ -205,14 +206,23 @@ def test_parts_that_no_edge_joins_are_averaged_on_their_own() -> None:
 @pytest.mark.parametrize("backward", ["implicit", "unroll", "truncated", "detached"])
 def test_views_without_edges_stay_where_they_are(backward: str) -> None:
     nothing = torch.zeros(0, 3, 3, dtype=torch.float64, requires_grad=True)
-    solution = average_rotations(torch.zeros(0, 2, dtype=torch.int64), nothing, 2, backward=backward)
+    solution = solve_rotations(
+        torch.zeros(0, 2, dtype=torch.int64),
+        nothing,
+        2,
+        options=UNWEIGHTED_ROTATION_OPTIONS.replace(backward=backward),
+    )
     assert torch.equal(solution.R_cw, torch.eye(3, dtype=torch.float64).expand(2, 3, 3))
     assert solution.component.tolist() == [0, 1]
     assert solution.success.tolist() == [True, True]
     assert solution.angles.shape == (0,)
     start = so3_exp(draw(0, 1, 3))
-    alone = average_rotations(
-        torch.zeros(0, 2, dtype=torch.int64), nothing, 1, start=start, backward=backward
+    alone = solve_rotations(
+        torch.zeros(0, 2, dtype=torch.int64),
+        nothing,
+        1,
+        start=start,
+        options=UNWEIGHTED_ROTATION_OPTIONS.replace(backward=backward),
     )
     assert torch.equal(alone.R_cw, start)
 
@@ -222,7 +232,7 @@ def test_a_part_that_is_not_determined_costs_no_other_its_gradient() -> None:
     edges = torch.tensor([(0, 1), (1, 2), (2, 0), (3, 4), (4, 5)])
     weights = torch.tensor([1e3, 1e3, 1e3, 1e-4, 1e12], dtype=torch.float64)
     R_ji = so3_exp(0.01 * draw(0, 5, 3)).requires_grad_()
-    solution = average_rotations(edges, R_ji, 6, weights)
+    solution = solve_rotations(edges, R_ji, 6, weights)
     assert solution.success.tolist() == [True] * 3 + [False] * 3
     assert torch.isfinite(solution.R_cw).all()
     solution.R_cw.sum().backward()
@@ -238,7 +248,9 @@ def test_a_view_that_loses_all_its_edges_is_flagged() -> None:
     R_ji = torch.cat((axes.expand(15, 3, 3), so3_exp(0.105 * torch.cat((axes, -axes))))).requires_grad_()
     weights = torch.tensor([1e4] * 15 + [1.0] * 6, dtype=torch.float64)
     for kernel, is_kept in (("geman_mcclure", True), ("truncated", False)):
-        solution = average_rotations(edges, R_ji, 7, weights, kernel=kernel, scale=0.1)
+        solution = solve_rotations(
+            edges, R_ji, 7, weights, options=ROTATION_OPTIONS.replace(kernel=kernel, scale=0.1)
+        )
         assert solution.success.tolist() == [is_kept] * 7
         (gradient,) = torch.autograd.grad(solution.R_cw[6].sum(), R_ji)
         assert bool(gradient.any()) == is_kept
@@ -253,8 +265,12 @@ def test_gradcheck(kernel: str) -> None:
 
     def rotations(twist: Tensor, log_weights: Tensor, scale: Tensor) -> Tensor:
         weights = views.weights * log_weights.exp()
-        solution = average_rotations(
-            views.edges, so3_exp(twist) @ R_ji, 4, weights, kernel=kernel, scale=scale, **CONVERGED
+        solution = solve_rotations(
+            views.edges,
+            so3_exp(twist) @ R_ji,
+            4,
+            weights,
+            options=ROTATION_OPTIONS.replace(kernel=kernel, scale=scale, **CONVERGED),
         )
         return solution.R_cw[1:]
 
@@ -281,7 +297,7 @@ def test_gradient_to_the_start_is_that_of_the_first_view() -> None:
 def test_wrong_edges_have_nearly_no_gradient() -> None:
     views = make_views(scattered(20, 8), wrong=0.2)
     R_ji, weights = views.R_ji.clone().requires_grad_(), views.weights.clone().requires_grad_()
-    solution = average_rotations(views.edges, R_ji, 20, weights, **CONVERGED)
+    solution = solve_rotations(views.edges, R_ji, 20, weights, options=ROTATION_OPTIONS.replace(**CONVERGED))
     (solution.R_cw * draw(7, 20, 3, 3)).sum().backward()
     for gradient in (R_ji.grad.flatten(1).norm(dim=-1), (weights.grad * weights.detach()).abs()):
         assert gradient[views.is_wrong].max() < 1e-2 * gradient[~views.is_wrong].median()
@@ -293,12 +309,12 @@ def test_derivatives_in_both_directions_and_twice() -> None:
     ramp, sums = torch.linspace(-1, 1, len(views.R_ji)).double()[:, None], draw(8, 2, 5, 3, 3)
 
     def mixed(x: Tensor) -> Tensor:
-        solution = average_rotations(
+        solution = solve_rotations(
             views.edges,
             so3_exp(x[:3] * ramp) @ views.R_ji,
             5,
             views.weights * (1 + x[3].square()),
-            **CONVERGED,
+            options=ROTATION_OPTIONS.replace(**CONVERGED),
         )
         return (solution.R_cw * sums).flatten(1).sum(-1)
 
@@ -323,7 +339,7 @@ def test_order_and_direction_of_edges_do_not_change_a_bit() -> None:
     edges = torch.where(is_reversed[:, None], views.edges[order].flip(-1), views.edges[order])
     R_ji = torch.where(is_reversed[:, None, None], views.R_ji[order].mT, views.R_ji[order])
     plain = average(views)
-    other = average_rotations(edges, R_ji, 30, views.weights[order])
+    other = solve_rotations(edges, R_ji, 30, views.weights[order])
     assert torch.equal(other.R_cw, plain.R_cw)
     assert torch.equal(other.angles, plain.angles[order])
 
@@ -354,7 +370,7 @@ def test_a_view_whose_start_is_not_finite_is_left_out() -> None:
 
 def test_dtype_and_device_come_from_the_inputs(dtype: torch.dtype, device: torch.device) -> None:
     views = make_views(scattered(20, 8), wrong=0.2)
-    solution = average_rotations(
+    solution = solve_rotations(
         views.edges.to(device), views.R_ji.to(device, dtype), 20, views.weights.to(device, dtype)
     )
     for tensor in (solution.R_cw, solution.angles):
@@ -370,24 +386,24 @@ def test_invalid_input_is_rejected_by_name() -> None:
     views = make_views(chain(4, 2))
     edges, R_ji = views.edges, views.R_ji
     with pytest.raises(ValueError, match=r"\(E, 2\)"):
-        average_rotations(edges[:, :1], R_ji, 4)
+        solve_rotations(edges[:, :1], R_ji, 4)
     with pytest.raises(ValueError, match=r"\(E, 3, 3\)"):
-        average_rotations(edges, R_ji[1:], 4)
+        solve_rotations(edges, R_ji[1:], 4)
     with pytest.raises(ValueError, match="weights"):
-        average_rotations(edges, R_ji, 4, views.weights[1:])
+        solve_rotations(edges, R_ji, 4, views.weights[1:])
     with pytest.raises(ValueError, match="start"):
-        average_rotations(edges, R_ji, 4, start=views.R_cw[1:])
+        solve_rotations(edges, R_ji, 4, start=views.R_cw[1:])
     with pytest.raises(ValueError, match=r"0 \.\.\. 2"):
-        average_rotations(edges, R_ji, 3)
+        solve_rotations(edges, R_ji, 3)
     with pytest.raises(ValueError, match="itself"):
-        average_rotations(0 * edges, R_ji, 4)
+        solve_rotations(0 * edges, R_ji, 4)
     with pytest.raises(ValueError, match="num_views"):
-        average_rotations(edges[:0], R_ji[:0], 0)
+        solve_rotations(edges[:0], R_ji[:0], 0)
     with pytest.raises(ValueError, match="float32"):
-        average_rotations(edges, R_ji, 4, views.weights.float())
+        solve_rotations(edges, R_ji, 4, views.weights.float())
     with pytest.raises(ValueError, match="scale"):
-        average_rotations(edges, R_ji, 4, scale=0.0)
+        solve_rotations(edges, R_ji, 4, options=UNWEIGHTED_ROTATION_OPTIONS.replace(scale=0.0))
     with pytest.raises(ValueError, match="'exact'"):
-        average_rotations(edges, R_ji, 4, backward="exact")
+        solve_rotations(edges, R_ji, 4, options=UNWEIGHTED_ROTATION_OPTIONS.replace(backward="exact"))
     with pytest.raises(ValueError, match="'l2'"):
-        average_rotations(edges, R_ji, 4, kernel="l2")
+        solve_rotations(edges, R_ji, 4, options=UNWEIGHTED_ROTATION_OPTIONS.replace(kernel="l2"))

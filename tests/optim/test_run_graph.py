@@ -9,7 +9,7 @@ from torchslam.errors import ConvergenceError, TorchslamError
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
 from torchslam.geometry.camera_measurement import CameraMeasurement
-from torchslam.optim import DepthPrior, FrameFactors
+from torchslam.optim import GRAPH_OPTIONS, DepthPrior, FrameFactors
 from torchslam.optim.run_graph import (
     ObservationGraph,
     RunGraph,
@@ -80,7 +80,8 @@ def test_gradient_of_the_trajectory_error_to_pixels_weights_and_camera():
     def loss(pixels, weights, params):
         camera = graph.camera.with_params(params)
         solution = solve_graph(
-            replace(graph, pixels=pixels, weights=weights, camera=camera), "cauchy", 2.0, **CONVERGED
+            replace(graph, pixels=pixels, weights=weights, camera=camera),
+            options=GRAPH_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED),
         )
         return aligned_error(solution, truth)
 
@@ -148,12 +149,14 @@ def test_a_graph_without_observations_is_flagged_as_failed():
 
 def test_frames_say_whether_they_are_at_a_minimum():
     _, graph = simulated()
-    first = solve_graph(graph, iterations=1)
+    first = solve_graph(graph, options=GRAPH_OPTIONS.replace(iterations=1))
     assert not first.converged.any()  # without points there, no frame is where it belongs
     there = replace(graph, T_cw=solve_graph(graph).T_cw, points_w=solve_graph(graph).points_w)
     off = replace(there, T_cw=torch.where(graph.is_keyframe[:, None, None], there.T_cw, graph.T_cw))
-    assert solve_graph(there, iterations=2).converged.all()
-    assert torch.equal(solve_graph(off, iterations=2).converged, graph.is_keyframe)
+    assert solve_graph(there, options=GRAPH_OPTIONS.replace(iterations=2)).converged.all()
+    assert torch.equal(
+        solve_graph(off, options=GRAPH_OPTIONS.replace(iterations=2)).converged, graph.is_keyframe
+    )
 
 
 def test_keyframes_only_and_no_keyframe():
@@ -272,12 +275,17 @@ def test_gradients_of_all_submaps_reach_pixels_and_the_shared_camera():
     def gradients(graph, loss):
         pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
         moved = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
-        loss(solve_graph(moved, **CONVERGED).T_cw).backward()
+        loss(solve_graph(moved, options=GRAPH_OPTIONS.replace(**CONVERGED)).T_cw).backward()
         return pixels.grad, params.grad
 
-    pixels, params = gradients(both, lambda T_cw: ate(T_cw[:10], truth_1) + ate(T_cw[10:], truth_2))
-    pixels_1, params_1 = gradients(one, lambda T_cw: ate(T_cw, truth_1))
-    pixels_2, params_2 = gradients(two, lambda T_cw: ate(T_cw, truth_2))
+    pixels, params = gradients(
+        both,
+        lambda T_cw: (
+            ate(T_cw=T_cw[:10], T_cw_groundtruth=truth_1) + ate(T_cw=T_cw[10:], T_cw_groundtruth=truth_2)
+        ),
+    )
+    pixels_1, params_1 = gradients(one, lambda T_cw: ate(T_cw=T_cw, T_cw_groundtruth=truth_1))
+    pixels_2, params_2 = gradients(two, lambda T_cw: ate(T_cw=T_cw, T_cw_groundtruth=truth_2))
     torch.testing.assert_close(pixels, torch.cat([pixels_1, pixels_2]))
     torch.testing.assert_close(params, params_1 + params_2)
     assert (params_1 != 0).all()
@@ -376,7 +384,10 @@ def test_the_gradient_reaches_the_calibration():
 
     def loss(params):
         calibration = replace(given.calibration, camera=given.camera.with_params(params))
-        return aligned_error(solve_graph(replace(given, calibration=calibration), **CONVERGED), truth)
+        return aligned_error(
+            solve_graph(replace(given, calibration=calibration), options=GRAPH_OPTIONS.replace(**CONVERGED)),
+            truth,
+        )
 
     params = given.calibration.camera.params.clone().requires_grad_()
     loss(params).backward()
@@ -388,7 +399,7 @@ def test_the_gradient_reaches_the_calibration():
     torch.testing.assert_close(params.grad[0], numeric, rtol=1e-5, atol=0)
     start = given.camera.params.clone().requires_grad_()
     moved = replace(given, camera=given.camera.with_params(start))
-    aligned_error(solve_graph(moved, **CONVERGED), truth).backward()
+    aligned_error(solve_graph(moved, options=GRAPH_OPTIONS.replace(**CONVERGED)), truth).backward()
     assert start.grad[:2] @ given.calibration.directions[:2, 0] == pytest.approx(0.0, abs=1e-9)
 
 
@@ -423,10 +434,10 @@ def test_graphs_with_calibrations_are_solved_as_alone():
 
 def test_strict_raises_where_a_frame_is_not_at_a_minimum():
     graph = simulated()[1]
-    assert solve_graph(graph, strict=True).converged.all()
+    assert solve_graph(graph, options=GRAPH_OPTIONS.replace(strict=True)).converged.all()
     for solve in (
-        lambda: solve_graph(graph, iterations=1, strict=True),
-        lambda: solve_graphs([graph, graph], iterations=1, strict=True),
+        lambda: solve_graph(graph, options=GRAPH_OPTIONS.replace(iterations=1, strict=True)),
+        lambda: solve_graphs([graph, graph], options=GRAPH_OPTIONS.replace(iterations=1, strict=True)),
     ):
         with pytest.raises(ConvergenceError, match=r"frames: .* not converged"):
             solve()
@@ -439,7 +450,7 @@ def test_factors_and_depths_of_a_graph_determine_the_scale_of_every_submap():
         ((graph.submap == submap) & graph.is_keyframe).nonzero().squeeze(-1) for submap in graph.submaps
     ]
     frames = torch.stack((keyframes[0][:-1], keyframes[0][1:]), dim=-1)
-    exact = solve_graph(graph, "none", iterations=200, tolerance=1e-20)
+    exact = solve_graph(graph, options=GRAPH_OPTIONS.replace(kernel="none", iterations=200, tolerance=1e-20))
 
     def centers(solution, rows):
         return se3_inverse(solution.T_cw)[rows, :3, 3]
@@ -451,7 +462,12 @@ def test_factors_and_depths_of_a_graph_determine_the_scale_of_every_submap():
     depths = 1.2 * (seen.sum(-1) + exact.T_cw[graph.frame_index, 2, 3])
     information = torch.where(graph.submap[graph.frame_index] == graph.submaps[1], 1e4, 0.0).double()
     prior = DepthPrior(depths.detach(), information)
-    solution = solve_graph(graph, "none", strict=True, frame_factors=factors, depth_prior=prior)
+    solution = solve_graph(
+        graph,
+        frame_factors=factors,
+        depth_prior=prior,
+        options=GRAPH_OPTIONS.replace(kernel="none", strict=True),
+    )
     for rows in keyframes:
         grown = centers(solution, rows) - centers(solution, rows[:1])
         before = centers(exact, rows) - centers(exact, rows[:1])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.optim.test_run_graph import aligned_error, simulated, two_submaps
 from torchslam.geometry import Camera
-from torchslam.optim import run_graph
+from torchslam.optim import GRAPH_OPTIONS, run_graph
 from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph, solve_graphs
 
 SIZES = ((10, 50, 0), (8, 40, 1), (7, 60, 2))
@@ -86,12 +86,14 @@ def test_convergence_is_reported_per_graph_and_submap() -> None:
     there = replace(apart, T_cw=ends.T_cw, points_w=ends.points_w)
     second = (apart.submap == 1)[:, None, None]
     half = replace(there, T_cw=torch.where(second, apart.T_cw, there.T_cw))
-    found = solve_graphs([graph, half, there], iterations=2)
+    found = solve_graphs([graph, half, there], options=GRAPH_OPTIONS.replace(iterations=2))
     assert [bool(each.converged.any()) for each in found] == [False, True, True]
     assert torch.equal(found[1].converged, apart.submap == 4)
     assert found[2].converged.all()
     for each, alone in zip(found, (graph, half, there), strict=True):
-        assert torch.equal(each.converged, solve_graph(alone, iterations=2).converged)
+        assert torch.equal(
+            each.converged, solve_graph(alone, options=GRAPH_OPTIONS.replace(iterations=2)).converged
+        )
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy"])
@@ -106,7 +108,11 @@ def test_gradients_in_a_batch_equal_those_of_single_solves(kernel: str) -> None:
             camera = graph.camera.with_params(own[2])
             moved.append(replace(graph, pixels=own[0], weights=own[1], camera=camera))
             leaves += own
-        found = solve_graphs(moved, kernel) if together else [solve_graph(graph, kernel) for graph in moved]  # type: ignore[arg-type]
+        found = (
+            solve_graphs(moved, options=GRAPH_OPTIONS.replace(kernel=kernel))
+            if together
+            else [solve_graph(graph, options=GRAPH_OPTIONS.replace(kernel=kernel)) for graph in moved]
+        )  # type: ignore[arg-type]
         loss = sum(aligned_error(one, truth) for one, truth in zip(found, truths, strict=True))
         return list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]
 
@@ -138,13 +144,13 @@ def test_padding_is_bounded_by_a_few_times_the_graph_size(monkeypatch: pytest.Mo
     graphs = [large[0], *small, large[1]]
     expected = [solve_graph(graph) for graph in graphs]
     batches = []
-    adjust = run_graph.bundle_adjust
+    adjust = run_graph.solve_bundle
 
     def counting(problem, *options):  # type: ignore[no-untyped-def]
         batches.append(tuple(problem.points_w.shape[:2]))
         return adjust(problem, *options)
 
-    monkeypatch.setattr(run_graph, "bundle_adjust", counting)
+    monkeypatch.setattr(run_graph, "solve_bundle", counting)
     for found, alone in zip(solve_graphs(graphs), expected, strict=True):
         assert_alike(found, alone)
     assert sorted((count, points > 100) for count, points in batches) == [(2, True), (3, False)]

@@ -229,8 +229,8 @@ def calls() -> dict[str, Call]:
         "squared_reprojection_errors": of(
             g.squared_reprojection_errors, points_c=points_c, pixels=v["pixels_2"], camera=CAMERA
         ),
-        "refine_pose": of(
-            o.refine_pose,
+        "solve_pose": of(
+            o.solve_pose,
             T_cw=T_2 @ se3_exp(0.01 * rand(B, 6)),
             points_w=v["points_w"],
             pixels=v["pixels_2"],
@@ -239,10 +239,10 @@ def calls() -> dict[str, Call]:
             mask=v["mask"],
             prior=o.PosePrior(T_2, torch.eye(6, dtype=F64).repeat(B, 1, 1)),
         ),
-        "bundle_adjust": Call(o.bundle_adjust, {"problem": bundle()}),
-        "pose_graph_optimize": of(o.pose_graph_optimize, graph=graph()),
-        "average_rotations": Call(
-            o.average_rotations,
+        "solve_bundle": Call(o.solve_bundle, {"problem": bundle()}),
+        "solve_pose_graph": of(o.solve_pose_graph, graph=graph()),
+        "solve_rotations": Call(
+            o.solve_rotations,
             {
                 "edges": edges,
                 "R_ji": R_cw[edges[:, 1]] @ R_cw[edges[:, 0]].mT @ so3_exp(0.01 * rand(4, 3)),
@@ -251,8 +251,8 @@ def calls() -> dict[str, Call]:
             },
             vmap=False,
         ),
-        "position_globally": Call(
-            o.position_globally,
+        "solve_positions": Call(
+            o.solve_positions,
             {
                 "view_index": seen[:, 0],
                 "point_index": seen[:, 1],
@@ -265,8 +265,8 @@ def calls() -> dict[str, Call]:
             },
             vmap=False,
         ),
-        "minimize": of(
-            o.minimize,
+        "solve_least_squares": of(
+            o.solve_least_squares,
             residual=line,
             start=torch.zeros(B, 2, dtype=F64),
             inputs=(rand(B, N), ones),

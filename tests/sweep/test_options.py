@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import inspect
 import math
+from typing import Any
 
 import pytest
 import torch
 
 from tests.sweep.calls import CAMERA, Call, calls
 from torchslam.geometry import umeyama
+from torchslam.optim import POSE_OPTIONS
 
 CALLS = calls()
 WRONG: dict[str, tuple[float, ...]] = {
@@ -29,11 +31,8 @@ CASES = [
     for name, call in CALLS.items()
     for option in inspect.signature(call.function).parameters
     for value in WRONG.get(option, ())
-    if (name, option) not in {(each, "tolerance") for each in ("refine_pose", "bundle_adjust", "minimize")}
-    and (
-        option != "tolerance" or name not in ("pose_graph_optimize", "average_rotations", "position_globally")
-    )
 ]
+SOLVERS = [name for name, call in CALLS.items() if "options" in inspect.signature(call.function).parameters]
 
 
 @pytest.mark.usefixtures("without_shape_checks")
@@ -43,13 +42,36 @@ def test_a_senseless_number_is_refused(call: Call, option: str, value: float) ->
         call.function(**{**call.arguments, option: value})
 
 
+@pytest.mark.parametrize("value", WRONG["scale"])
+@pytest.mark.parametrize("name", SOLVERS)
+def test_a_senseless_scale_of_a_solver_is_refused(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=rf"scale must be .*{value}"):
+        CALLS[name].function(**CALLS[name].arguments, options=POSE_OPTIONS.replace(scale=value))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kernel": "l2"}, "unknown kernel 'l2'; known are none, huber"),
+        ({"iterations": -1}, "iterations must not be below zero, got -1"),
+        ({"tolerance": -1.0}, "tolerance must not be below zero"),
+        ({"tolerance": math.nan}, "tolerance must not be below zero, got nan"),
+        ({"backward": "exact"}, "unknown backward mode 'exact'"),
+    ],
+)
+@pytest.mark.usefixtures("without_shape_checks")
+def test_senseless_options_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        POSE_OPTIONS.replace(**change)
+
+
 def test_a_scale_of_another_dtype_is_a_number() -> None:
-    call = CALLS["refine_pose"]
-    expected = call.function(**call.arguments, scale=2.0)
-    found = call.function(**call.arguments, scale=torch.tensor(2.0))
+    call = CALLS["solve_pose"]
+    expected = call.function(**call.arguments, options=POSE_OPTIONS.replace(scale=2.0))
+    found = call.function(**call.arguments, options=POSE_OPTIONS.replace(scale=torch.tensor(2.0)))
     assert torch.equal(found.T_cw, expected.T_cw)
     with pytest.raises(ValueError, match=r"scale must be above zero, not -2.0"):
-        call.function(**call.arguments, scale=torch.tensor(-2.0))
+        call.function(**call.arguments, options=POSE_OPTIONS.replace(scale=torch.tensor(-2.0)))
 
 
 def test_weights_that_are_not_positive_do_not_count() -> None:

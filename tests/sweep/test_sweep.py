@@ -297,7 +297,7 @@ def test_vmap(call: Call) -> None:
         torch.testing.assert_close(a[1], b, rtol=1e-6, atol=1e-8, equal_nan=True)
 
 
-SOLVERS = ("refine_pose", "bundle_adjust", "pose_graph_optimize", "average_rotations", "minimize")
+SOLVERS = ("solve_pose", "solve_bundle", "solve_pose_graph", "solve_rotations", "solve_least_squares")
 
 
 @pytest.mark.parametrize("name", SOLVERS)

@@ -20,16 +20,17 @@ from torchslam import Features, evaluation, geometry
 from torchslam import optim as solvers
 from torchslam.geometry import Camera, rigid, se3_exp, sim3_exp, so3_exp
 from torchslam.optim import (
+    LEAST_SQUARES_OPTIONS,
     BundleProblem,
     PosePrior,
-    average_rotations,
-    bundle_adjust,
     log_distance_error,
-    minimize,
-    pose_graph_optimize,
-    position_globally,
-    refine_pose,
     relative_pose_error,
+    solve_bundle,
+    solve_least_squares,
+    solve_pose,
+    solve_pose_graph,
+    solve_positions,
+    solve_rotations,
 )
 from torchslam.optim.run_graph import solve_graph
 
@@ -121,9 +122,16 @@ def estimator_cases() -> dict[str, Case]:
             ),
             (points_w, pixels, params),
         ),
-        "triangulate": (with_camera(geometry.triangulate, 2), (*pair, params)),
+        "triangulate": (
+            with_camera(
+                lambda T_1w, T_2w, pixels_1, pixels_2, camera: geometry.triangulate(
+                    pixels_1, pixels_2, T_1w=T_1w, T_2w=T_2w, camera_1=camera, camera_2=camera
+                )
+            ),
+            (*pair, params),
+        ),
         "triangulate_many": (
-            with_camera(lambda pixels, T, camera: geometry.triangulate_many(T, pixels, camera)),
+            with_camera(lambda pixels, T, camera: geometry.triangulate_many(pixels, T_cw=T, camera=camera)),
             (*many, params),
         ),
         "triangulation_covariance": (
@@ -170,7 +178,7 @@ def solver_cases() -> dict[str, Case]:
 
     def refine(start: Tensor, points: Tensor, pixels: Tensor, params: Tensor, information: Tensor) -> Any:
         camera, prior = Camera("pinhole", params, (640, 480)), PosePrior(start.detach(), information)
-        return refine_pose(start, points, pixels, camera, prior=prior)
+        return solve_pose(points, pixels, T_cw=start, camera=camera, prior=prior)
 
     def cast(graph: Any, like: Tensor) -> Any:
         tensors = {field.name: getattr(graph, field.name) for field in fields(graph)}
@@ -181,9 +189,7 @@ def solver_cases() -> dict[str, Case]:
 
     def bundle(T_cw: Tensor, points: Tensor, pixels: Tensor, params: Tensor) -> Any:
         camera = replace(graph.camera, params=params)
-        return bundle_adjust(
-            BundleProblem(T_cw, points, graph.frame_index, graph.point_index, pixels, camera)
-        )
+        return solve_bundle(BundleProblem(T_cw, points, graph.frame_index, graph.point_index, pixels, camera))
 
     def solve(pixels: Tensor, params: Tensor) -> Any:
         camera = replace(graph.camera, params=params)
@@ -193,12 +199,18 @@ def solver_cases() -> dict[str, Case]:
         def residual(T: Tensor, points: Tensor, targets: Tensor) -> Tensor:
             return geometry.transform(T, points) - targets
 
-        return minimize(residual, start.detach(), (points, targets), "se3", kernel="cauchy")
+        return solve_least_squares(
+            residual,
+            start.detach(),
+            (points, targets),
+            "se3",
+            options=LEAST_SQUARES_OPTIONS.replace(kernel="cauchy"),
+        )
 
     return {
-        "minimize": (align, (start, points_w, points_w + 0.1 * normal(*points_w.shape, seed=8))),
-        "refine_pose": (refine, (start, points_w, pixels, params, spd(6)[:1])),
-        "bundle_adjust": (bundle, (graph.T_cw, graph.points_w, graph.pixels, graph.camera.params)),
+        "solve_least_squares": (align, (start, points_w, points_w + 0.1 * normal(*points_w.shape, seed=8))),
+        "solve_pose": (refine, (start, points_w, pixels, params, spd(6)[:1])),
+        "solve_bundle": (bundle, (graph.T_cw, graph.points_w, graph.pixels, graph.camera.params)),
         "relative_pose_error": (
             relative_pose_error, (se3_exp(0.3 * normal(2, 6)), start, se3_exp(0.3 * normal(2, 6, seed=3)))
         ),
@@ -206,14 +218,14 @@ def solver_cases() -> dict[str, Case]:
             log_distance_error, (se3_exp(0.3 * normal(2, 6)), se3_exp(normal(2, 6, seed=4)), 1 + normal(2).square())
         ),
         "solve_graph": (solve, (graph.pixels, graph.camera.params)),
-        "pose_graph_optimize": (
-            lambda S: pose_graph_optimize(replace(cast(pose_graph, S), S_ji=S)), (pose_graph.S_ji,)
+        "solve_pose_graph": (
+            lambda S: solve_pose_graph(replace(cast(pose_graph, S), S_ji=S)), (pose_graph.S_ji,)
         ),
-        "average_rotations": (
-            lambda R: average_rotations(torch.tensor(((0, 1), (1, 2), (0, 2))), R, 3), (so3_exp(0.1 * normal(3, 3)),)
+        "solve_rotations": (
+            lambda R: solve_rotations(torch.tensor(((0, 1), (1, 2), (0, 2))), R, 3), (so3_exp(0.1 * normal(3, 3)),)
         ),
-        "position_globally": (
-            lambda rays_w: position_globally(*torch.cartesian_prod(torch.arange(4), torch.arange(9)).T, rays_w, 4, 9),
+        "solve_positions": (
+            lambda rays_w: solve_positions(*torch.cartesian_prod(torch.arange(4), torch.arange(9)).T, rays_w, 4, 9),
             ((4 * unit(9, 3) - normal(4, 1, 3, seed=1)).flatten(0, 1),),
         ),
     }  # fmt: skip
@@ -282,7 +294,7 @@ def test_autocast_does_not_change_results(name: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["refine_pose", "bundle_adjust", "solve_graph", "pose_graph_optimize", "minimize"]
+    "name", ["solve_pose", "solve_bundle", "solve_graph", "solve_pose_graph", "minimize"]
 )
 def test_autocast_does_not_affect_the_backward_pass(name: str) -> None:
     function, inputs = CASES[name]

@@ -182,7 +182,7 @@ def test_gradients_reach_the_information(kind: str) -> None:
         with torch.no_grad():
             eyes.falloff.fill_(falloff)
         poses = clip_slam(images, walk.camera, graph)
-        return ate(poses.T_cw, truth, poses.posed)
+        return ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
 
     loss(1.0).backward()
     assert eyes.falloff.grad is not None

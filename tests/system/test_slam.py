@@ -33,6 +33,7 @@ from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import AsyncBundleAdjustment
 from torchslam.mapping.mapper import MapInitializer
+from torchslam.optim import GRAPH_OPTIONS
 from torchslam.system.front_end import Simulated
 from torchslam.system.modes import Mode
 from torchslam.tracking.localizer import Localizer
@@ -353,7 +354,7 @@ def test_the_trajectory_of_a_run_minimizes_its_graph() -> None:
     graph = run.graph
     assert int(graph.is_keyframe.sum()) == run.map.num_keyframes
     assert len(graph.timestamps) == 20
-    solution = solve_graph(graph, backward="detached")
+    solution = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached"))
     assert torch.allclose(solution.trajectory.timestamps, run.trajectory.timestamps)
     assert torch.allclose(solution.trajectory.T_wc, run.trajectory.T_wc, atol=1e-5)
 
@@ -365,8 +366,8 @@ def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
     def error(fx: torch.Tensor, pixels: torch.Tensor) -> torch.Tensor:
         params = torch.cat([fx[None], graph.camera.params[1:]])
         moved = replace(graph, camera=graph.camera.with_params(params), pixels=pixels)
-        solution = solve_graph(moved, tolerance=1e-14, iterations=60)
-        return ate(solution.T_cw, true_T_cw(walk)[graph.frame_ids])
+        solution = solve_graph(moved, options=GRAPH_OPTIONS.replace(iterations=60, tolerance=1e-14))
+        return ate(T_cw=solution.T_cw, T_cw_groundtruth=true_T_cw(walk)[graph.frame_ids])
 
     fx = graph.camera.params[0].clone().requires_grad_()
     pixels = graph.pixels.clone().requires_grad_()

@@ -29,7 +29,7 @@ from torchslam.geometry.camera_measurement import (
     simplify_model,
     with_radial_terms,
 )
-from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.run_graph import ObservationGraph
 
 # A distortion coefficient must lower the cost by this ratio; a smaller gain may also come from an error of the focal
@@ -247,12 +247,14 @@ def adjust_with_camera(
     problem: BundleProblem, which: list[int], iterations: int = ITERATIONS
 ) -> BundleSolution:
     """Minimize the robust cost over poses, points and the selected parameters of the camera."""
-    return bundle_adjust(
+    return solve_bundle(
         problem,
-        "huber",
-        KERNEL_SCALE,
-        intrinsics_directions(problem.camera, which),
-        "detached",
-        iterations,
-        TOLERANCE,
+        free_camera=intrinsics_directions(problem.camera, which),
+        options=BUNDLE_OPTIONS.replace(
+            kernel="huber",
+            scale=KERNEL_SCALE,
+            iterations=iterations,
+            tolerance=TOLERANCE,
+            backward="detached",
+        ),
     )

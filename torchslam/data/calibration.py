@@ -14,9 +14,9 @@ from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
 from torchslam.utils.files import write_whole
 
-COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "fisheye": (8,)}
+COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "rational": (12,), "fisheye": (8,)}
 """Numbers of parameters that a text may have, by camera model."""
-NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
+NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
 
 Size = tuple[int, int]
 
@@ -32,7 +32,7 @@ class Calibration:
     """A camera whose image size may not be known yet.
 
     Attributes:
-        model: "pinhole", "radial_tangential" or "fisheye".
+        model: "pinhole", "radial_tangential", "rational" or "fisheye".
         params: fx fy cx cy in pixels, and all distortion coefficients of the model. A guess has fx alone, in `unit`:
             no distortion, centered principal point. That of EXIF has nothing before the first image is known.
         source: origin of the numbers, for messages.
@@ -63,11 +63,11 @@ class Calibration:
         Raises CalibrationError for a wrong count, a number that is not finite, and a focal length or a size that is not
         positive.
         """
-        counts = COUNTS[model] if model else (4, 8, 9)
+        counts = COUNTS[model] if model else (4, 8, 9, 12)
         if len(numbers) not in counts:
             raise CalibrationError(f"{source}: expected {NUMBERS}, got {len(numbers)} numbers")
         if not all(map(math.isfinite, numbers)):
-            raise CalibrationError(f"{source}: the parameters must be finite, got {numbers[:9]}")
+            raise CalibrationError(f"{source}: the parameters must be finite, got {numbers[:12]}")
         if numbers[0] <= 0 or numbers[1] <= 0:
             raise CalibrationError(
                 f"{source}: focal lengths must be positive, got {numbers[0]:g} and {numbers[1]:g}"
@@ -76,7 +76,9 @@ class Calibration:
             raise CalibrationError(
                 f"{source}: the size of the images must be positive, got {size_text(size)}"
             )
-        if model is None and any(numbers[4:]):
+        if model is None and any(numbers[9:]):
+            model = "rational"
+        elif model is None and any(numbers[4:]):
             model = "radial_tangential"
         elif model is None:
             model, numbers = "pinhole", numbers[:4]
@@ -143,7 +145,7 @@ GivenCamera = Camera | Calibration
 
 
 def parse_numbers(text: str, source: str) -> Calibration:
-    """Parse `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]` or `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`.
+    """Parse `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]` or `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`.
 
     Raises CalibrationError naming `source`.
     """
@@ -174,8 +176,8 @@ def read_numbers(path: Path) -> Calibration:
     number, line = _first_line(distortion)
     where = f"{distortion}:{number}"
     numbers = parse_floats(line, where, CalibrationError)
-    if len(numbers) not in (4, 5):
-        raise CalibrationError(f"{where}: expected k1 k2 p1 p2 [k3], got {len(numbers)} numbers")
+    if len(numbers) not in (4, 5, 8):
+        raise CalibrationError(f"{where}: expected k1 k2 p1 p2 [k3 [k4 k5 k6]], got {len(numbers)} numbers")
     whole = Calibration.from_numbers([*calibration.params, *numbers], calibration.source)
     return replace(whole, size=calibration.size, std=calibration.std)
 
@@ -249,6 +251,7 @@ FOCAL_STD = "relative standard error of the focal length"
 PARAMETER_NAMES = {
     "pinhole": "fx fy cx cy",
     "radial_tangential": "fx fy cx cy k1 k2 p1 p2 k3",
+    "rational": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
     "fisheye": "fx fy cx cy k1 k2 k3 k4",
 }
 

@@ -62,7 +62,7 @@ def parse_camera(text: str, size: Size, example: Path | None = None) -> Camera:
     """Parse a `--camera` argument for images of `size` (width, height).
 
     Args:
-        text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3]]`, `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`, a focal length as `f=0.8w`
+        text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]`, `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`, a focal length as `f=0.8w`
             (widths of the image) or `f=500` (pixels), `fov=65` (horizontal, degrees), a preset such as
             `tum-fr1`, `exif`, `auto` (unknown), or a file (`read_calibration`)
         example: an image file, for `exif`

@@ -123,7 +123,7 @@ class Sequence(ABC):
         if self._camera is None:
             raise CalibrationError(
                 f"{self.name}: the camera is unknown ({self.kind}); give it with "
-                "--camera fx,fy,cx,cy[,k1,k2,p1,p2,k3], a calibration file, a preset such as tum-fr1, "
+                "--camera fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]], a calibration file, a preset such as tum-fr1, "
                 "or a guess: fov=65 (degrees), f=0.8w (image widths), exif"
             )
         return self._camera

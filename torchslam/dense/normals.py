@@ -21,7 +21,9 @@ LEAST_SHARE = 0.3
 """Of a window that must be known."""
 
 
-def normals(depth: Float[Tensor, "B H W"], camera: Camera, radius: int = RADIUS) -> Float[Tensor, "B 3 H W"]:
+def depth_normals(
+    depth: Float[Tensor, "B H W"], camera: Camera, radius: int = RADIUS
+) -> Float[Tensor, "B 3 H W"]:
     """Compute unit normals in the camera frame, facing the camera; 0 where they or the depth are unknown.
 
     Differentiable with respect to depth and camera.

@@ -28,7 +28,7 @@ from torchslam.dense.depth_maps import DepthMaps, join, read_about
 from torchslam.dense.estimate import estimate_depth
 from torchslam.dense.fusion import CloudFusion
 from torchslam.dense.learned import learned_confidence
-from torchslam.dense.normals import normals
+from torchslam.dense.normals import depth_normals
 from torchslam.densify.pictures import write_picture
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
 from torchslam.errors import ResultsError
@@ -208,7 +208,7 @@ def _write_merged(job: DenseJob, view: int) -> None:
     maps = DepthMaps(
         frame_index=views.frame_index[view, None],
         depth=depth[None],
-        normal=normals(depth[None], camera),
+        normal=depth_normals(depth[None], camera),
         confidence=torch.where(is_kept, probability, 0.0)[None],
         T_cw=views.T_cw[view, None],
         camera=views.camera,

@@ -9,11 +9,11 @@ from typing import Protocol, runtime_checkable
 import torch
 from jaxtyping import Bool, Float, Shaped
 from torch import Tensor
-from torch._C import _are_functorch_transforms_active
 
 from torchslam.errors import ConfigError, FrameError
 from torchslam.geometry.gating import is_definite
 from torchslam.types import Features
+from torchslam.utils.torch_internals import in_transform
 
 COLUMNS: dict[str, tuple[int, ...]] = {
     "keypoints": (2,),
@@ -61,7 +61,7 @@ def check_gray(images: Shaped[Tensor, "*batch"], name: str) -> None:
         raise FrameError(
             f"{name} must be floats in [0, 1], not {images.dtype}: divide by what is white, 255 for uint8"
         )
-    if images.numel() == 0 or _are_functorch_transforms_active() or torch.compiler.is_compiling():
+    if images.numel() == 0 or in_transform() or torch.compiler.is_compiling():
         return
     low, high = images.detach().aminmax()
     if not bool((low >= -_OVER) & (high <= 1 + _OVER)):  # also for NaN

@@ -1,4 +1,4 @@
-"""Camera models: pinhole, radial-tangential (Brown-Conrady) and fisheye (Kannala-Brandt).
+"""Camera models: pinhole, radial-tangential (Brown-Conrady), rational (OpenCV) and fisheye (Kannala-Brandt).
 
 Camera frame: x right, y down, z forward. Pixel (0, 0) is the center of the top left pixel.
 """
@@ -9,17 +9,17 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch._C import _are_functorch_transforms_active
-from torch.utils import _pytree
-from torch.utils.data._utils.collate import default_collate_fn_map
 
 from torchslam.geometry import distortion
 from torchslam.geometry.precision import without_autocast
+from torchslam.utils.torch_internals import default_collate_fn_map, in_transform, register_pytree
 
 Scalar = float | Tensor
+Numbers = Tensor | np.ndarray | Sequence[Any]
 
 
 @dataclass(frozen=True)
@@ -31,9 +31,10 @@ class Camera:
     `torch.utils.data.default_collate` accept it.
 
     Attributes:
-        model: "pinhole", "radial_tangential" or "fisheye".
+        model: "pinhole", "radial_tangential", "rational" or "fisheye".
         params: fx, fy, cx, cy in pixels, then the distortion as OpenCV orders and defines it: none for a
-            pinhole, k1, k2, p1, p2, k3 for radial_tangential, k1, k2, k3, k4 for fisheye.
+            pinhole, k1, k2, p1, p2, k3 for radial_tangential, these and k4, k5, k6 for rational, k1, k2, k3, k4 for
+            fisheye.
         size: (width, height) in pixels.
     """
 
@@ -93,6 +94,56 @@ class Camera:
         """An equidistant fisheye camera with a polynomial in the angle, as OpenCV's fisheye model."""
         return Camera("fisheye", _stack(fx, fy, cx, cy, k1, k2, k3, k4), size)
 
+    @staticmethod
+    def from_opencv(
+        K: Numbers,
+        dist: Numbers | None,
+        size: tuple[int, int],
+        *,
+        fisheye: bool = False,
+    ) -> Camera:
+        """The camera of a matrix and distortion coefficients, as `cv2.calibrateCamera` returns them.
+
+        Args:
+            K: camera matrix (..., 3, 3), without skew.
+            dist: none, or 4, 5 or 8 coefficients k1, k2, p1, p2[, k3[, k4, k5, k6]] in any of OpenCV's shapes,
+                or (..., n) for (..., 3, 3); more, of a thin prism and a tilted sensor, must be zero. None is no
+                distortion. Eight make the model "rational".
+            size: (width, height) in pixels.
+            fisheye: the four coefficients are those of `cv2.fisheye`.
+
+        Raises:
+            ValueError: The matrix is not (..., 3, 3), has a skew or another last row than 0, 0, 1, or the coefficients
+                are of another number or not zero from the ninth on.
+        """
+        K = K if isinstance(K, Tensor) else torch.as_tensor(np.asarray(K))
+        K = K if K.is_floating_point() else K.double()
+        if K.shape[-2:] != (3, 3):
+            raise ValueError(f"K must be (..., 3, 3), not {tuple(K.shape)}")
+        if bool((K[..., 0, 1] != 0).any()) or bool((K[..., 1:, 0] != 0).any()):
+            raise ValueError("K has a skew, or entries below its diagonal, which no camera model here has")
+        if bool((K[..., 2, :] != K.new_tensor((0.0, 0.0, 1.0))).any()):
+            raise ValueError("the last row of K must be 0, 0, 1")
+        pinhole = torch.stack((K[..., 0, 0], K[..., 1, 1], K[..., 0, 2], K[..., 1, 2]), dim=-1)
+        k = torch.as_tensor([] if dist is None else dist, dtype=K.dtype, device=K.device)
+        k = k.flatten() if K.ndim == 2 else k
+        allowed = (0, 4) if fisheye else (0, 4, 5, 8, 12, 14)
+        if k.shape[-1] not in allowed:
+            raise ValueError(
+                f"OpenCV's {'fisheye ' * fisheye}distortion has {', '.join(map(str, allowed))} coefficients, "
+                f"not {k.shape[-1]}"
+            )
+        if bool((k[..., 8:] != 0).any()):
+            raise ValueError(
+                "coefficients from the ninth on, of a thin prism and a tilted sensor, are not modeled: calibrate "
+                "without them, or undistort the images"
+            )
+        by_count = {0: "pinhole", 4: "radial_tangential", 5: "radial_tangential"}
+        model = "fisheye" if fisheye else by_count.get(k.shape[-1], "rational")
+        count = distortion.MODELS[model].num_params
+        k = torch.nn.functional.pad(k[..., :count], (0, max(0, count - k.shape[-1])))
+        return Camera(model, torch.cat((pinhole, k.expand(*pinhole.shape[:-1], count)), dim=-1), size)
+
     @property
     def fx(self) -> Float[Tensor, "*batch"]:
         """Focal length along x, pixels."""
@@ -139,7 +190,7 @@ class Camera:
     def limit(self) -> Float[Tensor, "*batch"]:
         """Extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
         k = self.params.detach()[..., 4:]
-        if torch.compiler.is_compiling() or _are_functorch_transforms_active():
+        if torch.compiler.is_compiling() or in_transform():
             return self._distortion.limit(k)
         # Kept, since it takes longer than the distortion itself, until an optimizer changes the parameters in place.
         known = self.__dict__.get("_limit")
@@ -315,11 +366,6 @@ def _flatten(camera: Camera) -> tuple[list[Any], tuple[str, tuple[int, int]]]:
     return [camera.params], (camera.model, camera.size)
 
 
-def _flatten_with_keys(camera: Camera) -> tuple[list[tuple[_pytree.KeyEntry, Any]], Any]:
-    leaves, structure = _flatten(camera)
-    return [(_pytree.GetAttrKey("params"), leaf) for leaf in leaves], structure
-
-
 def _unflatten(leaves: Iterable[Any], structure: tuple[str, tuple[int, int]]) -> Camera:
     """Unchecked: trees hold other things than tensors, too, such as dimensions."""
     camera = object.__new__(Camera)
@@ -335,5 +381,5 @@ def _collate(cameras: Sequence[Camera], *, collate_fn_map: object = None) -> Cam
 
 # A camera is a pytree of its parameters for `torch.func` and `default_collate`. Model and size are structure: they must
 # agree where trees are compared, and in a batch.
-_pytree.register_pytree_node(Camera, _flatten, _unflatten, flatten_with_keys_fn=_flatten_with_keys)
+register_pytree(Camera, "params", _flatten, _unflatten)
 default_collate_fn_map[Camera] = _collate

@@ -11,13 +11,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch._C import _are_functorch_transforms_active
 
 from torchslam.geometry.estimate_gradients import needs_gradient
+from torchslam.utils.torch_internals import in_transform
 
 _NEWTON_STEPS = 12
 """Of the inverse map; more are needed close to the limit of the model. Tried at this value only."""
@@ -68,7 +69,7 @@ def _converged(step: Tensor) -> bool:
 
     Under `torch.func`, where no decision may depend on values, all steps are taken.
     """
-    if _are_functorch_transforms_active():
+    if in_transform():
         return False
     return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.5
 
@@ -162,12 +163,19 @@ def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
     return _stack_columns(*columns).unflatten(-1, (2, 5))
 
 
-def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) -> Tensor:
+def _invert(
+    distort: Callable[[Tensor, Tensor], Tensor],
+    slope: Callable[[Tensor, Tensor], Tensor],
+    distorted: Tensor,
+    k: Tensor,
+    limit: Tensor,
+) -> Tensor:
+    """Undistorted coordinates by Newton's method, for a model whose limit is a radius."""
     with torch.no_grad():
         xy = distorted / length(distorted)[..., None].clamp_min(1.0)  # no start far outside
         edge = torch.where(torch.isfinite(limit), 0.999 * limit, 1e3)[..., None]
         for _ in range(_NEWTON_STEPS):
-            step = _implicit_step(_radial_tangential_slope(xy, k), _radial_tangential(xy, k) - distorted)
+            step = _implicit_step(slope(xy, k), distort(xy, k) - distorted)
             xy = xy + step
             xy = xy * (edge / length(xy)[..., None].clamp_min(1e-12)).clamp_max(1.0)
             if _converged(step):
@@ -176,7 +184,7 @@ def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) ->
         return xy
     clamped = length(xy)[..., None] >= edge * (1 - 1e-9)
     for _ in range(_GRAPH_STEPS):
-        step = _implicit_step(_radial_tangential_slope(xy, k), _radial_tangential(xy, k) - distorted)
+        step = _implicit_step(slope(xy, k), distort(xy, k) - distorted)
         xy = xy + torch.where(clamped, 0.0, step - step.detach())
     return xy
 
@@ -184,6 +192,66 @@ def _radial_tangential_undistort(distorted: Tensor, k: Tensor, limit: Tensor) ->
 def _radial_tangential_limit(k: Tensor) -> Tensor:
     """The radius at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing."""
     return first_positive_root(torch.stack((3 * k[..., 0], 5 * k[..., 1], 7 * k[..., 4]), dim=-1)).sqrt()
+
+
+# --- rational: the radial factor over 1 + k4 r^2 + k5 r^4 + k6 r^6 (Claus and Fitzgibbon, 2005, as in OpenCV) ---
+
+
+def _denominator(r2: Tensor, k: Tensor) -> Tensor:
+    return 1 + r2 * (k[..., 5] + r2 * (k[..., 6] + r2 * k[..., 7]))
+
+
+def _rational(xy: Tensor, k: Tensor) -> Tensor:
+    x, y = xy.unbind(-1)
+    p1, p2 = k[..., 2], k[..., 3]
+    r2, xy2 = x * x + y * y, 2 * x * y
+    radial = _radial_factor(r2, k) / _denominator(r2, k)
+    return _stack_columns(
+        x * radial + p1 * xy2 + p2 * (r2 + 2 * x * x), y * radial + p2 * xy2 + p1 * (r2 + 2 * y * y)
+    )
+
+
+def _rational_slope(xy: Tensor, k: Tensor) -> Tensor:
+    """d distorted / d xy. (..., 2, 2)."""
+    x, y = xy.unbind(-1)
+    k1, k2, p1, p2, k3, k4, k5, k6 = k.unbind(-1)
+    r2 = x * x + y * y
+    below = _denominator(r2, k)
+    radial = _radial_factor(r2, k) / below
+    slope_above = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    slope_below = k4 + r2 * (2 * k5 + r2 * 3 * k6)
+    slope = 2 * (slope_above - radial * slope_below) / below  # d radial / d x = slope x
+    cross = slope * x * y + 2 * (p1 * x + p2 * y)
+    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
+    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
+    return _stack_columns(xx, cross, cross, yy).unflatten(-1, (2, 2))
+
+
+def _rational_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
+    """d distorted / d k. (..., 2, 8)."""
+    r2 = xy.square().sum(-1)
+    below = _denominator(r2, k)
+    radial = _radial_factor(r2, k) / below
+    tangential = _radial_tangential_coefficient_slope(xy, k)[..., 2:4]
+    powers = torch.stack((r2, r2 * r2, r2 * r2 * r2), dim=-1) / below[..., None]
+    above = xy[..., None] * powers[..., None, :]  # k1, k2, k3; those of k4, k5, k6 differ by a factor
+    return torch.cat((above[..., :2], tangential, above[..., 2:], -radial[..., None, None] * above), dim=-1)
+
+
+def _rational_limit(k: Tensor) -> Tensor:
+    """The radius at which r N / D, with N and D polynomials in u = r^2, stops growing, or D vanishes.
+
+    Its derivative is (N D + 2 u (N' D - N D')) / D^2.
+    """
+    one = torch.ones_like(k[..., :1])
+    above = torch.cat((one, k[..., :2], k[..., 4:5]), dim=-1)
+    below = torch.cat((one, k[..., 5:]), dim=-1)
+    terms: list[Tensor] = [torch.zeros_like(k[..., 0]) for _ in range(7)]
+    for i in range(4):
+        for j in range(4):
+            terms[i + j] = terms[i + j] + (1 + 2 * (i - j)) * above[..., i] * below[..., j]
+    turning = first_positive_root(torch.stack(terms[1:], dim=-1))
+    return torch.minimum(turning, first_positive_root(below[..., 1:])).sqrt()
 
 
 # --- fisheye (Kannala and Brandt, 2006) ---
@@ -268,8 +336,17 @@ MODELS = {
         _radial_tangential,
         _radial_tangential_slope,
         _radial_tangential_coefficient_slope,
-        _radial_tangential_undistort,
+        partial(_invert, _radial_tangential, _radial_tangential_slope),
         _radial_tangential_limit,
+        torch.abs,
+    ),
+    "rational": Distortion(
+        8,
+        _rational,
+        _rational_slope,
+        _rational_coefficient_slope,
+        partial(_invert, _rational, _rational_slope),
+        _rational_limit,
         torch.abs,
     ),
     "fisheye": Distortion(

@@ -1,6 +1,6 @@
 """First derivatives of what an estimator found, by the implicit function theorem where it is a minimizer.
 
-Those of any order, of minima of least squares: `optim._core.implicit`.
+Those of any order, of minima of least squares: `torchslam.optim._core.implicit`.
 """
 
 from __future__ import annotations
@@ -11,14 +11,14 @@ from typing import Any
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch._C import _are_functorch_transforms_active
-from torch.autograd import forward_ad
+
+from torchslam.utils.torch_internals import in_forward_mode, in_transform
 
 
 def needs_gradient(*tensors: Tensor) -> bool:
     """Test whether a graph is being recorded for any of the tensors, or may be by forward mode."""
     recorded = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors)
-    return recorded or _are_functorch_transforms_active() or forward_ad._current_level >= 0
+    return recorded or in_transform() or in_forward_mode()
 
 
 def with_zero_gradient(tensor: Float[Tensor, "*batch"], *inputs: Tensor) -> Float[Tensor, "*batch"]:
@@ -32,10 +32,10 @@ def with_zero_gradient(tensor: Float[Tensor, "*batch"], *inputs: Tensor) -> Floa
 
 def refuse_transforms(name: str) -> None:
     """Raise RuntimeError within a transform of `torch.func`, for an estimator that chooses among random samples."""
-    if _are_functorch_transforms_active():
+    if in_transform():
         raise RuntimeError(
             f"{name} chooses among random samples, which torch.func cannot transform: call it outside, on a batch in "
-            "place of vmap, and differentiate with backward; refine_pose and bundle_adjust can be transformed"
+            "place of vmap, and differentiate with backward; solve_pose and solve_bundle can be transformed"
         )
 
 

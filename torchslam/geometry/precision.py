@@ -8,9 +8,9 @@ from typing import ParamSpec, TypeVar
 
 import torch
 from torch import Tensor
-from torch._C import _is_any_autocast_enabled
 
 from torchslam.geometry.signatures import check_arguments
+from torchslam.utils.torch_internals import is_any_autocast_enabled
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -38,7 +38,7 @@ def _precise(function: Callable[P, R], one_dtype: bool) -> Callable[P, R]:
     def precise(*args: P.args, **kwargs: P.kwargs) -> R:
         if not (torch.compiler.is_compiling() or torch.jit.is_tracing()):
             check_arguments(function, args, kwargs, one_dtype)
-        if not _is_any_autocast_enabled():
+        if not is_any_autocast_enabled():
             return function(*args, **kwargs)
         for device_type in _DEVICE_TYPES:
             if torch.is_autocast_enabled(device_type):

@@ -31,6 +31,7 @@ from torchslam.geometry.relative_pose_search import (
 )
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.geometry.two_view import TwoViews, tangent_basis
+from torchslam.utils.deprecation import OldCall
 
 _MODELS, _KERNELS = get_args(Model), get_args(Kernel)
 
@@ -74,10 +75,12 @@ class RelativePose:
         return tuple(MODELS[index] for index in self.model_index.tolist())
 
 
+@OldCall("pixels_1 pixels_2 camera_1 camera_2 threshold mask seed confidence max_samples").accepted
 @full_precision
 def estimate_relative_pose(
     pixels_1: Float[Tensor, "B N 2"],
     pixels_2: Float[Tensor, "B N 2"],
+    *,
     camera_1: Camera,
     camera_2: Camera,
     threshold: float = 1.0,
@@ -85,7 +88,6 @@ def estimate_relative_pose(
     seed: int = 0,
     confidence: float = 0.9999,
     max_samples: int = 4000,
-    *,
     model: Model = "auto",
     kernel: Kernel = "cauchy",
     weights: Float[Tensor, "B N"] | None = None,

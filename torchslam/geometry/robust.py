@@ -15,7 +15,8 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from jaxtyping import Float
 from torch import Tensor
-from torch._C import _are_functorch_transforms_active
+
+from torchslam.utils.torch_internals import in_transform
 
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
 """Robust kernels, by the cost of a residual beyond the scale.
@@ -91,9 +92,7 @@ def kernel_scale(
     Raises:
         ValueError: It is not above zero.
     """
-    if not _are_functorch_transforms_active() and not (
-        bool((scale > 0).all()) if isinstance(scale, Tensor) else scale > 0
-    ):
+    if not in_transform() and not (bool((scale > 0).all()) if isinstance(scale, Tensor) else scale > 0):
         raise ValueError(
             f"scale must be above zero, not {scale.tolist() if isinstance(scale, Tensor) else scale}"
         )

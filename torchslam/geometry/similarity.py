@@ -28,6 +28,7 @@ from torchslam.geometry.ransac import (
     truncated_rows,
     truncated_score,
 )
+from torchslam.utils.deprecation import OldCall
 
 
 @full_precision
@@ -135,12 +136,17 @@ class Similarity:
     score: Float[Tensor, " B"]
 
 
+@OldCall(
+    "points_1 points_2 pixels_1 pixels_2 camera_1 camera_2 sigmas_1 sigmas_2 threshold depth_sigma mask seed "
+    "with_scale confidence max_samples"
+).accepted
 @full_precision
 def estimate_similarity(
     points_1: Float[Tensor, "B N 3"],
     points_2: Float[Tensor, "B N 3"],
     pixels_1: Float[Tensor, "B N 2"],
     pixels_2: Float[Tensor, "B N 2"],
+    *,
     camera_1: Camera,
     camera_2: Camera,
     sigmas_1: Float[Tensor, "B N"] | None = None,

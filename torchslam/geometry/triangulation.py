@@ -12,6 +12,7 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import inverse_2x2, whitening
 from torchslam.geometry.lie import se3_inverse, skew, transform
 from torchslam.geometry.precision import full_precision
+from torchslam.utils.deprecation import OldCall
 
 
 @dataclass(frozen=True)
@@ -56,12 +57,14 @@ class MultiViewTriangulation:
     mask: Bool[Tensor, "*batch N"]
 
 
+@OldCall("T_1w T_2w pixels_1 pixels_2 camera_1 camera_2 mask normalized").accepted
 @full_precision
 def triangulate(
-    T_1w: Float[Tensor, "*#batch 4 4"],
-    T_2w: Float[Tensor, "*#batch 4 4"],
     pixels_1: Float[Tensor, "*#batch N 2"],
     pixels_2: Float[Tensor, "*#batch N 2"],
+    *,
+    T_1w: Float[Tensor, "*#batch 4 4"],
+    T_2w: Float[Tensor, "*#batch 4 4"],
     camera_1: Camera,
     camera_2: Camera,
     mask: Bool[Tensor, "*#batch N"] | None = None,
@@ -190,10 +193,12 @@ def correct_matches(
     return x_1 - step * moved_1, x_2 - step * moved_2
 
 
+@OldCall("T_cw pixels camera mask iterations").accepted
 @full_precision
 def triangulate_many(
-    T_cw: Float[Tensor, "*#batch V 4 4"],
     pixels: Float[Tensor, "*#batch N V 2"],
+    *,
+    T_cw: Float[Tensor, "*#batch V 4 4"],
     camera: Camera,
     mask: Bool[Tensor, "*#batch N V"] | None = None,
     iterations: int = 3,
@@ -204,8 +209,8 @@ def triangulate_many(
     `depths` and `errors`.
 
     Args:
-        T_cw: world to camera.
         pixels: observations; entries outside the mask may hold anything.
+        T_cw: world to camera.
         camera: of all views.
         mask: which views see the point.
         iterations: of Gauss-Newton.

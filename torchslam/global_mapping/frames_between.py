@@ -19,7 +19,7 @@ from torchslam.tracking.data_association import match_keyframe
 from torchslam.tracking.pose_validation import check_pose
 from torchslam.tracking.relocalization import single_frame_state
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate, State, StepResult
+from torchslam.types import Explanation, FrameFeatures, MatchIndices, PoseEstimate, Reason, State, StepResult
 
 NUM_NEAREST = 3  # keyframes in time for the relocalization of a lost frame
 
@@ -93,7 +93,9 @@ class FramePoser:
         if estimate is None:
             estimate = self._find(submap, view)
         if estimate is None:
-            return StepResult(view.index, view.timestamp, State.LOST, None, reason="not found in the map")
+            return StepResult(
+                view.index, view.timestamp, State.LOST, None, reasons=(Explanation(Reason.NOT_FOUND),)
+            )
         state = single_frame_state(submap.tracking, estimate)
         rejection = check_pose(estimate, None, state, self.config.pose_validation).rejection
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
@@ -106,7 +108,7 @@ class FramePoser:
             covariance=estimate.covariance,
             matches=estimate.matches,
             inliers=estimate.inliers,
-            reason=str(rejection or ""),
+            reasons=(rejection,) if rejection else (),
         )
 
     def _find(self, submap: Submap, view: FrameFeatures) -> PoseEstimate | None:

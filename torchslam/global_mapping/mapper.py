@@ -28,11 +28,12 @@ from torchslam.global_mapping.view_graph import (
     connected_views,
 )
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.optim.rotation_averaging import average_rotations
+from torchslam.optim import ROTATION_OPTIONS
+from torchslam.optim.rotation_averaging import solve_rotations
 from torchslam.system.front_end import Extractor, FeatureExtractor, check_size, image_extractor, source
 from torchslam.system.run import FinalAdjustment, Run
 from torchslam.tracking.matcher import make_matcher, prepare_view
-from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult
+from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, Reason, State, StepResult
 
 SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 """Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
@@ -176,7 +177,9 @@ class GlobalMapper:
         R_21 = torch.stack([pair.T_21[:3, :3] for pair in pairs])
         weights = R_21.new_tensor([float(len(pair)) for pair in pairs])
         weights = weights / weights.mean() / ROTATION_STD_RAD**2
-        average = average_rotations(edges, R_21, len(views), weights, backward="detached")
+        average = solve_rotations(
+            edges, R_21, len(views), weights, options=ROTATION_OPTIONS.replace(backward="detached")
+        )
         off = so3_log(R_21 @ average.R_cw[edges[:, 0]] @ average.R_cw[edges[:, 1]].mT).norm(dim=-1)
         pairs = [
             pair for pair, angle in zip(pairs, off.tolist(), strict=True) if angle < MAX_ROTATION_ERROR_RAD
@@ -292,7 +295,10 @@ class GlobalMapper:
                     yield view
 
     def _failed(self, reason: str, views: list[FrameFeatures], pairs: list[ViewPair]) -> GlobalMap:
-        results = [StepResult(view.index, view.timestamp, State.LOST, None, reason=reason) for view in views]
+        reasons = (Explanation.of(Reason.OTHER, text=reason),)
+        results = [
+            StepResult(view.index, view.timestamp, State.LOST, None, reasons=reasons) for view in views
+        ]
         run = Run((), self.camera, self.config, results, self.skipped, False, reason)
         return GlobalMap(run, views, pairs, frozenset())
 

@@ -16,7 +16,7 @@ from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.view_graph import PairMatcher
 from torchslam.system.run import Run, keyframe_rows
 from torchslam.tracking.matcher import make_matcher
-from torchslam.types import Reason, State, StepResult
+from torchslam.types import Explanation, Reason, State, StepResult
 
 FEW_POSED = 0.98
 """Share of the frames with a pose in the main submap below which a recording is mapped as a whole as well."""
@@ -163,6 +163,6 @@ def with_doubts(run: Run, check: MapCheck | None) -> Run:
         if result.index in uncertain or result.index in certain:
             doubted = result.index in uncertain
         if doubted and result.state is State.TRACKING:
-            result = replace(result, state=State.UNCERTAIN, reason=Reason.WEAK_LINK.value)
+            result = replace(result, state=State.UNCERTAIN, reasons=(Explanation(Reason.WEAK_LINK),))
         results.append(result)
     return replace(run, results=results)

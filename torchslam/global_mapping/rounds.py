@@ -27,7 +27,7 @@ from torchslam.global_mapping.tracks import (
     parallax,
     triangulate_tracks,
 )
-from torchslam.optim import BundleProblem, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import FrameFeatures
 
@@ -147,7 +147,9 @@ class ObservedTracks:
                 continue
             points_w = found.points_w[self.tracks.track[rows]]
             threshold = FINE[1] * float(self.noise.sigmas[rows].median())
-            pose = estimate_absolute_pose(points_w[None], self.pixels[rows][None], found.camera, threshold)
+            pose = estimate_absolute_pose(
+                points_w[None], self.pixels[rows][None], camera=found.camera, threshold=threshold
+            )
             if bool(pose.success[0]):
                 T_cw[view], changed = pose.T_cw[0], True
         return replace(found, T_cw=T_cw) if changed else found
@@ -175,7 +177,14 @@ def adjust(
         camera_prior=None if given is None else camera_prior(given),
     )
     free: bool | Tensor = False if given is None else given.directions
-    solution = bundle_adjust(problem, kernel, scale, free, "detached", ITERATIONS, tolerance, check=False)
+    solution = solve_bundle(
+        problem,
+        free_camera=free,
+        check=False,
+        options=BUNDLE_OPTIONS.replace(
+            kernel=kernel, scale=scale, iterations=ITERATIONS, tolerance=tolerance, backward="detached"
+        ),
+    )
     points_w = found.points_w.clone()
     points_w[former] = solution.points_w
     return Reconstruction(solution.T_cw, solution.camera, points_w, found.agrees)

@@ -120,8 +120,8 @@ class PairMatcher:
         relative = estimate_relative_pose(
             pixels[0],
             pixels[1],
-            self.camera,
-            self.camera,
+            camera_1=self.camera,
+            camera_2=self.camera,
             threshold=self.threshold_px,
             mask=mask,
             seed=self.config.seed,

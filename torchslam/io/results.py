@@ -31,7 +31,7 @@ from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
 from torchslam.system.run import Run, keyframe_rows
-from torchslam.types import State, StepResult, Trajectory
+from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.files import JSON_BYTES, parse_json, read_text, write_whole
 
 TRAJECTORY = "trajectory.txt"
@@ -356,7 +356,7 @@ def _frame_result(row: dict[str, str], where: str) -> StepResult:
             is_keyframe=bool(int(row["keyframe"])),
             matches=int(row["matches"]),
             inliers=int(row["inliers"]),
-            reason=row["reason"],
+            reasons=Explanation.parsed(row["reason"]),
             stage_ms={
                 name.removesuffix(STAGE_SUFFIX): _finite(value)
                 for name, value in row.items()

@@ -22,10 +22,12 @@ from torchslam.features.contract import FixedKeypoints, check_features, check_gr
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera, KeypointNoise
 from torchslam.geometry.gating import times
+from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graphs
 from torchslam.system.run import finish
 from torchslam.system.slam import SLAM
 from torchslam.types import Features, Frame
+from torchslam.utils.deprecation import OldCall
 
 OnFailure = Literal["raise", "skip"] | float
 
@@ -120,10 +122,12 @@ class ClipLoss(NamedTuple):
     failure_rate: float
 
 
+@OldCall("poses T_cw_groundtruth error on_failure").accepted
 def clip_loss(
     poses: ClipPoses,
+    *,
     T_cw_groundtruth: Float[Tensor, "*batch T 4 4"],
-    error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
+    error: Callable[..., Tensor] = ate,
     on_failure: OnFailure = "raise",
 ) -> ClipLoss:
     """Average an error against the true poses over the clips.
@@ -131,13 +135,16 @@ def clip_loss(
     Args:
         poses: Of a clip, or of B clips.
         T_cw_groundtruth: Their true poses.
-        error: Maps poses, true poses and mask, shaped like those of `poses`, to () or (B,).
+        error: Maps `T_cw`, `T_cw_groundtruth` and `mask`, by these names and shaped like those of `poses`, to () or
+            (B,).
         on_failure: See `clip_mean`.
 
     Raises:
         ClipError: As `clip_mean`.
     """
-    return clip_mean(poses, error(poses.T_cw, T_cw_groundtruth, poses.posed), on_failure)
+    return clip_mean(
+        poses, error(T_cw=poses.T_cw, T_cw_groundtruth=T_cw_groundtruth, mask=poses.posed), on_failure
+    )
 
 
 def clip_mean(poses: ClipPoses, errors: Float[Tensor, "*batch"], on_failure: OnFailure = "raise") -> ClipLoss:
@@ -167,7 +174,7 @@ def clip_mean(poses: ClipPoses, errors: Float[Tensor, "*batch"], on_failure: OnF
 def clip_halves(
     even: ClipPoses,
     odd: ClipPoses,
-    error: Callable[[Tensor, Tensor, Tensor], Tensor] = ate,
+    error: Callable[..., Tensor] = ate,
     on_failure: OnFailure = "raise",
 ) -> ClipLoss:
     """Average an error between poses from two halves of the points over the clips; needs no ground truth.
@@ -192,7 +199,7 @@ def clip_halves(
     posed = even.posed & odd.posed
     reasons = tuple(one or other for one, other in zip(even.reasons, odd.reasons, strict=True))
     both = replace(even, posed=posed, success=even.success & odd.success, reasons=reasons)
-    return clip_mean(both, error(even.T_cw, odd.T_cw, posed), on_failure)
+    return clip_mean(both, error(T_cw=even.T_cw, T_cw_groundtruth=odd.T_cw, mask=posed), on_failure)
 
 
 class ClipSLAM(nn.Module):
@@ -354,7 +361,11 @@ class ClipSLAM(nn.Module):
             for run, each, weights_of, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
         )
         solvable = [each for each in graphs if each is not None]
-        found = iter(solve_graphs(solvable, iterations=_ITERATIONS, tolerance=_TOLERANCE))
+        found = iter(
+            solve_graphs(
+                solvable, options=GRAPH_OPTIONS.replace(iterations=_ITERATIONS, tolerance=_TOLERANCE)
+            )
+        )
         solutions = tuple(None if each is None else next(found) for each in graphs)
         clips = [_posed(*one) for one in zip(graphs, solutions, seen, keypoint_weights, cameras, strict=True)]
         T_cw, posed = (torch.stack(each) for each in zip(*clips, strict=True))

@@ -119,18 +119,17 @@ def collate(clips: Several[Clip]) -> Clip:
 
 
 def stack_cameras(cameras: Several[Camera]) -> Camera:
-    """Stack B cameras of one size into one with params (B, P); pinholes are padded where others are distorted.
+    """Stack B cameras of one size into one with params (B, P); parameters are padded where others have more.
 
     Raises:
         ValueError: Different sizes, or models that cannot be mixed.
     """
-    models = {camera.model for camera in cameras}
-    if models == {"pinhole", "radial_tangential"}:
+    nested = ("pinhole", "radial_tangential", "rational")  # each is the next one with zeros at the end
+    if all(camera.model in nested for camera in cameras):
+        model = max((camera.model for camera in cameras), key=nested.index)
         width = max(camera.params.shape[-1] for camera in cameras)
         padded = [torch.nn.functional.pad(c.params, (0, width - c.params.shape[-1])) for c in cameras]
-        cameras = [
-            Camera("radial_tangential", params, c.size) for c, params in zip(cameras, padded, strict=True)
-        ]
+        cameras = [Camera(model, params, c.size) for c, params in zip(cameras, padded, strict=True)]
     return Camera.stack(cameras)
 
 
@@ -323,7 +322,7 @@ def parallax(
     pixels_1 = first.keypoints[0, matches.indices_1[0, rows]].to(camera.params.dtype)
     pixels_2 = second.keypoints[0, matches.indices_2[0, rows]].to(camera.params.dtype)
     if R_21 is None:
-        motion = estimate_relative_pose(pixels_1[None], pixels_2[None], camera, camera)
+        motion = estimate_relative_pose(pixels_1[None], pixels_2[None], camera_1=camera, camera_2=camera)
         if not motion.success[0]:
             return 0.0
         R_21 = motion.T_21[0, :3, :3]

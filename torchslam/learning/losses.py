@@ -29,6 +29,7 @@ from torchslam.geometry import (
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.learning.clip_slam import ClipPoses
+from torchslam.utils.deprecation import OldCall
 
 __all__ = [
     "ate",
@@ -50,8 +51,10 @@ def path_length(T_cw: Float[Tensor, "*batch N 4 4"]) -> Float[Tensor, "*batch"]:
     return se3_inverse(T_cw)[..., :3, 3].diff(dim=-2).norm(dim=-1).sum(-1)
 
 
+@OldCall("T_cw T_cw_groundtruth mask").accepted
 @full_precision
 def relative_ate(
+    *,
     T_cw: Float[Tensor, "*batch N 4 4"],
     T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
     mask: Bool[Tensor, "*batch N"] | None = None,
@@ -67,13 +70,16 @@ def relative_ate(
         A ratio, NaN where fewer than three poses count or the true camera does not move.
     """
     length = path_length(T_cw_groundtruth)
-    share = ate(T_cw, T_cw_groundtruth, mask) / torch.where(length > 0, length, 1.0)
+    share = ate(T_cw=T_cw, T_cw_groundtruth=T_cw_groundtruth, mask=mask) / torch.where(
+        length > 0, length, 1.0
+    )
     return torch.where(length > 0, share, torch.nan)
 
 
+@OldCall("T_cw T_cw_groundtruth").accepted
 @full_precision
 def pose_errors(
-    T_cw: Float[Tensor, "*#batch 4 4"], T_cw_groundtruth: Float[Tensor, "*#batch 4 4"]
+    *, T_cw: Float[Tensor, "*#batch 4 4"], T_cw_groundtruth: Float[Tensor, "*#batch 4 4"]
 ) -> Float[Tensor, "*#batch 2"]:
     """Compute the distance between poses in the same world frame.
 
@@ -104,8 +110,10 @@ def motion_difference(
     return torch.stack((rotation, direction), dim=-2)
 
 
+@OldCall("T_cw T_cw_groundtruth covariance mask").accepted
 @full_precision
 def pose_nll(
+    *,
     T_cw: Float[Tensor, "*#batch N 4 4"],
     T_cw_groundtruth: Float[Tensor, "*#batch N 4 4"],
     covariance: Float[Tensor, "*#batch N 6 6"],
@@ -197,7 +205,7 @@ def reprojection_loss(
     Returns:
         px^2: mean over points of the robust sum of squares.
     """
-    points = triangulate_many(T_cw, pixels, camera, mask)
+    points = triangulate_many(pixels, T_cw=T_cw, camera=camera, mask=mask)
     seen = points.errors.isfinite()
     squared = torch.where(seen, points.errors, 0.0).square().sum(-1)
     return _mean(_robust(squared, kernel, scale), points.mask & (seen.sum(-1) >= 2))

@@ -21,7 +21,7 @@ from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import match_in_keyframes, merge_points
-from torchslam.optim import PoseGraph, pose_graph_optimize
+from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
 from torchslam.tracking.relocalization import Candidate
 from torchslam.types import FrameFeatures, Matcher
 
@@ -125,7 +125,9 @@ def essential_graph_solution(found: LoopCandidate) -> Float[Tensor, "K 4 4"]:
     S_km = T_cw[found.keyframe] @ sim3_inverse(found.relation.S_21) @ T_wm
     relations = torch.cat([measured, S_km[None]])
     graph = PoseGraph(T_cw, torch.cat([edges, closing]), relations, fixed=(0,))
-    return pose_graph_optimize(graph, backward="detached", iterations=_ITERATIONS).S_cw
+    return solve_pose_graph(
+        graph, options=POSE_GRAPH_OPTIONS.replace(iterations=_ITERATIONS, backward="detached")
+    ).S_cw
 
 
 def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Submap, int]:

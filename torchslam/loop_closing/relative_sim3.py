@@ -22,7 +22,7 @@ from torchslam.geometry import (
 )
 from torchslam.geometry.ransac import samples_needed
 from torchslam.map.map import Map
-from torchslam.optim import refine_pose
+from torchslam.optim import POSE_OPTIONS, solve_pose
 from torchslam.tracking.localizer import match_projected_points, project_points
 from torchslam.tracking.matcher import DescriptorMatcher, run_matcher
 from torchslam.types import Matcher
@@ -217,10 +217,10 @@ def _first_guess(
         transform(T_2, map_2.positions_w[points_2[rows_2]])[None],
         view_1.keypoints[rows_1][None],
         view_2.keypoints[rows_2][None],
-        camera,
-        camera,
-        view_1.noise[rows_1].gate_sigma[None],
-        view_2.noise[rows_2].gate_sigma[None],
+        camera_1=camera,
+        camera_2=camera,
+        sigmas_1=view_1.noise[rows_1].gate_sigma[None],
+        sigmas_2=view_2.noise[rows_2].gate_sigma[None],
         seed=config.seed,
         confidence=_CONFIDENCE,
         max_samples=min(_MOST_SAMPLES, math.ceil(float(samples))),
@@ -242,15 +242,14 @@ def _refined(
     """The refined pose of another map's keyframe in this map, and which matches are inliers."""
     view, points_w = other.frame_features(keyframe), slam_map.positions_w[ids]
     pixels, noise = view.keypoints[keypoints], view.noise[keypoints]
-    refined = refine_pose(
-        T_cw[None],
+    refined = solve_pose(
         points_w[None],
         pixels[None],
-        camera,
+        T_cw=T_cw[None],
+        camera=camera,
         weights=noise.weights[None],
-        kernel="cauchy",
-        scale=_KERNEL_SCALE,
-        backward="detached",
-        iterations=_ITERATIONS,
+        options=POSE_OPTIONS.replace(
+            kernel="cauchy", scale=_KERNEL_SCALE, iterations=_ITERATIONS, backward="detached"
+        ),
     ).T_cw[0]
     return refined, passes_gate(noise.squared_reprojection(transform(refined, points_w), pixels, camera))

@@ -22,7 +22,7 @@ from torchslam.geometry import CHI_SQUARE_95, Camera, passes_gate, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
-from torchslam.optim import BundleProblem, Marginals, Progress, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Marginals, Progress, solve_bundle
 from torchslam.optim.bundle.dense_numpy import bundle_adjust_numpy
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
@@ -89,7 +89,7 @@ def select_window(
 def solve_local(problem: BundleProblem, iterations: int, covariances: bool) -> BundleResult:
     """Solve a local bundle adjustment; fixed poses count as exact. A pure function that any process may call.
 
-    The covariances are those of `bundle_adjust` at the solution, so that they do not change it.
+    The covariances are those of `solve_bundle` at the solution, so that they do not change it.
     """
     T_cw, points_w, _ = bundle_adjust_numpy(problem, HUBER, iterations, LOCAL_TOLERANCE)
     if not covariances:
@@ -184,19 +184,18 @@ def solve(
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
 ) -> BundleResult:
-    """Minimize the reprojection error of a window by `bundle_adjust`, over the camera as well with a calibration."""
+    """Minimize the reprojection error of a window by `solve_bundle`, over the camera as well with a calibration."""
     free: bool | Tensor = False
     if calibration is not None:
         problem, free = replace(problem, camera_prior=camera_prior(calibration)), calibration.directions
-    solution = bundle_adjust(
+    solution = solve_bundle(
         problem,
-        kernel="huber",
-        scale=HUBER,
         free_camera=free,
-        backward="detached",
-        iterations=iterations,
         progress=progress,
         check=False,
+        options=BUNDLE_OPTIONS.replace(
+            kernel="huber", scale=HUBER, iterations=iterations, backward="detached"
+        ),
     )
     marginals = solution.covariance() if covariances else None
     found = None if calibration is None else solution.camera

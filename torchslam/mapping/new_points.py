@@ -123,7 +123,7 @@ def _triangulate(
     pixels = here.features.keypoints[seen_1], there.features.keypoints[seen_2]
     normalized = here.normalized[seen_1], there.normalized[seen_2]
     scale_1, scale_2 = here.features.scales[seen_1], there.features.scales[seen_2]
-    seen = triangulate(T_1w, T_2w, *pixels, camera, camera, normalized=normalized)
+    seen = triangulate(*pixels, T_1w=T_1w, T_2w=T_2w, camera_1=camera, camera_2=camera, normalized=normalized)
     noise_1, noise_2 = here.noise[seen_1], there.noise[seen_2]
     good = seen.mask
     for T_cw, noise, seen_at in ((T_1w, noise_1, pixels[0]), (T_2w, noise_2, pixels[1])):

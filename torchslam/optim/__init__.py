@@ -1,10 +1,22 @@
 """Differentiable least squares for poses, maps and pose graphs: robust, batched, with implicit gradients."""
 
 from torchslam.optim._core.implicit import Backward
-from torchslam.optim._core.levenberg_marquardt import Convergence, Progress
+from torchslam.optim._core.levenberg_marquardt import Convergence, Progress, SolverReason
+from torchslam.optim._core.options import (
+    BUNDLE_OPTIONS,
+    GRAPH_OPTIONS,
+    LEAST_SQUARES_OPTIONS,
+    POSE_GRAPH_OPTIONS,
+    POSE_OPTIONS,
+    POSITION_OPTIONS,
+    ROTATION_OPTIONS,
+    UNWEIGHTED_ROTATION_OPTIONS,
+    SolverOptions,
+)
 from torchslam.optim._core.tangent import CameraPrior, PosePrior
-from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, minimize
-from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, solve_least_squares
+from torchslam.optim._old_names import bundle_adjust, minimize, pose_graph_optimize, refine_pose  # noqa: F401
+from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import (
     DepthPrior,
     FrameFactors,
@@ -12,12 +24,20 @@ from torchslam.optim.bundle._factors import (
     relative_pose_error,
 )
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.global_positioning import GlobalPositions, position_globally
-from torchslam.optim.pose._refinement import RefinedPose, refine_pose
-from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, pose_graph_optimize
-from torchslam.optim.rotation_averaging import RotationAverage, average_rotations
+from torchslam.optim.global_positioning import GlobalPositions, solve_positions
+from torchslam.optim.pose._refinement import RefinedPose, solve_pose
+from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, solve_pose_graph
+from torchslam.optim.rotation_averaging import RotationAverage, solve_rotations
 
 __all__ = [
+    "BUNDLE_OPTIONS",
+    "GRAPH_OPTIONS",
+    "LEAST_SQUARES_OPTIONS",
+    "POSE_GRAPH_OPTIONS",
+    "POSE_OPTIONS",
+    "POSITION_OPTIONS",
+    "ROTATION_OPTIONS",
+    "UNWEIGHTED_ROTATION_OPTIONS",
     "Backward",
     "BundleProblem",
     "BundleSolution",
@@ -35,12 +55,14 @@ __all__ = [
     "Progress",
     "RefinedPose",
     "RotationAverage",
-    "average_rotations",
-    "bundle_adjust",
+    "SolverOptions",
+    "SolverReason",
     "log_distance_error",
-    "minimize",
-    "pose_graph_optimize",
-    "position_globally",
-    "refine_pose",
     "relative_pose_error",
+    "solve_bundle",
+    "solve_least_squares",
+    "solve_pose",
+    "solve_pose_graph",
+    "solve_positions",
+    "solve_rotations",
 ]

@@ -15,10 +15,10 @@ from torch.func import grad, jvp, vmap
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale, robustify
 from torchslam.optim._core import tangent
-from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_options, find_minimum
+from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
-    MAX_ITERATIONS,
     Convergence,
+    SolverReason,
     check_minimum,
     index_tree,
     minimize_batch,
@@ -26,6 +26,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     where_tree,
 )
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
+from torchslam.optim._core.options import LEAST_SQUARES_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import Linearization, flat_along
 
 Manifold = Literal["euclidean", "se3", "sim3"]
@@ -149,21 +150,22 @@ class LeastSquaresSolution:
         """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
         return self.convergence.converged.view_as(self.success)
 
+    @property
+    def reasons(self) -> list[SolverReason]:
+        """How the search ended, for each element."""
+        return self.convergence.reasons(self.success)
+
 
 @full_precision
-def minimize(
+def solve_least_squares(
     residual: Residual,
     start: Tensor | Sequence[Tensor],
     inputs: Sequence[Tensor] = (),
     manifolds: Manifold | Sequence[Manifold] = "euclidean",
     weights: Float[Tensor, "#B N"] | None = None,
     mask: Bool[Tensor, "#B N"] | None = None,
-    kernel: Kernel = "none",
-    scale: Float[Tensor, "*#scale"] | float = 1.0,
-    backward: Backward = "implicit",
-    iterations: int = MAX_ITERATIONS,
-    tolerance: float = 1e-10,
-    strict: bool = False,
+    *,
+    options: SolverOptions = LEAST_SQUARES_OPTIONS,
 ) -> LeastSquaresSolution:
     """Minimize half the sum of rho(weight * |residual|^2) over unknowns by Levenberg-Marquardt, many problems at once.
 
@@ -173,7 +175,8 @@ def minimize(
             points_2 = transform(T_21, backprojected(depth_1, K))
             return bilinear(depth_2, projected(points_2, K)) - points_2[..., 2]
 
-        solution = minimize(residual, T_21, (depth_1, depth_2, K), "se3", kernel="huber", scale=0.02)
+        huber = LEAST_SQUARES_OPTIONS.replace(kernel="huber", scale=0.02)
+        solution = solve_least_squares(residual, T_21, (depth_1, depth_2, K), "se3", options=huber)
 
     The implicit gradient is zero where the exact Hessian is not positive definite, that is, not at a strict minimum.
 
@@ -186,36 +189,34 @@ def minimize(
         manifolds: manifold of each unknown, or one for all.
         weights: inverse variances, one if None.
         mask: residuals that count, all if None; the others must be finite, with finite derivatives.
-        kernel: robust kernel.
-        scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
-        backward: how gradients reach inputs, weights and scale.
-        iterations: maximum number of steps.
-        tolerance: stop where the predicted reduction of the cost is below this share of it.
-        strict: raise an error for any element that is not at a minimum: `success` or `converged` is False.
+        options: how to minimize; gradients reach inputs, weights and the scale of the kernel.
 
     Raises:
         ValueError: a shape or a dtype does not fit, a name is unknown, or the residual has gradients to tensors other
             than its inputs, which would not receive any.
-        ConvergenceError: with `strict`.
+        ConvergenceError: with `options.strict`.
     """
-    check_options(backward, iterations, tolerance)
     unknowns = (start,) if isinstance(start, Tensor) else tuple(start)
     names = (manifolds,) * len(unknowns) if isinstance(manifolds, str) else tuple(manifolds)
     product = Product.of(names, unknowns)
-    weights, counted, scale = _checked(residual, unknowns, tuple(inputs), weights, mask, scale)
-    minimization = _Minimization(residual, product, len(unknowns), kernel, iterations, tolerance)
+    weights, counted, scale = _checked(residual, unknowns, tuple(inputs), weights, mask, options.scale)
+    minimization = _Minimization(
+        residual, product, len(unknowns), options.kernel, options.iterations, options.tolerance
+    )
     tensors = (*unknowns, counted, weights, scale, *inputs)
     minimization.ndims = minimization.dimensions(tensors)
-    found = find_minimum(minimization, tensors, backward)
+    found = find_minimum(minimization, tensors, options.backward)
     solution, (success, cost, steps, converged, initial_cost) = (
         found[: len(unknowns)],
         found[len(unknowns) :],
     )
-    if strict:
+    if options.strict:
         check_minimum(success, converged, "elements")
-    if backward == "truncated":
+    if options.backward == "truncated":
         solution = minimization.last_step(solution, tensors, success)
-    return LeastSquaresSolution(solution, cost, success, Convergence(steps, converged, initial_cost, cost))
+    return LeastSquaresSolution(
+        solution, cost, success, Convergence(steps, converged, initial_cost, cost, options.iterations)
+    )
 
 
 def _checked(

@@ -11,9 +11,9 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, check_options, find_minimum
-from torchslam.optim._core.levenberg_marquardt import Convergence
+from torchslam.optim._core.implicit import find_minimum
+from torchslam.optim._core.levenberg_marquardt import Convergence, SolverReason, check_minimum
+from torchslam.optim._core.options import POSITION_OPTIONS, SolverOptions
 from torchslam.optim._positions import (
     PositionInputs,
     PositionMinimization,
@@ -51,9 +51,14 @@ class GlobalPositions:
     success: Bool[Tensor, ""]
     convergence: Convergence
 
+    @property
+    def reasons(self) -> list[SolverReason]:
+        """How the search ended, for each problem, of which there is one."""
+        return self.convergence.reasons(self.success)
+
 
 @full_precision
-def position_globally(
+def solve_positions(
     view_index: Int[Tensor, " O"],
     point_index: Int[Tensor, " O"],
     rays_w: Float[Tensor, "O 3"],
@@ -61,12 +66,9 @@ def position_globally(
     num_points: int,
     weights: Float[Tensor, " O"] | None = None,
     start: tuple[Float[Tensor, "K 3"], Float[Tensor, "N 3"]] | None = None,
-    kernel: Kernel = "huber",
-    scale: Float[Tensor, ""] | float = 0.1,
+    *,
     seed: int = 0,
-    backward: Backward = "implicit",
-    iterations: int = 100,
-    tolerance: float = 1e-5,
+    options: SolverOptions = POSITION_OPTIONS,
 ) -> GlobalPositions:
     """Minimize the robust sines of the angles between rays and the directions from cameras to points, over both.
 
@@ -92,24 +94,23 @@ def position_globally(
         num_points: N.
         weights: inverse variances of the directions, in rad^-2; one if None.
         start: centers and points to begin with in place of the search.
-        kernel: robust kernel of the last minimization. The search has Huber's, with a scale of 0.1 or more. Many wrong
-            rays pull the centers with that one too: "geman_mcclure" with a few standard deviations as the scale
-            leaves them behind.
-        scale: of the kernel, in units of the whitened error: the sine of the angle times the root of the weight.
         seed: of the random positions from which the search begins.
-        backward: how gradients reach rays_w, weights and scale.
-        iterations: maximum number of steps of the last part of the search, and of the last minimization.
-        tolerance: stop either where the predicted reduction of the cost is below this share of it.
+        options: of the last part of the search, and of the last minimization. The latter alone has the kernel, in units
+            of the sine of the angle times the root of the weight: the search has Huber's, with a scale of 0.1 or more.
+            Many wrong rays pull the centers with that one too: "geman_mcclure" with a few standard deviations as the
+            scale leaves them behind. Gradients reach rays_w, weights and scale.
 
     Returns:
         Positions, differentiable.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
+        ConvergenceError: with `options.strict`.
     """
-    check_options(backward, iterations, tolerance)
+    kernel, backward = options.kernel, options.backward
+    iterations, tolerance = options.iterations, options.tolerance
     _check(view_index, point_index, rays_w, (num_views, num_points), weights, start)
-    scale = torch.as_tensor(scale, dtype=torch.float64, device=rays_w.device)
+    scale = torch.as_tensor(options.scale, dtype=torch.float64, device=rays_w.device)
     if not scale > 0:
         raise ValueError(f"scale must be positive, not {float(scale)}")
     dtype, rays_w, view, point = rays_w.dtype, rays_w.double(), view_index, point_index
@@ -141,6 +142,8 @@ def position_globally(
     inputs = part.inputs(rays_w, weights, scale, at)
     found = find_minimum(minimization, inputs, backward)
     centers_w, points_w, success, *convergence = found
+    if options.strict:
+        check_minimum(success, convergence[1], "problems")
     if backward == "truncated" and len(part.rows):
         centers_w, points_w, _ = minimization.last_step(found, inputs)
     # The gauge of the result.
@@ -160,7 +163,13 @@ def position_globally(
     centers_w, points_w = everything.to(dtype).tensor_split((num_views,))
     determined = determined[:num_views]
     return GlobalPositions(
-        centers_w, points_w, angles.to(dtype), determined, component, success, Convergence(*convergence)
+        centers_w,
+        points_w,
+        angles.to(dtype),
+        determined,
+        component,
+        success,
+        Convergence(*convergence, options.iterations),
     )
 
 

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -13,16 +12,11 @@ from torch import Tensor
 
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale, robustify
-from torchslam.optim._core.implicit import Backward, check_options
-from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence
+from torchslam.optim._core.levenberg_marquardt import Convergence, SolverReason, check_minimum
+from torchslam.optim._core.options import ROTATION_OPTIONS, UNWEIGHTED_ROTATION_OPTIONS, SolverOptions
 from torchslam.optim._rotation_start import RotationEdges, robust_start, spanning_forest
-from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, is_similarity, pose_graph_optimize
+from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, is_similarity, solve_pose_graph
 from torchslam.optim.pose_graph._problem import connected_parts
-
-# 95 % of the norms of three standard normal numbers lie below.
-_SCALE = 2.8
-# Without weights, in radians: as COLMAP's. Relative rotations of two views are right to a degree or two, or wrong.
-_SCALE_OF_UNKNOWN_NOISE = math.radians(5.0)
 
 
 @dataclass(frozen=True)
@@ -44,27 +38,29 @@ class RotationAverage:
     success: Bool[Tensor, " K"]
     convergence: Convergence
 
+    @property
+    def reasons(self) -> list[SolverReason]:
+        """How the search ended, for each view."""
+        return self.convergence.reasons(self.success)
+
 
 @full_precision
-def average_rotations(
+def solve_rotations(
     edges: Int[Tensor, "E 2"],
     R_ji: Float[Tensor, "E 3 3"],
     num_views: int,
     weights: Float[Tensor, " E"] | None = None,
     start: Float[Tensor, "K 3 3"] | None = None,
-    kernel: Kernel = "geman_mcclure",
-    scale: Float[Tensor, ""] | float | None = None,
-    backward: Backward = "implicit",
-    iterations: int = MAX_ITERATIONS,
-    tolerance: float = 1e-8,
+    *,
+    options: SolverOptions | None = None,
 ) -> RotationAverage:
     """Minimize the robust angles between R_j and R_ji R_i over the rotations of all views.
 
     A cost with a robust kernel has many minima. The search starts on a spanning forest of edges that agree with others,
-    narrows a Geman-McClure kernel down to `scale`, whatever the `kernel`, and ends with Levenberg-Marquardt. Edges
+    narrows a Geman-McClure kernel down to the scale, whatever the kernel, and ends with Levenberg-Marquardt. Edges
     that are not finite, have no positive weight or touch a view whose start is not finite do not count. The result does
     not depend on the order and the direction of the edges, to the last bit. With gradients, like those of
-    `pose_graph_optimize`: zero where the exact Hessian is not positive definite.
+    `solve_pose_graph`: zero where the exact Hessian is not positive definite.
     Sources: Hartley, Trumpf, Dai and Li, "Rotation averaging", 2013; Chatterjee and Govindu, "Robust relative rotation
     averaging", 2018; Yang et al., "Graduated non-convexity for robust spatial perception", 2020.
 
@@ -74,24 +70,21 @@ def average_rotations(
         num_views: K.
         weights: inverse variances per axis, in rad^-2; one if None.
         start: rotations to begin with in place of the forest. First views stay there, with a gradient to it.
-        kernel: robust kernel of the last minimization.
-        scale: of the kernels, in units of the whitened error: radians times the root of the weight. If None, 2.8, or
-            5 degrees without weights.
-        backward: how gradients reach R_ji, weights, scale and the start of first views.
-        iterations: maximum number of steps of the last minimization.
-        tolerance: stop it where the predicted reduction of the cost is below this share of it.
+        options: how to minimize, in the end; None: `ROTATION_OPTIONS`, or without weights
+            `UNWEIGHTED_ROTATION_OPTIONS`. The scale of the kernels is in radians times the root of the weight.
+            Gradients reach R_ji, weights, scale and the start of first views.
 
     Returns:
         Rotations, differentiable.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
+        ConvergenceError: with `options.strict`.
     """
-    check_options(backward, iterations, tolerance)
     _check(edges, R_ji, num_views, weights, start)
-    if scale is None:
-        scale = _SCALE_OF_UNKNOWN_NOISE if weights is None else _SCALE
-    scale = kernel_scale(scale, R_ji)
+    if options is None:
+        options = UNWEIGHTED_ROTATION_OPTIONS if weights is None else ROTATION_OPTIONS
+    kernel, scale = options.kernel, kernel_scale(options.scale, R_ji)
     weights = R_ji.new_ones(len(edges)) if weights is None else weights
     eye = torch.eye(3, dtype=R_ji.dtype, device=R_ji.device).expand(num_views, 3, 3)
     known = eye[:, 0, 0] > 0 if start is None else is_similarity(start)
@@ -103,8 +96,7 @@ def average_rotations(
     first = component == torch.arange(num_views, device=component.device)
     R_cw = torch.where(first[:, None, None], given, R_cw)
     graph = PoseGraph(R_cw, measured.pairs, measured.R_ji, measured.weights, fixed=first)
-    options = _Options(kernel, scale, backward, iterations, tolerance)
-    solution, determined = _minimum(graph, first, component, options)
+    solution, determined = _minimum(graph, first, component, options.replace(scale=scale, strict=False))
 
     with torch.no_grad():
         error = measured.residuals(solution.S_cw)
@@ -114,6 +106,8 @@ def average_rotations(
         split = _components(measured.select(kept), num_views) != component
         lost = torch.zeros_like(split).index_fill(0, component[split], True)
         success = determined & ~lost[component]
+    if options.strict:
+        check_minimum(success, solution.converged.expand_as(success), "views")
     R_cw = torch.where(success[:, None, None], solution.S_cw, solution.S_cw.detach())
     return RotationAverage(R_cw, component, angles, success, solution.convergence)
 
@@ -168,7 +162,7 @@ class _Start(torch.autograd.Function):
     @staticmethod
     def vmap(*args: Any) -> Any:
         raise RuntimeError(
-            "average_rotations decides which edges count and joins the views by them, which vmap cannot do: "
+            "solve_rotations decides which edges count and joins the views by them, which vmap cannot do: "
             "call it for one graph after the other, or join them to one of several components"
         )
 
@@ -190,21 +184,11 @@ def _components(edges: RotationEdges, num_views: int) -> Int[Tensor, " K"]:
     return connected_parts(edges.pairs, counted, counted.new_zeros(1, num_views))[0]
 
 
-class _Options(NamedTuple):
-    """Of `pose_graph_optimize`, as they follow the graph."""
-
-    kernel: Kernel
-    scale: Tensor
-    backward: Backward
-    iterations: int
-    tolerance: float
-
-
 def _minimum(
-    graph: PoseGraph, first: Bool[Tensor, " K"], component: Int[Tensor, " K"], options: _Options
+    graph: PoseGraph, first: Bool[Tensor, " K"], component: Int[Tensor, " K"], options: SolverOptions
 ) -> tuple[PoseGraphSolution, Bool[Tensor, " K"]]:
     """The minimum, and the views of components that are determined, or a single view."""
-    solution = pose_graph_optimize(graph, *options)
+    solution = solve_pose_graph(graph, options=options)
     counts = torch.bincount(component, minlength=len(component))
     single = counts[component] == 1
     joined = (counts > 1).nonzero().flatten().tolist()
@@ -214,6 +198,6 @@ def _minimum(
     determined = single
     for label in joined:
         own = component == label
-        alone = pose_graph_optimize(replace(graph, fixed=first | ~own), *options)
+        alone = solve_pose_graph(replace(graph, fixed=first | ~own), options=options)
         determined = determined | (own & alone.success)
-    return pose_graph_optimize(replace(graph, fixed=first | ~determined), *options), determined
+    return solve_pose_graph(replace(graph, fixed=first | ~determined), options=options), determined

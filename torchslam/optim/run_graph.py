@@ -24,14 +24,14 @@ from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import ERROR_FACTOR, CameraMeasurement
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward
-from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Progress, check_minimum
+from torchslam.optim._core.levenberg_marquardt import Progress, check_minimum
+from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.tangent import CameraPrior
-from torchslam.optim.bundle._api import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
-from torchslam.optim.pose._refinement import refine_pose
+from torchslam.optim.pose._refinement import solve_pose
 from torchslam.types import Trajectory
+from torchslam.utils.deprecation import OldCall
 from torchslam.utils.files import check_regular
 
 POSE_ITERATIONS = 30
@@ -265,17 +265,17 @@ class GraphSolution:
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
+@OldCall(
+    "graph kernel scale free_camera backward iterations tolerance progress strict frame_factors depth_prior",
+    GRAPH_OPTIONS,
+).accepted
 @full_precision
 def solve_graph(
     graph: ObservationGraph,
-    kernel: Kernel = "huber",
-    scale: Float[Tensor, "*#scale"] | float = 2.45,
+    *,
     free_camera: bool | Float[Tensor, "P n"] | None = None,
-    backward: Backward = "implicit",
-    iterations: int = MAX_ITERATIONS,
-    tolerance: float = 1e-10,
+    options: SolverOptions = GRAPH_OPTIONS,
     progress: Progress | None = None,
-    strict: bool = False,
     frame_factors: Sequence[FrameFactors] = (),
     depth_prior: DepthPrior | None = None,
 ) -> GraphSolution:
@@ -287,15 +287,10 @@ def solve_graph(
 
     Args:
         graph: observation graph, as `Run.graph`.
-        kernel: robust kernel.
-        scale: of the kernel, in units of the whitened residual; the default is the 95 % quantile of a Gaussian.
-        free_camera: as in `bundle_adjust`. None: along the directions of `graph.calibration`, with it as a prior; the
+        free_camera: as in `solve_bundle`. None: along the directions of `graph.calibration`, with it as a prior; the
             camera is fixed where there is none.
-        backward: how gradients reach pixels, weights and camera, or the calibration where that is a prior.
-        iterations: maximum number of steps.
-        tolerance: stop where the predicted reduction of the cost is below this share of it.
+        options: how to minimize; gradients reach pixels, weights and camera, or the calibration where that is a prior.
         progress: called before each iteration of a bundle adjustment.
-        strict: raise an error for any frame that is not at a minimum: `success` or `converged` is False.
         frame_factors: measured motions or distances between keyframes of one submap, or errors of one's own, with rows
             of the graph's frames.
         depth_prior: depths of the observations. Those of frames that are not keyframes do not count.
@@ -306,9 +301,9 @@ def solve_graph(
     Raises:
         ValueError: a submap has no keyframe, two submaps see the same point, or a factor joins other frames than
             keyframes of one submap.
-        ConvergenceError: with `strict`.
+        ConvergenceError: with `options.strict`.
     """
-    options = kernel, scale, backward, iterations, tolerance
+    strict, options = options.strict, options.replace(strict=False)
     _check_factors(graph, frame_factors)
     free, prior = (False, None) if free_camera is None else (free_camera, None)
     if free_camera is None and graph.calibration is not None:
@@ -316,7 +311,7 @@ def solve_graph(
 
     def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
         def solved(problem: BundleProblem, free: bool | Tensor) -> BundleSolution:
-            return bundle_adjust(problem, kernel, scale, free, backward, iterations, tolerance, progress)
+            return solve_bundle(problem, free_camera=free, options=options, progress=progress)
 
         main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
         problems = [_with_factors(submap, graph, frame_factors, depth_prior) for submap in submaps]
@@ -326,7 +321,7 @@ def solve_graph(
             for row, problem in enumerate(problems)
         ]
 
-    (solution,) = _solve([graph], adjust, *options)
+    (solution,) = _solve([graph], adjust, options)
     if strict:
         check_minimum(solution.success, solution.converged, "frames")
     return solution
@@ -419,11 +414,7 @@ def _pose_other_frames(
     camera: Camera,
     moved: Tensor,
     success: Tensor,
-    kernel: Kernel,
-    scale: Tensor | float,
-    backward: Backward,
-    iterations: int,
-    tolerance: float,
+    options: SolverOptions,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The poses (K, 4, 4), with frames that are not keyframes refined against the points, `success` and `converged`.
 
@@ -439,18 +430,14 @@ def _pose_other_frames(
         mask = slot < counts[frames, None]
         seen = in_rank[torch.where(mask, starts[frames, None] + slot, 0)]
         mask = mask & moved[graph.point_index[seen]]
-        refined = refine_pose(
-            graph.T_cw[frames],
+        refined = solve_pose(
             points_w[graph.point_index[seen]],
             graph.pixels[seen],
-            camera if camera.params.ndim == 1 else camera[frames],
-            graph.weights[seen],
-            mask,
-            kernel,
-            scale,
-            backward=backward,
-            iterations=iterations,
-            tolerance=tolerance,
+            T_cw=graph.T_cw[frames],
+            camera=camera if camera.params.ndim == 1 else camera[frames],
+            weights=graph.weights[seen],
+            mask=mask,
+            options=options,
         )
         T_cw = T_cw.index_copy(0, frames, refined.T_cw)
         success = success.index_copy(0, frames, refined.success)
@@ -486,25 +473,20 @@ class _GraphSubmap(NamedTuple):
         return len(self.problem.T_cw) * len(self.points)
 
 
+@OldCall("graphs kernel scale backward iterations tolerance strict", GRAPH_OPTIONS).accepted
 @full_precision
 def solve_graphs(
-    graphs: Sequence[ObservationGraph],
-    kernel: Kernel = "huber",
-    scale: Float[Tensor, "*#scale"] | float = 2.45,
-    backward: Backward = "implicit",
-    iterations: int = MAX_ITERATIONS,
-    tolerance: float = 1e-10,
-    strict: bool = False,
+    graphs: Sequence[ObservationGraph], *, options: SolverOptions = GRAPH_OPTIONS
 ) -> tuple[GraphSolution, ...]:
     """The minimum of every graph as `solve_graph` finds it, up to rounding; options and errors as there.
 
     Graphs may differ in size and camera. Those with an exact camera of one model, and the same kind of weights, are
     solved together. Converged problems leave the batch, and a failure does not affect the others.
     """
-    options = kernel, scale, backward, iterations, tolerance
+    strict, options = options.strict, options.replace(strict=False)
 
     def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
-        return _adjust_together(submaps, *options)
+        return _adjust_together(submaps, options)
 
     alike: dict[tuple[object, ...], list[int]] = {}
     for row, graph in enumerate(graphs):
@@ -521,9 +503,9 @@ def solve_graphs(
     found: Sequence[GraphSolution]
     for rows in alike.values():
         if len(rows) == 1:
-            found = (solve_graph(graphs[rows[0]], kernel, scale, None, *options[2:]),)
+            found = (solve_graph(graphs[rows[0]], options=options),)
         else:
-            found = _solve([graphs[row] for row in rows], adjust, *options)
+            found = _solve([graphs[row] for row in rows], adjust, options)
         solved.update(zip(rows, found, strict=True))
     solutions = tuple(solved[row] for row in range(len(graphs)))
     if strict and solutions:
@@ -537,7 +519,7 @@ def solve_graphs(
 def _solve(
     graphs: Sequence[ObservationGraph],
     adjust: Callable[[Sequence[_GraphSubmap]], list[BundleSolution]],
-    *options: Any,
+    options: SolverOptions,
 ) -> tuple[GraphSolution, ...]:
     """Solve graphs with one camera model; `adjust` solves the bundle adjustments of all their submaps."""
     for graph in graphs:
@@ -565,7 +547,7 @@ def _solve(
     camera = cameras[0]
     if len(cameras) > 1:
         camera = camera.with_params(torch.stack([each.params for each in cameras])[joined.submap])
-    T_cw, success, is_minimum = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, *options)
+    T_cw, success, is_minimum = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, options)
     solutions = []
     for number, graph in enumerate(graphs):
         rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
@@ -577,19 +559,12 @@ def _solve(
     return tuple(solutions)
 
 
-def _adjust_together(
-    submaps: Sequence[_GraphSubmap],
-    kernel: Kernel,
-    scale: Tensor | float,
-    backward: Backward,
-    iterations: int,
-    tolerance: float,
-) -> list[BundleSolution]:
+def _adjust_together(submaps: Sequence[_GraphSubmap], options: SolverOptions) -> list[BundleSolution]:
     """The bundle adjustment of each submap, found together with those of like size."""
     found: dict[int, BundleSolution] = {}
     for rows in _group_by_size(submaps):
         problems = [submaps[row].problem for row in rows]
-        together = bundle_adjust(_padded(problems), kernel, scale, False, backward, iterations, tolerance)
+        together = solve_bundle(_padded(problems), options=options)
         for number, (row, problem) in enumerate(zip(rows, problems, strict=True)):
             found[row] = together.element(number, len(problem.T_cw), len(problem.points_w))
     return [found[row] for row in range(len(submaps))]

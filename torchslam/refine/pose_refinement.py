@@ -51,7 +51,7 @@ from torchslam.global_mapping.view_graph import (
 )
 from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.run import Run
-from torchslam.types import State, StepResult, Trajectory
+from torchslam.types import Explanation, Reason, State, StepResult, Trajectory
 
 GOOD_POSES = 0.9
 """Share of image pairs that agree with the given poses, from which on the rounds start with them."""
@@ -257,8 +257,9 @@ class _Refinement:
 
     def lost(self, reason: str) -> list[StepResult]:
         """A result for every image, without a pose."""
+        reasons = (Explanation.of(Reason.OTHER, text=reason),)
         return [
-            StepResult(view.index, view.timestamp, State.LOST, None, reason=reason) for view in self.views
+            StepResult(view.index, view.timestamp, State.LOST, None, reasons=reasons) for view in self.views
         ]
 
     def _given(self) -> dict[int, Float[Tensor, "4 4"]]:

@@ -27,7 +27,7 @@ from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
-from torchslam.types import State, StepResult
+from torchslam.types import Explanation, State, StepResult
 
 STATES = tuple(State)
 """The order of states in a file."""
@@ -230,7 +230,7 @@ def _results(tensors: dict[str, Tensor], run: dict[str, Any], device: torch.devi
                 is_keyframe=bool(is_keyframe),
                 matches=matches,
                 inliers=inliers,
-                reason=run["reasons"][row],
+                reasons=Explanation.parsed(run["reasons"][row]),
                 stage_ms={
                     stage: time
                     for stage, time in zip(stages, times[row], strict=True)

@@ -24,7 +24,7 @@ from torchslam.map.atlas import Atlas, Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.local_bundle import adjust_all, squared_errors
-from torchslam.optim import Progress
+from torchslam.optim import GRAPH_OPTIONS, Progress
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
     GraphSolution,
@@ -332,7 +332,11 @@ class FinalAdjustment:
         submap: Submap, camera: Camera, given: CameraMeasurement | None, progress: Progress | None
     ) -> GraphSolution:
         graph = submap.posed_frames.graph(submap.map, camera, calibration=given)
-        solution = solve_graph(graph, backward="detached", iterations=POSE_ITERATIONS, progress=progress)
+        solution = solve_graph(
+            graph,
+            progress=progress,
+            options=GRAPH_OPTIONS.replace(iterations=POSE_ITERATIONS, backward="detached"),
+        )
         submap.posed_frames.apply_solution(solution, graph, submap.map)
         return solution
 

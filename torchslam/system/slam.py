@@ -45,7 +45,7 @@ from torchslam.system.state_machine import FrameOutcome, StateMachine
 from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.tracking.non_static import SceneFilter
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
+from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
 from torchslam.utils.timing import Stopwatch
 
 
@@ -336,6 +336,8 @@ class SLAM:
             is_keyframe=outcome.is_keyframe,
             matches=estimate.matches if estimate else 0,
             inliers=estimate.inliers if estimate else 0,
-            reason="; ".join(map(str, outcome.reasons)),
+            reasons=tuple(
+                each if isinstance(each, Explanation) else Explanation(each) for each in outcome.reasons
+            ),
             stage_ms=self.clock.take(),
         )

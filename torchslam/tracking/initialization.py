@@ -27,7 +27,7 @@ from torchslam.geometry import (
 from torchslam.geometry.rotating_camera import fit_rotating_camera
 from torchslam.geometry.two_view import TRANSFER_WIDTH
 from torchslam.map.atlas import Submap
-from torchslam.optim import BundleProblem, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.tracking.matcher import make_matcher, run_matcher
 from torchslam.types import FrameFeatures, Matcher, Reason, Rejection, TwoViewMap
 
@@ -230,8 +230,8 @@ class Initializer:
         return estimate_relative_pose(
             self.reference.keypoints[first][None],
             view.keypoints[second][None],
-            self.camera,
-            self.camera,
+            camera_1=self.camera,
+            camera_2=self.camera,
             threshold=self.config.initialization.threshold_px,
             seed=self.config.seed,
             kernel="truncated",
@@ -250,7 +250,9 @@ class Initializer:
         noise = (known.with_explicit_information() if noise.information.shape[-1] else known).pairwise_max(
             noise
         )
-        seen = triangulate(T_1w, T_cw, pixels_1, pixels_2, self.camera, self.camera)
+        seen = triangulate(
+            pixels_1, pixels_2, T_1w=T_1w, T_2w=T_cw, camera_1=self.camera, camera_2=self.camera
+        )
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
         errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera)
         good = is_good(seen, errors.amax(0), noise.gate_sigma, self.camera, settings)
@@ -342,7 +344,9 @@ def refine_pair(
     problem = BundleProblem(
         T, points_w, frame_index, point_index, pixels, camera, weights=weights, fixed_frames=fixed
     )
-    solution = bundle_adjust(problem, kernel="huber", scale=2.0, iterations=10, backward="detached")
+    solution = solve_bundle(
+        problem, options=BUNDLE_OPTIONS.replace(kernel="huber", scale=2.0, iterations=10, backward="detached")
+    )
     factor = torch.linalg.vector_norm(T_cw[:3, 3]) / torch.linalg.vector_norm(solution.T_cw[1, :3, 3])
     refined = solution.T_cw[1].clone()
     refined[:3, 3] *= factor

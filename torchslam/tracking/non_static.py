@@ -253,8 +253,8 @@ class IndependentMotion:
         motion = estimate_relative_pose(
             earlier.keypoints[first[rows]][None],
             view.keypoints[second[rows]][None],
-            self.camera,
-            self.camera,
+            camera_1=self.camera,
+            camera_2=self.camera,
             threshold=self.settings.threshold_px,
             kernel="truncated",
             min_samples=64,

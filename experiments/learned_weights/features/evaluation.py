@@ -83,7 +83,13 @@ def matched_pixels(features: Features) -> tuple[Tensor, Tensor]:
 def motion_of(pixels_1: Tensor, pixels_2: Tensor, camera: Camera) -> RelativePose:
     """The relative pose of matches (M, 2) within a threshold, as in map initialization."""
     return estimate_relative_pose(
-        pixels_1[None], pixels_2[None], camera, camera, THRESHOLD_PX, kernel="truncated", min_samples=64
+        pixels_1[None],
+        pixels_2[None],
+        camera_1=camera,
+        camera_2=camera,
+        threshold=THRESHOLD_PX,
+        kernel="truncated",
+        min_samples=64,
     )
 
 
@@ -100,4 +106,4 @@ def clip_from(sequence: Sequence, start: int, device: torch.device) -> Clip:
 def position_error(clip_slam: ClipSLAM, clip: Clip) -> float:
     """ATE as a share of the path, NaN where there are no poses to compare."""
     poses = clip_slam(clip.images, clip.camera)
-    return float(clip_loss(poses, clip.T_cw, relative_ate, on_failure=math.nan).loss)
+    return float(clip_loss(poses, T_cw_groundtruth=clip.T_cw, error=relative_ate, on_failure=math.nan).loss)

@@ -100,7 +100,7 @@ def agreeing(
 ) -> Tensor:
     """(N,) which tracks make a point that all their views, with their true poses, see about where it is."""
     pixels, pinhole = straightened(keypoints[views, columns], camera)
-    points = triangulate_many(T_cw[views], pixels, pinhole, found)
+    points = triangulate_many(pixels, T_cw=T_cw[views], camera=pinhole, mask=found)
     near = ((points.errors < MAX_ERROR) | ~found).all(-1)
     return (found.sum(-1) >= MIN_VIEWS) & points.mask & near & (points.angles > MIN_PARALLAX)
 

@@ -12,7 +12,7 @@ from experiments.learned_weights.features.tracks import MIN_PARALLAX, MIN_VIEWS,
 from torchslam.geometry import Camera, se3_inverse, triangulate_many
 from torchslam.learning.losses import pose_errors
 from torchslam.learning.training import Training
-from torchslam.optim import refine_pose
+from torchslam.optim import POSE_OPTIONS, solve_pose
 
 UNIT = 3e-3  # of the errors, radians and shares of the median depth: about their median
 KERNEL_PX = 1.5
@@ -79,23 +79,21 @@ def localization_errors(extractor: SubPixel, tracks: Tracks, drawn: Draw) -> tup
     others = [view for view in range(pixels.shape[2]) if view != drawn.query]
     T_cw = tracks.T_cw[drawn.frames]
     T_vq = T_cw[:, others] @ se3_inverse(T_cw[:, drawn.query])[:, None]
-    points = triangulate_many(T_vq, pixels[:, :, others], pinhole, drawn.seen[..., others])
+    points = triangulate_many(pixels[:, :, others], T_cw=T_vq, camera=pinhole, mask=drawn.seen[..., others])
     mask = drawn.seen[..., drawn.query] & points.mask & (points.angles > MIN_PARALLAX)
     start = torch.eye(4, dtype=pixels.dtype).expand(len(pixels), 4, 4)
-    refined = refine_pose(
-        start,
+    refined = solve_pose(
         points.points_w,
         pixels[:, :, drawn.query],
-        pinhole,
+        T_cw=start,
+        camera=pinhole,
         mask=mask,
-        scale=KERNEL_PX,
-        iterations=8,
-        tolerance=1e-6,
+        options=POSE_OPTIONS.replace(scale=KERNEL_PX, iterations=8, tolerance=1e-6),
     )
     depths = points.points_w[..., 2].detach().masked_fill(~mask, torch.nan).nanmedian(-1).values
     success = refined.success & (mask.sum(-1) >= MIN_TRACKS) & (depths > 0)
     scales = torch.stack([torch.where(success, depths, 1.0), torch.ones_like(depths)], -1)
-    return pose_errors(refined.T_cw, start) / scales, success
+    return pose_errors(T_cw=refined.T_cw, T_cw_groundtruth=start) / scales, success
 
 
 def pose_loss(extractor: SubPixel, tracks: Tracks, drawn: Draw) -> Tensor:

@@ -118,7 +118,7 @@ def poses_of(method: Method, problems: Problems) -> Tensor:
 
 def median_error(method: Method, problems: Problems) -> Tensor:
     """The median relative error against the reference poses."""
-    errors = pose_errors(poses_of(method, problems), problems.T_true)
+    errors = pose_errors(T_cw=poses_of(method, problems), T_cw_groundtruth=problems.T_true)
     return relative_errors(errors, problems).median()
 
 

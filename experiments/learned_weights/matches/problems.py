@@ -241,10 +241,12 @@ def _triangulate(frames: _Frames, base: int, references: list[int]) -> _Landmark
     # A reference that does not agree with the base spoils the point: keep those that do, pair by pair.
     for view in range(1, len(T_vb)):
         pair = torch.tensor([0, view])
-        two = triangulate_many(T_vb[pair], views_pixels[:, pair], frames.camera, views_seen[:, pair])
+        two = triangulate_many(
+            views_pixels[:, pair], T_cw=T_vb[pair], camera=frames.camera, mask=views_seen[:, pair]
+        )
         agrees = two.mask & (two.errors < MAX_TRIANGULATION_ERROR * views_scales[:, pair]).all(-1)
         views_seen[:, view] &= agrees
-    many = triangulate_many(T_vb, views_pixels, frames.camera, views_seen)
+    many = triangulate_many(views_pixels, T_cw=T_vb, camera=frames.camera, mask=views_seen)
     whitened = torch.where(views_seen, many.errors / views_scales, 0.0)
     mask = many.mask & (whitened < MAX_TRIANGULATION_ERROR).all(-1) & (many.angles > MIN_PARALLAX)
     views = views_seen.sum(-1)
@@ -319,7 +321,9 @@ def with_ransac(problems: Problems) -> Problems:
     """The problems with the poses that RANSAC finds; those for which it finds none at START_PX are left out."""
     results = [
         [
-            estimate_absolute_pose(part.points, part.pixels, part.camera, threshold, part.mask)
+            estimate_absolute_pose(
+                part.points, part.pixels, camera=part.camera, threshold=threshold, mask=part.mask
+            )
             for threshold in RANSAC_PX
         ]
         for part in (problems[start : start + _CHUNK] for start in range(0, len(problems), _CHUNK))

@@ -34,7 +34,7 @@ def losses(network: MatchWeights, problems: Problems, units: Tensor) -> Tensor:
     """
     total = torch.zeros_like(units[:, 0])
     for refined in refine_learned(network, problems):
-        errors = pose_errors(refined.T_cw, problems.T_true)
+        errors = pose_errors(T_cw=refined.T_cw, T_cw_groundtruth=problems.T_true)
         total = total + torch.where(refined.success, (errors / units).log1p().sum(-1), 0.0)
     return total
 

@@ -8,7 +8,7 @@ from torch import Tensor, nn
 from experiments.learned_weights.matches.problems import Problems
 from torchslam.geometry import innovation_covariances, mahalanobis_squared, transform
 from torchslam.geometry.robust import Kernel
-from torchslam.optim import RefinedPose, refine_pose
+from torchslam.optim import POSE_OPTIONS, RefinedPose, solve_pose
 
 NUM_FEATURES = 21
 ROUNDS = 2
@@ -73,17 +73,14 @@ def refine(
     start: Tensor | None = None,
 ) -> RefinedPose:
     """Poses from a start (P, 4, 4), RANSAC's if None, with weights (P, N) in px^-2, one if None."""
-    return refine_pose(
-        problems.T_start if start is None else start,
+    return solve_pose(
         problems.points,
         problems.pixels,
-        problems.camera,
-        weights,
-        problems.mask,
-        kernel,
-        scale,
-        iterations=ITERATIONS,
-        tolerance=TOLERANCE,
+        T_cw=problems.T_start if start is None else start,
+        camera=problems.camera,
+        weights=weights,
+        mask=problems.mask,
+        options=POSE_OPTIONS.replace(kernel=kernel, scale=scale, iterations=ITERATIONS, tolerance=TOLERANCE),
     )
 
 

@@ -14,6 +14,7 @@ from experiments.learned_weights.noise.model import NoiseModel
 from torchslam.evaluation import ate
 from torchslam.geometry import transform
 from torchslam.geometry.robust import robustify
+from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, solve_graph
 
 BEND = 2.45
@@ -78,7 +79,7 @@ def weighed(example: Example, model: NoiseModel) -> Example:
 
 def solved(example: Example) -> Example:
     """The run at the minimum of its graph."""
-    solution = solve_graph(example.graph, scale=BEND, backward="detached")
+    solution = solve_graph(example.graph, options=GRAPH_OPTIONS.replace(scale=BEND, backward="detached"))
     return replace(example, graph=replace(example.graph, T_cw=solution.T_cw, points_w=solution.points_w))
 
 
@@ -163,7 +164,7 @@ def position_error(example: Example, solution: GraphSolution) -> Tensor:
     """ATE in meters of the frames whose truth is known, differentiable. Raises ValueError for too few."""
     if int(example.known.sum()) < LEAST_KNOWN:
         raise ValueError(f"{int(example.known.sum())} keyframes with true poses: they teach no trajectory")
-    return ate(solution.T_cw[example.known], example.T_cw[example.known])
+    return ate(T_cw=solution.T_cw[example.known], T_cw_groundtruth=example.T_cw[example.known])
 
 
 def fit_trajectories(model: NoiseModel, examples: Sequence[Example], settings: Settings) -> NoiseModel:
@@ -176,7 +177,9 @@ def fit_trajectories(model: NoiseModel, examples: Sequence[Example], settings: S
         optimizer.zero_grad()
         for row, example in enumerate(now):
             informed = weighed(example, found)
-            solution = solve_graph(informed.graph, scale=BEND, iterations=10, tolerance=1e-8)
+            solution = solve_graph(
+                informed.graph, options=GRAPH_OPTIONS.replace(scale=BEND, iterations=10, tolerance=1e-8)
+            )
             (position_error(example, solution).log() / len(now)).backward()
             # The next step starts where this one ended.
             graph = replace(example.graph, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())

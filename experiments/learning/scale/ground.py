@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.dense.cost_volume import correlation
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_log, transform
-from torchslam.optim import PoseGraph, PoseGraphSolution, pose_graph_optimize
+from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, PoseGraphSolution, solve_pose_graph
 
 ROWS, COLUMNS = 60, 40
 """Samples of the patch of ground: rows at equal steps of 1 / distance, as pixels are."""
@@ -179,4 +179,4 @@ def scaled_by_heights(
     graph = PoseGraph(
         torch.cat((ground, T_cw), -3), edges, torch.cat((heights, motions), -3), torch.diag_embed(diagonal)
     )
-    return pose_graph_optimize(graph, "huber", KERNEL)
+    return solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(kernel="huber", scale=KERNEL))

@@ -16,7 +16,7 @@ from torchslam import SLAM, Trajectory, evaluate, load_config, open_sequence
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import rigid, se3_inverse, sim3_scale
 from torchslam.geometry.transforms import without_scale
-from torchslam.optim import FrameFactors
+from torchslam.optim import GRAPH_OPTIONS, FrameFactors
 from torchslam.optim.run_graph import RunGraph, solve_graph
 
 HERE = Path(__file__).parent
@@ -222,7 +222,9 @@ def in_run_graph(one: Observed, prior: HandMade | Learned) -> Tensor:
     )
     pairs = torch.stack((one.rows[:-1], one.rows[1:]), -1)
     factors = [FrameFactors.distances(pairs, distances, both)]
-    return solve_graph(one.graph, frame_factors=factors, backward="detached").T_cw[one.rows]
+    return solve_graph(
+        one.graph, frame_factors=factors, options=GRAPH_OPTIONS.replace(backward="detached")
+    ).T_cw[one.rows]
 
 
 ARMS = "true scale", "hand-made", "learned", "hand-made, run's graph"

@@ -60,6 +60,7 @@ def test_colmap_poses_round_trip(scene: ExportedScene, tmp_path: Path, name: str
         assert params_of(given, scene.camera) == pytest.approx(scene.camera.params.tolist())
 
 
+@pytest.mark.parametrize("lens", ["pinhole", "tangential", "third", "fisheye"], indirect=True)
 def test_nerfstudio_poses_round_trip(scene: ExportedScene, tmp_path: Path) -> None:
     """From the file or its folder; the axes of its cameras are turned."""
     write_nerfstudio(tmp_path, scene, torch.eye(3, dtype=torch.float64))

@@ -18,6 +18,9 @@ CAMERAS = {
     "pinhole": Camera.pinhole(*PINHOLE, size=SIZE),
     "tangential": Camera.radial_tangential(*PINHOLE, -0.2, 0.05, 0.002, -0.001, size=SIZE),
     "third": Camera.radial_tangential(*PINHOLE, -0.2, 0.05, 0.002, -0.001, 0.3, size=SIZE),
+    "rational": Camera(
+        "rational", torch.tensor([*PINHOLE, 0.5, -0.3, 2e-3, -1e-3, 0.1, 0.8, -0.1, 0.02]).double(), SIZE
+    ),
     "fisheye": Camera.fisheye(*PINHOLE, 0.02, -0.01, 0.003, -0.001, size=SIZE),
 }
 NOISE_PX = 0.5

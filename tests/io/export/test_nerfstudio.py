@@ -12,6 +12,7 @@ import torch
 
 from tests.box_room import HALF, box_cloud, box_depths
 from tests.io.export.conftest import reprojection_error
+from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.depths import enlarged
@@ -39,8 +40,16 @@ def read_cloud(path: Path) -> np.ndarray:
 
 @pytest.fixture
 def folder(scene: ExportedScene, tmp_path: Path) -> Path:
+    if scene.camera.model == "rational":
+        pytest.skip("no model of nerfstudio holds it")
     write_nerfstudio(tmp_path, scene, upright_rotation(scene.T_wc))
     return tmp_path
+
+
+@pytest.mark.parametrize("lens", ["rational"], indirect=True)
+def test_a_model_that_nerfstudio_does_not_have_is_refused(scene: ExportedScene, tmp_path: Path) -> None:
+    with pytest.raises(ResultsError, match="nerfstudio has no rational camera: export to colmap"):
+        write_nerfstudio(tmp_path, scene, upright_rotation(scene.T_wc))
 
 
 def test_points_fall_on_their_keypoints(scene: ExportedScene, folder: Path) -> None:

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, umeyama
-from torchslam.optim import bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, solve_bundle
 from torchslam.optim.bundle import _schur as schur
 from torchslam.optim.bundle import _sparse
 from torchslam.optim.bundle._sparse import SparseBundle
@@ -14,7 +14,7 @@ CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
 def test_exact_data_gives_the_exact_map(bundle_scene, model):
     scene = bundle_scene(noise=0.0, model=model)
-    solution = bundle_adjust(scene.problem, kernel="none")
+    solution = solve_bundle(scene.problem, options=BUNDLE_OPTIONS.replace(kernel="none"))
     assert solution.success
     assert solution.convergence.converged
     torch.testing.assert_close(solution.T_cw, scene.T_cw, atol=1e-8, rtol=0)
@@ -28,7 +28,11 @@ def test_free_camera_finds_the_intrinsics(bundle_scene, model):
     off[:2] *= 1.05
     off[4:] *= 0.5
     problem = replace(scene.problem, camera=camera.with_params(off))
-    solution = bundle_adjust(problem, kernel="none", free_camera=True, iterations=60, tolerance=1e-14)
+    solution = solve_bundle(
+        problem,
+        free_camera=True,
+        options=BUNDLE_OPTIONS.replace(kernel="none", iterations=60, tolerance=1e-14),
+    )
     torch.testing.assert_close(solution.camera.params, camera.params, atol=1e-4, rtol=1e-4)
 
 
@@ -39,13 +43,20 @@ def test_camera_that_moves_in_some_directions_alone(bundle_scene):
     along = torch.cat((camera.params[:2], torch.zeros(2, dtype=torch.float64)))[:, None]
     off = camera.with_params(camera.params + 0.05 * along[:, 0])
     problem = replace(scene.problem, camera=off)
-    solution = bundle_adjust(problem, "none", free_camera=along, iterations=60, tolerance=1e-14)
+    solution = solve_bundle(
+        problem,
+        free_camera=along,
+        options=BUNDLE_OPTIONS.replace(kernel="none", iterations=60, tolerance=1e-14),
+    )
     torch.testing.assert_close(solution.camera.params, camera.params, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(solution.camera.params[2:], camera.params[2:], atol=0, rtol=0)
 
     noisy = bundle_scene(frames=8, points=80, noise=0.5).problem
     every = torch.eye(4, dtype=torch.float64) * torch.tensor([2.0, 3.0, 4.0, 5.0], dtype=torch.float64)
-    one, other = (bundle_adjust(noisy, free_camera=free, **CONVERGED) for free in (True, every))
+    one, other = (
+        solve_bundle(noisy, free_camera=free, options=BUNDLE_OPTIONS.replace(**CONVERGED))
+        for free in (True, every)
+    )
     torch.testing.assert_close(one.camera.params, other.camera.params, rtol=1e-8, atol=0)
     covariance = every @ other.covariance().camera @ every.mT
     torch.testing.assert_close(covariance, one.covariance().camera, rtol=1e-5, atol=1e-9)
@@ -58,7 +69,9 @@ def test_robust_kernel_survives_outliers(bundle_scene, generator):
     problem = replace(scene.problem, pixels=pixels)
 
     def error(kernel):
-        T_cw = bundle_adjust(problem, kernel=kernel, scale=1.5, iterations=50).T_cw
+        T_cw = solve_bundle(
+            problem, options=BUNDLE_OPTIONS.replace(kernel=kernel, scale=1.5, iterations=50)
+        ).T_cw
         return se3_log(T_cw @ se3_inverse(scene.T_cw)).norm()
 
     assert error("cauchy") < 0.3 * error("none")
@@ -67,12 +80,12 @@ def test_robust_kernel_survives_outliers(bundle_scene, generator):
 
 def test_tiles_do_not_change_the_answer(bundle_scene, monkeypatch):
     scene = bundle_scene(frames=8, points=40, visible=0.3)
-    one = bundle_adjust(scene.problem)
+    one = solve_bundle(scene.problem)
     monkeypatch.setattr(schur, "_TILE_POINTS", 5)
-    many = bundle_adjust(scene.problem)
+    many = solve_bundle(scene.problem)
     monkeypatch.setattr(schur, "_MANY_FRAMES", 7)
     monkeypatch.setattr(schur, "_TILE_POINTS_OF_MANY", 3)
-    lower = bundle_adjust(scene.problem)
+    lower = solve_bundle(scene.problem)
     for other in (many, lower):
         torch.testing.assert_close(one.T_cw, other.T_cw)
         torch.testing.assert_close(one.points_w, other.points_w)
@@ -98,12 +111,12 @@ def test_order_of_the_observations_does_not_matter(bundle_scene, generator):
         point_index=problem.point_index[order],
         pixels=problem.pixels[order],
     )
-    torch.testing.assert_close(bundle_adjust(problem).T_cw, bundle_adjust(shuffled).T_cw)
+    torch.testing.assert_close(solve_bundle(problem).T_cw, solve_bundle(shuffled).T_cw)
 
 
 def test_same_input_same_bytes(bundle_scene):
     scene = bundle_scene(frames=30, points=300, visible=0.2)
-    first, second = bundle_adjust(scene.problem), bundle_adjust(scene.problem)
+    first, second = solve_bundle(scene.problem), solve_bundle(scene.problem)
     assert torch.equal(first.T_cw, second.T_cw)
     assert torch.equal(first.points_w, second.points_w)
 
@@ -113,7 +126,7 @@ def test_fixed_parameters_do_not_change(bundle_scene):
     mask = torch.zeros(5, dtype=torch.bool)
     mask[[1, 3]] = True
     problem = replace(scene.problem, fixed_frames=mask, fixed_points=[2, 5])
-    solution = bundle_adjust(problem)
+    solution = solve_bundle(problem)
     assert torch.equal(solution.T_cw[[1, 3]], problem.T_cw[[1, 3]])
     assert torch.equal(solution.points_w[[2, 5]], problem.points_w[[2, 5]])
     assert (solution.T_cw[[0, 2, 4]] != problem.T_cw[[0, 2, 4]]).any()
@@ -124,14 +137,16 @@ def test_fixed_parameters_do_not_change(bundle_scene):
 def test_structure_only_and_motion_only(bundle_scene):
     scene = bundle_scene(noise=0.0)
     problem = replace(scene.problem, T_cw=scene.T_cw, fixed_frames=range(5))
-    torch.testing.assert_close(bundle_adjust(problem).points_w, scene.points_w, atol=1e-7, rtol=0)
+    torch.testing.assert_close(solve_bundle(problem).points_w, scene.points_w, atol=1e-7, rtol=0)
     problem = replace(scene.problem, points_w=scene.points_w, fixed_frames=(), fixed_points=range(30))
-    torch.testing.assert_close(bundle_adjust(problem).T_cw, scene.T_cw, atol=1e-8, rtol=0)
+    torch.testing.assert_close(solve_bundle(problem).T_cw, scene.T_cw, atol=1e-8, rtol=0)
 
 
-def shape(problem, **options):
+def shape(problem):
     """Distances between the camera centers, relative to the first: what no gauge changes."""
-    centers = se3_inverse(bundle_adjust(problem, "cauchy", 2.0, **CONVERGED, **options).T_cw)[:, :3, 3]
+    centers = se3_inverse(
+        solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)).T_cw
+    )[:, :3, 3]
     distances = (centers[1:] - centers[:1]).norm(dim=-1)
     return distances / distances.sum()
 
@@ -152,7 +167,7 @@ def test_the_shape_and_its_gradient_do_not_depend_on_the_gauge(bundle_scene):
 
 def test_an_open_gauge_keeps_the_scale_and_has_covariances(bundle_scene):
     scene = bundle_scene(frames=6, points=60)
-    solution = bundle_adjust(replace(scene.problem, fixed_frames=(0,)))
+    solution = solve_bundle(replace(scene.problem, fixed_frames=(0,)))
     assert solution.success
     s, _, _ = umeyama(solution.points_w, scene.problem.points_w)
     assert s.item() == pytest.approx(1, abs=0.02)
@@ -166,9 +181,9 @@ def test_two_maps_without_a_common_point_are_not_determined(bundle_scene):
     problem = replace(
         problem, frame_index=problem.frame_index[apart], point_index=problem.point_index[apart], pixels=pixels
     )
-    solution = bundle_adjust(problem)
+    solution = solve_bundle(problem)
     assert not solution.success
-    unchecked = bundle_adjust(problem, check=False)
+    unchecked = solve_bundle(problem, check=False)
     assert unchecked.success
     assert torch.equal(unchecked.T_cw, solution.T_cw)
     assert solution.T_cw.isfinite().all()
@@ -190,7 +205,7 @@ def test_invalid_observations_and_unobserved_rows_are_ignored(bundle_scene):
     broken = replace(
         problem, T_cw=T_cw, points_w=points_w, frame_index=frame_index, point_index=point_index, pixels=pixels
     )
-    solution, expected = bundle_adjust(broken), bundle_adjust(problem)
+    solution, expected = solve_bundle(broken), solve_bundle(problem)
     torch.testing.assert_close(solution.T_cw[:6], expected.T_cw)
     torch.testing.assert_close(solution.points_w[:30], expected.points_w)
     assert torch.equal(solution.T_cw[6], T_cw[6])
@@ -206,7 +221,7 @@ def test_a_point_behind_the_cameras_does_not_spoil_the_rest(bundle_scene):
     scene = bundle_scene()
     points_w = scene.problem.points_w.clone()
     points_w[4, 2] = -5.0
-    solution = bundle_adjust(replace(scene.problem, points_w=points_w))
+    solution = solve_bundle(replace(scene.problem, points_w=points_w))
     assert solution.T_cw.isfinite().all()
     keep = scene.problem.point_index != 4
     without = replace(
@@ -215,7 +230,7 @@ def test_a_point_behind_the_cameras_does_not_spoil_the_rest(bundle_scene):
         point_index=scene.problem.point_index[keep],
         pixels=scene.problem.pixels[keep],
     )
-    torch.testing.assert_close(solution.T_cw, bundle_adjust(without).T_cw, atol=1e-6, rtol=0)
+    torch.testing.assert_close(solution.T_cw, solve_bundle(without).T_cw, atol=1e-6, rtol=0)
 
 
 def gradcheck_inputs(scene, generator, model):
@@ -250,7 +265,11 @@ def test_implicit_gradient_by_gradcheck(bundle_scene, model, free_camera, genera
             weights=weights,
             camera=problem.camera.with_params(params),
         )
-        solution = bundle_adjust(moved, "cauchy", scale, free_camera, **CONVERGED)
+        solution = solve_bundle(
+            moved,
+            free_camera=free_camera,
+            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=scale, **CONVERGED),
+        )
         return solution.T_cw[:, :3], solution.points_w, solution.camera.params
 
     inputs = gradcheck_inputs(scene, generator, model)
@@ -263,7 +282,10 @@ def test_implicit_gradient_by_gradcheck(bundle_scene, model, free_camera, genera
 
 def gradient_to_pixels(problem, backward, **options):
     pixels = problem.pixels.clone().requires_grad_()
-    solution = bundle_adjust(replace(problem, pixels=pixels), "cauchy", 2.0, backward=backward, **options)
+    solution = solve_bundle(
+        replace(problem, pixels=pixels),
+        options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, backward=backward, **options),
+    )
     weights = torch.linspace(-1, 1, solution.points_w.numel(), dtype=torch.float64).view_as(solution.points_w)
     ((solution.points_w * weights).sum() + solution.T_cw[:, :3].sum()).backward()
     return pixels.grad
@@ -279,7 +301,9 @@ def test_backward_modes_agree_where_they_should(bundle_scene):
     bias = (gradient_to_pixels(problem, "truncated", **options) - implicit).norm() / implicit.norm()
     assert 0.01 < bias < 1
     pixels = problem.pixels.clone().requires_grad_()
-    detached = bundle_adjust(replace(problem, pixels=pixels), backward="detached")
+    detached = solve_bundle(
+        replace(problem, pixels=pixels), options=BUNDLE_OPTIONS.replace(backward="detached")
+    )
     assert not detached.T_cw.requires_grad
 
 
@@ -289,7 +313,9 @@ def test_covariance_is_calibrated(bundle_scene, kernel):
     frames, points = [], []
     for seed in range(50):
         scene = bundle_scene(frames=8, points=120, noise=0.7, perturbation=0.002, visible=1.0, seed=seed)
-        solution = bundle_adjust(scene.problem, kernel=kernel, scale=2.0, tolerance=1e-10)
+        solution = solve_bundle(
+            scene.problem, options=BUNDLE_OPTIONS.replace(kernel=kernel, scale=2.0, tolerance=1e-10)
+        )
         covariance = solution.covariance(frames=range(2, 8))
         error = se3_log(scene.T_cw @ se3_inverse(solution.T_cw))[2:]
         frames.append((error * torch.linalg.solve(covariance.frames, error)).sum(-1))
@@ -308,7 +334,7 @@ def test_dtype_and_device_come_from_the_inputs(bundle_scene, dtype, device):
         **{name: getattr(problem, name).to(device) for name in ("frame_index", "point_index")},
         camera=problem.camera.to(device).to(dtype),
     )
-    solution = bundle_adjust(problem)
+    solution = solve_bundle(problem)
     assert solution.success
     for tensor in (solution.T_cw, solution.points_w, solution.cost, solution.covariance().points):
         assert tensor.dtype == dtype
@@ -320,11 +346,11 @@ def test_dtype_and_device_come_from_the_inputs(bundle_scene, dtype, device):
 def test_invalid_input_is_rejected_by_name(bundle_scene):
     problem = bundle_scene().problem
     with pytest.raises(ValueError, match=r"frame_index must lie in 0 ... 4"):
-        bundle_adjust(replace(problem, frame_index=problem.frame_index + 1))
+        solve_bundle(replace(problem, frame_index=problem.frame_index + 1))
     with pytest.raises(ValueError, match=r"point_index must be \(..., O\), not \(140,\): O is 141"):
-        bundle_adjust(replace(problem, point_index=problem.point_index[:-1]))
+        solve_bundle(replace(problem, point_index=problem.point_index[:-1]))
     with pytest.raises(ValueError, match=r"shape \(5,\)"):
-        bundle_adjust(replace(problem, fixed_frames=torch.ones(4, dtype=torch.bool)))
+        solve_bundle(replace(problem, fixed_frames=torch.ones(4, dtype=torch.bool)))
 
 
 def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
@@ -338,7 +364,10 @@ def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
         return found
 
     monkeypatch.setattr(SparseBundle, "_settled", settled)
-    bundle_adjust(bundle_scene(frames=6, points=40, perturbation=0.05).problem, iterations=1)
+    solve_bundle(
+        bundle_scene(frames=6, points=40, perturbation=0.05).problem,
+        options=BUNDLE_OPTIONS.replace(iterations=1),
+    )
     (bundle, before, after), *_ = seen
     assert torch.equal(before.T_cw, after.T_cw)
     assert torch.equal(before.params, after.params)
@@ -355,8 +384,8 @@ def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
 
 def test_steps_of_points_lead_to_the_same_minimum(monkeypatch, bundle_scene):
     problem = bundle_scene(frames=6, points=40, perturbation=0.05).problem
-    alone = bundle_adjust(problem, tolerance=1e-12)
+    alone = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(tolerance=1e-12))
     monkeypatch.setattr(_sparse, "_INNER_FRAMES", 2)
-    settled = bundle_adjust(problem, tolerance=1e-12)
+    settled = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(tolerance=1e-12))
     torch.testing.assert_close(settled.T_cw, alone.T_cw, rtol=0, atol=1e-7)
     torch.testing.assert_close(settled.cost, alone.cost, rtol=1e-9, atol=0)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform
-from torchslam.optim import BundleProblem, CameraPrior, PosePrior, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, CameraPrior, PosePrior, solve_bundle
 
 CONVERGED = {"iterations": 60, "tolerance": 0.0}
 
@@ -29,10 +29,12 @@ def zoomed(bundle_scene, noise=0.0, **options) -> tuple[BundleProblem, torch.Ten
 
 def test_every_frame_has_its_camera(bundle_scene):
     problem, _ = zoomed(bundle_scene)
-    solution = bundle_adjust(problem, "none")
+    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none"))
     assert solution.cost < 1e-12
     assert solution.camera.params.shape == (2, 4)
-    swapped = bundle_adjust(replace(problem, camera_index=1 - problem.camera_index), "none")
+    swapped = solve_bundle(
+        replace(problem, camera_index=1 - problem.camera_index), options=BUNDLE_OPTIONS.replace(kernel="none")
+    )
     assert swapped.cost > 1
 
 
@@ -42,7 +44,11 @@ def test_every_camera_is_found(bundle_scene, directions):
     step = torch.tensor([1.0, 1.02, 0.0, 0.0], dtype=torch.float64)
     off = params + torch.tensor([[20.0], [-15.0]], dtype=torch.float64) * step
     problem = replace(problem, camera=problem.camera.with_params(off))
-    solution = bundle_adjust(problem, "none", free_camera=directions, iterations=60, tolerance=1e-16)
+    solution = solve_bundle(
+        problem,
+        free_camera=directions,
+        options=BUNDLE_OPTIONS.replace(kernel="none", iterations=60, tolerance=1e-16),
+    )
     torch.testing.assert_close(solution.camera.params, params, atol=1e-4, rtol=1e-6)
     size = 8 if directions is True else 2
     assert solution.covariance().camera.shape == (size, size)
@@ -60,7 +66,11 @@ def test_a_camera_per_frame_is_found(bundle_scene):
     problem, params = one_each(problem), params[problem.camera_index]
     off = 1 + torch.linspace(-0.03, 0.03, 8, dtype=torch.float64)[:, None] * torch.tensor([1, 1, 0, 0])
     problem = replace(problem, camera=problem.camera.with_params(off * params))
-    solution = bundle_adjust(problem, "none", free_camera=True, iterations=60, tolerance=1e-16)
+    solution = solve_bundle(
+        problem,
+        free_camera=True,
+        options=BUNDLE_OPTIONS.replace(kernel="none", iterations=60, tolerance=1e-16),
+    )
     assert solution.success
     torch.testing.assert_close(solution.camera.params, params, atol=1e-4, rtol=1e-6)
     assert solution.covariance().camera.shape == (32, 32)
@@ -69,11 +79,15 @@ def test_a_camera_per_frame_is_found(bundle_scene):
 def test_cameras_tied_by_a_prior_are_as_one(bundle_scene):
     """A camera per frame, held by a strong prior at shared ones; the prior is then its covariance."""
     shared, _ = zoomed(bundle_scene, noise=1.0)
-    one = bundle_adjust(shared, "cauchy", 2.0, free_camera=True, **CONVERGED)
+    one = solve_bundle(
+        shared, free_camera=True, options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
+    )
     eye = 1e6 * torch.eye(4, dtype=torch.float64).expand(8, 4, 4)
     mean = one.camera.params[shared.camera_index]
     tied = replace(one_each(shared), camera_prior=CameraPrior(mean, eye))
-    found = bundle_adjust(tied, "cauchy", 2.0, free_camera=True, **CONVERGED)
+    found = solve_bundle(
+        tied, free_camera=True, options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
+    )
     torch.testing.assert_close(found.T_cw, one.T_cw, atol=1e-5, rtol=0)
     torch.testing.assert_close(found.camera.params, mean, atol=1e-3, rtol=0)
     spread = found.covariance().camera.unflatten(0, (8, 4)).unflatten(2, (8, 4)).diagonal(dim1=0, dim2=2)
@@ -89,7 +103,11 @@ def test_the_gradient_of_a_camera_per_frame_by_gradcheck(bundle_scene):
     def solve(pixels, weights, scale, centers):
         params = torch.cat((problem.camera.params[:, :2], centers), dim=1)
         moved = replace(problem, pixels=pixels, weights=weights, camera=problem.camera.with_params(params))
-        solution = bundle_adjust(moved, "cauchy", scale, focal, iterations=30, tolerance=0.0)
+        solution = solve_bundle(
+            moved,
+            free_camera=focal,
+            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=scale, iterations=30, tolerance=0.0),
+        )
         return solution.T_cw[:, :3], solution.points_w, solution.camera.params
 
     weights, scale = torch.ones_like(problem.pixels[:, 0]), torch.tensor(3.0).double()
@@ -105,8 +123,9 @@ def test_two_equal_cameras_give_the_result_of_one(bundle_scene, model):
     gradients, solutions = [], []
     for camera, camera_index in ((problem.camera, None), (cameras, index)):
         params = camera.params.clone().requires_grad_()
-        solution = bundle_adjust(
-            replace(problem, camera=camera.with_params(params), camera_index=camera_index), "cauchy", 2.0
+        solution = solve_bundle(
+            replace(problem, camera=camera.with_params(params), camera_index=camera_index),
+            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0),
         )
         solution.T_cw.sum().backward()
         gradients.append(params.grad)
@@ -125,13 +144,15 @@ def pose_prior(problem: BundleProblem, T_cw: torch.Tensor, weights: list[float])
 def test_a_strong_prior_acts_like_a_fixed_frame(bundle_scene):
     """And one without information is none."""
     problem = bundle_scene(frames=5, points=40).problem
-    fixed = bundle_adjust(replace(problem, fixed_frames=(0, 1, 3)), **CONVERGED)
+    fixed = solve_bundle(
+        replace(problem, fixed_frames=(0, 1, 3)), options=BUNDLE_OPTIONS.replace(**CONVERGED)
+    )
     held = pose_prior(problem, problem.T_cw, [0, 0, 0, 1e12, 0])
-    solution = bundle_adjust(replace(problem, pose_prior=held), **CONVERGED)
+    solution = solve_bundle(replace(problem, pose_prior=held), options=BUNDLE_OPTIONS.replace(**CONVERGED))
     torch.testing.assert_close(solution.T_cw, fixed.T_cw, atol=1e-6, rtol=0)
     nothing = pose_prior(problem, problem.T_cw, [0] * 5)
     torch.testing.assert_close(
-        bundle_adjust(replace(problem, pose_prior=nothing)).T_cw, bundle_adjust(problem).T_cw
+        solve_bundle(replace(problem, pose_prior=nothing)).T_cw, solve_bundle(problem).T_cw
     )
 
 
@@ -143,7 +164,7 @@ def test_priors_instead_of_fixed_frames(bundle_scene, batched, weights, is_open)
     problem = replace(scene.problem, pose_prior=pose_prior(scene.problem, scene.T_cw, weights))
     if batched:
         problem = replace(problem, T_cw=problem.T_cw.expand(3, 5, 4, 4))
-    solution = bundle_adjust(problem, "none", **CONVERGED)
+    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none", **CONVERGED))
     assert solution.success.all()
     T_cw = solution.T_cw.view(-1, 5, 4, 4)[-1]
     torch.testing.assert_close(T_cw[0], scene.T_cw[0], atol=1e-8, rtol=0)
@@ -161,7 +182,9 @@ def test_a_prior_weighs_against_pixels(bundle_scene):
     off = se3_exp(torch.tensor([0.01, 0, 0, 0, 0.02, 0], dtype=torch.float64)) @ problem.T_cw
     weights = [0, 0, 0, 1e4, 1e4]
     prior = pose_prior(problem, off, weights)
-    solution = bundle_adjust(replace(problem, pose_prior=prior), "none", **CONVERGED)
+    solution = solve_bundle(
+        replace(problem, pose_prior=prior), options=BUNDLE_OPTIONS.replace(kernel="none", **CONVERGED)
+    )
     twist = torch.zeros(5, 6, dtype=torch.float64, requires_grad=True)
     T_cw = se3_exp(twist) @ solution.T_cw
     points_c = transform(T_cw[problem.frame_index], solution.points_w[problem.point_index][:, None])[:, 0]
@@ -182,7 +205,7 @@ def test_a_frame_with_too_few_observations_stays_at_its_prior(bundle_scene):
     T_cw = torch.cat((problem.T_cw, problem.T_cw[-1:]))
     expected = se3_exp(torch.tensor([0.1, 0, 0, 0, 0.1, 0], dtype=torch.float64)) @ T_cw
     prior = pose_prior(problem, expected, [0, 0, 0, 0, 0, 100])
-    solution = bundle_adjust(replace(problem, T_cw=T_cw, pose_prior=prior))
+    solution = solve_bundle(replace(problem, T_cw=T_cw, pose_prior=prior))
     assert solution.success
     assert solution.moved_frames.tolist() == [False, False, True, True, True, True]
     torch.testing.assert_close(solution.T_cw[5], expected[5], atol=1e-8, rtol=0)
@@ -198,14 +221,18 @@ def test_the_camera_lies_between_its_prior_and_the_data(bundle_scene):
     for weight in (0.0, 1.0, 1e9):
         information = weight * torch.eye(4, dtype=torch.float64)
         prior = CameraPrior(mean, information)
-        solution = bundle_adjust(replace(problem, camera_prior=prior), free_camera=True, **CONVERGED)
+        solution = solve_bundle(
+            replace(problem, camera_prior=prior),
+            free_camera=True,
+            options=BUNDLE_OPTIONS.replace(**CONVERGED),
+        )
         found.append(solution.camera.params)
-    free = bundle_adjust(problem, free_camera=True, **CONVERGED).camera.params
+    free = solve_bundle(problem, free_camera=True, options=BUNDLE_OPTIONS.replace(**CONVERGED)).camera.params
     torch.testing.assert_close(found[0], free, rtol=1e-8, atol=0)
     torch.testing.assert_close(found[2], mean, atol=1e-4, rtol=0)
     assert free[0] < found[1][0] < mean[0]
-    covariance = bundle_adjust(problem, free_camera=True).covariance().camera
-    tight = bundle_adjust(
+    covariance = solve_bundle(problem, free_camera=True).covariance().camera
+    tight = solve_bundle(
         replace(problem, camera_prior=CameraPrior(mean, 1e4 * torch.eye(4).double())), free_camera=True
     ).covariance()
     assert (torch.linalg.eigvalsh(covariance - tight.camera) > 0).all()
@@ -230,7 +257,11 @@ def test_gradients_to_priors_and_cameras_by_gradcheck(bundle_scene, angle):
             pose_prior=prior,
             camera_prior=CameraPrior(mean, 0.5 * (tight + tight.mT)),
         )
-        solution = bundle_adjust(moved, "cauchy", 3.0, free_camera=not angle, iterations=30, tolerance=0.0)
+        solution = solve_bundle(
+            moved,
+            free_camera=not angle,
+            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=3.0, iterations=30, tolerance=0.0),
+        )
         return solution.T_cw[:, :3], solution.points_w, solution.camera.params
 
     inputs = (params, twist, information, params + 1.0, tight)

@@ -1,4 +1,4 @@
-"""The NumPy backend of the dense formulation against `bundle_adjust`: the sparse one, and its PyTorch backend."""
+"""The NumPy backend of the dense formulation against `solve_bundle`: the sparse one, and its PyTorch backend."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import se3_inverse, se3_log
-from torchslam.optim import BundleProblem, BundleSolution, bundle_adjust
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._dense import suits_dense
 from torchslam.optim.bundle._problem import sanitized, select_moving
 from torchslam.optim.bundle.dense_numpy import NumpyBundleSolution, bundle_adjust_numpy
@@ -20,8 +20,12 @@ SCALE = 2.0  # of the kernel
 def both(
     problem: BundleProblem, iterations: int = 30, tolerance: float = 1e-10
 ) -> tuple[NumpyBundleSolution, BundleSolution]:
-    wanted = bundle_adjust(
-        problem, "huber", SCALE, backward="detached", iterations=iterations, tolerance=tolerance, check=False
+    wanted = solve_bundle(
+        problem,
+        check=False,
+        options=BUNDLE_OPTIONS.replace(
+            kernel="huber", scale=SCALE, iterations=iterations, tolerance=tolerance, backward="detached"
+        ),
     )
     return bundle_adjust_numpy(problem, SCALE, iterations, tolerance), wanted
 
@@ -65,8 +69,12 @@ def test_both_backends_of_the_dense_formulation_agree(
     batch = replace(first, **{name: torch.stack([getattr(p, name) for p in problems]) for name in names})
     given = sanitized(batch, SCALE)
     assert suits_dense(given, select_moving(given))
-    together = bundle_adjust(
-        batch, "huber", SCALE, backward="detached", iterations=iterations, tolerance=1e-12, check=False
+    together = solve_bundle(
+        batch,
+        check=False,
+        options=BUNDLE_OPTIONS.replace(
+            kernel="huber", scale=SCALE, iterations=iterations, tolerance=1e-12, backward="detached"
+        ),
     )
     for row, problem in enumerate(problems):
         found = bundle_adjust_numpy(problem, SCALE, iterations, 1e-12)
@@ -194,9 +202,7 @@ def test_unsupported_problems_are_an_error(bundle_scene, name) -> None:
         problem = replace(problem, T_cw=problem.T_cw[None])
     else:
         problem = replace(problem, **{name: given[name]})
-    with pytest.raises(
-        ValueError, match=r"the NumPy backend takes one problem without .*: use bundle_adjust"
-    ):
+    with pytest.raises(ValueError, match=r"the NumPy backend takes one problem without .*: use solve_bundle"):
         bundle_adjust_numpy(problem, SCALE, 1, 1e-6)
 
 

@@ -1,4 +1,4 @@
-"""The lean pose of one frame, against `refine_pose`, which takes the long way."""
+"""The lean pose of one frame, against `solve_pose`, which takes the long way."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import KeypointNoise, UndistortedKeypoints, se3_exp, se3_inverse, se3_log
-from torchslam.optim import refine_pose
+from torchslam.optim import POSE_OPTIONS, solve_pose
 from torchslam.optim.pose.frame_pose import SCALE, FrameProblem
 
 
@@ -29,15 +29,14 @@ def test_it_reaches_the_pose_of_refine_pose(pose_scene, kernel, model):
     noise = KeypointNoise.of(1 + torch.arange(200).double() % 3, None)
     weights = torch.where(torch.arange(200) % 4 == 0, 0.5, 1.0).double()
     mask = torch.arange(200) % 7 != 0
-    wanted = refine_pose(
-        scene.start,
+    wanted = solve_pose(
         scene.points_w,
         scene.pixels,
-        scene.camera,
+        T_cw=scene.start,
+        camera=scene.camera,
         weights=(noise.weights * weights)[None],
         mask=mask[None],
-        kernel=kernel,
-        scale=SCALE,
+        options=POSE_OPTIONS.replace(kernel=kernel, scale=SCALE),
     )
     problem = problem_of(scene, noise)
     found = problem.minimize(problem.linearize(scene.start[0]), weights * mask, kernel)

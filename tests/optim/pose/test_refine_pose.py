@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from torchslam.geometry import se3_exp, se3_inverse, se3_log
-from torchslam.optim import PosePrior, refine_pose
+from torchslam.optim import POSE_OPTIONS, PosePrior, solve_pose
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -15,7 +15,13 @@ def errors(T_cw, truth):
 
 def test_exact_data_gives_the_exact_pose(pose_scene, model):
     scene = pose_scene(noise=0.0, model=model)
-    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel="none")
+    refined = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(kernel="none"),
+    )
     assert refined.success.all()
     assert errors(refined.T_cw, scene.T_cw).max() < 1e-9
 
@@ -24,14 +30,32 @@ def test_exact_data_gives_the_exact_pose(pose_scene, model):
 def test_robust_kernels_survive_outliers(pose_scene, kernel):
     scene = pose_scene(count=200, outliers=0.3, noise=0.3, perturbation=0.01)
     scale = 8.0 if kernel == "truncated" else 2.0
-    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel=kernel, scale=scale)
-    plain = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel="none")
+    refined = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(kernel=kernel, scale=scale),
+    )
+    plain = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(kernel="none"),
+    )
     assert (errors(refined.T_cw, scene.T_cw) < 0.3 * errors(plain.T_cw, scene.T_cw)).all()
 
 
 def test_the_gradient_of_the_cost_vanishes_at_the_solution(pose_scene, model):
     scene = pose_scene(outliers=0.2, model=model)
-    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, scale=2.0, **CONVERGED)
+    refined = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(scale=2.0, **CONVERGED),
+    )
     xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
     points_c = scene.points_w @ (se3_exp(xi) @ refined.T_cw)[:, :3, :3].mT
     points_c = points_c + (se3_exp(xi) @ refined.T_cw)[:, None, :3, 3]
@@ -45,11 +69,21 @@ def test_the_gradient_of_the_cost_vanishes_at_the_solution(pose_scene, model):
 def test_batch_is_the_same_as_a_loop(pose_scene):
     scene = pose_scene(batch=3, outliers=0.2)
     scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    together = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, scale=scale)
+    together = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(scale=scale),
+    )
     for row in range(3):
         one = slice(row, row + 1)
-        alone = refine_pose(
-            scene.start[one], scene.points_w[one], scene.pixels[one], scene.camera, scale=scale[one]
+        alone = solve_pose(
+            scene.points_w[one],
+            scene.pixels[one],
+            T_cw=scene.start[one],
+            camera=scene.camera,
+            options=POSE_OPTIONS.replace(scale=scale[one]),
         )
         torch.testing.assert_close(alone.T_cw[0], together.T_cw[row], atol=1e-12, rtol=0)
         torch.testing.assert_close(alone.covariance[0], together.covariance[row])
@@ -59,8 +93,8 @@ def test_batch_is_the_same_as_a_loop(pose_scene):
 def test_same_input_same_bytes_with_and_without_gradient(pose_scene):
     scene = pose_scene(outliers=0.2)
     pixels = scene.pixels.clone().requires_grad_()
-    first = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera)
-    second = refine_pose(scene.start, scene.points_w, pixels, scene.camera)
+    first = solve_pose(scene.points_w, scene.pixels, T_cw=scene.start, camera=scene.camera)
+    second = solve_pose(scene.points_w, pixels, T_cw=scene.start, camera=scene.camera)
     assert torch.equal(first.T_cw, second.T_cw)
     assert second.T_cw.requires_grad
 
@@ -77,8 +111,8 @@ def test_masked_and_non_finite_rows_are_ignored(pose_scene):
         -1,
     )
     tensors = [tensor.requires_grad_() for tensor in (points, pixels, weights)]
-    refined = refine_pose(scene.start, points, pixels, scene.camera, weights, mask)
-    expected = refine_pose(scene.start, scene.points_w[:, 5:], scene.pixels[:, 5:], scene.camera)
+    refined = solve_pose(points, pixels, T_cw=scene.start, camera=scene.camera, weights=weights, mask=mask)
+    expected = solve_pose(scene.points_w[:, 5:], scene.pixels[:, 5:], T_cw=scene.start, camera=scene.camera)
     torch.testing.assert_close(refined.T_cw, expected.T_cw)
     refined.T_cw.sum().backward()
     for tensor in tensors:
@@ -92,9 +126,19 @@ def test_points_behind_the_camera_are_ignored(pose_scene):
     points = scene.points_w.clone()
     center = se3_inverse(scene.T_cw)[:, None, :3, 3]
     points[:, :5] = 2 * center - points[:, :5]
-    refined = refine_pose(scene.start, points, scene.pixels, scene.camera, kernel="none")
-    expected = refine_pose(
-        scene.start, scene.points_w[:, 5:], scene.pixels[:, 5:], scene.camera, kernel="none"
+    refined = solve_pose(
+        points,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(kernel="none"),
+    )
+    expected = solve_pose(
+        scene.points_w[:, 5:],
+        scene.pixels[:, 5:],
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(kernel="none"),
     )
     torch.testing.assert_close(refined.T_cw, expected.T_cw, atol=1e-8, rtol=0)
 
@@ -111,7 +155,14 @@ def test_failures_are_flagged_and_have_no_gradient(pose_scene, backward):
     points[4] = (1 - line) * points[4, :1] + line * points[4, 1:2]  # the pose may turn about the line
     points.requires_grad_()
     pixels = scene.pixels.clone().requires_grad_()
-    refined = refine_pose(start, points, pixels, scene.camera, mask=mask, kernel="none", backward=backward)
+    refined = solve_pose(
+        points,
+        pixels,
+        T_cw=start,
+        camera=scene.camera,
+        mask=mask,
+        options=POSE_OPTIONS.replace(kernel="none", backward=backward),
+    )
     assert refined.success.tolist()[:3] == [True, False, False]
     assert not refined.success[4]
     assert refined.T_cw.isfinite().all()
@@ -136,17 +187,15 @@ def test_implicit_gradient_by_gradcheck(pose_scene, model, with_prior, generator
 
     def solve(points_w, pixels, weights, params, scale, twist, root):
         prior = PosePrior(se3_exp(twist) @ scene.start, root @ root.mT) if with_prior else None
-        return refine_pose(
-            scene.start,
+        return solve_pose(
             points_w,
             pixels,
-            replace(scene.camera, params=params),
-            weights,
-            mask,
-            "cauchy",
-            scale,
-            prior,
-            **CONVERGED,
+            T_cw=scene.start,
+            camera=replace(scene.camera, params=params),
+            weights=weights,
+            mask=mask,
+            prior=prior,
+            options=POSE_OPTIONS.replace(kernel="cauchy", scale=scale, **CONVERGED),
         ).T_cw[:, :3]
 
     weights = 0.5 + torch.rand(2, 8, generator=generator, dtype=torch.float64)
@@ -162,8 +211,12 @@ def test_implicit_gradient_of_every_kernel(pose_scene, kernel):
     scene = pose_scene(batch=1, count=12, noise=1.0, outliers=0.2)
 
     def solve(pixels):
-        return refine_pose(
-            scene.start, scene.points_w, pixels, scene.camera, kernel=kernel, scale=3.0, **CONVERGED
+        return solve_pose(
+            scene.points_w,
+            pixels,
+            T_cw=scene.start,
+            camera=scene.camera,
+            options=POSE_OPTIONS.replace(kernel=kernel, scale=3.0, **CONVERGED),
         ).T_cw[:, :3]
 
     pixels = scene.pixels.clone().requires_grad_()
@@ -172,8 +225,12 @@ def test_implicit_gradient_of_every_kernel(pose_scene, kernel):
 
 def gradient_to_pixels(scene, backward):
     pixels = scene.pixels.clone().requires_grad_()
-    refined = refine_pose(
-        scene.start, scene.points_w, pixels, scene.camera, scale=2.0, backward=backward, **CONVERGED
+    refined = solve_pose(
+        scene.points_w,
+        pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(scale=2.0, backward=backward, **CONVERGED),
     )
     (refined.T_cw[:, :3] * torch.linspace(-1, 1, 12).view(3, 4)).sum().backward()
     return pixels.grad
@@ -190,8 +247,10 @@ def test_backward_modes_agree_where_they_should(pose_scene):
 def test_unroll_reaches_the_start(pose_scene):
     scene = pose_scene()
     start = scene.start.clone().requires_grad_()
-    options = {"kernel": "none", "backward": "unroll", "iterations": 1, "tolerance": 0.0}
-    refine_pose(start, scene.points_w, scene.pixels, scene.camera, **options).T_cw.sum().backward()
+    options = POSE_OPTIONS.replace(kernel="none", backward="unroll", iterations=1, tolerance=0.0)
+    solve_pose(
+        scene.points_w, scene.pixels, T_cw=start, camera=scene.camera, options=options
+    ).T_cw.sum().backward()
     assert start.grad.isfinite().all()
     assert (start.grad != 0).any()
 
@@ -200,7 +259,13 @@ def test_unroll_reaches_the_start(pose_scene):
 def test_covariance_is_calibrated(pose_scene, kernel):
     """The normalized error squared, over many noisy views, averages to its six degrees of freedom."""
     scene = pose_scene(batch=400, count=100, noise=1.3)
-    refined = refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, kernel=kernel, scale=2.0)
+    refined = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        options=POSE_OPTIONS.replace(kernel=kernel, scale=2.0),
+    )
     error = se3_log(scene.T_cw @ se3_inverse(refined.T_cw))
     squared = (error * torch.linalg.solve(refined.covariance, error)).sum(-1)
     assert 0.9 < squared.mean() / 6 < 1.1
@@ -210,27 +275,31 @@ def test_prior_alone_and_prior_against_data(pose_scene):
     scene = pose_scene()
     eye = torch.eye(6, dtype=torch.float64).expand(2, 6, 6)
     nothing = torch.zeros(2, 40, dtype=torch.bool)
-    alone = refine_pose(
-        scene.start,
+    alone = solve_pose(
         scene.points_w,
         scene.pixels,
-        scene.camera,
+        T_cw=scene.start,
+        camera=scene.camera,
         mask=nothing,
         prior=PosePrior(scene.T_cw, 4 * eye),
     )
     assert alone.success.all()
     torch.testing.assert_close(alone.T_cw, scene.T_cw, atol=1e-5, rtol=0)
     torch.testing.assert_close(alone.covariance, eye / 4)
-    stiff = refine_pose(
-        scene.start, scene.points_w, scene.pixels, scene.camera, prior=PosePrior(scene.start, 1e12 * eye)
+    stiff = solve_pose(
+        scene.points_w,
+        scene.pixels,
+        T_cw=scene.start,
+        camera=scene.camera,
+        prior=PosePrior(scene.start, 1e12 * eye),
     )
     torch.testing.assert_close(stiff.T_cw, scene.start, atol=1e-6, rtol=0)
 
 
 def test_dtype_and_device_come_from_the_inputs(pose_scene, dtype, device):
     scene = pose_scene(outliers=0.1)
-    inputs = [tensor.to(device, dtype) for tensor in (scene.start, scene.points_w, scene.pixels)]
-    refined = refine_pose(*inputs, scene.camera.to(device).to(dtype))
+    start, *seen = (tensor.to(device, dtype) for tensor in (scene.start, scene.points_w, scene.pixels))
+    refined = solve_pose(*seen, T_cw=start, camera=scene.camera.to(device).to(dtype))
     for tensor in (refined.T_cw, refined.covariance, refined.cost):
         assert tensor.dtype == dtype
         assert tensor.device.type == device.type
@@ -242,6 +311,12 @@ def test_dtype_and_device_come_from_the_inputs(pose_scene, dtype, device):
 def test_invalid_input_is_rejected_by_name(pose_scene):
     scene = pose_scene()
     with pytest.raises(ValueError, match=r"\(B, 4, 4\)"):
-        refine_pose(scene.start[0], scene.points_w, scene.pixels, scene.camera)
+        solve_pose(scene.points_w, scene.pixels, T_cw=scene.start[0], camera=scene.camera)
     with pytest.raises(ValueError, match="'exact'"):
-        refine_pose(scene.start, scene.points_w, scene.pixels, scene.camera, backward="exact")
+        solve_pose(
+            scene.points_w,
+            scene.pixels,
+            T_cw=scene.start,
+            camera=scene.camera,
+            options=POSE_OPTIONS.replace(backward="exact"),
+        )

@@ -17,7 +17,7 @@ from torchslam.geometry import (
     sim3_scale,
     so3_exp,
 )
-from torchslam.optim import PoseGraph, pose_graph_optimize
+from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
 from torchslam.optim.pose_graph._api import _sanitized
 from torchslam.optim.pose_graph._problem import PoseGraphProblem, build_pose_graph_layout
 from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, dissect, factorize_sparse
@@ -164,7 +164,7 @@ def test_rotations_are_rigid_poses_without_translation() -> None:
         graph = replace(
             scene.graph, S_cw=S_cw[..., :n, :n], S_ji=turned @ S_ji[..., :n, :n], information=information
         )
-        solution = pose_graph_optimize(graph, kernel="cauchy", **CONVERGED)
+        solution = solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(kernel="cauchy", **CONVERGED))
         assert solution.success.all()
         R_cw = solution.S_cw[..., :3, :3]
         gradient = torch.autograd.grad((R_cw * draw(6, 2, 12, 3, 3)).sum(), (twist, root))
@@ -187,7 +187,7 @@ def test_a_start_at_the_minimum_is_seen_to_be_one() -> None:
         S_ji=scene.graph.S_ji[:, tree],
         information=scene.graph.information[tree],
     )
-    convergence = pose_graph_optimize(graph).convergence
+    convergence = solve_pose_graph(graph).convergence
     assert convergence.converged.all()
     assert (convergence.iterations <= 1).all()
 
@@ -195,7 +195,7 @@ def test_a_start_at_the_minimum_is_seen_to_be_one() -> None:
 @pytest.mark.parametrize("with_scale", [True, False])
 def test_exact_measurements_give_the_exact_nodes(with_scale: bool) -> None:
     scene = make_scene(noise=0.0, with_scale=with_scale)
-    solution = pose_graph_optimize(scene.graph)
+    solution = solve_pose_graph(scene.graph)
     assert solution.success.all()
     assert solution.moved.tolist() == [[False] + [True] * 11] * 2
     torch.testing.assert_close(solution.S_cw, scene.S_cw, rtol=0, atol=1e-9)
@@ -208,7 +208,7 @@ def test_a_loop_in_log_scale_has_the_known_solution() -> None:
     S_ji = eye.repeat(3, 1, 1)
     S_ji[0, :3, :3] *= math.exp(0.3)
     graph = PoseGraph(eye.repeat(3, 1, 1), torch.tensor([(0, 1), (1, 2), (2, 0)]), S_ji)
-    solution = pose_graph_optimize(graph, kernel="none", **CONVERGED)
+    solution = solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none", **CONVERGED))
     expected = torch.tensor([0.0, 0.2, 0.1], dtype=torch.float64)
     torch.testing.assert_close(sim3_scale(solution.S_cw).log(), expected, rtol=0, atol=1e-12)
     assert float(solution.cost) == pytest.approx(0.5 * 3 * 0.1**2)
@@ -222,7 +222,7 @@ def test_a_scalar_weight_scales_the_identity_and_none_means_one() -> None:
         (weights, weights[:, None, None] * eye),
         (None, torch.ones_like(weights)[:, None, None] * eye),
     ):
-        one, other = (pose_graph_optimize(replace(scene.graph, information=value)) for value in (short, full))
+        one, other = (solve_pose_graph(replace(scene.graph, information=value)) for value in (short, full))
         assert torch.equal(one.S_cw, other.S_cw)
 
 
@@ -230,7 +230,7 @@ def test_a_scalar_weight_scales_the_identity_and_none_means_one() -> None:
 def test_the_gradient_of_the_cost_vanishes_at_the_solution(with_scale: bool) -> None:
     scene = make_scene(with_scale=with_scale)
     dims = 7 if with_scale else 6
-    solution = pose_graph_optimize(scene.graph, kernel="none", **CONVERGED)
+    solution = solve_pose_graph(scene.graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none", **CONVERGED))
     xi = torch.zeros(2, 12, dims, dtype=torch.float64, requires_grad=True)
     moved = sim3_exp(torch.nn.functional.pad(xi, (0, 7 - dims))) @ solution.S_cw
     cost = cost_of(scene.graph, moved)
@@ -244,7 +244,11 @@ def test_the_gradient_of_the_cost_vanishes_at_the_solution(with_scale: bool) -> 
 def test_robust_kernels_survive_wrong_edges(kernel: str) -> None:
     scene = make_scene(nodes=20, outliers=3, noise=0.5, spread=0.02)
     error = {
-        name: (pose_graph_optimize(scene.graph, kernel=name).S_cw - scene.S_cw).abs().max()
+        name: (
+            solve_pose_graph(scene.graph, options=POSE_GRAPH_OPTIONS.replace(kernel=name)).S_cw - scene.S_cw
+        )
+        .abs()
+        .max()
         for name in (kernel, "none")
     }
     assert error[kernel] < 0.5 * error["none"]
@@ -278,7 +282,7 @@ def test_the_optimum_equals_that_of_gtsam(with_scale: bool) -> None:
     params.setMaxIterations(100)
     found = gtsam.LevenbergMarquardtOptimizer(factors, values, params).optimize()
 
-    solution = pose_graph_optimize(graph, kernel="none", **CONVERGED)
+    solution = solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none", **CONVERGED))
     ours = gtsam.Values()
     for node, S_wc in enumerate(sim3_inverse(solution.S_cw[0])):
         ours.insert(node, element(S_wc))
@@ -308,7 +312,9 @@ def test_the_optimum_equals_that_of_scipy(kernel: str) -> None:
     found = optimize.least_squares(
         errors, torch.zeros(21).double().numpy(), xtol=1e-14, ftol=1e-14, gtol=1e-12
     )
-    solution = pose_graph_optimize(graph, kernel=kernel, scale=2.0, **CONVERGED)
+    solution = solve_pose_graph(
+        graph, options=POSE_GRAPH_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED)
+    )
     assert float(solution.cost) == pytest.approx(found.cost, rel=1e-8)
     expected = sim3_exp(torch.from_numpy(found.x).view(3, 7)) @ start[1:]
     torch.testing.assert_close(solution.S_cw[0, 1:], expected, rtol=0, atol=1e-5)
@@ -331,7 +337,9 @@ def test_implicit_gradient_by_gradcheck(kernel: str, with_scale: bool) -> None:
             information=root.mT @ scene.graph.information @ root,
             mask=mask,
         )
-        return pose_graph_optimize(graph, kernel=kernel, scale=scale, **CONVERGED).S_cw[..., :3, :]
+        return solve_pose_graph(
+            graph, options=POSE_GRAPH_OPTIONS.replace(kernel=kernel, scale=scale, **CONVERGED)
+        ).S_cw[..., :3, :]
 
     edges = len(scene.graph.edges)
     inputs = (
@@ -350,8 +358,11 @@ def test_backward_modes_agree_where_they_should(backward: str) -> None:
 
     def gradient(mode: str) -> Tensor:
         S_ji = scene.graph.S_ji.clone().requires_grad_()
-        solution = pose_graph_optimize(
-            replace(scene.graph, S_ji=S_ji), "cauchy", 3.0, mode, iterations=40, tolerance=1e-24
+        solution = solve_pose_graph(
+            replace(scene.graph, S_ji=S_ji),
+            options=POSE_GRAPH_OPTIONS.replace(
+                kernel="cauchy", scale=3.0, iterations=40, tolerance=1e-24, backward=mode
+            ),
         )
         (solution.S_cw[..., :3, :].flatten(1) @ torch.linspace(-1, 1, 72).double()).sum().backward()
         return S_ji.grad[..., :3, :]
@@ -377,8 +388,9 @@ def test_unconnected_nodes_stay_and_have_no_gradient() -> None:
         mask[others[2:]] = False
         S_ji.requires_grad_()
         weights.requires_grad_()
-        solution = pose_graph_optimize(
-            replace(scene.graph, S_ji=S_ji, information=weights, mask=mask), backward=backward
+        solution = solve_pose_graph(
+            replace(scene.graph, S_ji=S_ji, information=weights, mask=mask),
+            options=POSE_GRAPH_OPTIONS.replace(backward=backward),
         )
         assert solution.success.all()
         assert solution.moved[0].tolist() == [False] + [True] * 8 + [False] * 3
@@ -405,7 +417,7 @@ def test_failures_are_flagged_and_have_no_gradient() -> None:
     mask[3] = False
     S_ji = scene.graph.S_ji.clone().requires_grad_()
     graph = replace(scene.graph, S_cw=S_cw, S_ji=S_ji, information=information, mask=mask)
-    solution = pose_graph_optimize(graph)
+    solution = solve_pose_graph(graph)
     assert solution.success.tolist() == [True, False, False, False]
     assert torch.isfinite(solution.S_cw).all()
     assert torch.equal(solution.S_cw[1, 1:], S_cw[1, 1:])
@@ -421,10 +433,12 @@ def test_batch_is_the_same_as_a_loop() -> None:
     scene = make_scene(batch=3, outliers=2)
     mask = torch.rand(3, len(scene.graph.edges), generator=torch.Generator().manual_seed(0)) < 0.9
     scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    together = pose_graph_optimize(replace(scene.graph, mask=mask), scale=scale)
+    together = solve_pose_graph(
+        replace(scene.graph, mask=mask), options=POSE_GRAPH_OPTIONS.replace(scale=scale)
+    )
     for row in range(3):
         one = replace(scene.graph, S_cw=scene.graph.S_cw[row], S_ji=scene.graph.S_ji[row], mask=mask[row])
-        alone = pose_graph_optimize(one, scale=scale[row])
+        alone = solve_pose_graph(one, options=POSE_GRAPH_OPTIONS.replace(scale=scale[row]))
         assert alone.S_cw.shape == (12, 4, 4)
         assert alone.cost.shape == alone.success.shape == ()
         torch.testing.assert_close(alone.S_cw, together.S_cw[row], rtol=0, atol=1e-9)
@@ -436,8 +450,8 @@ def test_batch_is_the_same_as_a_loop() -> None:
 def test_same_input_same_bytes_with_and_without_gradient() -> None:
     scene = make_scene(nodes=40)
     S_ji = scene.graph.S_ji.clone().requires_grad_()
-    first = pose_graph_optimize(scene.graph)
-    second = pose_graph_optimize(replace(scene.graph, S_ji=S_ji))
+    first = solve_pose_graph(scene.graph)
+    second = solve_pose_graph(replace(scene.graph, S_ji=S_ji))
     assert torch.equal(first.S_cw, second.S_cw)
     assert second.S_cw.requires_grad
 
@@ -447,7 +461,7 @@ def test_order_and_direction_of_edges_do_not_matter() -> None:
     order = torch.randperm(len(scene.graph.edges), generator=torch.Generator().manual_seed(0))
     S_ji = scene.graph.S_ji[:, order]
     information = scene.graph.information[order]
-    plain = pose_graph_optimize(scene.graph, kernel="none", **CONVERGED)
+    plain = solve_pose_graph(scene.graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none", **CONVERGED))
     shuffled = replace(scene.graph, edges=scene.graph.edges[order], S_ji=S_ji, information=information)
     # The error of the reversed edge is minus the adjoint of the reversed measurement times that of the edge.
     carry = sim3_adjoint(S_ji)
@@ -458,7 +472,7 @@ def test_order_and_direction_of_edges_do_not_matter() -> None:
         information=carry.mT @ information @ carry,
     )
     for graph in (shuffled, transposed):
-        other = pose_graph_optimize(graph, kernel="none", **CONVERGED)
+        other = solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(kernel="none", **CONVERGED))
         torch.testing.assert_close(other.S_cw, plain.S_cw, rtol=0, atol=1e-8)
         torch.testing.assert_close(other.cost, plain.cost)
 
@@ -473,7 +487,10 @@ def test_two_measurements_of_one_pair_both_count() -> None:
         information=graph.information.repeat(2, 1, 1),
     )
     heavy = replace(graph, information=2 * graph.information)
-    one, other = (pose_graph_optimize(g, kernel="none", **CONVERGED) for g in (doubled, heavy))
+    one, other = (
+        solve_pose_graph(g, options=POSE_GRAPH_OPTIONS.replace(kernel="none", **CONVERGED))
+        for g in (doubled, heavy)
+    )
     torch.testing.assert_close(one.S_cw, other.S_cw, rtol=0, atol=1e-9)
     torch.testing.assert_close(one.cost, other.cost)
 
@@ -481,7 +498,7 @@ def test_two_measurements_of_one_pair_both_count() -> None:
 def test_scales_stay_fixed_without_scale_estimation() -> None:
     scene = make_scene()
     graph = replace(scene.graph, information=None, with_scale=False)
-    solution = pose_graph_optimize(graph)
+    solution = solve_pose_graph(graph)
     torch.testing.assert_close(sim3_scale(solution.S_cw), sim3_scale(graph.S_cw), rtol=1e-12, atol=0)
     assert (solution.S_cw - graph.S_cw).abs().max() > 1e-3
 
@@ -535,12 +552,12 @@ def test_dtype_and_device_come_from_the_inputs(dtype: torch.dtype, device: torch
     scene = make_scene()
     graph = scene.graph
     moved = {name: getattr(graph, name).to(device, dtype) for name in ("S_cw", "S_ji", "information")}
-    solution = pose_graph_optimize(replace(graph, edges=graph.edges.to(device), **moved))
+    solution = solve_pose_graph(replace(graph, edges=graph.edges.to(device), **moved))
     for tensor in (solution.S_cw, solution.cost):
         assert tensor.dtype == dtype
         assert tensor.device.type == device.type
     assert solution.success.all()
-    expected = pose_graph_optimize(graph)
+    expected = solve_pose_graph(graph)
     torch.testing.assert_close(solution.S_cw.cpu().double(), expected.S_cw, rtol=0, atol=1e-2)
 
 
@@ -548,20 +565,20 @@ def test_dtype_and_device_come_from_the_inputs(dtype: torch.dtype, device: torch
 def test_invalid_input_is_rejected_by_name() -> None:
     graph = make_scene().graph
     with pytest.raises(ValueError, match=r"\(E, 2\)"):
-        pose_graph_optimize(replace(graph, edges=graph.edges[:, :1]))
+        solve_pose_graph(replace(graph, edges=graph.edges[:, :1]))
     with pytest.raises(ValueError, match=r"S_cw must be \(..., K, n, n\)"):
-        pose_graph_optimize(replace(graph, S_cw=graph.S_cw[..., :3, :]))
+        solve_pose_graph(replace(graph, S_cw=graph.S_cw[..., :3, :]))
     with pytest.raises(ValueError, match="S_ji"):
-        pose_graph_optimize(replace(graph, S_ji=graph.S_ji[:, 1:]))
+        solve_pose_graph(replace(graph, S_ji=graph.S_ji[:, 1:]))
     with pytest.raises(ValueError, match=r"S_ji must be \(..., E, n, n\), .*: n is 3 in graph.S_cw"):
-        pose_graph_optimize(replace(graph, S_cw=graph.S_cw[..., :3, :3]))
+        solve_pose_graph(replace(graph, S_cw=graph.S_cw[..., :3, :3]))
     with pytest.raises(ValueError, match="information"):
-        pose_graph_optimize(replace(graph, with_scale=False))
+        solve_pose_graph(replace(graph, with_scale=False))
     with pytest.raises(ValueError, match=r"0 \.\.\. 11"):
-        pose_graph_optimize(replace(graph, edges=graph.edges + 1))
+        solve_pose_graph(replace(graph, edges=graph.edges + 1))
     with pytest.raises(ValueError, match="itself"):
-        pose_graph_optimize(replace(graph, edges=0 * graph.edges))
+        solve_pose_graph(replace(graph, edges=0 * graph.edges))
     with pytest.raises(ValueError, match="fixed"):
-        pose_graph_optimize(replace(graph, fixed=torch.ones(3, dtype=torch.bool)))
+        solve_pose_graph(replace(graph, fixed=torch.ones(3, dtype=torch.bool)))
     with pytest.raises(ValueError, match="'exact'"):
-        pose_graph_optimize(graph, backward="exact")
+        solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(backward="exact"))

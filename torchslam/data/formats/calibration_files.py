@@ -180,7 +180,7 @@ class Keys:
                 continue
             raise CalibrationError(
                 f"{self._source}: `{written}` looks like a distortion, but is not understood; "
-                "call it distortion_coefficients, k1 k2 p1 p2 [k3], or remove it"
+                "call it distortion_coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6]], or remove it"
             )
 
 
@@ -232,11 +232,14 @@ def checked(
         if len(coefficients) < 4 or any(coefficients[4:]):
             raise CalibrationError(f"{source}: a fisheye has 4 coefficients, not {len(coefficients)}")
         return Calibration.from_numbers([*intrinsics, *coefficients[:4]], source, "fisheye", size)
-    if any(coefficients[5:]):
+    if any(coefficients[8:]) or (any(coefficients[5:]) and len(coefficients) < 8):
         raise CalibrationError(
-            f"{source}: more than k1 k2 p1 p2 k3 is not modeled; calibrate with these alone"
+            f"{source}: of {len(coefficients)} distortion coefficients more than k1 k2 p1 p2 [k3 [k4 k5 k6]] is not "
+            "modeled; calibrate with these alone"
         )
-    if coefficients:
+    if any(coefficients[5:]):
+        coefficients = coefficients[:8]
+    elif coefficients:
         coefficients = [*coefficients, 0.0, 0.0, 0.0, 0.0][: max(4, min(5, len(coefficients)))]
     return Calibration.from_numbers([*intrinsics, *coefficients], source, size=size)
 
@@ -448,7 +451,12 @@ def _from_transforms(keys: Keys, source: str) -> Calibration:
         if center is None and extent is None:
             raise CalibrationError(f"{source}: no {key} in it, nor the size of the images")
         intrinsics.append((extent or 0.0) / 2 - HALF_PIXEL if center is None else center - HALF_PIXEL)
-    return replace(_with_distortion(keys, intrinsics, source, size=size), as_stored=True)
+    found = _with_distortion(keys, intrinsics, source, size=size)
+    if found.model == "rational":
+        raise CalibrationError(
+            f"{source}: k4 is not modeled as nerfstudio means it, the fourth term of a polynomial"
+        )
+    return replace(found, as_stored=True)
 
 
 def _check_shared(keys: Keys, source: str) -> None:

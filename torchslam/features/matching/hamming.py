@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchslam.geometry.precision import without_autocast
 from torchslam.utils.indexing import true_indices
+from torchslam.utils.torch_internals import int8_matmul
 
 # Product with this word moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
 _GATHER_BITS = sum(1 << (56 - 7 * i) for i in range(8))
@@ -143,11 +144,11 @@ def int8_product(
     Returns:
         int32 where the processor multiplies these quickly, else float32, which is exact while no sum exceeds 2^24.
     """
-    if not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
+    if int8_matmul is None or not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
         return left.float() @ right.float()
     batch = left.shape[:-2]
     pairs = zip(left.reshape(-1, *left.shape[-2:]), right.reshape(-1, *right.shape[-2:]), strict=True)
-    products = [torch._int_mm(*pair) for pair in pairs]
+    products = [int8_matmul(*pair) for pair in pairs]
     stacked = products[0] if len(products) == 1 else torch.stack(products)
     return stacked.view(*batch, *products[0].shape)
 
@@ -156,7 +157,6 @@ def _fast_int8(device: torch.device) -> bool:
     """Test whether int8 matrix products beat float32: on x86 processors with AVX-512, through oneDNN."""
     return (
         device.type == "cpu"
-        and hasattr(torch, "_int_mm")
         and torch.backends.mkldnn.is_available()
         and torch.backends.cpu.get_cpu_capability().startswith("AVX512")
     )

@@ -51,9 +51,11 @@ def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
         return "PINHOLE", params
     if camera.model == "fisheye":
         return "OPENCV_FISHEYE", params
-    if params[8] == 0.0:
+    if not any(params[8:]):
         return "OPENCV", params[:8]
-    return "FULL_OPENCV", [*params, 0.0, 0.0, 0.0]  # k4, k5, k6 of a denominator
+    return "FULL_OPENCV", [*params, 0.0, 0.0, 0.0][
+        :12
+    ]  # k4, k5, k6 of a denominator are zero without a rational model
 
 
 def write_colmap(folder: Path, scene: ExportedScene) -> None:

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.dense.cloud import PointCloud
+from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, opengl
 from torchslam.io.export.depths import MAX_POINTS, depth_images, depth_png
@@ -39,7 +40,12 @@ MODELS = {
 
 
 def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
-    """The camera's entries of transforms.json."""
+    """The camera's entries of transforms.json. Raises ResultsError for a model that it cannot hold."""
+    if camera.model not in MODELS:
+        raise ResultsError(
+            f"nerfstudio has no {camera.model} camera: export to colmap, whose FULL_OPENCV holds it, or with "
+            "--undistort"
+        )
     model, distortion = MODELS[camera.model]
     names = ("fl_x", "fl_y", "cx", "cy", *distortion)
     params = corner_camera(camera).params.tolist()

@@ -12,15 +12,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from functools import wraps
-from typing import Any, Literal, ParamSpec, Protocol, TypeVar, get_args
+from typing import Any, Literal, ParamSpec, Protocol, TypeVar
 
 import torch
 from torch import Tensor
-from torch._C import _are_functorch_transforms_active
-from torch._C._functorch import TransformType, get_interpreter_stack
 from torch.func import grad, vjp, vmap
 
 from torchslam.geometry.precision import full_precision
+from torchslam.utils.torch_internals import forward_mode_depth, in_transform
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -51,16 +50,6 @@ def _alone(function: Callable[P, R]) -> Callable[P, R]:
             return function(*args, **kwargs)
 
     return alone
-
-
-def check_options(backward: str, iterations: int, tolerance: float) -> None:
-    """Raises ValueError for a mode that is unknown, and for numbers that no minimization can end by."""
-    if not iterations >= 0:
-        raise ValueError(f"iterations must not be below zero, got {iterations}")
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance must not be below zero, got {tolerance}")
-    if backward not in get_args(Backward):
-        raise ValueError(f"unknown backward mode {backward!r}; known are {', '.join(get_args(Backward))}")
 
 
 class Minimization(Protocol):
@@ -114,8 +103,7 @@ def find_minimum(problem: Minimization, inputs: Sequence[Tensor], backward: Back
         return problem.minimize(tuple(inputs))
     if backward != "implicit":
         inputs = [tensor.detach() for tensor in inputs]
-    stack = (get_interpreter_stack() or ()) if _are_functorch_transforms_active() else ()
-    if sum(transform.key() == TransformType.Jvp for transform in stack) > 1:
+    if forward_mode_depth() > 1:
         raise RuntimeError(
             "forward mode within forward mode is not supported: take torch.func.jacfwd of torch.func.jacrev"
         )
@@ -145,7 +133,7 @@ class _Minimum(torch.autograd.Function):
     def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
         problem, needed = ctx.problem, ctx.needs_input_grad[1:]
         inputs, found = _split(ctx.saved_tensors, ctx.num_inputs)
-        if not torch.is_grad_enabled() and not _are_functorch_transforms_active():
+        if not torch.is_grad_enabled() and not in_transform():
             vector = problem.pull_back(found, tuple(gradient[: problem.num_unknowns]))
             direction = problem.factorized(found, inputs)(vector)
             return None, *_last_gradient(lambda x: -problem.slope(found, x, direction), inputs, needed)

@@ -10,7 +10,8 @@ can be differentiated through ("unroll"). Sources: Levenberg, 1944; Marquardt, 1
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 from typing import Protocol, Self, TypeVar, runtime_checkable
 
 import torch
@@ -29,10 +30,6 @@ _DAMPING_RANGE = (1e-10, 1e8)
 _NAMED = 10  # rows that an error lists
 CURVATURE_BELOW = 1e-2
 """Predicted relative reduction of the cost below which the kernel's curvature is used."""
-
-MAX_ITERATIONS = 200
-"""Limit of the steps where the caller gives none. With a fifth of outliers a Huber kernel needs up to 50, and short of
-the minimum the gradient is another one."""
 
 Progress = Callable[[int, int], None]
 """Called before each iteration with its number, from 0, and the maximum number of iterations."""
@@ -93,6 +90,20 @@ class Rounded(Protocol):
         ...
 
 
+class SolverReason(Enum):
+    """How a search ended."""
+
+    CONVERGED = "converged"
+    ITERATION_LIMIT = "not converged: allow more iterations"
+    GAVE_UP = "not converged: no shorter step lowers the cost"
+    UNDETERMINED = (
+        "not determined: too few observations, a degenerate configuration, or a start that is not finite"
+    )
+
+    def __str__(self) -> str:
+        return self.value
+
+
 @dataclass(frozen=True)
 class Convergence:
     """Convergence of a minimization, per element.
@@ -102,17 +113,40 @@ class Convergence:
         converged: the predicted reduction of the last step was below the tolerance.
         initial_cost: half the sum of robustified squared residuals at the start.
         cost: the same at the end.
+        limit: of the iterations.
     """
 
     iterations: Int[Tensor, " B"]
     converged: Bool[Tensor, " B"]
     initial_cost: Float[Tensor, " B"]
     cost: Float[Tensor, " B"]
+    limit: int
+
+    def reasons(self, success: Bool[Tensor, "*batch"]) -> list[SolverReason]:
+        """How the search ended for each element of a solution, given which of them are determined."""
+        shape = success.flatten().shape
+        rows = (x.expand(shape).tolist() for x in (success.flatten(), self.converged, self.iterations))
+        return [
+            SolverReason.UNDETERMINED
+            if not determined
+            else SolverReason.CONVERGED
+            if converged
+            else SolverReason.GAVE_UP
+            if steps < self.limit
+            else SolverReason.ITERATION_LIMIT
+            for determined, converged, steps in zip(*rows, strict=True)
+        ]
 
     def of(self, row: int) -> Convergence:
         """Of one element."""
         one = slice(row, row + 1)
-        return Convergence(self.iterations[one], self.converged[one], self.initial_cost[one], self.cost[one])
+        return replace(
+            self,
+            iterations=self.iterations[one],
+            converged=self.converged[one],
+            initial_cost=self.initial_cost[one],
+            cost=self.cost[one],
+        )
 
 
 def check_minimum(success: Bool[Tensor, "*batch"], converged: Bool[Tensor, "*batch"], what: str) -> None:
@@ -210,4 +244,4 @@ def minimize_batch(
     if finished:
         where, models = zip(*finished, (rows, model), strict=True)
         model = concat_tree(models, where)
-    return model, Convergence(steps, converged, initial_cost, model.cost.detach())
+    return model, Convergence(steps, converged, initial_cost, model.cost.detach(), iterations)

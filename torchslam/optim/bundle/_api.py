@@ -12,16 +12,16 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.robust import Kernel
-from torchslam.optim._core.implicit import Backward, check_options, find_minimum
-from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, Progress, check_minimum
+from torchslam.optim._core.implicit import find_minimum
+from torchslam.optim._core.levenberg_marquardt import Convergence, Progress, SolverReason, check_minimum
+from torchslam.optim._core.options import BUNDLE_OPTIONS, SolverOptions
 from torchslam.optim.bundle._factors import factor_kinds
 from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.utils.indexing import row_numbers
 
-__all__ = ["BundleProblem", "BundleSolution", "bundle_adjust"]
+__all__ = ["BundleProblem", "BundleSolution", "solve_bundle"]
 
 
 @dataclass(frozen=True)
@@ -55,6 +55,11 @@ class BundleSolution:
     def converged(self) -> Bool[Tensor, "*batch"]:
         """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
         return self.convergence.converged.view_as(self.success)
+
+    @property
+    def reasons(self) -> list[SolverReason]:
+        """How the search ended, for each problem."""
+        return self.convergence.reasons(self.success)
 
     @cached_property
     def _covariance(self) -> Marginals:
@@ -114,17 +119,13 @@ class BundleSolution:
 
 
 @full_precision
-def bundle_adjust(
+def solve_bundle(
     problem: BundleProblem,
-    kernel: Kernel = "huber",
-    scale: Float[Tensor, "*#scale"] | float = 1.0,
+    *,
     free_camera: bool | Float[Tensor, "P n"] = False,
-    backward: Backward = "implicit",
-    iterations: int = MAX_ITERATIONS,
-    tolerance: float = 1e-8,
+    options: SolverOptions = BUNDLE_OPTIONS,
     progress: Progress | None = None,
     check: bool = True,
-    strict: bool = False,
 ) -> BundleSolution:
     """Minimize robust reprojection errors over poses, points and, if `free_camera`, the cameras' parameters.
 
@@ -138,41 +139,36 @@ def bundle_adjust(
 
     Args:
         problem: one bundle adjustment, or a batch.
-        kernel: robust kernel.
-        scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
         free_camera: True frees all P parameters of every camera. A tensor (P, n) frees steps along its n columns, of
             which the covariances then are. Every problem of a batch finds its own parameters.
-        backward: how gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed poses and fixed
-            points, and depths and what factors measure, with their information. Nothing flows to the start of free
-            unknowns.
-        iterations: maximum number of steps.
-        tolerance: stop where the predicted reduction of the cost is below this share of it.
+        options: how to minimize; gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed
+            poses and fixed points, and depths and what factors measure, with their information. Nothing flows to the
+            start of free unknowns.
         progress: called before each iteration with its number and the maximum; its exceptions end the minimization.
         check: test whether all that moves is determined. Without, `success` is that of the start; saves a tenth.
-        strict: raise an error for any problem that is not at a minimum: `success` or `converged` is False.
 
     Returns:
         The minimum, differentiable, with covariances on demand.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
-        ConvergenceError: with `strict`.
+        ConvergenceError: with `options.strict`.
     """
-    check_options(backward, iterations, tolerance)
-    given = sanitized(problem, scale)
+    backward = options.backward
+    given = sanitized(problem, options.scale)
     minimization = BundleMinimization(
         problem.camera,
-        kernel,
+        options.kernel,
         free_camera,
-        iterations,
-        tolerance,
+        options.iterations,
+        options.tolerance,
         progress,
         check,
         given.weights.ndim > 2,
         factor_kinds(problem.frame_factors),
     )
     found = BundleMinimum(*find_minimum(minimization, given, backward))
-    if strict:
+    if options.strict:
         check_minimum(found.success, found.converged, "bundle adjustments")
     detached = [x.detach() for x in given]
     solution = found.estimate
@@ -182,7 +178,9 @@ def bundle_adjust(
     if backward == "truncated":
         solution = minimization.last_step(found, given)
     params = solution.params if problem.camera_index is not None else solution.params[:, 0]
-    convergence = Convergence(found.iterations, found.converged, found.initial_cost, found.cost)
+    convergence = Convergence(
+        found.iterations, found.converged, found.initial_cost, found.cost, options.iterations
+    )
 
     def marginals() -> Marginals:
         of_all = minimization.marginals(found, detached)

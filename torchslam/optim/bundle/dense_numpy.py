@@ -170,7 +170,7 @@ def _rows_of(problem: BundleProblem) -> tuple[Array, Array, Array]:
     names = ("fixed_points", "mask", "camera_index", "pose_prior", "camera_prior", "depth_prior")
     if problem.is_batch or problem.frame_factors or any(getattr(problem, name) is not None for name in names):
         raise ValueError(
-            f"the NumPy backend takes one problem without {', '.join(names)} and factors: use bundle_adjust"
+            f"the NumPy backend takes one problem without {', '.join(names)} and factors: use solve_bundle"
         )
     shape = (1, len(problem.pixels))
     frame = checked_rows("frame_index", problem.frame_index, shape, len(problem.T_cw))

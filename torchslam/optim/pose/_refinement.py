@@ -19,14 +19,15 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale
-from torchslam.optim._core.implicit import Backward, Ndims, Tensors, check_options, find_minimum
+from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
-    MAX_ITERATIONS,
     Convergence,
+    SolverReason,
     check_minimum,
     minimize_batch,
 )
 from torchslam.optim._core.linear import diagonal_floor, factorize
+from torchslam.optim._core.options import POSE_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import (
     ReprojectionData,
     Weighed,
@@ -203,7 +204,7 @@ class PoseInputs:
 
 
 class PoseProblem:
-    """The least-squares problem of `refine_pose` for `minimize_batch`, with covariances and the exact Hessian."""
+    """The least-squares problem of `solve_pose` for `minimize_batch`, with covariances and the exact Hessian."""
 
     def __init__(self, inputs: PoseInputs) -> None:
         self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
@@ -270,7 +271,7 @@ class PoseProblem:
 
 
 class PoseMinimization:
-    """`refine_pose` for `find_minimum`: found are the poses, and `success`, `cost` and how it went."""
+    """`solve_pose` for `find_minimum`: found are the poses, and `success`, `cost` and how it went."""
 
     num_unknowns = 1
     num_vectors = 1
@@ -350,6 +351,11 @@ class RefinedPose:
         """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
         return self.convergence.converged.view_as(self.success)
 
+    @property
+    def reasons(self) -> list[SolverReason]:
+        """How the search ended, for each pose."""
+        return self.convergence.reasons(self.success)
+
     @cached_property
     def covariance(self) -> Float[Tensor, "B 6 6"]:
         """Covariance of the left perturbation (translation, rotation), detached; zero where `success` is False.
@@ -362,36 +368,29 @@ class RefinedPose:
 
 
 @full_precision
-def refine_pose(
-    T_cw: Float[Tensor, "B 4 4"],
+def solve_pose(
     points_w: Float[Tensor, "#B N 3"],
     pixels: Float[Tensor, "#B N 2"],
+    *,
+    T_cw: Float[Tensor, "B 4 4"],
     camera: Camera,
     weights: Float[Tensor, "#B N"] | Float[Tensor, "#B N 2 2"] | None = None,
     mask: Bool[Tensor, "#B N"] | None = None,
-    kernel: Kernel = "cauchy",
-    scale: Float[Tensor, "*#scale"] | float = 1.0,
     prior: PosePrior | None = None,
-    backward: Backward = "implicit",
-    iterations: int = MAX_ITERATIONS,
-    tolerance: float = 1e-10,
-    strict: bool = False,
+    options: SolverOptions = POSE_OPTIONS,
 ) -> RefinedPose:
     """Minimize robust reprojection errors over poses by Levenberg-Marquardt, many problems at once.
 
     Args:
+        points_w: known points.
+        pixels: where they are seen.
         T_cw: world to camera, the start.
         camera: of all problems, params (P,), or of one each, (B, P).
         weights: inverse variances in px^-2, or (B, N, 2, 2) inverse covariances, which count where they are
             positive definite; one if None.
         mask: the observations that count, all if None. Observations that are not finite never count.
-        kernel: robust kernel.
-        scale: of the kernel, in units of the whitened residual: a number, a scalar tensor or (B,).
         prior: Gaussian prior on the poses, in the same units.
-        backward: how gradients reach points, pixels, weights, camera.params, scale and prior.
-        iterations: maximum number of steps.
-        tolerance: stop where the predicted reduction of the cost is below this share of it.
-        strict: raise an error for any pose that is not at a minimum: `success` or `converged` is False.
+        options: how to minimize; gradients reach points, pixels, weights, camera.params, scale and prior.
 
     Returns:
         The poses. Where `success` is False (too few points, or a pose that they do not determine), the gradient is
@@ -399,18 +398,21 @@ def refine_pose(
 
     Raises:
         ValueError: a shape does not fit, or a name is unknown.
-        ConvergenceError: with `strict`.
+        ConvergenceError: with `options.strict`.
     """
-    check_options(backward, iterations, tolerance)
-    inputs = PoseInputs.sanitized(T_cw, points_w, pixels, camera, weights, mask, kernel, scale, prior)
-    minimization = PoseMinimization(inputs, iterations, tolerance)
+    inputs = PoseInputs.sanitized(
+        T_cw, points_w, pixels, camera, weights, mask, options.kernel, options.scale, prior
+    )
+    minimization = PoseMinimization(inputs, options.iterations, options.tolerance)
     tensors = (T_cw, *inputs.tensors())
-    found = find_minimum(minimization, tensors, backward)
+    found = find_minimum(minimization, tensors, options.backward)
     refined, success, cost, steps, converged, initial_cost = found
-    if strict:
+    if options.strict:
         check_minimum(success, converged, "poses")
-    if backward == "truncated":
+    if options.backward == "truncated":
         problem = PoseProblem(inputs)
         last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(cost))
         refined = torch.where(success[:, None, None], last, refined)
-    return RefinedPose(refined, cost, success, Convergence(steps, converged, initial_cost, cost), inputs)
+    return RefinedPose(
+        refined, cost, success, Convergence(steps, converged, initial_cost, cost, options.iterations), inputs
+    )

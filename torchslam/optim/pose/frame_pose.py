@@ -1,4 +1,4 @@
-"""The pose of one frame against known points by NumPy, for every frame of a run; `refine_pose` is the general solver.
+"""The pose of one frame against known points by NumPy, for every frame of a run; `solve_pose` is the general solver.
 
 Errors are taken in undistorted coordinates and multiplied with the slope of the distortion at the keypoint, which makes
 them pixels to first order, so no iteration evaluates the distortion. Gross outliers must be removed before. The NumPy

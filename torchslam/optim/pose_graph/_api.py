@@ -10,14 +10,12 @@ from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel, kernel_scale
-from torchslam.optim._core.implicit import Backward, check_options, find_minimum
-from torchslam.optim._core.levenberg_marquardt import MAX_ITERATIONS, Convergence, check_minimum
+from torchslam.geometry.robust import kernel_scale
+from torchslam.optim._core.implicit import find_minimum
+from torchslam.optim._core.levenberg_marquardt import Convergence, SolverReason, check_minimum
+from torchslam.optim._core.options import POSE_GRAPH_OPTIONS, SolverOptions
 from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
 from torchslam.utils.indexing import row_mask
-
-# 95 % of the norms of seven standard normal numbers lie below.
-_SCALE = 3.75
 
 
 @dataclass(frozen=True)
@@ -71,17 +69,14 @@ class PoseGraphSolution:
         """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
         return self.convergence.converged.view_as(self.success)
 
+    @property
+    def reasons(self) -> list[SolverReason]:
+        """How the search ended, for each graph."""
+        return self.convergence.reasons(self.success)
+
 
 @full_precision
-def pose_graph_optimize(
-    graph: PoseGraph,
-    kernel: Kernel = "huber",
-    scale: Float[Tensor, "*#scale"] | float = _SCALE,
-    backward: Backward = "implicit",
-    iterations: int = MAX_ITERATIONS,
-    tolerance: float = 1e-8,
-    strict: bool = False,
-) -> PoseGraphSolution:
+def solve_pose_graph(graph: PoseGraph, *, options: SolverOptions = POSE_GRAPH_OPTIONS) -> PoseGraphSolution:
     """Minimize the robust errors log(S_j S_i^-1 S_ji^-1) of the edges over the nodes by Levenberg-Marquardt.
 
     Edges that are not finite, have no weight or touch a node that is not finite do not count. The implicit gradient is
@@ -91,27 +86,25 @@ def pose_graph_optimize(
 
     Args:
         graph: the pose graph, or a batch.
-        kernel: robust kernel.
-        scale: of the kernel, in units of the whitened error: a number, a scalar tensor or (B,).
-        backward: how gradients reach S_ji, information, scale and fixed nodes, but not the start of free ones.
-        iterations: maximum number of steps.
-        tolerance: stop where the predicted reduction of the cost is below this share of it.
-        strict: raise an error for any graph that is not at a minimum: `success` or `converged` is False.
+        options: how to minimize; gradients reach S_ji, information, scale and fixed nodes, but not the start of free
+            ones.
 
     Returns:
         The nodes at the minimum, differentiable.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
-        ConvergenceError: with `strict`.
+        ConvergenceError: with `options.strict`.
     """
-    check_options(backward, iterations, tolerance)
-    counted, fixed, inputs = _sanitized(graph, scale)
-    minimization = PoseGraphMinimization(inputs.information.shape[-1], kernel, iterations, tolerance)
+    backward = options.backward
+    counted, fixed, inputs = _sanitized(graph, options.scale)
+    minimization = PoseGraphMinimization(
+        inputs.information.shape[-1], options.kernel, options.iterations, options.tolerance
+    )
     tensors = (*inputs, counted, fixed, graph.edges)
     found = find_minimum(minimization, tensors, backward)
     solution, success, moving, cost, steps, converged, initial_cost = found
-    if strict:
+    if options.strict:
         check_minimum(success, converged, "pose graphs")
     at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
     if backward == "implicit":
@@ -123,7 +116,11 @@ def pose_graph_optimize(
 
     row = slice(None) if graph.S_cw.ndim == 4 else 0
     return PoseGraphSolution(
-        solution[row], cost[row], success[row], moving[row], Convergence(steps, converged, initial_cost, cost)
+        solution[row],
+        cost[row],
+        success[row],
+        moving[row],
+        Convergence(steps, converged, initial_cost, cost, options.iterations),
     )
 
 

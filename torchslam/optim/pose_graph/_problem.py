@@ -1,4 +1,4 @@
-"""The least-squares problem behind `pose_graph_optimize`: its order, its local models, its adjoint.
+"""The least-squares problem behind `solve_pose_graph`: its order, its local models, its adjoint.
 
 An edge's error is e = log(E) with E = X S_ji^-1, X = S_j S_i^-1. Nodes moved by exp(xi) from the left move E to
 exp(xi_j) exp(-Ad(X) xi_i) E: to first order by eta = xi_j - Ad(X) xi_i, from the left too, so that the derivative of e
