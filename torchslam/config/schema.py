@@ -18,6 +18,7 @@ from typing import Any, ClassVar, TypeVar, get_type_hints
 from torchslam.errors import ConfigError
 from torchslam.plugins import ALLOWED, is_code_of_others, is_known, registered
 from torchslam.utils.files import read_text
+from torchslam.utils.text import is_unicode
 
 Value = TypeVar("Value", bool, int, float, str)
 Section = TypeVar("Section", bound="Settings")
@@ -245,7 +246,7 @@ def _checked(name: str, value: Any, kind: type, allowed: Allowed) -> Any:
         raise ConfigError(f"{name} must be of type {kind.__name__}, not {_shown(value)}")
     if number not in allowed:
         raise ConfigError(f"{name} must be {allowed}, not {_shown(value)}")
-    if kind is str and not _is_unicode(value):
+    if kind is str and not is_unicode(value):
         raise ConfigError(f"{name} must be text that can be written as UTF-8, not {value!r}")
     return number
 
@@ -259,11 +260,6 @@ def _shown(value: object) -> str:
 
 def _short(text: str) -> str:
     return text if len(text) <= SHOWN else text[:SHOWN] + "..."
-
-
-def _is_unicode(text: str) -> bool:
-    """Return True without lone surrogates, which file names in other encodings have."""
-    return not any("\ud800" <= character <= "\udfff" for character in text)
 
 
 def _toml_value(value: object) -> str:

@@ -11,14 +11,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import to_toml
 from torchslam.data.calibration import CALIBRATION, write_calibration
-from torchslam.data.formats.image_file import read_gray
+from torchslam.data.formats.image_file import read_gray, write_image
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import read_trajectory, write_trajectory
@@ -33,6 +32,7 @@ from torchslam.map.map import Map
 from torchslam.system.run import Run, keyframe_rows
 from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.files import JSON_BYTES, parse_json, read_text, write_whole
+from torchslam.utils.text import is_unicode
 
 TRAJECTORY = "trajectory.txt"
 OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number
@@ -111,9 +111,13 @@ def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
         resume: continue from the checkpoint in the folder.
 
     Raises:
-        ResultsError: if the folder has results that would be lost.
+        ResultsError: if the folder has results that would be lost, or a name with which they could not be read again.
         OSError: if the folder cannot be written to.
     """
+    if not is_unicode(str(folder.absolute())):
+        raise ResultsError(
+            f"{folder}: its name is not UTF-8, so that maps in it could not be read: choose another one"
+        )
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / PROBE, b"")
     (folder / PROBE).unlink()
@@ -263,7 +267,7 @@ def _write_example_image(path: Path, run: Run, sequence: Sequence) -> None:
         image = sequence.image(index)
     except FrameError:  # simulated features need no image; then there is nothing to draw
         return
-    cv2.imwrite(str(path), (image[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy())
+    write_image(path, (image[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy())
 
 
 FRAME_COLUMNS = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason", "image")

@@ -27,3 +27,8 @@ def printable(text: str) -> str:
 
 def _escaped(character: str) -> str:
     return character if character.isprintable() else character.encode("unicode_escape").decode()
+
+
+def is_unicode(text: str) -> bool:
+    """Return True without lone surrogates, which file names in other encodings have."""
+    return not any("\ud800" <= character <= "\udfff" for character in text)

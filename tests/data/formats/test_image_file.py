@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zlib
 from collections.abc import Callable
 from pathlib import Path
@@ -14,8 +15,8 @@ from PIL import Image
 
 from torchslam.data import open_sequence
 from torchslam.data.formats.given_poses import read_poses
-from torchslam.data.formats.image_file import PNG_MAX_CHUNKS, is_turned, read_color, read_gray
-from torchslam.errors import FrameError, TrajectoryError
+from torchslam.data.formats.image_file import PNG_MAX_CHUNKS, is_turned, read_color, read_gray, write_image
+from torchslam.errors import FrameError, ResultsError, TrajectoryError
 
 
 @pytest.fixture
@@ -149,3 +150,13 @@ def test_images_are_read_as_colmap_read_them(tmp_path: Path) -> None:
         TrajectoryError, match=r"0\.jpg: its EXIF orientation turns it, which .* ignores: open"
     ):
         given.rows(shown)
+
+
+def test_images_are_written_into_folders_whose_name_is_not_utf8(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xe9t\xe9"))
+    folder.mkdir()
+    pixels = np.arange(48, dtype=np.uint8).reshape(4, 4, 3)
+    write_image(folder / "a.png", pixels)
+    assert np.array_equal(cv2.imdecode(np.fromfile(folder / "a.png", np.uint8), cv2.IMREAD_COLOR), pixels)
+    with pytest.raises(ResultsError, match="cannot be written: No such file or directory"):
+        write_image(folder / "missing" / "a.png", pixels)

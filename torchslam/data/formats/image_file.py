@@ -20,7 +20,7 @@ from jaxtyping import Float, Shaped, UInt8
 from PIL import Image
 from torch import Tensor
 
-from torchslam.errors import FrameError
+from torchslam.errors import FrameError, ResultsError
 from torchslam.utils.files import check_regular, read_bytes
 
 SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".pgm", ".ppm"})
@@ -37,6 +37,23 @@ MAX_BYTES = 1 << 29
 """Size limit of image files."""
 MAX_PIXELS = 1 << 26
 """Maximum number of pixels; a small file may declare any number."""
+
+
+def write_image(path: Path, pixels: UInt8[np.ndarray, "H W *channels"]) -> None:
+    """Write gray or BGR pixels in the format that the suffix names; any name of a folder will do.
+
+    OpenCV's own writer takes UTF-8 names only, and says by a return value that it failed.
+
+    Raises:
+        ResultsError: If the file cannot be written.
+    """
+    is_encoded, content = cv2.imencode(path.suffix, pixels)
+    try:
+        if not is_encoded:
+            raise OSError(f"OpenCV cannot encode {path.suffix}")
+        path.write_bytes(content.tobytes())
+    except OSError as error:
+        raise ResultsError(f"{path}: cannot be written: {error.strerror or error}") from error
 
 
 def read_gray(

@@ -18,6 +18,7 @@ from torch import Tensor
 from torchslam.data import open_sequence
 from torchslam.data.calibration import Calibration
 from torchslam.data.formats.given_poses import rows_by_name
+from torchslam.data.formats.image_file import write_image
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Sequence
 from torchslam.data.transforms import resize
@@ -404,5 +405,4 @@ def write_images(folder: Path, scene: ExportedScene, images: Images) -> None:
     for old in folder.glob("[0-9]" * 6 + ".png"):
         old.unlink()
     for frame_id, name in zip(scene.frame_ids.tolist(), scene.image_names, strict=True):
-        if not cv2.imwrite(str(folder / name), images.bgr(frame_id)):
-            raise ResultsError(f"{folder / name}: cannot be written")
+        write_image(folder / name, images.bgr(frame_id))
