@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +14,16 @@ from torchslam.data import read_trajectory
 from torchslam.errors import ResultsError
 from torchslam.io.export.ply import upright_from_map, write_cloud
 from torchslam.io.report import run_metrics
-from torchslam.io.results import DENSE_CLOUD, DEPTHS, MESH, PICTURES, read_results, results_in, write_results
+from torchslam.io.results import (
+    DENSE_CLOUD,
+    DEPTHS,
+    MESH,
+    PICTURES,
+    prepare,
+    read_results,
+    results_in,
+    write_results,
+)
 from torchslam.io.write_run import draw
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Submap
@@ -172,3 +182,12 @@ def test_unknown_metrics_are_refused(tmp_path: Path, run: Run) -> None:
         (tmp_path / "metrics.json").write_text(content)
         with pytest.raises(ResultsError, match=r"metrics\.json: not the metrics of a run: .*submap"):
             read_results(tmp_path)
+
+
+def test_a_folder_whose_maps_could_not_be_read_is_refused_before_the_run(tmp_path: Path) -> None:
+    folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/\xe9t\xe9"))
+    with pytest.raises(ResultsError, match="its name is not UTF-8"):
+        prepare(folder, overwrite=False, resume=False)
+    assert not folder.exists()
+    prepare(tmp_path / "été", overwrite=False, resume=False)
+    assert (tmp_path / "été").is_dir()
