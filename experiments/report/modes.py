@@ -28,7 +28,7 @@ from torchslam.types import State
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.patches import FancyBboxPatch
+    from matplotlib.patches import FancyBboxPatch, Patch
 
 PICTURE = ROOT / "docs" / "images" / "tracking_modes.svg"
 PLACES = {
@@ -91,14 +91,13 @@ def _box(mode: Mode) -> FancyBboxPatch:
     )
 
 
-def _arrow(axes: Axes, number: int, boxes: dict[Mode, FancyBboxPatch], before: Mode, after: Mode) -> None:
+def _arrow(axes: Axes, number: int, boxes: dict[Mode, Patch], before: Mode, after: Mode) -> None:
     """An arrow that bends to its left, and its number on it."""
     from matplotlib.patches import FancyArrowPatch
 
-    start, end = np.array(PLACES[before]), np.array(PLACES[after])
     arrow = FancyArrowPatch(
-        tuple(start),
-        tuple(end),
+        PLACES[before],
+        PLACES[after],
         connectionstyle=f"arc3,rad={-BEND}",
         arrowstyle="-|>",
         mutation_scale=11,
@@ -110,11 +109,12 @@ def _arrow(axes: Axes, number: int, boxes: dict[Mode, FancyBboxPatch], before: M
         zorder=1,
     )
     axes.add_patch(arrow)
-    first, control, last = arrow.get_path().vertices[:3]  # a quadratic curve between the boxes
+    curve = np.asarray(arrow.get_path().vertices, dtype=np.float64)[:3]  # control points, from box to box
+    weights = np.array([(1 - LABEL_AT) ** 2, 2 * LABEL_AT * (1 - LABEL_AT), LABEL_AT**2])
+    x, y = (weights @ curve).tolist()
     label = {"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": "none"}
-    middle = (1 - LABEL_AT) ** 2 * first + 2 * LABEL_AT * (1 - LABEL_AT) * control + LABEL_AT**2 * last
     axes.text(
-        *middle, str(number), ha="center", va="center", color=GROUND_TRUTH, fontsize=8, bbox=label, zorder=4
+        x, y, str(number), ha="center", va="center", color=GROUND_TRUTH, fontsize=8, bbox=label, zorder=4
     )
 
 
