@@ -53,8 +53,8 @@ def ring_submap(scale: float = 1.0, twist: float = 0.0) -> Submap:
         fresh = [name for name in names if name not in rows]
         rows |= {name: len(rows) + offset for offset, name in enumerate(fresh)}
         if fresh:
-            born = torch.tensor([point for point, _ in fresh])
-            submap.map.add_points(scene.points_w[born], scene.descriptors[born], keyframe)
+            new = torch.tensor([point for point, _ in fresh])
+            submap.map.add_points(scene.points_w[new], scene.descriptors[new], keyframe)
         if keyframe < EARLY:
             early.update(seen)
         ids = torch.tensor([rows[name] for name in names])

@@ -25,7 +25,7 @@ SETTINGS = load_config(None, ["bundle_adjustment.local_window=3"]).bundle_adjust
 PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with nothing else to do
 
 
-def shaken(seed: int = 0) -> Map:
+def perturbed_map(seed: int = 0) -> Map:
     """A row of keyframes, the last ones not where they should be."""
     slam_map = submap_of_scene(SCENE, sideways(5)).map
     generator = torch.Generator().manual_seed(seed)
@@ -44,19 +44,19 @@ def columns(slam_map: Map) -> list[Tensor]:
 CHANGED = ("positions_w", "covariances_w", "view_directions_w", "is_valid", "times_observed")
 
 
-def check_same(mine: Map, other: Map) -> None:
+def assert_same(mine: Map, other: Map) -> None:
     assert all(torch.equal(a, b) for a, b in zip(columns(mine), columns(other), strict=True))
 
 
 def adjusted(seed: int = 0) -> Map:
-    """What it should come to."""
-    slam_map = shaken(seed)
+    """The same map, adjusted at once."""
+    slam_map = perturbed_map(seed)
     adjust_local(slam_map, 4, CAMERA, SETTINGS, covariances=True)
     return slam_map
 
 
 def test_the_map_does_not_change_before_the_result_is_applied() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     assert not adjusting.is_pending
     assert adjusting.due is None
     assert not adjusting.is_due(100)
@@ -64,37 +64,37 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
     assert adjusting.is_pending
     assert adjusting.due == 12
     assert [adjusting.is_due(frame) for frame in (11, 12, 13)] == [False, True, True]
-    check_same(slam_map, shaken())
+    assert_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
     assert not adjusting.is_pending
     adjusting.apply(slam_map)  # there is nothing more
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
 
 
 def test_a_request_is_started_once() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
-    begun: list[BundleProblem] = []
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+    started: list[BundleProblem] = []
 
     def solver(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
-        begun.append(problem)
+        started.append(problem)
         return solve_here(problem, iterations, covariances)
 
     adjusting.solver = solver
     adjusting.start()  # nothing was requested
     adjusting.request(slam_map, 4, due=12)
-    assert not begun
+    assert not started
     adjusting.start()
     adjusting.start()
-    assert len(begun) == 1
-    check_same(slam_map, shaken())
+    assert len(started) == 1
+    assert_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
     adjusting.start()
-    assert len(begun) == 1
+    assert len(started) == 1
     adjusting.request(slam_map, 3, due=20)
-    adjusting.apply(slam_map)  # who was not begun begins now
-    assert len(begun) == 2
+    adjusting.apply(slam_map)  # one that was not started is started now
+    assert len(started) == 2
     adjusting.request(slam_map, 4, due=30)
     adjusting.start()
     adjusting.drop()
@@ -104,7 +104,7 @@ def test_a_request_is_started_once() -> None:
 
 
 def test_a_request_can_be_hurried_or_dropped() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     adjusting.set_deadline(3)
     assert not adjusting.is_pending
     adjusting.request(slam_map, 4, due=12)
@@ -112,11 +112,11 @@ def test_a_request_can_be_hurried_or_dropped() -> None:
     assert adjusting.due == 9
     adjusting.drop()
     adjusting.apply(slam_map)
-    check_same(slam_map, shaken())
+    assert_same(slam_map, perturbed_map())
 
 
 def test_a_request_may_be_due_before_the_next_frame() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     assert not adjusting.is_due_before_next_frame
     adjusting.request(slam_map, 4, due=12)
     assert not adjusting.is_due_before_next_frame
@@ -126,14 +126,14 @@ def test_a_request_may_be_due_before_the_next_frame() -> None:
     assert adjusting.is_due_before_next_frame
     assert adjusting.due is None
     assert adjusting.is_due(0)  # after whatever frame, at the latest
-    check_same(slam_map, shaken())
+    assert_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
     assert not adjusting.is_due_before_next_frame
 
 
 def test_an_empty_request_is_due_as_well() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     slam_map.keyframes["point_ids"][:] = -1
     adjusting.request(slam_map, 4, due=12)
     assert adjusting.is_due(12)
@@ -143,7 +143,7 @@ def test_an_empty_request_is_due_as_well() -> None:
     assert not adjusting.is_pending
 
 
-@pytest.fixture(scope="module", params=["copied", "begun anew"])
+@pytest.fixture(scope="module", params=["copied", "started anew"])
 def worker(request: pytest.FixtureRequest) -> Iterator[BundleWorker]:
     """A process that has started, however it was."""
     is_copied = request.param == "copied"
@@ -164,33 +164,33 @@ def test_another_process_computes_the_same_result(
     adjusting.solver = worker
     for seed in (0, 1):
         expected = adjusted(seed)
-        slam_map = shaken(seed)
+        slam_map = perturbed_map(seed)
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
-        check_same(slam_map, expected)
-    adjusting.request(shaken(2), 4, due=12)
+        assert_same(slam_map, expected)
+    adjusting.request(perturbed_map(2), 4, due=12)
     adjusting.drop()  # its answer comes all the same, and is not mistaken for the next one
-    slam_map = shaken(3)
+    slam_map = perturbed_map(3)
     adjusting.request(slam_map, 4, due=12)
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted(3))
+    assert_same(slam_map, adjusted(3))
 
 
 def test_a_worker_computes_no_covariances_unless_requested(worker: BundleWorker) -> None:
     adjusting, slam_map, expected = (
         AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False),
-        shaken(),
-        shaken(),
+        perturbed_map(),
+        perturbed_map(),
     )
     adjusting.solver = worker
     adjusting.request(slam_map, 4, due=12)
     adjusting.apply(slam_map)
     adjust_local(expected, 4, CAMERA, SETTINGS)
-    check_same(slam_map, expected)
+    assert_same(slam_map, expected)
 
 
 def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
-    slam_map = shaken()
+    slam_map = perturbed_map()
     adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False)
 
     def wrong(problem: BundleProblem, iterations: int, covariances: bool):  # type: ignore[no-untyped-def]
@@ -205,7 +205,7 @@ def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
 
 
 def test_the_run_continues_without_a_killed_worker() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
     with BundleWorker(CAMERA) as solver:
         assert solver._worker._ours.poll(PATIENCE)
         adjusting.solver = solver
@@ -215,19 +215,19 @@ def test_the_run_continues_without_a_killed_worker() -> None:
         solver._worker._ours.close()  # what it may have answered before
         with pytest.warns(UserWarning, match="has ended"):
             adjusting.apply(slam_map)
-        check_same(slam_map, adjusted())
-        slam_map = shaken(1)
+        assert_same(slam_map, adjusted())
+        slam_map = perturbed_map(1)
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
-        check_same(slam_map, adjusted(1))
+        assert_same(slam_map, adjusted(1))
 
 
 def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.worker.starts_at_once", lambda: False)
     with BundleWorker(CAMERA) as solver:
         monkeypatch.setattr(solver._worker, "receive", None)
-        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), shaken()
+        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
-        check_same(slam_map, adjusted())
+        assert_same(slam_map, adjusted())
