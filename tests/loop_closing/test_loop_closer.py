@@ -101,21 +101,21 @@ def test_the_final_adjustment_can_be_left_out() -> None:
         assert len(submap.map.observed_points(torch.tensor([0]))) > 0
 
 
-@pytest.mark.parametrize("query", ["younger", "older"])
+@pytest.mark.parametrize("query", ["newer", "older"])
 def test_two_submaps_are_merged(S_21: Tensor, query: str) -> None:
     older = submap_of_scene(SCENE, sideways(4), number=0)
-    younger = submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
-    if query == "younger":
-        found = LoopCandidate(younger, 3, older, 2, RelativeSim3(sim3_inverse(S_21), 0, 0, 0))
+    newer = submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
+    if query == "newer":
+        found = LoopCandidate(newer, 3, older, 2, RelativeSim3(sim3_inverse(S_21), 0, 0, 0))
     else:
-        found = LoopCandidate(older, 3, younger, 2, RelativeSim3(S_21, 0, 0, 0))
-    camera = younger if query == "younger" else older
-    last = moved(camera.T_cw, sim3_inverse(S_21)) if query == "younger" else camera.T_cw.clone()
+        found = LoopCandidate(older, 3, newer, 2, RelativeSim3(S_21, 0, 0, 0))
+    camera = newer if query == "newer" else older
+    last = moved(camera.T_cw, sim3_inverse(S_21)) if query == "newer" else camera.T_cw.clone()
     submap, keyframe = merge_maps(found, CAMERA, CONFIG)
     assert submap is older
     assert submap.map.num_keyframes == 8
-    assert len(younger.map.keyframes) == 0
-    assert int(submap.map.keyframes["frame_index"][keyframe]) == (103 if query == "younger" else 3)
+    assert len(newer.map.keyframes) == 0
+    assert int(submap.map.keyframes["frame_index"][keyframe]) == (103 if query == "newer" else 3)
     torch.testing.assert_close(submap.map.T_cw, torch.cat([sideways(4), OTHER]), atol=1e-5, rtol=0)
     torch.testing.assert_close(submap.T_cw, last, atol=1e-5, rtol=0)
     torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), submap.map.T_cw, atol=1e-5, rtol=0)

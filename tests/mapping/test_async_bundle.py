@@ -43,12 +43,12 @@ def columns(slam_map: Map) -> list[Tensor]:
 CHANGED = ("positions_w", "covariances_w", "view_directions_w", "is_valid", "times_observed")
 
 
-def check_same(mine: Map, other: Map) -> None:
+def assert_same(mine: Map, other: Map) -> None:
     assert all(torch.equal(a, b) for a, b in zip(columns(mine), columns(other), strict=True))
 
 
 def adjusted(seed: int = 0) -> Map:
-    """What it should come to."""
+    """The same map, adjusted at once."""
     slam_map = perturbed_map(seed)
     adjust_local(slam_map, 4, CAMERA, SETTINGS, covariances=True)
     return slam_map
@@ -63,37 +63,37 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
     assert adjusting.is_pending
     assert adjusting.due == 12
     assert [adjusting.is_due(frame) for frame in (11, 12, 13)] == [False, True, True]
-    check_same(slam_map, perturbed_map())
+    assert_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
     assert not adjusting.is_pending
     adjusting.apply(slam_map)  # there is nothing more
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
 
 
 def test_a_request_is_started_once() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
-    begun: list[BundleProblem] = []
+    started: list[BundleProblem] = []
 
     def solver(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
-        begun.append(problem)
+        started.append(problem)
         return solve_here(problem, iterations, covariances)
 
     adjusting.solver = solver
     adjusting.start()  # nothing was requested
     adjusting.request(slam_map, 4, due=12)
-    assert not begun
+    assert not started
     adjusting.start()
     adjusting.start()
-    assert len(begun) == 1
-    check_same(slam_map, perturbed_map())
+    assert len(started) == 1
+    assert_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
     adjusting.start()
-    assert len(begun) == 1
+    assert len(started) == 1
     adjusting.request(slam_map, 3, due=20)
-    adjusting.apply(slam_map)  # who was not begun begins now
-    assert len(begun) == 2
+    adjusting.apply(slam_map)  # one that was not started is started now
+    assert len(started) == 2
     adjusting.request(slam_map, 4, due=30)
     adjusting.start()
     adjusting.drop()
@@ -111,7 +111,7 @@ def test_a_request_can_be_hurried_or_dropped() -> None:
     assert adjusting.due == 9
     adjusting.drop()
     adjusting.apply(slam_map)
-    check_same(slam_map, perturbed_map())
+    assert_same(slam_map, perturbed_map())
 
 
 def test_a_request_may_be_due_before_the_next_frame() -> None:
@@ -125,9 +125,9 @@ def test_a_request_may_be_due_before_the_next_frame() -> None:
     assert adjusting.is_due_before_next_frame
     assert adjusting.due is None
     assert adjusting.is_due(0)  # after whatever frame, at the latest
-    check_same(slam_map, perturbed_map())
+    assert_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted())
+    assert_same(slam_map, adjusted())
     assert not adjusting.is_due_before_next_frame
 
 
@@ -161,13 +161,13 @@ def test_another_process_computes_the_same_result(
         slam_map = perturbed_map(seed)
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
-        check_same(slam_map, expected)
+        assert_same(slam_map, expected)
     adjusting.request(perturbed_map(2), 4, due=12)
     adjusting.drop()  # its answer comes all the same, and is not mistaken for the next one
     slam_map = perturbed_map(3)
     adjusting.request(slam_map, 4, due=12)
     adjusting.apply(slam_map)
-    check_same(slam_map, adjusted(3))
+    assert_same(slam_map, adjusted(3))
 
 
 def test_a_worker_computes_no_covariances_unless_requested(worker: BundleWorker) -> None:
@@ -180,7 +180,7 @@ def test_a_worker_computes_no_covariances_unless_requested(worker: BundleWorker)
     adjusting.request(slam_map, 4, due=12)
     adjusting.apply(slam_map)
     adjust_local(expected, 4, CAMERA, SETTINGS)
-    check_same(slam_map, expected)
+    assert_same(slam_map, expected)
 
 
 def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
@@ -208,11 +208,11 @@ def test_the_run_continues_without_a_killed_worker() -> None:
         solver._processes[0].join()
         with pytest.warns(UserWarning, match="has ended"):
             adjusting.apply(slam_map)
-        check_same(slam_map, adjusted())
+        assert_same(slam_map, adjusted())
         slam_map = perturbed_map(1)
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
-        check_same(slam_map, adjusted(1))
+        assert_same(slam_map, adjusted(1))
 
 
 def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -222,4 +222,4 @@ def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.Mon
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)
-        check_same(slam_map, adjusted())
+        assert_same(slam_map, adjusted())

@@ -182,10 +182,10 @@ def test_a_local_bundle_adjustment_follows_a_keyframe() -> None:
         assert ("bundle" in by.clock.take()) is (enabled == "true")
 
 
-def young_map(
+def is_kept(
     age: int, *, found: int = 10, visible: int = 10, observed: int = 3, from_initialization: bool = False
 ) -> bool:
-    """Whether a point of that kind survives; the keyframe asking is number 8."""
+    """Whether a point of that age, in keyframes, is kept when keyframe 8 is inserted."""
     submap = submap_of_scene(SCENE, sideways(9, step=0.01))
     slam_map = submap.map
     point = int(torch.nonzero(slam_map.points["times_observed"] == 9)[0])
@@ -203,17 +203,17 @@ def young_map(
 
 
 def test_new_points_must_be_found_where_they_are_visible() -> None:
-    assert young_map(1, found=5, visible=20)
-    assert not young_map(1, found=4, visible=20)
-    assert not young_map(RECENT_KEYFRAMES, found=4, visible=20)
-    assert young_map(RECENT_KEYFRAMES + 1, found=4, visible=20)
+    assert is_kept(1, found=5, visible=20)
+    assert not is_kept(1, found=4, visible=20)
+    assert not is_kept(RECENT_KEYFRAMES, found=4, visible=20)
+    assert is_kept(RECENT_KEYFRAMES + 1, found=4, visible=20)
     assert RECENT_KEYFRAMES == 3
 
 
 def test_new_points_must_be_observed_by_a_third_keyframe_in_time() -> None:
-    assert young_map(1, observed=2)
-    assert not young_map(2, observed=2)
-    assert young_map(2, observed=3)
-    assert not young_map(3, observed=2)
-    assert young_map(4, observed=2)
-    assert young_map(2, observed=2, from_initialization=True)
+    assert is_kept(1, observed=2)
+    assert not is_kept(2, observed=2)
+    assert is_kept(2, observed=3)
+    assert not is_kept(3, observed=2)
+    assert is_kept(4, observed=2)
+    assert is_kept(2, observed=2, from_initialization=True)

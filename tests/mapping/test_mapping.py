@@ -186,13 +186,13 @@ def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
 
 def test_points_that_are_never_found_are_culled(slam: SLAM) -> None:
     newest = slam.map.num_keyframes - 1
-    new_points = torch.nonzero(
-        (slam.map.points["first_keyframe"] >= newest - 2) & slam.map.points["is_valid"]
-    )[:3, 0]
-    assert len(new_points) > 0
-    slam.map.points["times_visible"][new_points] += 1000
+    recent = torch.nonzero((slam.map.points["first_keyframe"] >= newest - 2) & slam.map.points["is_valid"])[
+        :3, 0
+    ]
+    assert len(recent) > 0
+    slam.map.points["times_visible"][recent] += 1000
     slam.mapper.cull_recent_points(slam.map, newest)
-    assert not slam.map.points["is_valid"][new_points].any()
+    assert not slam.map.points["is_valid"][recent].any()
 
 
 def test_epipolar_matches_are_correct(slam: SLAM) -> None:

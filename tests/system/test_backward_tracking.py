@@ -27,7 +27,7 @@ FIRST = 100  # frame of the map's first keyframe
 MAP_FRAMES = [100, 101, 102, 103]
 
 
-class Walk:
+class Frames:
     """A map whose first keyframe is frame 100, and frames before it, the last of them first, without a pose.
 
     Attributes:
@@ -53,7 +53,7 @@ class Walk:
 
         monkeypatch.setattr(LocalMapping, "add_tentative_keyframe", add)
 
-    def tracked(self) -> Walk:
+    def tracked(self) -> Frames:
         self.backward.from_first_keyframe(self.submap)
         return self
 
@@ -78,8 +78,10 @@ class Walk:
         return self.submap.map.keyframes["frame_index"].tolist()
 
 
-def walked(T_cw: Tensor, monkeypatch: pytest.MonkeyPatch, *overrides: str, noise: float = 0.0) -> Walk:
-    return Walk(T_cw, monkeypatch, *overrides, noise=noise).tracked()
+def tracked_backward(
+    T_cw: Tensor, monkeypatch: pytest.MonkeyPatch, *overrides: str, noise: float = 0.0
+) -> Frames:
+    return Frames(T_cw, monkeypatch, *overrides, noise=noise).tracked()
 
 
 def doubting(monkeypatch: pytest.MonkeyPatch, doubtful: Container[int]) -> None:
@@ -108,7 +110,7 @@ def _without_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_frames_before_the_map_get_their_true_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     T_cw = sideways(6, -0.05, start=-0.05)
-    walk = walked(T_cw, monkeypatch)
+    walk = tracked_backward(T_cw, monkeypatch)
     assert walk.posed == [99, 98, 97, 96, 95, 94]
     assert walk.unposed == []
     for index, found in walk.poses.items():
@@ -119,7 +121,7 @@ def test_a_few_blank_frames_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None
     T_cw = sideways(12, -0.02, start=-0.02)
     T_cw[2 : 2 + MAX_CONSECUTIVE_FAILURES - 1] = AWAY
     T_cw[8 : 8 + MAX_CONSECUTIVE_FAILURES - 1] = AWAY
-    walk = walked(T_cw, monkeypatch)
+    walk = tracked_backward(T_cw, monkeypatch)
     assert walk.posed == [99, 98, 93, 92]
     assert walk.unposed == [97, 96, 95, 94, 91, 90, 89, 88]
 
@@ -127,15 +129,15 @@ def test_a_few_blank_frames_are_skipped(monkeypatch: pytest.MonkeyPatch) -> None
 def test_many_blank_frames_end_backward_tracking(monkeypatch: pytest.MonkeyPatch) -> None:
     T_cw = sideways(10, -0.02, start=-0.02)
     T_cw[1 : 1 + MAX_CONSECUTIVE_FAILURES] = AWAY
-    walk = walked(T_cw, monkeypatch)
+    walk = tracked_backward(T_cw, monkeypatch)
     assert walk.posed == [99]
     assert walk.unposed == list(range(98, 89, -1))
 
 
 def test_frames_with_invalid_poses_are_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     T_cw = sideways(3, -0.05, start=-0.05)
-    assert walked(T_cw, monkeypatch, noise=0.5).posed == [99, 98, 97]
-    walk = walked(T_cw, monkeypatch, "pose_validation.max_rotation_std_deg=1e-6", noise=0.5)
+    assert tracked_backward(T_cw, monkeypatch, noise=0.5).posed == [99, 98, 97]
+    walk = tracked_backward(T_cw, monkeypatch, "pose_validation.max_rotation_std_deg=1e-6", noise=0.5)
     assert walk.posed == []
     assert walk.unposed == [99, 98, 97]
     assert walk.tried == []
@@ -145,7 +147,7 @@ def test_a_jump_from_the_predicted_motion_is_not_accepted(monkeypatch: pytest.Mo
     T_cw = sideways(4, -0.05, start=-0.05)
     # the first frame has no motion to be compared with; the motion from the second to the third is too large
     T_cw[2:] = sideways(2, -0.05, start=-0.5)
-    walk = walked(T_cw, monkeypatch, "pose_validation.max_jump=0.03")
+    walk = tracked_backward(T_cw, monkeypatch, "pose_validation.max_jump=0.03")
     assert walk.posed == [99, 98]
     assert walk.tried == []
 
@@ -155,7 +157,7 @@ def test_doubtful_frames_are_kept_when_tracking_reaches_the_first_frame(
 ) -> None:
     doubting(monkeypatch, range(2, 100))
     T_cw = sideways(10, -0.02, start=-0.02)
-    walk = walked(T_cw, monkeypatch)
+    walk = tracked_backward(T_cw, monkeypatch)
     assert walk.posed == list(range(99, 89, -1))
     assert walk.tried == list(range(97, 89, -1))
     assert walk.unposed == []
@@ -167,7 +169,7 @@ def test_doubtful_frames_are_unposed_again_when_tracking_ends_early(monkeypatch:
     with_keyframes(monkeypatch, [96, 94])
     T_cw = sideways(12, -0.02, start=-0.02)
     T_cw[6 : 6 + MAX_CONSECUTIVE_FAILURES] = AWAY
-    walk = walked(T_cw, monkeypatch)
+    walk = tracked_backward(T_cw, monkeypatch)
     assert walk.tried == [97, 96, 95, 94]
     assert walk.posed == [99, 98]
     assert walk.unposed == list(range(97, 87, -1))
@@ -181,7 +183,7 @@ def test_doubtful_frames_are_kept_after_enough_certain_ones(monkeypatch: pytest.
         doubting(monkeypatch, {1, 2})
         away = T_cw.clone()
         away[3 + certain : 3 + certain + MAX_CONSECUTIVE_FAILURES] = AWAY
-        walk = walked(away, monkeypatch)
+        walk = tracked_backward(away, monkeypatch)
         assert walk.posed == posed
         assert walk.tried == list(range(98, 96 - certain, -1))
         assert walk.unposed == [index for index in range(99, 84, -1) if index not in posed]
@@ -191,7 +193,7 @@ def test_tentative_keyframes_are_kept_with_their_frames(monkeypatch: pytest.Monk
     """Only then can their places be recognized."""
     doubting(monkeypatch, {1, 2})
     with_keyframes(monkeypatch, [97])
-    walk = walked(sideways(10, -0.02, start=-0.02), monkeypatch)
+    walk = tracked_backward(sideways(10, -0.02, start=-0.02), monkeypatch)
     assert walk.posed == list(range(99, 89, -1))
     assert walk.keyframes == [*MAP_FRAMES, 97]
     assert len(walk.slam.loop_closer.keyframe_database) == 1  # the map of the scene is not in it
@@ -203,7 +205,7 @@ def test_held_frames_are_committed_where_no_more_can_be_held(monkeypatch: pytest
     doubting(monkeypatch, range(100))
     T_cw = sideways(5 + MAX_CONSECUTIVE_FAILURES, -0.02, start=-0.02)
     T_cw[5:] = AWAY
-    walk = walked(T_cw, monkeypatch)
+    walk = tracked_backward(T_cw, monkeypatch)
     assert walk.tried == [99, 98, 97, 96, 95]
     assert walk.posed == [99, 98, 97]
     assert walk.unposed == [96, 95, 94, 93, 92, 91, 90]
@@ -211,7 +213,7 @@ def test_held_frames_are_committed_where_no_more_can_be_held(monkeypatch: pytest
 
 def test_the_tracking_state_of_the_map_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames are tracked forward from where they were."""
-    walk = Walk(sideways(6, -0.05, start=-0.05), monkeypatch)
+    walk = Frames(sideways(6, -0.05, start=-0.05), monkeypatch)
     before = walk.submap.T_cw.clone(), walk.submap.tracking
     walk.tracked()
     assert walk.submap.tracking is before[1]
@@ -222,7 +224,7 @@ def test_the_tracking_state_of_the_map_stays(monkeypatch: pytest.MonkeyPatch) ->
 def test_frames_before_a_relocalized_one_are_tracked_from_it(monkeypatch: pytest.MonkeyPatch) -> None:
     """Frames after it are not, nor those that are held."""
     T_cw = sideways(6, -0.05, start=-0.05)
-    walk = Walk(T_cw, monkeypatch)
+    walk = Frames(T_cw, monkeypatch)
     tracker, context = walk.context.tracker, walk.context
     view, held = walk.log.view(97), walk.log.view(96)
     state = walk.submap.fork()

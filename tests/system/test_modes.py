@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import random
-from collections import Counter
 from collections.abc import Callable, Iterator
-from itertools import product
+from itertools import pairwise, product
 
 import pytest
 
@@ -244,7 +243,7 @@ def test_every_transition_happens(transition: tuple[Mode, Mode], monkeypatch: py
             assert drive.results[-1].state is transition[1].state
 
 
-def test_modes_are_in_order_of_what_users_see() -> None:
+def test_every_mode_has_the_state_that_users_see() -> None:
     assert {mode: mode.state for mode in Mode} == {
         INITIALIZING: State.INITIALIZING,
         LOST: State.LOST,
@@ -284,10 +283,31 @@ def test_no_other_transition_happens_and_no_frame_is_forgotten_whatever_the_judg
         for _ in range(1 if judgment is NO_POSE else draw.randint(1, 12)):
             drive.step(judgment)
             drive.check()
-    happened = Counter(zip(drive.modes, drive.modes[1:], strict=False))
-    assert len([pair for pair in happened if pair[0] is not pair[1]]) >= 6
+    happened = {(before, after) for before, after in pairwise(drive.modes) if before is not after}
+    assert len(happened) >= 6
     drive.slam.finalize()
     drive.check()
     assert len(drive.slam.loop_closer.keyframe_database) == sum(
         submap.map.num_keyframes for submap in drive.slam.atlas
     )
+
+
+def test_a_map_that_is_confirmed_while_frames_are_held_keeps_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next frames are held until enough certain ones were seen; a loss takes back these only."""
+    for last in (None, NO_POSE):
+        with monkeypatch.context() as patched:
+            drive = Drive(patched, Walk(arc(120)))
+            doubt_in_provisional_map(drive)
+            held = len(drive.results) - 1
+            assert held not in drive.slam.posed_frames.frames["frame_index"].tolist()
+            drive.slam.confirm_map()
+            assert drive.slam.mode is DOUBTED
+            assert held in drive.slam.posed_frames.frames["frame_index"].tolist()
+            drive.check()
+            drive.step()
+            assert drive.slam.mode is DOUBTED
+            assert drive.step(last) is (TRACKING if last is None else LOST)
+            drive.check()
+            posed = drive.slam.posed_frames.frames["frame_index"].tolist()
+            assert held in posed
+            assert (held + 1 in posed) is (last is None)

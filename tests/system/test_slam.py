@@ -230,7 +230,7 @@ def test_a_contradicting_initialization_replaces_a_provisional_map(
 
 
 def test_frames_before_initialization_have_poses_in_the_end() -> None:
-    """A camera that stands at first: there is nothing to begin with before it moves."""
+    """A camera that stands at first: there is nothing to start with before it moves."""
     walk = Walk(torch.cat([still(6), arc(60)[1:20]]))
     run = run_walk(walk, "simulated.depth_near=0.6", "simulated.depth_far=2", "simulated.noise_px=0.2")
     begun = next(r.index for r in run.results if r.state is State.TRACKING)
@@ -455,23 +455,23 @@ def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
 # --- adjustments that wait -----------------------------------------------------------------------------------
 
 
-def asked_and_taken(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str) -> list[tuple[str, int]]:
+def adjustment_events(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: str) -> list[tuple[str, int]]:
     """Record when adjustments of confirmed submaps are requested and applied."""
     events: list[tuple[str, int]] = []
     slam = SLAM(walk.camera, load_config(None, [*SIMULATED, *overrides]))
     request, apply = slam.mapper.adjustment.request, slam.mapper.adjustment.apply
 
-    def asking(slam_map: Map, keyframe: int, due: int | None) -> None:
+    def record_request(slam_map: Map, keyframe: int, due: int | None) -> None:
         events.append(("requested", int(slam_map.keyframes["frame_index"][keyframe])))
         request(slam_map, keyframe, due)
 
-    def taking_over(slam_map: Map) -> None:
+    def record_application(slam_map: Map) -> None:
         assert slam.last_frame is not None
         events.append(("applied", slam.last_frame[0]))
         apply(slam_map)
 
-    monkeypatch.setattr(slam.mapper.adjustment, "request", asking)
-    monkeypatch.setattr(slam.mapper.adjustment, "apply", taking_over)
+    monkeypatch.setattr(slam.mapper.adjustment, "request", record_request)
+    monkeypatch.setattr(slam.mapper.adjustment, "apply", record_application)
     confirmed: list[int] = []  # frames in which the submap is confirmed
 
     def after(result: StepResult) -> None:
@@ -488,13 +488,13 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk = Walk(arc(80, 6.0)[:40])
-    at_once = asked_and_taken(monkeypatch, walk, "bundle_adjustment.delay_frames=0")
+    at_once = adjustment_events(monkeypatch, walk, "bundle_adjustment.delay_frames=0")
     assert len(at_once) >= 6
     assert {(what, frame) for what, frame in at_once if what == "requested"} == {
         ("requested", frame) for what, frame in at_once if what == "applied"
     }
     for delay in (1, 3):
-        events = asked_and_taken(monkeypatch, walk, f"bundle_adjustment.delay_frames={delay}")
+        events = adjustment_events(monkeypatch, walk, f"bundle_adjustment.delay_frames={delay}")
         kinds = [what for what, _ in events]
         assert kinds[: len(kinds) // 2 * 2] == ["requested", "applied"] * (
             len(kinds) // 2
@@ -505,7 +505,7 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
         ]
         assert len(waits) >= 3
         assert set(waits) <= set(range(1, delay + 1))
-    rare = asked_and_taken(
+    rare = adjustment_events(
         monkeypatch, walk, "bundle_adjustment.delay_frames=2", "keyframes.max_translation=0.6"
     )
     waits = [applied - requested for (_, requested), (_, applied) in zip(rare[::2], rare[1::2], strict=False)]
@@ -516,14 +516,14 @@ def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
-    begin = AsyncBundleAdjustment.start
+    start = AsyncBundleAdjustment.start
 
-    def beginning(self: AsyncBundleAdjustment) -> None:
+    def record_start(self: AsyncBundleAdjustment) -> None:
         if self and self._running is None:
             begun.append(self.due)
-        begin(self)
+        start(self)
 
-    monkeypatch.setattr(AsyncBundleAdjustment, "start", beginning)
+    monkeypatch.setattr(AsyncBundleAdjustment, "start", record_start)
     for delay in (0, 2):
         begun.clear()
         runs.append(
@@ -534,7 +534,7 @@ def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
     at_once, between = runs
     assert torch.equal(at_once.trajectory.T_wc, between.trajectory.T_wc)
     assert torch.equal(at_once.map.positions_w, between.map.positions_w)
-    events = asked_and_taken(
+    events = adjustment_events(
         monkeypatch, walk, "bundle_adjustment.local_window=1000", "bundle_adjustment.delay_frames=2"
     )
     assert [what for what, _ in events[:6]] == ["requested", "applied"] * 3
@@ -546,7 +546,7 @@ def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
 
 def test_a_lost_camera_leaves_no_pending_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(walk_with_jump())
-    events = asked_and_taken(
+    events = adjustment_events(
         monkeypatch, walk, "bundle_adjustment.delay_frames=1000", "keyframes.min_overlap=0"
     )
     assert [what for what, _ in events if what == "applied"]

@@ -46,7 +46,7 @@ def doubting(monkeypatch: pytest.MonkeyPatch, frames: Container[int], doubt: Rej
     return SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED))
 
 
-def shown(slam: SLAM, walk: Walk, each: Callable[[int], None] = lambda _: None) -> list[State]:
+def states_of(slam: SLAM, walk: Walk, each: Callable[[int], None] = lambda _: None) -> list[State]:
     """The states of the system at the frames of a walk."""
     frames, states = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(walk), []
     for index in range(len(walk)):
@@ -64,7 +64,7 @@ def tables(slam: SLAM) -> dict[str, Tensor]:
 def test_tentative_keyframes_are_committed_when_confirmed(monkeypatch: pytest.MonkeyPatch) -> None:
     slam, walk = doubting(monkeypatch, DOUBTFUL), Walk(arc(60)[: SEEN + 4])
     keyframes: list[int] = []
-    states = shown(slam, walk, lambda _: keyframes.append(slam.map.num_keyframes))
+    states = states_of(slam, walk, lambda _: keyframes.append(slam.map.num_keyframes))
     first, last = DOUBTFUL[0], DOUBTFUL[-1]
     assert keyframes[last] > keyframes[first - 1] + 1
     assert states[first : SEEN - 1] == [State.UNCERTAIN] * (SEEN - 1 - first)
@@ -80,14 +80,14 @@ def test_tentative_keyframes_are_rolled_back_when_the_camera_is_lost(monkeypatch
     walk = Leaving(arc(60)[:30], 27)
     slam = doubting(monkeypatch, DOUBTFUL)
     grown: list[int] = []
-    states = shown(slam, walk, lambda _: grown.append(slam.map.num_keyframes))
+    states = states_of(slam, walk, lambda _: grown.append(slam.map.num_keyframes))
     assert states[-1] is State.LOST
     assert max(grown) > grown[DOUBTFUL[0] - 1]
     assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes == grown[DOUBTFUL[0] - 1]
 
     cautious = doubting(monkeypatch, DOUBTFUL)
     monkeypatch.setattr(LocalMapping, "add_tentative_keyframe", lambda *_: None)
-    assert shown(cautious, walk) == states
+    assert states_of(cautious, walk) == states
     assert tables(slam).keys() == tables(cautious).keys()
     for name, column in tables(slam).items():
         assert torch.equal(column, tables(cautious)[name]), name
@@ -105,7 +105,7 @@ def test_a_pose_that_disagrees_with_its_matches_is_not_mapped(
     values = {"ratio": 0.1, "matches": 9, "std": 0.1, "translation": 0.1, "degrees": 30.0}
     slam = doubting(monkeypatch, DOUBTFUL, Rejection(rejection, values))
     grown: list[int] = []
-    states = shown(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
+    states = states_of(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
     assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
@@ -125,7 +125,7 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(
         lambda *_: moving if slam.last_frame and slam.last_frame[0] in DOUBTFUL else NO_MOVEMENT,
     )
     grown: list[int] = []
-    states = shown(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
+    states = states_of(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
     assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
@@ -135,7 +135,7 @@ def test_many_frames_that_are_held_back_are_kept_when_the_camera_is_lost(
 ) -> None:
     leaves = 75
     slam = doubting(monkeypatch, range(22, 200))
-    states = shown(slam, Leaving(arc(120)[: leaves + 3], leaves))
+    states = states_of(slam, Leaving(arc(120)[: leaves + 3], leaves))
     assert states[leaves - 1] is State.UNCERTAIN
     assert states[leaves + 1] is State.LOST
     assert len(slam.trajectory()) == leaves
@@ -144,7 +144,7 @@ def test_many_frames_that_are_held_back_are_kept_when_the_camera_is_lost(
 def test_tentative_frames_at_the_end_keep_their_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(arc(60)[:36])
     slam = doubting(monkeypatch, range(22, 60))
-    states = shown(slam, walk)
+    states = states_of(slam, walk)
     before = slam.map.num_keyframes
     slam.finalize()
     assert states[-1] is State.UNCERTAIN
@@ -167,7 +167,7 @@ def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_commit
     slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
     starting_late(monkeypatch, slam)
     judge(monkeypatch, local_mapping, lambda _: DOUBT)
-    shown(slam, walk)
+    states_of(slam, walk)
     assert len(slam.trajectory()) == len(walk)
     assert int(slam.map.keyframes["frame_index"].min()) < LATE
     assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
@@ -185,7 +185,7 @@ def test_unconfirmed_backward_tracking_is_rolled_back(monkeypatch: pytest.Monkey
         return WRONG if len(grown) > LATE // 2 else DOUBT
 
     judge(monkeypatch, local_mapping, rejection_of)
-    shown(slam, walk)
+    states_of(slam, walk)
     assert grown[-1] > grown[0]
     first = int(slam.map.keyframes["frame_index"][0])
     assert first >= LATE
@@ -202,7 +202,7 @@ def test_a_provisional_map_that_ends_uncertain_is_tracked_backward(
     walk = Walk(arc(60)[:36])
     slam = doubting(monkeypatch, range(22, 60))
     starting_late(monkeypatch, slam)
-    shown(slam, walk)
+    states_of(slam, walk)
     assert slam.mode is Mode.PROVISIONAL_DOUBTED
     assert slam.map.num_keyframes > len(slam.loop_closer.keyframe_database)
     end(slam)
@@ -216,7 +216,7 @@ def test_the_number_of_tentative_frames_is_bounded(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(savepoints, "MAX_HELD_FRAMES", 5)
     walk = Leaving(arc(60)[:40], 34)
     slam = doubting(monkeypatch, range(22, 60))
-    states = shown(slam, walk)
+    states = states_of(slam, walk)
     assert states[22:34] == [State.UNCERTAIN] * 12
     assert states[34:] == [State.LOST] * 6
     assert slam.posed_frames.frames["frame_index"].tolist() == list(range(32))

@@ -101,9 +101,7 @@ class Maintenance:
         since = newest - found.keyframe
         submap, keyframe = context.loop_closer.close(found)
         self.active_map.submap = submap
-        if (
-            self.active_map.doubted is not None
-        ):  # no more could be held back: frames that follow are in this map
+        if self.active_map.doubted is not None:  # where no more could be held back
             self.active_map.doubted.submap = submap
         context.tracker.reset_to_keyframe(submap, keyframe + since)
         context.scene_filter.forget_last()  # its pose was one of the map before

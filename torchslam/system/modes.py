@@ -57,11 +57,3 @@ TRANSITIONS: dict[tuple[Mode, Mode], str] = {
     (Mode.RELOCALIZED, Mode.LOST): "no pose: back to the savepoint",
 }
 """What leads from one mode to another with one frame. A mode may also stay."""
-
-
-def diagram() -> str:
-    """The transitions as a Mermaid diagram, for the documentation."""
-    lines = ["stateDiagram-v2", "    [*] --> INITIALIZING"]
-    lines += [f"    {mode.name} : {mode.value}" for mode in Mode]
-    lines += [f"    {before.name} --> {after.name} : {why}" for (before, after), why in TRANSITIONS.items()]
-    return "\n".join(lines)
