@@ -33,7 +33,7 @@ def found_in(
     return found, gray, near, far
 
 
-def a_net(dtype: torch.dtype = torch.float32) -> RatingNet:
+def small_net(dtype: torch.dtype = torch.float32) -> RatingNet:
     """A small one with random weights, also of the last layer."""
     torch.manual_seed(0)
     net = RatingNet((3, 4, 4, 5))
@@ -65,7 +65,7 @@ def test_a_batch_is_a_loop() -> None:
     other = found._replace(
         inverse_depth=found.inverse_depth * torch.tensor([1.0, 1.1])[:, None, None].double()
     )
-    net = a_net(torch.float64)
+    net = small_net(torch.float64)
     confidence = learned_confidence(other, gray, near, far, net)
     for row in range(2):
         one = slice(row, row + 1)
@@ -84,11 +84,11 @@ def test_a_batch_is_a_loop() -> None:
 
 def test_gradients_of_the_network() -> None:
     inputs = torch.rand(1, 27, 9, 12, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(a_net(torch.float64), (inputs,), fast_mode=True)
+    assert torch.autograd.gradcheck(small_net(torch.float64), (inputs,), fast_mode=True)
 
 
 def test_every_weight_has_a_gradient() -> None:
-    net = a_net()
+    net = small_net()
     learned_confidence(*found_in(), net).sum().backward()
     for name, weight in net.named_parameters():
         assert weight.grad is not None, name

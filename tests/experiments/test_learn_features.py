@@ -29,7 +29,7 @@ from experiments.learned_weights.features.front_end import (
 )
 from experiments.learned_weights.features.report import Result, bootstrap, medians, ratios
 from experiments.learned_weights.features.run import Part, spread
-from tests.learning.test_clip_slam import BentEyes
+from tests.learning.test_clip_slam import BentExtractor
 from tests.walks import T_cw, Walk, arc, still
 from torchslam import ORB, ClipSLAM, Features
 from torchslam.evaluation import ate
@@ -39,16 +39,16 @@ from torchslam.learning.losses import path_length
 CPU = torch.device("cpu")
 
 
-class PairEyes(nn.Module):
+class PairExtractor(nn.Module):
     """Features of a pair of a walk, from a feature extractor that knows the scene."""
 
-    def __init__(self, eyes: nn.Module, rows: list[int]) -> None:
+    def __init__(self, extractor: nn.Module, rows: list[int]) -> None:
         super().__init__()
-        self.eyes = eyes
+        self.extractor = extractor
         self.rows = rows
 
     def forward(self, images: Tensor) -> Features:
-        features = self.eyes(images)
+        features = self.extractor(images)
         return features[self.rows]
 
 
@@ -60,11 +60,11 @@ def test_the_error_of_a_clip_is_relative_to_its_path_and_nan_without_poses() -> 
     walk, standing = Walk(arc(20, length=2.0)), Walk(still(20))
     clip = clip_from(walk, 2, CPU)
     assert torch.equal(clip.T_cw, T_cw(walk)[2:18:2])
-    eyes = PairEyes(BentEyes(walk, bend=0.01), list(range(2, 18, 2)))
-    poses = ClipSLAM(eyes)(clip.images, clip.camera)
+    extractor = PairExtractor(BentExtractor(walk, bend=0.01), list(range(2, 18, 2)))
+    poses = ClipSLAM(extractor)(clip.images, clip.camera)
     expected = ate(T_cw=poses.T_cw, T_cw_groundtruth=clip.T_cw) / path_length(clip.T_cw)
-    assert position_error(ClipSLAM(eyes), clip) == pytest.approx(float(expected.detach()))
-    blind = PairEyes(BentEyes(standing, bend=0.0), list(range(8)))
+    assert position_error(ClipSLAM(extractor), clip) == pytest.approx(float(expected.detach()))
+    blind = PairExtractor(BentExtractor(standing, bend=0.0), list(range(8)))
     assert math.isnan(position_error(ClipSLAM(blind), clip_from(standing, 0, CPU)))
 
 
@@ -127,9 +127,9 @@ def test_a_caching_feature_extractor_extracts_an_image_once() -> None:
 def test_an_exact_feature_extractor_makes_no_error() -> None:
     walk = Walk(arc(10, length=1.0))
     pair = Pair.of(walk, 2, CPU)
-    eyes = PairEyes(BentEyes(walk, bend=0.0, noise_px=0.0), [2, 2 + frames_in(APART_S, walk)])
+    extractor = PairExtractor(BentExtractor(walk, bend=0.0, noise_px=0.0), [2, 2 + frames_in(APART_S, walk)])
     with torch.no_grad():
-        found = pair_errors(eyes(pair.images), pair)
+        found = pair_errors(extractor(pair.images), pair)
     assert found.inliers[0] > 50
     assert found.rotation[0] < 1e-4
     assert found.direction[0] < 1e-3

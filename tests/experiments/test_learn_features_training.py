@@ -17,7 +17,7 @@ from experiments.learned_weights.features.training import (
     pose_loss,
     train,
 )
-from tests.learning.test_clip_slam import BentEyes
+from tests.learning.test_clip_slam import BentExtractor
 from tests.walks import Walk, arc
 from torchslam import Features
 
@@ -26,12 +26,12 @@ SHIFT_PX = 1.5
 KINDS = 4
 
 
-class WalkEyes(nn.Module):
+class WalkExtractor(nn.Module):
     """What a feature extractor that knows the scene sees of a walk, frame after frame."""
 
     def __init__(self, walk: Walk) -> None:
         super().__init__()
-        self.features = BentEyes(walk, bend=0.0, noise_px=0.0).exact
+        self.features = BentExtractor(walk, bend=0.0, noise_px=0.0).exact
         self.next = 0
 
     def forward(self, images: Tensor) -> Features:
@@ -42,7 +42,7 @@ class WalkEyes(nn.Module):
 def exact_tracks() -> Tracks:
     """Tracks without noise."""
     walk = Walk(arc(16, length=1.5))
-    return Tracks.of(WalkEyes(walk), walk, range(16), CPU)
+    return Tracks.of(WalkExtractor(walk), walk, range(16), CPU)
 
 
 def disturbed(tracks: Tracks) -> Tracks:

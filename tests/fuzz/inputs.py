@@ -51,7 +51,7 @@ def mutated(reader: Reader, number: int) -> Mutated:
         return dict(reader.generate(rng))
     files = dict(reader.files)
     if reader.name == "settings of a run":
-        return {"argument": valid_inputs.absurd_setting(rng).encode()}
+        return {"argument": valid_inputs.extreme_setting(rng).encode()}
     if reader.name == "calibration conventions":
         return dict(conventions.example(rng))
     if "argument" in files:

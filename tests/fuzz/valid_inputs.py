@@ -298,7 +298,7 @@ OVERRIDES = [
 ABSURD = [0, 1, 2, -1, 1e-300, 1e-9, 1e-3, 0.5, 1e3, 1e4, 1e6, 1e12, 1e300]
 
 
-def absurd_setting(rng: random.Random) -> str:
+def extreme_setting(rng: random.Random) -> str:
     """A setting with a number that is finite, often allowed, and never meant."""
     numbers = [line for line in to_toml(Config()).splitlines() if "=" in line or line.startswith("[")]
     section, names = "", []

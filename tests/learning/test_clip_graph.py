@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.learning.test_clip_slam import CONFIG, FRAMES, BentEyes, clip_of, derivative
+from tests.learning.test_clip_slam import CONFIG, FRAMES, BentExtractor, clip_of, derivative
 from tests.walks import Walk, arc, still
 from torchslam import Camera, ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
 from torchslam.errors import ClipError
@@ -27,8 +27,8 @@ def camera_with(focal: Tensor | float) -> Camera:
 
 def test_a_call_equals_extraction_and_solution(walk: Walk) -> None:
     images, truth = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.01)
-    clip_slam = ClipSLAM(eyes)
+    extractor = BentExtractor(walk, bend=0.01)
+    clip_slam = ClipSLAM(extractor)
 
     def graph() -> ClipGraph:
         found = clip_slam.build_graph(images, walk.camera)
@@ -46,10 +46,10 @@ def test_a_call_equals_extraction_and_solution(walk: Walk) -> None:
 
     results = []
     for way in (of_call, in_two, with_graph):
-        eyes.bend.grad = None
+        extractor.bend.grad = None
         poses = way()
         ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed).backward()
-        results.append((poses.T_cw.detach(), poses.posed, eyes.bend.grad))
+        results.append((poses.T_cw.detach(), poses.posed, extractor.bend.grad))
     assert results[0][1].all()
     for other in results[1:]:
         assert all(torch.equal(*pair) for pair in zip(results[0], other, strict=True))
@@ -59,7 +59,7 @@ def test_a_clip_graph_is_detached(walk: Walk) -> None:
     images, _ = clip_of(walk)
     focal = torch.tensor(400.0, dtype=torch.float64, requires_grad=True)
     camera = camera_with(focal)
-    graph = ClipSLAM(BentEyes(walk, bend=0.01)).build_graph(images, camera)
+    graph = ClipSLAM(BentExtractor(walk, bend=0.01)).build_graph(images, camera)
     (run,) = graph.runs
     assert run is not None
     columns = [getattr(run, name) for name in run.columns()]
@@ -71,27 +71,29 @@ def test_a_clip_graph_is_detached(walk: Walk) -> None:
 
 def test_the_gradient_through_a_stored_graph_agrees_with_finite_differences(walk: Walk) -> None:
     images, truth = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.01)
-    clip_slam = ClipSLAM(eyes, config=CONFIG)
+    extractor = BentExtractor(walk, bend=0.01)
+    clip_slam = ClipSLAM(extractor, config=CONFIG)
     graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(bend: float, focal: Tensor | float) -> Tensor:
         with torch.no_grad():
-            eyes.bend.fill_(bend)
+            extractor.bend.fill_(bend)
         poses = clip_slam.pose(graph, clip_slam.extract(images), camera_with(focal))
         return ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
 
     focal = torch.tensor(405.0, dtype=torch.float64, requires_grad=True)
     loss(0.03, focal).backward()  # far from where it was looked
-    assert eyes.bend.grad is not None
+    assert extractor.bend.grad is not None
     assert focal.grad is not None
-    assert float(eyes.bend.grad) == pytest.approx(derivative(lambda x: loss(x, 405.0), 0.03, 1e-5), rel=1e-3)
+    assert float(extractor.bend.grad) == pytest.approx(
+        derivative(lambda x: loss(x, 405.0), 0.03, 1e-5), rel=1e-3
+    )
     assert float(focal.grad) == pytest.approx(derivative(lambda x: loss(0.03, x), 405.0, 1e-2), rel=1e-3)
 
 
 def test_clips_of_a_batch_have_their_own_cameras(walk: Walk) -> None:
     images, truth = clip_of(walk)
-    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0))
     params = torch.stack([camera_with(focal).params for focal in (400.0, 410.0)]).requires_grad_()
     poses = clip_slam(torch.stack([images, images]), walk.camera.with_params(params))
     alone = [clip_slam(images, camera_with(focal)) for focal in (400.0, 410.0)]
@@ -107,7 +109,7 @@ def test_clips_of_a_batch_have_their_own_cameras(walk: Walk) -> None:
 
 def test_graphs_of_clips_stack_to_a_batch(walk: Walk) -> None:
     images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0))
     graphs = [clip_slam.build_graph(images, camera_with(focal)) for focal in (400.0, 410.0)]
     features = clip_slam.extract(torch.stack([images, images]))
     poses = clip_slam.pose(ClipGraph.stack(graphs), features)
@@ -124,7 +126,7 @@ def test_graphs_of_clips_stack_to_a_batch(walk: Walk) -> None:
 
 def test_missing_keypoints_are_ignored(walk: Walk) -> None:
     images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0, noise_px=0.0))
+    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0, noise_px=0.0))
     graph, features = clip_slam.build_graph(images, walk.camera), clip_slam.extract(images)
     assert isinstance(features, Features)
     gone = torch.zeros_like(features.mask)
@@ -142,7 +144,7 @@ def test_missing_keypoints_are_ignored(walk: Walk) -> None:
 def test_a_clip_without_initialization_has_no_pose() -> None:
     walk = Walk(still(4))
     images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0))
     graph = clip_slam.build_graph(images, walk.camera)
     assert graph.runs == (None,)
     poses = clip_slam.pose(graph, clip_slam.extract(images))
@@ -155,14 +157,19 @@ def test_a_clip_without_initialization_has_no_pose() -> None:
 def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
     """Together they are what each is alone: cameras of two models, one clip without a map, one that is blind now."""
     images, truth = clip_of(walk)
-    eyes, idle = BentEyes(walk, bend=0.0), BentEyes(Walk(still(FRAMES)), bend=0.0)
+    extractor, idle = BentExtractor(walk, bend=0.0), BentExtractor(Walk(still(FRAMES)), bend=0.0)
     bent = Camera.radial_tangential(401.0, 402.0, 159.5, 119.5, 1e-3, 0.0, 0.0, 0.0, size=(320, 240))
     looked = [
-        ClipSLAM(extractor).build_graph(images, camera)
-        for extractor, camera in ((eyes, walk.camera), (idle, walk.camera), (eyes, bent), (eyes, walk.camera))
+        ClipSLAM(each).build_graph(images, camera)
+        for each, camera in (
+            (extractor, walk.camera),
+            (idle, walk.camera),
+            (extractor, bent),
+            (extractor, walk.camera),
+        )
     ]
-    clip_slam = ClipSLAM(eyes, keypoint_weight=lambda features: features.scores)
-    seen = eyes(images)
+    clip_slam = ClipSLAM(extractor, keypoint_weight=lambda features: features.scores)
+    seen = extractor(images)
     keypoints, scores = seen.keypoints.clone().requires_grad_(), torch.ones_like(seen.scores).requires_grad_()
     good = replace(seen, keypoints=keypoints, scores=scores)
     blind = replace(good, mask=torch.zeros_like(good.mask))
@@ -185,7 +192,7 @@ def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
         torch.testing.assert_close(gradient, other, rtol=1e-7, atol=1e-9 * float(other.abs().max()))
 
 
-class SortedEyes(BentEyes):
+class SortedExtractor(BentExtractor):
     """A feature extractor whose rows are in the order of scores that it learns, as those of a network are."""
 
     def __init__(self, walk: Walk) -> None:
@@ -196,25 +203,25 @@ class SortedEyes(BentEyes):
         return super().forward(images).rows(self.order)
 
 
-class FixedEyes(SortedEyes):
+class FixedExtractor(SortedExtractor):
     """The same, but it can describe given keypoints again."""
 
     def read(self, images: Tensor, keypoints: Tensor, mask: Tensor) -> Features:
         assert (keypoints - self.exact.keypoints)[mask].norm(
             dim=-1
         ).max() < 8  # those of the graph, in its rows
-        return BentEyes.forward(self, images)
+        return BentExtractor.forward(self, images)
 
 
 def test_keypoints_that_jump_to_other_rows_are_refused_and_fixed_ones_read_again(walk: Walk) -> None:
     images, truth = clip_of(walk)
     losses = []
-    for eyes in (SortedEyes(walk), FixedEyes(walk)):
-        clip_slam = ClipSLAM(eyes)
+    for extractor in (SortedExtractor(walk), FixedExtractor(walk)):
+        clip_slam = ClipSLAM(extractor)
         graph = clip_slam.build_graph(images, walk.camera)
         before = clip_slam(images, walk.camera, graph)
-        eyes.order = torch.cat((eyes.order[:100].flip(0), eyes.order[100:]))
-        if isinstance(eyes, FixedEyes):
+        extractor.order = torch.cat((extractor.order[:100].flip(0), extractor.order[100:]))
+        if isinstance(extractor, FixedExtractor):
             after = clip_slam(images, walk.camera, graph)
             losses = [
                 ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed) for poses in (before, after)
@@ -225,14 +232,14 @@ def test_keypoints_that_jump_to_other_rows_are_refused_and_fixed_ones_read_again
     assert before.success
     torch.testing.assert_close(*losses)
     losses[1].backward()
-    assert eyes.bend.grad is not None
-    assert eyes.bend.grad.abs() > 0
+    assert extractor.bend.grad is not None
+    assert extractor.bend.grad.abs() > 0
 
 
 def test_halves_share_no_observation_and_their_difference_has_right_gradients(walk: Walk) -> None:
     images, _ = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.01)
-    clip_slam = ClipSLAM(eyes)
+    extractor = BentExtractor(walk, bend=0.01)
+    clip_slam = ClipSLAM(extractor)
     graph = clip_slam.build_graph(torch.stack([images, images]), walk.camera)
     (whole, _), (even, _), (odd, _) = graph.runs, *(half.runs for half in graph.halves())
     assert not set(even.point_index.tolist()) & set(odd.point_index.tolist())
@@ -240,7 +247,7 @@ def test_halves_share_no_observation_and_their_difference_has_right_gradients(wa
 
     def loss(bend: float | Tensor) -> Tensor:
         with torch.no_grad():
-            eyes.bend.copy_(torch.as_tensor(bend))
+            extractor.bend.copy_(torch.as_tensor(bend))
         features = clip_slam.extract(torch.stack([images, images]), graph)
         poses = [clip_slam.pose(half, features, walk.camera) for half in graph.halves()]
         assert all(each.success.all() for each in poses)
@@ -249,13 +256,13 @@ def test_halves_share_no_observation_and_their_difference_has_right_gradients(wa
     found = loss(0.01)
     found.backward()
     assert float(found.detach()) > 0
-    assert eyes.bend.grad is not None
-    assert float(eyes.bend.grad) == pytest.approx(derivative(loss, 0.01, 1e-5), rel=1e-3)
+    assert extractor.bend.grad is not None
+    assert float(extractor.bend.grad) == pytest.approx(derivative(loss, 0.01, 1e-5), rel=1e-3)
 
 
 def test_a_clip_with_a_failed_half_counts_as_failed(walk: Walk) -> None:
     images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentEyes(walk, bend=0.01))
+    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.01))
     graph = clip_slam.build_graph(images, walk.camera)
     even, _ = graph.halves()
     nothing = replace(even, runs=(None,), reasons=("too few points",))

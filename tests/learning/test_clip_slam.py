@@ -20,7 +20,7 @@ FRAMES = 10
 CONFIG = load_config(None, ["bundle_adjustment.global_iterations=30"])
 
 
-class BentEyes(nn.Module):
+class BentExtractor(nn.Module):
     """An extractor that knows the scene, and sees it through a lens it does not know: a bend of 0 would be right."""
 
     def __init__(self, walk: Walk, bend: float, noise_px: float = 0.2) -> None:
@@ -60,12 +60,12 @@ def derivative(loss: object, value: float, h: float) -> float:
 def test_the_gradient_to_a_feature_extractor_agrees_with_finite_differences() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.01)
-    clip_slam = ClipSLAM(eyes, config=CONFIG)
+    extractor = BentExtractor(walk, bend=0.01)
+    clip_slam = ClipSLAM(extractor, config=CONFIG)
 
     def loss(bend: float) -> Tensor:
         with torch.no_grad():
-            eyes.bend.fill_(bend)
+            extractor.bend.fill_(bend)
         poses = clip_slam(images, walk.camera)
         return (
             ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
@@ -73,14 +73,14 @@ def test_the_gradient_to_a_feature_extractor_agrees_with_finite_differences() ->
         )
 
     loss(0.01).backward()
-    assert eyes.bend.grad is not None
-    assert float(eyes.bend.grad) == pytest.approx(derivative(loss, 0.01, 1e-5), rel=1e-3)
+    assert extractor.bend.grad is not None
+    assert float(extractor.bend.grad) == pytest.approx(derivative(loss, 0.01, 1e-5), rel=1e-3)
 
 
 def test_the_gradient_to_weights_and_camera_agrees_with_finite_differences() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.01)
+    extractor = BentExtractor(walk, bend=0.01)
 
     def loss(falloff: Tensor | float, focal: Tensor | float) -> Tensor:
         def keypoint_weight(features: Features) -> Tensor:
@@ -88,7 +88,7 @@ def test_the_gradient_to_weights_and_camera_agrees_with_finite_differences() -> 
             return torch.exp(-falloff * (away / 200).square().sum(-1))
 
         camera = Camera.pinhole(focal, focal, 159.5, 119.5, size=(320, 240))
-        poses = ClipSLAM(eyes, keypoint_weight, CONFIG)(images, camera)
+        poses = ClipSLAM(extractor, keypoint_weight, CONFIG)(images, camera)
         return ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
 
     falloff = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
@@ -103,8 +103,8 @@ def test_the_gradient_to_weights_and_camera_agrees_with_finite_differences() -> 
 def test_a_training_loop_estimates_the_distortion() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.02, noise_px=0.05)
-    clip_slam = ClipSLAM(eyes)
+    extractor = BentExtractor(walk, bend=0.02, noise_px=0.05)
+    clip_slam = ClipSLAM(extractor)
     optimizer = torch.optim.Adam(clip_slam.parameters(), 0.004)
     losses = []
     for _ in range(6):
@@ -116,7 +116,7 @@ def test_a_training_loop_estimates_the_distortion() -> None:
         optimizer.step()
         losses.append(float(loss.detach()))
     assert losses[-1] < 0.3 * losses[0]
-    assert abs(float(eyes.bend.detach())) < 0.01
+    assert abs(float(extractor.bend.detach())) < 0.01
 
 
 def test_the_gradient_reaches_the_images() -> None:
@@ -136,8 +136,8 @@ def test_the_gradient_reaches_the_images() -> None:
 def test_a_clip_without_a_map_has_no_pose_and_zero_gradient() -> None:
     walk = Walk(still(4))
     images, truth = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.02)
-    poses = ClipSLAM(eyes)(images, walk.camera)
+    extractor = BentExtractor(walk, bend=0.02)
+    poses = ClipSLAM(extractor)(images, walk.camera)
     assert not poses.posed.any()
     assert not poses.success
     (reason,) = poses.reasons
@@ -156,7 +156,7 @@ def test_a_clip_without_a_map_has_no_pose_and_zero_gradient() -> None:
     loss, failure_rate = clip_loss(poses, T_cw_groundtruth=truth, on_failure=2.5)
     assert (float(loss.detach()), failure_rate) == (2.5, 1.0)
     loss.backward()
-    assert eyes.bend.grad == 0
+    assert extractor.bend.grad == 0
 
 
 def test_a_failed_clip_does_not_count_as_zero_error() -> None:
@@ -186,7 +186,7 @@ def test_a_failed_clip_does_not_count_as_zero_error() -> None:
 def test_a_batch_equals_its_clips() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentEyes(walk, bend=0.0))
+    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0))
     one, two = clip_slam(images, walk.camera), clip_slam(torch.stack([images, images]), walk.camera)
     assert two.T_cw.shape == (2, FRAMES, 4, 4)
     torch.testing.assert_close(two.T_cw, torch.stack([one.T_cw, one.T_cw]), atol=1e-9, rtol=0)
@@ -198,7 +198,7 @@ def test_a_batch_equals_its_clips() -> None:
 def test_images_have_the_dimensions_of_clips() -> None:
     walk = Walk(arc(2, length=1.0))
     with pytest.raises(ValueError, match="images must be"):
-        ClipSLAM(BentEyes(walk, bend=0.0))(clip_of(walk)[0][0], walk.camera)
+        ClipSLAM(BentExtractor(walk, bend=0.0))(clip_of(walk)[0][0], walk.camera)
 
 
 def test_a_split_clip_has_the_poses_of_its_main_submap() -> None:
@@ -215,7 +215,7 @@ def test_a_split_clip_has_the_poses_of_its_main_submap() -> None:
             "bundle_adjustment.global_at_end=false",
         ],
     )
-    poses_found = ClipSLAM(BentEyes(walk, bend=0.0), config=config)(images, walk.camera)
+    poses_found = ClipSLAM(BentExtractor(walk, bend=0.0), config=config)(images, walk.camera)
     assert poses_found.posed.tolist() == [True] * 22 + [False] * 10
     assert float(ate(T_cw=poses_found.T_cw, T_cw_groundtruth=truth, mask=poses_found.posed).detach()) < 0.01
 
@@ -236,11 +236,11 @@ def test_the_gradient_is_the_same_under_detect_anomaly() -> None:
     walk, gradients = Walk(arc(FRAMES, length=1.0)), []
     images, truth = clip_of(walk)
     for is_detected in (False, True):
-        eyes = BentEyes(walk, bend=0.02)
+        extractor = BentExtractor(walk, bend=0.02)
         camera = walk.camera.with_params(walk.camera.params.clone().requires_grad_())
         with torch.autograd.set_detect_anomaly(is_detected):
-            ate(T_cw=ClipSLAM(eyes, config=CONFIG)(images, camera).T_cw, T_cw_groundtruth=truth).backward()
-        gradients.append((eyes.bend.grad, camera.params.grad))
+            ate(T_cw=ClipSLAM(extractor, config=CONFIG)(images, camera).T_cw, T_cw_groundtruth=truth).backward()
+        gradients.append((extractor.bend.grad, camera.params.grad))
     torch.testing.assert_close(*gradients)
     assert float(gradients[1][0]) != 0
 
@@ -250,8 +250,10 @@ def test_weights_of_keypoints_of_another_shape_are_refused() -> None:
     """As a network with one output gives them: (T, N, 1)."""
     walk = Walk(arc(FRAMES, length=1.0))
     for change in (lambda x: x[..., None], lambda x: x[0], lambda x: x.long()):
-        eyes = BentEyes(walk, bend=0.02)
-        clip_slam = ClipSLAM(eyes, lambda features, change=change: change(features.scores), config=CONFIG)
+        extractor = BentExtractor(walk, bend=0.02)
+        clip_slam = ClipSLAM(
+            extractor, lambda features, change=change: change(features.scores), config=CONFIG
+        )
         with pytest.raises(ValueError, match=r"keypoint_weight must give floats \(T, N\) = \(10, 300\), not"):
             clip_slam(clip_of(walk)[0], walk.camera)
 
@@ -260,7 +262,7 @@ def test_weights_of_keypoints_of_another_shape_are_refused() -> None:
 def test_images_that_are_not_gray_are_refused() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentEyes(walk, bend=0.02))
+    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.02))
     with pytest.raises(FrameError, match=r"images of a clip must be in \[0, 1\], these are from .* to 255"):
         clip_slam(torch.full_like(images, 255.0), walk.camera)
     with pytest.raises(ValueError, match=r"images must be \(T, 1, H, W\)"):

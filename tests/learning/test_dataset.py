@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
-from tests.learning.test_clip_slam import FRAMES, BentEyes
+from tests.learning.test_clip_slam import FRAMES, BentExtractor
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still, turn
 from torchslam import ORB, Camera, ClipSLAM, Features, open_sequence
@@ -215,14 +215,14 @@ def test_clips_work_with_a_data_loader(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_clip_graphs_are_computed_once() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
-    eyes = BentEyes(walk, bend=0.01)
-    clip_slam = ClipSLAM(eyes)
+    extractor = BentExtractor(walk, bend=0.01)
+    clip_slam = ClipSLAM(extractor)
     looking = GraphCache(clip_slam)
     with torch.no_grad():
-        eyes.bend.fill_(0.02)
+        extractor.bend.fill_(0.02)
     batch = collate([Clip.of(walk, 0, FRAMES, 1, number) for number in (3, 5)])
     graphs = looking(batch)
-    before = ClipSLAM(BentEyes(walk, bend=0.01)).build_graph(batch.images[0], walk.camera)
+    before = ClipSLAM(BentExtractor(walk, bend=0.01)).build_graph(batch.images[0], walk.camera)
     for run in graphs.runs:
         assert run is not None
         assert before.runs[0] is not None

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.autograd import gradcheck
 
-from tests.learning.test_clip_slam import FRAMES, BentEyes, clip_of, derivative
+from tests.learning.test_clip_slam import FRAMES, BentExtractor, clip_of, derivative
 from tests.walks import Walk, arc, still
 from torchslam import Camera, ClipSLAM, clip_loss
 from torchslam.errors import ClipError
@@ -306,18 +306,18 @@ def test_a_batch_equals_its_elements() -> None:
 def test_the_loss_of_a_clip_can_use_its_own_observations() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     images, _ = clip_of(walk)
-    eyes = BentEyes(walk, bend=0.02, noise_px=0.1)
-    clip_slam = ClipSLAM(eyes)
+    extractor = BentExtractor(walk, bend=0.02, noise_px=0.1)
+    clip_slam = ClipSLAM(extractor)
     graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(bend: float) -> Tensor:
         with torch.no_grad():
-            eyes.bend.fill_(bend)
+            extractor.bend.fill_(bend)
         return clip_reprojection(clip_slam.pose(graph, clip_slam.extract(images)))
 
     loss(0.02).backward()
-    assert eyes.bend.grad is not None
-    assert float(eyes.bend.grad) == pytest.approx(derivative(loss, 0.02, 1e-5), rel=1e-2)
+    assert extractor.bend.grad is not None
+    assert float(extractor.bend.grad) == pytest.approx(derivative(loss, 0.02, 1e-5), rel=1e-2)
     values = [float(loss(bend).detach()) for bend in (0.05, 0.02, 0.0)]
     assert values == sorted(values, reverse=True)
     # Two coordinates of 0.1 px each, less what points and poses take up of it.
@@ -326,7 +326,7 @@ def test_the_loss_of_a_clip_can_use_its_own_observations() -> None:
 
 def test_failed_frames_and_unconverged_points_are_excluded_from_the_loss() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
-    poses = ClipSLAM(BentEyes(walk, bend=0.02))(clip_of(walk)[0], walk.camera)
+    poses = ClipSLAM(BentExtractor(walk, bend=0.02))(clip_of(walk)[0], walk.camera)
     (graph,), (solution,) = poses.graphs, poses.solutions
     assert graph is not None
     assert solution is not None
@@ -348,7 +348,7 @@ def test_failed_frames_and_unconverged_points_are_excluded_from_the_loss() -> No
 
 def test_clips_have_separate_losses_and_failures_a_penalty() -> None:
     walk, standing = Walk(arc(FRAMES, length=1.0)), Walk(still(FRAMES))
-    seen, unseen = (ClipSLAM(BentEyes(each, bend=0.02)) for each in (walk, standing))
+    seen, unseen = (ClipSLAM(BentExtractor(each, bend=0.02)) for each in (walk, standing))
     good = seen(clip_of(walk)[0][None], walk.camera)
     assert clip_reprojection(good).shape == (1,)
     poses = unseen(clip_of(standing)[0][None], standing.camera)

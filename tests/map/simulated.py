@@ -56,7 +56,7 @@ def estimate_at(
     return PoseEstimate(T_cw, point_ids, keypoints, count, **(certain | values))  # type: ignore[arg-type]
 
 
-def spreads(count: int, size: int, generator: torch.Generator) -> Tensor:
+def random_covariances(count: int, size: int, generator: torch.Generator) -> Tensor:
     """(count, size, size) covariances."""
     root = torch.randn(count, size, size, generator=generator, dtype=torch.float64)
     return 1e-4 * (root @ root.mT + torch.eye(size, dtype=torch.float64))
@@ -80,7 +80,7 @@ def simulated_submap(
             keyframe = slam_map.add_keyframe(view, T_cw[index])
             new = seen[ids[seen] < 0]
             ids[new] = slam_map.add_points(
-                cloud_w[new], view.descriptors[new], keyframe, spreads(len(new), 3, generator)
+                cloud_w[new], view.descriptors[new], keyframe, random_covariances(len(new), 3, generator)
             )
             slam_map.add_observations(keyframe, seen, ids[seen])
         seen = seen[ids[seen] >= 0]
@@ -88,7 +88,7 @@ def simulated_submap(
         submap.posed_frames.add(view, estimate_at(T_cw[index], ids[seen], seen), T_cr, keyframe)
     everyone = torch.arange(slam_map.num_keyframes)
     slam_map.update_appearance(everyone)
-    slam_map.keyframes["covariances"][:] = spreads(len(everyone), 6, generator)
+    slam_map.keyframes["covariances"][:] = random_covariances(len(everyone), 6, generator)
     last = int(everyone[-1])
     submap.tracking = TrackingState(
         T_cr=T_cw[-1] @ se3_inverse(slam_map.T_cw[last]),

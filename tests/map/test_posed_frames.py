@@ -18,7 +18,7 @@ from torchslam.optim.run_graph import solve_graph
 SCENE = Scene.of(150)
 
 
-def walked(noise: float = 0.0) -> Submap:
+def submap_with_frames(noise: float = 0.0) -> Submap:
     """Two keyframes, and three frames that refer to the second."""
     submap = submap_of_scene(SCENE, sideways(2, step=0.5), noise=noise)
     for index, T_cw in enumerate(sideways(3, start=0.6), start=10):
@@ -32,7 +32,7 @@ def walked(noise: float = 0.0) -> Submap:
 
 
 def test_frames_follow_their_keyframe() -> None:
-    submap = walked()
+    submap = submap_with_frames()
     before = submap.posed_frames.T_cw(submap.map).clone()
     torch.testing.assert_close(before[2:], sideways(3, start=0.6))
     moved = pose(0, 0.3, 0, 0.1) @ submap.map.T_cw[1]
@@ -44,7 +44,7 @@ def test_frames_follow_their_keyframe() -> None:
 
 
 def test_a_trajectory_is_in_order_of_time() -> None:
-    submap = walked()
+    submap = submap_with_frames()
     trajectory = submap.trajectory()
     assert (trajectory.timestamps.diff() > 0).all()
     torch.testing.assert_close(trajectory.T_wc[2:], se3_inverse(sideways(3, start=0.6)))
@@ -54,7 +54,7 @@ def test_a_trajectory_is_in_order_of_time() -> None:
 
 
 def test_the_run_graph_holds_all_observations() -> None:
-    submap = walked()
+    submap = submap_with_frames()
     graph = submap.posed_frames.graph(submap.map, CAMERA)
     assert graph.frame_ids.tolist() == [0, 1, 10, 11, 12]
     assert graph.is_keyframe.tolist() == [True, True, False, False, False]
@@ -74,7 +74,7 @@ def test_the_run_graph_holds_all_observations() -> None:
 
 
 def test_map_and_frames_apply_the_solution_of_their_graph() -> None:
-    submap = walked(noise=0.5)
+    submap = submap_with_frames(noise=0.5)
     graph = submap.posed_frames.graph(submap.map, CAMERA)
     solution = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached"))
     submap.posed_frames.apply_solution(solution, graph, submap.map)
@@ -89,7 +89,7 @@ def test_map_and_frames_apply_the_solution_of_their_graph() -> None:
 
 
 def test_frames_apply_a_solution_in_any_order() -> None:
-    submap = walked(noise=0.5)
+    submap = submap_with_frames(noise=0.5)
     order = torch.tensor([3, 0, 4, 1, 2])
     shuffled = copy.deepcopy(submap)
     shuffled.posed_frames.frames.keep(order)
@@ -126,7 +126,7 @@ def test_another_reference_moves_no_frame() -> None:
 
 
 def test_a_scale_change_applies_around_each_keyframe() -> None:
-    submap = walked()
+    submap = submap_with_frames()
     before = submap.posed_frames.frames["T_cr"].clone()
     submap.posed_frames.rescale(torch.tensor([1.0, 3.0]).double())
     after = submap.posed_frames.frames["T_cr"]
@@ -148,7 +148,7 @@ def of_frames(submap: Submap) -> list[int]:
 
 
 def test_outliers_of_frames_are_removed() -> None:
-    submap = walked()
+    submap = submap_with_frames()
     before, ids = of_frames(submap), submap.posed_frames.observations["point_ids"].clone()
     at = torch.nonzero(submap.posed_frames.observations["frame_row"] == 3)[:, 0]
     stray(submap, 3, 5)
@@ -161,7 +161,7 @@ def test_outliers_of_frames_are_removed() -> None:
 @pytest.mark.parametrize(("off", "forgotten"), [(4.85, 0), (4.95, 5)])
 def test_the_outlier_threshold_is_twice_the_inlier_threshold(off: float, forgotten: int) -> None:
     """sqrt(4 x 5.991) = 4.895"""
-    submap = walked()
+    submap = submap_with_frames()
     count = len(submap.posed_frames.observations)
     stray(submap, 3, 5, off)
     submap.posed_frames.remove_outliers(submap.map, CAMERA)
@@ -169,7 +169,7 @@ def test_the_outlier_threshold_is_twice_the_inlier_threshold(off: float, forgott
 
 
 def test_a_frame_with_few_inliers_keeps_all_observations() -> None:
-    submap = walked()
+    submap = submap_with_frames()
     before = of_frames(submap)
     stray(submap, 3, before[3] // 4 + 1)
     submap.posed_frames.remove_outliers(submap.map, CAMERA)
@@ -177,7 +177,7 @@ def test_a_frame_with_few_inliers_keeps_all_observations() -> None:
 
 
 def test_an_outlier_does_not_move_its_frame() -> None:
-    submap = walked()
+    submap = submap_with_frames()
     truth = submap.posed_frames.T_cw(submap.map)[3].clone()
     stray(submap, 3, 3)
 

@@ -71,14 +71,14 @@ def test_coarser_observations_do_not_replace_finer_ones() -> None:
     assert which(world_of(standing(5), [1.44, 1.0, 1.44, 1.44, 1.44]), 1) == []
 
 
-def forget(slam_map: Map, keyframe: int, count: int) -> None:
+def remove_observations_of(slam_map: Map, keyframe: int, count: int) -> None:
     slam_map.remove_observations(torch.full((count,), keyframe), torch.arange(count))
 
 
 @pytest.mark.parametrize(("missing", "covered"), [(2, True), (3, False)])
 def test_nine_of_ten_redundant_points_are_enough(missing: int, covered: bool) -> None:
     submap = world_of(standing(4))
-    forget(submap.map, 3, missing)
+    remove_observations_of(submap.map, 3, missing)
     assert is_covered(submap.map, 1, torch.zeros(4, dtype=torch.bool)) is covered
 
 

@@ -27,7 +27,7 @@ def row(T: Tensor) -> Map:
     return submap_of_scene(SCENE, T).map
 
 
-def shake(slam_map: Map, keyframes: list[int], size: float = 0.003) -> None:
+def perturb(slam_map: Map, keyframes: list[int], size: float = 0.003) -> None:
     generator = torch.Generator().manual_seed(5)
     for keyframe in keyframes:
         twist = size * torch.randn(6, generator=generator, dtype=torch.float64)
@@ -47,7 +47,7 @@ def bundle(**changes: int) -> BundleAdjustmentConfig:
 def test_a_window_has_free_neighbors_and_fixed_keyframes() -> None:
     slam_map = row(sideways(6))
     truth = slam_map.T_cw.clone()
-    shake(slam_map, [4, 5])
+    perturb(slam_map, [4, 5])
     before = slam_map.T_cw.clone()
     adjust_local(slam_map, 5, CAMERA, bundle(local_window=2, local_iterations=20))
     assert which_moved(slam_map, before) == [4, 5]  # the one that shares most with it
@@ -56,7 +56,7 @@ def test_a_window_has_free_neighbors_and_fixed_keyframes() -> None:
 
 def test_the_first_keyframe_is_always_fixed() -> None:
     slam_map = row(sideways(3))
-    shake(slam_map, [1, 2])
+    perturb(slam_map, [1, 2])
     before = slam_map.T_cw.clone()
     adjust_local(slam_map, 1, CAMERA, bundle(local_window=8))
     assert which_moved(slam_map, before) == [1, 2]
@@ -155,7 +155,7 @@ def test_adjusted_points_are_refreshed_from_their_observations() -> None:
 def test_global_adjustment_fixes_the_first_keyframe() -> None:
     slam_map = row(sideways(5))
     truth = slam_map.T_cw.clone()
-    shake(slam_map, [1, 2, 3, 4])
+    perturb(slam_map, [1, 2, 3, 4])
     adjust_all(slam_map, CAMERA, bundle(global_iterations=30))
     torch.testing.assert_close(slam_map.T_cw[:, :3, :3], truth[:, :3, :3], atol=1e-6, rtol=0)
     scale = float(slam_map.T_cw[4, 0, 3] / truth[4, 0, 3])

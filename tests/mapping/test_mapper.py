@@ -87,7 +87,7 @@ def test_an_initialization_becomes_two_keyframes_with_points(scale: str) -> None
     assert torch.equal(begin.T_cw[:3, 3], 2 * BASE[1, :3, 3])  # the start itself is left alone
 
 
-def half_world(count: int = 2) -> Submap:
+def submap_of_half_the_points(count: int = 2) -> Submap:
     return submap_of_scene(SCENE, sideways(count, step=0.4), seen=torch.arange(300) % 2 == 0)
 
 
@@ -99,7 +99,7 @@ def inserted(by: Mapper, submap: Submap, T_cw: Tensor) -> int:
 
 
 def test_a_keyframe_adds_observations_and_new_points() -> None:
-    submap = half_world()
+    submap = submap_of_half_the_points()
     before = len(submap.map.points)
     keyframe = inserted(mapper("bundle_adjustment.local=false"), submap, sideways(1, start=0.8)[0])
     assert keyframe == 2
@@ -123,7 +123,7 @@ def test_a_keyframe_adds_observations_and_new_points() -> None:
 def test_new_points_come_from_the_configured_neighbors() -> None:
     made = []
     for count in (1, 5):
-        submap = half_world(3)
+        submap = submap_of_half_the_points(3)
         before = len(submap.map.points)
         inserted(
             mapper("bundle_adjustment.local=false", f"mapping.num_partners={count}"),
@@ -132,7 +132,7 @@ def test_new_points_come_from_the_configured_neighbors() -> None:
         )
         made.append(len(submap.map.points) - before)
     assert 0 < made[0] < made[1]
-    last = half_world(3)
+    last = submap_of_half_the_points(3)
     before = len(last.map.points)
     inserted(
         mapper("bundle_adjustment.local=false", "mapping.triangulation_partners=last"),

@@ -22,7 +22,7 @@ SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
 
 
-def half_known(T_cw: Tensor, noise: float = 0.0) -> Map:
+def map_of_half_the_points(T_cw: Tensor, noise: float = 0.0) -> Map:
     """Keyframes at T_cw that know every other point of the scene."""
     return submap_of_scene(SCENE, T_cw, noise=noise, seen=torch.arange(300) % 2 == 0).map
 
@@ -44,7 +44,7 @@ def shown(slam_map: Map, keyframe: int, points: Tensor) -> Tensor:
 
 
 def test_unmatched_keypoints_of_both_keyframes_are_triangulated() -> None:
-    slam_map = half_known(sideways(2, step=0.4))
+    slam_map = map_of_half_the_points(sideways(2, step=0.4))
     new = triangulated(slam_map)
     one, two = shown(slam_map, 1, new), shown(slam_map, 0, new)
     assert torch.equal(one, two)
@@ -61,7 +61,7 @@ def test_unmatched_keypoints_of_both_keyframes_are_triangulated() -> None:
 
 def test_several_neighbors_at_once_equal_one_after_the_other() -> None:
     T_cw = sideways(4, step=0.4)
-    together, apart = half_known(T_cw), half_known(T_cw)
+    together, apart = map_of_half_the_points(T_cw), map_of_half_the_points(T_cw)
     new = triangulated(together, keyframe=3, neighbors=(0, 1, 2))
     for neighbor in (0, 1, 2):
         assert len(triangulated(apart, keyframe=3, neighbors=(neighbor,))) > 0
@@ -72,16 +72,16 @@ def test_several_neighbors_at_once_equal_one_after_the_other() -> None:
 
 
 def test_the_first_of_several_neighbors_is_used() -> None:
-    slam_map = half_known(sideways(3, step=0.4))
+    slam_map = map_of_half_the_points(sideways(3, step=0.4))
     new = triangulated(slam_map, keyframe=2, neighbors=(0, 1))
     table = slam_map.keyframes["point_ids"]
-    alone = triangulated(half_known(sideways(3, step=0.4)), keyframe=2, neighbors=(0,))
+    alone = triangulated(map_of_half_the_points(sideways(3, step=0.4)), keyframe=2, neighbors=(0,))
     assert torch.isin(new, table[0]).sum() == len(alone) < len(new)
     assert not torch.isin(table[0][table[0] >= new[0]], table[1]).any()
 
 
 def test_new_points_have_covariances() -> None:
-    slam_map = half_known(sideways(2, step=0.4))
+    slam_map = map_of_half_the_points(sideways(2, step=0.4))
     new = triangulated(slam_map)
     scales = []
     for keyframe in (1, 0):
@@ -95,9 +95,9 @@ def test_new_points_have_covariances() -> None:
 
 def test_points_with_little_parallax_are_rejected() -> None:
     T_cw = sideways(2, step=0.1)
-    slam_map = half_known(T_cw)
+    slam_map = map_of_half_the_points(T_cw)
     new = triangulated(slam_map, "mapping.min_parallax_deg=1.5", "mapping.min_baseline=0.001")
-    every = half_known(T_cw)
+    every = map_of_half_the_points(T_cw)
     all_of_them = triangulated(every, "mapping.min_parallax_deg=0", "mapping.min_baseline=0.001")
 
     def angles(points_w: Tensor) -> Tensor:
@@ -117,7 +117,7 @@ def spoiled(slam_map: Map, keyframe: int, pixels: float, axis: int) -> None:
 @pytest.mark.parametrize(("offset", "good"), [(4.6, True), (5.2, False)])
 def test_points_must_reproject_onto_their_keypoints(offset: float, good: bool) -> None:
     """Across the epipolar line an error is shared by the two views: each may be off by 2.45 times its scale."""
-    slam_map = half_known(sideways(2, step=0.4))
+    slam_map = map_of_half_the_points(sideways(2, step=0.4))
     spoiled(slam_map, 0, offset, 1)
     new = triangulated(slam_map, "mapping.max_epipolar_px=100")
     assert (len(new) > 40) is good
@@ -125,16 +125,16 @@ def test_points_must_reproject_onto_their_keypoints(offset: float, good: bool) -
 
 
 def test_the_gate_is_the_configured_one() -> None:
-    slam_map = half_known(sideways(2, step=0.4))
+    slam_map = map_of_half_the_points(sideways(2, step=0.4))
     spoiled(slam_map, 0, 5.2, 1)
     assert len(triangulated(slam_map, "mapping.max_epipolar_px=100", "measurement.max_chi_square=9")) > 40
 
 
 def test_points_with_inconsistent_scales_are_rejected() -> None:
-    slam_map = half_known(sideways(2, step=0.4))
+    slam_map = map_of_half_the_points(sideways(2, step=0.4))
     scales, all_of_them = (
         slam_map.keyframes["scales"][1],
-        len(triangulated(half_known(sideways(2, step=0.4)))),
+        len(triangulated(map_of_half_the_points(sideways(2, step=0.4)))),
     )
     fine = scales < 1.3  # twice that is within the scales of the other view
     scales[fine] *= 2
@@ -144,7 +144,7 @@ def test_points_with_inconsistent_scales_are_rejected() -> None:
 
 
 def test_the_baseline_must_be_a_fraction_of_the_depth() -> None:
-    slam_map = half_known(sideways(2, step=0.4))
+    slam_map = map_of_half_the_points(sideways(2, step=0.4))
     seen = slam_map.observed_points(torch.tensor([0]))
     share = 0.4 / float(slam_map.positions_w[seen, 2].median())
     assert has_baseline(slam_map, 1, torch.tensor([0, 1]), 0.99 * share).tolist() == [True, False]
@@ -155,7 +155,7 @@ def test_the_baseline_must_be_a_fraction_of_the_depth() -> None:
 
 def test_the_median_depth_is_that_of_the_neighbor() -> None:
     T_cw = torch.stack([pose(0, 0, 2.0), pose(0.5, 0, 0)])  # the first stands two meters back
-    slam_map = half_known(T_cw)
+    slam_map = map_of_half_the_points(T_cw)
     seen = slam_map.observed_points(torch.tensor([0]))
     share = math.hypot(0.5, 2.0) / float(slam_map.positions_w[seen, 2].median() + 2.0)
     assert has_baseline(slam_map, 1, torch.tensor([0]), 0.99 * share)
@@ -290,7 +290,7 @@ def test_an_angle_window_wraps_around() -> None:
 
 
 def test_keypoints_with_a_point_are_not_matched_again() -> None:
-    slam_map = half_known(sideways(3, step=0.3))
+    slam_map = map_of_half_the_points(sideways(3, step=0.3))
     table = slam_map.keyframes["point_ids"]
     known = torch.nonzero(table[0] >= 0)[:40, 0]
     slam_map.remove_observations(

@@ -45,7 +45,7 @@ def by_matrix(features: Features) -> Tensor:
     return features.scales[..., None, None] ** -2 * torch.eye(2, dtype=torch.float64)
 
 
-def told_by(say: Say) -> Sequence:
+def sequence_with_information(say: Say) -> Sequence:
     """Simulated features that say something of their errors."""
     seen = Simulated(CONFIG, WALK.camera, true_T_cw(WALK))
 
@@ -58,7 +58,7 @@ def told_by(say: Say) -> Sequence:
 
 def run_with(say: Say) -> tuple[SLAM, Run]:
     slam = SLAM(WALK.camera, CONFIG)
-    return slam, slam.run(told_by(say))
+    return slam, slam.run(sequence_with_information(say))
 
 
 @pytest.fixture(scope="module", params=[by_number, by_matrix], ids=["number", "matrix"])
@@ -99,13 +99,13 @@ def test_a_map_stores_the_information(informed: tuple[SLAM, Run, Say], tmp_path:
     loaded = SLAM.load(tmp_path / "map", CONFIG, mapping=False)
     loaded.save(tmp_path / "again")
     assert (tmp_path / "again").read_bytes() == (tmp_path / "map").read_bytes()
-    assert len(loaded.run(told_by(say)).trajectory) > 10
+    assert len(loaded.run(sequence_with_information(say)).trajectory) > 10
     mute = SLAM.load(tmp_path / "map", CONFIG)
     with pytest.raises(ConfigError, match=r"its keypoints have .* as information, the frame's none"):
-        mute.step(told_by(lambda features: None)[0])
+        mute.step(sequence_with_information(lambda features: None)[0])
 
 
-SAID = told_by(by_matrix)
+SAID = sequence_with_information(by_matrix)
 
 
 def test_a_resumed_run_with_information_ends_with_the_same_bytes(tmp_path: Path) -> None:
@@ -174,18 +174,18 @@ class Doubtful(nn.Module):
 def test_gradients_reach_the_information(kind: str) -> None:
     walk = Walk(arc(6, length=1.0))
     images, truth = torch.cat([walk.image(index) for index in range(6)]), true_T_cw(walk)
-    eyes = Doubtful(walk, kind)
-    clip_slam = ClipSLAM(eyes, config=load_config(None, ["bundle_adjustment.global_iterations=30"]))
+    extractor = Doubtful(walk, kind)
+    clip_slam = ClipSLAM(extractor, config=load_config(None, ["bundle_adjustment.global_iterations=30"]))
     graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(falloff: float) -> Tensor:
         with torch.no_grad():
-            eyes.falloff.fill_(falloff)
+            extractor.falloff.fill_(falloff)
         poses = clip_slam(images, walk.camera, graph)
         return ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
 
     loss(1.0).backward()
-    assert eyes.falloff.grad is not None
+    assert extractor.falloff.grad is not None
     with torch.no_grad():
         wanted = float(loss(1.02) - loss(0.98)) / 0.04
-    assert float(eyes.falloff.grad) == pytest.approx(wanted, rel=0.01)
+    assert float(extractor.falloff.grad) == pytest.approx(wanted, rel=0.01)

@@ -27,12 +27,12 @@ def config_of(*overrides: str) -> Config:
     return load_config(None, [*SIMULATED, *overrides])
 
 
-def eyes(seed: int = 0) -> Simulated:
+def simulated_features(seed: int = 0) -> Simulated:
     """Features of the scene of the whole walk; frames of a part of it are known by their true poses."""
     return Simulated(config_of(f"seed={seed}"), WALK.camera, true_T_cw(WALK))
 
 
-SEEN = eyes().of(WALK)
+SEEN = simulated_features().of(WALK)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,7 @@ def test_localization_does_not_change_the_map(first: tuple[SLAM, Run, Path], tmp
 
 def test_localization_elsewhere_finds_no_pose_and_starts_no_map(first: tuple[SLAM, Run, Path]) -> None:
     slam = SLAM.load(first[2], config_of("relocalization.frames_before_new_submap=2"), mapping=False)
-    run = slam.run(eyes(seed=1).of(WALK).part(0, 10))  # another scene: a map of it could begin
+    run = slam.run(simulated_features(seed=1).of(WALK).part(0, 10))  # another scene: a map of it could begin
     assert {result.state for result in run.results} == {State.LOST}
     assert len(run.submaps) == 1
     assert len(run.trajectory) == 0
@@ -125,11 +125,11 @@ def test_localization_needs_a_map(tmp_path: Path) -> None:
 
 def test_another_feature_extractor_is_refused(first: tuple[SLAM, Run, Path]) -> None:
     def with_floats(frame: Frame) -> Features:
-        seen = eyes()(frame)
+        seen = simulated_features()(frame)
         return replace(seen, descriptors=seen.descriptors.float())
 
     def with_fewer(frame: Frame) -> Features:
-        seen = eyes()(frame)
+        seen = simulated_features()(frame)
         return seen.rows(slice(200))
 
     for other in (with_floats, with_fewer):
@@ -189,7 +189,7 @@ def test_a_run_skips_invalid_frames() -> None:
     slam = SLAM(WALK.camera, config_of("bundle_adjustment.global_at_end=false"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        run = slam.run(eyes().of(Stumbling()))
+        run = slam.run(simulated_features().of(Stumbling()))
     assert len(run.skipped) == len(caught) == 2
     assert "image 7 has 10 x 10 pixels" in run.skipped[0]
     assert "image 12" in run.skipped[1]

@@ -27,6 +27,7 @@ from torchslam.geometry.projections import (
     squared_projections,
 )
 from torchslam.geometry.ransac import (
+    CONFIDENCE,
     SUPPORT_WIDTH,
     ModelState,
     best_models,
@@ -80,7 +81,7 @@ def estimate_absolute_pose(
     threshold: float = 2.0,
     mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
-    confidence: float = 0.9999,
+    confidence: float = CONFIDENCE,
     max_samples: int = 3000,
 ) -> AbsolutePose:
     """Estimate poses of B cameras by RANSAC over P3P, with local optimization and a least-squares refinement.
@@ -144,7 +145,7 @@ def start_pose(
     size: tuple[int, int],
     threshold: float,
     seed: int = 0,
-    confidence: float = 0.9999,
+    confidence: float = CONFIDENCE,
     max_samples: int = 3000,
 ) -> Float[Tensor, "4 4"] | None:
     """Estimate the pose of one camera by RANSAC over P3P, as a start for a refinement.

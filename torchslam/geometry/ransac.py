@@ -18,6 +18,8 @@ from torchslam.geometry.precision import check_positive
 
 ModelState = tuple[Tensor, ...]
 
+CONFIDENCE = 0.9999
+"""Default of searches: probability that some sample has no outlier. Tried at this value only."""
 _MAX_VALUES_AT_ONCE = 300_000
 """Residuals that are in memory at once, which bounds it. Tried at this value only."""
 _MIN_ITERATIONS = 2  # before it may stop

@@ -22,7 +22,7 @@ from torchslam.geometry.homography import transfer_errors
 from torchslam.geometry.lie import rigid, so3_exp
 from torchslam.geometry.motion_models import ESSENTIAL, HOMOGRAPHY, MODELS, ROTATION
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.ransac import check_search
+from torchslam.geometry.ransac import CONFIDENCE, check_search
 from torchslam.geometry.relative_pose_search import (
     KERNEL_WIDTH,
     FoundPose,
@@ -86,7 +86,7 @@ def estimate_relative_pose(
     threshold: float = 1.0,
     mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
-    confidence: float = 0.9999,
+    confidence: float = CONFIDENCE,
     max_samples: int = 4000,
     model: Model = "auto",
     kernel: Kernel = "cauchy",

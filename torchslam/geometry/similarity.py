@@ -16,6 +16,7 @@ from torchslam.geometry.lie import cayley_rotation, rigid, so3_exp, transform, v
 from torchslam.geometry.precision import check_positive, full_precision
 from torchslam.geometry.projections import squared_projections
 from torchslam.geometry.ransac import (
+    CONFIDENCE,
     SUPPORT_WIDTH,
     ModelState,
     best_models,
@@ -156,7 +157,7 @@ def estimate_similarity(
     mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
     with_scale: bool = True,
-    confidence: float = 0.9999,
+    confidence: float = CONFIDENCE,
     max_samples: int = 3000,
 ) -> Similarity:
     """Estimate similarities of B pairs of cameras by RANSAC over three pairs of points, with a refinement in pixels.

@@ -34,7 +34,7 @@ WIDTHS = 20.0, 6.0, 3.0
 """Scales of the Cauchy kernel, in standard deviations, each for `STEPS` steps from the last."""
 STEPS = 10
 """Steps of reweighting with each width. Tried at this value only."""
-FEEBLE = 1e-6
+ZERO_PRIOR_WEIGHT = 1e-6
 """Relative weight that ties every node to zero: parts that nothing connects stay solvable."""
 
 
@@ -113,7 +113,7 @@ def solve_differences(
             squared = information * residuals.square().sum(-1)
             weights = information * robustify(squared, "cauchy", squared.new_tensor(width)).weight
         diagonal = by_node.sum(weights.repeat(2)[None])[0]
-        diagonal = diagonal + FEEBLE * diagonal.max()
+        diagonal = diagonal + ZERO_PRIOR_WEIGHT * diagonal.max()
         across = -by_pair.sum(weights[None])[..., None, None]
         factor = factorize_sparse(structure, diagonal[None, :, None, None], across)
         pull = weights[:, None] * residuals
