@@ -107,7 +107,7 @@ def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
     points_w, pixels = (torch.cat([problem[i] for problem in problems]) for i in (0, 1))
     batch, again = (estimate_absolute_pose(points_w, pixels, camera=CAMERA, seed=7) for _ in range(2))
     assert torch.equal(batch.T_cw, again.T_cw)
-    single = torch.cat([estimate_absolute_pose(*problem[:2], CAMERA).T_cw for problem in problems])
+    single = torch.cat([estimate_absolute_pose(*problem[:2], camera=CAMERA).T_cw for problem in problems])
     torch.testing.assert_close(
         batch.T_cw, single, atol=5e-3, rtol=0
     )  # other samples, nearly the same inliers

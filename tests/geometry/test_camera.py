@@ -15,8 +15,9 @@ from torch.func import grad, jacrev, vmap
 from torch.utils._pytree import tree_flatten_with_path, tree_map
 from torch.utils.data import DataLoader, default_collate
 
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, estimate_absolute_pose, rigid, transform
 from torchslam.geometry.distortion import first_positive_root
+from torchslam.optim import BundleProblem, solve_bundle, solve_pose
 
 SIZE = (640, 480)
 CAMERAS = {
@@ -447,3 +448,61 @@ def test_a_rational_model_ends_where_it_turns_and_where_its_denominator_vanishes
     assert limit(-0.2, 0.0, 0.0, 0.1, 0.05, 0.0) == pytest.approx(turning(-0.2, 0.1, 0.05), abs=1e-3)
     assert limit(0.0, 0.0, 0.0, -0.25, 0.0, 0.0) == pytest.approx(2.0)  # grows to infinity there
     assert math.isinf(limit(0.1, 0.0, 0.0, 0.05, 0.0, 0.0))
+
+
+def test_a_camera_of_numbers_goes_with_data_of_either_precision(camera: Camera, dtype: torch.dtype) -> None:
+    """Its methods and whoever takes it compute in the dtype of the data."""
+    params = camera.params.clone().requires_grad_()
+    given, exact = camera.with_params(params), camera.to(dtype)
+    cloud = points().to(dtype)
+    for method in ("project", "project_with_jacobians", "project_with_point_jacobians"):
+        for found, expected in zip(getattr(given, method)(cloud), getattr(exact, method)(cloud), strict=True):
+            assert torch.equal(found, expected)
+    pixels = given.project(points_c=cloud)[0]
+    assert pixels.dtype == dtype
+    for found, expected in (
+        (given.normalize(pixels), exact.normalize(pixels)),
+        (given.unproject(pixels), exact.unproject(pixels)),
+    ):
+        assert torch.equal(found, expected)
+    pixels.sum().backward()
+    assert params.grad.dtype == torch.float64
+    assert bool(params.grad.any())
+    pose = solve_pose(
+        cloud, pixels.detach(), T_cw=torch.eye(4, dtype=dtype).expand(2, 4, 4), camera=given
+    ).T_cw
+    assert pose.dtype == dtype
+    torch.testing.assert_close(pose, torch.eye(4, dtype=dtype).expand(2, 4, 4), atol=1e-4, rtol=0)
+
+
+def test_a_camera_within_a_problem_follows_its_data(dtype: torch.dtype) -> None:
+    cloud = points()[0].to(dtype)
+    rows = torch.arange(len(cloud))
+    frames, seen = torch.cat((0 * rows, 0 * rows + 1)), torch.cat((rows, rows))
+    T_cw = rigid(torch.eye(3).expand(2, 3, 3), torch.tensor([[0.0, 0, 0], [0.3, 0, 0]])).to(dtype)
+    camera = CAMERAS["pinhole"]
+    pixels = camera.project(transform(T_cw, cloud))[0].flatten(0, 1)
+    found = solve_bundle(BundleProblem(T_cw, cloud, frames, seen, pixels, camera))
+    assert (found.T_cw.dtype, found.camera.params.dtype) == (dtype, dtype)
+    assert camera.params.dtype == torch.float64
+
+
+def test_data_of_two_precisions_are_refused_by_name() -> None:
+    cloud, camera = points(), CAMERAS["pinhole"]
+    pixels = camera.project(cloud)[0].float()
+    with pytest.raises(
+        ValueError, match=r"pixels is torch.float32, but points_w is torch.float64: all must be"
+    ):
+        estimate_absolute_pose(cloud, pixels, camera=camera)
+    with pytest.raises(ValueError, match=r"float32 or float64, not torch\.float16"):
+        camera.project(cloud.half())
+
+
+def test_parameters_of_numbers_and_tensors() -> None:
+    one, two = torch.tensor(500.0), torch.tensor(500.0, dtype=torch.float64)
+    for fx, fy, dtype in (
+        (500.0, 500.0, torch.float64),
+        (one, 500.0, torch.float32),
+        (one, two, torch.float64),
+    ):
+        assert Camera.pinhole(fx, fy, 320.0, 240.0, SIZE).params.dtype == dtype

@@ -175,7 +175,7 @@ def test_false_alarms_bound_the_binomial_tail() -> None:
 def test_torch_func_is_refused_in_words(transform_of: Callable[..., Any]) -> None:
     points_w, pixels, _ = points_and_pixels(0, count=30)
     scene = two_views(0, count=30)
-    others = scene.points_1, scene.pixels_1, scene.pixels_2, CAMERA, CAMERA
+    others = scene.points_1, scene.pixels_1, scene.pixels_2
     for name, estimate, given in (
         ("absolute_pose", lambda x: estimate_absolute_pose(points_w, x, camera=CAMERA).T_cw, pixels),
         (
@@ -183,7 +183,11 @@ def test_torch_func_is_refused_in_words(transform_of: Callable[..., Any]) -> Non
             lambda x: estimate_relative_pose(x, scene.pixels_2, camera_1=CAMERA, camera_2=CAMERA).T_21,
             pixels,
         ),
-        ("similarity", lambda x: estimate_similarity(x, *others).S_21, scene.points_1),
+        (
+            "similarity",
+            lambda x: estimate_similarity(x, *others, camera_1=CAMERA, camera_2=CAMERA).S_21,
+            scene.points_1,
+        ),
     ):
         given = given[None] if transform_of is torch.func.vmap else given
         with pytest.raises(RuntimeError, match=f"estimate_{name} chooses among random samples"):

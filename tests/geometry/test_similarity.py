@@ -167,7 +167,7 @@ def check(S_21: Tensor, truth: Tensor, degrees: float = 0.3, length: float = 0.0
 def test_finds_the_similarity_among_wrong_pairs(camera: Camera, outliers: float) -> None:
     for seed in range(4):
         pairs = make_pairs(seed, outliers=outliers, camera_1=camera)
-        result = estimate_similarity(*pairs.inputs(), camera, CAMERA)
+        result = estimate_similarity(*pairs.inputs(), camera_1=camera, camera_2=CAMERA)
         assert result.success.all()
         check(result.S_21, pairs.S_21)
         assert float((result.inliers == pairs.right).double().mean()) > 0.95
@@ -176,7 +176,7 @@ def test_finds_the_similarity_among_wrong_pairs(camera: Camera, outliers: float)
 @pytest.mark.parametrize("log_scale", [-2.0, 0.0, 2.0])
 def test_exact_data_give_the_exact_similarity(log_scale: float) -> None:
     pairs = make_pairs(0, outliers=0.2, noise=0.0, log_scale=log_scale, camera_2=RADIAL)
-    result = estimate_similarity(*pairs.inputs(), CAMERA, RADIAL)
+    result = estimate_similarity(*pairs.inputs(), camera_1=CAMERA, camera_2=RADIAL)
     torch.testing.assert_close(result.S_21, pairs.S_21, atol=1e-8, rtol=0)
     assert torch.equal(result.inliers, pairs.right)
     assert float(result.score) == pytest.approx(int(pairs.right.sum()))
@@ -184,13 +184,13 @@ def test_exact_data_give_the_exact_similarity(log_scale: float) -> None:
 
 def test_without_scale() -> None:
     pairs = make_pairs(1, log_scale=0.0)
-    result = estimate_similarity(*pairs.inputs(), CAMERA, CAMERA, with_scale=False)
+    result = estimate_similarity(*pairs.inputs(), camera_1=CAMERA, camera_2=CAMERA, with_scale=False)
     assert result.success.all()
     torch.testing.assert_close(sim3_scale(result.S_21), torch.ones(1).double(), atol=1e-12, rtol=0)
     check(result.S_21, pairs.S_21)
     wrong_scale = make_pairs(1, log_scale=0.6)
-    free = estimate_similarity(*wrong_scale.inputs(), CAMERA, CAMERA)
-    fixed = estimate_similarity(*wrong_scale.inputs(), CAMERA, CAMERA, with_scale=False)
+    free = estimate_similarity(*wrong_scale.inputs(), camera_1=CAMERA, camera_2=CAMERA)
+    fixed = estimate_similarity(*wrong_scale.inputs(), camera_1=CAMERA, camera_2=CAMERA, with_scale=False)
     assert fixed.score < 0.5 * free.score
 
 
@@ -201,7 +201,7 @@ def test_an_inlier_agrees_in_both_images() -> None:
         inputs = list(pairs.inputs())
         inputs[side] = inputs[side].clone()
         inputs[side][:, :20] *= 0.5
-        result = estimate_similarity(*inputs, CAMERA, CAMERA)
+        result = estimate_similarity(*inputs, camera_1=CAMERA, camera_2=CAMERA)
         assert result.success.all()
         assert not result.inliers[:, :20].any()
         assert result.inliers[:, 20:].all()
@@ -213,7 +213,7 @@ def test_scale_where_both_cameras_are_at_one_place(log_scale: float) -> None:
     """Where no pixel depends on it."""
     for seed in range(4):
         pairs = make_pairs(seed, log_scale=log_scale, baseline=0.0)
-        result = estimate_similarity(*pairs.inputs(), CAMERA, CAMERA)
+        result = estimate_similarity(*pairs.inputs(), camera_1=CAMERA, camera_2=CAMERA)
         assert result.success.all()
         check(result.S_21, pairs.S_21)
 
@@ -228,10 +228,10 @@ def test_errors_are_whitened_by_their_standard_deviations() -> None:
         inputs[side][:, :10, 0] += 4.0
         sigmas = ones.clone()
         sigmas[:, :5] = 2.0  # of these 4 pixels are two, of the next five rows four
-        result = estimate_similarity(*inputs, CAMERA, CAMERA, **{name: sigmas})
+        result = estimate_similarity(*inputs, camera_1=CAMERA, camera_2=CAMERA, **{name: sigmas})
         assert result.inliers[0, :10].tolist() == [True] * 5 + [False] * 5
         assert result.inliers[:, 10:].all()
-        wide = estimate_similarity(*inputs, CAMERA, CAMERA, threshold=5.0, **{name: sigmas})
+        wide = estimate_similarity(*inputs, camera_1=CAMERA, camera_2=CAMERA, threshold=5.0, **{name: sigmas})
         assert wide.inliers.all()
 
 
@@ -240,7 +240,7 @@ def test_the_refinement_beats_the_alignment_of_points() -> None:
     ours, theirs = [], []
     for seed in range(10):
         pairs = make_pairs(seed, outliers=0.0, noise=1.0)
-        result = estimate_similarity(*pairs.inputs(), CAMERA, CAMERA)
+        result = estimate_similarity(*pairs.inputs(), camera_1=CAMERA, camera_2=CAMERA)
         _, R, _ = umeyama(pairs.points_1, pairs.points_2)
         R_true = pairs.S_21[:, :3, :3] / sim3_scale(pairs.S_21)[:, None, None]
         found = result.S_21[:, :3, :3] / sim3_scale(result.S_21)[:, None, None]
@@ -316,16 +316,21 @@ def test_pure_noise_is_never_a_success() -> None:
     pixels = torch.rand(2, 20, 60, 2, generator=generator, dtype=torch.float64) * count
     rays = CAMERA.unproject(pixels)
     points = rays * (2 + 4 * torch.rand(2, 20, 60, 1, generator=generator, dtype=torch.float64))
-    result = estimate_similarity(*points, *pixels, CAMERA, CAMERA, max_samples=500)
+    result = estimate_similarity(*points, *pixels, camera_1=CAMERA, camera_2=CAMERA, max_samples=500)
     assert not result.success.any()
 
 
 def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
     problems = [make_pairs(seed) for seed in range(4)]
     inputs = [torch.cat(part) for part in zip(*(problem.inputs() for problem in problems), strict=True)]
-    batch, again = (estimate_similarity(*inputs, CAMERA, CAMERA, seed=7) for _ in range(2))
+    batch, again = (estimate_similarity(*inputs, camera_1=CAMERA, camera_2=CAMERA, seed=7) for _ in range(2))
     assert torch.equal(batch.S_21, again.S_21)
-    single = torch.cat([estimate_similarity(*problem.inputs(), CAMERA, CAMERA).S_21 for problem in problems])
+    single = torch.cat(
+        [
+            estimate_similarity(*problem.inputs(), camera_1=CAMERA, camera_2=CAMERA).S_21
+            for problem in problems
+        ]
+    )
     torch.testing.assert_close(
         batch.S_21, single, atol=5e-3, rtol=0
     )  # other samples, nearly the same inliers
@@ -335,19 +340,23 @@ def test_a_camera_for_each_problem() -> None:
     problems = [make_pairs(seed) for seed in range(2)]
     inputs = [torch.cat(part) for part in zip(*(problem.inputs() for problem in problems), strict=True)]
     cameras = CAMERA.with_params(CAMERA.params.expand(2, -1))
-    together = estimate_similarity(*inputs, cameras, cameras)
-    torch.testing.assert_close(together.S_21, estimate_similarity(*inputs, CAMERA, CAMERA).S_21)
+    together = estimate_similarity(*inputs, camera_1=cameras, camera_2=cameras)
+    torch.testing.assert_close(
+        together.S_21, estimate_similarity(*inputs, camera_1=CAMERA, camera_2=CAMERA).S_21
+    )
 
 
 def test_result_is_detached() -> None:
     inputs = [x.requires_grad_() for x in make_pairs(0).inputs()]
-    assert not estimate_similarity(*inputs, CAMERA, CAMERA).S_21.requires_grad
+    assert not estimate_similarity(*inputs, camera_1=CAMERA, camera_2=CAMERA).S_21.requires_grad
 
 
 def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
     pairs = make_pairs(6)
     camera = CAMERA.to(device).to(dtype)
-    result = estimate_similarity(*(x.to(device, dtype) for x in pairs.inputs()), camera, camera)
+    result = estimate_similarity(
+        *(x.to(device, dtype) for x in pairs.inputs()), camera_1=camera, camera_2=camera
+    )
     assert (result.S_21.dtype, result.S_21.device.type) == (dtype, device.type)
     assert result.success.all()
     check(result.S_21.cpu().double(), pairs.S_21)

@@ -44,7 +44,7 @@ def test_a_fitted_line_solves_the_normal_equations():
 
 
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure"])
-def test_a_pose_equals_that_of_refine_pose(pose_scene, kernel, model):
+def test_a_pose_equals_that_of_solve_pose(pose_scene, kernel, model):
     """And so are its gradients, whatever the kernel."""
     scene = pose_scene(batch=3, count=12, noise=1.0, model=model)
     found = []

@@ -94,7 +94,7 @@ def test_strict_names_the_elements(pose_scene):
 
 
 @pytest.mark.parametrize("perturbation", [0.01, 0.04])
-def test_bundle_adjust_converges_at_its_defaults_with_a_fifth_of_outliers(bundle_scene, perturbation):
+def test_solve_bundle_converges_at_its_defaults_with_a_fifth_of_outliers(bundle_scene, perturbation):
     def distances(problem, **options):
         solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(**options))
         centers = se3_inverse(solution.T_cw)[:, :3, 3]

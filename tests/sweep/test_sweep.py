@@ -156,7 +156,9 @@ def test_a_mixture_of_precisions_is_refused_or_right(call: Call) -> None:
         if tensor.is_floating_point() and path != ("images",):
             other = torch.float32 if tensor.dtype == torch.float64 else torch.float64
             found = refused(call, path, tensor.to(other), "")
-            if found is not None:
+            if (
+                found is not None and call is not CALLS["SimulatedFeatures"]
+            ):  # which draws in the dtype of its poses
                 assert_same(found, expected, exact=False)
 
 

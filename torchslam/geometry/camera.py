@@ -5,9 +5,10 @@ Camera frame: x right, y down, z forward. Pixel (0, 0) is the center of the top 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from functools import reduce, wraps
+from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 
 import numpy as np
 import torch
@@ -22,9 +23,27 @@ Scalar = float | Tensor
 Numbers = Tensor | np.ndarray | Sequence[Any]
 
 
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+def _in_dtype_of_data(method: Callable[Concatenate[Camera, P], R]) -> Callable[Concatenate[Camera, P], R]:
+    """The method of the camera with parameters in the dtype of its argument."""
+
+    @wraps(method)
+    def following(self: Camera, *args: P.args, **kwargs: P.kwargs) -> R:
+        data: Any = args[0] if args else next(iter(kwargs.values()))
+        return method(self if data.dtype == self.params.dtype else self.to(data.dtype), *args, **kwargs)
+
+    return following
+
+
 @dataclass(frozen=True)
 class Camera:
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
+
+    Parameters given as Python numbers are float64, so that nothing is lost. Whoever takes a camera and tensors computes
+    in the dtype of the tensors, the methods as well: the camera follows the data.
 
     Every method is differentiable with respect to points, pixels and `params`, up to the third order where it undoes a
     distortion. A camera is a pytree with `params` as its only leaf, so that `torch.func` and
@@ -41,6 +60,9 @@ class Camera:
     model: str
     params: Float[Tensor, "*batch P"]
     size: tuple[int, int]
+
+    follows_data: ClassVar[bool] = True
+    """`check_arguments` lets it have another dtype, and `full_precision` converts it."""
 
     def __post_init__(self) -> None:
         if self.model not in distortion.MODELS:
@@ -235,6 +257,7 @@ class Camera:
         return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
     @without_autocast
+    @_in_dtype_of_data
     def project(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"]]:
@@ -249,6 +272,7 @@ class Camera:
         return self._to_pixels(distorted, valid), valid
 
     @without_autocast
+    @_in_dtype_of_data
     def project_with_point_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"], Float[Tensor, "*#batch N 2 3"]]:
@@ -273,6 +297,7 @@ class Camera:
         return self._to_pixels(distorted, valid), valid, J
 
     @without_autocast
+    @_in_dtype_of_data
     def project_with_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[
@@ -296,6 +321,7 @@ class Camera:
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
     @without_autocast
+    @_in_dtype_of_data
     def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Compute undistorted image coordinates x/z, y/z of pixels.
 
@@ -308,6 +334,7 @@ class Camera:
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
 
     @without_autocast
+    @_in_dtype_of_data
     def unproject(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 3"]:
         """Compute bearings of unit length of pixels."""
         normalized = self.normalize(pixels)
@@ -323,6 +350,7 @@ class Camera:
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
     @without_autocast
+    @_in_dtype_of_data
     def pixel_scale(self, normalized: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Pixels per unit of undistorted image coordinates, along x and y, locally.
 
@@ -354,9 +382,9 @@ class Camera:
 
 
 def _stack(*values: Scalar) -> Float[Tensor, "*batch P"]:
-    """Parameters from floats and tensors; float64 on the CPU unless a tensor says otherwise."""
+    """Parameters from floats and tensors; float64 on the CPU unless tensors say otherwise."""
     tensors = [value for value in values if isinstance(value, Tensor)]
-    dtype = tensors[0].dtype if tensors else torch.float64
+    dtype = reduce(torch.promote_types, [tensor.dtype for tensor in tensors]) if tensors else torch.float64
     device = tensors[0].device if tensors else "cpu"
     columns = [torch.as_tensor(value, dtype=dtype, device=device) for value in values]
     return torch.stack(torch.broadcast_tensors(*columns), dim=-1)

@@ -9,7 +9,7 @@ from typing import ParamSpec, TypeVar
 import torch
 from torch import Tensor
 
-from torchslam.geometry.signatures import check_arguments
+from torchslam.geometry.signatures import check_arguments, following
 from torchslam.utils.torch_internals import is_any_autocast_enabled
 
 P = ParamSpec("P")
@@ -23,7 +23,7 @@ def full_precision(function: Callable[P, R]) -> Callable[P, R]:
     """The function, with the same bits under `torch.autocast` as without, for tensors that its signature allows.
 
     Autocast would multiply matrices in bfloat16: rotations wrong in the third digit that look like any other. All
-    tensors of floats must have one dtype.
+    tensors of floats must have one dtype, which cameras follow.
     """
     return _precise(function, one_dtype=True)
 
@@ -37,7 +37,10 @@ def _precise(function: Callable[P, R], one_dtype: bool) -> Callable[P, R]:
     @wraps(function)
     def precise(*args: P.args, **kwargs: P.kwargs) -> R:
         if not (torch.compiler.is_compiling() or torch.jit.is_tracing()):
-            check_arguments(function, args, kwargs, one_dtype)
+            dtype = check_arguments(function, args, kwargs, one_dtype)
+            if one_dtype and dtype is not None:
+                args = tuple(following(value, dtype) for value in args)  # type: ignore[assignment]
+                kwargs = {name: following(value, dtype) for name, value in kwargs.items()}  # type: ignore[assignment]
         if not is_any_autocast_enabled():
             return function(*args, **kwargs)
         for device_type in _DEVICE_TYPES:

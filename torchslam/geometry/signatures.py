@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from functools import cache
 from types import NoneType, UnionType
 from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
@@ -121,13 +121,14 @@ class _Call:
     def _check_object(self, argument: _Argument, value: Any) -> None:
         name = argument.name
         if isinstance(value, argument.classes):
-            inner = _Call(self.one_dtype)
+            follows = getattr(value, "follows_data", False)
+            inner = _Call(self.one_dtype and not follows)
             inner.floats = self.floats
             for field, each in argument.holds:
                 content = getattr(value, field)
                 if content is not None:
                     inner.check(each, content)
-            self.floats = inner.floats
+            self.floats = self.floats if follows else inner.floats
             if "B" in self.sizes and "batch" in inner.batches:
                 (lead, field), (size, where) = inner.batches["batch"], self.sizes["B"]
                 if lead not in ((), (1,), (size,)):
@@ -251,14 +252,18 @@ def _arguments(function: Callable[..., Any]) -> tuple[list[_Argument | None], di
 
 def check_arguments(
     function: Callable[..., Any], args: tuple[Any, ...], kwargs: dict[str, Any], one_dtype: bool
-) -> None:
+) -> torch.dtype | None:
     """Check the tensors of a call against the signature.
 
     Args:
         function: whose signature counts.
         args: arguments by position.
         kwargs: arguments by name.
-        one_dtype: whether all tensors of floats must have the same dtype.
+        one_dtype: whether all tensors of floats must have the same dtype. Objects that follow data, such as cameras,
+            may have another one.
+
+    Returns:
+        The dtype of the tensors of floats; None if there are none.
 
     Raises:
         TypeError: An argument is no tensor.
@@ -272,3 +277,15 @@ def check_arguments(
     for name, value in kwargs.items():
         if value is not None and name in by_name:
             call.check(by_name[name], value)
+    return call.floats[0] if call.floats else None
+
+
+def following(value: Any, dtype: torch.dtype) -> Any:
+    """An argument whose camera, if it is or has one, is in a dtype."""
+    if isinstance(value, Tensor):
+        return value
+    if getattr(value, "follows_data", False):
+        return value if value.params.dtype == dtype else value.to(dtype)
+    camera = getattr(value, "camera", None) if is_dataclass(value) else None
+    found = None if camera is None else following(camera, dtype)
+    return value if found is camera else replace(value, camera=found)

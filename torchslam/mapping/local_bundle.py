@@ -23,7 +23,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Marginals, Progress, solve_bundle
-from torchslam.optim.bundle.dense_numpy import bundle_adjust_numpy
+from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
 from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
@@ -91,7 +91,7 @@ def solve_local(problem: BundleProblem, iterations: int, covariances: bool) -> B
 
     The covariances are those of `solve_bundle` at the solution, so that they do not change it.
     """
-    T_cw, points_w, _ = bundle_adjust_numpy(problem, HUBER, iterations, LOCAL_TOLERANCE)
+    T_cw, points_w, _ = solve_bundle_numpy(problem, HUBER, iterations, LOCAL_TOLERANCE)
     if not covariances:
         return BundleResult(T_cw, points_w, None)
     solved = replace(problem, T_cw=T_cw, points_w=points_w)

@@ -141,9 +141,9 @@ def solve_positions(
     minimization = PositionMinimization(part.layout, kernel, iterations, tolerance)
     inputs = part.inputs(rays_w, weights, scale, at)
     found = find_minimum(minimization, inputs, backward)
-    centers_w, points_w, success, *convergence = found
+    centers_w, points_w, success, steps, converged, initial_cost, cost = found
     if options.strict:
-        check_minimum(success, convergence[1], "problems")
+        check_minimum(success, converged, "problems")
     if backward == "truncated" and len(part.rows):
         centers_w, points_w, _ = minimization.last_step(found, inputs)
     # The gauge of the result.
@@ -169,7 +169,7 @@ def solve_positions(
         determined,
         component,
         success,
-        Convergence(*convergence, options.iterations),
+        Convergence(steps, converged, initial_cost, cost, options.iterations),
     )
 
 

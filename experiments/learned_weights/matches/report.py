@@ -27,7 +27,8 @@ class PartResult:
     @staticmethod
     def of(problems: Problems, poses: dict[str, list[Tensor]], T_true: Tensor) -> PartResult:
         errors = {
-            label: torch.stack([pose_errors(T, T_true) for T in seeds]) for label, seeds in poses.items()
+            label: torch.stack([pose_errors(T_cw=T, T_cw_groundtruth=T_true) for T in seeds])
+            for label, seeds in poses.items()
         }
         return PartResult(problems, errors)
 

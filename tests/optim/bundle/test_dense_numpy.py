@@ -12,7 +12,7 @@ from torchslam.geometry import se3_inverse, se3_log
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._dense import suits_dense
 from torchslam.optim.bundle._problem import sanitized, select_moving
-from torchslam.optim.bundle.dense_numpy import NumpyBundleSolution, bundle_adjust_numpy
+from torchslam.optim.bundle.dense_numpy import NumpyBundleSolution, solve_bundle_numpy
 
 SCALE = 2.0  # of the kernel
 
@@ -27,7 +27,7 @@ def both(
             kernel="huber", scale=SCALE, iterations=iterations, tolerance=tolerance, backward="detached"
         ),
     )
-    return bundle_adjust_numpy(problem, SCALE, iterations, tolerance), wanted
+    return solve_bundle_numpy(problem, SCALE, iterations, tolerance), wanted
 
 
 def with_outliers(problem: BundleProblem, every: int = 9) -> BundleProblem:
@@ -77,13 +77,13 @@ def test_both_backends_of_the_dense_formulation_agree(
         ),
     )
     for row, problem in enumerate(problems):
-        found = bundle_adjust_numpy(problem, SCALE, iterations, 1e-12)
+        found = solve_bundle_numpy(problem, SCALE, iterations, 1e-12)
         assert_same(found, together.element(row, frames, points), atol=1e-9)
 
 
 @pytest.mark.parametrize("weights", ["none", "numbers", "matrices"])
 @pytest.mark.parametrize("fixed", [(0, 1), (0,), (3, 1), ()])
-def test_it_reaches_the_solution_of_bundle_adjust(bundle_scene, fixed, weights) -> None:
+def test_it_reaches_the_solution_of_solve_bundle(bundle_scene, fixed, weights) -> None:
     """Whatever is fixed: what that leaves open stays where it is, in the same sense."""
     problem = with_outliers(bundle_scene(frames=6, points=60, fixed_frames=fixed).problem)
     problem = replace(problem, weights=weights_of(problem, weights))
@@ -94,7 +94,7 @@ def test_it_reaches_the_solution_of_bundle_adjust(bundle_scene, fixed, weights) 
 
 
 @pytest.mark.parametrize("iterations", [1, 2, 4])
-def test_its_steps_equal_those_of_bundle_adjust(bundle_scene, iterations) -> None:
+def test_its_steps_equal_those_of_solve_bundle(bundle_scene, iterations) -> None:
     """One by one, without a kernel's curvature at first and then with it."""
     problem = with_outliers(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
     found, wanted = both(problem, iterations, 1e-14)
@@ -110,7 +110,7 @@ def test_it_stops_when_the_predicted_decrease_is_small(bundle_scene) -> None:
     assert exact.cost < found.cost < 1.001 * exact.cost
 
 
-def test_the_predicted_decrease_equals_that_of_bundle_adjust(bundle_scene) -> None:
+def test_the_predicted_decrease_equals_that_of_solve_bundle(bundle_scene) -> None:
     """So that both stop together, whatever the tolerance."""
     problem = with_outliers(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
     costs = set()
@@ -171,14 +171,14 @@ def test_the_order_of_the_inputs_does_not_matter(bundle_scene) -> None:
         point_index=problem.point_index[order],
         pixels=problem.pixels[order],
     )
-    one, other = (bundle_adjust_numpy(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
+    one, other = (solve_bundle_numpy(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
     torch.testing.assert_close(one.T_cw, other.T_cw, rtol=0, atol=1e-10)
     torch.testing.assert_close(one.points_w, other.points_w, rtol=0, atol=1e-9)
 
 
 def test_exact_observations_leave_no_residual(bundle_scene) -> None:
     scene = bundle_scene(noise=0.0)
-    found = bundle_adjust_numpy(scene.problem, SCALE, 20, 1e-8)
+    found = solve_bundle_numpy(scene.problem, SCALE, 20, 1e-8)
     assert found.cost < 1e-12
     torch.testing.assert_close(found.T_cw, scene.T_cw, rtol=0, atol=1e-7)
 
@@ -190,7 +190,7 @@ def test_an_index_out_of_range_is_an_error(bundle_scene, name, size, wrong) -> N
     index = getattr(problem, name).clone()
     index[3] = wrong
     with pytest.raises(ValueError, match=rf"{name} must lie in 0 \.\.\. {size - 1}"):
-        bundle_adjust_numpy(replace(problem, **{name: index}), SCALE, 1, 1e-6)
+        solve_bundle_numpy(replace(problem, **{name: index}), SCALE, 1, 1e-6)
 
 
 @pytest.mark.parametrize("name", ["fixed_points", "mask", "camera_index", "batch"])
@@ -203,7 +203,7 @@ def test_unsupported_problems_are_an_error(bundle_scene, name) -> None:
     else:
         problem = replace(problem, **{name: given[name]})
     with pytest.raises(ValueError, match=r"the NumPy backend takes one problem without .*: use solve_bundle"):
-        bundle_adjust_numpy(problem, SCALE, 1, 1e-6)
+        solve_bundle_numpy(problem, SCALE, 1, 1e-6)
 
 
 def test_the_dtype_of_the_inputs_is_kept(bundle_scene, device) -> None:
@@ -216,7 +216,7 @@ def test_the_dtype_of_the_inputs_is_kept(bundle_scene, device) -> None:
         problem.camera.to(torch.float32).to(device),
         fixed_frames=torch.tensor([0, 1], device=device),
     )
-    found, exact = bundle_adjust_numpy(single, SCALE, 10, 1e-6), bundle_adjust_numpy(problem, SCALE, 10, 1e-6)
+    found, exact = solve_bundle_numpy(single, SCALE, 10, 1e-6), solve_bundle_numpy(problem, SCALE, 10, 1e-6)
     assert found.T_cw.dtype == found.points_w.dtype == torch.float32
     assert found.T_cw.device.type == device.type
     torch.testing.assert_close(found.T_cw.cpu().double(), exact.T_cw, rtol=0, atol=1e-4)

@@ -15,7 +15,7 @@ from torchslam.optim import (
     solve_bundle,
     solve_least_squares,
 )
-from torchslam.optim.bundle.dense_numpy import bundle_adjust_numpy
+from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
 
 CONVERGED = {"iterations": 100, "tolerance": 1e-18, "strict": True}
 
@@ -243,7 +243,7 @@ def test_what_does_not_fit_is_refused(bundle_scene):
         solve_bundle(replace(problem, depth_prior=DepthPrior(torch.ones(3).double(), torch.ones(3).double())))
     one_factor = (FrameFactors.relative_poses(torch.tensor([(0, 1)]), one, eye),)
     with pytest.raises(ValueError, match="use solve_bundle"):
-        bundle_adjust_numpy(replace(problem, frame_factors=one_factor), 1.0, 5, 1e-8)
+        solve_bundle_numpy(replace(problem, frame_factors=one_factor), 1.0, 5, 1e-8)
 
 
 def test_second_derivatives_and_transforms(bundle_scene):

@@ -23,7 +23,7 @@ def apart(T_cw: Tensor, other: Tensor) -> Tensor:
 
 
 @pytest.mark.parametrize("kernel", ["cauchy", "huber"])
-def test_it_reaches_the_pose_of_refine_pose(pose_scene, kernel, model):
+def test_it_reaches_the_pose_of_solve_pose(pose_scene, kernel, model):
     far = 0.2 if model == "pinhole" else 0.0  # the first order of a distortion says nothing so far away
     scene = pose_scene(batch=1, count=200, outliers=far, model=model, perturbation=0.01)
     noise = KeypointNoise.of(1 + torch.arange(200).double() % 3, None)

@@ -47,7 +47,7 @@ class NumpyBundleSolution(NamedTuple):
     cost: float
 
 
-def bundle_adjust_numpy(
+def solve_bundle_numpy(
     problem: BundleProblem, scale: float, iterations: int, tolerance: float
 ) -> NumpyBundleSolution:
     """Minimize Huber costs of reprojection errors over all points and the poses that are not fixed.
