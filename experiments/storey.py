@@ -28,9 +28,19 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.cli.main import console
-from torchslam.data.synthetic.buildings import FLOOR, HEIGHT, PARTITION, TEXEL
 from torchslam.data.synthetic.paths import poses
-from torchslam.data.synthetic.scene import Painter, Rectangle, Vector, X, Y, Z
+from torchslam.data.synthetic.scene import (
+    BUILDING_TEXEL,
+    FLOOR,
+    HEIGHT,
+    PARTITION,
+    Painter,
+    Rectangle,
+    Vector,
+    X,
+    Y,
+    Z,
+)
 from torchslam.data.synthetic.sequence import SCENES, Scene
 
 TOP = np.array((0.0, -HEIGHT / 2, 0.0))
@@ -96,7 +106,7 @@ ARM = 0.3
 
 def storey(seed: int) -> list[Rectangle]:
     """12 x 2.8 x 10 meters around the origin; textures from a seed."""
-    painter = Painter(np.random.default_rng(seed), TEXEL)
+    painter = Painter(np.random.default_rng(seed), BUILDING_TEXEL)
     plain = replace(painter, coverage=PLAIN)
     return _corridor(plain) + _boards(painter) + _storey_room(painter, plain)
 

@@ -22,10 +22,9 @@ from experiments.dense.compare import RIGHT, errors, kept_with, least_for, most_
 from experiments.dense.peers import Depth, fused
 from experiments.dense.run import opened, truth_of
 from torchslam.dense import DepthMaps
-from torchslam.dense.aggregation import semi_global
 from torchslam.dense.confidence import LEAST_KEPT, confidence_alone
 from torchslam.dense.consistency import render
-from torchslam.dense.cost_volume import inverse_depth_planes
+from torchslam.dense.cost_volume import inverse_depth_planes, semi_global
 from torchslam.dense.estimate import PLANES, estimate_depth
 from torchslam.densify.views import SWEPT, Views
 from torchslam.geometry import se3_inverse

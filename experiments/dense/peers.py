@@ -34,9 +34,8 @@ from torchslam.dense.confidence import (
     together_features,
 )
 from torchslam.dense.consistency import merge
-from torchslam.dense.cost_volume import box_sum, inverse_depth_planes, mean_of_best, warp
+from torchslam.dense.cost_volume import box_sum, find_minimum, inverse_depth_planes, mean_of_best, warp
 from torchslam.dense.estimate import BEST_VIEWS, FULL_RADIUS, PLANES, estimate_depth
-from torchslam.dense.minimum import find_minimum
 from torchslam.densify.views import SWEPT, ViewImages, Views
 from torchslam.geometry import se3_inverse
 from torchslam.io.results import DEPTHS

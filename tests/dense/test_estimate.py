@@ -9,19 +9,21 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.dense.slanted_plane import FAR, NEAR, NORMAL, a_camera, depth_of, poses, scene
-from torchslam.dense.aggregation import semi_global
 from torchslam.dense.confidence import confidence_alone, confidence_together, kept
 from torchslam.dense.consistency import as_seen_by, merge, render
 from torchslam.dense.cost_volume import (
+    STD_FACTOR,
     box_sum,
     correlation,
+    find_minimum,
     inverse_depth_planes,
     matching_cost,
     mean_of_best,
+    position_std,
+    semi_global,
     warp,
 )
 from torchslam.dense.estimate import estimate_depth, halved, refine_depth
-from torchslam.dense.minimum import STD_FACTOR, find_minimum, position_std
 from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
 from torchslam.dense.normals import depth_normals
 from torchslam.geometry import Camera, se3_inverse

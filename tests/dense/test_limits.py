@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.dense.limits import BORDER_PX, at_borders, lowest_minima
-from torchslam.dense.minimum import find_minimum
+from torchslam.dense.cost_volume import find_minimum
 
 
 def test_the_lowest_minima_come_first_and_lie_between_the_hypotheses() -> None:

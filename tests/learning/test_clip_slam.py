@@ -239,7 +239,9 @@ def test_the_gradient_is_the_same_under_detect_anomaly() -> None:
         extractor = BentExtractor(walk, bend=0.02)
         camera = walk.camera.with_params(walk.camera.params.clone().requires_grad_())
         with torch.autograd.set_detect_anomaly(is_detected):
-            ate(T_cw=ClipSLAM(extractor, config=CONFIG)(images, camera).T_cw, T_cw_groundtruth=truth).backward()
+            ate(
+                T_cw=ClipSLAM(extractor, config=CONFIG)(images, camera).T_cw, T_cw_groundtruth=truth
+            ).backward()
         gradients.append((extractor.bend.grad, camera.params.grad))
     torch.testing.assert_close(*gradients)
     assert float(gradients[1][0]) != 0

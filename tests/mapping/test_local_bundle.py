@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
+from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
 from torchslam.config import BundleAdjustmentConfig, load_config
 from torchslam.geometry import Camera, se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
@@ -14,7 +14,6 @@ from torchslam.mapping.local_bundle import (
     HUBER,
     adjust_all,
     adjust_keyframes,
-    adjust_local,
     remove_outliers,
     select,
 )

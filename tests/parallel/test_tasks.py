@@ -12,7 +12,7 @@ import pytest
 
 from tests.parallel.test_pool import wait_until_ready
 from torchslam.errors import FrameError
-from torchslam.parallel.tasks import SharedTasks
+from torchslam.parallel.pool import SharedTasks
 
 TASKS = [(number,) for number in range(12)]
 

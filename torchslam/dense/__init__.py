@@ -1,15 +1,21 @@
 """Dense depth from posed images: pure, batched functions on any device, and the two results, maps and a cloud."""
 
-from torchslam.dense.aggregation import Aggregation, semi_global
 from torchslam.dense.cloud import PointCloud
 from torchslam.dense.confidence import confidence_alone, confidence_together, kept
 from torchslam.dense.consistency import Merged, as_seen_by, merge, render
-from torchslam.dense.cost_volume import inverse_depth_planes, matching_cost, warp
+from torchslam.dense.cost_volume import (
+    Aggregation,
+    Minimum,
+    find_minimum,
+    inverse_depth_planes,
+    matching_cost,
+    semi_global,
+    warp,
+)
 from torchslam.dense.depth_maps import DepthMaps
 from torchslam.dense.estimate import Estimate, estimate_depth, refine_depth
 from torchslam.dense.fusion import CloudFusion
 from torchslam.dense.learned import RatingNet, learned_confidence, net_inputs
-from torchslam.dense.minimum import Minimum, find_minimum
 from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
 from torchslam.dense.normals import depth_normals
 

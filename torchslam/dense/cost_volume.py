@@ -1,12 +1,20 @@
-"""Plane sweep: how well the views agree with each depth hypothesis of each pixel of the reference view.
+"""A cost volume: how well the views agree with each depth hypothesis of each pixel, its aggregation and its minimum.
 
-A hypothesis is an inverse depth, 1 / z, per pixel: constant over the image for a sweep of planes, or around a known
-surface for a refinement, whose windows then follow the surface. Everything is differentiable with respect to images,
-poses, camera and hypotheses; whether a pixel is seen, and which views are the best ones, are decisions without a
-gradient.
+Plane sweep: a hypothesis is an inverse depth, 1 / z, per pixel: constant over the image for a sweep of planes, or
+around a known surface for a refinement, whose windows then follow the surface. Everything is differentiable with
+respect to images, poses, camera and hypotheses; whether a pixel is seen, and which views are the best ones, are
+decisions without a gradient.
+
+Semi-global aggregation (Hirschmüller 2008): smooth surfaces that may jump at edges of the image. A path comes to every
+pixel along each direction; its cost is the cost of the pixel and of the cheapest changes of hypothesis on the way. A
+change by one costs SMALL_STEP, which slanted surfaces need; any other one costs JUMP, or less where the image has an
+edge.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -147,3 +155,133 @@ def matching_cost(
         scores = torch.where(is_seen, scores, 0.0)
         costs.append(1 - mean_of_best(scores.movedim(-4, 0), num_best))
     return torch.cat(costs, dim=-3)
+
+
+STD_FACTOR = 0.61
+"""Measured on a rendered room; 0.55 to 0.69 in each eighth of the pixels, by the deviation."""
+
+
+class Minimum(NamedTuple):
+    """The minimum of the cost of each pixel.
+
+    Attributes:
+        position: of the minimum, in steps from the first hypothesis, between the hypotheses.
+        cost: at the best hypothesis.
+        curvature: second difference of the cost there; 0 at the first and the last hypothesis.
+        margin: how much more the best hypothesis that is not next to it costs.
+    """
+
+    position: Float[Tensor, "*batch H W"]
+    cost: Float[Tensor, "*batch H W"]
+    curvature: Float[Tensor, "*batch H W"]
+    margin: Float[Tensor, "*batch H W"]
+
+
+def find_minimum(cost: Float[Tensor, "*batch D H W"]) -> Minimum:
+    """Find the minimum of each pixel on the parabola through the best hypothesis and its neighbors.
+
+    Differentiable with respect to the cost; which hypothesis is the best one is a decision without a gradient.
+    """
+    planes = cost.shape[-3]
+    least, best = cost.min(dim=-3, keepdim=True)
+    below = cost.gather(-3, (best - 1).clamp(min=0))
+    above = cost.gather(-3, (best + 1).clamp(max=planes - 1))
+    is_inside = (best > 0) & (best < planes - 1)
+    curvature = torch.where(is_inside, below - 2 * least + above, 0.0)
+    has_minimum = curvature > torch.finfo(cost.dtype).eps
+    offset = torch.where(has_minimum, 0.5 * (below - above) / torch.where(has_minimum, curvature, 1.0), 0.0)
+    hypotheses = torch.arange(planes, device=cost.device)[:, None, None]
+    others = cost.masked_fill((hypotheses - best).abs() <= 1, torch.inf).amin(dim=-3, keepdim=True)
+    margin = torch.where(torch.isfinite(others), others - least, 0.0)
+    return Minimum(*(each.squeeze(-3) for each in (best + offset, least, curvature, margin)))
+
+
+def position_std(found: Minimum) -> Float[Tensor, "*batch H W"]:
+    """Standard deviation of the position of a minimum, in steps; infinite where the cost has no curvature.
+
+    The cost left at the minimum is the variance of what does not match, and its curvature is the square of what the
+    images change by in a step: their ratio is the variance of the position (the bound of Cramér and Rao). It holds
+    where the minimum is the right one; errors of the poses come on top.
+    """
+    has_minimum = found.curvature > torch.finfo(found.curvature.dtype).eps
+    ratio = found.cost.clamp(min=0) / torch.where(has_minimum, found.curvature, 1.0)
+    return torch.where(has_minimum, STD_FACTOR * ratio.sqrt(), torch.inf)
+
+
+Aggregation = Callable[[Tensor, Tensor], Tensor]
+"""From costs (*batch, D, H, W) and the gray image (*batch, H, W) to aggregated costs of the same shape."""
+
+SMALL_STEP = 0.1
+"""Cost of a change by one hypothesis, in units of the matching cost. Tried 0.025 to 0.1: 63.5 to 67.9 % of the pixels
+are within 5 % (experiments/dense)."""
+JUMP = 1.2
+"""Cost of any larger change. Tried 0.3 to 1.2, in proportion to `SMALL_STEP`."""
+LEAST_JUMP = 0.1
+"""Cost of a jump at the strongest edge: that of a small step."""
+EDGE = 10 / 255
+"""Difference of gray values of two pixels at which a jump costs half of JUMP."""
+
+
+def semi_global(
+    cost: Float[Tensor, "*batch D H W"],
+    image: Float[Tensor, "*batch H W"],
+    small_step: float = SMALL_STEP,
+    jump: float = JUMP,
+) -> Float[Tensor, "*batch D H W"]:
+    """Aggregate a cost volume along eight directions.
+
+    Args:
+        cost: matching costs, in the order of the hypotheses.
+        image: gray image in [0, 1] of the same pixels.
+        small_step, jump: costs of a change by one hypothesis, and by more.
+
+    Returns:
+        The mean cost of the paths that come to each pixel. Differentiable with respect to the cost; the image only
+        decides what a jump costs.
+    """
+    batch, (planes, height, width) = cost.shape[:-3], cost.shape[-3:]
+    cost, image = cost.reshape(-1, planes, height, width), image.detach().reshape(-1, height, width)
+    total = _paths(cost, image, (0,), small_step, jump)
+    across = _paths(cost.mT, image.mT, (-1, 0, 1), small_step, jump)
+    return ((total + across.mT) / 8).reshape(*batch, planes, height, width)
+
+
+def _paths(cost: Tensor, image: Tensor, shifts: tuple[int, ...], small_step: float, jump: float) -> Tensor:
+    """Sum of the costs of paths from column to column, both ways, that move by each shift of rows meanwhile.
+
+    Args:
+        cost: (B, D, H, W).
+        image: (B, H, W).
+        shifts: rows from a column to the next.
+    """
+    # Columns first, hypotheses last; the two ways beside each other.
+    columns = torch.stack((cost, cost.flip(-1))).permute(4, 0, 1, 3, 2).contiguous()  # (W, 2, B, H, D)
+    pixels = torch.stack((image, image.flip(-1))).permute(3, 0, 1, 2)  # (W, 2, B, H)
+    total = torch.zeros_like(columns)
+    for shift in shifts:
+        before = pixels.roll((1, shift), (0, 3))
+        jumps = jump / (1 + (pixels - before).abs() / EDGE)[..., None]
+        path, along = columns[0], [columns[0]]
+        for column, penalty in zip(columns[1:], jumps[1:], strict=True):
+            path = _step(_shifted(path, shift), column, penalty, small_step)
+            along.append(path)
+        total = total + torch.stack(along)
+    total = total.permute(1, 2, 4, 3, 0)
+    return total[0] + total[1].flip(-1)
+
+
+def _step(path: Tensor, cost: Tensor, jump: Tensor, small_step: float) -> Tensor:
+    """Costs of paths one pixel further on; the least one so far is subtracted, so that they do not grow."""
+    least = path.amin(-1, keepdim=True)
+    near = F.pad(path + small_step, (1, 1), value=torch.inf)
+    best = torch.minimum(near[..., :-2], near[..., 2:])
+    best = torch.minimum(torch.minimum(best, path), least + jump.clamp(min=LEAST_JUMP))
+    return cost + best - least
+
+
+def _shifted(path: Tensor, shift: int) -> Tensor:
+    """Costs (..., H, D) moved by a row; a path that begins at the edge costs nothing so far."""
+    if shift == 0:
+        return path
+    pad = (0, 0, 1, 0) if shift > 0 else (0, 0, 0, 1)
+    return F.pad(path[..., :-1, :] if shift > 0 else path[..., 1:, :], pad)

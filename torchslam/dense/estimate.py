@@ -13,9 +13,15 @@ import torch.nn.functional as F
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.dense.aggregation import Aggregation, semi_global
-from torchslam.dense.cost_volume import inverse_depth_planes, matching_cost
-from torchslam.dense.minimum import Minimum, find_minimum, position_std
+from torchslam.dense.cost_volume import (
+    Aggregation,
+    Minimum,
+    find_minimum,
+    inverse_depth_planes,
+    matching_cost,
+    position_std,
+    semi_global,
+)
 from torchslam.geometry import Camera
 from torchslam.geometry.precision import without_autocast
 

@@ -15,12 +15,15 @@ from enum import Enum
 from functools import lru_cache
 from pathlib import Path
 
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from torchslam.data.formats.image_file import write_image
 from torchslam.dense.cloud import PointCloud
 from torchslam.dense.confidence import confidence_alone, confidence_together, kept
 from torchslam.dense.consistency import merge
@@ -29,12 +32,11 @@ from torchslam.dense.estimate import estimate_depth
 from torchslam.dense.fusion import CloudFusion
 from torchslam.dense.learned import learned_confidence
 from torchslam.dense.normals import depth_normals
-from torchslam.densify.pictures import write_picture
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
 from torchslam.errors import ResultsError
 from torchslam.io.export.scene import Images
 from torchslam.io.results import DEPTHS, PICTURE_NAMES, PICTURES
-from torchslam.parallel.tasks import SharedTasks
+from torchslam.parallel.pool import SharedTasks
 from torchslam.utils.files import parse_json, read_text, write_whole
 
 PARTS = "parts"
@@ -245,3 +247,41 @@ def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"], skipped:
     return DenseSummary(
         len(spreads), known / pixels, confidence / max(known, 1), voxel, fusion.cloud(), skipped
     )
+
+
+QUANTILES = (0.02, 0.98)
+"""Of inverse depth, between which the colors reach from far (blue) to near (red)."""
+
+
+def depth_colors(depth: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colors of depth, blue, green, red; black where unknown."""
+    is_known = depth > 0
+    if not bool(is_known.any()):
+        return np.zeros((*depth.shape, 3), np.uint8)
+    inverse = torch.where(is_known, 1 / torch.where(is_known, depth, 1.0), 0.0)
+    far, near = (
+        inverse[is_known].quantile(torch.tensor(QUANTILES, dtype=inverse.dtype, device="cpu")).tolist()
+    )
+    scaled = ((inverse - far) / max(near - far, 1e-12)).clamp(0, 1)
+    colors = cv2.applyColorMap((scaled * 255).round().to(torch.uint8).numpy(), cv2.COLORMAP_TURBO)
+    colors[~is_known.numpy()] = 0
+    return colors
+
+
+def normal_colors(normal: Float[Tensor, "3 H W"]) -> UInt8[np.ndarray, "H W 3"]:
+    """Colors of normals, blue, green, red: x right is red, y up is green, towards the camera is blue."""
+    is_known = (normal != 0).any(0)
+    shown = normal * normal.new_tensor((1.0, -1.0, -1.0))[:, None, None]
+    colors = ((shown + 1) * 127.5).round().to(torch.uint8)
+    return torch.where(is_known, colors, torch.zeros_like(colors)).flip(0).movedim(0, -1).contiguous().numpy()
+
+
+def write_picture(
+    path: Path,
+    depth: Float[Tensor, "H W"],
+    normal: Float[Tensor, "3 H W"],
+    color: UInt8[Tensor, "H W 3"],
+) -> None:
+    """Write image, depth and normals side by side. Raises ResultsError."""
+    parts = (cv2.cvtColor(color.numpy(), cv2.COLOR_RGB2BGR), depth_colors(depth), normal_colors(normal))
+    write_image(path, np.concatenate(parts, axis=1))

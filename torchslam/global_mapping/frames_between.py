@@ -13,8 +13,6 @@ from torchslam.config import Config
 from torchslam.geometry import Camera, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.map.posed_frames import PosedFrames
-from torchslam.optim.run_graph import RunGraph
 from torchslam.tracking.data_association import match_keyframe
 from torchslam.tracking.pose_validation import check_pose
 from torchslam.tracking.relocalization import single_frame_state
@@ -134,14 +132,3 @@ def keyframe_estimate(slam_map: Map, keyframe: int) -> PoseEstimate:
     seen, T_cw = table[keypoints], slam_map.T_cw[keyframe]
     depth = float(transform(T_cw, slam_map.positions_w[seen])[:, 2].median()) if len(seen) else 0.0
     return PoseEstimate(T_cw, seen, keypoints, len(seen), slam_map.keyframes["covariances"][keyframe], depth)
-
-
-def graph_of(slam_map: Map, camera: Camera) -> RunGraph:
-    """Build the observation graph of the keyframes of a map, without other frames."""
-    posed_frames = PosedFrames()
-    for keyframe in range(slam_map.num_keyframes):
-        T_cr = torch.eye(4, dtype=slam_map.T_cw.dtype, device=slam_map.T_cw.device)
-        posed_frames.add(
-            slam_map.frame_features(keyframe), keyframe_estimate(slam_map, keyframe), T_cr, keyframe
-        )
-    return posed_frames.graph(slam_map, camera)

@@ -61,16 +61,6 @@ class BundleResult:
     camera: Camera | None = None
 
 
-def adjust_local(
-    slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig, covariances: bool = False
-) -> None:
-    """Run a local bundle adjustment around a keyframe; `covariances`: also update the covariances of the map."""
-    window = select_window(slam_map, keyframe, camera, settings)
-    if window is not None:
-        result = solve_local(window.problem, settings.local_iterations, covariances)
-        apply_result(slam_map, window, result, camera)
-
-
 def select_window(
     slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig
 ) -> BundleWindow | None:

@@ -17,9 +17,8 @@ from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.sequence import Calibrated, Reader, Sequence
 from torchslam.data.synthetic import paths
-from torchslam.data.synthetic.buildings import corridors, rooms
 from torchslam.data.synthetic.renderer import Renderer
-from torchslam.data.synthetic.scene import Rectangle, room, wall
+from torchslam.data.synthetic.scene import Rectangle, corridors, room, rooms, wall
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
