@@ -55,7 +55,5 @@ def test_a_result_has_the_values_and_their_text() -> None:
     turned = Explanation.of(Reason.TURNED, degrees=12.34)
     result = StepResult(0, 0.0, State.TRACKING, None, reasons=(turned, Explanation(Reason.STATIC_OVERLAY)))
     assert result.reasons[0].values["degrees"] == 12.34
-    assert result.reason == (
-        "turned by 12.3 degrees; some of the image does not move with the scene and is left out"
-    )
+    assert result.reason == ("turned by 12.3 degrees; static overlay masked out")
     assert StepResult(0, 0.0, State.LOST, None).reason == ""

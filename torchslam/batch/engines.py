@@ -28,6 +28,7 @@ LOST = (
     f"its process died {RETRIES + 1} times, or could not start: "
     "not enough memory, or torchslam is not installed where it ran"
 )
+"""What the table says of a row without a result."""
 
 
 @dataclass(frozen=True)

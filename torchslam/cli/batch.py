@@ -39,6 +39,7 @@ from torchslam.cli.progress import SIGNALS, STATUS
 from torchslam.utils.console import say
 
 ERRORS = 4
+"""Exit status where some rows failed."""
 READING = ("camera", "start", "stop", "stride", "fps", "limit", "resize", "mask")
 
 

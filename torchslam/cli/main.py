@@ -20,7 +20,9 @@ from torchslam.utils.console import say, with_install_hint
 from torchslam.utils.text import printable, without_credentials
 
 ERROR = 2
+"""Exit status of an error, as of argparse."""
 INTERRUPTED = 130
+"""Exit status after Ctrl-C: 128 and the number of the signal, as of shells."""
 
 # Module and first line of the description of each command; only the module of the requested command is imported.
 COMMANDS = {

@@ -33,6 +33,7 @@ from torchslam.types import Trajectory
 from torchslam.utils.console import say, table, warn
 
 DONE, NO_MAP = 0, 3
+"""Exit status with a map, and without one."""
 RADIAL = 2  # coefficients of the distortion that may be found
 REFINED = "refined"  # folder in the results
 

@@ -50,7 +50,9 @@ from torchslam.types import StepResult
 from torchslam.utils.console import say, table, warn
 
 DONE = 0
+"""Exit status with a map."""
 NO_MAP = 3
+"""Exit status without a map."""
 CHECKPOINT_EVERY = 20  # keyframes
 GROWTH = 0.05
 """Minimum ratio of new keyframes between two checkpoints, so that all checkpoints together cost O(n)."""
