@@ -11,7 +11,9 @@ import pytest
 import torch
 
 from torchslam.data import Calibrated, open_sequence
+from torchslam.data.calibration import write_calibration
 from torchslam.errors import CalibrationError, FrameError, SequenceError
+from torchslam.geometry import Camera
 
 CAMERA = "60,60,32,24"
 
@@ -39,6 +41,32 @@ def test_folder_needs_a_camera(tmp_path: Path, write_picture: Callable) -> None:
     (tmp_path / "mine.txt").write_text("62 62 32 24")
     assert float(open_sequence(tmp_path, tmp_path / "mine.txt").camera.fx) == 62.0
     assert float(open_sequence(tmp_path, str(tmp_path / "mine.txt")).camera.fx) == 62.0
+
+
+def test_the_stated_error_of_a_calibration_counts_wherever_it_lies(
+    tmp_path: Path, write_picture: Callable
+) -> None:
+    write_picture(tmp_path / "0.png")
+    camera = Camera.pinhole(60.0, 60.0, 32.0, 24.0, size=(64, 48))
+    write_calibration(tmp_path / "calibration.txt", camera, [], std=0.04)
+    found, given = open_sequence(tmp_path), open_sequence(tmp_path, tmp_path / "calibration.txt")
+    assert (found.camera_std, given.camera_std) == (0.04, 0.04)
+    assert found.with_guess() is found
+    assert open_sequence(tmp_path, "60,60,32,24").camera_std is None
+
+
+def test_a_camera_that_is_missing_is_guessed(tmp_path: Path, write_picture: Callable) -> None:
+    write_picture(tmp_path / "0.png")
+    guessed = open_sequence(tmp_path).with_guess()
+    assert guessed.calibrated is Calibrated.GUESSED
+    assert guessed.camera.params.tolist() == open_sequence(tmp_path, "auto").camera.params.tolist()
+
+
+def test_a_camera_of_another_size_is_refused(tmp_path: Path, write_picture: Callable) -> None:
+    write_picture(tmp_path / "0.png")
+    camera = Camera.pinhole(60.0, 60.0, 32.0, 24.0, size=(65, 48))
+    with pytest.raises(CalibrationError, match="the camera is for images of 65x48, these are 64x48"):
+        open_sequence(tmp_path, camera)
 
 
 def test_an_unknown_camera_gets_an_initial_guess(tmp_path: Path, write_picture: Callable) -> None:
