@@ -97,9 +97,13 @@ class FrameLog:
         self.unpose(*self.views(indices))
 
     def take_held(self, indices: Iterable[int]) -> list[HeldFrame]:
-        """Return and forget held frames, in order of their index."""
-        frames = [self._frames.pop(index)[1] for index in sorted(indices)]
-        return [frame for frame in frames if isinstance(frame, HeldFrame)]
+        """Return and forget held frames, in the given order."""
+        frames = []
+        for index in indices:
+            _, frame = self._frames.pop(index)
+            assert isinstance(frame, HeldFrame), f"frame {index} is not held"
+            frames.append(frame)
+        return frames
 
     def forget(self, indices: Iterable[int]) -> None:
         """Forget frames: their poses are final, or nothing can pose them."""

@@ -91,9 +91,8 @@ class MapStart:
         return is_discarded
 
     def _is_young(self, savepoint: Savepoint) -> bool:
-        """Whether a map has too few frames to be kept when the camera is lost; keyframes are worth several."""
-        frames = max(savepoint.num_certain, FRAMES_PER_KEYFRAME * savepoint.submap.map.num_keyframes)
-        return frames < savepoint.num_confirming
+        """Whether a map is too small to be kept when the camera is lost; keyframes are worth several frames."""
+        return FRAMES_PER_KEYFRAME * savepoint.submap.map.num_keyframes < savepoint.num_confirming
 
     def _create(self, start: TwoViewMap, views: list[FrameFeatures]) -> Rejection | None:
         """Create a submap from two views, and discard a provisional one; return why it is rejected, or None."""
