@@ -17,7 +17,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping import rounds
 from torchslam.global_mapping.rounds import COARSE, ObservedTracks, Reconstruction, adjust, adjust_in_rounds
 from torchslam.global_mapping.tracks import Tracks
-from torchslam.optim import BundleProblem
+from torchslam.optim import BundleProblem, SolverOptions
 
 SCENE = Recording.of(arc(10, 120.0, 2.5), ball(100))
 NOISY = Recording.of(arc(10, 120.0, 2.5), ball(80), noise_px=0.2, wrong=0.2, seed=12)
@@ -293,12 +293,12 @@ def test_only_observations_that_agree_are_adjusted() -> None:
 
 def test_the_problem_has_the_noise_the_kernel_and_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each observation its own weight; the camera is free along the directions of its error, with its prior."""
-    calls: list[tuple[BundleProblem, tuple[Any, ...]]] = []
+    calls: list[tuple[BundleProblem, SolverOptions, Any]] = []
     solve = rounds.solve_bundle
 
-    def spy(problem: BundleProblem, *options: Any, **more: Any) -> Any:
-        calls.append((problem, options))
-        return solve(problem, *options, **more)
+    def spy(problem: BundleProblem, *, options: SolverOptions, free_camera: Any, **more: Any) -> Any:
+        calls.append((problem, options, free_camera))
+        return solve(problem, options=options, free_camera=free_camera, **more)
 
     monkeypatch.setattr(rounds, "solve_bundle", spy)
     scales = 1 + torch.arange(100, dtype=torch.float64) / 100
@@ -307,17 +307,16 @@ def test_the_problem_has_the_noise_the_kernel_and_the_camera(monkeypatch: pytest
     measured = CameraMeasurement.of(CAMERA, 0.02)
     adjust(observed, replace(found, camera=measured.camera), "cauchy", 6.0, 1e-3, measured)
     adjust(observed, found, "huber", 2.0, 1e-4, None)
-    (problem, options), (fixed, others) = calls
+    (problem, options, free), (fixed, others, not_free) = calls
     torch.testing.assert_close(problem.weights, 4 / scales[SCENE.tracks.keypoint[found.agrees]] ** 2)
     assert torch.equal(problem.frame_index, SCENE.tracks.view[found.agrees])
     assert torch.equal(problem.point_index, SCENE.tracks.track[found.agrees])
     assert torch.equal(problem.pixels, observed.pixels[found.agrees])
-    assert options[:2] == ("cauchy", 6.0)
-    assert torch.equal(options[2], measured.directions)
-    assert options[4:] == (100, 1e-3)
+    assert options == SolverOptions("cauchy", 6.0, 100, 1e-3, "detached")
+    assert torch.equal(free, measured.directions)
     assert problem.camera_prior is not None
     assert torch.equal(problem.camera_prior.params, measured.camera.params)
-    assert (others[0], others[1], others[2], others[5]) == ("huber", 2.0, False, 1e-4)
+    assert (others.kernel, others.scale, others.tolerance, not_free) == ("huber", 2.0, 1e-4, False)
     assert fixed.camera_prior is None
 
 

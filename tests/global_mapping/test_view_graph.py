@@ -115,9 +115,16 @@ class FakeEstimate:
         self.options: list[dict[str, object]] = []
 
     def __call__(
-        self, pixels_1: Tensor, pixels_2: Tensor, *cameras: Camera, mask: Tensor, **options: object
+        self,
+        pixels_1: Tensor,
+        pixels_2: Tensor,
+        *,
+        camera_1: Camera,
+        camera_2: Camera,
+        mask: Tensor,
+        **options: object,
     ) -> SimpleNamespace:
-        assert cameras == (CAMERA, CAMERA)
+        assert (camera_1, camera_2) == (CAMERA, CAMERA)
         self.pixels.append((pixels_1, pixels_2))
         self.masks.append(mask)
         self.options.append(options)

@@ -146,9 +146,9 @@ def test_padding_is_bounded_by_a_few_times_the_graph_size(monkeypatch: pytest.Mo
     batches = []
     adjust = run_graph.solve_bundle
 
-    def counting(problem, *options):  # type: ignore[no-untyped-def]
+    def counting(problem, **options):  # type: ignore[no-untyped-def]
         batches.append(tuple(problem.points_w.shape[:2]))
-        return adjust(problem, *options)
+        return adjust(problem, **options)
 
     monkeypatch.setattr(run_graph, "solve_bundle", counting)
     for found, alone in zip(solve_graphs(graphs), expected, strict=True):
