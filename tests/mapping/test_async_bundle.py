@@ -204,8 +204,8 @@ def test_the_run_continues_without_a_killed_worker() -> None:
         wait_until_ready(solver)
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
-        os.kill(solver._processes[0].pid or 0, signal.SIGKILL)
-        solver._processes[0].join()
+        os.kill(solver._workers[0].process.pid or 0, signal.SIGKILL)
+        solver._workers[0].process.join()
         with pytest.warns(UserWarning, match="has ended"):
             adjusting.apply(slam_map)
         assert_same(slam_map, adjusted())

@@ -111,7 +111,7 @@ def test_a_frame_that_has_not_arrived_is_not_waited_for(monkeypatch: pytest.Monk
 def test_the_source_continues_without_the_worker(reader: LivePrefetcher) -> None:
     reader[0], reader[1]
     reader._call = reader.submit(reader._next)  # not answered yet
-    os.kill(reader._processes[0].pid or 0, signal.SIGKILL)
+    os.kill(reader._workers[0].process.pid or 0, signal.SIGKILL)
     with pytest.warns(UserWarning, match="has ended"):
         frame = reader[2]
     assert frame.index == 2

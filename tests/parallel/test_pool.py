@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
 import multiprocessing
 import os
 import signal
+import struct
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -22,8 +24,8 @@ PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with not
 
 def wait_until_ready(pool: WorkerPool) -> None:
     """Wait for all workers, which a run does not."""
-    for started in pool._ready:
-        started.result(PATIENCE)
+    for worker in pool._workers:
+        worker.started.result(PATIENCE)
     assert pool.is_ready
 
 
@@ -125,6 +127,31 @@ def test_a_stopped_worker_is_given_up(pool: WorkerPool, monkeypatch: pytest.Monk
     ):
         pool.result(call)
     assert pool.submit(torch.eye(2)) is None
+
+
+def die(is_asked: bool) -> int:
+    """End as if killed while the result is sent: the executor here has read its beginning by then."""
+    if not is_asked:
+        return os.getpid()
+    frame = inspect.currentframe()
+    while frame is not None and "result_queue" not in frame.f_locals:
+        frame = frame.f_back
+    assert frame is not None
+    os.write(frame.f_locals["result_queue"]._writer.fileno(), struct.pack("!i", 100) + b"half a result")
+    os.kill(os.getpid(), signal.SIGKILL)
+    return 0
+
+
+def test_a_worker_killed_while_it_sends_a_result_is_not_waited_for() -> None:
+    with WorkerPool(2, partial, die) as pool:
+        wait_until_ready(pool)
+        first, second = pool.submit(True), pool.submit(False)
+        assert first is not None
+        assert second is not None
+        with pytest.warns(UserWarning, match="has ended"), pytest.raises(WorkerLostError):
+            pool.result(first)
+        assert pool.result(second) == ask(pool, False) == second.worker.process.pid  # goes on
+    assert multiprocessing.active_children() == []
 
 
 @needs_stop

@@ -143,8 +143,8 @@ def test_the_run_continues_without_a_killed_worker(sequence: Sequence) -> None:
     with ahead(sequence) as frames:
         check_same(frames, sequence, 0)
         assert check_same(frames, sequence, 1)
-        os.kill(frames._processes[0].pid or 0, signal.SIGKILL)
-        frames._processes[0].join()
+        os.kill(frames._workers[0].process.pid or 0, signal.SIGKILL)
+        frames._workers[0].process.join()
         with pytest.warns(UserWarning, match="has ended: going on without it"):
             theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
     assert not all(theirs[4:])

@@ -18,10 +18,12 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from multiprocessing import connection, resource_tracker
+from multiprocessing.process import BaseProcess
 from types import TracebackType
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import torch
 from torch import Tensor
@@ -40,6 +42,39 @@ class WorkerLostError(Exception):
     """A worker was killed or does not answer: whoever needs its result computes it."""
 
 
+@dataclass(eq=False)
+class _Worker:
+    """A worker process with an executor of its own: where one is lost, the others go on."""
+
+    executor: ProcessPoolExecutor
+    process: BaseProcess
+    started: Future[int]
+
+    @classmethod
+    def spawn(cls, task: bytes) -> _Worker:
+        """Begin to start a worker."""
+        context, before = multiprocessing.get_context("spawn"), multiprocessing.active_children()
+        executor = ProcessPoolExecutor(1, context, _begin, (task,))
+        started = executor.submit(os.getpid)
+        (process,) = (each for each in multiprocessing.active_children() if each not in before)
+        # As long as this process could write to the pipe of the results, too, the executor would wait for ever for the
+        # rest of a result whose sender was killed.
+        executor._result_queue._writer.close()  # type: ignore[attr-defined]
+        return cls(executor, process, started)
+
+    def end(self) -> None:
+        """End the process at once, also one that is still starting or was stopped."""
+        self.process.kill()
+        self.executor.shutdown()
+
+
+class Call(NamedTuple):
+    """A call that a worker answers."""
+
+    worker: _Worker
+    answer: Future[bytes]
+
+
 class WorkerPool:
     """Worker processes that answer calls while this is entered.
 
@@ -55,69 +90,60 @@ class WorkerPool:
     ) -> None:
         self.count = count
         self._task = _pack((torch.get_num_threads(), niceness, make, parts))
-        self._executor: ProcessPoolExecutor | None = None
-        self._ready: list[Future[int]] = []
+        self._workers: deque[_Worker] = deque()
 
     def __enter__(self) -> Self:
-        if self.count > 0:
-            spawn = multiprocessing.get_context("spawn")
-            self._executor = ProcessPoolExecutor(self.count, spawn, _begin, (self._task,))
-            before = multiprocessing.active_children()
-            with _without_interrupts():
-                self._ready = [self._executor.submit(os.getpid) for _ in range(self.count)]
-            self._processes = [each for each in multiprocessing.active_children() if each not in before]
+        with _without_interrupts():
+            for _ in range(self.count):
+                self._workers.append(_Worker.spawn(self._task))
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._executor is not None:
-            self._kill()
-            self._executor.shutdown()
-            self._executor = None
+        while self._workers:
+            self._workers.pop().end()
 
     @property
     def is_ready(self) -> bool:
-        """Whether calls are accepted: a worker has started, and none is lost."""
-        return self._executor is not None and any(each.done() for each in self._ready)
+        """Whether calls are accepted: a worker has started."""
+        return any(each.started.done() for each in self._workers)
 
-    def submit(self, *question: object) -> Future[bytes] | None:
-        """Begin a call; None if calls are not accepted."""
-        if self._executor is None or not self.is_ready:
-            return None
-        try:
-            return self._executor.submit(_call, _pack(question))
-        except BrokenProcessPool:
-            self._lose("has ended")
-            return None
+    def submit(self, *question: object) -> Call | None:
+        """Begin a call, of the workers in turn; None if calls are not accepted."""
+        for _ in range(len(self._workers)):
+            worker = self._workers[0]
+            self._workers.rotate(-1)
+            if not worker.started.done():
+                continue
+            try:
+                return Call(worker, worker.executor.submit(_call, _pack(question)))
+            except BrokenProcessPool:
+                self._lose(worker, "has ended")
+        return None
 
-    def result(self, call: Future[bytes]) -> Any:
+    def result(self, call: Call) -> Any:
         """Wait for the result of a call.
 
         Raises:
             WorkerLostError: If there will be none.
             Exception: What the call raised, with its traceback as the cause.
         """
-        if not wait([call], RESPONSE_TIMEOUT_S).done:
-            self._kill()
-            self._lose("does not answer")
+        if not wait([call.answer], RESPONSE_TIMEOUT_S).done:
+            self._lose(call.worker, "does not answer")
             raise WorkerLostError
         try:
-            return pickle.loads(call.result())
+            return pickle.loads(call.answer.result())
         except BrokenProcessPool:
-            self._lose("has ended")
+            self._lose(call.worker, "has ended")
             raise WorkerLostError from None
 
-    def _lose(self, reason: str) -> None:
-        """Accept no further call, and warn once."""
-        if self._ready:
+    def _lose(self, worker: _Worker, reason: str) -> None:
+        """Go on without a worker, and warn once."""
+        if worker in self._workers:
+            self._workers.remove(worker)
+            worker.end()
             warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=3)
-        self._ready = []
-
-    def _kill(self) -> None:
-        """End the workers at once, also those that are still starting or were stopped."""
-        for process in self._processes:
-            process.kill()
 
 
 class SharedTasks(WorkerPool):
@@ -141,7 +167,7 @@ class SharedTasks(WorkerPool):
         Raises what a task raises, here or in a worker.
         """
         waiting = deque(tasks)
-        calls: dict[Future[bytes], tuple[Any, ...]] = {}
+        calls: dict[Call, tuple[Any, ...]] = {}
         while waiting or calls:
             while waiting and len(calls) < AHEAD * self.count:
                 call = self.submit(*waiting[0])
@@ -152,8 +178,8 @@ class SharedTasks(WorkerPool):
                 self._do(*waiting.popleft())
                 yield
             else:
-                wait(calls, return_when=FIRST_COMPLETED)
-            for call in [each for each in calls if each.done()]:
+                wait([each.answer for each in calls], return_when=FIRST_COMPLETED)
+            for call in [each for each in calls if each.answer.done()]:
                 task = calls.pop(call)
                 try:
                     self.result(call)

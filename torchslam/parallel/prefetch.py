@@ -8,14 +8,13 @@ already arrived from a live source, while the frame before it is tracked.
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
 from dataclasses import replace
 
 import torch
 
 from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import FrameError
-from torchslam.parallel.pool import WorkerLostError, WorkerPool
+from torchslam.parallel.pool import Call, WorkerLostError, WorkerPool
 from torchslam.types import Features, Frame
 from torchslam.utils.timing import Stopwatch
 
@@ -49,7 +48,7 @@ class FeaturePrefetcher(WorkerPool):
     ) -> None:
         super().__init__(processes, _frame_reader, sequence, make_extractor, niceness=NICENESS)
         self._sequence, self._clock = sequence, clock
-        self._requested: dict[int, Future[bytes]] = {}
+        self._requested: dict[int, Call] = {}
         self._next = 0  # first frame that was not requested yet
 
     def __getitem__(self, index: int) -> Frame:
@@ -89,7 +88,7 @@ class LivePrefetcher(WorkerPool):
         super().__init__(1, make_extractor, niceness=NICENESS)
         self._sequence, self._clock = sequence, clock
         self._next: Frame | FrameError | None = None  # taken from the source before its turn
-        self._call: Future[bytes] | None = None  # for its features
+        self._call: Call | None = None  # for its features
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError if it cannot be read or does not fit the camera."""

@@ -48,6 +48,12 @@ MAX_ASPECT_ERROR = 0.02
 """Relative error of fy / fx of a given camera before a note says that the file contradicts it."""
 
 
+class Bar(tqdm):
+    """A progress bar without tqdm's monitor, which is a thread: this process may be forked."""
+
+    monitor_interval = 0
+
+
 class VideoSequence(Sequence):
     """Frames of a video at their presentation times, in seconds from the beginning of its stream.
 
@@ -152,10 +158,10 @@ class VideoSequence(Sequence):
             need(times[frame] for frame in _rising(grabbed()))
         return first, times, ended
 
-    def _bar(self, what: str, total: int | None) -> tqdm:
+    def _bar(self, what: str, total: int | None) -> Bar:
         """A progress bar for what takes long."""
         words = f"{what} of {printable(self._path.name)}"
-        return tqdm(total=total, desc=words, delay=QUIET, leave=False, **tqdm_options())
+        return Bar(total=total, desc=words, delay=QUIET, leave=False, **tqdm_options())
 
     def _retrieve(self, where: str, error: type[TorchslamError]) -> np.ndarray | None:
         try:
