@@ -45,8 +45,9 @@ MIN_AGREEING = 0.5
 """Least share of them that agree; single ones may be wrong themselves, by repetitive structure."""
 
 TIED = 0.9
-"""Least share of the matches, and of the triplets, between two stretches that must agree so that both are one: by loops,
-or because a break was told by few. On courthouse 97 % and more of those across two breaks do, on garden 98 %."""
+"""Least share of the matches, and of the triplets, between two stretches that must agree so that both are one, as by
+loops, or where few told of the break. On a right map of courthouse 98 % and more agree across two breaks, on garden
+98 %; where maps were bent by hand by 20 % and more, the halves stay apart."""
 
 MIN_SCORE = 0.8
 """Score below which a map counts as wrong even without a break; right ones have 0.98 and more."""
@@ -96,7 +97,7 @@ class MapCheck:
         used_agreeing: share of all pairs, used or not, that agree.
         distance_px: median distance of the matches of pairs that mapping did not use from where the map allows them.
         breaks: moments at which the map does not fit together, or may not, in the order of time.
-        certain: frames of the images in the longest stretch that nothing contradicts, ascending.
+        certain: frames of the images in the largest part that nothing contradicts, ascending.
         uncertain: frames of the other images that have a pose.
     """
 
@@ -113,7 +114,7 @@ class MapCheck:
 
     @property
     def score(self) -> float:
-        """Share of pairs and triplets that agree, times that of the images in the longest stretch without a break.
+        """Share of pairs and triplets that agree, times that of the images in the largest part without a break.
 
         Images without a pose count as contradictions.
         """
@@ -188,9 +189,9 @@ def check_map(
     agrees = [distance < limit for distance in distances]
     unused = range(len(pairs)) if held_back is None else sorted(held_back)
     triplets, untold = _triplets(depths, pairs, posed, agrees)
-    breaks, stretches = _breaks(posed, pairs, agrees, triplets, views)
-    longest = max(stretches, key=len, default=[])
-    others = [row for stretch in stretches if stretch is not longest for row in stretch]
+    breaks, parts = _breaks(posed, pairs, agrees, triplets, views)
+    largest = max(parts, key=len, default=[])
+    others = [row for part in parts if part is not largest for row in part]
     return MapCheck(
         len(views),
         len(unused),
@@ -200,7 +201,7 @@ def check_map(
         sum(agrees) / len(agrees) if agrees else 0.0,
         float(np.median([distances[row] for row in unused])) if len(unused) else 0.0,
         breaks,
-        tuple(views[row].index for row in longest),
+        tuple(views[row].index for row in largest),
         tuple(views[row].index for row in others),
     )
 

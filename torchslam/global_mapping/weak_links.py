@@ -1,4 +1,4 @@
-"""Weak links of a view graph: moments across which few matches hold the images together, matched again by a map's poses.
+"""Weak links of a view graph: moments across which few matches hold the images together, matched again by poses.
 
 Where few tracks cross, each side may be exact and the scale between them off. By approximate poses a match may lie near
 its epipolar line only, so that fewer descriptors compete and the ratio test may be laxer.
