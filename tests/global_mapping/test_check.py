@@ -171,7 +171,8 @@ def test_a_camera_that_is_moved_sideways_contradicts_the_image_pairs() -> None:
         (10, 11, BreakKind.POSE),
     ]
     assert [each.scale_ratio for each in found.breaks] == [1, 1]
-    assert (found.certain, found.uncertain) == (tuple(range(11, 24)), tuple(range(11)))
+    # Only that image: pairs that go past it tie what is before and after.
+    assert (found.certain, found.uncertain) == ((*range(10), *range(11, 24)), (10,))
     assert (found.pairs, found.agreeing) == (45, 41)
     assert not found.is_right
 
@@ -205,6 +206,59 @@ def there_and_back() -> Recording:
     T_cw[:, 0, 3] = -0.25 * steps
     T_cw[12:, 2, 3] = -0.1  # not the same poses, which had no parallax
     return Recording.of(T_cw, wall(300, 3.0), noise_px=0.3, first=0)
+
+
+def tied_by_loops(*apart: tuple[int, int]) -> tuple[Recording, list[ViewPair], list[ViewPair]]:
+    """A walk there and back, its neighbors without those across some moments, and pairs of the same places."""
+    recording = there_and_back()
+    near = [
+        pair
+        for pair in recording.pairs(*NEAR)
+        if not any(pair.first <= before and pair.second >= after for before, after in apart)
+    ]
+    loops = [recording.pair(row, 23 - row) for row in range(4)]
+    return recording, near, loops
+
+
+def test_loops_tie_what_a_moment_does_not() -> None:
+    """The two ends of a walk that returns; where the camera turns around, nothing ties them."""
+    recording, near, loops = tied_by_loops((11, 12))
+    found = check(recording, pairs=near)
+    assert found.breaks == (Break(11, 12, BreakKind.UNKNOWN),)
+    assert len(found.uncertain) == 12
+    found = check(recording, pairs=[*near, *loops])
+    assert found.is_right
+    assert (found.breaks, found.certain, found.uncertain) == ((), tuple(range(24)), ())
+    # Both ends tied, and the middle by nothing: only that hangs on weak links.
+    recording, near, loops = tied_by_loops((7, 8), (15, 16))
+    found = check(recording, pairs=[*near, *loops])
+    assert found.breaks == (Break(7, 8, BreakKind.UNKNOWN), Break(15, 16, BreakKind.UNKNOWN))
+    assert (found.certain, found.uncertain) == ((*range(8), *range(16, 24)), tuple(range(8, 16)))
+    assert found.score == pytest.approx(16 / 24)
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.3])
+def test_loops_that_contradict_the_scale_tie_nothing(factor: float) -> None:
+    """The way back has another scale: its depths by pairs of the way there are others."""
+    recording, near, loops = tied_by_loops((11, 12))
+    T_wc = se3_inverse(recording.T_cw)
+    center = T_wc[23, :3, 3].clone()
+    T_wc[12:, :3, 3] = center + factor * (T_wc[12:, :3, 3] - center)
+    found = check(recording, se3_inverse(T_wc), [*near, *loops])
+    assert Break(11, 12, BreakKind.UNKNOWN) in found.breaks
+    assert len(found.uncertain) == 12
+
+
+@pytest.mark.parametrize(("wrong", "matches", "uncertain"), [(1, 60, 0), (4, 200, 12)])
+def test_nine_in_ten_matches_must_agree(wrong: int, matches: int, uncertain: int) -> None:
+    """A small wrong pair is outvoted by the loops, and wrong ones with many matches are not."""
+    recording, near, loops = tied_by_loops((11, 12))
+    bad = [
+        of_points(contradicting(recording, row, 23 - row), recording, 0, matches)
+        for row in range(4, 4 + wrong)
+    ]
+    found = check(recording, pairs=[*near, *loops, *bad])
+    assert len(found.uncertain) == uncertain
 
 
 def test_contradicting_loops_are_found() -> None:

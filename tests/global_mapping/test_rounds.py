@@ -487,3 +487,14 @@ def test_a_walk_along_a_line_is_adjusted() -> None:
     assert int(recording.tracks.lengths.min()) < 12
     found = adjust_in_rounds(recording.observed, disturbed(recording.T_cw, 0.05, 0.5), None, CAMERA)
     assert apart(found.T_cw, recording.T_cw)[0] < 5e-3
+
+
+@pytest.mark.parametrize(("shared", "held"), [(4, 6), (5, 10)])
+def test_five_points_hold_parts_together(shared: int, held: int) -> None:
+    """Images 0 to 5 see forty points of their own, 6 to 9 others, and both some: what four hold leaves the map."""
+    tracks = SCENE.tracks
+    early = tracks.view < 6
+    own = torch.where(early, tracks.track < 40, (tracks.track >= 40) & (tracks.track < 80))
+    seen, _ = tracks.select(own | ((tracks.track >= 80) & (tracks.track < 80 + shared)))
+    found = adjust_in_rounds(ObservedTracks.of(seen, SCENE.views), SCENE.T_cw, None, CAMERA, coarse=False)
+    assert torch.unique(seen.view[found.agrees]).tolist() == list(range(held))

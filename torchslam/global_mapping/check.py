@@ -13,6 +13,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from itertools import pairwise, product
+from typing import Any
 
 import numpy as np
 import torch
@@ -42,6 +43,11 @@ STRONG_MATCHES = 100
 hardly moves has many and no parallax, a weak link has few."""
 MIN_AGREEING = 0.5
 """Least share of them that agree; single ones may be wrong themselves, by repetitive structure."""
+
+TIED = 0.9
+"""Least share of the matches, and of the triplets, between two stretches that must agree so that both are one, as by
+loops, or where few told of the break. On a right map of courthouse 98 % and more agree across two breaks, on garden
+98 %; where maps were bent by hand by 20 % and more, the halves stay apart."""
 
 MIN_SCORE = 0.8
 """Score below which a map counts as wrong even without a break; right ones have 0.98 and more."""
@@ -91,7 +97,7 @@ class MapCheck:
         used_agreeing: share of all pairs, used or not, that agree.
         distance_px: median distance of the matches of pairs that mapping did not use from where the map allows them.
         breaks: moments at which the map does not fit together, or may not, in the order of time.
-        certain: frames of the images in the longest stretch that nothing contradicts, ascending.
+        certain: frames of the images in the largest part that nothing contradicts, ascending.
         uncertain: frames of the other images that have a pose.
     """
 
@@ -108,7 +114,7 @@ class MapCheck:
 
     @property
     def score(self) -> float:
-        """Share of pairs and triplets that agree, times that of the images in the longest stretch without a break.
+        """Share of pairs and triplets that agree, times that of the images in the largest part without a break.
 
         Images without a pose count as contradictions.
         """
@@ -183,9 +189,9 @@ def check_map(
     agrees = [distance < limit for distance in distances]
     unused = range(len(pairs)) if held_back is None else sorted(held_back)
     triplets, untold = _triplets(depths, pairs, posed, agrees)
-    breaks, stretches = _breaks(posed, pairs, agrees, triplets, views)
-    longest = max(stretches, key=len, default=[])
-    others = [row for stretch in stretches if stretch is not longest for row in stretch]
+    breaks, parts = _breaks(posed, pairs, agrees, triplets, views)
+    largest = max(parts, key=len, default=[])
+    others = [row for part in parts if part is not largest for row in part]
     return MapCheck(
         len(views),
         len(unused),
@@ -195,7 +201,7 @@ def check_map(
         sum(agrees) / len(agrees) if agrees else 0.0,
         float(np.median([distances[row] for row in unused])) if len(unused) else 0.0,
         breaks,
-        tuple(views[row].index for row in longest),
+        tuple(views[row].index for row in largest),
         tuple(views[row].index for row in others),
     )
 
@@ -253,14 +259,15 @@ def _breaks(
     triplets: Sequence[_Triplet],
     views: Sequence[FrameFeatures],
 ) -> tuple[tuple[Break, ...], list[list[int]]]:
-    """The moments at which pairs or triplets disagree, and the posed images in the stretches between them."""
+    """The moments at which pairs or triplets disagree, and the posed images in the parts between them."""
     rows = [row for row, known in enumerate(posed) if known]
     told = [row for row, pair in enumerate(pairs) if posed[pair.first] and posed[pair.second]]
-    ends = np.array([(pairs[row].first, pairs[row].second) for row in told]).reshape(-1, 2)
+    ends = np.array([(pairs[row].first, pairs[row].second) for row in told], dtype=np.int64).reshape(-1, 2)
     good = np.array([agrees[row] for row in told], dtype=bool)
     sizes = np.array([len(pairs[row]) for row in told])
     near = ends[:, 1] - ends[:, 0] < FAR
-    spans = np.array([(each.first, each.middle, each.last) for each in triplets]).reshape(-1, 3)
+    spans = np.array([(each.first, each.middle, each.last) for each in triplets], dtype=np.int64)
+    spans = spans.reshape(-1, 3)
     right = np.array([each.agrees for each in triplets], dtype=bool)
     ratios = np.array([each.log_ratio for each in triplets])
 
@@ -268,6 +275,7 @@ def _breaks(
         return bool(np.count_nonzero(chosen) >= MIN_SPANNING and agreeing[chosen].mean() < MIN_AGREEING)
 
     breaks: list[Break] = []
+    apart: list[tuple[int, Break]] = []
     stretches = [[rows[0]]] if rows else []
     for before, after in pairwise(rows):
         crossing = near & (ends[:, 0] <= before) & (ends[:, 1] >= after)
@@ -286,12 +294,78 @@ def _breaks(
         if kind is None:
             stretches[-1].append(after)
             continue
-        breaks.append(Break(views[before].index, views[after].index, kind, ratio))
+        found = Break(views[before].index, views[after].index, kind, ratio)
         if kind is BreakKind.UNKNOWN and (crossing & good).any():  # weak, but nothing contradicts it
             stretches[-1].append(after)
+            breaks.append(found)
         else:
             stretches.append([after])
+            apart.append((len(stretches) - 1, found))
+    label = _tied(stretches, len(posed), ends, good * sizes, sizes, spans, right)
+    breaks += [found for later, found in apart if label[later - 1] != label[later]]
     if disagree(~near, good):
         first, last = ends[~near & ~good][0].tolist()
         breaks.append(Break(views[first].index, views[last].index, BreakKind.LOOP))
-    return tuple(sorted(breaks, key=lambda each: each.before)), stretches
+    parts = [
+        [row for stretch, own in zip(stretches, label, strict=True) if own == part for row in stretch]
+        for part in dict.fromkeys(label)
+    ]
+    return tuple(sorted(breaks, key=lambda each: each.before)), parts
+
+
+def _tied(
+    stretches: Sequence[Sequence[int]],
+    images: int,
+    ends: NDArray[np.int64],
+    agreeing: NDArray[np.int64],
+    matches: NDArray[np.int64],
+    spans: NDArray[np.int64],
+    right: NDArray[np.bool_],
+) -> list[int]:
+    """The part that each stretch belongs to: two are one where nearly all pairs and triplets between them agree.
+
+    The two parts that the most right triplets tie are joined first; then all is counted anew.
+
+    Args:
+        stretches: images of each.
+        images: number of images.
+        ends: images of pairs, both in some stretch.
+        agreeing: matches of the pairs, zero where the pair does not agree.
+        matches: matches of the pairs.
+        spans: images of triplets.
+        right: whether their ratios of scales agree.
+    """
+    label = list(range(len(stretches)))
+    stretch_of = np.zeros(images, dtype=np.int64)
+    for number, stretch in enumerate(stretches):
+        stretch_of[list(stretch)] = number
+    sides = np.concatenate([spans[:, :2], spans[:, 1:]])  # the pairs of each triplet
+    ratios = np.concatenate([right, right]).astype(np.float64)
+    while True:
+        part = np.array(label)[stretch_of] if label else stretch_of
+        by_pairs, by_triplets = part[ends], part[sides]
+        tied = _shares(by_pairs, agreeing, matches, len(label))
+        counts = _shares(by_triplets, ratios, np.ones(len(ratios)), len(label))
+        able = [
+            (counts[key][0], key)
+            for key in counts.keys() & tied.keys()
+            if counts[key][0] >= MIN_SPANNING and all(whole[key][1] >= TIED for whole in (tied, counts))
+        ]
+        if not able:
+            return label
+        _, (one, other) = max(able, key=lambda each: (each[0], -each[1][0], -each[1][1]))
+        label = [one if own == other else own for own in label]
+
+
+def _shares(
+    parts: NDArray[np.int64], agreeing: NDArray[Any], whole: NDArray[Any], count: int
+) -> dict[tuple[int, int], tuple[float, float]]:
+    """What agrees between two different parts, and its share, by their numbers, the lower one first."""
+    low, high = parts.min(axis=1), parts.max(axis=1)
+    across = low != high
+    keys, which = np.unique(low[across] * count + high[across], return_inverse=True)
+    sums = np.bincount(which, agreeing[across]), np.bincount(which, whole[across])
+    return {
+        (int(key) // count, int(key) % count): (agrees, agrees / every)
+        for key, agrees, every in zip(keys, *(each.tolist() for each in sums), strict=True)
+    }

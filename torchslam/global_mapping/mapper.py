@@ -18,7 +18,13 @@ from torchslam.geometry import Camera, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.chained_positions import chained_positions
 from torchslam.global_mapping.frames_between import FramePoser
-from torchslam.global_mapping.rounds import MIN_VIEWS, ObservedTracks, Reconstruction, adjust_in_rounds
+from torchslam.global_mapping.rounds import (
+    MIN_VIEWS,
+    ObservedTracks,
+    Reconstruction,
+    adjust_coarsely,
+    adjust_in_rounds,
+)
 from torchslam.global_mapping.tracks import join_matches, make_map
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
@@ -27,6 +33,7 @@ from torchslam.global_mapping.view_graph import (
     build_view_graph,
     connected_views,
 )
+from torchslam.global_mapping.weak_links import strengthen
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.rotation_averaging import solve_rotations
@@ -193,11 +200,9 @@ class GlobalMapper:
         rows = connected_views(pairs, len(views))
         connected = set(rows.tolist())
         pairs = [pair for pair in pairs if pair.first in connected]
-        tracks = join_matches(pairs, len(views), len(views[0].mask))
-        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
-        if tracks.count == 0:
+        observed = self._tracks(pairs, views)
+        if observed.tracks.count == 0:
             return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
-        observed = ObservedTracks.of(tracks, views)
         self.progress("positions", 0, 1)
         T_cw = torch.eye(4, dtype=R_21.dtype, device=device).repeat(len(views), 1, 1)
         T_cw[:, :3, :3] = average.R_cw
@@ -205,13 +210,26 @@ class GlobalMapper:
         centers_w = chained_positions(pairs, average.R_cw, views, self.camera)
         T_cw[:, :3, 3] = -(average.R_cw @ centers_w[..., None])[..., 0]
         self.progress("adjustment", 0, 1)
-        found = adjust_in_rounds(
-            observed, T_cw, self.given, camera, log=lambda words: self.progress(words, 0, 1)
-        )
-        seen = torch.unique(tracks.view[found.agrees])
+
+        def log(words: str) -> None:
+            self.progress(words, 0, 1)
+
+        coarse = adjust_coarsely(observed, T_cw, self.given, camera, log)
+        matcher = PairMatcher(views, self.camera, self.matcher, self.scaled)
+        self.progress("weak links", 0, 1)
+        observed = self._tracks(strengthen(matcher, pairs, coarse.T_cw, coarse.camera), views)
+        found = adjust_in_rounds(observed, coarse.T_cw, self.given, coarse.camera, False, log)
+        seen = torch.unique(observed.tracks.view[found.agrees])
         if len(seen) < MIN_VIEWS:
             return f"no map: {len(views)} images agree on no points; the camera may only turn"
         return seen, observed, found
+
+    @staticmethod
+    def _tracks(pairs: list[ViewPair], views: list[FrameFeatures]) -> ObservedTracks:
+        """The tracks of pairs that enough images see."""
+        tracks = join_matches(pairs, len(views), len(views[0].mask))
+        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
+        return ObservedTracks.of(tracks, views)
 
     def finish(
         self,

@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
@@ -13,10 +15,10 @@ from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
-from torchslam.global_mapping.view_graph import PairMatcher
+from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
 from torchslam.system.run import Run, keyframe_rows
 from torchslam.tracking.matcher import make_matcher
-from torchslam.types import Explanation, Reason, State, StepResult
+from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
 
 FEW_POSED = 0.98
 """Share of the frames with a pose in the main submap below which a recording is mapped as a whole as well."""
@@ -132,9 +134,20 @@ def _loss(run: Run) -> str:
     return f"tracking was lost in {lost} frames" if lost else ""
 
 
-@torch.no_grad()
 def check_run(run: Run) -> MapCheck | None:
     """Check the main submap of a run by pairs of its keyframes, matched anew; None if there is nothing to check."""
+    found = keyframe_pairs(run)
+    if found is None:
+        return None
+    T_cw, views, pairs = found
+    known = torch.ones(len(views), dtype=torch.bool, device="cpu")
+    reduction = run.config.for_size(run.camera.size).features.reduction(run.camera.size)
+    return check_map(T_cw, known, views, pairs, run.camera, None, reduction)
+
+
+@torch.no_grad()
+def keyframe_pairs(run: Run) -> tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]] | None:
+    """Poses and features of the keyframes of the main submap, and their verified pairs; None for fewer than three."""
     rows = keyframe_rows(run.map, run.session).tolist()
     if len(rows) < 3 or run.config.features.kind == "simulated":
         return None
@@ -147,9 +160,7 @@ def check_run(run: Run) -> MapCheck | None:
         for distance in CHECKED_DISTANCES
         if row + distance < len(rows)
     )
-    known = torch.ones(len(rows), dtype=torch.bool, device="cpu")
-    reduction = scaled.features.reduction(run.camera.size)
-    return check_map(run.map.T_cw[rows], known, views, pairs, run.camera, None, reduction)
+    return run.map.T_cw[rows], views, pairs
 
 
 def with_doubts(run: Run, check: MapCheck | None) -> Run:

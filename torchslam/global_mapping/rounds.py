@@ -190,6 +190,31 @@ def adjust(
     return Reconstruction(solution.T_cw, solution.camera, points_w, found.agrees)
 
 
+def adjust_coarsely(
+    observed: ObservedTracks,
+    T_cw: Float[Tensor, "K 4 4"],
+    given: CameraMeasurement | None,
+    camera: Camera,
+    log: Callable[[str], None] = lambda words: None,
+) -> Reconstruction:
+    """Find poses that are right to about a pixel, and the camera, from poses that may be many pixels off.
+
+    Args:
+        observed: the tracks, of which the longest ones are used.
+        T_cw: approximate poses.
+        given: the given camera with its error, a prior; None: the camera is exact.
+        camera: to start with.
+        log: receives what each round found.
+    """
+    chosen = observed.select(longest_tracks(observed.tracks, COARSE_TRACKS))
+    found = chosen.triangulate(T_cw, camera, COARSE_GATE * COARSE[0][1])
+    for (kernel, scale), (_, following) in pairwise((*COARSE, FINE)):
+        found = adjust(chosen, found, kernel, scale, COARSE_TOLERANCE, given)
+        found = chosen.filter(found, COARSE_GATE * following)
+        log(f"{kernel} {scale:g}: {int(found.agrees.sum())} of {len(chosen.tracks)} observations agree")
+    return found
+
+
 def adjust_in_rounds(
     observed: ObservedTracks,
     T_cw: Float[Tensor, "K 4 4"],
@@ -209,13 +234,8 @@ def adjust_in_rounds(
         log: receives what each round found.
     """
     if coarse:
-        chosen = observed.select(longest_tracks(observed.tracks, COARSE_TRACKS))
-        found = chosen.triangulate(T_cw, camera, COARSE_GATE * COARSE[0][1])
-        for (kernel, scale), (_, following) in pairwise((*COARSE, FINE)):
-            found = adjust(chosen, found, kernel, scale, COARSE_TOLERANCE, given)
-            found = chosen.filter(found, COARSE_GATE * following)
-            log(f"{kernel} {scale:g}: {int(found.agrees.sum())} of {len(chosen.tracks)} observations agree")
-        T_cw, camera = found.T_cw, found.camera
+        begun = adjust_coarsely(observed, T_cw, given, camera, log)
+        T_cw, camera = begun.T_cw, begun.camera
     found = observed.triangulate(T_cw, camera, FINE_START * GATE)
     for number in range(MAX_ROUNDS):
         before = found.agrees

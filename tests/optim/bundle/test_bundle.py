@@ -389,3 +389,19 @@ def test_steps_of_points_lead_to_the_same_minimum(monkeypatch, bundle_scene):
     settled = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(tolerance=1e-12))
     torch.testing.assert_close(settled.T_cw, alone.T_cw, rtol=0, atol=1e-7)
     torch.testing.assert_close(settled.cost, alone.cost, rtol=1e-9, atol=0)
+
+
+@pytest.mark.parametrize(("free", "is_settled"), [(31, False), (32, True)])
+def test_points_settle_by_themselves_from_32_free_frames_on(monkeypatch, bundle_scene, free, is_settled):
+    scene = bundle_scene(frames=33, points=40, perturbation=0.01).problem
+    fixed = torch.arange(33) >= free
+    evaluated = []
+    of_points = SparseBundle._of_points
+
+    def counted(self, estimate):
+        evaluated.append(estimate)
+        return of_points(self, estimate)
+
+    monkeypatch.setattr(SparseBundle, "_of_points", counted)
+    bundle_adjust(replace(scene, fixed_frames=fixed), iterations=1)
+    assert bool(evaluated) == is_settled
