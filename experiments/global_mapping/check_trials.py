@@ -50,7 +50,7 @@ PARTS: dict[str, list[tuple[int, int, int]]] = {
 """First frame, end and stride of the parts of sequences that are run."""
 SCALES = 1.1, 1.2, 1.5
 RIGHT, POSED = 0.02, 0.98
-"""A run is right if its ATE is below this share of the extent of the true path, and at least so many frames are posed."""
+"""A run is right if its ATE is below this share of the extent of the true path, and so many frames are posed."""
 WAYS = (*(f"scale {scale:g}" for scale in SCALES), "wrong loop")
 HEADER = "maps | number | called wrong or uncertain"
 MARKS = "<!-- check -->\n", "<!-- end of check -->"
