@@ -14,11 +14,11 @@ from torchslam.data import open_sequence
 from torchslam.system.run import no_map_message
 from torchslam.system.slam import SLAM
 from torchslam.tracking.relocalization import Relocalizer
-from torchslam.types import Reason, Rejection, State, StepResult
+from torchslam.types import Explanation, Reason, Rejection, State, StepResult
 
 
-def result(index: int, reason: str) -> StepResult:
-    return StepResult(index, float(index), State.INITIALIZING, None, None, None, False, 0, 0, reason)
+def result(index: int, reason: Explanation) -> StepResult:
+    return StepResult(index, float(index), State.INITIALIZING, None, reasons=(reason,))
 
 
 @pytest.mark.parametrize(
@@ -29,13 +29,13 @@ def result(index: int, reason: str) -> StepResult:
     ],
 )
 def test_the_reason_of_most_frames_is_reported(rejection: Rejection) -> None:
-    few = str(rejection)
-    results = [result(0, Reason.NEW_REFERENCE), *(result(index, few) for index in range(1, 1000))]
-    assert no_map_message(results, []) == f"no map was initialized in 1000 frames: {few}"
+    reference = Explanation(Reason.NEW_REFERENCE)
+    results = [result(0, reference), *(result(index, rejection) for index in range(1, 1000))]
+    assert no_map_message(results, []) == f"no map was initialized in 1000 frames: {rejection}"
 
 
 def test_a_single_reference_frame_is_reported_as_too_few_frames() -> None:
-    assert "1 frames are too few" in no_map_message([result(0, Reason.NEW_REFERENCE)], [])
+    assert "1 frames are too few" in no_map_message([result(0, Explanation(Reason.NEW_REFERENCE))], [])
 
 
 def test_a_video_without_texture_and_views_far_apart_are_told_apart() -> None:
