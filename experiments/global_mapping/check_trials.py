@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -128,7 +129,7 @@ def tried(sequence: Sequence) -> Columns:
         return check_map(T_cw, known, views, matched, run.camera, None, reduction)
 
     before = checked(T_cw)
-    bends: list[Callable[[Tensor], Tensor]] = [lambda T, by=by: scaled(T, by) for by in SCALES]
+    bends: list[Callable[[Tensor], Tensor]] = [partial(scaled, factor=factor) for factor in SCALES]
     bent = dict(zip(WAYS, [*bends, closed_wrongly], strict=True))
     return {
         "is_right": error < RIGHT and len(run.trajectory) >= POSED * len(sequence),
