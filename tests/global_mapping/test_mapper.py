@@ -227,6 +227,7 @@ def test_progress_names_the_stages() -> None:
         "rotations",
         "positions",
         "adjustment",
+        "weak links",
         "frames between",
         "final adjustment",
     ]
