@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
 from torchslam.config import BundleAdjustmentConfig, load_config
-from torchslam.geometry import Camera, se3_exp, transform
+from torchslam.geometry import se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.local_bundle import (
     HUBER,
@@ -89,7 +89,7 @@ def weighted(coarse: float) -> float:
     slam_map.keyframes["scales"][:2], slam_map.keyframes["scales"][2:] = 1.0, coarse
     seen = slam_map.observed_points(torch.arange(4))
     before = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
-    adjust_keyframes(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA, 30, covariances=False)
+    adjust_keyframes(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA, 30)
     after = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
     return float((after - before)[:, 1].median())
 
@@ -163,41 +163,11 @@ def test_global_adjustment_fixes_the_first_keyframe() -> None:
     assert (slam_map.keyframes["covariances"] == 0).all()
 
 
-def test_covariances_are_stored_on_request() -> None:
-    for requested in (False, True):
-        slam_map = submap_of_scene(SCENE, sideways(4), noise=0.5).map
-        adjust_local(slam_map, 3, CAMERA, bundle(local_window=2), covariances=requested)
-        known = slam_map.keyframes["covariances"].diagonal(dim1=-2, dim2=-1).sum(-1) > 0
-        assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if requested else [])
-        seen = slam_map.observed_points(torch.tensor([2, 3]))
-        seen = seen[slam_map.points["times_observed"][seen] >= 2]
-        trace = slam_map.points["covariances_w"][seen].diagonal(dim1=-2, dim2=-1).sum(-1)
-        assert bool((trace > 0).all()) is requested
-
-
-DISTORTED = Camera(
-    "radial_tangential", torch.cat([CAMERA.params, CAMERA.params.new_tensor([0.02, 0, 0, 0, 0])]), CAMERA.size
-)
-
-
-@pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
-def test_covariances_do_not_change_the_adjustment(camera: Camera) -> None:
-    """So that `measurement.gate = "mahalanobis"`, which needs them, has no other solver and no other residual."""
-    plain, certain = (submap_of_scene(SCENE, sideways(4), noise=0.5).map for _ in range(2))
-    adjust_local(plain, 3, camera, bundle(local_window=2))
-    adjust_local(certain, 3, camera, bundle(local_window=2), covariances=True)
-    for name in ("T_cw", "point_ids"):
-        assert torch.equal(plain.keyframes[name], certain.keyframes[name])
-    for name in ("positions_w", "is_valid"):
-        assert torch.equal(plain.points[name], certain.points[name])
-    assert (certain.keyframes["covariances"][2:] != 0).any()
-
-
 def test_an_empty_window_changes_nothing() -> None:
     slam_map = row(sideways(2))
     slam_map.remove_points(slam_map.valid_points())
     before = slam_map.T_cw.clone()
-    adjust_keyframes(slam_map, torch.tensor([1]), torch.tensor([0]), CAMERA, 5, covariances=True)
+    adjust_keyframes(slam_map, torch.tensor([1]), torch.tensor([0]), CAMERA, 5)
     assert torch.equal(slam_map.T_cw, before)
 
 

@@ -22,7 +22,7 @@ from torchslam.geometry import CHI_SQUARE_95, Camera, passes_gate, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
-from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Marginals, Progress, solve_bundle
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Progress, solve_bundle
 from torchslam.optim.bundle.dense_numpy import bundle_adjust_numpy
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
@@ -53,21 +53,18 @@ class BundleWindow:
 
 @dataclass(frozen=True)
 class BundleResult:
-    """The solution of a window, with covariances if requested, and the camera if it was free."""
+    """The solution of a window, and the camera if it was free."""
 
     T_cw: Float[Tensor, "K 4 4"]
     points_w: Float[Tensor, "N 3"]
-    marginals: Marginals | None
     camera: Camera | None = None
 
 
-def adjust_local(
-    slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig, covariances: bool = False
-) -> None:
-    """Run a local bundle adjustment around a keyframe; `covariances`: also update the covariances of the map."""
+def adjust_local(slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig) -> None:
+    """Run a local bundle adjustment around a keyframe."""
     window = select_window(slam_map, keyframe, camera, settings)
     if window is not None:
-        result = solve_local(window.problem, settings.local_iterations, covariances)
+        result = solve_local(window.problem, settings.local_iterations)
         apply_result(slam_map, window, result, camera)
 
 
@@ -86,16 +83,10 @@ def select_window(
     return build_window(slam_map, free, top_rows(shared, settings.max_fixed_keyframes, least=1), camera)
 
 
-def solve_local(problem: BundleProblem, iterations: int, covariances: bool) -> BundleResult:
-    """Solve a local bundle adjustment; fixed poses count as exact. A pure function that any process may call.
-
-    The covariances are those of `solve_bundle` at the solution, so that they do not change it.
-    """
+def solve_local(problem: BundleProblem, iterations: int) -> BundleResult:
+    """Solve a local bundle adjustment; fixed poses count as exact. A pure function that any process may call."""
     T_cw, points_w, _ = bundle_adjust_numpy(problem, HUBER, iterations, LOCAL_TOLERANCE)
-    if not covariances:
-        return BundleResult(T_cw, points_w, None)
-    solved = replace(problem, T_cw=T_cw, points_w=points_w)
-    return BundleResult(T_cw, points_w, solve(solved, iterations=0, covariances=True).marginals)
+    return BundleResult(T_cw, points_w)
 
 
 def adjust_all(
@@ -135,7 +126,6 @@ def adjust_keyframes(
     fixed: Int[Tensor, " R"],
     camera: Camera,
     iterations: int,
-    covariances: bool = False,
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
 ) -> Camera:
@@ -145,7 +135,7 @@ def adjust_keyframes(
     """
     window = build_window(slam_map, free, fixed, camera)
     if window is not None:
-        result = solve(window.problem, iterations, covariances, progress, calibration)
+        result = solve(window.problem, iterations, progress, calibration)
         camera = result.camera or camera
         apply_result(slam_map, window, result, camera)
     return camera
@@ -180,7 +170,6 @@ def build_window(
 def solve(
     problem: BundleProblem,
     iterations: int,
-    covariances: bool = False,
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
 ) -> BundleResult:
@@ -197,9 +186,8 @@ def solve(
             kernel="huber", scale=HUBER, iterations=iterations, backward="detached"
         ),
     )
-    marginals = solution.covariance() if covariances else None
     found = None if calibration is None else solution.camera
-    return BundleResult(solution.T_cw, solution.points_w, marginals, found)
+    return BundleResult(solution.T_cw, solution.points_w, found)
 
 
 def apply_result(slam_map: Map, window: BundleWindow, result: BundleResult, camera: Camera) -> None:
@@ -209,8 +197,6 @@ def apply_result(slam_map: Map, window: BundleWindow, result: BundleResult, came
     """
     slam_map.keyframes["T_cw"][window.keyframes] = result.T_cw
     slam_map.points["positions_w"][window.point_ids] = result.points_w
-    if result.marginals is not None:
-        slam_map.set_covariances(window.keyframes, window.point_ids, result.marginals)
     remove_outliers(slam_map, window.seen, camera)
     slam_map.update_appearance(window.keyframes)
 
@@ -242,14 +228,14 @@ PendingResult = Callable[[], BundleResult]
 
 
 class Solver(Protocol):
-    """Starts a local bundle adjustment (problem, iterations, covariances) and returns its pending result."""
+    """Starts a local bundle adjustment (problem, iterations) and returns its pending result."""
 
-    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult: ...
+    def __call__(self, problem: BundleProblem, iterations: int) -> PendingResult: ...
 
 
-def solve_here(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
+def solve_here(problem: BundleProblem, iterations: int) -> PendingResult:
     """Solve in this process, when the result is requested."""
-    return lambda: solve_local(problem, iterations, covariances)
+    return lambda: solve_local(problem, iterations)
 
 
 class ApplyAt(Enum):
@@ -295,14 +281,8 @@ class AsyncBundleAdjustment:
         solver: solver of the problem; default: in this process
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        settings: BundleAdjustmentConfig,
-        covariances: bool,
-        solver: Solver = solve_here,
-    ) -> None:
-        self.camera, self.settings, self.covariances, self.solver = camera, settings, covariances, solver
+    def __init__(self, camera: Camera, settings: BundleAdjustmentConfig, solver: Solver = solve_here) -> None:
+        self.camera, self.settings, self.solver = camera, settings, solver
         self._request: AdjustmentRequest | None = None
         self._running: RunningAdjustment | None = None
 
@@ -351,7 +331,7 @@ class AsyncBundleAdjustment:
         window = select_window(self._request.slam_map, self._request.keyframe, self.camera, self.settings)
         result = None
         if window is not None:
-            result = self.solver(window.problem, self.settings.local_iterations, self.covariances)
+            result = self.solver(window.problem, self.settings.local_iterations)
         self._running = RunningAdjustment(window, result)
 
     def apply(self, slam_map: Map) -> None:

@@ -150,14 +150,14 @@ class BundleWorker(WorkerPool):
     def __init__(self) -> None:
         super().__init__(1, partial, solve_local)
 
-    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
-        call = self.submit(problem, iterations, covariances)
+    def __call__(self, problem: BundleProblem, iterations: int) -> PendingResult:
+        call = self.submit(problem, iterations)
 
         def answer() -> BundleResult:
             if call is not None:
                 with suppress(WorkerLostError):
                     found: BundleResult = self.result(call)
                     return found
-            return solve_local(problem, iterations, covariances)
+            return solve_local(problem, iterations)
 
         return answer
