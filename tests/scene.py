@@ -12,9 +12,11 @@ import torch
 from torch import Tensor
 
 from tests.map.simulated import estimate_at
-from torchslam.config import Config
+from torchslam.config import BundleAdjustmentConfig, Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
 from torchslam.map.atlas import Submap
+from torchslam.map.map import Map
+from torchslam.mapping.local_bundle import AsyncBundleAdjustment
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures
 
@@ -161,3 +163,10 @@ def assert_same_state(one: dict[str, object], two: dict[str, object]) -> None:
             assert torch.equal(value, two[name]), name
         else:
             assert value == two[name], name
+
+
+def adjust_local(slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig) -> None:
+    """Request a local bundle adjustment around a keyframe, and apply it at once."""
+    adjusting = AsyncBundleAdjustment(camera, settings)
+    adjusting.request(slam_map, keyframe, due=None)
+    adjusting.apply(slam_map)

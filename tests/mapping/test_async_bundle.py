@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from tests.parallel.test_pool import wait_until_ready
-from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
+from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp
 from torchslam.map.map import Map
-from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingResult, adjust_local, solve_here
+from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingSolution, solve_here
 from torchslam.optim import BundleProblem
 from torchslam.parallel.workers import BundleWorker
 
@@ -75,7 +75,7 @@ def test_a_request_is_started_once() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
     begun: list[BundleProblem] = []
 
-    def solver(problem: BundleProblem, iterations: int) -> PendingResult:
+    def solver(problem: BundleProblem, iterations: int) -> PendingSolution:
         begun.append(problem)
         return solve_here(problem, iterations)
 

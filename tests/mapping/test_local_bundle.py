@@ -6,17 +6,18 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.scene import CAMERA, Scene, rows_of, sideways, submap_of_scene
+from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
 from torchslam.config import BundleAdjustmentConfig, load_config
 from torchslam.geometry import se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.local_bundle import (
     HUBER,
     adjust_all,
-    adjust_keyframes,
-    adjust_local,
+    apply_solution,
+    build_window,
     remove_outliers,
     select,
+    solve_local,
 )
 
 SCENE = Scene.of(200)
@@ -89,7 +90,9 @@ def weighted(coarse: float) -> float:
     slam_map.keyframes["scales"][:2], slam_map.keyframes["scales"][2:] = 1.0, coarse
     seen = slam_map.observed_points(torch.arange(4))
     before = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
-    adjust_keyframes(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA, 30)
+    window = build_window(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA)
+    assert window is not None
+    apply_solution(slam_map, window, *solve_local(window.problem, 30), CAMERA)
     after = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
     return float((after - before)[:, 1].median())
 
@@ -167,7 +170,8 @@ def test_an_empty_window_changes_nothing() -> None:
     slam_map = row(sideways(2))
     slam_map.remove_points(slam_map.valid_points())
     before = slam_map.T_cw.clone()
-    adjust_keyframes(slam_map, torch.tensor([1]), torch.tensor([0]), CAMERA, 5)
+    adjust_local(slam_map, 1, CAMERA, bundle())
+    assert adjust_all(slam_map, CAMERA, bundle()) is CAMERA
     assert torch.equal(slam_map.T_cw, before)
 
 

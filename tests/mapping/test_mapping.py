@@ -8,13 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.scene import adjust_local
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.geometry import KeypointNoise, se3_exp, se3_inverse, transform
 from torchslam.map.map import NO_POINT, Map
-from torchslam.mapping.local_bundle import adjust_all, adjust_local
+from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.mapper import Mapper, initial_scale, keyframe_reason
 from torchslam.mapping.new_points import fuse, has_consistent_scale
 from torchslam.system.front_end import Simulated
