@@ -12,8 +12,7 @@ import torch
 from torch import Tensor
 
 from tests.map.simulated import estimate_at
-from torchslam.config import Config
-from torchslam.config.sections import BundleAdjustmentConfig
+from torchslam.config import BundleAdjustmentConfig, Config
 from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
@@ -166,10 +165,8 @@ def assert_same_state(one: dict[str, object], two: dict[str, object]) -> None:
             assert value == two[name], name
 
 
-def adjust_local(
-    slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig, covariances: bool = False
-) -> None:
-    """Request a local adjustment around a keyframe and apply it at once."""
-    adjustment = AsyncBundleAdjustment(camera, settings, covariances)
-    adjustment.request(slam_map, keyframe, due=None)
-    adjustment.apply(slam_map)
+def adjust_local(slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig) -> None:
+    """Request a local bundle adjustment around a keyframe, and apply it at once."""
+    adjusting = AsyncBundleAdjustment(camera, settings)
+    adjusting.request(slam_map, keyframe, due=None)
+    adjusting.apply(slam_map)

@@ -24,7 +24,7 @@ TOLERANCE = {"rtol": 1e-4, "atol": 1e-6}
 
 def gradients(walk: Walk, device: torch.device) -> dict[str, Tensor]:
     """What a run on a device finds, and the gradient of its error."""
-    config = load_config(None, [*NOISY, "measurement.gate=mahalanobis"])
+    config = load_config(None, NOISY)
     run = SLAM(walk.camera.to(device), config).run(walk)
     assert run.trajectory.T_wc.device.type == device.type
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0

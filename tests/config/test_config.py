@@ -16,8 +16,8 @@ from torchslam.config import (
     BundleAdjustmentConfig,
     Config,
     FeaturesConfig,
+    InitializationConfig,
     MatchingConfig,
-    MeasurementConfig,
     TrackingConfig,
     load_config,
     to_toml,
@@ -198,7 +198,6 @@ def test_the_choices_of_settings() -> None:
         "dense.aggregation": ("classical", "learned"),
         "features.kind": ("orb", "opencv-orb", "sift", "simulated", "xfeat", "aliked"),
         "initialization.criterion": ("uncertainty", "parallax"),
-        "measurement.gate": ("chi_square", "mahalanobis"),
         "mapping.triangulation_partners": ("covisible", "last"),
         "matching.matcher": ("descriptors", "lightglue"),
     }
@@ -209,8 +208,8 @@ def test_the_choices_of_settings() -> None:
     [
         (lambda: Config(scale="metric"), "^scale must be one of unit, groundtruth, not 'metric'"),
         (
-            lambda: MeasurementConfig(gate="xyz"),
-            "^measurement.gate must be one of chi_square, mahalanobis, not 'xyz'",
+            lambda: InitializationConfig(criterion="xyz"),
+            "^initialization.criterion must be one of uncertainty, parallax, not 'xyz'",
         ),
         (
             lambda: replace(Config().bundle_adjustment, local_window=1),

@@ -25,7 +25,7 @@ from torchslam.loop_closing.loop_closer import (
     merge_maps,
 )
 from torchslam.loop_closing.loop_detector import LoopCandidate
-from torchslam.loop_closing.relative_sim3 import RelativeSim3, estimate_relative_sim3
+from torchslam.loop_closing.relative_sim3 import RelativeSim3, RelativeSim3Estimator
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.tracking.tracker import Tracker
@@ -44,7 +44,7 @@ def error(submap: Submap) -> float:
 
 
 def loop(submap: Submap) -> LoopCandidate:
-    relation = estimate_relative_sim3(submap.map, END, submap.map, 0, CAMERA, CONFIG)
+    relation = RelativeSim3Estimator(CAMERA, CONFIG).estimate(submap.map, END, submap.map, 0)
     assert relation is not None
     return LoopCandidate(submap, END, submap, 0, relation)
 

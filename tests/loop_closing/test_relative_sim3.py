@@ -14,13 +14,10 @@ from torchslam.geometry import estimate_similarity, se3_inverse, sim3_inverse, t
 from torchslam.geometry.similarity import Similarity
 from torchslam.loop_closing.relative_sim3 import (
     RelativeSim3,
-    estimate_relative_sim3,
-    inlier_matches,
-    match_by_sim3_pose,
+    RelativeSim3Estimator,
     neighborhood,
     scaling_sim3,
     transfer_pose,
-    verify_relative_sim3,
 )
 from torchslam.map.map import Map
 
@@ -28,6 +25,7 @@ SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
 ONE = sideways(4)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
+ESTIMATOR = RelativeSim3Estimator(CAMERA, Config())
 TWO = 100  # first frame of the second map
 
 
@@ -38,7 +36,7 @@ def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
 
 
 def related(map_1: Map, map_2: Map, *overrides: str) -> RelativeSim3 | None:
-    return estimate_relative_sim3(map_1, 2, map_2, 1, CAMERA, load_config(None, overrides))
+    return RelativeSim3Estimator(CAMERA, load_config(None, overrides)).estimate(map_1, 2, map_2, 1)
 
 
 def test_the_similarity_between_two_maps_is_estimated(S_21: Tensor) -> None:
@@ -56,7 +54,7 @@ def test_the_similarity_between_two_maps_is_estimated(S_21: Tensor) -> None:
 
 def test_the_reverse_similarity_is_the_inverse(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
-    relation = estimate_relative_sim3(map_2, 1, map_1, 2, CAMERA, Config())
+    relation = ESTIMATOR.estimate(map_2, 1, map_1, 2)
     assert relation is not None
     torch.testing.assert_close(relation.S_21, sim3_inverse(S_21), atol=1e-6, rtol=0)
 
@@ -90,7 +88,7 @@ def test_sampling_stops_when_enough_matches_would_have_been_found(
 
 def test_a_map_is_related_to_itself_by_the_identity() -> None:
     slam_map = submap_of_scene(SCENE, ONE).map
-    relation = estimate_relative_sim3(slam_map, 3, slam_map, 0, CAMERA, Config())
+    relation = ESTIMATOR.estimate(slam_map, 3, slam_map, 0)
     assert relation is not None
     torch.testing.assert_close(relation.S_21, pose(), atol=1e-6, rtol=0)
 
@@ -165,17 +163,17 @@ def test_a_neighbor_verifies_a_similarity_that_predicts_its_points(S_21: Tensor)
     map_1, map_2 = maps(S_21)
     near = torch.arange(4)
     right = RelativeSim3(S_21, 0, 0, 0)
-    assert verify_relative_sim3(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert ESTIMATOR.verify(right, map_1, 3, map_2, near)
     for wrong in (
         pose(0.5) @ S_21,
         pose(0, 0, 0, 0, 0.1) @ S_21,
         scaling_sim3(torch.tensor(1.3).double()) @ S_21,
     ):
-        assert not verify_relative_sim3(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near, CAMERA, Config())
+        assert not ESTIMATOR.verify(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near)
     thinned(map_2, in_both(map_1, map_2)[:20])
-    assert verify_relative_sim3(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert ESTIMATOR.verify(right, map_1, 3, map_2, near)
     thinned(map_2, in_both(map_1, map_2)[:19])
-    assert not verify_relative_sim3(right, map_1, 3, map_2, near, CAMERA, Config())
+    assert not ESTIMATOR.verify(right, map_1, 3, map_2, near)
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(4.85, True), (4.95, False)])
@@ -184,8 +182,8 @@ def test_points_agree_within_twice_the_noise(S_21: Tensor, offset: float, agrees
     T_12 = moved(ONE[2], S_21)
     keypoints, scales = map_1.keyframes["keypoints"], map_1.keyframes["scales"]
     keypoints[2, :, 0] += offset * scales[2]
-    ids, _ = match_by_sim3_pose(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
-    good, at = inlier_matches(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
+    ids, _ = ESTIMATOR.match(map_2, map_2.valid_points(), T_12, map_1, 2)
+    good, at = ESTIMATOR.match_inliers(map_2, map_2.valid_points(), T_12, map_1, 2)
     assert len(ids) > 100
     assert (len(good) > 100) is agrees
     assert len(good) > 100 or len(good) < 0.1 * len(ids)  # a stray one is near another's place
@@ -198,7 +196,7 @@ def test_projected_points_are_searched_within_eight_pixels(S_21: Tensor) -> None
         map_1, map_2 = maps(S_21)
         map_1.keyframes["keypoints"][2, :, 0] += offset * map_1.keyframes["scales"][2]
         T_12 = moved(ONE[2], S_21)
-        ids, _ = match_by_sim3_pose(map_2, map_2.valid_points(), T_12, map_1, 2, CAMERA, Config())
+        ids, _ = ESTIMATOR.match(map_2, map_2.valid_points(), T_12, map_1, 2)
         assert (len(ids) > 100) is found
 
 

@@ -15,7 +15,7 @@ from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_o
 from torchslam.config import load_config
 from torchslam.geometry import se3_exp
 from torchslam.map.map import Map
-from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingResult, solve_here
+from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingSolution, solve_here
 from torchslam.optim import BundleProblem
 from torchslam.parallel.workers import BundleWorker
 
@@ -50,12 +50,12 @@ def assert_same(mine: Map, other: Map) -> None:
 def adjusted(seed: int = 0) -> Map:
     """The same map, adjusted at once."""
     slam_map = perturbed_map(seed)
-    adjust_local(slam_map, 4, CAMERA, SETTINGS, covariances=True)
+    adjust_local(slam_map, 4, CAMERA, SETTINGS)
     return slam_map
 
 
 def test_the_map_does_not_change_before_the_result_is_applied() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
     assert not adjusting.is_pending
     assert adjusting.due is None
     assert not adjusting.is_due(100)
@@ -72,12 +72,12 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
 
 
 def test_a_request_is_started_once() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
     started: list[BundleProblem] = []
 
-    def solver(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
+    def solver(problem: BundleProblem, iterations: int) -> PendingSolution:
         started.append(problem)
-        return solve_here(problem, iterations, covariances)
+        return solve_here(problem, iterations)
 
     adjusting.solver = solver
     adjusting.start()  # nothing was requested
@@ -103,7 +103,7 @@ def test_a_request_is_started_once() -> None:
 
 
 def test_a_request_can_be_hurried_or_dropped() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
     adjusting.set_deadline(3)
     assert not adjusting.is_pending
     adjusting.request(slam_map, 4, due=12)
@@ -115,7 +115,7 @@ def test_a_request_can_be_hurried_or_dropped() -> None:
 
 
 def test_a_request_may_be_due_before_the_next_frame() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
     assert not adjusting.is_due_before_next_frame
     adjusting.request(slam_map, 4, due=12)
     assert not adjusting.is_due_before_next_frame
@@ -132,7 +132,7 @@ def test_a_request_may_be_due_before_the_next_frame() -> None:
 
 
 def test_an_empty_request_is_due_as_well() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
     slam_map.keyframes["point_ids"][:] = -1
     adjusting.request(slam_map, 4, due=12)
     assert adjusting.is_due(12)
@@ -154,7 +154,7 @@ def test_another_process_computes_the_same_result(
     worker: BundleWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.parallel.workers.solve_local", None)  # here nothing is solved
-    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True)
+    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS)
     adjusting.solver = worker
     for seed in (0, 1):
         expected = adjusted(seed)
@@ -170,26 +170,13 @@ def test_another_process_computes_the_same_result(
     assert_same(slam_map, adjusted(3))
 
 
-def test_a_worker_computes_no_covariances_unless_requested(worker: BundleWorker) -> None:
-    adjusting, slam_map, expected = (
-        AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False),
-        perturbed_map(),
-        perturbed_map(),
-    )
-    adjusting.solver = worker
-    adjusting.request(slam_map, 4, due=12)
-    adjusting.apply(slam_map)
-    adjust_local(expected, 4, CAMERA, SETTINGS)
-    assert_same(slam_map, expected)
-
-
 def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
     slam_map = perturbed_map()
-    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=False)
+    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS)
 
-    def wrong(problem: BundleProblem, iterations: int, covariances: bool):  # type: ignore[no-untyped-def]
+    def wrong(problem: BundleProblem, iterations: int):  # type: ignore[no-untyped-def]
         problem.frame_index[0] = 99
-        return worker(problem, iterations, covariances)
+        return worker(problem, iterations)
 
     adjusting.solver = wrong
     adjusting.request(slam_map, 4, due=12)
@@ -199,7 +186,7 @@ def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
 
 
 def test_the_run_continues_without_a_killed_worker() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
     with BundleWorker() as solver:
         wait_until_ready(solver)
         adjusting.solver = solver
@@ -218,7 +205,7 @@ def test_the_run_continues_without_a_killed_worker() -> None:
 def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     with BundleWorker() as solver:
         monkeypatch.setattr(solver, "result", None)
-        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS, covariances=True), perturbed_map()
+        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)

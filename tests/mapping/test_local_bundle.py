@@ -8,14 +8,16 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
 from torchslam.config import BundleAdjustmentConfig, load_config
-from torchslam.geometry import Camera, se3_exp, transform
+from torchslam.geometry import se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.local_bundle import (
     HUBER,
     adjust_all,
-    adjust_keyframes,
+    apply_solution,
+    build_window,
     remove_outliers,
     select,
+    solve_local,
 )
 
 SCENE = Scene.of(200)
@@ -88,7 +90,9 @@ def weighted(coarse: float) -> float:
     slam_map.keyframes["scales"][:2], slam_map.keyframes["scales"][2:] = 1.0, coarse
     seen = slam_map.observed_points(torch.arange(4))
     before = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
-    adjust_keyframes(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA, 30, covariances=False)
+    window = build_window(slam_map, torch.tensor([2]), torch.tensor([0, 1, 3]), CAMERA)
+    assert window is not None
+    apply_solution(slam_map, window, *solve_local(window.problem, 30), CAMERA)
     after = CAMERA.project(transform(T_cw[0], slam_map.positions_w[seen]))[0]
     return float((after - before)[:, 1].median())
 
@@ -162,41 +166,12 @@ def test_global_adjustment_fixes_the_first_keyframe() -> None:
     assert (slam_map.keyframes["covariances"] == 0).all()
 
 
-def test_covariances_are_stored_on_request() -> None:
-    for requested in (False, True):
-        slam_map = submap_of_scene(SCENE, sideways(4), noise=0.5).map
-        adjust_local(slam_map, 3, CAMERA, bundle(local_window=2), covariances=requested)
-        known = slam_map.keyframes["covariances"].diagonal(dim1=-2, dim2=-1).sum(-1) > 0
-        assert torch.nonzero(known)[:, 0].tolist() == ([2, 3] if requested else [])
-        seen = slam_map.observed_points(torch.tensor([2, 3]))
-        seen = seen[slam_map.points["times_observed"][seen] >= 2]
-        trace = slam_map.points["covariances_w"][seen].diagonal(dim1=-2, dim2=-1).sum(-1)
-        assert bool((trace > 0).all()) is requested
-
-
-DISTORTED = Camera(
-    "radial_tangential", torch.cat([CAMERA.params, CAMERA.params.new_tensor([0.02, 0, 0, 0, 0])]), CAMERA.size
-)
-
-
-@pytest.mark.parametrize("camera", [CAMERA, DISTORTED], ids=["pinhole", "distorted"])
-def test_covariances_do_not_change_the_adjustment(camera: Camera) -> None:
-    """So that `measurement.gate = "mahalanobis"`, which needs them, has no other solver and no other residual."""
-    plain, certain = (submap_of_scene(SCENE, sideways(4), noise=0.5).map for _ in range(2))
-    adjust_local(plain, 3, camera, bundle(local_window=2))
-    adjust_local(certain, 3, camera, bundle(local_window=2), covariances=True)
-    for name in ("T_cw", "point_ids"):
-        assert torch.equal(plain.keyframes[name], certain.keyframes[name])
-    for name in ("positions_w", "is_valid"):
-        assert torch.equal(plain.points[name], certain.points[name])
-    assert (certain.keyframes["covariances"][2:] != 0).any()
-
-
 def test_an_empty_window_changes_nothing() -> None:
     slam_map = row(sideways(2))
     slam_map.remove_points(slam_map.valid_points())
     before = slam_map.T_cw.clone()
-    adjust_keyframes(slam_map, torch.tensor([1]), torch.tensor([0]), CAMERA, 5, covariances=True)
+    adjust_local(slam_map, 1, CAMERA, bundle())
+    assert adjust_all(slam_map, CAMERA, bundle()) is CAMERA
     assert torch.equal(slam_map.T_cw, before)
 
 

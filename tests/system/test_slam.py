@@ -28,7 +28,7 @@ from torchslam import (
 from torchslam.errors import ConfigError, FrameError
 from torchslam.evaluation import ate, ate_apart
 from torchslam.features import SimulatedFeatures
-from torchslam.geometry import KeypointNoise, se3_inverse, se3_log, transform
+from torchslam.geometry import se3_inverse, se3_log, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import AsyncBundleAdjustment
@@ -36,7 +36,6 @@ from torchslam.mapping.mapper import MapInitializer
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.system.front_end import Simulated
 from torchslam.system.modes import Mode
-from torchslam.tracking.localizer import Localizer
 from torchslam.types import FrameFeatures, Reason, TwoViewMap
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
@@ -429,27 +428,6 @@ def true_points(slam: SLAM, walk: Walk) -> tuple[torch.Tensor, torch.Tensor]:
 
 def normalized(errors: torch.Tensor, covariances: torch.Tensor) -> torch.Tensor:
     return (errors * torch.linalg.solve(covariances, errors)).sum(-1)
-
-
-def test_the_mahalanobis_gate_keeps_uncertain_points() -> None:
-    """An error that is too large for the pixel alone is accepted where the point is uncertain by as much."""
-    walk = Walk(arc(40)[:16])
-    run = run_walk(
-        walk, "simulated.noise_px=0.5", "simulated.outlier_ratio=0.1", "measurement.gate=mahalanobis"
-    )
-    assert len(run.trajectory) == 16
-    assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01 * 3.0
-    localizer = Localizer(run.camera, run.config)
-    ids = run.map.observed_points(torch.tensor([1]))
-    T_cw, noise = run.map.T_cw[1], KeypointNoise.of(torch.ones(len(ids), dtype=torch.float64), None)
-    pixels, _ = run.camera.project(transform(T_cw, run.map.positions_w[ids]))
-    assert localizer.agrees(run.map, T_cw, ids, pixels, noise).all()
-    run.map.points["covariances_w"][ids] = 0
-    assert not localizer.agrees(run.map, T_cw, ids, pixels + 4.0, noise).any()
-    depth = transform(T_cw, run.map.positions_w[ids])[:, 2]
-    spread = (10 * depth / run.camera.focal) ** 2  # ten pixels
-    run.map.points["covariances_w"][ids] = spread[:, None, None] * torch.eye(3, dtype=torch.float64)
-    assert localizer.agrees(run.map, T_cw, ids, pixels + 4.0, noise).all()
 
 
 # --- adjustments that wait -----------------------------------------------------------------------------------

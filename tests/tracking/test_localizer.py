@@ -74,44 +74,25 @@ def test_a_pose_elsewhere_in_the_map_uses_the_local_map_there() -> None:
     assert estimate.inliers > 60
 
 
-@pytest.mark.parametrize(("offset", "agrees"), [(2.44, True), (2.46, False)])
+@pytest.mark.parametrize(("offset", "agrees"), [(2.40, True), (2.50, False)])
 @pytest.mark.parametrize("scale", [0.5, 3.0])
+@pytest.mark.parametrize("width", [1, 2])
 def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
-    offset: float, agrees: bool, scale: float
+    offset: float, agrees: bool, scale: float, width: int
 ) -> None:
     here = submap()
     seen = here.map.observed_points(torch.tensor([0]))
     T_cw = here.map.T_cw[0]
     pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
-    off = offset * scale * torch.tensor([0.6, -0.8], dtype=torch.float64)
-    scales = torch.full((len(seen),), scale, dtype=torch.float64)
-    agreeing = localizer().agrees(here.map, T_cw, seen, pixels + off, KeypointNoise.of(scales, None))
-    assert agreeing.all() if agrees else not agreeing.any()
-    wide = localizer("measurement.max_chi_square=24")
-    assert wide.agrees(
-        here.map, T_cw, seen, pixels + 2 * 2.44 * off / offset, KeypointNoise.of(scales, None)
-    ).all()
-
-
-@pytest.mark.parametrize(("offset", "agrees"), [(0.99, True), (1.01, False)])
-def test_the_gate_by_uncertainty_is_as_wide_as_pixel_and_point_together(offset: float, agrees: bool) -> None:
-    here = submap()
-    seen = here.map.observed_points(torch.tensor([0]))
-    roll = pose(0, 0, 0, 0, 0, math.pi / 2)  # the uncertain axis of the map lies along y of the image
-    T_cw = roll @ here.map.T_cw[0]
-    points_c = transform(T_cw, here.map.positions_w[seen])
-    pixels, depth = CAMERA.project(points_c)[0], points_c[:, 2]
-    deviation = 3.0 * depth / 200.0  # three pixels
-    here.map.points["covariances_w"][seen] = torch.diag_embed(
-        torch.stack([deviation**2, 0 * depth, 0 * depth], -1)
-    )
-    gate = localizer("measurement.gate=mahalanobis")
-    scales = torch.full((len(seen),), 2.0, dtype=torch.float64)
-    for axis, sigma in ((0, 2.0), (1, math.hypot(2.0, 3.0))):
-        off = torch.zeros(2, dtype=torch.float64)
-        off[axis] = offset * sigma * math.sqrt(5.991)
-        agreeing = gate.agrees(here.map, T_cw, seen, pixels + off, KeypointNoise.of(scales, None))
-        assert agreeing.all() if agrees else not agreeing.any()
+    off = torch.zeros(len(seen), dtype=torch.float64)
+    off[::40] = width * offset * scale
+    off[::80] *= -1
+    shifted = pixels + off[:, None] * torch.tensor([0.6, -0.8], dtype=torch.float64)
+    noise = KeypointNoise.of(torch.full((len(seen),), scale, dtype=torch.float64), None)
+    by = localizer(f"measurement.max_chi_square={5.991 * width**2}")
+    undistorted = UndistortedKeypoints.of(shifted, CAMERA)
+    _, _, inliers = by._refine(here.map, T_cw, seen, shifted, undistorted, noise)
+    assert torch.equal(inliers, (off == 0) | agrees)
 
 
 def test_points_behind_the_camera_are_no_inliers() -> None:
@@ -119,12 +100,10 @@ def test_points_behind_the_camera_are_no_inliers() -> None:
     seen = here.map.observed_points(torch.tensor([0]))
     T_cw = pose(0, 0, 0, 0, math.pi)
     middle = torch.tensor([159.5, 119.5], dtype=torch.float64).expand(len(seen), 2)
-    here.map.points["covariances_w"][seen] = 1e6 * torch.eye(3, dtype=torch.float64)
-    for gate in ("chi_square", "mahalanobis"):
-        by = localizer(f"measurement.gate={gate}")
-        assert not by.agrees(
-            here.map, T_cw, seen, middle, KeypointNoise.of(torch.ones(len(seen), dtype=torch.float64), None)
-        ).any()
+    noise = KeypointNoise.of(torch.ones(len(seen), dtype=torch.float64), None)
+    undistorted = UndistortedKeypoints.of(middle, CAMERA)
+    _, _, inliers = localizer()._refine(here.map, T_cw, seen, middle, undistorted, noise)
+    assert not inliers.any()
 
 
 def test_a_keypoint_is_weighted_by_its_inverse_variance() -> None:

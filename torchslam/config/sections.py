@@ -137,13 +137,6 @@ class MatchingConfig(Settings, section="matching"):
 class MeasurementConfig(Settings, section="measurement"):
     """Inlier test of tracking, mapping and bundle adjustment: distance of a keypoint from its prediction."""
 
-    gate: str = setting(
-        "chi_square",
-        "Unit of the errors; chi_square: the keypoint noise; "
-        "mahalanobis: in tracking, the keypoint noise combined with the uncertainty of the point, which the local "
-        "bundle adjustment then computes.",
-        choices=("chi_square", "mahalanobis"),
-    )
     max_chi_square: float = setting(
         5.991,
         "Maximum squared error in units of the noise; the default is the 95 % quantile for two degrees of freedom.",

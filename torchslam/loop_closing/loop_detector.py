@@ -15,9 +15,8 @@ from torchslam.geometry.transforms import rotation_angle
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.relative_sim3 import (
     RelativeSim3,
-    estimate_relative_sim3,
+    RelativeSim3Estimator,
     neighborhood,
-    verify_relative_sim3,
 )
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
@@ -92,11 +91,10 @@ class LoopDetector:
         keyframe_database: KeyframeDatabase,
         matcher: Matcher | None = None,
     ) -> None:
-        self.camera = camera
         self.config = config
         self.atlas = atlas
         self.keyframe_database = keyframe_database
-        self.matcher = matcher
+        self.estimator = RelativeSim3Estimator(camera, config, matcher)
 
     def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
         """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
@@ -129,9 +127,7 @@ class LoopDetector:
         self, submap: Submap, keyframe: int, other: Submap, matched_keyframe: int
     ) -> RelativeSim3 | None:
         """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
-        relation = estimate_relative_sim3(
-            submap.map, keyframe, other.map, matched_keyframe, self.camera, self.config, self.matcher
-        )
+        relation = self.estimator.estimate(submap.map, keyframe, other.map, matched_keyframe)
         if relation is None:
             return None
         if submap is other and not is_plausible_drift(
@@ -141,8 +137,7 @@ class LoopDetector:
         near = neighborhood(other.map, matched_keyframe)
         covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
         sure = sum(
-            verify_relative_sim3(relation, submap.map, one, other.map, near, self.camera, self.config)
-            for one in covisible.tolist()
+            self.estimator.verify(relation, submap.map, one, other.map, near) for one in covisible.tolist()
         )
         return relation if sure >= self.config.loop_closing.min_confirming_keyframes else None
 

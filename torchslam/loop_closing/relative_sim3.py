@@ -63,70 +63,147 @@ class RelativeSim3:
     shared_points: int
 
 
-def estimate_relative_sim3(
-    map_1: Map,
-    keyframe_1: int,
-    map_2: Map,
-    keyframe_2: int,
-    camera: Camera,
-    config: Config,
-    matcher: Matcher | None = None,
-) -> RelativeSim3 | None:
-    """Estimate the Sim(3) between two maps from a keyframe of each; None if it is not certain.
+class RelativeSim3Estimator:
+    """Estimates and verifies the Sim(3) between two maps, which may be the same: then it is the drift of a loop."""
 
-    Both may be the same map: then the Sim(3) is the drift between the two keyframes.
+    def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
+        """Create the estimator; `matcher`: of two keyframes, by descriptors if None."""
+        self.camera, self.config = camera, config
+        self.guided_matcher = DescriptorMatcher(config.matching)
+        self.matcher = matcher or self.guided_matcher
 
-    Args:
-        map_1: The first map.
-        keyframe_1: Row of its keyframe.
-        map_2: The second map.
-        keyframe_2: Row of its keyframe.
-        camera: Of both keyframes.
-        config: Thresholds, and the descriptor matcher of guided matching.
-        matcher: Of the two keyframes; by descriptors if None.
-    """
-    matcher = matcher or DescriptorMatcher(config.matching)
-    T_12 = _first_guess(map_1, keyframe_1, map_2, keyframe_2, camera, config, matcher)
-    if T_12 is None:
-        return None
-    settings = config.loop_closing
-    points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
-    ids, keypoints = match_by_sim3_pose(map_2, points_2, T_12, map_1, keyframe_1, camera, config)
-    if len(ids) < settings.min_matches:
-        return None
-    T_12, agrees = _refined(map_2, ids, T_12, map_1, keyframe_1, keypoints, camera)
-    ids, keypoints = ids[agrees], keypoints[agrees]
-    own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
-    is_shared = own >= 0
-    shared = int(is_shared.sum())
-    if len(ids) < settings.min_matches or shared < settings.min_sim3_points:
-        return None
-    # One pose has no scale, but the depths of points that both maps have do.
-    T_11 = map_1.T_cw[keyframe_1]
-    depth_1 = transform(T_11, map_1.positions_w[own[is_shared]])[:, 2]
-    depth_2 = transform(T_12, map_2.positions_w[ids[is_shared]])[:, 2]
-    S_21 = se3_inverse(T_12) @ scaling_sim3((depth_2 / depth_1).median()) @ T_11
-    points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
-    T_21 = transfer_pose(map_2.T_cw[keyframe_2], S_21)
-    back, _ = inlier_matches(map_1, points_1, T_21, map_2, keyframe_2, camera, config)
-    if len(back) < settings.min_matches // 2:
-        return None
-    return RelativeSim3(S_21, len(ids), len(back), shared)
+    def estimate(self, map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int) -> RelativeSim3 | None:
+        """Estimate the Sim(3) between two maps from a keyframe of each; None if it is not certain."""
+        T_12 = self._first_guess(map_1, keyframe_1, map_2, keyframe_2)
+        if T_12 is None:
+            return None
+        settings = self.config.loop_closing
+        points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
+        ids, keypoints = self.match(map_2, points_2, T_12, map_1, keyframe_1)
+        if len(ids) < settings.min_matches:
+            return None
+        T_12, agrees = self._refined(map_2, ids, T_12, map_1, keyframe_1, keypoints)
+        ids, keypoints = ids[agrees], keypoints[agrees]
+        own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
+        is_shared = own >= 0
+        shared = int(is_shared.sum())
+        if len(ids) < settings.min_matches or shared < settings.min_sim3_points:
+            return None
+        # One pose has no scale, but the depths of points that both maps have do.
+        T_11 = map_1.T_cw[keyframe_1]
+        depth_1 = transform(T_11, map_1.positions_w[own[is_shared]])[:, 2]
+        depth_2 = transform(T_12, map_2.positions_w[ids[is_shared]])[:, 2]
+        S_21 = se3_inverse(T_12) @ scaling_sim3((depth_2 / depth_1).median()) @ T_11
+        points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
+        T_21 = transfer_pose(map_2.T_cw[keyframe_2], S_21)
+        back, _ = self.match_inliers(map_1, points_1, T_21, map_2, keyframe_2)
+        if len(back) < settings.min_matches // 2:
+            return None
+        return RelativeSim3(S_21, len(ids), len(back), shared)
 
+    def verify(
+        self, relation: RelativeSim3, map_1: Map, other: int, map_2: Map, near_2: Int[Tensor, " K"]
+    ) -> bool:
+        """Whether another keyframe of map 1 observes points of keyframes of map 2 where the Sim(3) predicts them."""
+        T_o2 = transfer_pose(map_1.T_cw[other], sim3_inverse(relation.S_21))
+        ids, _ = self.match_inliers(map_2, map_2.observed_points(near_2), T_o2, map_1, other)
+        return len(ids) >= self.config.loop_closing.min_matches // 2
 
-def verify_relative_sim3(
-    relation: RelativeSim3,
-    map_1: Map,
-    other: int,
-    map_2: Map,
-    near_2: Int[Tensor, " K"],
-    camera: Camera,
-    settings: Config,
-) -> bool:
-    """Whether another keyframe of map 1 observes the points of keyframes of map 2 where the Sim(3) predicts them."""
-    T_o2 = transfer_pose(map_1.T_cw[other], sim3_inverse(relation.S_21))
-    ids, _ = inlier_matches(map_2, map_2.observed_points(near_2), T_o2, map_1, other, camera, settings)
-    return len(ids) >= settings.loop_closing.min_matches // 2
+    def match(
+        self,
+        slam_map: Map,
+        point_ids: Int[Tensor, " N"],
+        T_cw: Float[Tensor, "4 4"],
+        other: Map,
+        keyframe: int,
+    ) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
+        """Match points of a map to the keypoints of another map's keyframe, whose pose in this map is T_cw."""
+        view = other.frame_features(keyframe)
+        angle = self.config.tracking.max_view_angle_deg
+        near = project_points(slam_map, point_ids, T_cw, self.camera, angle, view.scale_range)
+        pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, self.guided_matcher)
+        return pairs.first, pairs.second
+
+    def match_inliers(
+        self,
+        slam_map: Map,
+        point_ids: Int[Tensor, " N"],
+        T_cw: Float[Tensor, "4 4"],
+        other: Map,
+        keyframe: int,
+    ) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
+        """Return the matches of `match` that pass a gate widened for the noise of the Sim(3)."""
+        ids, keypoints = self.match(slam_map, point_ids, T_cw, other, keyframe)
+        view = other.frame_features(keyframe)
+        points_c = transform(T_cw, slam_map.positions_w[ids])
+        errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], self.camera)
+        good = passes_gate(errors, _GATE_WIDENING**2 * self.config.measurement.max_chi_square)
+        return ids[good], keypoints[good]
+
+    def _first_guess(
+        self, map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int
+    ) -> Float[Tensor, "4 4"] | None:
+        """The pose of keyframe 1 in map 2, from points that both keyframes observe; None if none was found."""
+        view_1, view_2 = map_1.frame_features(keyframe_1), map_2.frame_features(keyframe_2)
+        points_1 = map_1.keyframes["point_ids"][keyframe_1]
+        points_2 = map_2.keyframes["point_ids"][keyframe_2]
+        pairs = run_matcher(
+            self.matcher,
+            replace(view_1, mask=view_1.mask & (points_1 >= 0)),
+            replace(view_2, mask=view_2.mask & (points_2 >= 0)),
+        )
+        rows_1, rows_2 = pairs.first, pairs.second
+        if len(rows_1) < _NEEDED:
+            return None
+        T_1, T_2 = map_1.T_cw[keyframe_1], map_2.T_cw[keyframe_2]
+        # With this many samples, a similarity with at least _NEEDED inliers is found if there is one.
+        samples = samples_needed(
+            torch.tensor([_NEEDED], device="cpu"), torch.tensor([len(rows_1)], device="cpu"), 3, _CONFIDENCE
+        )
+        found = estimate_similarity(
+            transform(T_1, map_1.positions_w[points_1[rows_1]])[None],
+            transform(T_2, map_2.positions_w[points_2[rows_2]])[None],
+            view_1.keypoints[rows_1][None],
+            view_2.keypoints[rows_2][None],
+            camera_1=self.camera,
+            camera_2=self.camera,
+            sigmas_1=view_1.noise[rows_1].gate_sigma[None],
+            sigmas_2=view_2.noise[rows_2].gate_sigma[None],
+            seed=self.config.seed,
+            confidence=_CONFIDENCE,
+            max_samples=min(_MOST_SAMPLES, math.ceil(float(samples))),
+        )
+        if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
+            return None
+        return transfer_pose(
+            torch.eye(4, dtype=T_1.dtype, device=T_1.device), sim3_inverse(found.S_21[0]) @ T_2
+        )
+
+    def _refined(
+        self,
+        slam_map: Map,
+        ids: Int[Tensor, " M"],
+        T_cw: Float[Tensor, "4 4"],
+        other: Map,
+        keyframe: int,
+        keypoints: Int[Tensor, " M"],
+    ) -> tuple[Float[Tensor, "4 4"], Bool[Tensor, " M"]]:
+        """The refined pose of another map's keyframe in this map, and which matches are inliers."""
+        view, points_w = other.frame_features(keyframe), slam_map.positions_w[ids]
+        pixels, noise = view.keypoints[keypoints], view.noise[keypoints]
+        refined = solve_pose(
+            points_w[None],
+            pixels[None],
+            T_cw=T_cw[None],
+            camera=self.camera,
+            weights=noise.weights[None],
+            options=POSE_OPTIONS.replace(
+                kernel="cauchy", scale=_KERNEL_SCALE, iterations=_ITERATIONS, backward="detached"
+            ),
+        ).T_cw[0]
+        return refined, passes_gate(
+            noise.squared_reprojection(transform(refined, points_w), pixels, self.camera)
+        )
 
 
 def neighborhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Int[Tensor, " R"]:
@@ -149,107 +226,3 @@ def transfer_pose(T_cw: Float[Tensor, "4 4"], S_wv: Float[Tensor, "4 4"]) -> Flo
     S_cv = T_cw @ S_wv
     scale = sim3_scale(S_cv)
     return rigid(S_cv[:3, :3] / scale, S_cv[:3, 3] / scale)
-
-
-def match_by_sim3_pose(
-    slam_map: Map,
-    point_ids: Int[Tensor, " N"],
-    T_cw: Float[Tensor, "4 4"],
-    other: Map,
-    keyframe: int,
-    camera: Camera,
-    config: Config,
-) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
-    """Match points of a map to the keypoints of another map's keyframe, whose pose in this map is T_cw."""
-    view = other.frame_features(keyframe)
-    angle = config.tracking.max_view_angle_deg
-    near = project_points(slam_map, point_ids, T_cw, camera, angle, view.scale_range)
-    pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, DescriptorMatcher(config.matching))
-    return pairs.first, pairs.second
-
-
-def inlier_matches(
-    slam_map: Map,
-    point_ids: Int[Tensor, " N"],
-    T_cw: Float[Tensor, "4 4"],
-    other: Map,
-    keyframe: int,
-    camera: Camera,
-    config: Config,
-) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
-    """Return the matches of `match_by_sim3_pose` that pass a gate widened for the noise of the Sim(3)."""
-    ids, keypoints = match_by_sim3_pose(slam_map, point_ids, T_cw, other, keyframe, camera, config)
-    view = other.frame_features(keyframe)
-    points_c = transform(T_cw, slam_map.positions_w[ids])
-    errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], camera)
-    good = passes_gate(errors, _GATE_WIDENING**2 * config.measurement.max_chi_square)
-    return ids[good], keypoints[good]
-
-
-def _first_guess(
-    map_1: Map,
-    keyframe_1: int,
-    map_2: Map,
-    keyframe_2: int,
-    camera: Camera,
-    config: Config,
-    matcher: Matcher,
-) -> Float[Tensor, "4 4"] | None:
-    """The pose of keyframe 1 in map 2, from points that both keyframes observe; None if none was found."""
-    view_1, view_2 = map_1.frame_features(keyframe_1), map_2.frame_features(keyframe_2)
-    points_1 = map_1.keyframes["point_ids"][keyframe_1]
-    points_2 = map_2.keyframes["point_ids"][keyframe_2]
-    pairs = run_matcher(
-        matcher,
-        replace(view_1, mask=view_1.mask & (points_1 >= 0)),
-        replace(view_2, mask=view_2.mask & (points_2 >= 0)),
-    )
-    rows_1, rows_2 = pairs.first, pairs.second
-    if len(rows_1) < _NEEDED:
-        return None
-    T_1, T_2 = map_1.T_cw[keyframe_1], map_2.T_cw[keyframe_2]
-    # With this many samples, a similarity with at least _NEEDED inliers is found if there is one.
-    samples = samples_needed(
-        torch.tensor([_NEEDED], device="cpu"), torch.tensor([len(rows_1)], device="cpu"), 3, _CONFIDENCE
-    )
-    found = estimate_similarity(
-        transform(T_1, map_1.positions_w[points_1[rows_1]])[None],
-        transform(T_2, map_2.positions_w[points_2[rows_2]])[None],
-        view_1.keypoints[rows_1][None],
-        view_2.keypoints[rows_2][None],
-        camera_1=camera,
-        camera_2=camera,
-        sigmas_1=view_1.noise[rows_1].gate_sigma[None],
-        sigmas_2=view_2.noise[rows_2].gate_sigma[None],
-        seed=config.seed,
-        confidence=_CONFIDENCE,
-        max_samples=min(_MOST_SAMPLES, math.ceil(float(samples))),
-    )
-    if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
-        return None
-    return transfer_pose(torch.eye(4, dtype=T_1.dtype, device=T_1.device), sim3_inverse(found.S_21[0]) @ T_2)
-
-
-def _refined(
-    slam_map: Map,
-    ids: Int[Tensor, " M"],
-    T_cw: Float[Tensor, "4 4"],
-    other: Map,
-    keyframe: int,
-    keypoints: Int[Tensor, " M"],
-    camera: Camera,
-) -> tuple[Float[Tensor, "4 4"], Bool[Tensor, " M"]]:
-    """The refined pose of another map's keyframe in this map, and which matches are inliers."""
-    view, points_w = other.frame_features(keyframe), slam_map.positions_w[ids]
-    pixels, noise = view.keypoints[keypoints], view.noise[keypoints]
-    refined = solve_pose(
-        points_w[None],
-        pixels[None],
-        T_cw=T_cw[None],
-        camera=camera,
-        weights=noise.weights[None],
-        options=POSE_OPTIONS.replace(
-            kernel="cauchy", scale=_KERNEL_SCALE, iterations=_ITERATIONS, backward="detached"
-        ),
-    ).T_cw[0]
-    return refined, passes_gate(noise.squared_reprojection(transform(refined, points_w), pixels, camera))

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import Enum
-from typing import Protocol
 
 import torch
 from jaxtyping import Float, Int
@@ -22,7 +21,7 @@ from torchslam.geometry import CHI_SQUARE_95, Camera, passes_gate, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
-from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Marginals, Progress, solve_bundle
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Progress, solve_bundle
 from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
@@ -51,14 +50,12 @@ class BundleWindow:
     problem: BundleProblem
 
 
-@dataclass(frozen=True)
-class BundleResult:
-    """The solution of a window, with covariances if requested, and the camera if it was free."""
-
-    T_cw: Float[Tensor, "K 4 4"]
-    points_w: Float[Tensor, "N 3"]
-    marginals: Marginals | None
-    camera: Camera | None = None
+Solution = tuple[Float[Tensor, "K 4 4"], Float[Tensor, "N 3"]]
+"""Poses and points of a solved window."""
+PendingSolution = Callable[[], Solution]
+"""Waits for the solution of a started adjustment."""
+Solver = Callable[[BundleProblem, int], PendingSolution]
+"""Starts a local bundle adjustment, given its problem and the number of iterations."""
 
 
 def select_window(
@@ -76,16 +73,15 @@ def select_window(
     return build_window(slam_map, free, top_rows(shared, settings.max_fixed_keyframes, least=1), camera)
 
 
-def solve_local(problem: BundleProblem, iterations: int, covariances: bool) -> BundleResult:
-    """Solve a local bundle adjustment; fixed poses count as exact. A pure function that any process may call.
-
-    The covariances are those of `solve_bundle` at the solution, so that they do not change it.
-    """
+def solve_local(problem: BundleProblem, iterations: int) -> Solution:
+    """Solve a local bundle adjustment; fixed poses count as exact. A pure function that any process may call."""
     T_cw, points_w, _ = solve_bundle_numpy(problem, HUBER, iterations, LOCAL_TOLERANCE)
-    if not covariances:
-        return BundleResult(T_cw, points_w, None)
-    solved = replace(problem, T_cw=T_cw, points_w=points_w)
-    return BundleResult(T_cw, points_w, solve(solved, iterations=0, covariances=True).marginals)
+    return T_cw, points_w
+
+
+def solve_here(problem: BundleProblem, iterations: int) -> PendingSolution:
+    """Solve in this process, when the solution is requested."""
+    return lambda: solve_local(problem, iterations)
 
 
 def adjust_all(
@@ -108,36 +104,24 @@ def adjust_all(
         The camera of the adjusted map.
     """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
-    return adjust_keyframes(
-        slam_map,
-        everyone[1:],
-        everyone[:1],
-        camera,
-        settings.global_iterations,
+    window = build_window(slam_map, everyone[1:], everyone[:1], camera)
+    if window is None:
+        return camera
+    problem = window.problem
+    free: bool | Tensor = False
+    if calibration is not None:
+        problem, free = replace(problem, camera_prior=camera_prior(calibration)), calibration.directions
+    solution = solve_bundle(
+        problem,
+        free_camera=free,
         progress=progress,
-        calibration=calibration,
+        check=False,
+        options=BUNDLE_OPTIONS.replace(
+            kernel="huber", scale=HUBER, iterations=settings.global_iterations, backward="detached"
+        ),
     )
-
-
-def adjust_keyframes(
-    slam_map: Map,
-    free: Int[Tensor, " K"],
-    fixed: Int[Tensor, " R"],
-    camera: Camera,
-    iterations: int,
-    covariances: bool = False,
-    progress: Progress | None = None,
-    calibration: CameraMeasurement | None = None,
-) -> Camera:
-    """Minimize the reprojection error over the free keyframes and their points, then remove outliers.
-
-    With a calibration the camera is free as well; returns it.
-    """
-    window = build_window(slam_map, free, fixed, camera)
-    if window is not None:
-        result = solve(window.problem, iterations, covariances, progress, calibration)
-        camera = result.camera or camera
-        apply_result(slam_map, window, result, camera)
+    camera = camera if calibration is None else solution.camera
+    apply_solution(slam_map, window, solution.T_cw, solution.points_w, camera)
     return camera
 
 
@@ -167,40 +151,19 @@ def build_window(
     return BundleWindow(keyframes, point_ids, seen, problem)
 
 
-def solve(
-    problem: BundleProblem,
-    iterations: int,
-    covariances: bool = False,
-    progress: Progress | None = None,
-    calibration: CameraMeasurement | None = None,
-) -> BundleResult:
-    """Minimize the reprojection error of a window by `solve_bundle`, over the camera as well with a calibration."""
-    free: bool | Tensor = False
-    if calibration is not None:
-        problem, free = replace(problem, camera_prior=camera_prior(calibration)), calibration.directions
-    solution = solve_bundle(
-        problem,
-        free_camera=free,
-        progress=progress,
-        check=False,
-        options=BUNDLE_OPTIONS.replace(
-            kernel="huber", scale=HUBER, iterations=iterations, backward="detached"
-        ),
-    )
-    marginals = solution.covariance() if covariances else None
-    found = None if calibration is None else solution.camera
-    return BundleResult(solution.T_cw, solution.points_w, marginals, found)
-
-
-def apply_result(slam_map: Map, window: BundleWindow, result: BundleResult, camera: Camera) -> None:
+def apply_solution(
+    slam_map: Map,
+    window: BundleWindow,
+    T_cw: Float[Tensor, "K 4 4"],
+    points_w: Float[Tensor, "N 3"],
+    camera: Camera,
+) -> None:
     """Move a window of the map to its solution and remove outlier observations.
 
     Since the window was built, only the frame counters of the map may have changed.
     """
-    slam_map.keyframes["T_cw"][window.keyframes] = result.T_cw
-    slam_map.points["positions_w"][window.point_ids] = result.points_w
-    if result.marginals is not None:
-        slam_map.set_covariances(window.keyframes, window.point_ids, result.marginals)
+    slam_map.keyframes["T_cw"][window.keyframes] = T_cw
+    slam_map.points["positions_w"][window.point_ids] = points_w
     remove_outliers(slam_map, window.seen, camera)
     slam_map.update_appearance(window.keyframes)
 
@@ -227,21 +190,6 @@ def select(seen: Observations, rows: Int[Tensor, " R"]) -> Observations:
     return Observations(*(column.index_select(0, rows) for column in columns))
 
 
-PendingResult = Callable[[], BundleResult]
-"""Waits for the result of a started adjustment."""
-
-
-class Solver(Protocol):
-    """Starts a local bundle adjustment (problem, iterations, covariances) and returns its pending result."""
-
-    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult: ...
-
-
-def solve_here(problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
-    """Solve in this process, when the result is requested."""
-    return lambda: solve_local(problem, iterations, covariances)
-
-
 class ApplyAt(Enum):
     """When the result of a local bundle adjustment is applied to the map."""
 
@@ -250,29 +198,25 @@ class ApplyAt(Enum):
     AFTER_DELAY = "after `bundle_adjustment.delay_frames` more frames"
 
 
-@dataclass(frozen=True)
-class AdjustmentRequest:
-    """A requested adjustment: applied after frame `due`, or before the next frame if `due` is None.
+@dataclass
+class _Adjustment:
+    """A requested adjustment.
 
     Attributes:
-        due: index of a frame, or None.
+        due: the frame after which it is applied; None: before the next frame.
         slam_map: the map.
         keyframe: row of the keyframe around which to adjust.
         version: `Map.version` at the time of the request.
+        window: what is adjusted, once it was started; None as well if there is nothing to adjust.
+        solution: of the window.
     """
 
     due: int | None
     slam_map: Map
     keyframe: int
     version: int
-
-
-@dataclass(frozen=True)
-class RunningAdjustment:
-    """A started adjustment and its pending result; both None if there is nothing to adjust."""
-
-    window: BundleWindow | None
-    result: PendingResult | None
+    window: BundleWindow | None = None
+    solution: PendingSolution | None = None
 
 
 class AsyncBundleAdjustment:
@@ -285,16 +229,9 @@ class AsyncBundleAdjustment:
         solver: solver of the problem; default: in this process
     """
 
-    def __init__(
-        self,
-        camera: Camera,
-        settings: BundleAdjustmentConfig,
-        covariances: bool,
-        solver: Solver = solve_here,
-    ) -> None:
-        self.camera, self.settings, self.covariances, self.solver = camera, settings, covariances, solver
-        self._request: AdjustmentRequest | None = None
-        self._running: RunningAdjustment | None = None
+    def __init__(self, camera: Camera, settings: BundleAdjustmentConfig, solver: Solver = solve_here) -> None:
+        self.camera, self.settings, self.solver = camera, settings, solver
+        self._pending: _Adjustment | None = None
 
     @contextmanager
     def solved_by(self, solver: Solver) -> Iterator[None]:
@@ -308,53 +245,51 @@ class AsyncBundleAdjustment:
     @property
     def is_pending(self) -> bool:
         """Whether an adjustment is requested and not applied yet."""
-        return self._request is not None
+        return self._pending is not None
 
     @property
     def is_due_before_next_frame(self) -> bool:
         """Whether the result must be applied before the next frame is tracked."""
-        return self._request is not None and self._request.due is None
+        return self._pending is not None and self._pending.due is None
 
     @property
     def due(self) -> int | None:
         """The frame after which the result is applied; None if none is pending or it is due before the next frame."""
-        return None if self._request is None else self._request.due
+        return None if self._pending is None else self._pending.due
 
     def is_due(self, frame: int) -> bool:
         """Whether the result must be applied after this frame."""
-        return self._request is not None and (self._request.due is None or frame >= self._request.due)
+        return self._pending is not None and (self._pending.due is None or frame >= self._pending.due)
 
     def set_deadline(self, frame: int) -> None:
         """Apply a pending result after this frame, since the map is about to change."""
-        if self._request is not None:
-            self._request = replace(self._request, due=frame)
+        if self._pending is not None:
+            self._pending.due = frame
 
     def request(self, slam_map: Map, keyframe: int, due: int | None) -> None:
         """Request an adjustment around a keyframe, applied after frame `due` or, if None, before the next frame."""
-        assert self._request is None, "an adjustment is pending"
-        self._request = AdjustmentRequest(due, slam_map, keyframe, slam_map.version)
+        assert self._pending is None, "an adjustment is pending"
+        self._pending = _Adjustment(due, slam_map, keyframe, slam_map.version)
 
     def start(self) -> None:
         """Start the requested adjustment if it is not running."""
-        if self._request is None or self._running is not None:
+        pending = self._pending
+        if pending is None or pending.window is not None:
             return
-        window = select_window(self._request.slam_map, self._request.keyframe, self.camera, self.settings)
-        result = None
+        window = select_window(pending.slam_map, pending.keyframe, self.camera, self.settings)
         if window is not None:
-            result = self.solver(window.problem, self.settings.local_iterations, self.covariances)
-        self._running = RunningAdjustment(window, result)
+            pending.window = window
+            pending.solution = self.solver(window.problem, self.settings.local_iterations)
 
     def apply(self, slam_map: Map) -> None:
         """Wait for a requested adjustment and apply it to the map."""
         self.start()
-        request, running = self._request, self._running
-        self._request = self._running = None
-        if request is None or running is None:
+        pending, self._pending = self._pending, None
+        if pending is None or pending.window is None or pending.solution is None:
             return
-        assert slam_map.version == request.version, "rows were renumbered since the request"
-        if running.window is not None and running.result is not None:
-            apply_result(slam_map, running.window, running.result(), self.camera)
+        assert slam_map.version == pending.version, "rows were renumbered since the request"
+        apply_solution(slam_map, pending.window, *pending.solution(), self.camera)
 
     def drop(self) -> None:
         """Discard a pending adjustment, since its map is gone."""
-        self._request = self._running = None
+        self._pending = None

@@ -47,9 +47,7 @@ class Mapper:
         self.camera = camera
         self.config = config
         self.clock = clock
-        self.adjustment = AsyncBundleAdjustment(
-            camera, config.bundle_adjustment, config.measurement.gate == "mahalanobis"
-        )
+        self.adjustment = AsyncBundleAdjustment(camera, config.bundle_adjustment)
         self.matcher = matcher
         self.undistortion = undistortion or Undistortion(camera)
 

@@ -20,7 +20,7 @@ from typing import Protocol
 from torchslam.config import Config
 from torchslam.data.sequence import Frames, Sequence
 from torchslam.geometry import Camera
-from torchslam.mapping.local_bundle import BundleResult, PendingResult, solve_local
+from torchslam.mapping.local_bundle import PendingSolution, Solution, solve_local
 from torchslam.mapping.mapper import Mapper
 from torchslam.optim import BundleProblem
 from torchslam.parallel.pool import WorkerLostError, WorkerPool
@@ -150,14 +150,14 @@ class BundleWorker(WorkerPool):
     def __init__(self) -> None:
         super().__init__(1, partial, solve_local)
 
-    def __call__(self, problem: BundleProblem, iterations: int, covariances: bool) -> PendingResult:
-        call = self.submit(problem, iterations, covariances)
+    def __call__(self, problem: BundleProblem, iterations: int) -> PendingSolution:
+        call = self.submit(problem, iterations)
 
-        def answer() -> BundleResult:
+        def answer() -> Solution:
             if call is not None:
                 with suppress(WorkerLostError):
-                    found: BundleResult = self.result(call)
+                    found: Solution = self.result(call)
                     return found
-            return solve_local(problem, iterations, covariances)
+            return solve_local(problem, iterations)
 
         return answer

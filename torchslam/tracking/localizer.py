@@ -14,11 +14,8 @@ from torchslam.geometry import (
     KeypointNoise,
     UndistortedKeypoints,
     Undistortion,
-    innovation_covariances,
-    mahalanobis_squared,
     passes_gate,
     start_pose,
-    transform,
 )
 from torchslam.map.map import Map
 from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel, nearby_pose
@@ -48,7 +45,7 @@ class Localizer:
         self.undistorted = Undistortion(camera)
         self.guided_matcher = DescriptorMatcher(config.matching)
         self.settings = config.tracking
-        self.measurement = config.measurement
+        self.max_chi_square = config.measurement.max_chi_square
         self.min_inlier_ratio = config.pose_validation.min_inlier_ratio
         self.seed = config.seed
 
@@ -173,7 +170,7 @@ class Localizer:
         linearization = problem.linearize(T_cw)
         mask = passes_gate(
             linearization.squared / noise.gate_factor**2,
-            OUTLIER_GATE_FACTOR * self.measurement.max_chi_square,
+            OUTLIER_GATE_FACTOR * self.max_chi_square,
         )
         old = mask & (slam_map.points["times_found"][ids] >= MATURE_OBSERVATIONS)
         if int(old.sum()) >= self.settings.min_matches:
@@ -184,44 +181,10 @@ class Localizer:
             refined = problem.minimize(linearization, weights * mask, kernel)
             linearization = refined.linearization
             errors = linearization.squared / noise.gate_factor**2
-            mask = self.agrees(slam_map, refined.T_cw, ids, pixels, noise, errors)
+            mask = passes_gate(errors, self.max_chi_square)
             if int(mask.sum()) < 6:
                 break
         return refined, errors, mask
-
-    def agrees(
-        self,
-        slam_map: Map,
-        T_cw: Float[Tensor, "4 4"],
-        ids: Int[Tensor, " N"],
-        pixels: Float[Tensor, "N 2"],
-        noise: KeypointNoise,
-        errors: Float[Tensor, " N"] | None = None,
-    ) -> Bool[Tensor, " N"]:
-        """Inliers of a pose by the configured gate.
-
-        The pose was fitted to these pixels, so its own uncertainty does not widen the gate.
-
-        Args:
-            slam_map: the map.
-            T_cw: the pose.
-            ids: matched points.
-            pixels: of the matched keypoints.
-            noise: of the matched keypoints.
-            errors: squared, in units of the noise, if they are known.
-        """
-        chi_square, points = self.measurement.max_chi_square, slam_map.points
-        by_noise = self.measurement.gate == "chi_square"
-        if by_noise and errors is not None:
-            return passes_gate(errors, chi_square)
-        points_c = transform(T_cw, points["positions_w"][ids])
-        if by_noise:
-            return passes_gate(noise.squared_reprojection(points_c, pixels, self.camera), chi_square)
-        projected, valid, J_c, _ = self.camera.project_with_jacobians(points_c)
-        innovations = innovation_covariances(
-            J_c @ T_cw[:3, :3], points["covariances_w"][ids], noise.sigma_or_covariance
-        )
-        return valid & (mahalanobis_squared(projected - pixels, innovations) < chi_square)
 
 
 def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Float[Tensor, " M"] | None:
