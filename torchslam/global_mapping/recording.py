@@ -14,7 +14,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.view_graph import PairMatcher
-from torchslam.system.run import Run, keyframe_rows
+from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import Explanation, Reason, State, StepResult
 
@@ -135,7 +135,7 @@ def _loss(run: Run) -> str:
 @torch.no_grad()
 def check_run(run: Run) -> MapCheck | None:
     """Check the main submap of a run by pairs of its keyframes, matched anew; None if there is nothing to check."""
-    rows = keyframe_rows(run.map, run.session).tolist()
+    rows = run.map.keyframe_rows(run.session).tolist()
     if len(rows) < 3 or run.config.features.kind == "simulated":
         return None
     views = [run.map.frame_features(row) for row in rows]
