@@ -497,7 +497,7 @@ def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
     start = AsyncBundleAdjustment.start
 
     def record_start(self: AsyncBundleAdjustment) -> None:
-        if self and self._running is None:
+        if self._pending is None or self._pending.window is None:
             begun.append(self.due)
         start(self)
 

@@ -66,7 +66,6 @@ from torchslam.io.results import (
 )
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
-from torchslam.system.run import keyframe_rows, keyframe_trajectory
 from torchslam.types import Trajectory
 from torchslam.utils.console import table
 
@@ -145,7 +144,7 @@ class Job:
     def trajectory(self) -> Trajectory:
         """The poses of the run in the submap; those of all frames are read, since localization adds none to the map."""
         if self.keyframes_alone:
-            return keyframe_trajectory(self.submap.map, self.session)
+            return self.submap.map.keyframe_trajectory(self.session)
         name = TRAJECTORY if self.is_main else OTHER_TRAJECTORY.format(self.submap.number)
         return read_trajectory(self.directory / name)
 
@@ -323,7 +322,7 @@ def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
 
 def _ply(job: Job) -> dict[str, str]:
     write_map_cloud(job.output, job.submap.map, job.session)
-    keyframes = len(keyframe_rows(job.submap.map, job.session))
+    keyframes = len(job.submap.map.keyframe_rows(job.session))
     return {"points": f"{job.submap.map.num_points}, and {keyframes} keyframes"}
 
 

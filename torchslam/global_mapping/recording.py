@@ -16,7 +16,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
-from torchslam.system.run import Run, keyframe_rows
+from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
 
@@ -148,7 +148,7 @@ def check_run(run: Run) -> MapCheck | None:
 @torch.no_grad()
 def keyframe_pairs(run: Run) -> tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]] | None:
     """Poses and features of the keyframes of the main submap, and their verified pairs; None for fewer than three."""
-    rows = keyframe_rows(run.map, run.session).tolist()
+    rows = run.map.keyframe_rows(run.session).tolist()
     if len(rows) < 3 or run.config.features.kind == "simulated":
         return None
     views = [run.map.frame_features(row) for row in rows]

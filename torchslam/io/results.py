@@ -29,7 +29,7 @@ from torchslam.io.export.scene import ExampleFrame, ImageSource
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
-from torchslam.system.run import Run, keyframe_rows
+from torchslam.system.run import Run
 from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.files import JSON_BYTES, parse_json, read_text, write_whole
 from torchslam.utils.text import is_unicode
@@ -254,7 +254,7 @@ def results_in(directory: Path) -> list[Path]:
 
 def example_keyframe(slam_map: Map, session: int) -> int | None:
     """Return the keyframe in the middle of the session, for the example plot; None if there is none."""
-    rows = keyframe_rows(slam_map, session)
+    rows = slam_map.keyframe_rows(session)
     return int(rows[len(rows) // 2]) if len(rows) else None
 
 

@@ -18,7 +18,7 @@ from torchslam.io import plots as figures
 from torchslam.io.results import PLOTS, Results, aligned, example_keyframe, read_results, write_results
 from torchslam.io.viewer.page import write_view
 from torchslam.map.map import NO_POINT, Map
-from torchslam.system.run import Run, keyframe_rows
+from torchslam.system.run import Run
 from torchslam.types import Trajectory
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def colorize_points(maps: Iterable[Map], sequence: Sequence, session: int) -> No
             continue
         device = slam_map.positions_w.device
         total = torch.zeros(len(slam_map.points), 4, dtype=torch.int64, device=device)
-        for keyframe in keyframe_rows(slam_map, session).tolist():
+        for keyframe in slam_map.keyframe_rows(session).tolist():
             _add_colors(total, slam_map, keyframe, sequence)
         seen = torch.nonzero(total[:, 3])[:, 0]
         count = total[seen, 3:]
@@ -127,7 +127,7 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     certainty = [
         S[:3, :3] @ covariances_w @ S[:3, :3].mT
         for covariances_w in (
-            results.map.center_covariances_w()[keyframe_rows(results.map, results.session)],
+            results.map.center_covariances_w()[results.map.keyframe_rows(results.session)],
             results.map.points["covariances_w"][ids],
         )
     ]
@@ -193,7 +193,7 @@ def _example(slam_map: Map, session: int, image: Float[Tensor, "H W"]) -> Iterat
     previous = torch.full(
         (len(slam_map.points) + 1, 2), torch.nan, dtype=columns["keypoints"].dtype, device="cpu"
     )
-    rows = keyframe_rows(slam_map, session).tolist()
+    rows = slam_map.keyframe_rows(session).tolist()
     if rows[0] != keyframe:
         before = rows[rows.index(keyframe) - 1]
         seen = columns["point_ids"][before]

@@ -16,7 +16,7 @@ from torchslam.geometry import KeypointNoise, se3_inverse
 from torchslam.map.observation_index import ObservationIndex, first_of_each, top_rows
 from torchslam.map.table import KEYFRAMES, POINTS, Table
 from torchslam.optim import Marginals
-from torchslam.types import Features, FrameFeatures, Observations
+from torchslam.types import Features, FrameFeatures, Observations, Trajectory
 from torchslam.utils.indexing import distinct, ranks_among
 
 NO_POINT = -1
@@ -133,6 +133,20 @@ class Map:
         scales, mask = self.keyframes["scales"][keyframes], self.keyframes["mask"][keyframes]
         finest = scales.masked_fill(~mask, torch.inf).amin(1, keepdim=True)
         return finest, scales.masked_fill(~mask, 0.0).amax(1, keepdim=True)
+
+    def keyframe_rows(self, session: int) -> Int[Tensor, " K"]:
+        """Return the rows of the keyframes of one session, in order of time."""
+        if self.num_keyframes == 0:
+            return torch.zeros(0, dtype=torch.int64, device="cpu")
+        rows = torch.nonzero(self.keyframes["session"] == session)[:, 0]
+        return rows[torch.argsort(self.keyframes["timestamp"][rows], stable=True)]
+
+    def keyframe_trajectory(self, session: int = 0) -> Trajectory:
+        """Return the keyframes of one session, camera to world, in order of time."""
+        rows = self.keyframe_rows(session)
+        if len(rows) == 0:
+            return Trajectory.empty()
+        return Trajectory(self.keyframes["timestamp"][rows], se3_inverse(self.T_cw[rows]))
 
     def center_covariances_w(self) -> Float[Tensor, "K 3 3"]:
         """Return the covariances of the camera centers of the keyframes, zero where unknown."""

@@ -65,7 +65,17 @@ def triangulate_against(
         FreeKeypoints.of(slam_map, rows, normalize or camera.normalize)
         for rows in (slam_map.index_tensor(keyframe), neighbors)
     )
-    found = _match(slam_map, keyframe, neighbors, here, there, camera, config, matcher)
+    T_21 = slam_map.T_cw[neighbors] @ se3_inverse(slam_map.T_cw[keyframe])
+    epipolar_px = config.mapping.max_epipolar_px
+    if matcher is None or isinstance(matcher, DescriptorMatcher):
+        limit = max_distance(here.features.descriptors, config.matching)
+        found = NewPointMatches(
+            *match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None
+        )
+    else:
+        views = [free_view(slam_map, row) for row in (keyframe, *neighbors.tolist())]
+        priors = [MatchPrior(T_21=each, camera=camera, epipolar_px=epipolar_px) for each in T_21]
+        found = NewPointMatches(*match_each(matcher, views, here, there, priors))
     _triangulate(slam_map, keyframe, neighbors, here, there, found, camera, config)
 
 
@@ -81,29 +91,6 @@ class NewPointMatches(NamedTuple):
         """Some of the matches, by index."""
         weights = None if self.weights is None else self.weights[rows]
         return NewPointMatches(self.which[rows], self.at_1[rows], self.at_2[rows], weights)
-
-
-def _match(
-    slam_map: Map,
-    keyframe: int,
-    neighbors: Tensor,
-    here: FreeKeypoints,
-    there: FreeKeypoints,
-    camera: Camera,
-    config: Config,
-    matcher: Matcher | None,
-) -> NewPointMatches:
-    """Match along epipolar lines, by descriptors or by a custom matcher."""
-    T_21 = slam_map.T_cw[neighbors] @ se3_inverse(slam_map.T_cw[keyframe])
-    epipolar_px = config.mapping.max_epipolar_px
-    if matcher is None or isinstance(matcher, DescriptorMatcher):
-        limit = max_distance(here.features.descriptors, config.matching)
-        return NewPointMatches(
-            *match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None
-        )
-    views = [free_view(slam_map, row) for row in (keyframe, *neighbors.tolist())]
-    priors = [MatchPrior(T_21=each, camera=camera, epipolar_px=epipolar_px) for each in T_21]
-    return NewPointMatches(*match_each(matcher, views, here, there, priors))
 
 
 def _triangulate(

@@ -175,13 +175,6 @@ def _check_tracking(tracking: TrackingState) -> None:
 def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], list[str]]:
     """Results as columns, their reasons, and the names of their stages; NaN for what a frame does not have."""
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
-    nan = float("nan")
-    no_pose, no_covariance = (
-        torch.full((4, 4), nan, dtype=torch.float32, device="cpu"),
-        torch.full((6, 6), nan, dtype=torch.float32, device="cpu"),
-    )
-    poses = [no_pose if result.T_cw is None else result.T_cw for result in results]
-    covariances = [no_covariance if result.covariance is None else result.covariance for result in results]
     counts = [
         (
             result.index,
@@ -193,23 +186,25 @@ def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], li
         )
         for result in results
     ]
-    times = [[result.stage_ms.get(stage, nan) for stage in stages] for result in results]
+    times = [[result.stage_ms.get(stage, math.nan) for stage in stages] for result in results]
     columns: dict[str, Any] = {
         "run.counts": torch.tensor(counts, dtype=torch.int64, device="cpu").reshape(-1, 6),
         "run.timestamps": torch.tensor(
             [result.timestamp for result in results], dtype=torch.float64, device="cpu"
         ),
-        "run.T_cw": _stack(poses, 4),
-        "run.covariances": _stack(covariances, 6),
+        "run.T_cw": _stack([result.T_cw for result in results], 4),
+        "run.covariances": _stack([result.covariance for result in results], 6),
         "run.stage_ms": torch.tensor(times, dtype=torch.float64, device="cpu").reshape(-1, len(stages)),
     }
     return columns, [result.reason for result in results], stages
 
 
-def _stack(matrices: list[Tensor], size: int) -> Tensor:
-    if not matrices:
-        return torch.zeros(0, size, size, dtype=torch.float64, device="cpu")
-    return torch.stack([matrix.detach().double().cpu() for matrix in matrices])
+def _stack(matrices: list[Tensor | None], size: int) -> Tensor:
+    stacked = torch.full((len(matrices), size, size), math.nan, dtype=torch.float64, device="cpu")
+    for row, matrix in enumerate(matrices):
+        if matrix is not None:
+            stacked[row] = matrix.detach()
+    return stacked
 
 
 def _results(tensors: dict[str, Tensor], run: dict[str, Any], device: torch.device | str) -> list[StepResult]:

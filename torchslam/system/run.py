@@ -9,8 +9,6 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Frames, Sequence
@@ -111,7 +109,7 @@ class Run:
     @property
     def keyframes(self) -> Trajectory:
         """The final poses of the keyframes of the main submap."""
-        return keyframe_trajectory(self.map, self.session)
+        return self.map.keyframe_trajectory(self.session)
 
     @property
     def online(self) -> Trajectory:
@@ -339,22 +337,6 @@ class FinalAdjustment:
         )
         submap.posed_frames.apply_solution(solution, graph, submap.map)
         return solution
-
-
-def keyframe_rows(slam_map: Map, session: int) -> Int[Tensor, " K"]:
-    """Rows of the keyframes of one session, in order of time."""
-    if slam_map.num_keyframes == 0:
-        return torch.zeros(0, dtype=torch.int64, device="cpu")
-    rows = torch.nonzero(slam_map.keyframes["session"] == session)[:, 0]
-    return rows[torch.argsort(slam_map.keyframes["timestamp"][rows], stable=True)]
-
-
-def keyframe_trajectory(slam_map: Map, session: int = 0) -> Trajectory:
-    """The keyframes of one session, camera to world, in order of time."""
-    rows = keyframe_rows(slam_map, session)
-    if len(rows) == 0:
-        return Trajectory.empty()
-    return Trajectory(slam_map.keyframes["timestamp"][rows], se3_inverse(slam_map.T_cw[rows]))
 
 
 def failure_message(slam: _System, results: list[StepResult], skipped: list[str]) -> str:

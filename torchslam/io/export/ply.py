@@ -18,7 +18,6 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.map.map import Map
-from torchslam.system.run import keyframe_rows
 from torchslam.utils.files import read_bytes, write_whole
 
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
@@ -50,7 +49,7 @@ def write_map_cloud(path: str | Path, slam_map: Map, session: int) -> None:
         path,
         slam_map.positions_w[alive] @ R_up.mT,
         points["colors"][alive],
-        T_wc[keyframe_rows(slam_map, session), :3, 3] @ R_up.mT,
+        T_wc[slam_map.keyframe_rows(session), :3, 3] @ R_up.mT,
         -points["view_directions_w"][alive] @ R_up.mT,
         points["times_observed"][alive],
     )

@@ -25,7 +25,6 @@ from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
 from torchslam.io.results import Results, aligned, aligned_poses
 from torchslam.map.atlas import Submap
-from torchslam.system.run import keyframe_trajectory
 from torchslam.types import State, Trajectory
 from torchslam.utils.text import printable
 
@@ -150,7 +149,7 @@ def _submap(
         if evaluation is None
         else evaluation.S_groundtruth_estimate.clone()
     )
-    keyframes = keyframe_trajectory(submap.map, results.session)
+    keyframes = submap.map.keyframe_trajectory(results.session)
     up = torch.eye(4, dtype=torch.float64, device="cpu")
     up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
     S = up @ S
