@@ -27,7 +27,7 @@ from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
-from torchslam.types import Explanation, State, StepResult
+from torchslam.types import Explanation, Reason, State, StepResult
 
 STATES = tuple(State)
 """The order of states in a file."""
@@ -172,7 +172,7 @@ def _check_tracking(tracking: TrackingState) -> None:
         raise ValueError(f"the tracking state has invalid numbers: {counts}, {shares}")
 
 
-def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], list[str]]:
+def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[list[Any]], list[str]]:
     """Results as columns, their reasons, and the names of their stages; NaN for what a frame does not have."""
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
     counts = [
@@ -196,7 +196,25 @@ def _packed(results: list[StepResult]) -> tuple[dict[str, Tensor], list[str], li
         "run.covariances": _stack([result.covariance for result in results], 6),
         "run.stage_ms": torch.tensor(times, dtype=torch.float64, device="cpu").reshape(-1, len(stages)),
     }
-    return columns, [result.reason for result in results], stages
+    return columns, [[_plain(each) for each in result.reasons] for result in results], stages
+
+
+def _plain(explanation: Explanation) -> list[Any]:
+    """The name of a reason and its values, as JSON has them."""
+    values = explanation.values.items()
+    return [
+        explanation.reason.name,
+        {name: _plain(value) if isinstance(value, Explanation) else value for name, value in values},
+    ]
+
+
+def _explanation(plain: list[Any]) -> Explanation:
+    """Invert `_plain`; raise KeyError, TypeError or ValueError for anything else."""
+    name, values = plain
+    return Explanation(
+        Reason[name],
+        {key: _explanation(value) if isinstance(value, list) else value for key, value in values.items()},
+    )
 
 
 def _stack(matrices: list[Tensor | None], size: int) -> Tensor:
@@ -225,7 +243,7 @@ def _results(tensors: dict[str, Tensor], run: dict[str, Any], device: torch.devi
                 is_keyframe=bool(is_keyframe),
                 matches=matches,
                 inliers=inliers,
-                reasons=Explanation.parsed(run["reasons"][row]),
+                reasons=tuple(map(_explanation, run["reasons"][row])),
                 stage_ms={
                     stage: time
                     for stage, time in zip(stages, times[row], strict=True)

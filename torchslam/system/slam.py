@@ -45,7 +45,7 @@ from torchslam.system.state_machine import FrameOutcome, StateMachine
 from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.tracking.non_static import SceneFilter
 from torchslam.tracking.tracker import Tracker
-from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, State, StepResult, Trajectory
+from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, Reason, State, StepResult, Trajectory
 from torchslam.utils.timing import Stopwatch
 
 
@@ -337,7 +337,8 @@ class SLAM:
             matches=estimate.matches if estimate else 0,
             inliers=estimate.inliers if estimate else 0,
             reasons=tuple(
-                each if isinstance(each, Explanation) else Explanation(each) for each in outcome.reasons
+                Explanation(each) if isinstance(each, Reason) else Explanation(each.reason, each.values)
+                for each in outcome.reasons
             ),
             stage_ms=self.clock.take(),
         )
