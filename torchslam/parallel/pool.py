@@ -191,12 +191,16 @@ class SharedTasks(WorkerPool):
 
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
-    """Start processes that ignore Ctrl-C, which this process handles."""
+    """Start processes that ignore Ctrl-C and SIGTERM, which this process handles: it ends them.
+
+    A process that SIGTERM ends while it starts would leave this one waiting: it writes what the process is to do into a
+    pipe, whose other end it has open as well.
+    """
     if not hasattr(signal, "pthread_sigmask"):  # not on Windows
         yield
         return
     resource_tracker.ensure_running()  # its start would let signals through again
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])
     try:
         yield
     finally:
