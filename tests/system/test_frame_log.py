@@ -92,14 +92,14 @@ def test_a_forgotten_frame_is_gone(status: FrameStatus) -> None:
     assert log.status(4) is status
 
 
-def test_held_frames_are_taken_in_order_with_their_poses() -> None:
+def test_held_frames_are_taken_with_their_poses_in_the_order_asked_for() -> None:
     log = log_of()
     frames = {index: held_frame(index) for index in (5, 3, 4, 6)}
     for frame in frames.values():
         log.hold(frame)
     taken = log.take_held([4, 5, 3])
-    assert taken == [frames[3], frames[4], frames[5]]
-    assert [frame.reference for frame in taken] == [103, 104, 105]
+    assert taken == [frames[4], frames[5], frames[3]]
+    assert [frame.reference for frame in taken] == [104, 105, 103]
     assert all(torch.equal(frame.T_cr, pose(0.1 * frame.view.index)) for frame in taken)
     assert [log.status(index) for index in (3, 4, 5, 6)] == [None, None, None, HELD]
 

@@ -138,7 +138,7 @@ class Camera:
             ValueError: The matrix is not (..., 3, 3), has a skew or another last row than 0, 0, 1, or the coefficients
                 are of another number or not zero from the ninth on.
         """
-        K = K if isinstance(K, Tensor) else torch.as_tensor(np.asarray(K))
+        K = K if isinstance(K, Tensor) else torch.as_tensor(np.asarray(K), device="cpu")
         K = K if K.is_floating_point() else K.double()
         if K.shape[-2:] != (3, 3):
             raise ValueError(f"K must be (..., 3, 3), not {tuple(K.shape)}")

@@ -403,5 +403,5 @@ def test_points_settle_by_themselves_from_32_free_frames_on(monkeypatch, bundle_
         return of_points(self, estimate)
 
     monkeypatch.setattr(SparseBundle, "_of_points", counted)
-    bundle_adjust(replace(scene, fixed_frames=fixed), iterations=1)
+    solve_bundle(replace(scene, fixed_frames=fixed), options=BUNDLE_OPTIONS.replace(iterations=1))
     assert bool(evaluated) == is_settled
