@@ -294,7 +294,7 @@ class FinalAdjustment:
             atlas: the submaps.
             session: the session whose main submap determines the camera.
             progress: called before each iteration; if it raises, what was adjusted so far stays.
-            settled: keyframes and points are at a minimum already.
+            settled: keyframes and points are at a minimum already, and what is far from it has been removed.
         """
         main = atlas.main(session)
         if main is None or not (self.settings.local and self.settings.global_at_end):
@@ -314,12 +314,14 @@ class FinalAdjustment:
         self.camera, self.given = camera, given or self.given
         submap.posed_frames.remove_outliers(submap.map, camera)
         solution = self._solve(submap, camera, given, progress)
-        # Poses are right now where they can be, so that what is still far is wrong.
-        seen = submap.map.observations()
-        wrong = ~passes_gate(squared_errors(submap.map, seen, solution.camera), FINAL_CHI_SQUARE)
-        submap.map.remove_masked_observations(seen, wrong)
-        submap.posed_frames.remove_outliers(submap.map, solution.camera, FINAL_CHI_SQUARE, LEAST_RATIO)
-        solution = self._solve(submap, solution.camera, given, progress)
+        if not settled:
+            # Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map
+            # have removed that already, and what holds a weak link is often less exact than the rest.
+            seen = submap.map.observations()
+            wrong = ~passes_gate(squared_errors(submap.map, seen, solution.camera), FINAL_CHI_SQUARE)
+            submap.map.remove_masked_observations(seen, wrong)
+            submap.posed_frames.remove_outliers(submap.map, solution.camera, FINAL_CHI_SQUARE, LEAST_RATIO)
+            solution = self._solve(submap, solution.camera, given, progress)
         self.camera = solution.camera
         if given is not None:
             (bundle,) = solution.keyframes
