@@ -83,10 +83,10 @@ class StateMachine:
 
     def confirm_map(self) -> None:
         """Confirm a provisional map as it is, with the frames that are held back."""
-        if self.active_map.submap is not None and self.active_map.provisional is not None:
+        if self.active_map.provisional is not None:
             self._keep_held()
             self.maintenance.after_frame(None)
-        self.map_start.confirm()
+            self.map_start.confirm()
 
     def finalize(self) -> None:
         """End the session: frames that are held back keep their poses, uncertain as they are."""
@@ -142,15 +142,13 @@ class StateMachine:
             self.mapping.add_tentative_keyframe(doubted, view, estimate)
         doubted.count(verdict.rejection)
         hold(self.context, doubted, view, estimate)
-        if doubted.is_open:
-            active_map.doubted, reason = doubted, verdict.rejection or doubted.reason
-            if doubted.is_full:
-                self.maintenance.close_loops(self._keep_held())
-            return FrameOutcome([reason], active_map.current, estimate)
-        num_new = self._keep_held()
-        active_map.doubted = None
-        self.maintenance.close_loops(num_new)
-        return FrameOutcome([], active_map.current, estimate)
+        reasons = [verdict.rejection or doubted.reason] if doubted.is_open else []
+        active_map.doubted = doubted
+        if doubted.is_full or not doubted.is_open:
+            num_new = self._keep_held()
+            active_map.doubted = doubted if doubted.is_open else None
+            self.maintenance.close_loops(num_new)
+        return FrameOutcome(reasons, active_map.current, estimate)
 
     def _keep_held(self) -> int:
         """Keep the poses of frames that are held back; return the number of keyframes that were tentative."""
