@@ -81,10 +81,10 @@ def test_enough_certain_frames_confirm_a_map(monkeypatch: pytest.MonkeyPatch) ->
     started.count(5)
     assert started.active.provisional is None
     assert started.tracked_back == [started.submap]
-    assert not any(index in started.log for index in range(6))  # their poses are final
+    assert not any(started.log.status(index) for index in range(6))  # their poses are final
     assert not started.map_start.is_almost_confirmed
     assert started.count(6) == [False]
-    assert 6 not in started.log
+    assert started.log.status(6) is None
 
 
 def test_frames_that_were_held_are_logged_but_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -23,8 +23,8 @@ BITS = 256
 CODE_BITS = 64
 """Bits of a code: one machine word."""
 _CODE_NOISE = 9.0
-"""Bits by which codes of one place differ: their similarity falls by exp(-(distance / _CODE_NOISE)^2). By
-`experiments/places`."""
+"""Bits by which codes of one place differ: their similarity falls by exp(-(distance / _CODE_NOISE)^2).
+Tried at this value only."""
 _CODE_LIMIT = 19
 """Bits by which codes differ that count as different: the similarity is 0.01 there."""
 # by experiments/places/train.py, from rendered images

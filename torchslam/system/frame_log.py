@@ -54,10 +54,6 @@ class FrameLog:
         self.settings = settings
         self._frames: dict[int, tuple[FrameStatus, FrameFeatures | HeldFrame]] = {}
 
-    def __contains__(self, index: int) -> bool:
-        """Whether a frame is in the log."""
-        return index in self._frames
-
     def status(self, index: int) -> FrameStatus | None:
         """The status of a frame; None for one that is not in the log."""
         return self._frames[index][0] if index in self._frames else None

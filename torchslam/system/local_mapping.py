@@ -12,8 +12,7 @@ from torchslam.tracking.pose_validation import Certainty, Verdict, check_pose
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate
 
 MAX_CONSECUTIVE_FAILURES = 5
-"""Frames in a row without a plausible pose that end backward tracking: as many as blur or a passer-by costs at 30 Hz.
-Tried at this value only."""
+"""Frames in a row without a plausible pose that end backward tracking. Tried at this value only."""
 
 
 class LocalMapping:

@@ -1,7 +1,7 @@
 """Maintenance of the active map, always in this order: local adjustment, loops, culling.
 
-It runs before a frame is tracked and after it was mapped. Rows may be renumbered, and the submap that the active one is
-merged into takes its place; who holds rows gets them by the `RowRemap`.
+It runs before a frame is tracked and after it was mapped. Rows may be renumbered; what the submap refers to follows
+(`map/compaction.py`). The submap that the active one is merged into takes its place.
 """
 
 from __future__ import annotations

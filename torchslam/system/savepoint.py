@@ -13,7 +13,8 @@ from torchslam.map.map import MapSnapshot
 from torchslam.types import Explanation, Reason, Rejection
 
 MAX_HELD_FRAMES = 1000
-"""Frames that are held back at most; memory bound: a frame has 50 to 300 kB of features. No recording reached it."""
+"""Frames that are held back at most, so that memory is bounded: about 100 MB of ORB features. Tried at this value
+only."""
 MANY_HELD_FRAMES = 40
 """Frames that are held back and kept when the camera is lost: a wrong pose does not last that long."""
 

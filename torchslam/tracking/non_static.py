@@ -28,8 +28,8 @@ are nearly even in the image, from what is close to the lens to infinity."""
 _NUM_NEIGHBORS = 3
 """Nearest keypoints that vote on whether a keypoint belongs to the object; odd. Tried at this value only."""
 _MOVING_PATIENCE = 10
-"""Comparisons in which a keypoint that was seen to move may agree with the map: a pedestrian who stops stays masked for
-a few seconds. Tried at this value only."""
+"""Comparisons in which a keypoint that was seen to move may agree with the map: an object that stops stays masked for a
+while. Tried at this value only."""
 _NEARBY_PATIENCE = 3
 """The same for a keypoint that is only near those; shorter, since it may be of the scene. Tried at this value only."""
 _MAX_DISTANCE_RATIO = 0.06
