@@ -119,7 +119,7 @@ def test_custom_components_stay_in_the_main_process() -> None:
     sequence = room(20)
     slam = SLAM(sequence.camera, CONFIG, extractor=OpenCVORB(300))
     assert who(sequence, slam, 3) == (type(sequence).__name__, True)
-    assert "custom front end" in prefetch_obstacle(sequence, slam)
+    assert "custom feature extractor" in prefetch_obstacle(sequence, slam)
 
 
 def test_more_processes_give_the_same_run() -> None:

@@ -135,7 +135,7 @@ def prefetch_obstacle(sequence: Sequence, slam: _System) -> str:
     if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"
     if slam.has_custom_components:
-        return "a custom front end or matcher is known only there"
+        return "a custom feature extractor or matcher is known only there"
     if slam.config.matching.matcher != "descriptors":
         return "the matcher may need images"
     return ""
