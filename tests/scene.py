@@ -13,7 +13,16 @@ from torch import Tensor
 
 from tests.map.simulated import estimate_at
 from torchslam.config import BundleAdjustmentConfig, Config
-from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_inverse, sim3_scale, transform
+from torchslam.geometry import (
+    Camera,
+    SharedCamera,
+    rigid,
+    se3_exp,
+    se3_inverse,
+    sim3_inverse,
+    sim3_scale,
+    transform,
+)
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import AsyncBundleAdjustment
@@ -126,7 +135,7 @@ def submap_of_scene(
     submap.map.update_appearance(torch.arange(len(T_cw)))
     lonely = torch.nonzero(submap.map.points["times_observed"] == 0)[:, 0]
     submap.map.remove_points(lonely)
-    Tracker(CAMERA, Config()).reset_to_keyframe(submap, len(T_cw) - 1)
+    Tracker(SharedCamera(CAMERA), Config()).reset_to_keyframe(submap, len(T_cw) - 1)
     return submap
 
 
@@ -167,6 +176,6 @@ def assert_same_state(one: dict[str, object], two: dict[str, object]) -> None:
 
 def adjust_local(slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig) -> None:
     """Request a local bundle adjustment around a keyframe, and apply it at once."""
-    adjusting = AsyncBundleAdjustment(camera, settings)
+    adjusting = AsyncBundleAdjustment(SharedCamera(camera), settings)
     adjusting.request(slam_map, keyframe, due=None)
     adjusting.apply(slam_map)

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from experiments.common import parser_of, table
 from torchslam.config import Config
-from torchslam.geometry import Camera, transform
+from torchslam.geometry import Camera, SharedCamera, transform
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas
 from torchslam.mapping.mapper import Mapper
@@ -50,15 +50,15 @@ class Walk:
         self.rows = torch.full((count,), -1)  # of the points in the map
         self.atlas = Atlas(CAMERA.params)
         self.submap = self.atlas.create()
-        self.tracker = Tracker(CAMERA, Config())
-        self.mapper = Mapper(CAMERA, Config(), Stopwatch())
+        self.tracker = Tracker(SharedCamera(CAMERA), Config())
+        self.mapper = Mapper(SharedCamera(CAMERA), Config(), Stopwatch())
         for index in range(keyframes):
             self._add(index)
         slam_map = self.submap.map
         for some in torch.arange(keyframes).split(100):
             slam_map.update_appearance(some)
         self.submap.num_cull_checked = keyframes
-        self.loop_closer = LoopCloser(CAMERA, Config(), self.atlas)
+        self.loop_closer = LoopCloser(SharedCamera(CAMERA), Config(), self.atlas)
 
     def look(self, index: int) -> tuple[FrameFeatures, Tensor]:
         """The features at a step of the path, and the rows of their points."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.map.simulated import estimate_at
 from tests.scene import CAMERA, Scene, pose
 from torchslam.config import Config
-from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp
+from torchslam.geometry import SharedCamera, rigid, se3_exp, se3_inverse, so3_exp
 from torchslam.map.atlas import Submap
 from torchslam.tracking.tracker import Tracker
 
@@ -62,7 +62,7 @@ def ring_submap(scale: float = 1.0, twist: float = 0.0) -> Submap:
         submap.posed_frames.add(view, estimate_at(true, ids, at), pose(), keyframe)
     submap.map.update_appearance(torch.arange(KEYFRAMES))
     submap.apply_sim3_correction(drifted(T_cw, scale, twist))
-    Tracker(CAMERA, Config()).reset_to_keyframe(submap, END)
+    Tracker(SharedCamera(CAMERA), Config()).reset_to_keyframe(submap, END)
     return submap
 
 

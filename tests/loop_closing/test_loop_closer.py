@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.loop_closing.ring import END, around, ring, ring_submap
 from tests.scene import CAMERA, Scene, camera_center, moved, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
-from torchslam.geometry import se3_inverse, sim3_inverse
+from torchslam.geometry import SharedCamera, se3_inverse, sim3_inverse
 from torchslam.geometry.similarity import umeyama
 from torchslam.loop_closing import loop_closer
 from torchslam.loop_closing.loop_closer import (
@@ -44,7 +44,7 @@ def error(submap: Submap) -> float:
 
 
 def loop(submap: Submap) -> LoopCandidate:
-    relation = RelativeSim3Estimator(CAMERA, CONFIG).estimate(submap.map, END, submap.map, 0)
+    relation = RelativeSim3Estimator(SharedCamera(CAMERA), CONFIG).estimate(submap.map, END, submap.map, 0)
     assert relation is not None
     return LoopCandidate(submap, END, submap, 0, relation)
 
@@ -154,7 +154,7 @@ def two_visits(S_21: Tensor, tied: int = 60, between: bool = True) -> Submap:
     same = torch.nonzero(looks[late][:, None] == looks[early])[:tied]
     submap.map.merge_points(late[same[:, 0]], early[same[:, 1]])
     submap.map.update_appearance(torch.arange(submap.map.num_keyframes))
-    Tracker(CAMERA, CONFIG).reset_to_keyframe(submap, submap.map.num_keyframes - 1)
+    Tracker(SharedCamera(CAMERA), CONFIG).reset_to_keyframe(submap, submap.map.num_keyframes - 1)
     return submap
 
 
@@ -251,7 +251,7 @@ def test_the_loop_closer_fuses_earlier_visits_without_detection(S_21: Tensor) ->
         submap, atlas = two_visits(S_21), Atlas(CAMERA.params)
         atlas._submaps = [submap]
         memory = LoopCloser(
-            CAMERA, load_config(None, [f"loop_closing.enabled={str(enabled).lower()}"]), atlas
+            SharedCamera(CAMERA), load_config(None, [f"loop_closing.enabled={str(enabled).lower()}"]), atlas
         )
         last = submap.map.num_keyframes - 1
         points = submap.map.num_points

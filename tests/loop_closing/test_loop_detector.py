@@ -12,7 +12,7 @@ from torch import Tensor
 from tests.loop_closing.ring import END, KEYFRAMES, ring_submap
 from tests.scene import CAMERA, Scene, camera_center, pose, sideways, submap_of_scene
 from torchslam.config import Config, LoopClosingConfig, load_config
-from torchslam.geometry import sim3_inverse
+from torchslam.geometry import SharedCamera, sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.loop_detector import (
     LoopCandidate,
@@ -38,7 +38,7 @@ def loop_detector(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetecto
         for keyframe in range(submap.map.num_keyframes):
             view = submap.map.frame_features(keyframe)
             database.add(submap.map.key(keyframe), view.descriptors, view.mask)
-    return LoopDetector(CAMERA, load_config(None, overrides), atlas, database)
+    return LoopDetector(SharedCamera(CAMERA), load_config(None, overrides), atlas, database)
 
 
 def two_submaps(S_21: Tensor) -> tuple[Submap, Submap]:

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, moved, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
-from torchslam.geometry import estimate_similarity, se3_inverse, sim3_inverse, transform
+from torchslam.geometry import SharedCamera, estimate_similarity, se3_inverse, sim3_inverse, transform
 from torchslam.geometry.similarity import Similarity
 from torchslam.loop_closing.relative_sim3 import (
     RelativeSim3,
@@ -25,7 +25,7 @@ SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
 ONE = sideways(4)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
-ESTIMATOR = RelativeSim3Estimator(CAMERA, Config())
+ESTIMATOR = RelativeSim3Estimator(SharedCamera(CAMERA), Config())
 TWO = 100  # first frame of the second map
 
 
@@ -36,7 +36,9 @@ def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
 
 
 def related(map_1: Map, map_2: Map, *overrides: str) -> RelativeSim3 | None:
-    return RelativeSim3Estimator(CAMERA, load_config(None, overrides)).estimate(map_1, 2, map_2, 1)
+    return RelativeSim3Estimator(SharedCamera(CAMERA), load_config(None, overrides)).estimate(
+        map_1, 2, map_2, 1
+    )
 
 
 def test_the_similarity_between_two_maps_is_estimated(S_21: Tensor) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 from tests.parallel.test_pool import wait_until_ready
 from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
-from torchslam.geometry import se3_exp
+from torchslam.geometry import SharedCamera, se3_exp
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingSolution, solve_here
 from torchslam.optim import BundleProblem
@@ -55,7 +55,7 @@ def adjusted(seed: int = 0) -> Map:
 
 
 def test_the_map_does_not_change_before_the_result_is_applied() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
     assert not adjusting.is_pending
     assert adjusting.due is None
     assert not adjusting.is_due(100)
@@ -72,7 +72,7 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
 
 
 def test_a_request_is_started_once() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
     started: list[BundleProblem] = []
 
     def solver(problem: BundleProblem, iterations: int) -> PendingSolution:
@@ -103,7 +103,7 @@ def test_a_request_is_started_once() -> None:
 
 
 def test_a_request_can_be_hurried_or_dropped() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
     adjusting.set_deadline(3)
     assert not adjusting.is_pending
     adjusting.request(slam_map, 4, due=12)
@@ -115,7 +115,7 @@ def test_a_request_can_be_hurried_or_dropped() -> None:
 
 
 def test_a_request_may_be_due_before_the_next_frame() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
     assert not adjusting.is_due_before_next_frame
     adjusting.request(slam_map, 4, due=12)
     assert not adjusting.is_due_before_next_frame
@@ -132,7 +132,7 @@ def test_a_request_may_be_due_before_the_next_frame() -> None:
 
 
 def test_an_empty_request_is_due_as_well() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
     slam_map.keyframes["point_ids"][:] = -1
     adjusting.request(slam_map, 4, due=12)
     assert adjusting.is_due(12)
@@ -154,7 +154,7 @@ def test_another_process_computes_the_same_result(
     worker: BundleWorker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("torchslam.parallel.workers.solve_local", None)  # here nothing is solved
-    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS)
+    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
     adjusting.solver = worker
     for seed in (0, 1):
         expected = adjusted(seed)
@@ -172,7 +172,7 @@ def test_another_process_computes_the_same_result(
 
 def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
     slam_map = perturbed_map()
-    adjusting = AsyncBundleAdjustment(CAMERA, SETTINGS)
+    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
 
     def wrong(problem: BundleProblem, iterations: int):  # type: ignore[no-untyped-def]
         problem.frame_index[0] = 99
@@ -186,7 +186,7 @@ def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
 
 
 def test_the_run_continues_without_a_killed_worker() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
     with BundleWorker() as solver:
         wait_until_ready(solver)
         adjusting.solver = solver
@@ -205,7 +205,7 @@ def test_the_run_continues_without_a_killed_worker() -> None:
 def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     with BundleWorker() as solver:
         monkeypatch.setattr(solver, "result", None)
-        adjusting, slam_map = AsyncBundleAdjustment(CAMERA, SETTINGS), perturbed_map()
+        adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from tests.map.simulated import CAMERA, estimate_at, path, view_of
 from torchslam.config import Config, KeyframesConfig, load_config
-from torchslam.geometry import se3_exp, se3_inverse
+from torchslam.geometry import SharedCamera, se3_exp, se3_inverse
 from torchslam.map import compaction
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
@@ -119,7 +119,7 @@ def test_a_mapper_culls_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) ->
         submap.map.add_points(torch.zeros(40, 3, dtype=torch.float64), descriptors, 2)[1:]
     )
     before, left = submap.map.keyframes["frame_index"].clone(), submap.map.positions_w[:21].clone()
-    went = Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap)
+    went = Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).cull_and_compact(submap)
     assert went is not None
     assert went.points.tolist() == [*range(21)] + [-1] * 39
     assert torch.equal(submap.map.positions_w, left)
@@ -128,12 +128,12 @@ def test_a_mapper_culls_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) ->
     assert torch.equal(went.replacement[stays], went.keyframes[stays])
     assert int(went.replacement.min()) >= 0
     assert submap.map.num_keyframes < 30
-    assert Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap) is None
+    assert Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).cull_and_compact(submap) is None
 
 
 def test_keyframes_are_culled_without_renumbering_points() -> None:
     submap = world_of(standing(30))
-    went = Mapper(CAMERA, Config(), Stopwatch()).cull_and_compact(submap)
+    went = Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).cull_and_compact(submap)
     assert went is not None
     assert went.points.tolist() == list(range(POINTS))
     assert submap.map.num_keyframes == NUM_NEWEST_KEPT + 1
@@ -161,4 +161,4 @@ def test_a_moving_camera_keeps_its_keyframes() -> None:
 
 def test_culling_can_be_disabled() -> None:
     keeping = load_config(None, ["mapping.cull=false"])
-    assert Mapper(CAMERA, keeping, Stopwatch()).cull_and_compact(world_of(standing(30))) is None
+    assert Mapper(SharedCamera(CAMERA), keeping, Stopwatch()).cull_and_compact(world_of(standing(30))) is None

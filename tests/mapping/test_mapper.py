@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene, camera_center, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
-from torchslam.geometry import transform, triangulation_covariance
+from torchslam.geometry import SharedCamera, transform, triangulation_covariance
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.mapping.mapper import RECENT_KEYFRAMES, Mapper, initial_scale
@@ -25,7 +25,7 @@ BASE = sideways(2, step=0.5)
 
 
 def mapper(*overrides: str) -> Mapper:
-    return Mapper(CAMERA, load_config(None, overrides), Stopwatch())
+    return Mapper(SharedCamera(CAMERA), load_config(None, overrides), Stopwatch())
 
 
 def start(true: bool = True) -> tuple[TwoViewMap, Tensor]:
@@ -93,7 +93,7 @@ def submap_of_half_the_points(count: int = 2) -> Submap:
 
 def inserted(by: Mapper, submap: Submap, T_cw: Tensor) -> int:
     view = SCENE.view(50, T_cw)
-    estimate = Tracker(CAMERA, Config()).track(submap, view)
+    estimate = Tracker(SharedCamera(CAMERA), Config()).track(submap, view)
     assert estimate is not None
     return by.insert(submap.map, view, estimate)
 
@@ -158,7 +158,7 @@ def test_fusion_culling_and_adjustment_can_be_disabled() -> None:
         )
         submap.map.add_observations(0, at, twins)
         submap.map.update_appearance(torch.arange(2))
-        Tracker(CAMERA, Config()).reset_to_keyframe(submap, 1)
+        Tracker(SharedCamera(CAMERA), Config()).reset_to_keyframe(submap, 1)
         inserted(
             mapper("bundle_adjustment.local=false", "mapping.cull=false", f"mapping.fuse={fuse}"),
             submap,

@@ -13,7 +13,7 @@ from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, turn
 from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
-from torchslam.geometry import KeypointNoise, se3_exp, se3_inverse, transform
+from torchslam.geometry import KeypointNoise, SharedCamera, se3_exp, se3_inverse, transform
 from torchslam.map.map import NO_POINT, Map
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.mapper import Mapper, initial_scale, keyframe_reason
@@ -107,7 +107,7 @@ def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
     "override", ["tracking.motion_model=false", "tracking.guided_matching=false", "tracking.recent_frames=10"]
 )
 def test_tracking_works_without_optional_checks(slam: SLAM, override: str) -> None:
-    tracker = Tracker(slam.camera, load_config(None, ["features.kind=simulated", override]))
+    tracker = Tracker(SharedCamera(slam.camera), load_config(None, ["features.kind=simulated", override]))
     tracker.reset_to_keyframe(slam.submap, slam.map.num_keyframes - 1)
     estimate = tracker.track(slam.submap, view_of(slam, 20))
     assert estimate is not None
@@ -226,7 +226,7 @@ def test_scale_consistency() -> None:
 
 def start_of(indices: tuple[int, int], walk: Walk, config: Config) -> TwoViewMap | Rejection:
     extract = Simulated(config, walk.camera, true_T_cw(walk))
-    initializer = Initializer(walk.camera, config)
+    initializer = Initializer(SharedCamera(walk.camera), config)
     for i in indices:
         result = initializer.step(FrameFeatures.of(walk[i], extract(walk[i]), walk.camera.params.double()))
     return result
@@ -293,7 +293,7 @@ def test_a_mapper_starts_with_two_covisible_keyframes() -> None:
     assert isinstance(start, TwoViewMap)
     slam = SLAM(WALK.camera, CONFIG)
     slam_map = Map()
-    first, second = Mapper(slam.camera, CONFIG, slam.clock).start(slam_map, start)
+    first, second = Mapper(SharedCamera(slam.camera), CONFIG, slam.clock).start(slam_map, start)
     seen = [slam_map.observed_points(torch.tensor([k])) for k in (first, second)]
     assert torch.equal(*seen)
     assert len(seen[0]) == len(start.points_w)

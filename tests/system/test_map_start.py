@@ -7,6 +7,7 @@ import torch
 
 from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
 from torchslam import SLAM, load_config
+from torchslam.geometry import SharedCamera
 from torchslam.map.atlas import Submap
 from torchslam.system import map_start as map_starts
 from torchslam.system.frame_log import FrameStatus
@@ -132,7 +133,7 @@ def test_a_discarded_map_leaves_no_pending_adjustment(monkeypatch: pytest.Monkey
 
 
 def two_views() -> TwoViewMap:
-    initializer = Initializer(CAMERA, load_config(None, []))
+    initializer = Initializer(SharedCamera(CAMERA), load_config(None, []))
     initializer.step(SCENE.view(0, pose()))
     start = initializer.step(SCENE.view(7, SIDE))
     assert isinstance(start, TwoViewMap), start

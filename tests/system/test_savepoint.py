@@ -7,6 +7,7 @@ import torch
 
 from tests.scene import CAMERA, Scene, assert_same_state, sideways, state_of, submap_of_scene
 from torchslam.config import Config
+from torchslam.geometry import SharedCamera
 from torchslam.map.atlas import Submap
 from torchslam.mapping.mapper import Mapper
 from torchslam.system import savepoint as savepoints
@@ -26,12 +27,12 @@ def savepoint_of(num_confirming: int = 2, submap: Submap | None = None) -> Savep
 def extended(savepoint: Savepoint, index: int = 3) -> None:
     """Insert a tentative keyframe, which moves the map: it observes, triangulates, fuses, culls and adjusts."""
     submap, view = savepoint.submap, SCENE.view(index, sideways(1, start=0.15 * index)[0], noise=0.7)
-    tracker = Tracker(CAMERA, Config())
+    tracker = Tracker(SharedCamera(CAMERA), Config())
     estimate = tracker.track(submap, view)
     assert estimate is not None
     tracker.commit(submap, view, estimate)
     savepoint.save_map()
-    keyframe = Mapper(CAMERA, Config(), Stopwatch()).insert(submap.map, view, estimate)
+    keyframe = Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).insert(submap.map, view, estimate)
     tracker.reset_to_keyframe(submap, keyframe)
 
 
@@ -125,11 +126,14 @@ def test_the_number_of_held_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -
 
 def test_a_rollback_restores_every_byte_of_the_map_and_the_tracking_state() -> None:
     submap = submap_of_scene(SCENE, sideways(3))
-    tracker, view = Tracker(CAMERA, Config()), SCENE.view(3, sideways(1, start=0.45)[0], noise=0.7)
+    tracker, view = (
+        Tracker(SharedCamera(CAMERA), Config()),
+        SCENE.view(3, sideways(1, start=0.45)[0], noise=0.7),
+    )
     estimate = tracker.track(submap, view)
     assert estimate is not None
     tracker.commit(submap, view, estimate)
-    savepoint, mapper = savepoint_of(submap=submap), Mapper(CAMERA, Config(), Stopwatch())
+    savepoint, mapper = savepoint_of(submap=submap), Mapper(SharedCamera(CAMERA), Config(), Stopwatch())
     savepoint.save_map()
     before = state_of(submap)
     noise_variance = submap.map.noise_variance

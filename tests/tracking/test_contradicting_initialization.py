@@ -10,7 +10,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, submap_of_scene
 from torchslam.config import Config
-from torchslam.geometry import epipolar_offsets, se3_inverse, so3_exp
+from torchslam.geometry import SharedCamera, epipolar_offsets, se3_inverse, so3_exp
 from torchslam.tracking.initialization import (
     MIN_SUPPORT_RATIO,
     Initializer,
@@ -45,7 +45,7 @@ def contradiction(T_cw: Tensor, last: FrameFeatures | None = None) -> TwoViewMap
 
 
 def two_views() -> TwoViewMap:
-    initializer = Initializer(CAMERA, Config())
+    initializer = Initializer(SharedCamera(CAMERA), Config())
     initializer.step(SCENE.view(0, pose()))
     start = initializer.step(SCENE.view(1, SIDE))
     assert isinstance(start, TwoViewMap), start

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose
 from torchslam.config import IndependentMotionConfig, MatchingConfig
-from torchslam.geometry import se3_inverse
+from torchslam.geometry import SharedCamera, se3_inverse
 from torchslam.tracking.non_static import IndependentMotion, Movement
 from torchslam.types import FrameFeatures, PoseEstimate, Reason
 
@@ -55,7 +55,9 @@ def estimate(view: FrameFeatures, T_cw: Tensor, keypoints: Tensor) -> PoseEstima
 
 
 def watcher(**settings: float) -> IndependentMotion:
-    return IndependentMotion(CAMERA, replace(IndependentMotionConfig(), **settings), MatchingConfig())
+    return IndependentMotion(
+        SharedCamera(CAMERA), replace(IndependentMotionConfig(), **settings), MatchingConfig()
+    )
 
 
 def watched(

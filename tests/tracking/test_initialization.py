@@ -12,7 +12,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, camera_center, pose
 from torchslam.config import InitializationConfig, load_config
-from torchslam.geometry import KeypointNoise, Triangulation, transform
+from torchslam.geometry import KeypointNoise, SharedCamera, Triangulation, transform
 from torchslam.tracking.initialization import Initializer, check_two_view_map, is_good, refine_pair
 from torchslam.types import FrameFeatures, TwoViewMap
 
@@ -28,7 +28,7 @@ def tried(
 
 
 def tried_views(views: list[FrameFeatures], *overrides: str) -> tuple[TwoViewMap | None, str]:
-    initializer = Initializer(CAMERA, load_config(None, overrides))
+    initializer = Initializer(SharedCamera(CAMERA), load_config(None, overrides))
     for view in views:
         result = step(initializer, view)
     return result
@@ -60,7 +60,7 @@ def test_an_initialization_has_motion_and_points_in_units_of_its_baseline() -> N
 
 
 def test_the_first_frame_is_the_reference_until_it_is_too_old() -> None:
-    initializer = Initializer(CAMERA, load_config(None, ["initialization.max_reference_age=3"]))
+    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.max_reference_age=3"]))
     for index, reason in (
         (0, "took"),
         (1, "the camera stands"),
@@ -77,7 +77,9 @@ def test_too_few_matches_replace_the_reference() -> None:
     views = [SCENE.view(index, T) for index, T in enumerate(pair(SIDE))]
     both = len(torch.nonzero(views[0].mask[SCENE.at(0)] & views[1].mask[SCENE.at(1)]))
     assert tried(pair(SIDE), f"initialization.min_matches={both}")[0] is not None
-    initializer = Initializer(CAMERA, load_config(None, [f"initialization.min_matches={both + 1}"]))
+    initializer = Initializer(
+        SharedCamera(CAMERA), load_config(None, [f"initialization.min_matches={both + 1}"])
+    )
     step(initializer, views[0])
     start, reason = step(initializer, views[1])
     assert start is None
@@ -134,7 +136,7 @@ def test_static_image_points_are_excluded_from_initialization(share: float) -> N
     """Most of the image moves with the scene, but some of it stays."""
     views = [SCENE.view(0, pose()), SCENE.view(1, ROLLED)]
     some = static(views[1], share, SCENE.shows(1), views[0], SCENE.shows(0))
-    initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
+    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60"]))
     step(initializer, views[0])
     start, reason = step(initializer, some)
     assert start is not None, reason
@@ -149,7 +151,7 @@ def test_points_behind_the_camera_are_excluded(T_cw: Tensor) -> None:
     """Sideways, what stays in place is near its epipolar line; the turn says that it would be behind the camera."""
     views = [SCENE.view(0, pose(), noise=0.2), SCENE.view(1, T_cw, noise=0.2)]
     some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
-    initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
+    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60"]))
     step(initializer, views[0])
     start, reason = step(initializer, some)
     assert start is not None, reason
@@ -163,7 +165,7 @@ def test_points_at_infinity_within_noise_are_inliers(turn: float, left_out: bool
     """A turn of 0.003 moves the image of infinity by 0.6 pixels, less than the threshold of 1.5."""
     views = [SCENE.view(0, pose()), SCENE.view(1, pose(-0.5, 0.0, 0.0, 0.0, turn, 0.0))]
     some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
-    initializer = Initializer(CAMERA, load_config(None, ["initialization.min_matches=60"]))
+    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60"]))
     step(initializer, views[0])
     step(initializer, some)
     assert (len(initializer.static_pixels) > 80) is left_out
@@ -350,7 +352,7 @@ def turning(focal: float, *overrides: str, T_cw: Tensor | None = None) -> tuple[
     camera = CAMERA.with_params(torch.cat((torch.full_like(CAMERA.params[:2], focal), CAMERA.params[2:])))
     scene = Scene.of(600, width=14.0)
     always = ["initialization.min_matches=60", "initialization.min_planar_frames=2"]
-    initializer = Initializer(camera, load_config(None, [*always, *overrides]))
+    initializer = Initializer(SharedCamera(camera), load_config(None, [*always, *overrides]))
     start, reason = None, ""
     for index, T in enumerate(T_cw):
         start, reason = step(initializer, scene.view(index, T, noise=0.2))

@@ -10,7 +10,7 @@ import torch
 from tests.map.simulated import estimate_at
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
-from torchslam.geometry import KeypointNoise, UndistortedKeypoints, transform
+from torchslam.geometry import KeypointNoise, SharedCamera, UndistortedKeypoints, transform
 from torchslam.map.atlas import Submap
 from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.tracker import Tracker
@@ -21,7 +21,7 @@ ROWS = rows_of(SCENE)
 
 
 def localizer(*overrides: str) -> Localizer:
-    return Localizer(CAMERA, load_config(None, overrides))
+    return Localizer(SharedCamera(CAMERA), load_config(None, overrides))
 
 
 def submap() -> Submap:
@@ -58,7 +58,9 @@ def test_with_few_inliers_other_candidates_are_tried(
 
 def test_a_pose_elsewhere_in_the_map_uses_the_local_map_there() -> None:
     here, finder = submap_of_scene(SCENE, sideways(12, step=0.6)), localizer("tracking.local_keyframes=1")
-    Tracker(CAMERA, load_config(None, ["tracking.local_keyframes=1"])).reset_to_keyframe(here, 11)
+    Tracker(SharedCamera(CAMERA), load_config(None, ["tracking.local_keyframes=1"])).reset_to_keyframe(
+        here, 11
+    )
     T_cw = sideways(1, start=0.05)[0]
     view = SCENE.view(50, T_cw)
     at = torch.nonzero(view.mask)[:, 0]

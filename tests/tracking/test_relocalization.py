@@ -7,6 +7,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
+from torchslam.geometry import SharedCamera
 from torchslam.map.atlas import Submap
 from torchslam.tracking.data_association import match_keyframe, match_points
 from torchslam.tracking.matcher import max_distance
@@ -21,7 +22,7 @@ ANYWHERE = pose(-0.3, 0.1, 0.2, 0.05, 0.1, -0.1)
 
 def relocalizer(*overrides: str) -> Relocalizer:
     config = load_config(None, overrides)
-    return Relocalizer(Tracker(CAMERA, config), config)
+    return Relocalizer(Tracker(SharedCamera(CAMERA), config), config)
 
 
 def submaps() -> tuple[Submap, Submap]:

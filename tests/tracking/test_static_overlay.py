@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways
 from torchslam.config import MatchingConfig, StaticOverlayConfig
+from torchslam.geometry import SharedCamera
 from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_segments
 from torchslam.types import FrameFeatures
 
@@ -45,7 +46,9 @@ def with_logo(
 
 
 def overlay_detector(**changes: float) -> StaticOverlayDetector:
-    return StaticOverlayDetector(CAMERA, replace(StaticOverlayConfig(), **changes), MatchingConfig())
+    return StaticOverlayDetector(
+        SharedCamera(CAMERA), replace(StaticOverlayConfig(), **changes), MatchingConfig()
+    )
 
 
 def observed(by: StaticOverlayDetector, T_cw: Tensor, *, logo: bool = True, **options: float) -> list[int]:

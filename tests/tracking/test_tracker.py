@@ -22,7 +22,7 @@ from tests.scene import (
     submap_of_scene,
 )
 from torchslam.config import load_config
-from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.geometry import SharedCamera, se3_exp, se3_inverse, transform
 from torchslam.map.atlas import EMA_RATE, Submap
 from torchslam.tracking.data_association import (
     GRID,
@@ -47,7 +47,7 @@ AWAY = pose(0, 0, 0, 0, 3.0)
 
 
 def tracker(*overrides: str) -> Tracker:
-    return Tracker(CAMERA, load_config(None, overrides))
+    return Tracker(SharedCamera(CAMERA), load_config(None, overrides))
 
 
 def submap(count: int = 4, **options: float) -> Submap:

@@ -57,7 +57,7 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
-from torchslam.geometry.undistorted import UndistortedKeypoints, Undistortion
+from torchslam.geometry.undistorted import SharedCamera, UndistortedKeypoints, Undistortion
 
 __all__ = [
     "CHI_SQUARE_95",
@@ -66,6 +66,7 @@ __all__ = [
     "KeypointNoise",
     "MultiViewTriangulation",
     "RelativePose",
+    "SharedCamera",
     "Similarity",
     "Triangulation",
     "UndistortedKeypoints",

@@ -119,3 +119,19 @@ class Undistortion:
         inverse = torch.where(is_within[:, None, None], inverse, 0.0)
         inverse = inverse.permute(2, 1, 0)
         return torch.cat((exact.xy, exact.slope.flatten(0, 1), inverse.flatten(0, 1))).mT.contiguous()
+
+
+class SharedCamera:
+    """The camera that the components of a running system share; it changes where the run finds a better one.
+
+    Attributes:
+        current: The camera of the map as it is now.
+        undistortion: Of the keypoints of its images.
+    """
+
+    def __init__(self, camera: Camera) -> None:
+        self.replace(camera)
+
+    def replace(self, camera: Camera) -> None:
+        """Use another camera from now on."""
+        self.current, self.undistortion = camera, Undistortion(camera)

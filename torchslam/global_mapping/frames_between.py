@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, transform
+from torchslam.geometry import Camera, SharedCamera, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.tracking.data_association import match_keyframe
@@ -32,7 +32,7 @@ class FramePoser:
             camera: Of all views.
             config: For the size of the images.
         """
-        self.tracker = Tracker(camera, config)
+        self.tracker = Tracker(SharedCamera(camera), config)
         self.config = config
 
     @torch.no_grad()

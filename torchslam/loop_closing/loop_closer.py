@@ -13,7 +13,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, se3_inverse, sim3_inverse
+from torchslam.geometry import Camera, SharedCamera, se3_inverse, sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector
 from torchslam.loop_closing.relative_sim3 import neighborhood
@@ -43,7 +43,9 @@ class LoopCloser:
         loop_precheck: key of the last keyframe of `precheck`, and whether a loop was detected.
     """
 
-    def __init__(self, camera: Camera, config: Config, atlas: Atlas, matcher: Matcher | None = None) -> None:
+    def __init__(
+        self, camera: SharedCamera, config: Config, atlas: Atlas, matcher: Matcher | None = None
+    ) -> None:
         self.camera = camera
         self.config = config
         self.atlas = atlas
@@ -93,16 +95,16 @@ class LoopCloser:
         looks_new = self.loop_precheck == (submap.map.key(keyframe), False)
         found = None if looks_new else self.loop_detector.detect(submap, keyframe)
         if found is None:
-            fuse_with_earlier_visits(submap, keyframe, self.camera, self.config)
+            fuse_with_earlier_visits(submap, keyframe, self.camera.current, self.config)
         return found
 
     def close(self, found: LoopCandidate) -> tuple[Submap, int]:
         """Close a loop or merge two submaps; return the submap and the row of the keyframe in it."""
         self.loop_closures.append(found.closure)
         if found.is_loop:
-            close_loop(found, self.camera, self.config)
+            close_loop(found, self.camera.current, self.config)
             return found.submap, found.keyframe
-        submap, keyframe = merge_maps(found, self.camera, self.config)
+        submap, keyframe = merge_maps(found, self.camera.current, self.config)
         self.atlas.remove(found.submap if submap is found.matched_submap else found.matched_submap)
         return submap, keyframe
 

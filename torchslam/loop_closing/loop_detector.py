@@ -10,7 +10,7 @@ from jaxtyping import Int
 from torch import Tensor
 
 from torchslam.config import Config, LoopClosingConfig
-from torchslam.geometry import Camera, se3_inverse, sim3_scale
+from torchslam.geometry import SharedCamera, se3_inverse, sim3_scale
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.relative_sim3 import (
@@ -85,7 +85,7 @@ class LoopDetector:
 
     def __init__(
         self,
-        camera: Camera,
+        camera: SharedCamera,
         config: Config,
         atlas: Atlas,
         keyframe_database: KeyframeDatabase,

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import (
-    Camera,
+    SharedCamera,
     estimate_similarity,
     passes_gate,
     rigid,
@@ -66,7 +66,7 @@ class RelativeSim3:
 class RelativeSim3Estimator:
     """Estimates and verifies the Sim(3) between two maps, which may be the same: then it is the drift of a loop."""
 
-    def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
+    def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher | None = None) -> None:
         """Create the estimator; `matcher`: of two keyframes, by descriptors if None."""
         self.camera, self.config = camera, config
         self.guided_matcher = DescriptorMatcher(config.matching)
@@ -120,7 +120,7 @@ class RelativeSim3Estimator:
         """Match points of a map to the keypoints of another map's keyframe, whose pose in this map is T_cw."""
         view = other.frame_features(keyframe)
         angle = self.config.tracking.max_view_angle_deg
-        near = project_points(slam_map, point_ids, T_cw, self.camera, angle, view.scale_range)
+        near = project_points(slam_map, point_ids, T_cw, self.camera.current, angle, view.scale_range)
         pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, self.guided_matcher)
         return pairs.first, pairs.second
 
@@ -136,7 +136,9 @@ class RelativeSim3Estimator:
         ids, keypoints = self.match(slam_map, point_ids, T_cw, other, keyframe)
         view = other.frame_features(keyframe)
         points_c = transform(T_cw, slam_map.positions_w[ids])
-        errors = view.noise[keypoints].squared_reprojection(points_c, view.keypoints[keypoints], self.camera)
+        errors = view.noise[keypoints].squared_reprojection(
+            points_c, view.keypoints[keypoints], self.camera.current
+        )
         good = passes_gate(errors, _GATE_WIDENING**2 * self.config.measurement.max_chi_square)
         return ids[good], keypoints[good]
 
@@ -165,8 +167,8 @@ class RelativeSim3Estimator:
             transform(T_2, map_2.positions_w[points_2[rows_2]])[None],
             view_1.keypoints[rows_1][None],
             view_2.keypoints[rows_2][None],
-            camera_1=self.camera,
-            camera_2=self.camera,
+            camera_1=self.camera.current,
+            camera_2=self.camera.current,
             sigmas_1=view_1.noise[rows_1].gate_sigma[None],
             sigmas_2=view_2.noise[rows_2].gate_sigma[None],
             seed=self.config.seed,
@@ -195,14 +197,14 @@ class RelativeSim3Estimator:
             points_w[None],
             pixels[None],
             T_cw=T_cw[None],
-            camera=self.camera,
+            camera=self.camera.current,
             weights=noise.weights[None],
             options=POSE_OPTIONS.replace(
                 kernel="cauchy", scale=_KERNEL_SCALE, iterations=_ITERATIONS, backward="detached"
             ),
         ).T_cw[0]
         return refined, passes_gate(
-            noise.squared_reprojection(transform(refined, points_w), pixels, self.camera)
+            noise.squared_reprojection(transform(refined, points_w), pixels, self.camera.current)
         )
 
 

@@ -17,7 +17,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import BundleAdjustmentConfig
-from torchslam.geometry import CHI_SQUARE_95, Camera, passes_gate, transform
+from torchslam.geometry import CHI_SQUARE_95, Camera, SharedCamera, passes_gate, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
@@ -229,7 +229,9 @@ class AsyncBundleAdjustment:
         solver: solver of the problem; default: in this process
     """
 
-    def __init__(self, camera: Camera, settings: BundleAdjustmentConfig, solver: Solver = solve_here) -> None:
+    def __init__(
+        self, camera: SharedCamera, settings: BundleAdjustmentConfig, solver: Solver = solve_here
+    ) -> None:
         self.camera, self.settings, self.solver = camera, settings, solver
         self._pending: _Adjustment | None = None
 
@@ -276,7 +278,7 @@ class AsyncBundleAdjustment:
         pending = self._pending
         if pending is None or pending.window is not None:
             return
-        window = select_window(pending.slam_map, pending.keyframe, self.camera, self.settings)
+        window = select_window(pending.slam_map, pending.keyframe, self.camera.current, self.settings)
         if window is not None:
             pending.window = window
             pending.solution = self.solver(window.problem, self.settings.local_iterations)
@@ -288,7 +290,7 @@ class AsyncBundleAdjustment:
         if pending is None or pending.window is None or pending.solution is None:
             return
         assert slam_map.version == pending.version, "rows were renumbered since the request"
-        apply_solution(slam_map, pending.window, *pending.solution(), self.camera)
+        apply_solution(slam_map, pending.window, *pending.solution(), self.camera.current)
 
     def drop(self) -> None:
         """Discard a pending adjustment, since its map is gone."""

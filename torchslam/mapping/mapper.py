@@ -10,7 +10,7 @@ import torch
 
 from torchslam.config import Config, KeyframesConfig
 from torchslam.errors import ConfigError
-from torchslam.geometry import Camera, Undistortion, se3_inverse, triangulation_covariance
+from torchslam.geometry import SharedCamera, se3_inverse, triangulation_covariance
 from torchslam.geometry.transforms import pose_distance
 from torchslam.map.atlas import Submap
 from torchslam.map.compaction import RowRemap, compact
@@ -37,19 +37,16 @@ class Mapper:
 
     def __init__(
         self,
-        camera: Camera,
+        camera: SharedCamera,
         config: Config,
         clock: Stopwatch,
         matcher: Matcher | None = None,
-        undistortion: Undistortion | None = None,
     ) -> None:
-        """Create a mapper; `undistortion` is that of the camera if there is one already."""
         self.camera = camera
         self.config = config
         self.clock = clock
         self.adjustment = AsyncBundleAdjustment(camera, config.bundle_adjustment)
         self.matcher = matcher
-        self.undistortion = undistortion or Undistortion(camera)
 
     def start(self, slam_map: Map, start: TwoViewMap) -> tuple[int, int]:
         """Create the first map of two views at the configured scale; return the rows of the two keyframes."""
@@ -57,7 +54,7 @@ class Mapper:
         T_cw = start.T_cw.clone()
         T_cw[:3, 3] *= factor
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
-        points_w, camera = start.points_w * factor, self.camera
+        points_w, camera = start.points_w * factor, self.camera.current
         spread_1 = start.reference.noise[start.keypoints_1].sigma_or_covariance
         spread_2 = start.view.noise[start.keypoints_2].sigma_or_covariance
         covariances_w = triangulation_covariance(T_1w, T_cw, points_w, spread_1, spread_2, camera, camera)
@@ -98,13 +95,13 @@ class Mapper:
                 neighbors if settings.triangulation_partners == "covisible" else slam_map.index_tensor(*last)
             )
             partners = partners[: settings.num_partners]
-            normalize = self.undistortion.normalize
+            normalize = self.camera.undistortion.normalize
             triangulate_against(
-                slam_map, keyframe, partners, self.camera, self.config, self.matcher, normalize
+                slam_map, keyframe, partners, self.camera.current, self.config, self.matcher, normalize
             )
             slam_map.update_appearance(slam_map.index_tensor(keyframe))
             if settings.fuse:
-                fuse(slam_map, keyframe, neighbors, self.camera, self.config)
+                fuse(slam_map, keyframe, neighbors, self.camera.current, self.config)
         if self.config.bundle_adjustment.local:
             is_delayed = apply_at is ApplyAt.AFTER_DELAY
             with self.clock("bundle"):

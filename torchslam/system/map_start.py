@@ -130,7 +130,7 @@ class MapStart:
         context, submap, views = self.context, savepoint.submap, self.context.log.views(savepoint.frames)
         with context.clock("initialization"):
             start = contradicting_initialization(
-                submap, views[0], views[-1], context.camera, context.config, context.matcher
+                submap, views[0], views[-1], context.camera.current, context.config, context.matcher
             )
             is_replaced = start is not None and not self._create(start, views)
         if is_replaced:

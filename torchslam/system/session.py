@@ -12,7 +12,7 @@ import torch
 
 from torchslam.config import Config
 from torchslam.errors import ResultsError
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, SharedCamera
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.file import read_atlas, write_atlas
@@ -112,7 +112,7 @@ class SystemContext:
         active_map: The active submap and the savepoints.
     """
 
-    camera: Camera
+    camera: SharedCamera
     config: Config
     clock: Stopwatch
     matcher: Matcher

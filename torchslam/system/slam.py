@@ -21,7 +21,7 @@ from torchslam.config import Config
 from torchslam.data.formats.image_file import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, SharedCamera
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map, feature_mismatch, key_of
@@ -84,9 +84,9 @@ class SLAM:
         self.clock = Stopwatch()
         scaled = self.scaled_config = self.config.for_size(camera.size)
         self.matcher = make_matcher(scaled.matching, matcher, camera.size, scaled.features.kind)
-        self.tracker = Tracker(self.camera, scaled, self.matcher)
-        undistorted = self.tracker.localizer.undistorted
-        self.mapper = Mapper(self.camera, scaled, self.clock, self.matcher, undistorted)
+        self.shared_camera = SharedCamera(self.camera)
+        self.tracker = Tracker(self.shared_camera, scaled, self.matcher)
+        self.mapper = Mapper(self.shared_camera, scaled, self.clock, self.matcher)
         self.reset()
 
     def reset(self) -> None:
@@ -132,10 +132,10 @@ class SLAM:
         self.last_features: FrameFeatures | None = None  # of the last frame, before masking
         self.tracker = self.tracker.for_session(session.mapping)
         self.mapper.adjustment.drop()
-        self.loop_closer = LoopCloser(self.camera, self.scaled_config, self.atlas, self.matcher)
-        self.scene_filter = SceneFilter(self.camera, self.scaled_config)
+        self.loop_closer = LoopCloser(self.shared_camera, self.scaled_config, self.atlas, self.matcher)
+        self.scene_filter = SceneFilter(self.shared_camera, self.scaled_config)
         self._context = SystemContext(
-            camera=self.camera,
+            camera=self.shared_camera,
             config=self.scaled_config,
             clock=self.clock,
             matcher=self.matcher,
@@ -258,7 +258,7 @@ class SLAM:
     @torch.inference_mode()
     def precompute_undistortion(self) -> None:
         """Compute the undistortion table of the camera before the first frame is tracked."""
-        self.tracker.localizer.undistorted.prepare()
+        self.shared_camera.undistortion.prepare()
 
     @torch.inference_mode()
     def confirm_map(self) -> None:

@@ -16,6 +16,7 @@ from torchslam.geometry import (
     Camera,
     KeypointNoise,
     RelativePose,
+    SharedCamera,
     Triangulation,
     epipolar_offsets,
     estimate_relative_pose,
@@ -62,14 +63,14 @@ On 46 cuts of real sequences it is 0.83 or more for correct maps; for deliberate
 class Initializer:
     """Matches every frame with a reference frame until two of them give a map."""
 
-    def __init__(self, camera: Camera, config: Config, matcher: Matcher | None = None) -> None:
+    def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.config = config
         self._reference: FrameFeatures | None = None
         self.num_views = 0  # the reference and the frames after it
         # keypoints of the last view that do not belong to the scene
-        self.static_pixels: Float[Tensor, "N 2"] = camera.params.new_zeros(0, 2)
+        self.static_pixels: Float[Tensor, "N 2"] = camera.current.params.new_zeros(0, 2)
         self.num_planar_views = 0  # whose matches with the reference a homography explained
         self.planar_reason: Rejection | None = None  # of the last such view that was tested for a rotation
 
@@ -176,7 +177,7 @@ class Initializer:
         rotating = fit_rotating_camera(
             self.reference.keypoints[first][None],
             view.keypoints[second][None],
-            self.camera,
+            self.camera.current,
             largest / MAX_FOCAL_SIGMAS,
             threshold,
             relative.inliers,
@@ -214,7 +215,7 @@ class Initializer:
             return None if self._relative_pose(view, first, second).model[0] == "essential" else everything
         pixels_1, pixels_2 = self.reference.keypoints[first[still]], view.keypoints[second[still]]
         across, along = epipolar_offsets(
-            others.T_21_essential[0], pixels_1, pixels_2, self.camera, self.camera
+            others.T_21_essential[0], pixels_1, pixels_2, self.camera.current, self.camera.current
         )
         threshold = self.config.initialization.threshold_px
         explained = (across.abs() < threshold) & (along > -threshold)
@@ -230,8 +231,8 @@ class Initializer:
         return estimate_relative_pose(
             self.reference.keypoints[first][None],
             view.keypoints[second][None],
-            camera_1=self.camera,
-            camera_2=self.camera,
+            camera_1=self.camera.current,
+            camera_2=self.camera.current,
             threshold=self.config.initialization.threshold_px,
             seed=self.config.seed,
             kernel="truncated",
@@ -251,17 +252,22 @@ class Initializer:
             noise
         )
         seen = triangulate(
-            pixels_1, pixels_2, T_1w=T_1w, T_2w=T_cw, camera_1=self.camera, camera_2=self.camera
+            pixels_1,
+            pixels_2,
+            T_1w=T_1w,
+            T_2w=T_cw,
+            camera_1=self.camera.current,
+            camera_2=self.camera.current,
         )
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
-        errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera)
-        good = is_good(seen, errors.amax(0), noise.gate_sigma, self.camera, settings)
+        errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera.current)
+        good = is_good(seen, errors.amax(0), noise.gate_sigma, self.camera.current, settings)
         rejection = check_two_view_map(good, seen, len(first), settings, min_good_ratio)
         if rejection:
             return rejection
         keep = torch.nonzero(good)[:, 0]
         poses, points_w, accurate = refine_pair(
-            T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], noise[keep], self.camera
+            T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], noise[keep], self.camera.current
         )
         if int(accurate.sum()) < settings.min_points:
             count = int(accurate.sum())
@@ -384,7 +390,7 @@ def contradicting_initialization(
     pixels = first.keypoints[pairs.first], last.keypoints[pairs.second]
     if support(*pixels, T_21, camera, threshold_px) >= MIN_SUPPORT_RATIO * len(pairs.first):
         return None  # no motion can have twice the support
-    initializer = Initializer(camera, config, matcher)
+    initializer = Initializer(SharedCamera(camera), config, matcher)
     initializer.step(first)
     start = initializer.step(last)
     if not isinstance(start, TwoViewMap):

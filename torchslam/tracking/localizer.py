@@ -10,10 +10,9 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import (
-    Camera,
     KeypointNoise,
+    SharedCamera,
     UndistortedKeypoints,
-    Undistortion,
     passes_gate,
     start_pose,
 )
@@ -40,9 +39,8 @@ OUTLIER_GATE_FACTOR = 4.0
 class Localizer:
     """Estimates the pose of a frame from matches with map points; stateless, and does not change the map."""
 
-    def __init__(self, camera: Camera, config: Config) -> None:
+    def __init__(self, camera: SharedCamera, config: Config) -> None:
         self.camera = camera
-        self.undistorted = Undistortion(camera)
         self.guided_matcher = DescriptorMatcher(config.matching)
         self.settings = config.tracking
         self.max_chi_square = config.measurement.max_chi_square
@@ -91,8 +89,8 @@ class Localizer:
         if len(point_ids) < settings.min_matches:
             return None
         chosen = select_mature(slam_map.points["times_found"][point_ids], settings.min_matches)
-        chosen = chosen[subsample_per_cell(view.keypoints[keypoints[chosen]], self.camera.size)]
-        undistorted = self.undistorted(view.keypoints)
+        chosen = chosen[subsample_per_cell(view.keypoints[keypoints[chosen]], self.camera.current.size)]
+        undistorted = self.camera.undistortion(view.keypoints)
         points_w = slam_map.positions_w[point_ids[chosen]]
         T_cw = self._start(points_w, undistorted[keypoints[chosen]], expected_T_cw)
         if T_cw is None:
@@ -119,8 +117,8 @@ class Localizer:
             covariance=refined.covariance(),
             depth=float(refined.linearization.depths[inliers].median()),
             error=float(errors.median()) / slam_map.noise_variance,
-            coverage_ratio=coverage_ratio(slam_map, near, seen, self.camera.size),
-            explained_ratio=explained_ratio(view, at[inliers], self.camera.size),
+            coverage_ratio=coverage_ratio(slam_map, near, seen, self.camera.current.size),
+            explained_ratio=explained_ratio(view, at[inliers], self.camera.current.size),
             weights=None if weights is None else weights[inliers],
             expected=near.ids,
         )
@@ -131,14 +129,18 @@ class Localizer:
         """Initial pose: the one near the expected pose, or else by RANSAC."""
         threshold = self.settings.threshold_px
         T_cw = None if expected_T_cw is None else nearby_pose(expected_T_cw, points_w, seen, threshold)
-        return start_pose(points_w, seen, self.camera.size, threshold, self.seed) if T_cw is None else T_cw
+        return (
+            start_pose(points_w, seen, self.camera.current.size, threshold, self.seed)
+            if T_cw is None
+            else T_cw
+        )
 
     def project(
         self, slam_map: Map, point_ids: Int[Tensor, " N"], T_cw: Float[Tensor, "4 4"], view: FrameFeatures
     ) -> Projected:
         """The points that a view at a pose should observe, see `project_points`."""
         max_angle = self.settings.max_view_angle_deg
-        return project_points(slam_map, point_ids, T_cw, self.camera, max_angle, view.scale_range)
+        return project_points(slam_map, point_ids, T_cw, self.camera.current, max_angle, view.scale_range)
 
     def _local_points_with(self, slam_map: Map, point_ids: Tensor, local_points: Tensor) -> Tensor:
         """The local points, or those around the matched points if these are elsewhere in the map."""
@@ -175,7 +177,7 @@ class Localizer:
         old = mask & (slam_map.points["times_found"][ids] >= MATURE_OBSERVATIONS)
         if int(old.sum()) >= self.settings.min_matches:
             mask = old
-        weights = grid_weights(pixels, self.camera.size)
+        weights = grid_weights(pixels, self.camera.current.size)
         kernels: tuple[RobustKernel, ...] = ("cauchy", "huber")
         for kernel in kernels:
             refined = problem.minimize(linearization, weights * mask, kernel)

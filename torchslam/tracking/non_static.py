@@ -16,7 +16,7 @@ from torch import Tensor
 
 from torchslam.config import Config, IndependentMotionConfig, MatchingConfig
 from torchslam.features import match_by_projection
-from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, transform
+from torchslam.geometry import SharedCamera, estimate_relative_pose, se3_inverse, transform
 from torchslam.tracking.data_association import cell_numbers, match_views
 from torchslam.tracking.matcher import max_distance
 from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_segments
@@ -101,7 +101,9 @@ NO_MOVEMENT = Movement()
 class IndependentMotion:
     """Detects one group of keypoints that moves against the scene, and follows it."""
 
-    def __init__(self, camera: Camera, settings: IndependentMotionConfig, matching: MatchingConfig) -> None:
+    def __init__(
+        self, camera: SharedCamera, settings: IndependentMotionConfig, matching: MatchingConfig
+    ) -> None:
         self.camera = camera
         self.settings = settings
         self.matching = matching
@@ -218,7 +220,7 @@ class IndependentMotion:
 
     def _area(self, pixels: Float[Tensor, "N 2"]) -> int:
         """Number of image cells that contain pixels."""
-        return len(torch.unique(cell_numbers(pixels, self.camera.size)))
+        return len(torch.unique(cell_numbers(pixels, self.camera.current.size)))
 
     def _errors(
         self, last: _Observation, look: _Observation, first: Int[Tensor, " M"], second: Int[Tensor, " M"]
@@ -230,10 +232,10 @@ class IndependentMotion:
         seen, view = last.view, look.view
         if last.T_cw is None or look.T_cw is None:
             return seen.keypoints.new_zeros(len(first))
-        rays = self.camera.unproject(seen.keypoints[first])
+        rays = self.camera.current.unproject(seen.keypoints[first])
         depths = last.depth * rays.new_tensor(_DEPTHS)
         points_c = rays / rays[:, 2:] * depths[:, None, None]
-        pixels, valid = self.camera.project(transform(look.T_cw @ se3_inverse(last.T_cw), points_c))
+        pixels, valid = self.camera.current.project(transform(look.T_cw @ se3_inverse(last.T_cw), points_c))
         distances = distances_to_segments(view.keypoints[second], pixels[:-1], pixels[1:])
         errors = distances.where(valid[:-1] & valid[1:], torch.inf).amin(0)
         return errors / torch.maximum(seen.noise.gate_sigma[first], view.noise.gate_sigma[second])
@@ -253,8 +255,8 @@ class IndependentMotion:
         motion = estimate_relative_pose(
             earlier.keypoints[first[rows]][None],
             view.keypoints[second[rows]][None],
-            camera_1=self.camera,
-            camera_2=self.camera,
+            camera_1=self.camera.current,
+            camera_2=self.camera.current,
             threshold=self.settings.threshold_px,
             kernel="truncated",
             min_samples=64,
@@ -274,7 +276,9 @@ class IndependentMotion:
         k = min(_NUM_NEIGHBORS, len(both))
         distances, nearest = torch.cdist(pixels, both).topk(k, largest=False)
         is_group = nearest < len(group)
-        reach = distances.where(is_group, torch.inf).amin(-1) < _MAX_DISTANCE_RATIO * self.camera.width
+        reach = (
+            distances.where(is_group, torch.inf).amin(-1) < _MAX_DISTANCE_RATIO * self.camera.current.width
+        )
         return reach & (2 * is_group.sum(-1) > k)
 
 
@@ -296,7 +300,7 @@ class FilteredView:
 class SceneFilter:
     """Masks out keypoints of static overlays and moving objects, as far as each is enabled."""
 
-    def __init__(self, camera: Camera, config: Config) -> None:
+    def __init__(self, camera: SharedCamera, config: Config) -> None:
         self.config = config
         self.static_overlay = StaticOverlayDetector(camera, config.static_overlay, config.matching)
         self.independent_motion = IndependentMotion(camera, config.independent_motion, config.matching)

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchslam.config import MatchingConfig, StaticOverlayConfig
 from torchslam.features import match_by_projection
-from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry import Camera, SharedCamera, se3_inverse, transform
 from torchslam.tracking.data_association import image_cells
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures
@@ -55,13 +55,13 @@ class _Reference:
 class StaticOverlayDetector:
     """Collects evidence of static overlays in a grid of image cells."""
 
-    def __init__(self, camera: Camera, settings: StaticOverlayConfig, matching: MatchingConfig) -> None:
+    def __init__(self, camera: SharedCamera, settings: StaticOverlayConfig, matching: MatchingConfig) -> None:
         self.camera = camera
         self.settings = settings
         self.matching = matching
-        width, height = camera.size
+        width, height = camera.current.size
         shape = (int(height // settings.cell_px) + 1, int(width // settings.cell_px) + 1)
-        self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.params.device)
+        self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.current.params.device)
         self._last: _Reference | None = None
         self._pause = 0
 
@@ -89,7 +89,7 @@ class StaticOverlayDetector:
         """
         last = self._last
         if last is None or view.session != last.view.session:
-            self._last = _Reference.of(view, T_cw, depth, self.camera)
+            self._last = _Reference.of(view, T_cw, depth, self.camera.current)
             return 0
         self._pause -= 1
         if self._pause >= 0 or not self._is_far(self._must_move(last, T_cw, _STRIDE)):
@@ -99,7 +99,7 @@ class StaticOverlayDetector:
             return 0
         must_move = view.mask.new_zeros(len(last.view.mask))
         must_move[last.view.mask] = moving
-        self._last = _Reference.of(view, T_cw, depth, self.camera)
+        self._last = _Reference.of(view, T_cw, depth, self.camera.current)
         stayed = self._stayed(last.view, view, must_move)
         before = int((self.evidence >= self.settings.min_evidence).sum())
         if len(stayed) < self.settings.min_keypoints:
@@ -124,7 +124,7 @@ class StaticOverlayDetector:
 
     def _must_move(self, last: _Reference, T_cw: Float[Tensor, "4 4"], step: int = 1) -> Bool[Tensor, " N"]:
         """Whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
-        moved, valid = self.camera.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
+        moved, valid = self.camera.current.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
         distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
         return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
 

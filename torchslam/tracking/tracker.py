@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry import SharedCamera, se3_inverse
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
@@ -31,7 +31,7 @@ class Tracker:
     """
 
     def __init__(
-        self, camera: Camera, config: Config, matcher: Matcher | None = None, counts: bool = True
+        self, camera: SharedCamera, config: Config, matcher: Matcher | None = None, counts: bool = True
     ) -> None:
         self.localizer = Localizer(camera, config)
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
