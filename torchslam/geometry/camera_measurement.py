@@ -80,6 +80,11 @@ class CameraMeasurement:
         spread = axes * variances.clamp_min(0.0).sqrt() * ERROR_FACTOR
         return CameraMeasurement(camera, self.directions @ spread)
 
+    def with_error(self, camera: Camera, covariance: Float[Tensor, "n n"]) -> CameraMeasurement:
+        """Another camera with a covariance of the steps along the directions."""
+        variances, axes = torch.linalg.eigh(covariance)
+        return CameraMeasurement(camera, self.directions @ (axes * variances.clamp_min(0.0).sqrt()))
+
     def departure(self, camera: Camera) -> float:
         """Distance of a camera's focal length from the mean, in standard deviations; 0 for an exact one."""
         std = self.focal_std

@@ -24,6 +24,7 @@ from torchslam.optim.bundle._factors import (
     relative_pose_error,
 )
 from torchslam.optim.bundle._schur import Marginals
+from torchslam.optim.camera_evidence import CameraEstimate, CameraEvidence, camera_evidence
 from torchslam.optim.global_positioning import GlobalPositions, solve_positions
 from torchslam.optim.pose._refinement import RefinedPose, solve_pose
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, solve_pose_graph
@@ -41,6 +42,8 @@ __all__ = [
     "Backward",
     "BundleProblem",
     "BundleSolution",
+    "CameraEstimate",
+    "CameraEvidence",
     "CameraPrior",
     "Convergence",
     "DepthPrior",
@@ -57,6 +60,7 @@ __all__ = [
     "RotationAverage",
     "SolverOptions",
     "SolverReason",
+    "camera_evidence",
     "log_distance_error",
     "relative_pose_error",
     "solve_bundle",

@@ -165,7 +165,7 @@ class BundleMinimization:
         with torch.no_grad():
             solvers = [
                 (part.rows, bundle.exact_solver(_part(found.estimate, part)))
-                for part, bundle in self._bundles(given)
+                for part, bundle in self.formulations(given)
             ]
 
         def solve(right: Tensors) -> Tensors:
@@ -269,7 +269,7 @@ class BundleMinimization:
         """The estimates after one more step from the minima, with the gradient of that step."""
         given = BundleData(*inputs)
         at, steps = self.at_minimum(found, given), []
-        for part, bundle in self._bundles(given):
+        for part, bundle in self.formulations(given):
             model = bundle.evaluate(bundle.ordered(_part(at, part)), ~bundle.solvable)
             solution, _ = bundle.step(model, torch.zeros_like(model.cost))
             steps.append(bundle.in_order(solution))
@@ -277,7 +277,7 @@ class BundleMinimization:
 
     def marginals(self, found: BundleMinimum, inputs: Sequence[Tensor]) -> Marginals:
         with torch.no_grad():
-            bundles = self._bundles(BundleData(*inputs))
+            bundles = self.formulations(BundleData(*inputs))
             return Marginals(
                 *_concatenated([bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles])
             )
@@ -287,7 +287,8 @@ class BundleMinimization:
         report, before = self.progress, self.iterations * part.rows.start
         return None if report is None else lambda now, most: report(before + now, most * len(given.T_cw))
 
-    def _bundles(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any, Any]]]:
+    def formulations(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any, Any]]]:
+        """The parts of a batch and their solvers."""
         return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
 
     def _bundle(self, given: BundleData, part: BatchPart) -> BundleFormulation[Any, Any]:

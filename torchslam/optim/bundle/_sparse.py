@@ -44,6 +44,7 @@ from torchslam.optim.bundle._problem import (
 )
 from torchslam.optim.bundle._schur import (
     BundleTangent,
+    FactorizedEquations,
     Marginals,
     NormalEquations,
     Structure,
@@ -429,6 +430,21 @@ class SparseBundle:
         frames = free.new_zeros(len(estimate.T_cw), 6, 6).index_copy(0, layout.free_frames, free)
         blocks = factor * frames, factor * points[layout.point_rank], factor * camera
         return Marginals(*(block[None] for block in blocks))
+
+    def linear_system(
+        self, estimate: BundleEstimate
+    ) -> tuple[Linearization, Float[Tensor, "2 m O"], Float[Tensor, "3 O"], FactorizedEquations]:
+        """The observations alone, linearized at an estimate in the layout's order.
+
+        Returns:
+            Residuals, their derivatives in the point and what moves of the camera, in the axes of the world, the rays
+            from the observing frames to the points, and the normal equations, factorized.
+        """
+        seen = self._seen(estimate)
+        lin = self._linearize(estimate, seen)
+        equations = self._equations(seen, lin, torch.zeros_like(self.solvable))
+        J = self._in_world(lin.J.movedim(0, -1), seen.R_cw)
+        return lin, J, seen.rays_w, equations.factorized(gauge=self._gauge(estimate))
 
     def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
         """v -> H^-1 v with the exact Hessian at a minimum, for a batch of one in the order of the problem."""

@@ -1,0 +1,175 @@
+"""What stretches of a recording say about its camera: slopes of the cost, errors at their rate, agreement."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchslam.geometry import Camera, se3_exp, transform
+from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.optim import GRAPH_OPTIONS, BundleProblem, solve_bundle
+from torchslam.optim.bundle._camera_scores import camera_scores
+from torchslam.optim.camera_evidence import CameraEvidence, camera_evidence
+
+TRUTH = Camera.radial_tangential(400.0, 404.0, 320.0, 240.0, -0.05, 0.02, 0.0, 0.0, size=(640, 480))
+OPTIONS = GRAPH_OPTIONS.replace(backward="detached", tolerance=1e-12)
+
+
+def walk(seed: int, noise: float = 0.5, frames: int = 24, camera: Camera = TRUTH) -> BundleProblem:
+    """Frames that pass by points, of which each is seen by a few in a row, at the true poses and points."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    twists = 0.05 * normal(frames, 6)
+    twists[:, 0] -= torch.linspace(0, 8, frames, dtype=torch.float64)
+    T_cw = se3_exp(twists)
+    points_w = torch.stack((4 + 3.5 * normal(300), 1.5 * normal(300), 4 + normal(300).clamp(-2, 2)), -1)
+    frame, point = torch.ones(frames, len(points_w)).nonzero().unbind(-1)
+    points_c = transform(T_cw[frame], points_w[point][:, None])
+    pixels, valid = (part[:, 0] for part in camera.project(points_c))
+    seen = valid & camera.in_image(pixels) & (points_c[:, 0, 2] > 0.5)
+    pixels = pixels + noise * normal(*pixels.shape)
+    return BundleProblem(T_cw, points_w, frame[seen], point[seen], pixels[seen], camera)
+
+
+def solved(problem: BundleProblem, given: CameraMeasurement | None = None) -> BundleProblem:
+    """The problem at its minimum, the camera free along the directions of a given one, without a prior."""
+    free = False if given is None else given.directions
+    found = solve_bundle(problem, free_camera=free, check=False, options=OPTIONS)
+    return replace(problem, T_cw=found.T_cw, points_w=found.points_w, camera=found.camera)
+
+
+def off_by(factor: float, std: float = 0.02) -> CameraMeasurement:
+    params = TRUTH.params.clone()
+    params[:2] *= factor
+    return CameraMeasurement.of(TRUTH.with_params(params), std)
+
+
+def test_scores_are_the_slope_of_the_cost_where_frames_and_points_follow() -> None:
+    given = off_by(1.0)
+    problem = solved(walk(0, frames=8))  # with the true camera, which is not that of the minimum
+    found = camera_scores(problem, given.directions, OPTIONS)
+    assert found is not None
+
+    def cost(step: Tensor) -> float:
+        params = problem.camera.params + given.directions @ step
+        moved = replace(problem, camera=problem.camera.with_params(params))
+        return float(solve_bundle(moved, check=False, options=OPTIONS).cost)
+
+    eps = 0.02 * torch.eye(3, dtype=torch.float64)
+    slopes = torch.tensor([(cost(step) - cost(-step)) / 0.04 for step in eps], dtype=torch.float64)
+    torch.testing.assert_close(found.scores.sum(0), -slopes, rtol=1e-3, atol=1e-3)
+    curvatures = torch.tensor([(cost(s) - 2 * cost(0 * s) + cost(-s)) / 0.02**2 for s in eps]).double()
+    torch.testing.assert_close(found.information.sum(0).diagonal(), curvatures, rtol=0.05, atol=0.0)
+
+
+def test_steps_of_frames_and_points_change_no_score() -> None:
+    """Points 0.1 px from their minimum change the camera's own slope, but not the scores."""
+    given = off_by(1.0)
+    problem = solved(walk(1, frames=8), given)
+    generator = torch.Generator().manual_seed(0)
+    off = 1e-3 * torch.randn(problem.points_w.shape, generator=generator, dtype=torch.float64)
+    nudged = replace(problem, points_w=problem.points_w + off)
+    one, other = (camera_scores(each, given.directions, OPTIONS) for each in (problem, nudged))
+    assert one is not None
+    assert other is not None
+    error = one.information.sum(0).diagonal().sqrt()  # standard deviation of a score
+    assert bool((one.scores - other.scores).norm(dim=0).max() > 0.01 * error.min())  # they did move
+    assert float(((one.scores - other.scores).sum(0).abs() / error).max()) < 0.02
+
+
+def whitened_errors(seeds: range, factor: float, shifted: float = 0.0) -> Tensor:
+    """Errors of cameras over their stated ones; `shifted`: each quarter of a walk has another focal length."""
+    given, found = off_by(factor), []
+    for seed in seeds:
+        problem = walk(seed)
+        if shifted:
+            generator = torch.Generator().manual_seed(seed)
+            zoom = 1 + shifted * torch.randn(4, generator=generator, dtype=torch.float64)
+            center = TRUTH.params[2:4]
+            frames = len(problem.T_cw)
+            zoom = (zoom - zoom.mean() + 1)[problem.frame_index * 4 // frames][:, None]
+            problem = replace(problem, pixels=center + zoom * (problem.pixels - center))
+        evidence = camera_evidence(solved(problem, given), given, OPTIONS)
+        assert evidence is not None
+        estimate = evidence.estimate(3)
+        off = torch.linalg.pinv(given.directions) @ (TRUTH.params - given.camera.params)
+        found.append((estimate.step - off) / estimate.covariance.diagonal().sqrt())
+    return torch.stack(found)
+
+
+def test_errors_are_stated_at_their_rate() -> None:
+    """68 % within one, 95 % within two: 90 errors, which are not independent."""
+    off = whitened_errors(range(30), 1.02).abs()
+    assert 0.55 < float((off < 1).double().mean()) < 0.9
+    assert float((off < 2).double().mean()) > 0.9
+
+
+def test_errors_that_stretches_have_in_common_are_stated() -> None:
+    """More than what the residuals grow by, which formal errors follow."""
+    off = whitened_errors(range(12), 1.0, shifted=0.01).abs()
+    assert float((off[:, 0] < 2).double().mean()) > 0.85
+    given = off_by(1.0)
+    plain = camera_evidence(solved(walk(0), given), given, OPTIONS)
+    problem = walk(0)
+    zoom = 1 + 0.02 * torch.sin(problem.frame_index * 1.3)[:, None]
+    wavy = replace(problem, pixels=TRUTH.params[2:4] + zoom * (problem.pixels - TRUTH.params[2:4]))
+    wavy = camera_evidence(solved(wavy, given), given, OPTIONS)
+    assert plain is not None
+    assert wavy is not None
+    ratio = wavy.estimate(3).covariance[0, 0] / plain.estimate(3).covariance[0, 0]
+    assert float(ratio) > 2 * wavy.variance / plain.variance
+
+
+def test_prior_and_evidence_are_weighed_by_their_errors() -> None:
+    given = off_by(1.02)
+    evidence = camera_evidence(solved(walk(3), given), given, OPTIONS)
+    assert evidence is not None
+    loose, tight = (
+        replace(
+            evidence,
+            given=replace(given, directions=given.directions * factor),
+            scores=evidence.scores * factor,
+            information=evidence.information * factor**2,
+        ).estimate()
+        for factor in (10.0, 0.001)
+    )
+    step = evidence.estimate(3).step
+    expected = given.camera.params + given.directions @ step
+    assert float(loose.camera.params[0]) == pytest.approx(float(expected[0]), rel=1e-3)
+    assert loose.departure > 3
+    assert float(tight.camera.params[0]) == pytest.approx(float(given.camera.params[0]), rel=1e-4)
+    assert tight.measured.focal_std <= 1.01 * 0.001 * given.focal_std
+    assert tight.departure == pytest.approx(loose.departure, rel=1e-6)
+
+
+def of_stretches(steps: list[float], information: float = 100.0) -> CameraEvidence:
+    """Stretches that each find a focal length so many standard deviations off, and nothing else."""
+    given = CameraMeasurement(TRUTH, off_by(1.0).directions[:, :1])
+    weights = torch.full((len(steps), 1, 1), information, dtype=torch.float64)
+    return CameraEvidence(given, weights[..., 0] * torch.tensor(steps).double()[:, None], weights, 1.0)
+
+
+def test_what_stretches_agree_on_is_free() -> None:
+    assert of_stretches([1.0, 1.1, 0.9, 1.0]).agreed == 1
+    assert of_stretches([0.01, -0.02, 0.02, 0.0]).agreed == 1  # the prior holds it where it was
+
+
+def test_what_stretches_contradict_is_held_with_the_given_error() -> None:
+    held = of_stretches([3.0, -3.0], information=10000.0)
+    assert held.agreed == 0
+    estimate = held.estimate()
+    assert torch.equal(estimate.camera.params, TRUTH.params)
+    assert estimate.measured.focal_std == pytest.approx(0.02)
+    assert estimate.departure == 0.0
+
+
+def test_a_camera_that_nothing_determines_has_no_evidence() -> None:
+    still = walk(0, frames=2)
+    empty = replace(still, pixels=torch.full_like(still.pixels, float("nan")))
+    assert camera_evidence(empty, off_by(1.0), OPTIONS) is None
