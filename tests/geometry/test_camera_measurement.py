@@ -9,7 +9,6 @@ import torch
 
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import (
-    ERROR_FACTOR,
     CameraMeasurement,
     may_be_same,
     simplify_model,
@@ -35,14 +34,22 @@ def test_the_information_is_the_inverse_along_the_directions() -> None:
     assert float(step @ given.information @ step) == pytest.approx(1 + 4 + 0.25)
 
 
-def test_an_update_inflates_errors_of_independent_observations() -> None:
+def test_another_error_has_the_covariance_that_was_found() -> None:
     given = CameraMeasurement.of(PINHOLE, 0.02)
     shrunk = torch.diag(torch.tensor([0.01, 0.04, 0.09], dtype=torch.float64))
     moved = given.camera.with_params(given.camera.params * 1.01)
-    found = given.updated(moved, shrunk)
+    found = given.with_error(moved, shrunk)
     assert found.camera is moved
-    assert found.focal_std == pytest.approx(0.02 / 1.01 * 0.1 * ERROR_FACTOR)
-    assert found.radial_std == pytest.approx((0.02 * 0.2 * ERROR_FACTOR, 0.02 * 0.3 * ERROR_FACTOR))
+    assert found.focal_std == pytest.approx(0.02 / 1.01 * 0.1)
+    assert found.radial_std == pytest.approx((0.02 * 0.2, 0.02 * 0.3))
+    assert found.observation_variance == given.observation_variance
+
+
+def test_a_camera_that_is_held_has_no_error() -> None:
+    given = CameraMeasurement.of(PINHOLE, 0.02)
+    held = CameraMeasurement(given.camera, given.directions[:, :0])
+    assert (held.focal_std, held.radial_std) == (0.0, (0.0, 0.0))
+    assert not held.information.any()
 
 
 def test_departure_counts_standard_deviations_of_the_focal_length() -> None:

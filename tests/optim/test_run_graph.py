@@ -377,6 +377,26 @@ def test_a_certain_calibration_is_kept():
     )
 
 
+def test_a_calibration_counts_as_much_as_observations_vary():
+    """The noisier the observations, the nearer the camera stays to what was given."""
+    _, graph = simulated(noise=0.5)
+    given, focal = measured(graph), []
+    for variance in (0.01, 1.0, 1e6):
+        calibration = replace(given.calibration, observation_variance=variance)
+        focal.append(float(solve_graph(replace(given, calibration=calibration)).camera.focal))
+    assert focal == sorted(focal)
+    assert focal[2] == pytest.approx(float(given.camera.focal), rel=1e-4)
+
+
+def test_a_camera_of_which_nothing_is_free_is_held():
+    _, graph = simulated(noise=0.5)
+    given = measured(graph)
+    held = replace(given.calibration, directions=given.calibration.directions[:, :0])
+    solution = solve_graph(replace(given, calibration=held))
+    assert torch.equal(solution.camera.params, given.camera.params)
+    torch.testing.assert_close(solution.T_cw, solve_graph(replace(given, calibration=None)).T_cw)
+
+
 def test_the_gradient_reaches_the_calibration():
     """It is that of central differences, and zero for the focal length from which the search starts."""
     truth, graph = simulated()
@@ -415,8 +435,10 @@ def test_the_main_submap_determines_the_camera_of_all():
 def test_a_calibration_is_saved_with_the_graph(tmp_path):
     _, graph = simulated()
     given = measured(graph)
+    given = replace(given, calibration=replace(given.calibration, observation_variance=0.3))
     given.save(tmp_path / "graph.safetensors")
     loaded = ObservationGraph.load(tmp_path / "graph.safetensors")
+    assert loaded.calibration.observation_variance == 0.3
     assert torch.equal(loaded.calibration.directions, given.calibration.directions)
     assert torch.equal(loaded.calibration.camera.params, given.calibration.camera.params)
     assert torch.equal(solve_graph(loaded).T_cw, solve_graph(given).T_cw)

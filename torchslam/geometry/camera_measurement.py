@@ -8,7 +8,7 @@ be wrong; bundle adjustments take it as a prior and move the camera along these 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Self
 
 import torch
@@ -20,11 +20,10 @@ from torchslam.geometry.camera import Camera
 # Parameters of a camera that may be free: the logarithm of the focal length, k1, k2, and the principal point in widths.
 FOCAL, K1, K2, CX, CY = range(5)
 
-ERROR_FACTOR = 3.0
-"""Standard errors of intrinsics are that many times those of independent observations.
-
-A point's errors in neighboring frames are alike: on real sequences, parts of a trajectory disagree by two to five
-formal standard errors (see `torchslam.calibration.intrinsics`)."""
+OBSERVATION_VARIANCE = 9.0
+"""`CameraMeasurement.observation_variance` before a recording has said anything: a point's errors in neighboring frames
+are alike, and parts of a trajectory disagree by two to five formal errors. `torchslam.optim.camera_evidence` finds 0.05
+to 2 at the end of a run: until then, what the recording says counts for little. Tried at this value only."""
 
 
 @dataclass(frozen=True)
@@ -34,10 +33,14 @@ class CameraMeasurement:
     Attributes:
         camera: The mean.
         directions: Columns along which the parameters may be wrong, each by one standard deviation.
+        observation_variance: Variance of an observation as far as it tells something about the camera, in units of the
+            stated one. Where a bundle adjustment has observations with their stated weights, the information of the
+            camera is multiplied by it.
     """
 
     camera: Camera
     directions: Float[Tensor, "P n"]
+    observation_variance: float = OBSERVATION_VARIANCE
 
     @classmethod
     def of(cls, camera: Camera, std: float) -> Self:
@@ -69,21 +72,12 @@ class CameraMeasurement:
         k1, k2 = self.directions[4:6].detach().norm(dim=-1).tolist()
         return k1, k2
 
-    def updated(self, camera: Camera, covariance: Float[Tensor, "n n"]) -> CameraMeasurement:
-        """The measurement after a bundle adjustment.
-
-        Args:
-            camera: The camera that was found.
-            covariance: Marginal covariance of the steps along the directions, of independent observations.
-        """
-        variances, axes = torch.linalg.eigh(covariance)
-        spread = axes * variances.clamp_min(0.0).sqrt() * ERROR_FACTOR
-        return CameraMeasurement(camera, self.directions @ spread)
-
     def with_error(self, camera: Camera, covariance: Float[Tensor, "n n"]) -> CameraMeasurement:
         """Another camera with a covariance of the steps along the directions."""
         variances, axes = torch.linalg.eigh(covariance)
-        return CameraMeasurement(camera, self.directions @ (axes * variances.clamp_min(0.0).sqrt()))
+        return replace(
+            self, camera=camera, directions=self.directions @ (axes * variances.clamp_min(0.0).sqrt())
+        )
 
     def departure(self, camera: Camera) -> float:
         """Distance of a camera's focal length from the mean, in standard deviations; 0 for an exact one."""

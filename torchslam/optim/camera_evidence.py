@@ -22,6 +22,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim.bundle._camera_scores import camera_scores
 from torchslam.optim.bundle._problem import BundleProblem
+from torchslam.optim.run_graph import ObservationGraph, keyframe_problem
 
 MAX_STRETCHES, STRETCH_FRAMES = 10, 3
 """Stretches of a recording, and the least frames of one. By 4 to 20 stretches of seven recordings the errors of the
@@ -44,18 +45,16 @@ class CameraEstimate:
     Attributes:
         measured: the camera and its error, prior and evidence together. Parameters that were held have the error that
             they were given with, and what follows from it for the others.
-        free: leading directions of the given camera that were free.
+        prior: the given camera, along the directions that are free, with the variance of observations that stretches
+            show: a bundle adjustment with it as its prior ends at `camera`.
         step: what the images alone say: steps along these directions, in standard deviations of the given camera.
         covariance: of these steps.
-        prior_factor: what to multiply the information of the given camera with where observations have their stated
-            weights: the variance of an observation, as far as the camera is concerned, in units of the stated one.
     """
 
     measured: CameraMeasurement
-    free: int
+    prior: CameraMeasurement
     step: Float[Tensor, " f"]
     covariance: Float[Tensor, "f f"]
-    prior_factor: float
 
     @property
     def camera(self) -> Camera:
@@ -69,7 +68,7 @@ class CameraEstimate:
         Of several parameters it is the length of the whitened step: 2.4 and 2.8 are exceeded by chance in 5 % of all
         cases with two and three of them.
         """
-        if self.free == 0:
+        if len(self.step) == 0:
             return 0.0
         return float((self.step @ torch.linalg.solve(self.covariance, self.step)).sqrt())
 
@@ -118,12 +117,12 @@ class CameraEvidence:
         covariance[:free, free:], covariance[free:, :free] = follows, follows.mT
         camera = self.given.camera
         camera = camera.with_params(camera.params + self.given.directions[:, :free] @ mean)
+        prior = CameraMeasurement(self.given.camera, self.given.directions[:, :free], factor)
         return CameraEstimate(
             self.given.with_error(camera, covariance),
-            free,
+            prior,
             inverse @ scores[:free],
             root @ scatter @ root.mT,
-            factor,
         )
 
     @cached_property
@@ -197,3 +196,18 @@ def camera_evidence(
     step = torch.linalg.pinv(given.directions) @ off
     at_given = scores + (information @ step[..., None])[..., 0]
     return CameraEvidence(given, at_given, information, float(found.variance))
+
+
+def graph_evidence(
+    graph: ObservationGraph, given: CameraMeasurement, options: SolverOptions = GRAPH_OPTIONS
+) -> CameraEvidence | None:
+    """What the keyframes of a run say about its camera: `camera_evidence` of the submap with most of them.
+
+    Args:
+        graph: at its minimum, keyframes in the order of time.
+        given: the given camera with its error.
+        options: kernel and scale of that minimum.
+    """
+    keyframes = torch.bincount(graph.submap[graph.is_keyframe])
+    *_, problem = keyframe_problem(graph, int(keyframes.argmax()))
+    return camera_evidence(problem, given, options)

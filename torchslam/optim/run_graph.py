@@ -7,6 +7,7 @@ minimizer: one linear solve for the keyframes and the points, one small one for 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from itertools import accumulate
@@ -22,7 +23,7 @@ from torch.nn.utils.rnn import pad_sequence
 
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.geometry.camera_measurement import ERROR_FACTOR, CameraMeasurement
+from torchslam.geometry.camera_measurement import OBSERVATION_VARIANCE, CameraMeasurement
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.optim._core.levenberg_marquardt import Progress, check_minimum
 from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
@@ -46,6 +47,8 @@ _MAX_SIDE = 1 << 26  # of an image, pixels
 _MAX_SIZE_RATIO = 2.0
 _CALIBRATION = "calibration.params", "calibration.directions"
 """Tensors of a file that has them."""
+_VARIANCE = "observation_variance"
+"""Of the calibration, in the metadata of a file; earlier versions wrote none."""
 
 Schema = dict[str, tuple[str, tuple[int, ...], type]]
 """Per column: what it has a row for (K frames, N points or O observations), the shape of a row, the kind of numbers."""
@@ -118,6 +121,8 @@ class ObservationGraph:
             tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
+        if self.calibration is not None:
+            metadata[_VARIANCE] = repr(self.calibration.observation_variance)
         safetensors.torch.save_file(tensors, path, metadata)
 
     @classmethod
@@ -142,7 +147,8 @@ class ObservationGraph:
             calibration = None
             if given:
                 params, directions = (tensors[name] for name in given)
-                calibration = CameraMeasurement(camera.with_params(params), directions)
+                variance = float(metadata.get(_VARIANCE, OBSERVATION_VARIANCE))
+                calibration = CameraMeasurement(camera.with_params(params), directions, variance)
             graph = cls(camera=camera, calibration=calibration, **{name: tensors[name] for name in names})
             graph._check()
             return graph
@@ -188,6 +194,8 @@ class ObservationGraph:
                 raise ValueError("the calibration does not fit the camera")
             if not all(bool(part.isfinite().all()) for part in given):
                 raise ValueError("the calibration is not finite")
+            if not 0 < self.calibration.observation_variance < math.inf:
+                raise ValueError("the calibration's observation variance is not above zero and finite")
         weights = self.weights.diagonal(dim1=1, dim2=2) if self.weights.ndim == 3 else self.weights
         if min(self.camera.size) < 1 or max(self.camera.size) > _MAX_SIDE or bool((weights < 0).any()):
             raise ValueError("an image of an impossible size, or a negative weight")
@@ -363,8 +371,8 @@ def _with_factors(
 
 
 def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
-    """A calibration as the prior of a bundle adjustment, whose observations count as if they were independent."""
-    return CameraPrior(calibration.camera.params, ERROR_FACTOR**2 * calibration.information)
+    """A calibration as the prior of a bundle adjustment whose observations have their stated weights."""
+    return CameraPrior(calibration.camera.params, calibration.observation_variance * calibration.information)
 
 
 def _check_submaps(graph: ObservationGraph) -> None:
@@ -381,7 +389,7 @@ def _check_submaps(graph: ObservationGraph) -> None:
         raise ValueError("a point is seen in two submaps")
 
 
-def _keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, Tensor, BundleProblem]:
+def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tensor, Tensor, BundleProblem]:
     """The keyframes (k,) of one submap, its points (p,), the observations (o,), and their bundle adjustment."""
     frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
@@ -525,7 +533,7 @@ def _solve(
     for graph in graphs:
         _check_submaps(graph)
     submaps = [
-        _GraphSubmap(number, *_keyframe_problem(graph, submap))
+        _GraphSubmap(number, *keyframe_problem(graph, submap))
         for number, graph in enumerate(graphs)
         for submap in graph.submaps
     ]

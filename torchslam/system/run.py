@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import torch
@@ -23,6 +23,7 @@ from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.local_bundle import adjust_all, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress
+from torchslam.optim.camera_evidence import graph_evidence
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
     GraphSolution,
@@ -313,19 +314,23 @@ class FinalAdjustment:
             camera = adjust_all(submap.map, camera, self.settings, progress, given)
         self.camera, self.given = camera, given or self.given
         submap.posed_frames.remove_outliers(submap.map, camera)
-        solution = self._solve(submap, camera, given, progress)
         if not settled:
+            self.camera = camera = self._solve(submap, camera, given, progress).camera
             # Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map
             # have removed that already, and what holds a weak link is often less exact than the rest.
             seen = submap.map.observations()
-            wrong = ~passes_gate(squared_errors(submap.map, seen, solution.camera), FINAL_CHI_SQUARE)
+            wrong = ~passes_gate(squared_errors(submap.map, seen, camera), FINAL_CHI_SQUARE)
             submap.map.remove_masked_observations(seen, wrong)
-            submap.posed_frames.remove_outliers(submap.map, solution.camera, FINAL_CHI_SQUARE, LEAST_RATIO)
-            solution = self._solve(submap, solution.camera, given, progress)
-        self.camera = solution.camera
-        if given is not None:
-            (bundle,) = solution.keyframes
-            self.calibration = given.updated(solution.camera, bundle.covariance().camera)
+            submap.posed_frames.remove_outliers(submap.map, camera, FINAL_CHI_SQUARE, LEAST_RATIO)
+        if given is None:
+            self.camera = self._solve(submap, camera, None, progress).camera
+            return
+        measured, evidence = given, graph_evidence(submap.posed_frames.graph(submap.map, camera), given)
+        if evidence is not None:
+            found = evidence.estimate()
+            camera, given, measured = found.camera, found.prior, found.measured
+        self.camera = self._solve(submap, camera, given, progress).camera
+        self.given, self.calibration = given, replace(measured, camera=self.camera)
 
     @staticmethod
     def _solve(
