@@ -15,6 +15,9 @@ from torch.autograd import gradcheck
 from torchslam.geometry import (
     Camera,
     estimate_similarity,
+    rigid,
+    se3_exp,
+    se3_inverse,
     sim3_exp,
     sim3_inverse,
     sim3_scale,
@@ -22,7 +25,8 @@ from torchslam.geometry import (
     transform,
     umeyama,
 )
-from torchslam.geometry.similarity import _inverse, _Problem, _View
+from torchslam.geometry.similarity import _inverse, _Problem, _View, align_poses
+from torchslam.geometry.transforms import without_scale
 
 
 def cloud(count: int = 12, batch: int = 2) -> Tensor:
@@ -376,3 +380,21 @@ def test_an_empty_batch_or_no_points() -> None:
         assert result.S_21.shape == (batch, 4, 4)
         assert result.inliers.shape == (batch, count)
         assert not result.success.any()
+
+
+@pytest.mark.parametrize("line", [False, True])
+def test_poses_are_aligned_with_their_rotations(line: bool) -> None:
+    """Also where the centers are on a line, about which they could turn."""
+    generator = torch.Generator().manual_seed(3)
+    T_ac = se3_exp(torch.randn(12, 6, generator=generator, dtype=torch.float64))
+    if line:
+        T_ac[:, 1:3, 3] = 0.0
+    S_ba = sim3_exp(torch.tensor([0.3, -1.0, 2.0, 0.4, -0.7, 0.2, 0.5], dtype=torch.float64))
+    T_bc = se3_inverse(without_scale(se3_inverse(T_ac) @ sim3_inverse(S_ba)))
+    torch.testing.assert_close(align_poses(T_ac, T_bc), S_ba, rtol=0, atol=1e-12)
+
+
+def test_poses_at_one_place_keep_their_unit() -> None:
+    T_ac = rigid(so3_exp(torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64)), torch.ones(1, 3).double())
+    S_ba = align_poses(T_ac, torch.eye(4, dtype=torch.float64)[None])
+    torch.testing.assert_close(S_ba @ T_ac[0], torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-12)

@@ -57,7 +57,10 @@ def compute_metrics(
         "camera": camera_remark(finished, camera),
         "rolling_shutter": rolling_shutter_remark(finished),
     }
-    return metrics | remarks | check_metrics(mapped) | {"dropped": sequence.dropped}
+    changes = [{"frame": c.frame, "focal_px": float(c.camera.focal)} for c in finished.camera_changes]
+    return (
+        metrics | remarks | check_metrics(mapped) | {"camera_changes": changes, "dropped": sequence.dropped}
+    )
 
 
 def check_metrics(mapped: MappedRecording | None) -> dict[str, Any]:

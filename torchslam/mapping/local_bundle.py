@@ -21,7 +21,7 @@ from torchslam.geometry import CHI_SQUARE_95, Camera, SharedCamera, passes_gate,
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
-from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Progress, solve_bundle
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, Progress, solve_bundle
 from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
@@ -107,11 +107,23 @@ def adjust_all(
     window = build_window(slam_map, everyone[1:], everyone[:1], camera)
     if window is None:
         return camera
-    problem = window.problem
+    solution = solve_window(window.problem, settings, progress, calibration)
+    camera = camera if calibration is None else solution.camera
+    apply_solution(slam_map, window, solution.T_cw, solution.points_w, camera)
+    return camera
+
+
+def solve_window(
+    problem: BundleProblem,
+    settings: BundleAdjustmentConfig,
+    progress: Progress | None = None,
+    calibration: CameraMeasurement | None = None,
+) -> BundleSolution:
+    """Solve the problem of a window; arguments as for `adjust_all`."""
     free: bool | Tensor = False
     if calibration is not None:
         problem, free = replace(problem, camera_prior=camera_prior(calibration)), calibration.directions
-    solution = solve_bundle(
+    return solve_bundle(
         problem,
         free_camera=free,
         progress=progress,
@@ -120,9 +132,6 @@ def adjust_all(
             kernel="huber", scale=HUBER, iterations=settings.global_iterations, backward="detached"
         ),
     )
-    camera = camera if calibration is None else solution.camera
-    apply_solution(slam_map, window, solution.T_cw, solution.points_w, camera)
-    return camera
 
 
 def build_window(

@@ -20,10 +20,13 @@ from torch import Tensor
 from torchslam.config import Config, to_toml
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
+from torchslam.geometry import Camera
+from torchslam.geometry.camera_measurement import with_radial_terms
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import TrackingState
 from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_submaps, write_tensors
 from torchslam.system.front_end import FeatureExtractor
+from torchslam.system.online_camera import CameraChange
 from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
@@ -64,6 +67,11 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
         "adjustment": slam.mapper.adjustment.is_pending,
         "due": slam.mapper.adjustment.due,
         "loop_precheck": slam.loop_closer.loop_precheck,
+        "camera_changes": [
+            [change.frame, change.camera.params.tolist(), change.departure]
+            for change in slam.online_camera.changes
+        ],
+        "next_camera_check": slam.online_camera.next_check,
         "loop_closures": [astuple(closure) for closure in slam.loop_closer.loop_closures],
     }
     write_tensors(
@@ -153,10 +161,21 @@ def _restore(
         [LoopClosureRecord(*closure) for closure in run["loop_closures"]],
         None if precheck is None else (int(precheck[0]), bool(precheck[1])),
     )
+    changes = [_camera_change(saved.camera, *change) for change in run["camera_changes"]]
+    slam.online_camera.restore(changes, int(run["next_camera_check"]))
     slam.scene_filter.static_overlay.restore(tensors["run.evidence"])
     if run["adjustment"]:  # around the newest keyframe, where the map is as it was at the request
         due = None if run["due"] is None else int(run["due"])
         slam.mapper.adjustment.request(submap.map, submap.map.num_keyframes - 1, due)
+
+
+def _camera_change(given: Camera, frame: int, params: list[float], departure: float) -> CameraChange:
+    """Raises ValueError where the parameters are no camera's."""
+    camera = with_radial_terms(given)
+    found = camera.params.new_tensor(params)
+    if found.shape != camera.params.shape or not bool(found.isfinite().all() and (found[:2] > 0).all()):
+        raise ValueError(f"the parameters of the camera are {params}")
+    return CameraChange(int(frame), camera.with_params(found), float(departure))
 
 
 def _check_tracking(tracking: TrackingState) -> None:

@@ -1,4 +1,4 @@
-"""Maintenance of the active map, always in this order: local adjustment, loops, culling.
+"""Maintenance of the active map, always in this order: local adjustment, loops, culling, the camera.
 
 It runs before a frame is tracked and after it was mapped. Rows may be renumbered; what the submap refers to follows
 (`map/compaction.py`). The submap that the active one is merged into takes its place.
@@ -10,6 +10,7 @@ import torch
 
 from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.system.map_start import MapStart
+from torchslam.system.modes import Mode
 from torchslam.system.session import SystemContext
 
 LOOP_STRIDE = 4
@@ -73,13 +74,18 @@ class Maintenance:
         self.context.mapper.apply_adjustment(self.active_map.current.map)
 
     def _close_and_cull(self) -> None:
-        """Close a loop at the newest keyframe, then cull keyframes and compact the map."""
+        """Close a loop at the newest keyframe, cull keyframes, compact the map, and check the camera."""
         self.close_loops()
         submap = self.active_map.current
         keys = submap.map.keys
         remap = self.context.mapper.cull_and_compact(submap)
         if remap is not None:
             self.context.loop_closer.remove(keys[remap.keyframes < 0])
+        if self.context.mode is Mode.TRACKING and not self.adjustment.is_pending:
+            with self.context.clock("bundle"):
+                has_changed = self.context.online_camera.check(submap)
+            if has_changed:
+                self.context.scene_filter.forget_last()  # its pose was one of the map before
 
     def _precheck_loop(self) -> None:
         """Look for a loop at the newest keyframe while its adjustment is pending.

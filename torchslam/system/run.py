@@ -13,8 +13,8 @@ import torch
 from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Frames, Sequence
 from torchslam.errors import FrameError, InitializationError, TorchslamError
-from torchslam.geometry import Camera, se3_inverse
-from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.geometry import Camera, SharedCamera, se3_inverse
+from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
 from torchslam.geometry.gating import passes_gate
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
@@ -32,6 +32,7 @@ from torchslam.optim.run_graph import (
     solve_graph,
 )
 from torchslam.system.front_end import source
+from torchslam.system.online_camera import CameraChange, OnlineCamera
 from torchslam.system.session import Session
 from torchslam.types import Frame, Reason, State, StepResult, Trajectory
 
@@ -40,6 +41,8 @@ class _System(Protocol):
     """The part of `torchslam.system.slam.SLAM` that a run needs."""
 
     camera: Camera
+    shared_camera: SharedCamera
+    online_camera: OnlineCamera
     config: Config
     session: Session
     loop_closer: LoopCloser
@@ -72,6 +75,7 @@ class Run:
         sessions: number of sessions of the map, without those that only localized.
         given: the given camera with its error, if the final adjustment changed it.
         calibration: `camera` with its error after the final adjustment.
+        camera_changes: cameras that the map took over while the run went on.
     """
 
     submaps: tuple[Submap, ...]
@@ -86,6 +90,7 @@ class Run:
     sessions: int = 1
     given: CameraMeasurement | None = None
     calibration: CameraMeasurement | None = None
+    camera_changes: tuple[CameraChange, ...] = ()
 
     @property
     def main(self) -> Submap | None:
@@ -236,7 +241,9 @@ def finish(
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
     with torch.inference_mode():
         slam.finalize()
-    final = FinalAdjustment(slam.camera, slam.config)
+    std = slam.config.camera.std
+    given = CameraMeasurement.of(slam.camera, std) if std else None
+    final = FinalAdjustment(slam.shared_camera.current, slam.config, given)
     try:
         if slam.session.mapping:
             final.adjust(slam.session.atlas, slam.session.number, adjusting)
@@ -256,6 +263,7 @@ def finish(
         slam.session.count,
         final.given,
         final.calibration,
+        tuple(slam.online_camera.changes),
     )
 
 
@@ -310,7 +318,7 @@ class FinalAdjustment:
     ) -> None:
         camera = self.camera
         if not settled:
-            camera = camera if given is None else given.camera
+            camera = camera if given is None else with_radial_terms(camera)
             camera = adjust_all(submap.map, camera, self.settings, progress, given)
         self.camera, self.given = camera, given or self.given
         submap.posed_frames.remove_outliers(submap.map, camera)

@@ -19,6 +19,7 @@ from torchslam.map.file import read_atlas, write_atlas
 from torchslam.mapping.mapper import Mapper
 from torchslam.system.frame_log import FrameLog
 from torchslam.system.modes import Mode
+from torchslam.system.online_camera import OnlineCamera
 from torchslam.system.savepoint import Savepoint
 from torchslam.tracking.non_static import SceneFilter
 from torchslam.tracking.tracker import Tracker
@@ -121,6 +122,7 @@ class SystemContext:
     session: Session
     loop_closer: LoopCloser
     scene_filter: SceneFilter
+    online_camera: OnlineCamera
     log: FrameLog
     active_map: ActiveMap
 

@@ -39,6 +39,7 @@ from torchslam.system.front_end import (
     source,
 )
 from torchslam.system.modes import Mode
+from torchslam.system.online_camera import OnlineCamera
 from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import ActiveMap, Session, SystemContext
 from torchslam.system.state_machine import FrameOutcome, StateMachine
@@ -91,6 +92,7 @@ class SLAM:
 
     def reset(self) -> None:
         """Forget all submaps, and wait for a new initialization."""
+        self.shared_camera.replace(self.camera)
         self.start_session(Session(self.camera, Atlas(self.camera.params)))
 
     @classmethod
@@ -134,6 +136,7 @@ class SLAM:
         self.mapper.adjustment.drop()
         self.loop_closer = LoopCloser(self.shared_camera, self.scaled_config, self.atlas, self.matcher)
         self.scene_filter = SceneFilter(self.shared_camera, self.scaled_config)
+        self.online_camera = OnlineCamera(self.shared_camera, self.config, self.atlas)
         self._context = SystemContext(
             camera=self.shared_camera,
             config=self.scaled_config,
@@ -144,6 +147,7 @@ class SLAM:
             session=session,
             loop_closer=self.loop_closer,
             scene_filter=self.scene_filter,
+            online_camera=self.online_camera,
             log=FrameLog(self.config.initialization),
             active_map=ActiveMap(submap),
         )

@@ -1,0 +1,134 @@
+"""The camera is corrected while the run goes on."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.walks import Walk
+from torchslam import SLAM, Camera, Config, Run, StepResult, evaluate, load_config
+from torchslam.data.sequence import Sequence
+from torchslam.errors import ResultsError
+from torchslam.geometry import rigid, so3_exp
+from torchslam.map.file import read_tensors, write_tensors
+from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
+from torchslam.system.front_end import Simulated, true_poses
+from torchslam.system.online_camera import MIN_DEPARTURE
+from torchslam.system.run import RunProgress, run_sequence
+
+SETTINGS = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
+SETTINGS += ["simulated.noise_px=0.5", "initialization.provisional_frames=8"]
+
+
+def bend(frames: int, angle: float) -> torch.Tensor:
+    """(F, 4, 4) T_wc of a walk along a bend: turning determines a focal length."""
+    s = torch.linspace(0, 1, frames, dtype=torch.float64)
+    centers = torch.stack([3 * s, 0.2 * torch.sin(9 * s), 1.5 * s * s], -1)
+    turns = torch.stack([0.1 * torch.sin(11 * s), angle * torch.sin(2.5 * s), 0.2 * torch.sin(7 * s)], -1)
+    return rigid(so3_exp(turns), centers)
+
+
+WALK = Walk(bend(70, 1.2))
+
+
+def config(*overrides: str) -> Config:
+    return load_config(None, [*SETTINGS, *overrides])
+
+
+def seen() -> Sequence:
+    """The walk with what its true camera sees."""
+    return Simulated(config(), WALK.camera, true_poses(WALK)).of(WALK)
+
+
+def given(factor: float) -> Camera:
+    """The camera with another focal length than the true one."""
+    params = WALK.camera.params.clone()
+    params[:2] *= factor
+    return WALK.camera.with_params(params)
+
+
+def run(factor: float, *overrides: str) -> Run:
+    return SLAM(given(factor), config(*overrides)).run(seen())
+
+
+def focal_error(camera: Camera) -> float:
+    return abs(float(camera.focal) / float(WALK.camera.focal) - 1)
+
+
+@pytest.fixture(scope="module")
+def corrected() -> Run:
+    return run(1.04)
+
+
+def test_a_wrong_camera_is_corrected_while_the_run_goes_on(corrected: Run) -> None:
+    assert corrected.camera_changes
+    for change in corrected.camera_changes:
+        assert change.departure >= MIN_DEPARTURE
+        assert 0 < change.frame < len(WALK) - 1
+    assert focal_error(corrected.camera_changes[-1].camera) < 0.02
+    assert focal_error(corrected.camera) < 0.01
+    fixed = run(1.04, "camera.std=0")
+    assert not fixed.camera_changes
+    online, with_given = (evaluate(each.online, WALK.groundtruth).ate_m for each in (corrected, fixed))
+    assert online < 0.6 * with_given
+
+
+def test_poses_go_on_where_the_map_was(corrected: Run) -> None:
+    """The map keeps its place and unit: no frame is far from those before and after it."""
+    centers = corrected.online.T_wc[:, :3, 3]
+    steps = centers.diff(dim=0).norm(dim=1)
+    assert float(steps.max()) < 2.0 * float(steps.median())
+
+
+def test_a_right_camera_stays() -> None:
+    found = run(1.0)
+    assert found.camera_changes == ()
+    assert focal_error(found.camera) < 0.01
+
+
+def half() -> tuple[SLAM, RunProgress]:
+    """A system after its camera was changed."""
+    slam, so_far = SLAM(given(1.04), config()), RunProgress()
+
+    class Enough(BaseException):
+        pass
+
+    def stop(_: StepResult) -> None:
+        if slam.online_camera.changes and slam.can_checkpoint:
+            raise Enough
+
+    with pytest.raises(Enough):
+        run_sequence(slam, seen(), stop, so_far)
+    return slam, so_far
+
+
+def test_a_resumed_run_goes_on_with_the_camera_that_was_found(corrected: Run, tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    slam, so_far = half()
+    write_checkpoint(path, slam, so_far, seen())
+    resumed, loaded = read_checkpoint(path, seen(), config())
+    assert torch.equal(resumed.shared_camera.current.params, slam.shared_camera.current.params)
+    assert not torch.equal(resumed.shared_camera.current.params[:4], resumed.camera.params[:4])
+    whole = run_sequence(resumed, seen(), so_far=loaded)
+    assert torch.equal(whole.trajectory.T_wc, corrected.trajectory.T_wc)
+    assert [change.frame for change in whole.camera_changes] == [c.frame for c in corrected.camera_changes]
+
+
+@pytest.mark.parametrize("params", [[400.0], [float("nan")] * 9, [0.0] * 9])
+def test_a_damaged_camera_is_named(params: list[float], tmp_path: Path) -> None:
+    path = tmp_path / "checkpoint.safetensors"
+    write_checkpoint(path, *half(), seen())
+    tensors, about = read_tensors(path)
+    about["run"]["camera_changes"][0][1] = params
+    write_tensors(path, tensors, about)
+    with pytest.raises(ResultsError, match="not a whole checkpoint"):
+        read_checkpoint(path, seen(), config())
+
+
+def test_a_new_start_has_the_given_camera_again() -> None:
+    slam, _ = half()
+    slam.reset()
+    assert torch.equal(slam.shared_camera.current.params, slam.camera.params)
+    assert slam.online_camera.changes == []
