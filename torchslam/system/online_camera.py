@@ -16,11 +16,11 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, SharedCamera, se3_inverse
+from torchslam.geometry import Camera, SharedCamera, se3_inverse, sim3_inverse, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
 from torchslam.geometry.similarity import align_poses
+from torchslam.geometry.transforms import without_scale
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all, apply_solution, build_window, solve_window
 from torchslam.optim import BundleProblem
 from torchslam.optim.camera_evidence import CameraEstimate, camera_evidence
@@ -40,7 +40,7 @@ class CameraChange:
     """A camera that the map took over while the run went on.
 
     Attributes:
-        frame: index of the newest keyframe, after which it is in use.
+        frame: index of the last frame that has its pose by the camera before.
         camera: the new camera.
         departure: standard errors by which the one before was off.
     """
@@ -97,20 +97,22 @@ class OnlineCamera:
         if departure < MIN_DEPARTURE:
             return False
         found = solve_window(at, self.settings, calibration=estimate.prior)
-        before_T_wc = se3_inverse(submap.map.T_cw)
-        apply_solution(submap.map, window, found.T_cw, found.points_w, found.camera)
-        submap.transform(align_poses(se3_inverse(submap.map.T_cw), before_T_wc))
+        # In place and unit of the map as it was: with them go the frames in between, and the poses that follow.
+        S_ba = align_poses(se3_inverse(found.T_cw), se3_inverse(submap.map.T_cw[window.keyframes]))
+        T_cw = without_scale(found.T_cw @ sim3_inverse(S_ba))
+        apply_solution(submap.map, window, T_cw, transform(S_ba, found.points_w), found.camera)
         self.camera.replace(found.camera)
-        self.changes.append(CameraChange(_newest_frame(submap.map), found.camera, departure))
+        self.changes.append(CameraChange(_newest_frame(submap), found.camera, departure))
         for other in self.atlas:
             if other is not submap:
                 adjust_all(other.map, found.camera, self.settings)
         return True
 
 
-def _newest_frame(slam_map: Map) -> int:
-    """Index of the frame of the newest keyframe."""
-    return int(slam_map.keyframes["frame_index"][slam_map.keys.argmax()])
+def _newest_frame(submap: Submap) -> int:
+    """Index of the newest posed frame."""
+    posed = submap.posed_frames
+    return int(posed.frames["frame_index"][posed.keys.argmax()])
 
 
 def _by_time(problem: BundleProblem, keys: Int[Tensor, " K"]) -> BundleProblem:
