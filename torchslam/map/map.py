@@ -390,7 +390,7 @@ class Map:
         self.noise_variance = min(max(variance, 1.0), _MAX_NOISE_VARIANCE)
 
     def set_noise(self, squared_errors: Float[Tensor, " O"]) -> None:
-        """Set the variance of keypoints by the squared errors of a map that is at its minimum, within the same bounds."""
+        """Set the variance of keypoints by the squared errors of a map at its minimum, within the same bounds."""
         if len(squared_errors):
             found = float(squared_errors.median()) / _ADJUSTED_SQUARED_ERROR
             self.noise_variance = min(max(found, 1.0), _MAX_NOISE_VARIANCE)
