@@ -187,6 +187,6 @@ def test_an_outlier_does_not_move_its_frame() -> None:
         T_cw = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached")).T_cw[row]
         return float((T_cw @ se3_inverse(truth))[:3, 3].norm())
 
-    assert off() > 1e-3
+    assert off() > 1e-4
     submap.posed_frames.remove_outliers(submap.map, CAMERA)
     assert off() < 1e-9

@@ -79,6 +79,12 @@ class CameraMeasurement:
             self, camera=camera, directions=self.directions @ (axes * variances.clamp_min(0.0).sqrt())
         )
 
+    def nearest(self, camera: Camera) -> Camera:
+        """The camera with what may be wrong as another one has it, and the rest as given."""
+        off = camera.params - self.camera.params
+        along = self.directions @ (torch.linalg.pinv(self.directions) @ off)
+        return camera.with_params(self.camera.params + along)
+
     def departure(self, camera: Camera) -> float:
         """Distance of a camera's focal length from the mean, in standard deviations; 0 for an exact one."""
         std = self.focal_std

@@ -35,6 +35,7 @@ from torchslam.global_mapping.view_graph import (
 )
 from torchslam.global_mapping.weak_links import strengthen
 from torchslam.map.atlas import Atlas, Submap
+from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.rotation_averaging import solve_rotations
 from torchslam.system.front_end import Extractor, FeatureExtractor, check_size, image_extractor, source
@@ -255,6 +256,8 @@ class GlobalMapper:
         atlas = Atlas(self.camera.params)
         submap = atlas.create()
         fill_submap(submap, views, rows, observed, found)
+        slam_map = submap.map
+        slam_map.set_noise(squared_errors(slam_map, slam_map.observations(), found.camera))
         poser = FramePoser(found.camera, self.scaled)
         mapped = {view.index: view for view in views}
         frames = range(len(self.sequence)) if frames is None else frames

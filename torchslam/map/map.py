@@ -43,6 +43,8 @@ class Map:
         images: Of the keyframes, by key, if the matcher needs them; not saved.
         version: Changes when rows are renumbered.
         noise_variance: Of keypoints, at least 1, in units of what the feature extractor states; poses are judged by it.
+        final_variance: Of keypoints as the final adjustment found it, in the same units, of any size: the weights of a
+            run's graph are by it. Not saved.
     """
 
     def __init__(self) -> None:
@@ -51,7 +53,7 @@ class Map:
         self.keyframes = Table(KEYFRAMES)
         self.images: dict[int, Shaped[Tensor, "1 1 H W"]] = {}
         self.version = 0
-        self.noise_variance = 1.0
+        self.noise_variance = self.final_variance = 1.0
         self._index: ObservationIndex | None = None  # None: not built yet
 
     @property
@@ -386,6 +388,12 @@ class Map:
         rate = 1 / (_PRIOR_ADJUSTMENTS + min(self.num_keyframes, _REMEMBERED_ADJUSTMENTS))
         variance = self.noise_variance + rate * (found - self.noise_variance)
         self.noise_variance = min(max(variance, 1.0), _MAX_NOISE_VARIANCE)
+
+    def set_noise(self, squared_errors: Float[Tensor, " O"]) -> None:
+        """Set the variance of keypoints by the squared errors of a map at its minimum, within the same bounds."""
+        if len(squared_errors):
+            found = float(squared_errors.median()) / _ADJUSTED_SQUARED_ERROR
+            self.noise_variance = min(max(found, 1.0), _MAX_NOISE_VARIANCE)
 
     def mark_renumbered(self) -> None:
         """Rebuild the index on the next query and raise the version, after rows were renumbered."""

@@ -256,7 +256,8 @@ class PosedFrames:
             pixels=with_own(seen.pixels, "pixels"),
             weights=KeypointNoise(
                 with_own(seen.scales, "scales"), with_own(seen.information, "information")
-            ).weights,
+            ).weights
+            / slam_map.final_variance,
             camera=camera,
             calibration=calibration,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)

@@ -19,6 +19,7 @@ from torch import Tensor
 from torchslam.config import BundleAdjustmentConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, SharedCamera, passes_gate, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.geometry.robust import middle_variance
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, Progress, solve_bundle
@@ -90,6 +91,7 @@ def adjust_all(
     settings: BundleAdjustmentConfig,
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
+    tolerance: float = BUNDLE_OPTIONS.tolerance,
 ) -> Camera:
     """Run a global bundle adjustment with the first keyframe fixed.
 
@@ -99,6 +101,7 @@ def adjust_all(
         settings: Number of iterations.
         progress: Called before each iteration; if it raises, the map stays as it was.
         calibration: The given camera with its error: the camera is adjusted as well; None: it is exact.
+        tolerance: Predicted relative reduction of the cost that ends it.
 
     Returns:
         The camera of the adjusted map.
@@ -107,7 +110,7 @@ def adjust_all(
     window = build_window(slam_map, everyone[1:], everyone[:1], camera)
     if window is None:
         return camera
-    solution = solve_window(window.problem, settings, progress, calibration)
+    solution = solve_window(window.problem, settings, progress, calibration, tolerance)
     camera = camera if calibration is None else solution.camera
     apply_solution(slam_map, window, solution.T_cw, solution.points_w, camera)
     return camera
@@ -118,6 +121,7 @@ def solve_window(
     settings: BundleAdjustmentConfig,
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
+    tolerance: float = BUNDLE_OPTIONS.tolerance,
 ) -> BundleSolution:
     """Solve the problem of a window; arguments as for `adjust_all`."""
     free: bool | Tensor = False
@@ -129,7 +133,11 @@ def solve_window(
         progress=progress,
         check=False,
         options=BUNDLE_OPTIONS.replace(
-            kernel="huber", scale=HUBER, iterations=settings.global_iterations, backward="detached"
+            kernel="huber",
+            scale=HUBER,
+            iterations=settings.global_iterations,
+            tolerance=tolerance,
+            backward="detached",
         ),
     )
 
@@ -191,6 +199,15 @@ def squared_errors(slam_map: Map, seen: Observations, camera: Camera) -> Float[T
     """Squared reprojection errors in units of the stated noise."""
     points_c = transform(slam_map.T_cw[seen.keyframe_index], slam_map.positions_w[seen.point_index][:, None])
     return seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera)
+
+
+def find_final_variance(slam_map: Map, camera: Camera) -> None:
+    """Estimate the variance of the keypoints of an adjusted map, and store it in the map."""
+    seen = slam_map.observations()
+    squared = squared_errors(slam_map, seen, camera) * seen.noise.gate_factor**2
+    unknowns = 6 * slam_map.num_keyframes + 3 * len(distinct(seen.point_index))
+    redundancy = 1 - unknowns / max(2 * len(seen), 1)
+    slam_map.final_variance = middle_variance(squared, redundancy)
 
 
 def select(seen: Observations, rows: Int[Tensor, " R"]) -> Observations:

@@ -9,7 +9,7 @@ from typing import Any, Self, get_args
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.geometry.robust import Kernel
+from torchslam.geometry.robust import TAIL_SCALE, Kernel
 from torchslam.optim._core.implicit import Backward
 
 MAX_ITERATIONS = 200
@@ -84,5 +84,6 @@ POSITION_OPTIONS = SolverOptions("huber", 0.1, iterations=100, tolerance=1e-5)
 """As in GLOMAP (Pan et al., 2024): the scale is the sine of 6 degrees, which rays of right matches are off by less even
 with averaged rotations; a bundle adjustment follows, to which more digits are of no use."""
 
-GRAPH_OPTIONS = SolverOptions("huber", 2.45, tolerance=1e-10)
-"""95 % of the norms of two standard normal numbers lie below the scale: a run has rejected wrong matches before."""
+GRAPH_OPTIONS = SolverOptions("cauchy", TAIL_SCALE, tolerance=1e-10)
+"""A run has rejected wrong matches before, but errors of right ones have heavy tails. The weights of its graph are by
+the noise that the run found, which mostly is a half to a fifth of a pixel of the level."""
