@@ -508,3 +508,67 @@ def test_a_run_that_is_ended_anywhere_can_be_resumed_to_the_same_bytes(tmp_path:
                 number,
                 frame,
             )
+
+
+MAPPED = """
+import os, signal, sys
+import torch
+torch.set_num_threads(1)
+from tests.system.test_resume import PATH
+from tests.walks import Walk
+from torchslam.cli import arguments
+from torchslam.cli.main import main
+from torchslam.global_mapping.mapper import GlobalMapper
+from torchslam.global_mapping.view_graph import PairMatcher
+
+match, views, left = PairMatcher.match, GlobalMapper.views, int(sys.argv[1])
+
+def counted(self, pairs):
+    global left
+    print("matching")
+    left -= 1
+    if left == 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return match(self, pairs)
+
+def read(self, indices):
+    print("reading")
+    return views(self, indices)
+
+PairMatcher.match, GlobalMapper.views = counted, read
+arguments.sequence = lambda options: Walk(PATH)
+sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.slow
+def test_a_run_that_is_killed_in_global_mapping_goes_on_there(tmp_path: Path) -> None:
+    """After the features and three distances of image pairs, neither of which is computed again."""
+    env = os.environ | {"OMP_NUM_THREADS": "1"}
+
+    def run(folder: str, kill: int, *more: str) -> subprocess.CompletedProcess[str]:
+        line = ["run", "walk", "--output", str(tmp_path / folder), *SET, "--mapping", "global", *more]
+        command = [sys.executable, "-c", MAPPED, str(kill), *line]
+        return subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=False)
+
+    whole = run("whole", 0)
+    assert whole.returncode == 0, whole.stderr
+    assert json.loads((tmp_path / "whole" / "metrics.json").read_text())["mapping"] == "global"
+    assert run("cut", 4).returncode == -signal.SIGKILL
+    folder = tmp_path / "cut"
+    left = sorted(path.name[:5] for path in (folder / "global_mapping").iterdir())
+    assert left == ["pairs", "pairs", "pairs", "views"]
+    refused = run("cut", 0)
+    assert refused.returncode == 2
+    assert "an unfinished run: --resume continues it" in refused.stderr
+    done = run("cut", 0, "--resume")
+    assert done.returncode == 0, done.stderr
+    assert f"resuming at frame {FRAMES} of {FRAMES}" in done.stderr
+    assert whole.stdout.count("reading") == FRAMES
+    assert "reading" not in done.stdout
+    assert done.stdout.count("matching") == whole.stdout.count("matching") - 3
+    assert sorted(path.name for path in folder.iterdir()) == sorted(
+        path.name for path in (tmp_path / "whole").iterdir()
+    )
+    for name in ("trajectory.txt", "map.safetensors", "online.txt", "calibration.txt"):
+        assert (folder / name).read_bytes() == (tmp_path / "whole" / name).read_bytes(), name

@@ -37,7 +37,16 @@ from torchslam.global_mapping.recording import MappedRecording, Mapping, map_rec
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
-from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, prepare, source_of
+from torchslam.io.results import (
+    CALIBRATION,
+    CHECKPOINT,
+    CONFIG,
+    MAP,
+    STAGES,
+    delete_unfinished,
+    prepare,
+    source_of,
+)
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
@@ -108,7 +117,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=arguments.not_negative,
         default=CHECKPOINT_EVERY,
         metavar="N",
-        help="save the state at most every N keyframes, for --resume; 0: never (default: %(default)s)",
+        help="save the state at most every N keyframes, and what global mapping finds, for --resume; 0: never "
+        "(default: %(default)s)",
     )
     parser.add_argument(
         "--mapping",
@@ -210,7 +220,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
     with StopSignals() as stop_signals, ExitStack() as viewers:
         attempt = _attempt(sequence, config, options, stop_signals, viewers)
         if mode is not None and not attempt.finished.interrupted:
-            attempt = _map_recording(attempt, mode, options.device, stop_signals)
+            attempt = _map_recording(attempt, mode, options, stop_signals)
         stop_signals.begin("when the results are written")
         metrics = _write(attempt, options)
         attempt.watching.end(attempt.finished)
@@ -224,7 +234,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
     if finished.interrupted:
         say("interrupted; the results so far were written")
         return stop_signals.status
-    (options.output / CHECKPOINT).unlink(missing_ok=True)
+    delete_unfinished(options.output)
     if finished.failure:
         say(finished.failure)
         return NO_MAP
@@ -250,13 +260,15 @@ def _attempt(
     )  # the viewers need the images in this process
     watching = viewers.enter_context(_watching(slam, sequence, options))
     latencies: list[float] = []
+    may_go_on = _mode(sequence, options) not in (None, Mapping.ONLINE)
     bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
     with bar as progress:
 
         def after_frame(result: StepResult) -> None:
             if sequence.is_live:
                 latencies.append(1e3 * (time.time() - result.timestamp))
-            checkpoints.offer(at_once=stop_signals.is_wanted)
+            is_last = may_go_on and result.index + 1 == sequence.known_length
+            checkpoints.offer(at_once=stop_signals.is_wanted or is_last)
             watching.show(result)
             progress.update(result)
 
@@ -266,14 +278,22 @@ def _attempt(
 
 
 def _map_recording(
-    attempt: Attempt, mapping: Mapping, device: torch.device, stop_signals: StopSignals
+    attempt: Attempt, mapping: Mapping, options: argparse.Namespace, stop_signals: StopSignals
 ) -> Attempt:
     """Check the run, and map the recording as a whole where that is wanted or needed; Ctrl-C keeps the run."""
     online, config = attempt.finished, attempt.finished.config
+    stages = options.output / STAGES if options.checkpoint else None
     try:
         with StageBar(stop_signals) as bar:
             mapped = map_recording(
-                attempt.sequence, online, config, attempt.sequence.camera, mapping, device, bar.update
+                attempt.sequence,
+                online,
+                config,
+                attempt.sequence.camera,
+                mapping,
+                options.device,
+                bar.update,
+                stages,
             )
     except KeyboardInterrupt:
         return replace(attempt, finished=replace(online, interrupted=True))

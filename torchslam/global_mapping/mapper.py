@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -25,6 +26,7 @@ from torchslam.global_mapping.rounds import (
     adjust_coarsely,
     adjust_in_rounds,
 )
+from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.tracks import join_matches, make_map
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
@@ -58,6 +60,9 @@ HELD_BACK = 10
 """One in so many verified pairs is not used for mapping, so that it can tell whether the map is right."""
 HELD_BACK_DISTANCE = 2
 """Least distance in images of pairs that are held back: pairs of neighbors keep the images together."""
+SAVED_TOGETHER = 50
+"""Images whose features are saved in one file, 80 MB. So many, some seconds of work, are lost when a run is killed.
+Tried at this value only."""
 
 
 Progress = Callable[[str, int, int], None]
@@ -127,6 +132,7 @@ class GlobalMapper:
         extractor: feature extractor; the configured one if None.
         matcher: of two views; the configured one if None.
         progress: receives stages.
+        saved: the costly stages of a run that was ended, and of this one; None: they are not saved.
     """
 
     def __init__(
@@ -139,6 +145,7 @@ class GlobalMapper:
         extractor: FeatureExtractor | None = None,
         matcher: Matcher | None = None,
         progress: Progress = lambda stage, done, most: None,
+        saved: SavedStages | None = None,
     ) -> None:
         self.camera = camera.to(device).to(torch.float64)
         self.config = mapping_config(config)
@@ -150,16 +157,17 @@ class GlobalMapper:
             self.extract = image_extractor(self.config, device, extractor)
         self.matcher = make_matcher(self.scaled.matching, matcher, camera.size, self.scaled.features.kind)
         self.progress = progress
+        self.saved = saved or SavedStages(None, self.sequence, config)
         self.skipped: list[str] = []
 
     @torch.no_grad()
     def run(self, results: Rows[StepResult] = ()) -> GlobalMap:
         """Map the recording; `results`: of an online run over it, whose doubtful frames are mapped as well."""
         images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
-        views = [view for view in self.views(images) if view is not None]
+        views = self._saved_views(images)
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
-        matcher = PairMatcher(views, self.camera, self.matcher, self.scaled)
+        matcher = self.saved.matcher(PairMatcher(views, self.camera, self.matcher, self.scaled))
         pairs = build_view_graph(matcher, lambda done, most: self.progress("matches", done, most))
         held_back = choose_held_back(pairs)
         found = self.reconstruct(views, [pair for row, pair in enumerate(pairs) if row not in held_back])
@@ -280,10 +288,25 @@ class GlobalMapper:
             calibration=final.calibration,
         )
 
-    def views(self, indices: Rows[int], stage: str = "features") -> Iterator[FrameFeatures | None]:
+    def _saved_views(self, images: list[int]) -> list[FrameFeatures]:
+        """The features of the images that can be read, saved in groups."""
+        views: list[FrameFeatures | None] = []
+
+        def find(own: list[int]) -> list[FrameFeatures | None]:
+            found: list[FrameFeatures | None] = []
+            for done, index in enumerate(own, len(views)):
+                self.progress("features", done, len(images))
+                found += self.views([index])
+            return found
+
+        for start in range(0, len(images), SAVED_TOGETHER):
+            own = images[start : start + SAVED_TOGETHER]
+            views += self.saved.views(own, partial(find, own))
+        return [view for view in views if view is not None]
+
+    def views(self, indices: Rows[int]) -> Iterator[FrameFeatures | None]:
         """The features of frames; None for those that cannot be read, which are counted once."""
-        for done, index in enumerate(indices):
-            self.progress(stage, done, len(indices))
+        for index in indices:
             try:
                 frame = self.sequence[index]
                 if frame.features is None or frame.image.numel():
@@ -311,7 +334,7 @@ class GlobalMapper:
             if index in mapped:
                 yield mapped[index]
                 continue
-            for view in self.views([index], "frames between"):
+            for view in self.views([index]):
                 if view is not None:
                     yield view
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from pathlib import Path
 
 import torch
 from jaxtyping import Float
@@ -15,6 +16,7 @@ from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
+from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
 from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher
@@ -67,6 +69,7 @@ def map_recording(
     mapping: Mapping = Mapping.AUTO,
     device: torch.device | str = "cpu",
     progress: Progress = lambda stage, done, most: None,
+    stages: Path | None = None,
 ) -> MappedRecording:
     """Check an online run, and map its recording as a whole where that is wanted or needed.
 
@@ -78,6 +81,8 @@ def map_recording(
         mapping: when to map as a whole.
         device: of torch.
         progress: receives the stages.
+        stages: folder in which features and pairs of images are saved, so that a run that is ended can go on; None:
+            they are not saved.
     """
     check = None
     why = _loss(online)
@@ -89,7 +94,8 @@ def map_recording(
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
         return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
-    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress)
+    saved = SavedStages(stages, sequence, config, device)
+    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress, saved=saved)
     made = mapper.run(online.results)
     if made.run.failure:
         check = check_run(online) if check is None else check

@@ -24,6 +24,7 @@ from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, rigid, transform
+from torchslam.global_mapping.saved_stages import delete_stages
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
 from torchslam.io.export.scene import ExampleFrame, ImageSource
 from torchslam.map.atlas import Submap
@@ -41,6 +42,7 @@ KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
 MAP = "map.safetensors"
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
+STAGES = "global_mapping"  # folder with what global mapping has found, while a run is going on
 POINT_CLOUD = "map.ply"
 DENSE_CLOUD = "dense.ply"  # of the main submap, z up as in POINT_CLOUD
 MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
@@ -107,8 +109,8 @@ def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
 
     Args:
         folder: the results folder.
-        overwrite: replace existing results; their checkpoint is deleted at once.
-        resume: continue from the checkpoint in the folder.
+        overwrite: replace existing results; their checkpoint and saved stages are deleted at once.
+        resume: continue from the checkpoint and the saved stages in the folder.
 
     Raises:
         ResultsError: if the folder has results that would be lost, or a name with which they could not be read again.
@@ -121,14 +123,23 @@ def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     write_whole(folder / PROBE, b"")
     (folder / PROBE).unlink()
-    checkpoint, there = folder / CHECKPOINT, results_in(folder)
+    there = results_in(folder)
+    unfinished = [path for path in (folder / CHECKPOINT, folder / STAGES) if path.exists()]
     if overwrite:
-        checkpoint.unlink(missing_ok=True)
-    elif checkpoint.exists() and not resume:
-        raise ResultsError(f"{checkpoint}: an unfinished run: --resume continues it, --overwrite replaces it")
-    elif there and not checkpoint.exists():
+        delete_unfinished(folder)
+    elif unfinished and not resume:
+        raise ResultsError(
+            f"{unfinished[0]}: an unfinished run: --resume continues it, --overwrite replaces it"
+        )
+    elif there and not unfinished:
         what = "but no checkpoint to resume from" if resume else "which would be lost"
         raise ResultsError(f"{there[0]}: results of an earlier run, {what}: --overwrite replaces them")
+
+
+def delete_unfinished(folder: Path) -> None:
+    """Delete what an unfinished run would be resumed from."""
+    (folder / CHECKPOINT).unlink(missing_ok=True)
+    delete_stages(folder / STAGES)
 
 
 def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path) -> None:

@@ -1,0 +1,209 @@
+"""What global mapping saves while it is going on, and what a resumed run makes of it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.global_mapping.synthetic import Recording, arc, ball
+from tests.global_mapping.test_mapper import WALK, config
+from torchslam.global_mapping.mapper import GlobalMapper
+from torchslam.global_mapping.saved_stages import SavedStages, delete_stages
+from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair
+from torchslam.map.file import FORMAT, read_tensors, write_tensors
+from torchslam.types import FrameFeatures
+
+RECORDING = Recording.of(arc(4), ball(60), first=0)
+VIEWS = RECORDING.views
+PAIRS = [RECORDING.pair(0, 1), RECORDING.pair(1, 3, Relation.PLANE)]
+ENDS = [(0, 1), (0, 2), (1, 3)]
+
+
+class Counted:
+    """A stage that counts how often it is computed."""
+
+    def __init__(self, found: list) -> None:
+        self.found, self.times = found, 0
+
+    def __call__(self) -> list:
+        self.times += 1
+        return self.found
+
+
+def equal(one: object, other: object) -> bool:
+    """Whether all attributes are equal to the bit."""
+
+    def same(a: object, b: object) -> bool:
+        return torch.equal(a, b) and a.dtype == b.dtype if isinstance(a, torch.Tensor) else a == b
+
+    return all(same(getattr(one, each.name), getattr(other, each.name)) for each in fields(one))
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Callable[..., SavedStages]:
+    return lambda *overrides: SavedStages(tmp_path / "stages", WALK, config(*overrides))
+
+
+def without_truth(view: FrameFeatures) -> FrameFeatures:
+    return replace(view, T_cw_groundtruth=None)
+
+
+def test_stages_are_read_as_they_were_saved(saved: Callable[..., SavedStages]) -> None:
+    views, pairs, images = Counted(VIEWS), Counted(PAIRS), [view.index for view in VIEWS]
+    for _ in range(2):
+        found = saved().views(images, views)
+        assert all(map(equal, found, map(without_truth, VIEWS)))
+        assert all(map(equal, saved().pairs(VIEWS, ENDS, pairs), PAIRS))
+    assert views.times == pairs.times == 1
+    nothing = Counted([])
+    assert [saved().pairs(VIEWS, [(2, 3)], nothing) for _ in range(2)] == [[], []]
+    assert nothing.times == 1
+
+
+def test_stages_of_anything_else_are_not_read(saved: Callable[..., SavedStages]) -> None:
+    """Another configuration, other images, other pairs."""
+    views, pairs, images = Counted(VIEWS[:2]), Counted(PAIRS), [view.index for view in VIEWS]
+    saved().views(images[:2], views)
+    saved("seed=3").views(images[:2], views)
+    saved().views(images[1:3], views)
+    assert views.times == 3
+    saved().pairs(VIEWS, ENDS, pairs)
+    saved().pairs(VIEWS, ENDS[:2], pairs)
+    saved().pairs(VIEWS[::-1], ENDS, pairs)
+    assert pairs.times == 3
+
+
+def test_without_a_folder_nothing_is_saved() -> None:
+    views = Counted(VIEWS)
+    saved = SavedStages(None, WALK, config())
+    assert saved.views([0], views) is saved.views([0], views) is VIEWS
+    assert views.times == 2
+
+
+def test_images_that_cannot_be_read_are_tried_again(saved: Callable[..., SavedStages]) -> None:
+    """So is the warning of them; and what a matcher needs of images is not saved."""
+    for found in ([VIEWS[0], None], [VIEWS[0], replace(VIEWS[1], image=torch.zeros(1, 1, 4, 4))]):
+        views = Counted(found)
+        assert all(saved().views([0, 1], views) is found for _ in range(2))
+        assert views.times == 2
+
+
+DAMAGES = {
+    "views": [
+        {"index": torch.arange(1, 5)},
+        {"mask": torch.ones(4, 3, dtype=torch.bool)},
+        {"mask": torch.ones(4, len(VIEWS[0].mask))},
+        {"keypoints": torch.full((4, len(VIEWS[0].mask), 2), torch.nan)},
+        {"scales": None},
+    ],
+    "pairs": [
+        {"about": torch.tensor([[0, 3, len(PAIRS[0]), 0], [1, 3, len(PAIRS[1]), 0]])},
+        {"about": torch.tensor([[0, 1, len(PAIRS[0]), 3], [1, 3, len(PAIRS[1]), 0]])},
+        {"about": torch.tensor([[0, 1, len(PAIRS[0]) + 1, 0], [1, 3, len(PAIRS[1]), 0]])},
+        {"about": torch.tensor([[0, 1, -1, 0], [1, 3, len(PAIRS[1]), 0]])},
+        {"T_21": torch.zeros(2, 3, 4)},
+        {"T_21": torch.full((2, 4, 4), torch.nan)},
+        {"keypoints_1": torch.full((len(PAIRS[0]) + len(PAIRS[1]),), 1 << 30)},
+        {"keypoints_2": torch.full((len(PAIRS[0]) + len(PAIRS[1]),), -1)},
+        {"keypoints_2": torch.zeros(len(PAIRS[0]) + len(PAIRS[1]))},
+        {"keypoints_1": None},
+    ],
+}
+
+
+@pytest.mark.parametrize(
+    ("name", "damage"), [(name, each) for name, all_of in DAMAGES.items() for each in all_of]
+)
+def test_a_damaged_file_is_said_and_computed_again(
+    saved: Callable[..., SavedStages], name: str, damage: dict[str, torch.Tensor | None]
+) -> None:
+    stage = Counted(VIEWS if name == "views" else PAIRS)
+
+    def read() -> list:
+        return saved().views([0, 1, 2, 3], stage) if name == "views" else saved().pairs(VIEWS, ENDS, stage)
+
+    read()
+    (path,) = saved().folder.glob(f"{name}_*")
+    columns, _ = read_tensors(path)
+    kept = {key: rows for key, rows in (columns | damage).items() if rows is not None}
+    write_tensors(path, kept, {"format": FORMAT})
+    with pytest.warns(UserWarning, match="damaged, so it is computed again"):
+        read()
+    assert stage.times == 2
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        read()  # it was written anew
+    assert stage.times == 2
+    path.write_bytes(b"half a fi")
+    with pytest.warns(UserWarning, match="damaged, so it is computed again"):
+        read()
+    assert stage.times == 3
+
+
+def test_only_stages_are_deleted(saved: Callable[..., SavedStages], tmp_path: Path) -> None:
+    folder = tmp_path / "stages"
+    delete_stages(folder)
+    saved().views([0, 1, 2, 3], lambda: VIEWS)
+    saved().pairs(VIEWS, ENDS, lambda: PAIRS)
+    (folder / "views_1.safetensors.part").write_bytes(b"of a killed run")
+    (folder / "notes.txt").write_text("mine")
+    delete_stages(folder)
+    assert [path.name for path in folder.iterdir()] == ["notes.txt"]
+    (folder / "notes.txt").unlink()
+    delete_stages(folder)
+    assert not folder.exists()
+
+
+class PowerCut(BaseException):
+    """Ends a run wherever it is."""
+
+
+def test_global_mapping_goes_on_with_the_same_bytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut after the features of five images, or after two distances of pairs: these are not computed again."""
+    import torchslam.global_mapping.mapper as module
+
+    monkeypatch.setattr(module, "SAVED_TOGETHER", 5)
+    read, matched = list[int](), list[int]()
+    views, match = GlobalMapper.views, PairMatcher.match
+
+    def counted_views(self: GlobalMapper, indices: list[int]) -> object:
+        read.extend(indices)
+        return views(self, indices)
+
+    def counted_match(self: PairMatcher, pairs: list[tuple[int, int]]) -> list[ViewPair]:
+        matched.append(len(pairs))
+        return match(self, pairs)
+
+    monkeypatch.setattr(GlobalMapper, "views", counted_views)
+    monkeypatch.setattr(PairMatcher, "match", counted_match)
+
+    def mapped(folder: Path | None, stop: tuple[str, int] | None = None) -> bytes:
+        read.clear()
+        matched.clear()
+
+        def progress(stage: str, done: int, most: int) -> None:
+            if (stage, done) == stop:
+                raise PowerCut
+
+        saved = SavedStages(folder, WALK, config())
+        run = GlobalMapper(WALK, WALK.camera, config(), None, progress=progress, saved=saved).run().run
+        assert len(run.trajectory) == len(WALK)
+        return run.trajectory.T_wc.numpy().tobytes() + run.map.positions_w.numpy().tobytes()
+
+    whole = mapped(None)
+    images, all_matched = read[:15], list(matched)
+    with pytest.raises(PowerCut):
+        mapped(tmp_path / "stages", ("features", 7))
+    with pytest.raises(PowerCut):
+        mapped(tmp_path / "stages", ("matches", 2))
+    assert read == images[5:]
+    assert mapped(tmp_path / "stages") == whole
+    assert not set(read) & set(images)
+    assert matched == all_matched[2:]
+    assert mapped(tmp_path / "stages") == whole
+    assert matched == []
