@@ -55,10 +55,11 @@ class TurningCamera:
         self.std = relative_focal_std(config.camera)
         self._first: list[FrameFeatures] = []
         self._last: list[FrameFeatures] = []
+        self._first_rates: list[Tensor] = []  # once they are known
 
     def refer_to(self, view: FrameFeatures) -> None:
         """Start with a reference frame."""
-        self._first, self._last = [view], [view]
+        self._first, self._last, self._first_rates = [view], [view], []
 
     def add(self, view: FrameFeatures) -> None:
         """Add the next frame."""
@@ -105,9 +106,12 @@ class TurningCamera:
         """Rotation vectors of both views over the interval before the last one; zero if few views tell them."""
         if len(self._last) < RATE_VIEWS:
             return self.camera.params.new_zeros(2, 3)
-        first, last = ([self._rate(*pair) for pair in pairwise(views)] for views in (self._first, self._last))
-        interval = self._last[-1].timestamp - self._last[-2].timestamp
+        first = self._first_rates = self._first_rates or self._rates(self._first)
+        last, interval = self._rates(self._last), self._last[-1].timestamp - self._last[-2].timestamp
         return interval * torch.stack((1.5 * first[0] - 0.5 * first[1], 1.5 * last[1] - 0.5 * last[0]))
+
+    def _rates(self, views: list[FrameFeatures]) -> list[Float[Tensor, "3"]]:
+        return [self._rate(*pair) for pair in pairwise(views)]
 
     def _rate(self, view_1: FrameFeatures, view_2: FrameFeatures) -> Float[Tensor, "3"]:
         """Angular velocity between a view and the next one, radians per second; zero if too few matches tell it."""
