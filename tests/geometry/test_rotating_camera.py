@@ -186,8 +186,7 @@ def test_without_turns_a_rolling_shutter_is_no_rotation() -> None:
 def test_at_the_middle_row_matches_are_those_of_a_rotation() -> None:
     pixels_1, pixels_2, R_21 = rolled_matches(BENT, 0.9, 0.0)
     middle_1, middle_2 = (
-        at_middle_row(x, BENT, 0.9 * turn)
-        for x, turn in ((pixels_1, TURNS[:, 0]), (pixels_2, TURNS[:, 1]))
+        at_middle_row(x, BENT, 0.9 * turn) for x, turn in ((pixels_1, TURNS[:, 0]), (pixels_2, TURNS[:, 1]))
     )
     mapped, _ = BENT.project(BENT.unproject(middle_1) @ R_21.mT)
     torch.testing.assert_close(mapped, middle_2, atol=1e-6, rtol=0)

@@ -195,7 +195,7 @@ def at_middle_row(
     return camera.project(_rotated(R, camera.unproject(pixels)))[0]
 
 
-def row_phases(camera: Camera, pixels: Float[Tensor, "B N 2"]) -> Float[Tensor, "B N"]:
+def row_phases(camera: Camera, pixels: Float[Tensor, "*batch N 2"]) -> Float[Tensor, "*batch N"]:
     """When the row of a pixel is exposed: from -1/2 in the first row to 1/2 in the last one."""
     return pixels[..., 1] / (camera.height - 1) - 0.5
 
