@@ -13,7 +13,13 @@ from torch import Tensor
 
 from torchslam.geometry import Camera, so3_exp
 from torchslam.geometry.camera_measurement import with_radial_terms
-from torchslam.geometry.rotating_camera import fit_rotating_camera
+from torchslam.geometry.rotating_camera import (
+    READOUT_STD,
+    at_middle_row,
+    fit_rotating_camera,
+    rotation_between,
+    row_phases,
+)
 
 TRUE = Camera.pinhole(500.0, 500.0, 319.5, 239.5, size=(640, 480))
 BENT = Camera.radial_tangential(500.0, 500.0, 319.5, 239.5, -0.15, 0.0, 0.0, 0.0, size=(640, 480))
@@ -133,3 +139,74 @@ def test_it_works_on_the_device_in_the_dtype_and_without_matches(
     nothing = fit_rotating_camera(pixels_1, pixels_2, camera, GUESS, 1.5, ~everything(pixels_1))
     assert torch.isfinite(nothing.R_21).all()
     torch.testing.assert_close(nothing.camera.params[0, :1], camera.params[:1])
+
+
+def rolled(pixels: Tensor, camera: Camera, turns: Tensor) -> Tensor:
+    """Where a rolling shutter sees what a global one sees at pixels (1, N, 2); turns (1, 3) during the readout."""
+    rays, seen = camera.unproject(pixels), pixels
+    for _ in range(30):
+        R = so3_exp(row_phases(camera, seen)[..., None] * turns[:, None])
+        seen = camera.project((R @ rays[..., None])[..., 0])[0]
+    return seen
+
+
+TURNS = torch.tensor([[[0.01, 0.04, -0.02], [-0.02, -0.03, 0.01]]], dtype=torch.float64)
+"""Over the interval between two frames, of a camera that turns back between two views."""
+
+
+def rolled_matches(camera: Camera, readout: float, noise: float) -> tuple[Tensor, Tensor, Tensor]:
+    pixels_1, pixels_2, R_21 = turned(camera, (0.05, 0.15, 0.1))
+    generator = torch.Generator().manual_seed(1)
+    pixels_1, pixels_2 = (
+        rolled(x, camera, readout * turn)
+        + noise * torch.randn(x.shape, generator=generator, dtype=torch.float64)
+        for x, turn in ((pixels_1, TURNS[:, 0]), (pixels_2, TURNS[:, 1]))
+    )
+    return pixels_1, pixels_2, R_21
+
+
+@pytest.mark.parametrize("camera", [TRUE, BENT, FISHEYE])
+@pytest.mark.parametrize("readout", [0.0, 0.3, 0.9])
+def test_a_rolling_shutter_is_found_with_its_readout_time(camera: Camera, readout: float) -> None:
+    pixels_1, pixels_2, R_21 = rolled_matches(camera, readout, 0.3)
+    found = fit_rotating_camera(pixels_1, pixels_2, camera, 0.02, 1.5, everything(pixels_1), TURNS)
+    assert abs(float(found.readout) - readout) < float(found.readout_std) < 0.05
+    assert rotation_error(found.R_21, R_21) < 0.1
+    assert float(found.errors_px.median()) < 0.6
+    assert float(found.departure) < 1.0
+
+
+def test_without_turns_a_rolling_shutter_is_no_rotation() -> None:
+    pixels_1, pixels_2, _ = rolled_matches(TRUE, 0.9, 0.0)
+    found = fit_rotating_camera(pixels_1, pixels_2, TRUE, 0.02, 1.5, everything(pixels_1))
+    assert float(found.errors_px.median()) > 3.0
+    assert (float(found.readout), float(found.readout_std)) == (0.0, READOUT_STD)
+
+
+def test_at_the_middle_row_matches_are_those_of_a_rotation() -> None:
+    pixels_1, pixels_2, R_21 = rolled_matches(BENT, 0.9, 0.0)
+    middle_1, middle_2 = (
+        at_middle_row(x, BENT, 0.9 * turn) for x, turn in ((pixels_1, TURNS[:, 0]), (pixels_2, TURNS[:, 1]))
+    )
+    mapped, _ = BENT.project(BENT.unproject(middle_1) @ R_21.mT)
+    torch.testing.assert_close(mapped, middle_2, atol=1e-6, rtol=0)
+
+
+def test_pixels_of_the_middle_row_stay_and_others_move_with_the_turn() -> None:
+    pixels = torch.tensor([[[319.5, 239.5], [319.5, 0.0], [319.5, 479.0]]], dtype=torch.float64)
+    turn = torch.tensor([[0.0, 0.0, 0.2]], dtype=torch.float64)
+    seen = at_middle_row(pixels, TRUE, turn)[0]
+    # The first row is exposed half a turn of 0.2 before the middle one, the last one half a turn after it.
+    shift = 239.5 * math.sin(0.1)
+    wanted = [[319.5, 239.5], [319.5 + shift, 239.5 - 239.5 * math.cos(0.1)]]
+    wanted.append([319.5 + shift, 239.5 + 239.5 * math.cos(0.1)])
+    torch.testing.assert_close(seen, torch.tensor(wanted, dtype=torch.float64), atol=1e-9, rtol=0)
+
+
+def test_wrong_matches_do_not_change_the_rotation_between_two_frames() -> None:
+    pixels_1, pixels_2, R_21 = turned(TRUE, (0.02, 0.06, -0.03), noise=0.3)
+    wrong = pixels_2.clone()
+    wrong[:, ::3] = wrong[:, ::3].flip(1)
+    assert rotation_error(rotation_between(pixels_1, wrong, TRUE, 1.5), R_21) < 0.05
+    both = rotation_between(pixels_1.repeat(2, 1, 1), torch.cat((pixels_2, wrong)), TRUE, 1.5)
+    assert rotation_error(both[1:], R_21) < 0.05

@@ -36,7 +36,7 @@ from torchslam.mapping.mapper import MapInitializer
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.system.front_end import Simulated
 from torchslam.system.modes import Mode
-from torchslam.types import FrameFeatures, Reason, TwoViewMap
+from torchslam.types import FrameFeatures, Reason, Trajectory, TwoViewMap
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 
@@ -337,6 +337,32 @@ def test_real_images_are_tracked(data_dir: object, name: str, frames: int, ate_m
     run = SLAM(sequence.camera).run(sequence)
     assert len(run.trajectory) >= 0.9 * frames
     assert evaluate(run.trajectory, sequence.groundtruth).ate_m < ate_m
+
+
+@pytest.mark.data
+@pytest.mark.parametrize(
+    ("name", "frames", "precision_m"),
+    [
+        ("shelf_bin", 50, 0.0005),
+        ("machine_hall", 320, 0.0005),
+        ("fr2_desk_20", 20, 0.0005),
+        ("kitti07", 160, 0.02),
+        ("redkitchen", 300, 0.01),
+    ],
+)
+def test_the_final_trajectory_is_not_worse_than_the_online_one(
+    data_dir: object, name: str, frames: int, precision_m: float
+) -> None:
+    """By more than a twentieth and what the ground truth tells, whose errors are up to 3 cm in redkitchen."""
+    sequence = open_sequence(f"{data_dir}/{name}").part(0, frames)
+    run = SLAM(sequence.camera).run(sequence)
+    assert len(run.online) > 0.5 * frames
+    both = torch.isin(run.trajectory.timestamps, run.online.timestamps)
+    posed_online = Trajectory(run.trajectory.timestamps[both], run.trajectory.T_wc[both])
+    online, final = (
+        evaluate(trajectory, sequence.groundtruth).ate_m for trajectory in (run.online, posed_online)
+    )
+    assert final <= 1.05 * online + precision_m
 
 
 @pytest.mark.data

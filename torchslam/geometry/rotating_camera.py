@@ -1,7 +1,8 @@
-"""A camera that only rotates, whose focal length and distortion are uncertain.
+"""A camera that only rotates, whose focal length, distortion and readout time are uncertain.
 
 With a wrong camera, no rotation explains the matches of a camera that turned, and a translation or a plane may seem to.
-A rotation with another camera then explains them as well.
+A rotation with another camera then explains them as well. A rolling shutter does the same: its rows are exposed one
+after the other, and the camera turns in between. Source: Hedborg et al., "Rolling shutter bundle adjustment", 2012.
 """
 
 from __future__ import annotations
@@ -14,16 +15,22 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.camera_measurement import FOCAL, K1, intrinsics_directions, with_radial_terms
-from torchslam.geometry.lie import cayley_rotation, generators
+from torchslam.geometry.lie import cayley_rotation, generators, so3_exp
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import robustify
+from torchslam.geometry.two_view import TwoViews, fit_rotation, propose_rotation
 
 _STARTS = 3  # focal lengths, over twice the standard deviation to both sides; the best result counts
 _ITERATIONS = 10
 """Of Levenberg-Marquardt from each start. Tried at this value only."""
 _KERNEL_SCALE = 2.0  # thresholds at which the Huber kernel becomes linear
 _BEHIND = 1e3  # squared thresholds: the cost of a match that turns behind the camera
+_ROTATION_SAMPLES = 16
+"""Minimal samples of a rotation. Tried at this value only."""
+READOUT_STD = 0.5
+"""Standard deviation of the readout time about zero, in intervals between frames; it is below one. Tried at this value
+only."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +40,16 @@ class RotatingCamera:
     Attributes:
         R_21: rotations from view 1 to view 2.
         camera: the B cameras, each of both views.
+        readout: time between the first and the last row of an image, in the unit of the turns.
+        readout_std: its standard deviation if matches are known to the threshold; without turns, that of the prior.
         departure: of the focal length or of k1, whichever is larger, from the given one, in standard deviations.
         errors_px: pixels between the matches in view 2 and where those of view 1 turn to; infinite behind the camera.
     """
 
     R_21: Float[Tensor, "B 3 3"]
     camera: Camera
+    readout: Float[Tensor, " B"]
+    readout_std: Float[Tensor, " B"]
     departure: Float[Tensor, " B"]
     errors_px: Float[Tensor, "B N"]
 
@@ -51,8 +62,9 @@ def fit_rotating_camera(
     std: float,
     threshold: float,
     mask: Bool[Tensor, "B N"],
+    turns: Float[Tensor, "B 2 3"] | None = None,
 ) -> RotatingCamera:
-    """Fit a rotation, a focal length and k1 to the matches of two views, few of which may be wrong.
+    """Fit a rotation, a focal length, k1 and a readout time to the matches of two views, few of which may be wrong.
 
     Minimizes the Huber cost of the errors in view 2 and of the departure from the given camera, by Levenberg-Marquardt
     from several focal lengths. Not differentiable by design: it serves a decision.
@@ -64,7 +76,10 @@ def fit_rotating_camera(
         std: relative standard deviation of its focal length, and of k1; above zero.
         threshold: pixels, about the noise of one coordinate or somewhat more.
         mask: matches in use.
+        turns: rotation vectors by which the camera turns at each view, from there on, in the interval between two
+            frames; without them the shutter is global.
     """
+    turns = pixels_1.new_zeros(len(mask), 2, 3) if turns is None else turns
     given = with_radial_terms(camera)
     axes = generators(given.params.dtype, given.params.device)
     directions = std * intrinsics_directions(given, [FOCAL, K1])
@@ -80,50 +95,113 @@ def fit_rotating_camera(
         )
         return given.with_params(torch.cat((focal, others), dim=-1))
 
-    def evaluate(R: Float[Tensor, "B 3 3"], change: Float[Tensor, "B 2"]) -> tuple[Tensor, Tensor]:
+    def image_points(
+        R: Float[Tensor, "B 3 3"], at: Camera, readout: Float[Tensor, "B 1"]
+    ) -> tuple[Float[Tensor, "B N 3 3"], Float[Tensor, "B N 3 3"], Tensor, Tensor, Tensor]:
+        """Rotations to the middle row of view 2 and on to the row of the match; the image points before and after."""
+        R_1, R_2 = (so3_exp(readout[..., None] * turn) for turn in row_turns)
+        R_middle = R[:, None] @ R_1.mT
+        h_1 = torch.nn.functional.pad(at.normalize(pixels_1), (0, 1), value=1.0)
+        h_middle = _rotated(R_middle, h_1)
+        return R_middle, R_2, h_1, h_middle, _rotated(R_2, h_middle)
+
+    def evaluate(
+        R: Float[Tensor, "B 3 3"], change: Float[Tensor, "B 2"], readout: Float[Tensor, "B 1"]
+    ) -> tuple[Tensor, Tensor]:
         at = changed(change)
-        h_1, h_2 = _turned(R, at, pixels_1)
+        R_middle, R_2, h_1, h_middle, h_2 = image_points(R, at, readout)
         along = (directions * torch.nn.functional.pad(factor(change), (0, 1), value=1.0)[:, None])[:, None]
         # The image points of fixed pixels move with the camera: 0 = J_point dx + J_params dparams.
         _, _, J_point, J_params = at.project_with_jacobians(h_1)
         moves = -torch.linalg.solve_ex(J_point[..., :2], J_params @ along)[0]
         pixels, valid, J_point, J_params = at.project_with_jacobians(h_2)
-        J_turn = J_point @ torch.einsum("aij,bnj->bnia", axes, h_2)
-        J_camera = J_point @ (R[:, None, :, :2] @ moves) + J_params @ along
+        J_middle = J_point @ R_2
+        J_turn = J_middle @ torch.einsum("aij,bnj->bnia", axes, h_middle)
+        J_camera = J_middle @ (R_middle[..., :2] @ moves) + J_params @ along
+        turned_1, turned_2 = (torch.linalg.cross(t, h) for t, h in zip(row_turns, (h_1, h_2), strict=True))
+        J_readout = J_point @ turned_2[..., None] - J_middle @ (R_middle @ turned_1[..., None])
         residual = (pixels - pixels_2) / threshold
         robust = robustify(residual.square().sum(-1), "huber", residual.new_tensor(_KERNEL_SCALE))
         weight = torch.where(valid & mask, robust.weight, 0.0).sqrt()[..., None, None]
-        rows = torch.cat((torch.cat((J_turn, J_camera), dim=-1) / threshold, residual[..., None]), dim=-1)
-        prior = torch.nn.functional.pad(torch.diag_embed(torch.ones_like(change)), (3, 0))
-        rows = torch.cat(
-            ((weight * rows).flatten(1, 2), torch.cat((prior, change[..., None]), dim=-1)), dim=1
-        )
+        rows = torch.cat((J_turn, J_camera, J_readout), dim=-1) / threshold
+        rows = (weight * torch.cat((rows, residual[..., None]), dim=-1)).flatten(1, 2)
+        departures = torch.cat((change, readout / READOUT_STD), dim=-1)
+        prior = torch.diag_embed(departures.new_tensor((1.0, 1.0, 1 / READOUT_STD)).expand_as(departures))
+        prior = torch.cat((torch.nn.functional.pad(prior, (3, 0)), departures[..., None]), dim=-1)
+        rows = torch.cat((rows, prior), dim=1)
         cost = torch.where(mask, torch.where(valid, robust.rho, _BEHIND), 0.0).sum(-1)
-        return rows.mT @ rows, cost + change.square().sum(-1)
+        return rows.mT @ rows, cost + departures.square().sum(-1)
 
-    def retract(state: ModelState, step: Float[Tensor, "B 5"]) -> ModelState:
-        return cayley_rotation(step[:, :3]) @ state[0], state[1] + step[:, 3:]
+    def retract(state: ModelState, step: Float[Tensor, "B 6"]) -> ModelState:
+        return cayley_rotation(step[:, :3]) @ state[0], state[1] + step[:, 3:5], state[2] + step[:, 5:]
 
     with torch.no_grad():
         B, focal = len(mask), torch.linspace(-2.0, 2.0, _STARTS, dtype=axes.dtype, device=axes.device)
+        row_turns = [
+            row_phases(camera, pixels)[..., None] * turn[:, None]
+            for pixels, turn in zip((pixels_1, pixels_2), turns.unbind(1), strict=True)
+        ]
+        row_turns = [x.repeat_interleave(_STARTS, dim=0) for x in row_turns]
         pixels_1, pixels_2, mask = (x.repeat_interleave(_STARTS, dim=0) for x in (pixels_1, pixels_2, mask))
         change = torch.nn.functional.pad(focal.repeat(B)[:, None], (0, 1))
         at = changed(change)
-        start = _rotation_of_rays(at.unproject(pixels_1), at.unproject(pixels_2), mask), change
-        found, cost = levenberg_marquardt(start, evaluate, retract, _ITERATIONS)
-        (R, change), _ = best_of(tuple(x.unflatten(0, (B, -1)) for x in found), cost.unflatten(0, (B, -1)))
-        at = changed(change)
-        pixels, valid = at.project(_turned(R, at, pixels_1[::_STARTS])[1])
-        errors = torch.where(valid, (pixels - pixels_2[::_STARTS]).norm(dim=-1), torch.inf)
-        return RotatingCamera(R, at, change.abs().amax(-1), errors)
+        R = _rotation_of_rays(at.unproject(pixels_1), at.unproject(pixels_2), mask)
+        found, cost = levenberg_marquardt(
+            (R, change, torch.zeros_like(change[:, :1])), evaluate, retract, _ITERATIONS
+        )
+        R, change, readout = found
+        covariance, singular = torch.linalg.inv_ex(evaluate(*found)[0][:, :-1, :-1])
+        readout_std = (
+            torch.where(singular == 0, covariance[:, -1, -1], torch.inf).sqrt().clamp_max(READOUT_STD)
+        )
+        pixels, valid = changed(change).project(image_points(R, changed(change), readout)[-1])
+        errors = torch.where(valid, (pixels - pixels_2).norm(dim=-1), torch.inf)
+        each = tuple(x.unflatten(0, (B, -1)) for x in (R, change, readout[:, 0], readout_std, errors))
+        (R, change, readout, readout_std, errors), _ = best_of(each, cost.unflatten(0, (B, -1)))
+        return RotatingCamera(R, changed(change), readout, readout_std, change.abs().amax(-1), errors)
 
 
-def _turned(
-    R: Float[Tensor, "B 3 3"], camera: Camera, pixels_1: Float[Tensor, "B N 2"]
-) -> tuple[Float[Tensor, "B N 3"], Float[Tensor, "B N 3"]]:
-    """The image points of pixels, and where they turn to."""
-    h_1 = torch.nn.functional.pad(camera.normalize(pixels_1), (0, 1), value=1.0)
-    return h_1, h_1 @ R.mT
+@full_precision
+def rotation_between(
+    pixels_1: Float[Tensor, "B N 2"], pixels_2: Float[Tensor, "B N 2"], camera: Camera, threshold: float
+) -> Float[Tensor, "B 3 3"]:
+    """The rotations from view 1 to view 2 that most matches support, as if the camera did not move.
+
+    Args:
+        pixels_1: matches in view 1.
+        pixels_2: matches in view 2.
+        camera: of both views, one.
+        threshold: pixels, about the noise of one coordinate or somewhat more.
+    """
+    with torch.no_grad():
+        mask = torch.ones_like(pixels_1[..., 0], dtype=torch.bool)
+        views = TwoViews.of(pixels_1, pixels_2, camera, camera, threshold, mask, None)
+        R = propose_rotation(views, _ROTATION_SAMPLES, torch.Generator().manual_seed(0))
+        ((R,), _) = best_of(*fit_rotation(views, R, _ITERATIONS, _KERNEL_SCALE))
+        return R
+
+
+def at_middle_row(
+    pixels: Float[Tensor, "B N 2"], camera: Camera, turns: Float[Tensor, "B 3"]
+) -> Float[Tensor, "B N 2"]:
+    """Where a camera that turns sees points of any distance while its middle row is exposed.
+
+    Args:
+        pixels: of the points, each seen while its own row is exposed.
+        camera: of the view.
+        turns: rotation vectors from the first row to the last one.
+    """
+    R = so3_exp(-row_phases(camera, pixels)[..., None] * turns[:, None])
+    return camera.project(_rotated(R, camera.unproject(pixels)))[0]
+
+
+def row_phases(camera: Camera, pixels: Float[Tensor, "*batch N 2"]) -> Float[Tensor, "*batch N"]:
+    """When the row of a pixel is exposed: from -1/2 in the first row to 1/2 in the last one."""
+    return pixels[..., 1] / (camera.height - 1) - 0.5
+
+
+def _rotated(R: Float[Tensor, "B N 3 3"], rays: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
+    return (R @ rays[..., None])[..., 0]
 
 
 def _rotation_of_rays(

@@ -6,6 +6,7 @@ Initialization is relative pose, triangulation, refinement, and the checks of th
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -25,11 +26,11 @@ from torchslam.geometry import (
     transform,
     triangulate,
 )
-from torchslam.geometry.rotating_camera import fit_rotating_camera
-from torchslam.geometry.two_view import TRANSFER_WIDTH
+from torchslam.geometry.robust import Kernel
 from torchslam.map.atlas import Submap
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.tracking.matcher import make_matcher, run_matcher
+from torchslam.tracking.turning_camera import TurningCamera
 from torchslam.types import FrameFeatures, Matcher, Reason, Rejection, TwoViewMap
 
 TRIANGULATION_GATE_SIGMA = 3.0
@@ -42,22 +43,44 @@ MIN_MATCHED_RATIO = 0.35
 """Minimum ratio of the keypoints that match if the camera stands still."""
 MIN_EXPLAINED_RATIO = 0.5
 """Ratio of the matches in place that the motion of the others must explain if they belong to the scene."""
-MAX_FOCAL_SIGMAS = 3.0
-"""Largest departure from the focal length of the camera with which a rotation may explain the matches."""
-MAX_LOG_FOCAL = math.log(3.0)
-"""The same for a guess, and for any camera, as a logarithm: about the ratio of the focal lengths of usual lenses."""
-MAX_CONTRADICTING_RATIO = 0.05
-"""Ratio of the matches that may contradict a rotation with another focal length.
-
-Of rendered rotations it is 0.01 or less, with any guess of the focal length and either ORB. Where two frames of real
-sequences determine a map, it is 0.13 or more.
-"""
+MAX_LEFT_RATIO = 0.5
+"""Ratio of the most matches of a reference below which the camera turns away from it: more parallax may not follow.
+Tried from 0.33 to 0.5: rendered walks start the earlier the larger it is."""
+LEAVING_INTERVAL = 3
+"""Views of which one is tried while the camera turns away, since a try takes as long as a view. Tried at 1 and 3."""
+LEAST_NOISE = 0.5
+"""Smallest noise of a keypoint that two views may show, in units of what is assumed: what is smaller is less than the
+errors of a camera model. Tried at this value, and without."""
+NOISE_SIGMAS = 2.0
+"""Threshold of a match that contradicts a rotation, in units of the noise. Tried at this value only."""
 
 MIN_SUPPORT_RATIO = 0.5
 """Minimum support of the map's motion, relative to that of the motion that two frames alone give.
 
 On 46 cuts of real sequences it is 0.83 or more for correct maps; for deliberately wrong ones, mostly below 0.4.
 """
+
+
+@dataclass(frozen=True)
+class ViewMatches:
+    """Matches of the reference with a view.
+
+    Attributes:
+        view: the view.
+        first: keypoints of the reference.
+        second: keypoints of the view that match them.
+        pixels: where both are.
+    """
+
+    view: FrameFeatures
+    first: Int[Tensor, " M"]
+    second: Int[Tensor, " M"]
+    pixels: tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]]
+
+    def of(self, rows: Bool[Tensor, " M"]) -> ViewMatches:
+        """Some of the matches."""
+        pixels_1, pixels_2 = self.pixels
+        return ViewMatches(self.view, self.first[rows], self.second[rows], (pixels_1[rows], pixels_2[rows]))
 
 
 class Initializer:
@@ -68,6 +91,8 @@ class Initializer:
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.config = config
         self._reference: FrameFeatures | None = None
+        self.turning = TurningCamera(camera, config, self.matcher)
+        self._most_matches = 0  # of the reference with a view
         self.num_views = 0  # the reference and the frames after it
         # keypoints of the last view that do not belong to the scene
         self.static_pixels: Float[Tensor, "N 2"] = camera.current.params.new_zeros(0, 2)
@@ -87,8 +112,10 @@ class Initializer:
             self._refer_to(view)
             return Rejection(Reason.NEW_REFERENCE)
         self.num_views += 1
+        self.turning.add(view)
         pairs = run_matcher(self.matcher, self.reference, view)
         first, second = pairs.first, pairs.second
+        self._most_matches = max(self._most_matches, len(first))
         view = view.weighed(second, pairs.weights)
         least = self.config.initialization.min_matches
         if len(first) < least:
@@ -97,52 +124,61 @@ class Initializer:
             if keypoints < least:
                 return Rejection.of(Reason.FEW_KEYPOINTS, count=keypoints, needed=least)
             return Rejection.of(Reason.FEW_MATCHES, count=len(first), needed=least)
-        return self._relate(view, first, second)
+        pixels = self.reference.keypoints[first], view.keypoints[second]
+        return self._relate(ViewMatches(view, first, second, pixels))
 
     def _refer_to(self, view: FrameFeatures) -> None:
         """Start again with another reference frame."""
         self._reference, self.num_views = view, 1
+        self.turning.refer_to(view)
+        self._most_matches = 0
         self.num_planar_views = 0
         self.planar_reason = None
 
-    def _relate(self, view: FrameFeatures, first: Tensor, second: Tensor) -> TwoViewMap | Rejection:
+    def _relate(self, matches: ViewMatches) -> TwoViewMap | Rejection:
         """Initialize from matches with the reference, unless the camera stands still."""
-        settings = self.config.initialization
-        motion = torch.linalg.vector_norm(view.keypoints[second] - self.reference.keypoints[first], dim=-1)
+        settings, view = self.config.initialization, matches.view
+        motion = torch.linalg.vector_norm(matches.pixels[1] - matches.pixels[0], dim=-1)
         moved = float(motion.median())
         if moved >= settings.min_motion_px:
-            scene = self._scene(view, first, second, motion)
+            scene = self._scene(matches, motion)
             if scene is None:
                 return Rejection(Reason.STATIC_AMBIGUOUS)
-            return self._relate_moving(view, first[scene], second[scene], scene_only=False)
-        if len(first) < MIN_MATCHED_RATIO * int(self.reference.mask.sum()):
-            self.static_pixels = view.keypoints[second[motion < settings.max_static_px]]
+            return self._relate_moving(matches.of(scene), scene_only=False)
+        if len(motion) < MIN_MATCHED_RATIO * int(self.reference.mask.sum()):
+            self.static_pixels = matches.pixels[1][motion < settings.max_static_px]
             self._refer_to(view)
             return Rejection(Reason.STATIC_REMAINDER)
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
         moving = motion >= settings.min_motion_px
         if int(moving.sum()) < settings.min_matches:
             return Rejection.of(Reason.STATIONARY, pixels=moved)
-        result = self._relate_moving(view, first[moving], second[moving], scene_only=True)
+        result = self._relate_moving(matches.of(moving), scene_only=True)
         if isinstance(result, TwoViewMap):
             return result
         ratio = 1 - float(moving.double().mean())
         return Rejection.of(Reason.STATIONARY_IN_PART, ratio=ratio, rejection=result)
 
-    def _relate_moving(
-        self, view: FrameFeatures, first: Tensor, second: Tensor, scene_only: bool
-    ) -> TwoViewMap | Rejection:
+    def _relate_moving(self, matches: ViewMatches, scene_only: bool) -> TwoViewMap | Rejection:
         """Initialize from matches that moved.
 
         Args:
-            view: the view.
-            first: keypoints of the reference.
-            second: keypoints of the view that match them.
+            matches: the matches.
             scene_only: True if the other matches stayed in place, so that these may be an object that moves in front
                 of a standing camera: only an essential matrix, which needs depth, is accepted.
         """
+        relative = self._relative_pose(matches)
+        result = self._relate_by_threshold(matches, relative, scene_only)
+        is_leaving = len(matches.first) < MAX_LEFT_RATIO * self._most_matches
+        if isinstance(result, Rejection) and is_leaving and self.num_views % LEAVING_INTERVAL == 0:
+            return self._relate_by_noise(matches, relative) or result
+        return result
+
+    def _relate_by_threshold(
+        self, matches: ViewMatches, relative: RelativePose, scene_only: bool
+    ) -> TwoViewMap | Rejection:
+        """`_relate_moving` with the model that the threshold alone determines."""
         settings = self.config.initialization
-        relative = self._relative_pose(view, first, second)
         model = relative.model[0]
         if scene_only and model != "essential":
             return Rejection.of(Reason.MOVING_OBJECT, model=model)
@@ -152,52 +188,60 @@ class Initializer:
         if model == "homography" and self.num_planar_views < settings.min_planar_frames:
             # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
             if self.num_planar_views.bit_count() == 1:  # the 1st, 2nd, 4th, ...: a test takes long
-                self.planar_reason = self._turns_only(view, first, second, relative)
+                self.planar_reason = self._turns_only(matches, relative)
             return self.planar_reason or Rejection(Reason.PLANAR_SCENE)
         if not bool(relative.success[0]):
             return Rejection.of(Reason.AMBIGUOUS_MOTION, model=model)
-        inliers = torch.nonzero(relative.inliers[0])[:, 0]
         min_good_ratio = settings.min_planar_ratio if model == "homography" else settings.min_good_ratio
-        found = self._triangulate(view, relative.T_21[0], first[inliers], second[inliers], min_good_ratio)
+        found = self._triangulate(matches.of(relative.inliers[0]), relative.T_21[0], min_good_ratio)
         if isinstance(found, Rejection):
             return found
-        return self._turns_only(view, first, second, relative) or found
+        return self._turns_only(matches, relative) or found
 
-    def _turns_only(
-        self, view: FrameFeatures, first: Int[Tensor, " M"], second: Int[Tensor, " M"], relative: RelativePose
-    ) -> Rejection | None:
+    def _relate_by_noise(self, matches: ViewMatches, rough: RelativePose) -> TwoViewMap | None:
+        """Initialize with a view that the camera turns away from, if the matches show more than a turn.
+
+        What parallax there is has to exceed the noise that the matches show, instead of the threshold. Keypoints are
+        those of the middle rows where the shutter rolls.
+
+        Args:
+            matches: the matches.
+            rough: the relative pose by the threshold.
+        """
+        settings = self.config.initialization
+        near = self._offsets(rough.T_21_essential[0], matches) < 2 * settings.threshold_px
+        turned, turns = self.turning.fit(*matches.pixels, near)
+        matches = replace(matches, pixels=self.turning.at_middle_rows(matches.pixels, turns))
+        relative = self._relative_pose(matches, kernel="cauchy")
+        if relative.model[0] != "essential" or not bool(relative.success[0]):
+            return None
+        inliers = relative.inliers[0]
+        # The noise of both views is in the distance from an epipolar line.
+        across = self._offsets(relative.T_21[0], matches.of(inliers)).median()
+        noise = min(max(float(across) / (math.sqrt(2) * 0.6745), LEAST_NOISE), 1.0)
+        if self.turning.explains(turned, inliers, NOISE_SIGMAS * noise):
+            return None
+        found = self._triangulate(matches.of(inliers), relative.T_21[0], settings.min_good_ratio, noise)
+        return found if isinstance(found, TwoViewMap) else None
+
+    def _offsets(self, T_21: Float[Tensor, "4 4"], matches: ViewMatches) -> Float[Tensor, " M"]:
+        """Distances of keypoints of the view from the epipolar lines of those of the reference, pixels."""
+        return epipolar_offsets(T_21, *matches.pixels, self.camera.current, self.camera.current)[0].abs()
+
+    def _turns_only(self, matches: ViewMatches, relative: RelativePose) -> Rejection | None:
         """A rejection if a rotation with another focal length explains the inliers of a relative pose as well.
 
         The focal length may be as wrong as the configuration says of the camera, not at all for an exact one.
         """
-        camera, threshold = self.config.camera, self.config.initialization.threshold_px
-        largest = MAX_LOG_FOCAL if camera.guessed else min(MAX_FOCAL_SIGMAS * camera.std, MAX_LOG_FOCAL)
-        if largest == 0 or not bool(relative.inliers.any()):
+        inliers = relative.inliers[0]
+        if self.turning.std == 0 or not bool(inliers.any()):
             return None
-        rotating = fit_rotating_camera(
-            self.reference.keypoints[first][None],
-            view.keypoints[second][None],
-            self.camera.current,
-            largest / MAX_FOCAL_SIGMAS,
-            threshold,
-            relative.inliers,
-        )
-        if float(rotating.departure) > MAX_FOCAL_SIGMAS:
+        turned, _ = self.turning.fit(*matches.pixels, inliers)
+        if not self.turning.explains(turned, inliers, self.config.initialization.threshold_px):
             return None
-        # Errors in two dimensions, with the noise of both views.
-        limit = math.sqrt(2) * TRANSFER_WIDTH * threshold
-        off = rotating.errors_px[relative.inliers] > limit
-        if float(off.double().mean()) > MAX_CONTRADICTING_RATIO:
-            return None
-        return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(rotating.camera.focal))
+        return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(turned.camera.focal))
 
-    def _scene(
-        self,
-        view: FrameFeatures,
-        first: Int[Tensor, " M"],
-        second: Int[Tensor, " M"],
-        motion: Float[Tensor, " M"],
-    ) -> Bool[Tensor, " M"] | None:
+    def _scene(self, matches: ViewMatches, motion: Float[Tensor, " M"]) -> Bool[Tensor, " M"] | None:
         """Which matches belong to the scene; None if it cannot be decided.
 
         Matches that stay in place do not, unless the motion of the others explains them, as it does far points and
@@ -210,42 +254,49 @@ class Initializer:
             or int((~still).sum()) < self.config.initialization.min_matches
         ):
             return everything
-        others = self._relative_pose(view, first[~still], second[~still])
+        others = self._relative_pose(matches.of(~still))
         if others.model[0] != "essential":
-            return None if self._relative_pose(view, first, second).model[0] == "essential" else everything
-        pixels_1, pixels_2 = self.reference.keypoints[first[still]], view.keypoints[second[still]]
+            return None if self._relative_pose(matches).model[0] == "essential" else everything
+        static = matches.of(still)
         across, along = epipolar_offsets(
-            others.T_21_essential[0], pixels_1, pixels_2, self.camera.current, self.camera.current
+            others.T_21_essential[0], *static.pixels, self.camera.current, self.camera.current
         )
         threshold = self.config.initialization.threshold_px
         explained = (across.abs() < threshold) & (along > -threshold)
         if float(explained.double().mean()) >= MIN_EXPLAINED_RATIO:
             return everything
-        self.static_pixels = view.keypoints[second[still]]
+        self.static_pixels = static.pixels[1]
         return ~still
 
-    def _relative_pose(
-        self, view: FrameFeatures, first: Int[Tensor, " M"], second: Int[Tensor, " M"]
-    ) -> RelativePose:
-        """The relative pose of a view from matching keypoints of the reference and of it."""
+    def _relative_pose(self, matches: ViewMatches, kernel: Kernel = "truncated") -> RelativePose:
+        """The relative pose of the view from matches with the reference."""
+        pixels_1, pixels_2 = matches.pixels
         return estimate_relative_pose(
-            self.reference.keypoints[first][None],
-            view.keypoints[second][None],
+            pixels_1[None],
+            pixels_2[None],
             camera_1=self.camera.current,
             camera_2=self.camera.current,
             threshold=self.config.initialization.threshold_px,
             seed=self.config.seed,
-            kernel="truncated",
+            kernel=kernel,
             min_samples=64,
         )
 
     def _triangulate(
-        self, view: FrameFeatures, T_cw: Tensor, first: Tensor, second: Tensor, min_good_ratio: float
+        self, matches: ViewMatches, T_cw: Tensor, min_good_ratio: float, noise_level: float = 1.0
     ) -> TwoViewMap | Rejection:
-        """Triangulate, refine pose and points together, and check that enough points are accurate."""
+        """Triangulate, refine pose and points together, and check that enough points are accurate.
+
+        Args:
+            matches: the matches.
+            T_cw: pose of the view.
+            min_good_ratio: least ratio of the matches whose depth is known.
+            noise_level: of the keypoints, in units of what is assumed.
+        """
         settings = self.config.initialization
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
-        pixels_1, pixels_2 = self.reference.keypoints[first], view.keypoints[second]
+        view, first, second = matches.view, matches.first, matches.second
+        pixels_1, pixels_2 = matches.pixels
         noise = view.noise[second]
         known = self.reference.noise[first]
         noise = (known.with_explicit_information() if noise.information.shape[-1] else known).pairwise_max(
@@ -261,7 +312,7 @@ class Initializer:
         )
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
         errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera.current)
-        good = is_good(seen, errors.amax(0), noise.gate_sigma, self.camera.current, settings)
+        good = is_good(seen, errors.amax(0), noise_level * noise.gate_sigma, self.camera.current, settings)
         rejection = check_two_view_map(good, seen, len(first), settings, min_good_ratio)
         if rejection:
             return rejection

@@ -1,0 +1,139 @@
+"""How fast a camera turns while a map is looked for, and whether two of its views show more than a turn.
+
+A camera that turns keeps each view for a short time only, and with a rolling shutter it bends what it sees. Both hide
+the parallax of a camera that moves, or look like it.
+"""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchslam.config import CameraConfig, Config
+from torchslam.geometry import SharedCamera
+from torchslam.geometry.lie import so3_log
+from torchslam.geometry.rotating_camera import (
+    RotatingCamera,
+    at_middle_row,
+    fit_rotating_camera,
+    rotation_between,
+)
+from torchslam.geometry.two_view import TRANSFER_WIDTH
+from torchslam.tracking.matcher import run_matcher
+from torchslam.types import FrameFeatures, Matcher
+
+RATE_VIEWS = 3
+"""Views that tell how fast the camera turns at the first or the last of them: two intervals, with which the rate is
+extrapolated by half an interval. Tried at this value only."""
+MAX_READOUT = 1.0
+"""Longest readout of an image, in intervals between frames: no camera needs more time. Tried at this value only."""
+READOUT_SIGMAS = 3.0
+"""Standard deviations from zero at which a readout time counts as measured. Tried at this value only."""
+MAX_FOCAL_SIGMAS = 3.0
+"""Largest departure from the focal length of the camera with which a rotation may explain the matches."""
+MAX_LOG_FOCAL = math.log(3.0)
+"""The same for a guess, and for any camera, as a logarithm: about the ratio of the focal lengths of usual lenses."""
+MAX_CONTRADICTING_RATIO = 0.05
+"""Ratio of the matches that may contradict a rotation with another focal length.
+
+Of rendered rotations it is 0.01 or less, with any guess of the focal length and either ORB. Where two frames of real
+sequences determine a map, it is 0.13 or more.
+"""
+
+
+class TurningCamera:
+    """The views that tell how fast the camera turns at the reference frame and at the last one."""
+
+    def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher) -> None:
+        self.camera, self.matcher = camera, matcher
+        self.threshold_px = config.initialization.threshold_px
+        self.min_matches = config.initialization.min_matches
+        self.std = relative_focal_std(config.camera)
+        self._first: list[FrameFeatures] = []
+        self._last: list[FrameFeatures] = []
+        self._first_rates: list[Tensor] = []  # once they are known
+
+    def refer_to(self, view: FrameFeatures) -> None:
+        """Start with a reference frame."""
+        self._first, self._last, self._first_rates = [view], [view], []
+
+    def add(self, view: FrameFeatures) -> None:
+        """Add the next frame."""
+        if len(self._first) < RATE_VIEWS:
+            self._first.append(view)
+        self._last = [*self._last, view][-RATE_VIEWS:]
+
+    def fit(
+        self, pixels_1: Float[Tensor, "M 2"], pixels_2: Float[Tensor, "M 2"], mask: Bool[Tensor, " M"]
+    ) -> tuple[RotatingCamera, Float[Tensor, "2 3"]]:
+        """The rotation that explains matches of the reference and the last view best, and the turns during a readout.
+
+        The focal length may be as wrong as the configuration says of the camera, the readout as long as the interval
+        between two frames. The turns, rotation vectors from the first row to the last one of both views, are zero where
+        no readout time is measured.
+        """
+        turns = self._turns()
+        found = fit_rotating_camera(
+            pixels_1[None],
+            pixels_2[None],
+            self.camera.current,
+            self.std,
+            self.threshold_px,
+            mask[None],
+            turns[None],
+        )
+        readout = float(found.readout)
+        if readout <= READOUT_SIGMAS * float(found.readout_std):
+            return found, torch.zeros_like(turns)
+        return found, min(readout, MAX_READOUT) * turns
+
+    def explains(self, turned: RotatingCamera, inliers: Bool[Tensor, " M"], noise_px: float) -> bool:
+        """Whether a rotation explains matches that are known to so many pixels."""
+        if float(turned.departure) > MAX_FOCAL_SIGMAS:
+            return False
+        # Errors in two dimensions, with the noise of both views.
+        off = turned.errors_px[0, inliers] > math.sqrt(2) * TRANSFER_WIDTH * noise_px
+        return float(off.double().mean()) <= MAX_CONTRADICTING_RATIO
+
+    def at_middle_rows(
+        self, pixels: tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]], turns: Float[Tensor, "2 3"]
+    ) -> tuple[Float[Tensor, "M 2"], Float[Tensor, "M 2"]]:
+        """Keypoints of the reference and of the last view as global shutters see them at the middle rows."""
+        first, last = (
+            at_middle_row(x[None], self.camera.current, turn[None])[0]
+            for x, turn in zip(pixels, turns, strict=True)
+        )
+        return first, last
+
+    def _turns(self) -> Float[Tensor, "2 3"]:
+        """Rotation vectors of both views over the interval before the last one; zero if few views tell them."""
+        if len(self._last) < RATE_VIEWS:
+            return self.camera.current.params.new_zeros(2, 3)
+        first = self._first_rates = self._first_rates or self._rates(self._first)
+        last, interval = self._rates(self._last), self._last[-1].timestamp - self._last[-2].timestamp
+        return interval * torch.stack((1.5 * first[0] - 0.5 * first[1], 1.5 * last[1] - 0.5 * last[0]))
+
+    def _rates(self, views: list[FrameFeatures]) -> list[Float[Tensor, "3"]]:
+        return [self._rate(*pair) for pair in pairwise(views)]
+
+    def _rate(self, view_1: FrameFeatures, view_2: FrameFeatures) -> Float[Tensor, "3"]:
+        """Angular velocity between a view and the next one, radians per second; zero if too few matches tell it."""
+        pairs = run_matcher(self.matcher, view_1, view_2)
+        if len(pairs.first) < self.min_matches:
+            return self.camera.current.params.new_zeros(3)
+        pixels_1, pixels_2 = view_1.keypoints[pairs.first], view_2.keypoints[pairs.second]
+        R_21 = rotation_between(pixels_1[None], pixels_2[None], self.camera.current, self.threshold_px)
+        return so3_log(R_21[0]) / (view_2.timestamp - view_1.timestamp)
+
+
+def relative_focal_std(camera: CameraConfig) -> float:
+    """Standard deviation of the logarithm of a focal length; zero if it is exact."""
+    return (
+        MAX_LOG_FOCAL / MAX_FOCAL_SIGMAS
+        if camera.guessed
+        else min(camera.std, MAX_LOG_FOCAL / MAX_FOCAL_SIGMAS)
+    )
