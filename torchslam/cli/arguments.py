@@ -9,7 +9,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchslam.config import CHOICES, Config, builtin_names, load_config
+from torchslam.config import CHOICES, READOUTS_MS, Config, builtin_names, load_config
 from torchslam.utils.console import say
 
 if TYPE_CHECKING:
@@ -139,6 +139,12 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         help="relative standard deviation of the given focal length (camera.std): 0.02 if neither this nor the "
         "calibration file says otherwise; 0: the camera is exact",
     )
+    parser.add_argument(
+        "--readout",
+        metavar="MS",
+        help="time from the exposure of the first row of an image to the last (camera.readout): milliseconds, "
+        f"{', '.join(READOUTS_MS)}, 0 for a global shutter, or auto, the default: found where the images show one",
+    )
     parser.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of the random number generators (seed)")
 
@@ -155,6 +161,7 @@ def overrides(options: argparse.Namespace) -> list[str]:
         "features.weights": options.weights,
         "matching.matcher": options.matcher,
         "camera.std": options.camera_std,
+        "camera.readout": options.readout,
         "scale": options.scale,
         "seed": options.seed,
     }

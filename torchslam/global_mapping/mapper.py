@@ -275,6 +275,8 @@ class GlobalMapper:
             "",
             given=final.given,
             calibration=final.calibration,
+            readout=final.readout,
+            shutter=final.shutter,
         )
 
     def views(self, indices: Rows[int], stage: str = "features") -> Iterator[FrameFeatures | None]:
