@@ -123,33 +123,31 @@ def frame_velocities(
 ) -> tuple[Float[Tensor, "K 6"], Bool[Tensor, " K"]]:
     """The velocity of each frame from the poses of the frames before and after, a left perturbation per second.
 
-    Differentiable with respect to the poses. Near a gap of more than `MAX_GAP` frame intervals, and in the first and
-    the last frame, the velocity is unknown and zero.
+    Differentiable with respect to the poses. Frames that are more than `MAX_GAP` frame intervals apart are no
+    neighbors. A frame with one neighbor has the velocity from there to it, one without any has none.
 
     Args:
         T_cw: poses, in any order.
         timestamps: seconds.
-        recordings: frames with different numbers are not neighbors; one recording if omitted.
+        recordings: frames with different numbers are no neighbors; one recording if omitted.
 
     Returns:
-        Velocities, and in which frames they are known.
+        Velocities, zero without neighbors, and which frames have neighbors on both sides.
     """
     order = torch.argsort(timestamps, stable=True)
     if recordings is not None:
         order = order[torch.argsort(recordings[order], stable=True)]
-    times = timestamps[order]
-    intervals = times.diff()
-    is_next = torch.ones_like(intervals, dtype=torch.bool)
+    intervals = timestamps[order].diff()
+    follows = intervals > 0
     if recordings is not None:
-        is_next = recordings[order].diff() == 0
-    is_next = is_next & (intervals > 0)
-    known = torch.zeros_like(timestamps, dtype=torch.bool)
+        follows = follows & (recordings[order].diff() == 0)
+    if bool(follows.any()):
+        follows = follows & (intervals < MAX_GAP * intervals[follows].median())
+    has_before, has_after = (torch.nn.functional.pad(follows, ends) for ends in ((1, 0), (0, 1)))
     velocities = torch.zeros_like(T_cw[:, 0, :1]).expand(len(T_cw), 6)
-    if not bool(is_next.any()):
-        return velocities, known
-    is_next = is_next & (intervals < MAX_GAP * intervals[is_next].median())
-    middle = 1 + (is_next[1:] & is_next[:-1]).nonzero()[:, 0]
-    frames, before, after = order[middle], order[middle - 1], order[middle + 1]
+    is_central = torch.zeros_like(has_before).index_copy(0, order, has_before & has_after)
+    place = (has_before | has_after).nonzero()[:, 0]
+    before, after = order[place - has_before[place].long()], order[place + has_after[place].long()]
     elapsed = (timestamps[after] - timestamps[before]).to(T_cw.dtype)
     steps = se3_log(T_cw[after] @ se3_inverse(T_cw[before])) / elapsed[:, None]
-    return velocities.index_copy(0, frames, steps), known.index_fill(0, frames, True)
+    return velocities.index_copy(0, order[place], steps), is_central

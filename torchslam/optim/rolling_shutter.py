@@ -160,8 +160,8 @@ def find_rolling_shutter(graph: ObservationGraph) -> RollingShutter | None:
         The result; None with too few frames, or too few observations of the same points.
     """
     largest = graph.submap == torch.bincount(graph.submap).argmax()
-    velocities, known = frame_velocities(graph.T_cw, graph.timestamps, graph.recordings)
-    frames = (known & largest).nonzero()[:, 0]
+    velocities, is_central = frame_velocities(graph.T_cw, graph.timestamps, graph.recordings)
+    frames = (is_central & largest).nonzero()[:, 0]
     if len(frames) < MIN_FRAMES:
         return None
     frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]

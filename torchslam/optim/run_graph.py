@@ -53,7 +53,7 @@ _CALIBRATION = "calibration.params", "calibration.directions"
 """Tensors of a file that has them."""
 _READOUT = "readout"
 """Tensor of a file of a rolling shutter: readout, standard error, prior and its standard deviation, in seconds."""
-MAX_ROUNDS, SETTLED_PX = 12, 1e-3
+MAX_ROUNDS, SETTLED_PX = 12, 2e-3
 """Most rounds with a rolling shutter, and the change of the keypoints, as a root mean square, that ends them. A round
 leaves a tenth to a third of the change of the one before."""
 GRADIENT_ROUNDS = 8

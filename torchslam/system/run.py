@@ -352,6 +352,7 @@ class FinalAdjustment:
             submap.posed_frames.remove_outliers(
                 submap.map, solution.camera, FINAL_CHI_SQUARE, LEAST_RATIO, self.readout
             )
+        if not settled or self.readout is not None:
             solution = self._solve(submap, solution.camera, given, progress)
         self.camera = solution.camera
         if given is not None:
@@ -365,9 +366,9 @@ class FinalAdjustment:
         given: CameraMeasurement | None,
         progress: Progress | None,
     ) -> GraphSolution:
-        """Find the readout of a rolling shutter, where there is one, and the solution with it.
+        """Find the readout of a rolling shutter, where there is one, and a solution with it that is nearly settled.
 
-        Each round is a Gauss-Newton step of the readout, with everything else eliminated, and a solution.
+        Each round is a Gauss-Newton step of the readout, with everything else eliminated, and one of the solution.
         """
         known = self._given_readout_s
         for _ in range(READOUT_ROUNDS if known != 0 else 0):
@@ -376,7 +377,7 @@ class FinalAdjustment:
             self.readout = _readout(known, self.shutter)
             if self.readout is None and graph.readout is None:
                 break
-            solution = self._solve(submap, solution.camera, given, progress)
+            solution = self._solve(submap, solution.camera, given, progress, once=True)
         return solution
 
     def _global_shutter(self, submap: Submap, seen: Observations, camera: Camera) -> Observations:
@@ -387,9 +388,16 @@ class FinalAdjustment:
         return replace(seen, pixels=graph.pixels[: len(seen)])  # those of keyframes come first
 
     def _solve(
-        self, submap: Submap, camera: Camera, given: CameraMeasurement | None, progress: Progress | None
+        self,
+        submap: Submap,
+        camera: Camera,
+        given: CameraMeasurement | None,
+        progress: Progress | None,
+        once: bool = False,
     ) -> GraphSolution:
+        """Solve the graph of a submap. once: with the keypoints as its poses correct them now."""
         graph = submap.posed_frames.graph(submap.map, camera, calibration=given, readout=self.readout)
+        graph = graph.global_shutter() if once else graph
         solution = solve_graph(
             graph,
             progress=progress,
