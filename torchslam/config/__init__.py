@@ -11,7 +11,6 @@ from pathlib import Path
 
 from torchslam.config.schema import Settings, choices, merge_settings, scale_pixel_settings, setting, to_toml
 from torchslam.config.sections import (
-    READOUTS_MS,
     BundleAdjustmentConfig,
     CameraConfig,
     DenseConfig,
@@ -34,7 +33,6 @@ from torchslam.errors import ConfigError
 
 __all__ = [
     "CHOICES",
-    "READOUTS_MS",
     "BundleAdjustmentConfig",
     "CameraConfig",
     "Config",

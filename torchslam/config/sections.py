@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from torchslam.config.schema import SHOWN, Settings, setting
-from torchslam.errors import ConfigError
+from torchslam.config.schema import Settings, setting
 from torchslam.plugins import FEATURE_EXTRACTORS, MATCHERS
 
 MAX_COUNT = 1_000_000
@@ -22,12 +21,9 @@ MIN_CELL_PX = 1.0
 MAX_FACTOR = 1_000_000
 """Upper bound of ratios and factors without a natural limit; far beyond the value that disables a test."""
 
-AUTO = "auto"
-"""The readout of a camera that is to be found."""
-READOUTS_MS = {"kinect": 30.0}
-"""Readouts of cameras, milliseconds. The Kinect's is that of its color camera at 30 frames a second."""
 MAX_READOUT_MS = 1000
-"""Bound of a given readout, milliseconds: cameras need 5 to 60."""
+"""Bound of the readout of a rolling shutter and of its error, milliseconds: cameras need 5 to 60."""
+
 MAX_PIXELS = 1 << 26
 """Number of pixels of the largest image that is decoded."""
 REDUCTION_TOLERANCE = 1.6
@@ -48,33 +44,20 @@ class CameraConfig(Settings, section="camera"):
         False,
         "The focal length is a guess: no map is made of what a rotation with another one explains as well.",
     )
-    readout: str = setting(
-        AUTO,
-        "Time from the exposure of the first row of an image to the last: milliseconds, or a camera (kinect); "
-        "0: a global shutter; auto: found where the images show a rolling one.",
+    readout: float = setting(
+        0.0,
+        "Given time from the exposure of the first row of an image to the last, in milliseconds: that of a rolling "
+        "shutter.",
+        low=-MAX_READOUT_MS,
+        high=MAX_READOUT_MS,
     )
-
-    def __post_init__(self) -> None:
-        if isinstance(self.readout, int | float) and not isinstance(self.readout, bool):
-            object.__setattr__(self, "readout", f"{self.readout:g}")
-        super().__post_init__()
-        if self.readout != AUTO and not abs(self._milliseconds()) <= MAX_READOUT_MS:
-            raise ConfigError(
-                f"camera.readout must be {AUTO}, {', '.join(READOUTS_MS)}, or milliseconds from -{MAX_READOUT_MS} to "
-                f"{MAX_READOUT_MS}, not {self.readout[:SHOWN]!r}"
-            )
-
-    @property
-    def readout_s(self) -> float | None:
-        """The given readout in seconds; None if it is to be found."""
-        return None if self.readout == AUTO else 1e-3 * self._milliseconds()
-
-    def _milliseconds(self) -> float:
-        """The given readout; NaN for what is no number."""
-        try:
-            return READOUTS_MS[self.readout] if self.readout in READOUTS_MS else float(self.readout)
-        except ValueError:
-            return math.nan
+    readout_std: float = setting(
+        float(MAX_READOUT_MS),
+        "Standard deviation of the readout, in milliseconds: images say more about it; a readout of 0 is replaced only "
+        "where they show a rolling shutter. 0: the readout is exact.",
+        low=0,
+        high=MAX_READOUT_MS,
+    )
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class Readout:
 
     def updated(self, seconds: float, std: float) -> Self:
         """The mean of the prior and of what images say, weighted by their information."""
-        if not math.isfinite(std):
+        if not math.isfinite(std) or not self.prior_std:
             return self
         share = self.prior_std**2 / (self.prior_std**2 + std**2)
         mean = self.prior + share * (seconds - self.prior)

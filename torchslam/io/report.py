@@ -60,17 +60,12 @@ def compute_metrics(
     return metrics | remarks | check_metrics(mapped) | {"dropped": sequence.dropped}
 
 
-def readout_metrics(finished: Run) -> dict[str, float | None] | None:
-    """The readout of a rolling shutter, its error, and what was given, in milliseconds; None for a global shutter."""
+def readout_metrics(finished: Run) -> dict[str, float] | None:
+    """The readout of a rolling shutter, its error and what was given, in milliseconds; None for a global shutter."""
     known = finished.readout
     if known is None:
         return None
-    given = finished.config.camera.readout_s
-    return {
-        "ms": 1e3 * float(known.seconds),
-        "std_ms": 1e3 * known.std,
-        "given_ms": None if given is None else 1e3 * given,
-    }
+    return {"ms": 1e3 * float(known.seconds), "std_ms": 1e3 * known.std, "given_ms": 1e3 * known.prior}
 
 
 def shake_remark(finished: Run) -> str:
@@ -261,7 +256,7 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
 
 def readout_words(readout: Mapping[str, Any]) -> str:
     """Describe the entry `readout` of metrics.json."""
-    source = "found" if readout["given_ms"] is None else f"given: {readout['given_ms']:g} ms"
+    source = f"given: {readout['given_ms']:g} ms" if readout["given_ms"] else "found"
     return (
         f"{readout['ms']:.1f} ± {readout['std_ms']:.1f} ms from the first row to the last ({source}): a rolling "
         "shutter, which the final poses take into account"

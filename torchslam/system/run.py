@@ -272,11 +272,6 @@ FINAL_CHI_SQUARE = 1.5**2
 Where poses are right keypoints are more exact than stated: the median squared error is .07 to .39 of it on five
 recordings. From 1.2 to 2.4 deviations, their ATE changes by up to 6 % without order; with 1.7 and more, over 2 % of
 redkitchen's errors stay above 4 px."""
-READOUT_STD = 1.0
-"""Frame intervals: standard deviation of the prior of a readout that is to be found, at zero. The rows of an image are
-read before those of the next one. Tried at this value only: readouts that are found have errors of a twentieth."""
-GIVEN_READOUT_STD = 0.001
-"""Seconds: standard deviation of a given readout. Tried at this value only."""
 READOUT_ROUNDS = 2
 """Steps of the readout: the second one changes it by a thirtieth, a third one by less than a hundredth."""
 LEAST_RATIO = 0.3
@@ -302,7 +297,7 @@ class FinalAdjustment:
         self._measured = measured
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
-        self._given_readout_s = config.camera.readout_s
+        self._known = Readout.known(1e-3 * config.camera.readout, 1e-3 * config.camera.readout_std)
         self.readout: Readout | None = None
         self.shutter: RollingShutter | None = None
 
@@ -370,11 +365,16 @@ class FinalAdjustment:
 
         Each round is a Gauss-Newton step of the readout, with everything else eliminated, and one of the solution.
         """
-        known = self._given_readout_s
-        for _ in range(READOUT_ROUNDS if known != 0 else 0):
+        known = self._known
+        is_given = known.prior != 0
+        if not (is_given or known.prior_std):
+            return solution
+        for _ in range(READOUT_ROUNDS):
             graph = submap.posed_frames.graph(submap.map, solution.camera, readout=self.readout)
-            self.shutter = find_rolling_shutter(graph)
-            self.readout = _readout(known, self.shutter)
+            found = self.shutter = find_rolling_shutter(graph)
+            self.readout = known if is_given else None
+            if found is not None and (is_given or found.is_read_out):
+                self.readout = known.updated(found.readout, found.readout_std)
             if self.readout is None and graph.readout is None:
                 break
             solution = self._solve(submap, solution.camera, given, progress, once=True)
@@ -405,16 +405,6 @@ class FinalAdjustment:
         )
         submap.posed_frames.apply_solution(solution, graph, submap.map)
         return solution
-
-
-def _readout(given_s: float | None, found: RollingShutter | None) -> Readout | None:
-    """The readout from a prior and what the residuals say; None where it is not given, and they show none."""
-    if given_s is not None:
-        prior = Readout.known(given_s, GIVEN_READOUT_STD)
-        return prior if found is None else prior.updated(found.readout, found.readout_std)
-    if found is None or not found.is_read_out:
-        return None
-    return Readout.known(0.0, READOUT_STD * found.interval).updated(found.readout, found.readout_std)
 
 
 def failure_message(slam: _System, results: list[StepResult], skipped: list[str]) -> str:
