@@ -14,7 +14,10 @@ from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 
 HERE = Path(__file__).parent
-HEADER = "sequence | posed | readout (ms) | ATE (mm) | ATE, global shutter (mm) | ATE, online (mm) | f (px) | f, global shutter (px)"
+HEADER = (
+    "sequence | posed | readout (ms) | ATE (mm) | ATE, global shutter (mm) | ATE, online (mm) | f (px)"
+    " | f, global shutter (px)"
+)
 ROOMS = [f"synthetic:room?readout={ms}{pace}" for pace in ("", "&pace=2") for ms in (0, 10, 30)]
 RECORDINGS = ["redkitchen", "fr2_desk_20", "kitti07", "machine_hall", "shelf_bin"]
 GLOBAL_SHUTTER = CameraConfig(readout_std=0.0)

@@ -32,5 +32,5 @@ def test_other_words_are_named(capsys: pytest.CaptureFixture[str]) -> None:
         parsed("--readout", "fast")
     assert "'fast' is neither a number nor one of auto, kinect" in capsys.readouterr().err
     for number in ("nan", "2000"):
-        with pytest.raises(ConfigError, match="camera.readout must be at least -1000 and at most 1000"):
+        with pytest.raises(ConfigError, match=r"camera\.readout must be at least -1000 and at most 1000"):
             parsed("--readout", number)

@@ -221,8 +221,10 @@ def _is_readout(value: object) -> bool:
     """Whether a value is none, or what `readout_of` reads."""
     if value is None:
         return True
-    numbers = [value.get("ms"), value.get("std_ms")] if isinstance(value, dict) else [None]
-    return all(_is_number(number) and abs(number) <= 1e3 * MAX_READOUT for number in numbers)
+    if not isinstance(value, dict):
+        return False
+    numbers = value.get("ms"), value.get("std_ms")
+    return all(_is_number(number) for number in numbers) and max(map(abs, numbers)) <= 1e3 * MAX_READOUT
 
 
 def _is_count(value: object) -> bool:

@@ -152,14 +152,14 @@ def project_out(values: Float[Tensor, "O 2 D"], blocks: Sequence[_Block]) -> Flo
 @full_precision
 @torch.no_grad()
 def find_rolling_shutter(graph: ObservationGraph) -> RollingShutter | None:
-    """Test the residuals of a run at its solution, in the submap with most frames.
+    """Test the residuals of a run at its solution, in the submap, and of its sessions in that, with most frames.
 
     A readout that the graph has already is the point of linearization, so that repeated tests are Gauss-Newton steps.
 
     Returns:
         The result; None with too few frames, or too few observations of the same points.
     """
-    largest = graph.submap == torch.bincount(graph.submap).argmax()
+    largest = graph.recordings == torch.bincount(graph.recordings).argmax()
     velocities, is_central = frame_velocities(graph.T_cw, graph.timestamps, graph.recordings)
     frames = (is_central & largest).nonzero()[:, 0]
     if len(frames) < MIN_FRAMES:
