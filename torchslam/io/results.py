@@ -223,8 +223,8 @@ def _is_readout(value: object) -> bool:
         return True
     if not isinstance(value, dict):
         return False
-    numbers = value.get("ms"), value.get("std_ms")
-    return all(_is_number(number) for number in numbers) and max(map(abs, numbers)) <= 1e3 * MAX_READOUT
+    milliseconds: list[Any] = [value.get("ms"), value.get("std_ms")]
+    return all(_is_number(number) and abs(number) <= 1e3 * MAX_READOUT for number in milliseconds)
 
 
 def _is_count(value: object) -> bool:
