@@ -52,6 +52,31 @@ def test_surfaces_behind_the_camera_or_edge_on_are_invisible() -> None:
     assert renderer.render(edge_on).max() == 0
 
 
+def test_rows_with_poses_of_their_own_are_those_of_whole_images() -> None:
+    renderer = Renderer(wall(seed=3), K, SIZE)
+    poses = np.tile(np.eye(4), (SIZE[1], 1, 1))
+    poses[:, 0, 3] = np.linspace(-0.1, 0.1, SIZE[1])
+    image = renderer.render(poses)
+    for row in (0, 17, 60, 119):
+        assert np.array_equal(image[row], renderer.render(poses[row])[row])
+    assert np.array_equal(renderer.render(np.tile(np.eye(4), (SIZE[1], 1, 1))), renderer.render(np.eye(4)))
+
+
+def test_the_middle_row_of_a_rolling_shutter_has_the_pose_of_the_frame() -> None:
+    """At twice the pace and with a readout of a frame interval, the first row has the pose of a slow frame."""
+    rolling, still = (open_sequence(f"synthetic:room?frames=8&noise=0&readout={ms}") for ms in (50, 0))
+    assert rolling.groundtruth is not None
+    assert still.groundtruth is not None
+    assert torch.equal(rolling.groundtruth.T_wc, still.groundtruth.T_wc)
+    off = (rolling.image(4) - still.image(4)).abs()[0, 0]
+    assert float(off[239:241].mean()) < 0.05 * float(off[:2].mean())
+    fast = open_sequence("synthetic:room?frames=8&noise=0&pace=2&readout=50")
+    assert torch.equal(fast.pose(3), still.pose(6))
+    first = open_sequence("synthetic:room?frames=8&noise=0&blur=0&pace=2&readout=50").image(3)[0, 0, 0]
+    slow = open_sequence("synthetic:room?frames=8&noise=0&blur=0").image(5)[0, 0, 0]
+    assert float((first - slow).abs().mean()) < 0.01
+
+
 def test_views_of_a_plane_differ_by_its_homography() -> None:
     renderer = Renderer(wall(seed=3), K, SIZE)
     T_21 = np.eye(4)

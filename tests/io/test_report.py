@@ -8,10 +8,20 @@ import torch
 
 from torchslam.evaluation import evaluate
 from torchslam.geometry import transform
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.check import Break, BreakKind, MapCheck
 from torchslam.global_mapping.recording import MappedRecording, Mapping
-from torchslam.io.report import check_metrics, quality, result_warnings, run_metrics, summary
+from torchslam.io.report import (
+    check_metrics,
+    quality,
+    readout_metrics,
+    result_warnings,
+    run_metrics,
+    shake_remark,
+    summary,
+)
 from torchslam.map.atlas import Submap
+from torchslam.optim.rolling_shutter import RollingShutter
 from torchslam.system.run import Run
 from torchslam.types import PoseEstimate, State, Trajectory
 from torchslam.utils.console import table
@@ -100,7 +110,20 @@ def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
     assert check_metrics(MappedRecording(run, None, Mapping.ONLINE, ""))["check"] is None
 
 
-def test_a_rolling_shutter_is_a_warning(run: Run) -> None:
+def test_a_readout_is_a_row_of_the_summary(run: Run) -> None:
+    known = replace(run, readout=Readout.known(0.0, 0.1).updated(0.028, 0.001))
+    found = {"readout": readout_metrics(known)}
+    assert summary(run_metrics(run) | found)["readout"].startswith(
+        "28.0 ± 1.0 ms from the first row to the last (found)"
+    )
+    assert "readout" not in summary(run_metrics(run) | {"readout": readout_metrics(run)})
+
+
+def test_a_shaking_camera_is_a_warning(run: Run) -> None:
+    still = RollingShutter(0.0, 0.01, 0.03, 0.0, 0.03, 0.02)
+    assert shake_remark(replace(run, shutter=still)) == ""
+    said = shake_remark(replace(run, shutter=replace(still, by_row=0.31)))
+    assert "the row explains 31% of the squared errors, the column 2%" in said
     figures = run_metrics(run) | {"rolling_shutter": "rows are exposed one after the other"}
     assert result_warnings(figures) == ["rows are exposed one after the other"]
     assert len(result_warnings(figures | {"keyframes": 12, "posed": 23})) == 2

@@ -20,7 +20,9 @@ from torchslam.io.results import (
     MESH,
     PICTURES,
     prepare,
+    read_metrics,
     read_results,
+    readout_of,
     results_in,
     write_results,
 )
@@ -191,3 +193,22 @@ def test_a_folder_whose_maps_could_not_be_read_is_refused_before_the_run(tmp_pat
     assert not folder.exists()
     prepare(tmp_path / "été", overwrite=False, resume=False)
     assert (tmp_path / "été").is_dir()
+
+
+@pytest.mark.parametrize(
+    "entry", [{"ms": 28.0}, {"ms": "28", "std_ms": 1.0}, {"ms": 1e9, "std_ms": 1.0}, 28.0]
+)
+def test_an_unknown_readout_is_refused(tmp_path: Path, run: Run, entry: object) -> None:
+    write(run, tmp_path)
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    (tmp_path / "metrics.json").write_text(json.dumps(metrics | {"readout": entry}))
+    with pytest.raises(ResultsError, match="not the metrics of a run: readout is"):
+        read_metrics(tmp_path)
+
+
+def test_the_readout_is_read() -> None:
+    known = readout_of({"readout": {"ms": 28.0, "std_ms": 1.0, "given_ms": 0.0}})
+    assert known is not None
+    assert (float(known.seconds), known.std) == pytest.approx((0.028, 0.001))
+    assert readout_of({"readout": None}) is None
+    assert readout_of({}) is None

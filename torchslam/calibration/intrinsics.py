@@ -92,6 +92,7 @@ def estimate_intrinsics(
     Returns:
         The estimate with its standard errors.
     """
+    graph = graph.global_shutter()
     camera = with_radial_terms(graph.camera)
     base = camera if start is None else with_radial_terms(start)
     problem = problem_of(replace(graph, camera=camera))

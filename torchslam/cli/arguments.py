@@ -24,6 +24,12 @@ SEQUENCE_HELP = (
 )
 PRESETS = "tum-fr1, tum-fr2, tum-fr3, euroc, kitti, 7-scenes, tartanair, icl"
 """The names in `torchslam.data.calibration`, which needs torch."""
+AUTO = "auto"
+"""The readout of a rolling shutter that is to be found."""
+READOUTS_MS = {"kinect": 30.0}
+"""Readouts by name, milliseconds: that of the Kinect's color camera at 30 frames a second."""
+GIVEN_READOUT_STD_MS = 1.0
+"""Standard deviation of a readout that is given, milliseconds. Tried at this value only."""
 
 
 def add_sequence(parser: argparse.ArgumentParser) -> None:
@@ -139,6 +145,14 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         help="relative standard deviation of the given focal length (camera.std): 0.02 if neither this nor the "
         "calibration file says otherwise; 0: the camera is exact",
     )
+    parser.add_argument(
+        "--readout",
+        type=_readout,
+        default=AUTO,
+        metavar="MS",
+        help="time from the exposure of the first row of an image to the last (camera.readout): milliseconds, "
+        f"{', '.join(READOUTS_MS)}, 0 for a global shutter, or auto, the default: found where the images show one",
+    )
     parser.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of the random number generators (seed)")
 
@@ -158,6 +172,9 @@ def overrides(options: argparse.Namespace) -> list[str]:
         "scale": options.scale,
         "seed": options.seed,
     }
+    if options.readout != AUTO:
+        named["camera.readout"] = options.readout
+        named["camera.readout_std"] = GIVEN_READOUT_STD_MS if options.readout else 0.0
     return [*options.overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]
 
 
@@ -193,6 +210,17 @@ def _device(text: str) -> torch.device:
         reason = str(error).splitlines()[0]
         raise argparse.ArgumentTypeError(f"{text!r} cannot be used here: {reason}") from None
     return device
+
+
+def _readout(text: str) -> float | str:
+    """Parse a readout in milliseconds, a name of one, or `AUTO`."""
+    if text == AUTO:
+        return text
+    try:
+        return READOUTS_MS[text] if text in READOUTS_MS else float(text)
+    except ValueError:
+        known = ", ".join((AUTO, *READOUTS_MS))
+        raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor one of {known}") from None
 
 
 def not_negative(text: str) -> int:

@@ -39,6 +39,7 @@ from torchslam.io.results import (
     read_image_source,
     read_metrics,
     read_results,
+    readout_of,
 )
 from torchslam.io.viewer.page import VIEW, write_view
 from torchslam.map.file import read_atlas
@@ -126,7 +127,7 @@ def densify_results(directory: Path, options: argparse.Namespace) -> dict[str, s
         raise ResultsError(
             f"{directory / METRICS}: does not say where the images are; give them with --images"
         )
-    scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=every is None)
+    scene = scene_of(submap, saved.camera, int(metrics["session"]), every is None, readout_of(metrics))
     size = map_size(options.resolution, pinhole_within(scene.camera).size)
     views = views_of(scene, size, every)
     elsewhere = "use --images for its new location"

@@ -63,6 +63,7 @@ from torchslam.io.results import (
     TRAJECTORY,
     read_image_source,
     read_metrics,
+    readout_of,
 )
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
@@ -131,7 +132,8 @@ class Job:
             pinhole: camera to undistort to; None: as requested.
             frame_ids: the frames to export; None: as requested.
         """
-        scene = scene_of(self.submap, self.camera, self.session, self.keyframes_alone and frame_ids is None)
+        alone = self.keyframes_alone and frame_ids is None
+        scene = scene_of(self.submap, self.camera, self.session, alone, readout_of(self.metrics))
         if frame_ids is not None:
             scene = scene.of_frames(frame_ids)
         if pinhole is None and self.undistort:
@@ -313,11 +315,16 @@ def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
     if job.keyframes_alone:
         posed = job.submap.posed_frames.count(job.session)
         frames = f"{len(scene.T_cw)} keyframes of {posed} posed frames; --frames all exports all of them"
-    return {
+    about = {
         "frames": frames,
         "points": f"{len(scene.points_w)} in {len(scene.pixels)} observations",
         "error": f"{error:.4f} px, mean over the points",
     }
+    if readout := readout_of(job.metrics):
+        about["keypoints"] = (
+            f"corrected to the middle row of each image, for a readout of {readout.description()}; images are not"
+        )
+    return about
 
 
 def _ply(job: Job) -> dict[str, str]:

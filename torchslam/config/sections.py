@@ -21,6 +21,9 @@ MIN_CELL_PX = 1.0
 MAX_FACTOR = 1_000_000
 """Upper bound of ratios and factors without a natural limit; far beyond the value that disables a test."""
 
+MAX_READOUT_MS = 1000
+"""Bound of the readout of a rolling shutter and of its error, milliseconds: cameras need 5 to 60."""
+
 MAX_PIXELS = 1 << 26
 """Number of pixels of the largest image that is decoded."""
 REDUCTION_TOLERANCE = 1.6
@@ -40,6 +43,20 @@ class CameraConfig(Settings, section="camera"):
     guessed: bool = setting(
         False,
         "The focal length is a guess: no map is made of what a rotation with another one explains as well.",
+    )
+    readout: float = setting(
+        0.0,
+        "Given time from the exposure of the first row of an image to the last, in milliseconds: that of a rolling "
+        "shutter.",
+        low=-MAX_READOUT_MS,
+        high=MAX_READOUT_MS,
+    )
+    readout_std: float = setting(
+        float(MAX_READOUT_MS),
+        "Standard deviation of the readout, in milliseconds: images say more about it; a readout of 0 is replaced only "
+        "where they show a rolling shutter. 0: the readout is exact.",
+        low=0,
+        high=MAX_READOUT_MS,
     )
 
 

@@ -286,6 +286,8 @@ class GlobalMapper:
             "",
             given=final.given,
             calibration=final.calibration,
+            readout=final.readout,
+            shutter=final.shutter,
         )
 
     def _saved_views(self, images: list[int]) -> list[FrameFeatures]:

@@ -10,7 +10,6 @@ from typing import Any, TypeVar
 import torch
 
 from torchslam.calibration.find_camera import camera_remark
-from torchslam.calibration.rolling_shutter import rolling_shutter_remark
 from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, ate_apart, evaluate
@@ -55,11 +54,32 @@ def compute_metrics(
     )
     remarks = {
         "camera": camera_remark(finished, camera),
-        "rolling_shutter": rolling_shutter_remark(finished),
+        "rolling_shutter": shake_remark(finished),
+        "readout": readout_metrics(finished),
     }
     changes = [{"frame": c.frame, "focal_px": float(c.camera.focal)} for c in finished.camera_changes]
     return (
         metrics | remarks | check_metrics(mapped) | {"camera_changes": changes, "dropped": sequence.dropped}
+    )
+
+
+def readout_metrics(finished: Run) -> dict[str, float] | None:
+    """The readout of a rolling shutter, its error and what was given, in milliseconds; None for a global shutter."""
+    known = finished.readout
+    if known is None:
+        return None
+    return {"ms": 1e3 * float(known.seconds), "std_ms": 1e3 * known.std, "given_ms": 1e3 * known.prior}
+
+
+def shake_remark(finished: Run) -> str:
+    """Say that the camera shakes within an image, as residuals that depend on the row show; empty if it does not."""
+    found = finished.shutter
+    if found is None or not found.is_shaken:
+        return ""
+    return (
+        "the rows of an image seem to be exposed one after the other, and the camera shakes within an image (the row "
+        f"explains {found.by_row:.0%} of the squared errors, the column {found.by_column:.0%}), which is not modeled: "
+        "poses in fast turns are less exact"
     )
 
 
@@ -141,7 +161,7 @@ def quality(run: Run) -> dict[str, float | None]:
     found: dict[str, float | None] = {"reprojection_px": None, "far_ratio": None, "track_length": None}
     if run.main is None or run.map.num_points == 0:
         return found
-    graph = run.posed_frames.graph(run.map, run.camera)
+    graph = run.posed_frames.graph(run.map, run.camera, readout=run.readout).global_shutter()
     rows = torch.nonzero(graph.sessions[graph.frame_index] == run.session)[:, 0]
     T_cw, points_w = graph.T_cw[graph.frame_index[rows]], graph.points_w[graph.point_index[rows]]
     pixels, valid = run.camera.project(transform(T_cw, points_w[:, None])[:, 0])
@@ -229,11 +249,21 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
         rows["check"] = f"{how}: {metrics['check']['sentence']}"
     rows |= _describe_submaps(metrics)
     rows |= {"camera": metrics["camera"]} if metrics.get("camera") else {}
+    rows |= {"readout": readout_words(readout)} if (readout := metrics.get("readout")) else {}
     rows |= {
         "speed": f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
         f"{metrics['ms_p95']:.0f} ms (95th percentile)",
     }
     return rows | accuracy(metrics)
+
+
+def readout_words(readout: Mapping[str, Any]) -> str:
+    """Describe the entry `readout` of metrics.json."""
+    source = f"given: {readout['given_ms']:g} ms" if readout["given_ms"] else "found"
+    return (
+        f"{readout['ms']:.1f} ± {readout['std_ms']:.1f} ms from the first row to the last ({source}): a rolling "
+        "shutter, which the final poses take into account"
+    )
 
 
 def _describe_submaps(metrics: Mapping[str, Any]) -> dict[str, str]:

@@ -24,6 +24,7 @@ from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, rigid, transform
+from torchslam.geometry.rolling_shutter import MAX_READOUT, Readout
 from torchslam.global_mapping.saved_stages import delete_stages
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
 from torchslam.io.export.scene import ExampleFrame, ImageSource
@@ -221,6 +222,22 @@ def read_metrics(directory: Path) -> dict[str, Any]:
     return metrics
 
 
+def readout_of(metrics: dict[str, Any]) -> Readout | None:
+    """The readout of a rolling shutter that a run found or was given; None for a global shutter."""
+    entry = metrics.get("readout")
+    return None if entry is None else Readout.known(1e-3 * entry["ms"], 1e-3 * entry["std_ms"])
+
+
+def _is_readout(value: object) -> bool:
+    """Whether a value is none, or what `readout_of` reads."""
+    if value is None:
+        return True
+    if not isinstance(value, dict):
+        return False
+    milliseconds: list[Any] = [value.get("ms"), value.get("std_ms")]
+    return all(_is_number(number) and abs(number) <= 1e3 * MAX_READOUT for number in milliseconds)
+
+
 def _is_count(value: object) -> bool:
     return isinstance(value, int) and not isinstance(value, bool) and 0 <= value < 1 << 31
 
@@ -240,6 +257,7 @@ _METRIC_CHECKS: dict[str, Callable[[Any], bool]] = {
     "submap": lambda value: value is None or _is_count(value),
     "submaps": _are_submaps,
     "ate_m": _is_number,
+    "readout": _is_readout,
     **dict.fromkeys(("session", "posed", "keyframes"), _is_count),
     "failure": lambda value: isinstance(value, str),
     "source": lambda value: value is None or isinstance(value, str),

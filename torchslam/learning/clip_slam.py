@@ -385,7 +385,7 @@ class ClipSLAM(nn.Module):
         # The camera is the one that poses are differentiated by. A clip is too short for the patience of a run.
         start = self.config.initialization
         start = replace(start, min_planar_frames=min(start.min_planar_frames, len(images) // 2))
-        config = replace(self.config, camera=CameraConfig(std=0.0), initialization=start)
+        config = replace(self.config, camera=CameraConfig(std=0.0, readout_std=0.0), initialization=start)
         slam = SLAM(camera, config, self.extractor)
         frames = [
             Frame(index, float(index), image[None], features=features[index : index + 1])

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, passes_gate, se3_inverse, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
@@ -179,6 +180,7 @@ class PosedFrames:
         camera: Camera,
         chi_square: float = _OUTLIER_CHI_SQUARE,
         least_ratio: float = _MIN_INLIER_RATIO,
+        readout: Readout | None = None,
     ) -> None:
         """Remove observations far from the current reprojection, since their point was merged or has moved.
 
@@ -187,11 +189,18 @@ class PosedFrames:
             camera: of all frames.
             chi_square: squared error, in units of the stated noise, from which on an observation is far.
             least_ratio: of its observations that must be near; else a frame keeps all, since its pose may be wrong.
+            readout: of a rolling shutter, by which keypoints are corrected; None: a global shutter.
         """
         T_cw, seen_by = self.T_cw(slam_map), self.observations["frame_row"]
+        velocities = None
+        if readout is not None:
+            velocities, _ = frame_velocities(T_cw, self.frames["timestamp"], self.frames["session"])
         every = torch.arange(len(seen_by), device=T_cw.device)
         agrees = torch.cat(
-            [self._agree(rows, T_cw, slam_map, camera, chi_square) for rows in every.split(_CHUNK)]
+            [
+                self._agree(rows, T_cw, slam_map, camera, chi_square, readout, velocities)
+                for rows in every.split(_CHUNK)
+            ]
         )
         count = torch.bincount(seen_by, minlength=len(self))
         is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= least_ratio * count.float()
@@ -206,13 +215,19 @@ class PosedFrames:
         slam_map: Map,
         camera: Camera,
         chi_square: float,
+        readout: Readout | None,
+        velocities: Float[Tensor, "F 6"] | None,
     ) -> Bool[Tensor, " O"]:
-        """Test which observations are near their reprojection by the frames."""
+        """Test which observations are near their reprojection by the frames, which with a readout have velocities."""
         seen = {name: values[rows] for name, values in self.observations.columns().items()}
         points_w = slam_map.positions_w[slam_map.follow_merges(seen["point_ids"])]
-        points_c = transform(T_cw[seen["frame_row"]], points_w[:, None])[:, 0]
+        frame, pixels = seen["frame_row"], seen["pixels"]
+        points_c = transform(T_cw[frame], points_w[:, None])[:, 0]
+        if readout is not None and velocities is not None:
+            seconds = readout.seconds.to(pixels)
+            pixels = global_shutter_pixels(pixels, T_cw[frame], velocities[frame], points_w, camera, seconds)
         noise = KeypointNoise(seen["scales"], seen["information"])
-        return passes_gate(noise.squared_reprojection(points_c, seen["pixels"], camera), chi_square)
+        return passes_gate(noise.squared_reprojection(points_c, pixels, camera), chi_square)
 
     def graph(
         self,
@@ -220,16 +235,19 @@ class PosedFrames:
         camera: Camera,
         submap: int = 0,
         calibration: CameraMeasurement | None = None,
+        readout: Readout | None = None,
     ) -> RunGraph:
         """Build the observation graph: keyframes first, then the frames between them.
 
-        Keyframes contribute all their observations, other frames those of points that keyframes observe.
+        Keyframes contribute all their observations, as `Map.observations` has them, other frames those of points that
+        keyframes observe.
 
         Args:
             slam_map: the map.
             camera: of all frames.
             submap: number of the submap.
             calibration: the given camera with its error; None: `camera` is exact.
+            readout: of a rolling shutter; None: a global one.
         """
         seen = slam_map.observations()
         point_ids = torch.unique(seen.point_index)
@@ -260,6 +278,7 @@ class PosedFrames:
             / slam_map.final_variance,
             camera=camera,
             calibration=calibration,
+            readout=readout,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
             frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),

@@ -3,6 +3,10 @@
 The trajectory of a finished run minimizes the reprojection errors of its observation graph. However many frames
 and discrete choices led there, its gradient with respect to every pixel, weight and camera parameter is that of the
 minimizer: one linear solve for the keyframes and the points, one small one for each frame in between.
+
+With a rolling shutter, rounds of two steps follow each other: the keypoints are moved to where the middle row would
+have seen them, by the present poses, points and camera, and the graph of a global shutter is solved. The rounds settle
+quickly, since poses hardly change the motion between them.
 """
 
 from __future__ import annotations
@@ -25,6 +29,7 @@ from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import OBSERVATION_VARIANCE, CameraMeasurement
 from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.rolling_shutter import MAX_READOUT, Readout, frame_velocities, global_shutter_pixels
 from torchslam.optim._core.levenberg_marquardt import Progress, check_minimum
 from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.tangent import CameraPrior
@@ -49,6 +54,13 @@ _CALIBRATION = "calibration.params", "calibration.directions"
 """Tensors of a file that has them."""
 _VARIANCE = "observation_variance"
 """Of the calibration, in the metadata of a file; earlier versions wrote none."""
+_READOUT = "readout"
+"""Tensor of a file of a rolling shutter: readout, standard error, prior and its standard deviation, in seconds."""
+MAX_ROUNDS, SETTLED_PX = 12, 2e-3
+"""Most rounds with a rolling shutter, and the change of the keypoints, as a root mean square, that ends them. A round
+leaves a tenth to a third of the change of the one before."""
+GRADIENT_ROUNDS = 8
+"""Rounds with a rolling shutter that gradients pass: each leaves a tenth to a third of the gradient's error."""
 
 Schema = dict[str, tuple[str, tuple[int, ...], type]]
 """Per column: what it has a row for (K frames, N points or O observations), the shape of a row, the kind of numbers."""
@@ -68,6 +80,7 @@ class ObservationGraph:
         is_keyframe: Keyframes and points are solved together, the other frames against the points.
         submap: submap of each frame, 0 if omitted. Submaps share nothing but the camera.
         calibration: the given camera with its error, from which `camera` was found; None: `camera` is exact.
+        readout: of a rolling shutter, for which `pixels` are not corrected; None: a global shutter.
     """
 
     timestamps: Float[Tensor, " K"]
@@ -81,6 +94,7 @@ class ObservationGraph:
     is_keyframe: Bool[Tensor, " K"]
     submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64, device="cpu"))
     calibration: CameraMeasurement | None = None
+    readout: Readout | None = None
 
     _SCHEMA: ClassVar[Schema] = {
         "timestamps": ("K", (), float),
@@ -111,6 +125,26 @@ class ObservationGraph:
         rows = (self.submap[self.frame_index] == submap).nonzero().squeeze(-1)
         return frames, rows, torch.unique(self.point_index[rows])
 
+    @property
+    def recordings(self) -> Int[Tensor, " K"]:
+        """The recording of each frame: frames of different ones are no neighbors in time."""
+        return self.submap
+
+    def global_shutter(self) -> Self:
+        """The graph of a global shutter, keypoints corrected by the poses, points and camera; itself if it is one."""
+        if self.readout is None:
+            return self
+        velocities, _ = frame_velocities(self.T_cw, self.timestamps, self.recordings)
+        pixels = global_shutter_pixels(
+            self.pixels,
+            self.T_cw[self.frame_index],
+            velocities[self.frame_index],
+            self.points_w[self.point_index],
+            self.camera,
+            self.readout.seconds.to(self.pixels),
+        )
+        return replace(self, pixels=pixels, readout=None)
+
     def save(self, path: str | Path) -> None:
         """Write to a safetensors file."""
         tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}
@@ -119,6 +153,10 @@ class ObservationGraph:
             given = self.calibration
             parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
             tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
+        if self.readout is not None:
+            known = self.readout
+            numbers = float(known.seconds), known.std, known.prior, known.prior_std
+            tensors[_READOUT] = torch.tensor(numbers, dtype=torch.float64, device="cpu")
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
         if self.calibration is not None:
@@ -141,7 +179,8 @@ class ObservationGraph:
                     cls = RunGraph  # type: ignore[assignment]
                 names = [name for name in cls.columns() if name in known or name != "submap"]
                 given = _CALIBRATION if set(_CALIBRATION) <= known else ()
-                tensors = {name: file.get_tensor(name) for name in (*names, "camera", *given)}
+                shutter = (_READOUT,) if _READOUT in known else ()
+                tensors = {name: file.get_tensor(name) for name in (*names, "camera", *given, *shutter)}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
             calibration = None
@@ -149,7 +188,9 @@ class ObservationGraph:
                 params, directions = (tensors[name] for name in given)
                 variance = float(metadata.get(_VARIANCE, OBSERVATION_VARIANCE))
                 calibration = CameraMeasurement(camera.with_params(params), directions, variance)
-            graph = cls(camera=camera, calibration=calibration, **{name: tensors[name] for name in names})
+            columns = {name: tensors[name] for name in names}
+            readout = _readout(tensors[_READOUT]) if shutter else None
+            graph = cls(camera=camera, calibration=calibration, readout=readout, **columns)
             graph._check()
             return graph
         except (
@@ -202,8 +243,9 @@ class ObservationGraph:
 
     @classmethod
     def columns(cls) -> list[str]:
-        """The names of all tensors but those of the camera and its calibration."""
-        return [column.name for column in fields(cls) if column.name not in ("camera", "calibration")]
+        """The names of all tensors but those of the camera, its calibration and its readout."""
+        others = "camera", "calibration", "readout"
+        return [column.name for column in fields(cls) if column.name not in others]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,12 +264,32 @@ class RunGraph(ObservationGraph):
     point_ids: Int[Tensor, " N"]
     keypoint_index: Int[Tensor, " O"]
 
+    @property
+    def recordings(self) -> Int[Tensor, " K"]:
+        """The recording of each frame: those of one session in one submap."""
+        return (
+            self.submap * (1 + int(self.sessions.max())) + self.sessions
+            if len(self.sessions)
+            else self.submap
+        )
+
     _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
         "frame_ids": ("K", (), int),
         "sessions": ("K", (), int),
         "point_ids": ("N", (), int),
         "keypoint_index": ("O", (), int),
     }
+
+
+def _readout(numbers: Tensor) -> Readout:
+    """The readout of a file. Raises ValueError for numbers that are none."""
+    if numbers.shape != (4,) or numbers.dtype != torch.float64:
+        raise ValueError(f"the readout is {tuple(numbers.shape)} of {numbers.dtype}, not four float64")
+    if not bool(numbers.isfinite().all()) or bool((numbers[[0, 2]].abs() > MAX_READOUT).any()):
+        raise ValueError(f"the readout is not finite, or above {MAX_READOUT:g} s")
+    if bool((numbers[[1, 3]] < 0).any()):
+        raise ValueError("the readout has a negative standard deviation")
+    return Readout(numbers[0].clone(), *numbers[1:].tolist())
 
 
 Graph = TypeVar("Graph", bound=ObservationGraph)
@@ -293,6 +355,10 @@ def solve_graph(
     depend on them (aligned trajectory errors do not). A camera that is free is found in the submap with most keyframes;
     the others are solved with it.
 
+    With `graph.readout`, the minimum is that of the keypoints that its own poses, points and camera correct. The
+    implicit gradient passes `GRADIENT_ROUNDS` rounds of correction and solution there, and is right to 1e-5; it also
+    reaches `graph.readout.seconds`, which stays as it is.
+
     Args:
         graph: observation graph, as `Run.graph`.
         free_camera: as in `solve_bundle`. None: along the directions of `graph.calibration`, with it as a prior; the
@@ -313,6 +379,47 @@ def solve_graph(
     """
     strict, options = options.strict, options.replace(strict=False)
     _check_factors(graph, frame_factors)
+
+    def solved(graph: ObservationGraph) -> GraphSolution:
+        return _solve_global_shutter(graph, free_camera, options, progress, frame_factors, depth_prior)
+
+    solution = solved(graph) if graph.readout is None else _solve_in_rounds(graph, solved, options)
+    if strict:
+        check_minimum(solution.success, solution.converged, "frames")
+    return solution
+
+
+def _solve_in_rounds(
+    graph: ObservationGraph, solved: Callable[[ObservationGraph], GraphSolution], options: SolverOptions
+) -> GraphSolution:
+    """Correct the keypoints of a rolling shutter and solve the graph of a global one, until they stay where they are.
+
+    With gradients, the number of rounds is fixed, and all of them are differentiated.
+    """
+    at, before = graph, graph.pixels
+    passes_gradient = options.backward != "detached"
+    for number in range(MAX_ROUNDS):
+        corrected = at.global_shutter()
+        solution = solved(corrected)
+        at = replace(at, T_cw=solution.T_cw, points_w=solution.points_w, camera=solution.camera)
+        if passes_gradient and number + 1 == GRADIENT_ROUNDS:
+            break
+        change = (corrected.pixels - before).detach().square().sum(-1).mean().sqrt()
+        if not passes_gradient and bool(change < SETTLED_PX):
+            break
+        before = corrected.pixels
+    return solution
+
+
+def _solve_global_shutter(
+    graph: ObservationGraph,
+    free_camera: bool | Float[Tensor, "P n"] | None,
+    options: SolverOptions,
+    progress: Progress | None,
+    frame_factors: Sequence[FrameFactors],
+    depth_prior: DepthPrior | None,
+) -> GraphSolution:
+    """The minimum of a graph whose keypoints are those of a global shutter; arguments as of `solve_graph`."""
     free, prior = (False, None) if free_camera is None else (free_camera, None)
     if free_camera is None and graph.calibration is not None:
         free, prior = graph.calibration.directions, camera_prior(graph.calibration)
@@ -330,8 +437,6 @@ def solve_graph(
         ]
 
     (solution,) = _solve([graph], adjust, options)
-    if strict:
-        check_minimum(solution.success, solution.converged, "frames")
     return solution
 
 
@@ -504,8 +609,8 @@ def solve_graphs(
             graph.camera.params.device,
             graph.weights.ndim,
         )
-        if graph.calibration is not None:
-            kind = (row,)  # directions of its own
+        if graph.calibration is not None or graph.readout is not None:
+            kind = (row,)  # directions, or rounds, of its own
         alike.setdefault(kind, []).append(row)
     solved: dict[int, GraphSolution] = {}
     found: Sequence[GraphSolution]

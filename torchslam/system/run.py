@@ -16,6 +16,7 @@ from torchslam.errors import FrameError, InitializationError, TorchslamError
 from torchslam.geometry import Camera, SharedCamera, se3_inverse
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
 from torchslam.geometry.gating import passes_gate
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Atlas, Submap, main_submap
@@ -24,6 +25,7 @@ from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions
 from torchslam.optim.camera_evidence import graph_evidence
+from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
     GraphSolution,
@@ -34,7 +36,7 @@ from torchslam.optim.run_graph import (
 from torchslam.system.front_end import source
 from torchslam.system.online_camera import CameraChange, OnlineCamera
 from torchslam.system.session import Session
-from torchslam.types import Frame, Reason, State, StepResult, Trajectory
+from torchslam.types import Frame, Observations, Reason, State, StepResult, Trajectory
 
 
 class _System(Protocol):
@@ -76,6 +78,9 @@ class Run:
         given: the given camera with its error, if the final adjustment changed it.
         calibration: `camera` with its error after the final adjustment.
         camera_changes: cameras that the map took over while the run went on.
+        readout: of a rolling shutter, given or found by the final adjustment; None: the final poses are those of a
+            global one.
+        shutter: what the residuals say of it; None where that was not tested.
     """
 
     submaps: tuple[Submap, ...]
@@ -91,6 +96,8 @@ class Run:
     given: CameraMeasurement | None = None
     calibration: CameraMeasurement | None = None
     camera_changes: tuple[CameraChange, ...] = ()
+    readout: Readout | None = None
+    shutter: RollingShutter | None = None
 
     @property
     def main(self) -> Submap | None:
@@ -158,7 +165,7 @@ class Run:
             raise InitializationError(self.failure)
         return concatenate_graphs(
             [
-                submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given)
+                submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given, self.readout)
                 for submap in self.submaps
             ]
         )
@@ -264,6 +271,8 @@ def finish(
         final.given,
         final.calibration,
         tuple(slam.online_camera.changes),
+        final.readout,
+        final.shutter,
     )
 
 
@@ -276,6 +285,8 @@ FINAL = GRAPH_OPTIONS.replace(iterations=POSE_ITERATIONS, backward="detached")
 ROUGH = FINAL.replace(tolerance=1e-5)
 """Before outliers leave: they move the minimum by more than the tolerance. With the tolerances of the solvers kitti07
 takes 1.2 times as long."""
+READOUT_ROUNDS = 2
+"""Steps of the readout: the second one changes it by a thirtieth, a third one by less than a hundredth."""
 LEAST_RATIO = 0.3
 """Least share of the observations of a frame that are near; else its pose may be wrong, and it keeps them all."""
 
@@ -287,6 +298,8 @@ class FinalAdjustment:
         camera: the camera of the adjusted maps.
         given: the given camera with its error; None until it is adjusted, and where it is exact.
         calibration: `camera` with its error; None as `given`.
+        readout: of a rolling shutter, by which the keypoints are corrected; None: a global shutter.
+        shutter: what the residuals say of it; None where that was not tested.
     """
 
     def __init__(self, camera: Camera, config: Config, measured: CameraMeasurement | None = None) -> None:
@@ -297,6 +310,9 @@ class FinalAdjustment:
         self._measured = measured
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
+        self._known = Readout.known(1e-3 * config.camera.readout, 1e-3 * config.camera.readout_std)
+        self.readout: Readout | None = None
+        self.shutter: RollingShutter | None = None
 
     def adjust(
         self, atlas: Atlas, session: int, progress: Progress | None = None, settled: bool = False
@@ -312,13 +328,18 @@ class FinalAdjustment:
         main = atlas.main(session)
         if main is None or not (self.settings.local and self.settings.global_at_end):
             return
-        self._adjust(main, self._measured, progress, settled)
+        self._adjust(main, self._measured, progress, settled, is_main=True)
         for submap in atlas:
             if submap is not main:
                 self._adjust(submap, None, progress, settled)
 
     def _adjust(
-        self, submap: Submap, given: CameraMeasurement | None, progress: Progress | None, settled: bool
+        self,
+        submap: Submap,
+        given: CameraMeasurement | None,
+        progress: Progress | None,
+        settled: bool,
+        is_main: bool = False,
     ) -> None:
         camera = self.camera
         if not settled:
@@ -327,34 +348,82 @@ class FinalAdjustment:
         self.camera, self.given = camera, given or self.given
         submap.posed_frames.remove_outliers(submap.map, camera)
         if not settled:
+            self.camera = camera = self._solve(submap, camera, given, progress, ROUGH).camera
+        if is_main:
+            # Before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
+            self.camera = camera = self._find_readout(submap, camera, given, progress)
+        if not settled:
             # Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map
             # have removed that already, and what holds a weak link is often less exact than the rest.
-            seen = submap.map.observations()
-            wrong = ~passes_gate(squared_errors(submap.map, seen, camera), FINAL_CHI_SQUARE)
+            seen, corrected = self._observations(submap, camera)
+            wrong = ~passes_gate(squared_errors(submap.map, corrected, camera), FINAL_CHI_SQUARE)
             submap.map.remove_masked_observations(seen, wrong)
-        find_final_variance(submap.map, camera)
+            submap.posed_frames.remove_outliers(
+                submap.map, camera, FINAL_CHI_SQUARE, LEAST_RATIO, self.readout
+            )
+        find_final_variance(submap.map, self._observations(submap, camera)[1], camera)
         if not settled:
             self.camera = camera = self._solve(submap, camera, given, progress, ROUGH).camera
-            submap.posed_frames.remove_outliers(submap.map, camera, FINAL_CHI_SQUARE, LEAST_RATIO)
         if given is None:
             self.camera = self._solve(submap, camera, None, progress).camera
             return
-        measured, evidence = given, graph_evidence(submap.posed_frames.graph(submap.map, camera), given)
+        measured, evidence = given, graph_evidence(self._graph(submap, camera), given)
         if evidence is not None:
             found = evidence.estimate()
             camera, given, measured = found.prior.nearest(camera), found.prior, found.measured
         self.camera = self._solve(submap, camera, given, progress).camera
         self.given, self.calibration = given, replace(measured, camera=self.camera)
 
-    @staticmethod
+    def _find_readout(
+        self,
+        submap: Submap,
+        camera: Camera,
+        given: CameraMeasurement | None,
+        progress: Progress | None,
+    ) -> Camera:
+        """Find the readout of a rolling shutter, where there is one, and solve with it; return the camera.
+
+        Each round is a Gauss-Newton step of the readout, with everything else eliminated, and one of the solution.
+        """
+        known = self._known
+        is_given = known.prior != 0
+        if not (is_given or known.prior_std):
+            return camera
+        for _ in range(READOUT_ROUNDS):
+            graph = submap.posed_frames.graph(submap.map, camera, readout=self.readout)
+            found = self.shutter = find_rolling_shutter(graph)
+            self.readout = known if is_given else None
+            if found is not None and (is_given or found.is_read_out):
+                self.readout = known.updated(found.readout, found.readout_std)
+            if self.readout is None and graph.readout is None:
+                break
+            camera = self._solve(submap, camera, given, progress, ROUGH, once=True).camera
+        return camera
+
+    def _observations(self, submap: Submap, camera: Camera) -> tuple[Observations, Observations]:
+        """The observations by all keyframes, and the same with the keypoints of a global shutter."""
+        seen = submap.map.observations()
+        if self.readout is None:
+            return seen, seen
+        graph = self._graph(submap, camera)
+        return seen, replace(seen, pixels=graph.pixels[: len(seen)])  # those of keyframes come first
+
+    def _graph(self, submap: Submap, camera: Camera) -> RunGraph:
+        """The graph of a submap, with the keypoints of a global shutter as its poses are now."""
+        return submap.posed_frames.graph(submap.map, camera, readout=self.readout).global_shutter()
+
     def _solve(
+        self,
         submap: Submap,
         camera: Camera,
         given: CameraMeasurement | None,
         progress: Progress | None,
         options: SolverOptions = FINAL,
+        once: bool = False,
     ) -> GraphSolution:
-        graph = submap.posed_frames.graph(submap.map, camera, calibration=given)
+        """Solve the graph of a submap. once: with the keypoints as its poses correct them now."""
+        graph = submap.posed_frames.graph(submap.map, camera, calibration=given, readout=self.readout)
+        graph = graph.global_shutter() if once else graph
         solution = solve_graph(graph, progress=progress, options=options)
         submap.posed_frames.apply_solution(solution, graph, submap.map)
         return solution

@@ -13,6 +13,9 @@ from torchslam.data.synthetic.scene import MIP_LEVELS, Rectangle
 
 NEAR = 0.05
 """Meters: what is nearer to the camera is not drawn."""
+ROWS_OF_BOUNDS = 9
+"""Rows whose poses bound where a rectangle may be seen, of an image with a pose for each row. Between them the camera
+moves by less than a pixel. Tried at this value only."""
 PADDING = 2
 """Texels that repeat the border of a texture, so that interpolation does not reach the next one."""
 SHARPNESS = 0.7
@@ -44,16 +47,27 @@ class Renderer:
         self._tiles = np.stack((shrink, *(offsets.reshape(-1, 2) - 0.5).T)).astype(np.float32)
 
     def render(self, T_cw: np.ndarray) -> np.ndarray:
-        """The image seen from T_cw (4, 4), (H, W) float32 in [0, 255]; black where no rectangle is hit."""
-        forms = self._linear_forms(T_cw)
-        winner = self._nearest(forms, self._bounds(T_cw))
+        """The image seen from T_cw, (H, W) float32 in [0, 255]; black where no rectangle is hit.
+
+        Args:
+            T_cw: (4, 4), or (H, 4, 4): a pose for each row, as of a rolling shutter.
+        """
+        T_cw = T_cw.reshape(-1, 4, 4)
+        forms = np.stack([self._linear_forms(pose) for pose in T_cw])
+        some = np.linspace(0, len(T_cw) - 1, ROWS_OF_BOUNDS).round().astype(int)
+        bounds = np.stack([self._bounds(pose) for pose in T_cw[some if len(T_cw) > 1 else [0]]])
+        bounds = np.concatenate((bounds[..., :2].min(0), bounds[..., 2:].max(0)), axis=1)
+        winner = self._nearest(forms, bounds)
         hit = winner >= 0
         winner[~hit] = 0
         x = np.arange(self._size[0], dtype=np.float32)[None, :]
         y = np.arange(self._size[1], dtype=np.float32)[:, None]
         # Of each pixel's rectangle: (u, v, 1) / z in texels as a x + b y + c.
-        texels = np.append(self._texels, np.ones((len(forms), 1)), axis=1)
-        a, b, c = ((texels * forms[..., i]).astype(np.float32).T[:, winner] for i in range(3))
+        texels = np.append(self._texels, np.ones((forms.shape[1], 1)), axis=1)
+        row = np.zeros_like(winner) if len(forms) == 1 else np.arange(len(forms))[:, None]
+        a, b, c = (
+            np.moveaxis((texels * forms[..., i]).astype(np.float32)[row, winner], -1, 0) for i in range(3)
+        )
         u, v, inverse_depth = a * x + b * y + c
         depth = 1.0 / np.where(hit, inverse_depth, 1.0)
         u *= depth
@@ -81,7 +95,7 @@ class Renderer:
         return np.where(edge_on[:, None, None], 0.0, forms)
 
     def _nearest(self, forms: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-        """Return (H, W) int64: the rectangle seen at each pixel, -1 for none."""
+        """Return (H, W) int64: the rectangle seen at each pixel, -1 for none; forms (1, R, 3, 3) or (H, R, 3, 3)."""
         best = np.zeros(self._size[::-1], np.float32)
         winner = np.full(self._size[::-1], -1, np.int64)
         for row, (x0, y0, x1, y1) in enumerate(bounds.tolist()):
@@ -89,8 +103,10 @@ class Renderer:
                 continue
             x = np.arange(x0, x1)[None, :]
             y = np.arange(y0, y1)[:, None]
+            seen_by = forms[:, row] if len(forms) == 1 else forms[y0:y1, row]
             u, v, inverse_depth = (
-                (a * x).astype(np.float32) + (b * y + c).astype(np.float32) for a, b, c in forms[row]
+                (a * x).astype(np.float32) + (b * y + c).astype(np.float32)
+                for a, b, c in seen_by.transpose(1, 2, 0)[..., None]
             )
             width, height = self._sizes[row].astype(np.float32)
             window = np.s_[y0:y1, x0:x1]

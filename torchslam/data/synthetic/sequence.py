@@ -72,6 +72,8 @@ class RenderOptions:
         blur: standard deviation of a Gaussian, pixels
         exposure: amplitude of a slow change of brightness, 0 to 1
         blank: 1: gray images instead of rendered ones, if only the poses are used
+        readout: milliseconds from the exposure of the first row to the last, whose middle has the frame's pose
+        pace: speed of the camera, 1 as the scene has it
     """
 
     frames: int
@@ -80,6 +82,8 @@ class RenderOptions:
     blur: float = 0.5
     exposure: float = 0.0
     blank: int = 0
+    readout: float = 0.0
+    pace: float = 1.0
 
 
 class SyntheticSequence(Sequence):
@@ -88,19 +92,19 @@ class SyntheticSequence(Sequence):
     def __init__(self, scene: str, options: RenderOptions | None = None) -> None:
         self._scene = SCENES[scene]
         options = RenderOptions(self._scene.frames) if options is None else options
-        T_wc = self._scene.path(paths.phases(options.frames, self._scene.frames_per_round))
+        self._phases = paths.phases(options.frames, self._scene.frames_per_round) * options.pace
+        T_wc = self._scene.path(self._phases)
         timestamps = torch.arange(options.frames, dtype=torch.float64, device="cpu") / FRAME_RATE
         center = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         camera = Camera.pinhole(FOCAL, FOCAL, *center, size=SIZE)
         super().__init__(scene, "rendered", camera, timestamps, Trajectory(timestamps, T_wc))
         self._options = options
-        self._poses_cw = se3_inverse(T_wc).numpy()
 
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         options = self._options
         if options.blank:
             return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5, dtype=torch.float32, device="cpu")
-        image = _renderer(self._scene.build, options.seed).render(self._poses_cw[index])
+        image = _renderer(self._scene.build, options.seed).render(self._row_poses(index))
         if options.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), options.blur)
         image *= 1.0 + options.exposure * np.sin(0.1 * index)
@@ -108,6 +112,15 @@ class SyntheticSequence(Sequence):
         rng = np.random.default_rng((options.seed, index))
         image += options.noise * rng.standard_normal(image.shape, dtype=np.float32)
         return gray_to_tensor(image.round().clip(0, 255).astype(np.uint8))
+
+    def _row_poses(self, index: int) -> np.ndarray:
+        """T_cw (H, 4, 4) of the rows of an image; (1, 4, 4) if they are exposed at once."""
+        options, phase = self._options, self._phases[index : index + 1]
+        if options.readout > 0:
+            fractions = (torch.arange(SIZE[1], dtype=torch.float64, device="cpu") + 0.5) / SIZE[1] - 0.5
+            per_second = paths.phases(2, self._scene.frames_per_round)[1] * FRAME_RATE * options.pace
+            phase = phase + per_second * 1e-3 * options.readout * fractions
+        return se3_inverse(self._scene.path(phase)).numpy()
 
     def image_name(self, index: int) -> str:
         return f"synthetic:{self.name}#{index}"

@@ -24,6 +24,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.data.transforms import resize
 from torchslam.errors import FrameError, ResultsError, SequenceError
 from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.map.atlas import Submap
 
 SAME_PX = 0.01
@@ -107,15 +108,18 @@ class ExportedScene:
         return total.index_add(0, self.point_index, self.errors()) / count
 
 
-def scene_of(submap: Submap, camera: Camera, session: int, keyframes_alone: bool) -> ExportedScene:
+def scene_of(
+    submap: Submap, camera: Camera, session: int, keyframes_alone: bool, readout: Readout | None = None
+) -> ExportedScene:
     """Build the scene of one session in a saved submap, from all frames or only from keyframes.
 
-    Points outside of the domain of the camera model and points with fewer than two observations are omitted. Raises
-    ResultsError if there are no frames.
+    With the readout of a rolling shutter, keypoints are where a global shutter would have seen them. Points outside of
+    the domain of the camera model and points with fewer than two observations are omitted. Raises ResultsError if there
+    are no frames.
     """
     if submap.map.num_keyframes == 0:
         raise ResultsError(f"submap {submap.number} is empty")
-    graph = submap.posed_frames.graph(submap.map, camera, submap.number)
+    graph = submap.posed_frames.graph(submap.map, camera, submap.number, readout=readout).global_shutter()
     wanted = (graph.sessions == session) & (graph.is_keyframe | (not keyframes_alone))
     rows = torch.nonzero(wanted)[:, 0]
     if len(rows) == 0:

@@ -23,7 +23,7 @@ from torchslam.geometry import Camera, se3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
-from torchslam.io.results import Results, aligned, aligned_poses
+from torchslam.io.results import Results, aligned, aligned_poses, readout_of
 from torchslam.map.atlas import Submap
 from torchslam.types import State, Trajectory
 from torchslam.utils.text import printable
@@ -88,9 +88,11 @@ def page_data(results: Results) -> dict[str, Any]:
     shown.sort(key=lambda submap: submap.number != metrics["submap"])
     budget = MAX_POINTS / max(sum(submap.map.num_points for submap in shown), 1)
     accuracy = f" · ATE {metrics['ate_m']:.3g} m" if "ate_m" in metrics else ""
+    readout = readout_of(metrics)
+    shutter = "" if readout is None else f" · readout {readout.description()}"
     return {
         "title": printable(Path(metrics.get("source") or "torchslam").name),
-        "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}",
+        "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}{shutter}",
         "failure": printable(metrics.get("failure", "")),
         "corners": _corners(results.camera).tolist(),
         "reasons": reasons,

@@ -23,18 +23,16 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry import se3_inverse, se3_log, transform
+from torchslam.geometry import transform
 from torchslam.geometry.gating import whitening
 from torchslam.geometry.lie import skew
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import robustify
+from torchslam.geometry.rolling_shutter import frame_velocities
 from torchslam.optim.run_graph import ObservationGraph
-from torchslam.system.run import Run
 
 MIN_FRAMES, MAX_FRAMES = 12, 60
 """Frames of a test, evenly distributed over a run; more would take longer than they tell."""
-MAX_GAP = 1.5
-"""Frame intervals between two frames whose poses still give a velocity."""
 KERNEL_SCALE = 2.45  # as in `solve_graph`
 PARTS, PART_FRAMES = 10, 5
 """Stretches of a run whose disagreement gives the standard error, and the frames of one: errors of neighboring frames
@@ -48,6 +46,9 @@ MIN_SIGMAS = 5.0
 """A readout of columns in place of rows, which no camera has, reaches 4 standard errors on real sequences."""
 MIN_SHIFT = 0.05
 """Median shift worth naming, as a ratio of the median residual: in fast turns it is several times as large."""
+MAX_RATIO = 1.2
+"""Readout in frame intervals from which on it is none: the rows of an image are read before those of the next one. The
+excess is for its error. Tried at this value only."""
 MIN_MORE_EXPLAINED = 0.1
 """Ratio of the squared residuals by which functions of the row must explain more than those of the column: it is 0.04
 or less on real sequences, 0.16 or more where the rows of their images are shifted by up to 6 px."""
@@ -58,8 +59,9 @@ class RollingShutter:
     """What the residuals of a run say about the exposure of the rows.
 
     Attributes:
-        readout: Time from the first to the last row, in frame intervals; negative from the last to the first.
+        readout: Time from the first to the last row, seconds; negative from the last to the first.
         readout_std: Standard error of it; infinite, and the readout zero, if the camera hardly moves.
+        interval: Frame interval, seconds.
         shift: Median shift by the readout, as a ratio of the median residual.
         by_row: Ratio of the squared residuals without the readout that smooth functions of the row explain, one for
             each frame.
@@ -68,6 +70,7 @@ class RollingShutter:
 
     readout: float
     readout_std: float
+    interval: float
     shift: float
     by_row: float
     by_column: float
@@ -75,31 +78,13 @@ class RollingShutter:
     @property
     def is_read_out(self) -> bool:
         """Whether the motion of the camera shows a rolling shutter."""
-        return abs(self.readout) > MIN_SIGMAS * self.readout_std and self.shift > MIN_SHIFT
+        is_certain = abs(self.readout) > MIN_SIGMAS * self.readout_std and self.shift > MIN_SHIFT
+        return is_certain and abs(self.readout) < MAX_RATIO * self.interval
 
     @property
     def is_shaken(self) -> bool:
         """Whether rows are shifted against each other in a way that the motion between frames does not show."""
         return self.by_row - self.by_column > MIN_MORE_EXPLAINED
-
-    def description(self) -> str:
-        """Say that there is a rolling shutter, and how large it is; empty if none is seen."""
-        sizes = []
-        if self.is_read_out:
-            sizes.append(
-                f"{100 * abs(self.readout):.0f} ± {100 * self.readout_std:.0f} % of the frame interval"
-            )
-        if self.is_shaken:
-            sizes.append(
-                f"the camera shakes, and the row explains {self.by_row:.0%} of the squared errors, "
-                f"the column {self.by_column:.0%}"
-            )
-        if not sizes:
-            return ""
-        return (
-            f"the rows of an image seem to be exposed one after the other (rolling shutter: {'; '.join(sizes)}), "
-            "which is not modeled: poses in fast turns are less exact"
-        )
 
 
 @dataclass(frozen=True)
@@ -164,27 +149,26 @@ def project_out(values: Float[Tensor, "O 2 D"], blocks: Sequence[_Block]) -> Flo
     return values
 
 
-def rolling_shutter_remark(finished: Run) -> str:
-    """Say that the residuals of a run show a rolling shutter; empty if they do not, or if there is no complete run."""
-    if finished.failure or finished.interrupted or finished.session:
-        return ""
-    found = find_rolling_shutter(finished.posed_frames.graph(finished.map, finished.camera))
-    return "" if found is None else found.description()
-
-
 @full_precision
 @torch.no_grad()
 def find_rolling_shutter(graph: ObservationGraph) -> RollingShutter | None:
-    """Test the residuals of a run at its solution, in the submap with most frames.
+    """Test the residuals of a run at its solution, in the submap, and of its sessions in that, with most frames.
+
+    A readout that the graph has already is the point of linearization, so that repeated tests are Gauss-Newton steps.
 
     Returns:
         The result; None with too few frames, or too few observations of the same points.
     """
-    velocities, known = image_interval_velocities(graph)
-    frames = known.nonzero()[:, 0]
+    largest = graph.recordings == torch.bincount(graph.recordings).argmax()
+    velocities, is_central = frame_velocities(graph.T_cw, graph.timestamps, graph.recordings)
+    frames = (is_central & largest).nonzero()[:, 0]
     if len(frames) < MIN_FRAMES:
         return None
     frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
+    interval = float(graph.timestamps[largest].sort().values.diff().median())
+    velocities, raw = interval * velocities, graph.pixels
+    start = 0.0 if graph.readout is None else float(graph.readout.seconds)
+    graph = graph.global_shutter()
     count = min(len(frames), MAX_FRAMES)
     frames = frames[torch.arange(count, device=frames.device) * len(frames) // count]
     rank = torch.full_like(graph.submap, -1)
@@ -204,7 +188,7 @@ def find_rolling_shutter(graph: ObservationGraph) -> RollingShutter | None:
     J_points = W @ J_points
     J_poses = torch.cat((J_points, -J_points @ skew(points_c)), dim=-1)
     size = pixels.new_tensor(graph.camera.size)
-    column, row = ((graph.pixels[rows] + 0.5) / size - 0.5)[..., None, None].unbind(1)  # (O, 1, 1)
+    column, row = ((raw[rows] + 0.5) / size - 0.5)[..., None, None].unbind(1)  # (O, 1, 1)
     flow = J_poses @ velocities[frames][frame][..., None]
     common = torch.cat((W @ J_camera, column * flow), dim=-1)
     others = [
@@ -222,27 +206,9 @@ def find_rolling_shutter(graph: ObservationGraph) -> RollingShutter | None:
         remaining = project_out(left, [bent, *others]).square().sum() / left.square().sum()
         ratios.append(1.0 - float(remaining))
     typical = (row * flow)[..., 0].norm(dim=-1).median() / residuals[..., 0].norm(dim=-1).median()
-    return RollingShutter(readout, std, abs(readout) * float(typical), *ratios)
-
-
-def image_interval_velocities(graph: ObservationGraph) -> tuple[Float[Tensor, "K 6"], Bool[Tensor, " K"]]:
-    """The motion of each frame per frame interval, a left perturbation of its pose, from the frames before and after.
-
-    Returns:
-        Velocities, and in which frames of the largest submap they are known; zero elsewhere.
-    """
-    velocities, known = graph.T_cw.new_zeros(len(graph.T_cw), 6), torch.zeros_like(graph.is_keyframe)
-    frames = (graph.submap == torch.bincount(graph.submap).argmax()).nonzero()[:, 0]
-    if len(frames) < 3:
-        return velocities, known
-    frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
-    T_cw, times = graph.T_cw[frames], graph.timestamps[frames]
-    intervals = times.diff() / times.diff().median()
-    near = (intervals > 0) & (intervals < MAX_GAP)
-    steps = se3_log(T_cw[2:] @ se3_inverse(T_cw[:-2])) / (intervals[1:] + intervals[:-1])[:, None]
-    known[frames[1:-1]] = near[1:] & near[:-1]
-    velocities[frames[1:-1]] = steps
-    return torch.where(known[:, None], velocities, 0.0), known
+    readout += start / interval
+    size_of_shift = abs(readout) * float(typical)
+    return RollingShutter(interval * readout, interval * std, interval, size_of_shift, *ratios)
 
 
 def _shared_rows(graph: ObservationGraph, rank: Int[Tensor, " K"]) -> Int[Tensor, " R"]:
