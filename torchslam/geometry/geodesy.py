@@ -1,7 +1,7 @@
 """Positions on the Earth: latitude and longitude, Earth-centered coordinates, and a local frame of east, north, up.
 
-Geodetic positions are (latitude, longitude, altitude): degrees, degrees and meters above the ellipsoid of WGS84. Sources:
-NIMA TR8350.2 (the ellipsoid); B. R. Bowring, "Transformation from spatial to geographical coordinates", 1976.
+Geodetic positions are (latitude, longitude, altitude): degrees, degrees and meters above the ellipsoid of WGS84.
+Sources: NIMA TR8350.2 (the ellipsoid); B. R. Bowring, "Transformation from spatial to geographical coordinates", 1976.
 """
 
 from __future__ import annotations
