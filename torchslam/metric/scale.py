@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.errors import TorchslamError
+from torchslam.errors import MeasurementError
 
 MAX_DISAGREEMENT = 3.0
 """Standard errors by which two measurements may differ before they count as a contradiction: .3 % of right pairs do."""
@@ -50,6 +50,8 @@ class ScaleMeasurement:
         up_std: its standard error, radians.
         S_ew: similarity from the map to a metric frame of the source (east, north, up), scale in the rotation block;
             None where the source has no such frame.
+        origin: latitude and longitude in degrees and altitude in meters (WGS84) of the origin of that frame; None where
+            it is nowhere on earth.
     """
 
     source: ScaleSource
@@ -61,10 +63,11 @@ class ScaleMeasurement:
     up_w: Float[Tensor, " 3"] | None = None
     up_std: float = math.inf
     S_ew: Float[Tensor, "4 4"] | None = None
+    origin: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.meters_per_unit < math.inf and 0 < self.relative_std < math.inf):
-            raise TorchslamError(
+            raise MeasurementError(
                 f"a scale of {self.meters_per_unit} with an error of {self.relative_std} is no measurement"
             )
 
@@ -93,10 +96,10 @@ def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
     contradiction is named.
 
     Raises:
-        TorchslamError: there is no measurement.
+        MeasurementError: there is no measurement.
     """
     if not measurements:
-        raise TorchslamError("there is no measurement of the scale")
+        raise MeasurementError("there is no measurement of the scale")
     logs = torch.tensor(
         [math.log(m.meters_per_unit) for m in measurements], dtype=torch.float64, device="cpu"
     )
