@@ -33,6 +33,8 @@ class ScaleSource(StrEnum):
     SPEED = "speed"
     ODOMETRY = "odometry"
     DEPTH = "depth"
+    MAP = "map"
+    """A map in meters that the session goes on with."""
 
 
 @dataclass(frozen=True)
@@ -45,6 +47,7 @@ class ScaleMeasurement:
         relative_std: its relative standard error, the disagreement of the single measurements included.
         count: single measurements that count, such as markers or fixes.
         unit: what is counted, in the plural, such as "markers".
+        apart: relative standard deviation of the single measurements; None where it is not known.
         rejected: one line for each single measurement, or group of them, that contradicts the others.
         up_w: unit vector against gravity in the frame of the map; None where the source does not say.
         up_std: its standard error, radians.
@@ -64,6 +67,7 @@ class ScaleMeasurement:
     up_std: float = math.inf
     S_ew: Float[Tensor, "4 4"] | None = None
     origin: tuple[float, float, float] | None = None
+    apart: float | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.meters_per_unit < math.inf and 0 < self.relative_std < math.inf):
