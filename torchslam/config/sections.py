@@ -640,3 +640,23 @@ class MetricConfig(Settings, section="metric"):
         low=0,
         high=MAX_FACTOR,
     )
+    gps: str = setting(
+        "",
+        "Positions on the Earth: DJI's .srt, .gpx, .nmea, .csv with the columns time or name, latitude, longitude and "
+        "altitude, KITTI's oxts, or a folder of images whose EXIF blocks have them.",
+    )
+    gps_clock: str = setting(
+        "",
+        "The clock of those positions: seconds to add to their times to get those of the images, or the date and time "
+        "of the first image, such as 2024-05-01T10:00:00Z. Default: the same, with a difference that is found.",
+    )
+    speed: str = setting(
+        "",
+        "Speeds along the path, as of a wheel encoder: .csv with the columns time and speed, meters per second.",
+    )
+    speed_clock: str = setting("", "The clock of those speeds, as --gps-clock.")
+    odometry: str = setting(
+        "",
+        "Poses of another sensor in meters, as of wheels: a trajectory in TUM format, in a frame of its own.",
+    )
+    odometry_clock: str = setting("", "The clock of that odometry, as --gps-clock.")

@@ -72,6 +72,17 @@ KINDS: tuple[SourceKind, ...] = (
         (Option("distance", ("FRAME:X,Y", "FRAME:X,Y", "METERS")),), "torchslam.metric.distances:from_options"
     ),
     SourceKind((Option("camera_height", ("METERS",)),), "torchslam.metric.camera_height:from_options"),
+    SourceKind(
+        (Option("gps", ("FILE",)), Option("gps_clock", ("CLOCK",))), "torchslam.metric.positions:from_options"
+    ),
+    SourceKind(
+        (Option("speed", ("FILE",)), Option("speed_clock", ("CLOCK",))),
+        "torchslam.metric.speeds:from_options",
+    ),
+    SourceKind(
+        (Option("odometry", ("FILE",)), Option("odometry_clock", ("CLOCK",))),
+        "torchslam.metric.odometry:from_options",
+    ),
 )
 """All kinds, in the order in which they measure: markers, which also improve the poses, come first."""
 

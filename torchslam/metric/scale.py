@@ -55,6 +55,7 @@ class ScaleMeasurement:
             None where the source has no such frame.
         origin: latitude and longitude in degrees and altitude in meters (WGS84) of the origin of that frame; None where
             it is nowhere on earth.
+        notes: remarks for the user, one line each.
     """
 
     source: ScaleSource
@@ -68,6 +69,7 @@ class ScaleMeasurement:
     S_ew: Float[Tensor, "4 4"] | None = None
     origin: tuple[float, float, float] | None = None
     apart: float | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if not (0 < self.meters_per_unit < math.inf and 0 < self.relative_std < math.inf):

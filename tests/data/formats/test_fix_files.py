@@ -14,7 +14,7 @@ from PIL import Image
 from torchslam.data.formats.csv_tables import utc_from_gps
 from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.fixes import Fixes
-from torchslam.errors import TorchslamError, TrajectoryError
+from torchslam.errors import TorchslamError, MeasurementError
 
 MAVIC_3 = """1
 00:00:00,000 --> 00:00:00,033
@@ -189,11 +189,11 @@ def test_exif_of_images(tmp_path: Path) -> None:
     torch.testing.assert_close(fixes.geodetic, expected)
     assert fixes.std[0, 0] == 3.0
     assert "1 images have no position" in fixes.notes[0]
-    with pytest.raises(TrajectoryError, match="give the folder"):
+    with pytest.raises(MeasurementError, match="give the folder"):
         read_fixes(tmp_path / "0.jpg")
     for file in ("0.jpg", "1.jpg"):
         (tmp_path / file).unlink()
-    with pytest.raises(TrajectoryError, match="no image of 1 has a position"):
+    with pytest.raises(MeasurementError, match="no image of 1 has a position"):
         read_fixes(tmp_path)
 
 
@@ -244,7 +244,7 @@ def test_packets_of_kitti(tmp_path: Path) -> None:
     ],
 )
 def test_wrong_files_are_refused(tmp_path: Path, name: str, content: str, message: str) -> None:
-    with pytest.raises(TrajectoryError, match=message):
+    with pytest.raises(MeasurementError, match=message):
         read(tmp_path, name, content)
 
 

@@ -18,7 +18,7 @@ from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.image_file import MAX_BYTES, SUFFIXES
 from torchslam.data.formats.oxts import is_oxts, read_oxts
 from torchslam.data.text_file import MAX_LINE, read_text
-from torchslam.errors import TrajectoryError
+from torchslam.errors import MeasurementError
 from torchslam.utils.files import read_bytes
 
 GPS_BLOCK = 0x8825
@@ -44,7 +44,7 @@ OXTS_ACCURACY = 23  # the place of `pos_accuracy` in a packet (dataformat.txt)
 def read_fixes(path: str | Path) -> Fixes:
     """The positions of a file, by its suffix: .srt, .gpx, .nmea, .csv or .txt, a folder of images, or one of oxts.
 
-    Raises TrajectoryError naming file and line.
+    Raises MeasurementError naming file and line.
     """
     path = Path(path)
     if os.path.isdir(path):  # Path.is_dir raises for a name that is too long
@@ -55,21 +55,21 @@ def read_fixes(path: str | Path) -> Fixes:
     if suffix == ".gpx":
         return checked_fixes(path, _gpx_rows(path))
     if suffix in SUFFIXES:
-        raise TrajectoryError(
+        raise MeasurementError(
             f"{path}: one image; give the folder of all whose EXIF blocks have the positions"
         )
-    text = read_text(path, TrajectoryError)
+    text = read_text(path, MeasurementError)
     if suffix == ".nmea" or text.lstrip().startswith(("$G", "$B")):
         return _read_nmea(path, text)
     return checked_fixes(path, _csv_rows(path))
 
 
 def _csv_rows(path: Path) -> Iterator[Fix]:
-    for row in read_csv(path, POSITION_COLUMNS, TrajectoryError):
+    for row in read_csv(path, POSITION_COLUMNS, MeasurementError):
         if not row.time_column and "name" not in row.cells:
-            raise TrajectoryError(f"{row.where}: neither a `time` nor the `name` of an image")
+            raise MeasurementError(f"{row.where}: neither a `time` nor the `name` of an image")
         if "latitude" not in row.cells and "longitude" not in row.cells and "altitude" in row.cells:
-            raise TrajectoryError(f"{row.where}: no `latitude` and `longitude`, in degrees")
+            raise MeasurementError(f"{row.where}: no `latitude` and `longitude`, in degrees")
         yield Fix(
             row.where,
             row.number("latitude"),
@@ -118,13 +118,13 @@ def _srt_rows(path: Path) -> Iterator[Fix]:
 
 def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
     """Place, beginning in seconds and text of each subtitle."""
-    text = read_text(path, TrajectoryError)
+    text = read_text(path, MeasurementError)
     for match in re.finditer(r"^[^\n]*-->[^\n]*\n((?:(?![^\n]*-->)[^\n]*\n?)*)", text, re.MULTILINE):
         where = f"{path}:{text.count(chr(10), 0, match.start()) + 1}"
         line = match[0].split("\n", 1)[0]
         time = CUE.search(line)
         if time is None or len(match[1]) > MAX_LINE:
-            raise TrajectoryError(f"{where}: expected `00:00:01,000 --> 00:00:02,000`, got `{line[:100]}`")
+            raise MeasurementError(f"{where}: expected `00:00:01,000 --> 00:00:02,000`, got `{line[:100]}`")
         hours, minutes, seconds, parts = time.groups()
         yield where, int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{parts}"), match[1]
 
@@ -150,16 +150,16 @@ def _srt_position(text: str) -> tuple[float, float, float] | None:
 
 def _gpx_rows(path: Path) -> Iterator[Fix]:
     """The points of all tracks, with their times. Source: GPX 1.1, www.topografix.com/GPX/1/1."""
-    text = read_text(path, TrajectoryError, XML_BYTES)
+    text = read_text(path, MeasurementError, XML_BYTES)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may expand to any size
-        raise TrajectoryError(f"{path}: a GPX file has no DOCTYPE")
+        raise MeasurementError(f"{path}: a GPX file has no DOCTYPE")
     try:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as cause:
-        raise TrajectoryError(f"{path}: not GPX: {cause}") from cause
+        raise MeasurementError(f"{path}: not GPX: {cause}") from cause
     points = [element for element in root.iter() if _tag(element) == "trkpt"]
     if not points:
-        raise TrajectoryError(
+        raise MeasurementError(
             f"{path}: no points of a track (trkpt) in it; routes and waypoints have no times"
         )
     for number, point in enumerate(points, start=1):
@@ -167,7 +167,9 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         children = {_tag(child): (child.text or "").strip() for child in point}
         time = parse_moment(children.get("time", ""))
         if time is None:
-            raise TrajectoryError(f"{where}: no time; a route that was planned says nothing about the images")
+            raise MeasurementError(
+                f"{where}: no time; a route that was planned says nothing about the images"
+            )
         numbers = [
             _number(text, where)
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
@@ -184,7 +186,7 @@ def _number(text: str, where: str) -> float:
     try:
         return float(text)
     except ValueError:
-        raise TrajectoryError(f"{where}: `{text}` is not a number") from None
+        raise MeasurementError(f"{where}: `{text}` is not a number") from None
 
 
 # --- NMEA ----------------------------------------------------------------------------------------------------
@@ -228,7 +230,7 @@ def _nmea_rows(rows: list[tuple[str, list[str]]]) -> Iterator[Fix]:
         if re.fullmatch(r"\d{6}", date):
             moment = parse_moment(f"20{date[4:]}-{date[2:4]}-{date[:2]}")
             if moment is None:
-                raise TrajectoryError(f"{where}: `{date}` is not a date")
+                raise MeasurementError(f"{where}: `{date}` is not a date")
             midnight = moment
         elif midnight + clock < last:  # past midnight
             midnight += 86400.0
@@ -248,7 +250,7 @@ def _degrees(text: str, hemisphere: str, expected: str, where: str) -> float:
     """Degrees of `4807.038` and `N`: 48 degrees, 7.038 minutes."""
     found = re.fullmatch(r"(\d{1,3})(\d\d(?:\.\d{1,12})?)", text)
     if found is None or hemisphere not in tuple(expected):
-        raise TrajectoryError(f"{where}: `{text},{hemisphere}` is not a latitude or longitude of NMEA")
+        raise MeasurementError(f"{where}: `{text},{hemisphere}` is not a latitude or longitude of NMEA")
     degrees = int(found[1]) + float(found[2]) / 60
     return degrees if hemisphere == expected[0] else -degrees
 
@@ -259,17 +261,17 @@ def _degrees(text: str, hemisphere: str, expected: str, where: str) -> float:
 def read_image_fixes(folder: Path) -> Fixes:
     """The positions in the EXIF blocks of the images of a folder, by their names; others have none.
 
-    Raises TrajectoryError where no image has one.
+    Raises MeasurementError where no image has one.
     """
     images = find_frames(folder).frames
     if not images:
-        raise TrajectoryError(
+        raise MeasurementError(
             f"{folder}: neither images nor oxts/ of KITTI in it; positions are read from .srt, .gpx, .nmea and .csv"
         )
     rows = [_image_fix(image) for image in images]
     found = [row for row in rows if row is not None]
     if not found:
-        raise TrajectoryError(f"{folder}: no image of {len(images)} has a position in its EXIF block")
+        raise MeasurementError(f"{folder}: no image of {len(images)} has a position in its EXIF block")
     missing = len(images) - len(found)
     return checked_fixes(folder, found, [f"{folder}: {missing} images have no position"] if missing else [])
 
@@ -286,7 +288,7 @@ def _image_fix(path: Path) -> Fix | None:
         altitude = float(block[ALTITUDE]) * (-1 if below else 1) if ALTITUDE in block else math.nan
         error = float(block[HORIZONTAL_ERROR]) if HORIZONTAL_ERROR in block else math.nan
     except Exception as cause:  # a damaged block fails in any way
-        raise TrajectoryError(f"{path}: its EXIF block cannot be read: {cause}") from cause
+        raise MeasurementError(f"{path}: its EXIF block cannot be read: {cause}") from cause
     return Fix(
         str(path), *degrees, altitude, name=path.name, std=(error if error > 0 else math.nan, math.nan)
     )

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.errors import TrajectoryError
+from torchslam.errors import MeasurementError
 
 MAX_FIXES = 1_000_000
 """Maximum number of positions of a file: more than a day at 10 Hz."""
@@ -70,21 +70,21 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
     """The positions of a file in the order of time, without those that the receiver did not have.
 
     Rows without a position (empty, NaN or the zeros that receivers write) and second ones of one time are left out,
-    with a note. Raises TrajectoryError for coordinates or errors that cannot be, times out of order, and where nothing
+    with a note. Raises MeasurementError for coordinates or errors that cannot be, times out of order, and where nothing
     is left.
     """
     kept: list[Fix] = []
     empty = doubled = 0
     for count, row in enumerate(rows):
         if count >= MAX_FIXES:
-            raise TrajectoryError(f"{path}: more than the {MAX_FIXES} positions that are read")
+            raise MeasurementError(f"{path}: more than the {MAX_FIXES} positions that are read")
         if math.isnan(row.latitude) or math.isnan(row.longitude) or row.latitude == row.longitude == 0:
             empty += 1
             continue
         _check(row)
         if row.time is not None and kept and kept[-1].time is not None and row.time <= kept[-1].time:
             if row.time < kept[-1].time:
-                raise TrajectoryError(
+                raise MeasurementError(
                     f"{row.where}: the time {row.time!r} is earlier than the one before, {kept[-1].time!r}: "
                     "sort the file by its times"
                 )
@@ -92,7 +92,7 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
             continue
         kept.append(row)
     if not kept:
-        raise TrajectoryError(f"{path}: no position in it" + (f"; {empty} rows are empty" if empty else ""))
+        raise MeasurementError(f"{path}: no position in it" + (f"; {empty} rows are empty" if empty else ""))
     said = [*notes]
     if empty:
         said.append(f"{path}: left out {empty} rows without a position")
@@ -111,18 +111,18 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
 
 
 def _check(row: Fix) -> None:
-    """Raise TrajectoryError for a position that is none of the Earth's, or an error that is none."""
+    """Raise MeasurementError for a position that is none of the Earth's, or an error that is none."""
     if not abs(row.latitude) <= 90:
         hint = ": are latitude and longitude swapped?" if abs(row.longitude) <= 90 else ""
-        raise TrajectoryError(
+        raise MeasurementError(
             f"{row.where}: a latitude of {row.latitude:g} degrees is beyond the poles{hint}"
         )
     if not abs(row.longitude) <= 360:
-        raise TrajectoryError(f"{row.where}: a longitude of {row.longitude:g} degrees is beyond 180")
+        raise MeasurementError(f"{row.where}: a longitude of {row.longitude:g} degrees is beyond 180")
     if not (math.isnan(row.altitude) or abs(row.altitude) <= MAX_ALTITUDE):
-        raise TrajectoryError(
+        raise MeasurementError(
             f"{row.where}: an altitude of {row.altitude:g} is no altitude in meters above the ground of the Earth"
         )
     for std in row.std:
         if not (math.isnan(std) or 0 < std < math.inf):
-            raise TrajectoryError(f"{row.where}: a standard deviation of {std:g} m is not above zero")
+            raise MeasurementError(f"{row.where}: a standard deviation of {std:g} m is not above zero")
