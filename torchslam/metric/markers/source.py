@@ -15,7 +15,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.data.sequence import Sequence as Images
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, transform
 from torchslam.metric.markers.corners import GraphWithCorners, PlacedTarget, Sighting, add_corners
@@ -23,7 +22,7 @@ from torchslam.metric.markers.detection import Detector, detector_of
 from torchslam.metric.markers.targets import Target, TargetKind, parse_target
 from torchslam.metric.options import Given
 from torchslam.metric.scale import MAX_DISAGREEMENT, ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import Images, SubmapView, Unmeasured
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graph
 
