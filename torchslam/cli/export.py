@@ -103,7 +103,7 @@ class Job:
     @property
     def R_up(self) -> Float[torch.Tensor, "3 3"]:
         """Rotation from the map frame to the upright one, the same for every format."""
-        return upright_from_map(self.submap.map)
+        return upright_from_map(self.submap)
 
     @property
     def depths(self) -> Path | None:
