@@ -133,6 +133,16 @@ def clocks_of(given: Given, option: str) -> list[tuple[str, Clock]]:
     return list(zip(files, clocks, strict=True))
 
 
+def clock_notes(file: Path, shift: float, std: float | None = None) -> list[str]:
+    """What is said of a clock if that of the images is so many seconds ahead, and of the error if it is known."""
+    if not shift:
+        return []
+    error = "" if std is None else f" ± {std:.2f}"
+    return [
+        f"{file}: its clock is {abs(shift):.2f}{error} s {'behind' if shift > 0 else 'ahead of'} that of the images"
+    ]
+
+
 def on_clock_of_images(
     times: Float[Tensor, " N"], path: CameraPath, clock: Clock, file: Path, option: str
 ) -> Float[Tensor, " N"]:

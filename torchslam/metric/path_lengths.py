@@ -17,7 +17,8 @@ from torchslam.metric.slow_noise import SlowMean, slow_mean
 from torchslam.metric.source import Unmeasured
 
 STRETCH = 1.0
-"""Seconds of a stretch: long enough that noise of single poses does not matter, short enough to tell slips from drift."""
+"""Seconds of a stretch: long enough that noise of single poses does not matter, short enough to tell slips from
+drift."""
 PARTS = 5
 """Straight parts of a stretch over which the path of the camera is measured: a car turns by less than 10 degrees in
 one."""
@@ -31,8 +32,9 @@ SEARCH_STEP = 0.1
 """Seconds between the clocks that are tried."""
 SEARCH_LIMIT, SEARCH_SHARE = 20.0, 0.25
 """Seconds, and part of the recording's duration, by which a clock may be off."""
-SEARCH_GAIN = 25.0
-"""Logarithm of the likelihood ratio from which on another clock is believed; as for positions."""
+SEARCH_GAIN = 18.0
+"""Logarithm of the likelihood ratio from which on another clock is believed, as for a difference of six standard
+deviations. Of 20 trials over 15 s, 12.5 believed a wrong one with slipping wheels, and 25 missed one of .8 s."""
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from torchslam.data.formats.fixes import Fixes
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, sim3_scale
-from torchslam.metric.camera_path import CameraPath, Clock, clocks_of, on_clock_of_images
+from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, on_clock_of_images
 from torchslam.metric.options import Given
 from torchslam.metric.position_fit import (
     CLOCK_STD,
@@ -45,9 +45,9 @@ SEARCH_SHARE = 0.25
 """Of the recording's duration: the most by which a clock may be off, so that most positions have a pose with any."""
 SEARCH_POSITIONS = 100
 """Positions that clocks are tried with."""
-SEARCH_GAIN = 25.0
+SEARCH_GAIN = 12.5
 """Logarithm of the likelihood ratio from which on another clock is believed, as for a difference of five standard
-deviations and the 80 clocks that are tried."""
+deviations."""
 SAID = 3.0
 """Standard errors from which on a difference of clocks is mentioned."""
 SECOND_PASS = 0.1
@@ -239,10 +239,7 @@ class PositionSource:
         notes += self.fixes.notes
         offset = shift + fit.offset
         if abs(offset) > SAID * fit.offset_std:
-            notes.append(
-                f"{self.fixes.path}: its clock is {abs(offset):.2f} ± {fit.offset_std:.2f} s "
-                f"{'behind' if offset > 0 else 'ahead of'} that of the images"
-            )
+            notes += clock_notes(self.fixes.path, offset, fit.offset_std)
         if line:
             notes.append(
                 f"{self.fixes.path}: the positions lie on a line: the turn about it is the one in which the images are "

@@ -18,6 +18,8 @@ STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 matter."""
 DURATIONS = (0.1, 0.3, 3.0)
 """After these parts of the recording the slow noise is forgotten; the last one is a walk without an end."""
+FORGOTTEN = DURATIONS[:2]
+"""For means: noise that lasts as long as the recording is part of its mean."""
 MAX_GROUPS = 120
 """Values that covariances are made for; of more, successive ones are averaged, which loses no slow noise."""
 GATE = 4.0
@@ -26,11 +28,13 @@ ROUNDS = 20
 """Rejections until nothing changes; two to four are usual."""
 
 
-def slow_correlations(times: Float[Tensor, " G"]) -> Float[Tensor, "B G G"]:
+def slow_correlations(
+    times: Float[Tensor, " G"], durations: tuple[float, ...] = DURATIONS
+) -> Float[Tensor, "B G G"]:
     """Covariances of slow noise in units of the variance of white noise; none at all is the first."""
     span = (times[-1] - times[0]).clamp_min(1e-9)
     apart = (times[:, None] - times).abs() / span
-    pairs = [(0.0, 1.0), *((strength, duration) for strength in STRENGTHS for duration in DURATIONS)]
+    pairs = [(0.0, 1.0), *((strength, duration) for strength in STRENGTHS for duration in durations)]
     strength, duration = torch.tensor(pairs, dtype=torch.float64, device="cpu").T[..., None, None]
     return strength.square() * torch.exp(-apart / duration)
 
@@ -108,7 +112,7 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
         values: three or more.
         stds: relative to each other.
     """
-    mean = values.median()
+    mean = _densest(values)
     inliers = torch.ones_like(values, dtype=torch.bool)
     for _ in range(ROUNDS):
         before = inliers
@@ -124,7 +128,7 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
     kept, own = values[inliers], stds[inliers].square()
     white = group_means(own, group, size) / size
     at = group_means(times[inliers], group, size)
-    V = slow_correlations(at) * own.mean() + torch.diag(white)
+    V = slow_correlations(at, FORGOTTEN) * own.mean() + torch.diag(white)
     L = torch.linalg.cholesky(V)
     y = torch.linalg.solve_triangular(
         L, group_means(kept, group, size).expand(len(V), -1)[..., None], upper=False
@@ -141,3 +145,11 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
         float(kept.std()),
         inliers,
     )
+
+
+def _densest(values: Float[Tensor, " N"]) -> Float[Tensor, ""]:
+    """The middle of the shortest interval with half of the values: wrong ones may all lie on one side."""
+    ordered = values.sort().values
+    half = len(values) // 2
+    start = (ordered[half:] - ordered[: len(values) - half]).argmin()
+    return (ordered[start] + ordered[start + half]) / 2

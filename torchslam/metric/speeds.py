@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.data.formats.speed_file import Speeds, read_speeds
-from torchslam.metric.camera_path import CameraPath, Clock, clocks_of, on_clock_of_images
+from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, on_clock_of_images
 from torchslam.metric.options import Given
 from torchslam.metric.path_lengths import (
     MIN_STRETCHES,
@@ -58,10 +58,7 @@ class SpeedSource:
         notes = [
             f"{file}: the scale is as right as the circumference of the wheels is, or whatever gives the speed"
         ]
-        if shift:
-            notes.append(
-                f"{file}: its clock is {abs(shift):.1f} s {'behind' if shift > 0 else 'ahead of'} that of the images"
-            )
+        notes += clock_notes(file, shift)
         return measured(at(shift), ScaleSource.SPEED, "the speeds", tuple(notes))
 
     def _lengths(
