@@ -24,6 +24,7 @@ from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, rigid, transform
+from torchslam.io.export.earth import GEOJSON, GPX, write_earth
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
 from torchslam.io.export.scene import ExampleFrame, ImageSource
 from torchslam.map.atlas import Submap
@@ -141,11 +142,15 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
         directory: the results folder, created if missing.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, DENSE_CLOUD, DEPTHS, MESH)]
+    stale = [
+        directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, DENSE_CLOUD, DEPTHS, MESH, GEOJSON, GPX)
+    ]
     stale += [*directory.glob(OTHER_TRAJECTORY.format("[0-9]*")), *(directory / PICTURES).glob(PICTURE_NAMES)]
     for old in stale:
         old.unlink(missing_ok=True)
     write_trajectory(directory / TRAJECTORY, run.trajectory)
+    if run.metric is not None:
+        write_earth(directory, run.trajectory, run.metric)
     write_trajectory(directory / ONLINE, run.online)
     for submap in run.submaps:
         if submap is not run.main and submap.posed_frames.count(run.session):

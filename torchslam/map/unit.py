@@ -49,6 +49,7 @@ class UnitSource:
         count, unit: how many of what, such as 12 "markers".
         apart: relative standard deviation of the single ones; None where it says nothing of them.
         rejected: one line for each single one that contradicts the others.
+        notes: other remarks for the user, one line each.
     """
 
     source: str
@@ -58,6 +59,7 @@ class UnitSource:
     unit: str
     apart: float | None
     rejected: tuple[str, ...]
+    notes: tuple[str, ...] = ()
 
     _CHECKS: ClassVar[dict[str, Any]] = {
         "source": _is_text,
@@ -67,11 +69,13 @@ class UnitSource:
         "unit": _is_text,
         "apart": lambda value: value is None or _is_number(value),
         "rejected": _are_texts,
+        "notes": _are_texts,
     }
 
     def __post_init__(self) -> None:
         _check(self, self._CHECKS)
-        object.__setattr__(self, "rejected", tuple(self.rejected))
+        for name in ("rejected", "notes"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
 
 
 @dataclass(frozen=True)
@@ -125,7 +129,10 @@ class MetricUnit:
     @property
     def remarks(self) -> tuple[str, ...]:
         """What the user must know beyond the sentence: contradictions, and single measurements that were rejected."""
-        return (*self.contradictions, *(line for source in self.sources for line in source.rejected))
+        return (
+            *self.contradictions,
+            *(line for source in self.sources for line in (*source.rejected, *source.notes)),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """The record for JSON."""

@@ -33,7 +33,7 @@ class CameraPath:
     Attributes:
         timestamps: seconds, ascending.
         T_wc: camera to world, float64 on the CPU.
-        first_image: time of the first image of the recording.
+        first_image: time of the first image of the recording, if images come at an even rate.
     """
 
     timestamps: Float[Tensor, " K"]
@@ -43,13 +43,14 @@ class CameraPath:
     @staticmethod
     def of(view: SubmapView) -> CameraPath:
         """The path of a session in a submap; of frames with the same time the first."""
-        times = view.timestamps.detach().double().cpu()
+        times, frames = view.timestamps.detach().double().cpu(), view.frame_index.double().cpu()
         T_wc = se3_inverse(view.T_cw.detach().double().cpu())
         later = torch.ones_like(times, dtype=torch.bool)
         later[1:] = times.diff() > 0
-        times, T_wc = times[later], T_wc[later]
-        recorded = () if view.sequence is None else view.sequence.timestamps
-        first = float(recorded[0]) if len(recorded) else float(times[0]) if len(times) else 0.0
+        times, T_wc, frames = times[later], T_wc[later], frames[later]
+        first = float(times[0]) if len(times) else 0.0
+        if len(times) > 1 and frames[-1] > frames[0]:  # images before the map, at the rate of those in it
+            first -= float(frames[0] * (times[-1] - times[0]) / (frames[-1] - frames[0]))
         return CameraPath(times, T_wc, first)
 
     @property

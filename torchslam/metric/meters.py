@@ -113,7 +113,14 @@ def unit_record(scale: CombinedScale, vertical: Vertical | None, S_mw: Float[Ten
         scale.relative_std,
         tuple(
             UnitSource(
-                str(m.source), m.meters_per_unit, m.relative_std, m.count, m.unit, m.apart, tuple(m.rejected)
+                str(m.source),
+                m.meters_per_unit,
+                m.relative_std,
+                m.count,
+                m.unit,
+                m.apart,
+                tuple(m.rejected),
+                tuple(m.notes),
             )
             for m in measurements
         ),

@@ -315,7 +315,8 @@ def position_residuals(
     errors = (whitening @ (moved - positions_e).mT[..., None]).squeeze(-1)
     up = (S_ew[..., :3, :3] @ camera_up_w[..., None]).squeeze(-1)
     up = up / up.norm(dim=-1, keepdim=True)
-    return torch.cat((errors.flatten(-2), offset / clock_std[..., None], up[..., :2] / CAMERA_UP_STD), dim=-1)
+    up = up - torch.tensor((0.0, 0.0, 1.0), dtype=up.dtype, device=up.device)
+    return torch.cat((errors.flatten(-2), offset / clock_std[..., None], up / CAMERA_UP_STD), dim=-1)
 
 
 def _jacobian(

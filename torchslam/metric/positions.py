@@ -76,7 +76,7 @@ class PositionSource:
         if self.fixes.timestamps is None:
             if view.sequence is None:
                 return _unmeasured(f"{self.fixes.path} has positions of images, which are not at hand")
-            names = [view.sequence.image_name(index) for index in view.frame_index.tolist()]
+            names = [view.sequence.file_name(index) for index in view.frame_index.tolist()]
             found = self._by_names(names, path)
         else:
             found = self._by_times(path)
@@ -224,7 +224,7 @@ class PositionSource:
             "positions",
             tuple(_rejected(pairs, fit)),
             up_w=None if line else fit.up_w,
-            up_std=math.inf if line else fit.up_std,
+            up_std=fit.up_std,
             S_ew=fit.S_ew,
             origin=self.origin,
             notes=tuple(self._notes(fit, shift, line)),
