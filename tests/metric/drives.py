@@ -33,7 +33,7 @@ def drive(seconds: float = 60.0, kind: str = "turns") -> tuple[Tensor, Tensor]:
     """Times (N,) and poses T_ec (N, 4, 4) of a car that stops once; along "turns" or a "line"."""
     times = torch.arange(int(seconds * RATE) + 1, dtype=torch.float64) / RATE
     speed = 6 + 3 * (times / 4).sin()
-    speed = torch.where((times > 0.4 * seconds) & (times < 0.5 * seconds), 0.0, speed)
+    speed = speed * (((times / seconds - 0.45).abs() - 0.05) / 0.03).clamp(0, 1)
     turning = torch.zeros_like(times) if kind == "line" else 0.25 * (times / 5).sin().clamp(-0.6, 1.0)
     heading = 0.3 + (turning * (speed > 0)).cumsum(0) / RATE
     step = (

@@ -103,13 +103,13 @@ def measured(
         what: the name of the instrument's lengths in messages.
         notes: remarks.
     """
-    moving = found.known & (found.lengths_w > 0) & (found.lengths > 0)
-    if int(moving.sum()) < MIN_STRETCHES:
+    if int(found.known.sum()) < MIN_STRETCHES:
         return Unmeasured(
-            source, f"{what} and the camera's path share {int(moving.sum())} stretches of {STRETCH:g} s"
+            source, f"{what} and the camera's path share {int(found.known.sum())} stretches of {STRETCH:g} s"
         )
+    moving = found.known
     for lengths in (found.lengths_w, found.lengths):
-        moving = moving & (lengths > STANDING * lengths[found.known].quantile(0.9))
+        moving = moving & (lengths > STANDING * lengths[found.known].quantile(0.9)) & (lengths > 0)
     if int(moving.sum()) < MIN_STRETCHES:
         return Unmeasured(source, "the camera hardly moves, or not when the vehicle does")
     times, logs = found.times[moving], (found.lengths[moving] / found.lengths_w[moving]).log()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchslam.geometry import sim3_scale, skew, transform, umeyama
 from torchslam.metric.slow_noise import averaged, group_means, group_rows, slow_correlations
-from torchslam.optim import solve_least_squares
+from torchslam.optim import LEAST_SQUARES_OPTIONS, solve_least_squares
 
 MIN_POSITIONS = 4
 """Fewer have no redundancy worth the name: three fix a similarity and leave two numbers over."""
@@ -28,6 +28,8 @@ GATE = 4.0
 Tried at 4 only."""
 ROUNDS = 10
 """Fits of the start, each to the positions that the one before explains; they settle in two to four."""
+TOLERANCE = 1e-6
+"""Relative change of the cost at which a fit ends: a thousandth of a standard error."""
 CAMERA_UP_STD = 1.0
 """Radians: how far the cameras' up may be from the true one. A line leaves the turn about it to this; elsewhere, where
 positions know their up to a degree, a camera that looks to the ground moves it by less than a hundredth of that."""
@@ -101,7 +103,6 @@ def fit_positions(
         clock_std: standard deviation of the difference of the clocks, seconds.
     """
     S_ew, stds = _robust_start(pairs)
-    fit = None
     inliers = torch.ones_like(pairs.has_height)
     for _ in range(ROUNDS):
         before = inliers
@@ -111,14 +112,16 @@ def fit_positions(
             return None
         stds = _scatter(residuals, inliers, pairs)
         kept = _grouped(pairs.select(inliers), stds[inliers])
-        fit = _average(kept, S_ew, camera_up_w, clock_std)
+        fit = _average(kept, S_ew, camera_up_w, clock_std, slow=False)
         if fit is None:
             return None
         S_ew = fit.S_ew
         if bool((inliers == before).all()):
             break
+    fit = _average(kept, S_ew, camera_up_w, clock_std, slow=True)
     if fit is None:
         return None
+    S_ew = fit.S_ew
     moved = pairs.positions_w + fit.offset * pairs.velocities_w
     residuals = pairs.positions_e - transform(S_ew, moved)
     residuals = torch.where(_known(pairs), residuals, 0.0)
@@ -238,15 +241,19 @@ class _Averaged:
 
 
 def _average(
-    groups: _Groups, start: Float[Tensor, "4 4"], camera_up_w: Float[Tensor, " 3"], clock_std: float
+    groups: _Groups,
+    start: Float[Tensor, "4 4"],
+    camera_up_w: Float[Tensor, " 3"],
+    clock_std: float,
+    slow: bool,
 ) -> _Averaged | None:
-    """The average over all covariances, weighted by their restricted likelihoods; None where one does not determine."""
-    slow = slow_correlations(groups.times)
-    B = len(slow)
+    """The average over all covariances, or white noise alone; None where one does not determine the similarity."""
+    correlations = slow_correlations(groups.times)[: None if slow else 1]
+    B = len(correlations)
     whitening, log_det = [], torch.zeros(B, dtype=torch.float64, device="cpu")
     eye = torch.eye(len(groups.times), dtype=torch.float64, device="cpu")
     for axis in range(3):
-        V = slow * groups.single[axis].square() + torch.diag(groups.white[:, axis].square())
+        V = correlations * groups.single[axis].square() + torch.diag(groups.white[:, axis].square())
         L = torch.linalg.cholesky(V)
         whitening.append(torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False))
         log_det = log_det + 2 * L.diagonal(dim1=-2, dim2=-1).log().sum(-1)
@@ -262,6 +269,7 @@ def _average(
         (start.expand(B, 4, 4), torch.zeros(B, 1, dtype=torch.float64, device="cpu")),
         inputs,
         ("sim3", "euclidean"),
+        options=LEAST_SQUARES_OPTIONS.replace(tolerance=TOLERANCE),
     )
     if not bool(solution.success.all()):
         return None

@@ -23,8 +23,9 @@ from torchslam.metric.path_lengths import (
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
 
-MAX_GAP = 1.0
-"""Seconds between two speeds up to which the speed in between is known: a car changes its own by 3 m/s in it."""
+MAX_GAP = 2.5
+"""Seconds between two speeds up to which the speed in between is known: a second or two is usual for cars, which change
+theirs evenly by 3 m/s in one."""
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class SpeedSource:
         gain = (speeds[left + 1] - speeds[left]) * part / 2
         at = driven[left] + part * steps[left] * (speeds[left] + gain)
         gaps = torch.zeros_like(times)
-        gaps[1:] = (steps > max(MAX_GAP, 3 * float(steps.median()))).cumsum(0)
+        gaps[1:] = (steps > MAX_GAP).cumsum(0)
         known = (gaps[left + 1][1:] == gaps[left][:-1]) & (ends[:-1] >= times[0]) & (ends[1:] <= times[-1])
         return at.diff(), known
 
