@@ -221,7 +221,7 @@ class PositionSource:
             float(sim3_scale(fit.S_ew)),
             fit.relative_std,
             int(fit.inliers.sum()),
-            "positions",
+            f"positions, {fit.noise[0]:.2g} m from the path",
             tuple(_rejected(pairs, fit)),
             up_w=None if line else fit.up_w,
             up_std=fit.up_std,
@@ -231,12 +231,7 @@ class PositionSource:
         )
 
     def _notes(self, fit: PositionFit, shift: float, line: bool) -> list[str]:
-        vertical = f" and {fit.noise[1]:.2g} m vertically" if fit.noise[1] > 0 else ", without heights,"
-        notes = [
-            f"{self.fixes.path}: positions scatter by {fit.noise[0]:.2g} m horizontally{vertical} about the path; they "
-            "are taken for those of the camera, not of an antenna beside it"
-        ]
-        notes += self.fixes.notes
+        notes = list(self.fixes.notes)
         offset = shift + fit.offset
         if abs(offset) > SAID * fit.offset_std:
             notes += clock_notes(self.fixes.path, offset, fit.offset_std)

@@ -56,11 +56,7 @@ class SpeedSource:
 
         duration = float(path.timestamps[-1] - path.timestamps[0])
         shift = found_shift(at, duration) if self.clock.seconds is None else 0.0
-        notes = [
-            f"{file}: the scale is as right as the circumference of the wheels is, or whatever gives the speed"
-        ]
-        notes += clock_notes(file, shift)
-        return measured(at(shift), ScaleSource.SPEED, "the speeds", tuple(notes))
+        return measured(at(shift), ScaleSource.SPEED, "the speeds", tuple(clock_notes(file, shift)))
 
     def _lengths(
         self, times: Float[Tensor, " N"], ends: Float[Tensor, " E"]

@@ -14,7 +14,7 @@ from PIL import Image
 from torchslam.data.formats.csv_tables import utc_from_gps
 from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.fixes import Fixes
-from torchslam.errors import TorchslamError, MeasurementError
+from torchslam.errors import MeasurementError, TorchslamError
 
 MAVIC_3 = """1
 00:00:00,000 --> 00:00:00,033

@@ -118,15 +118,25 @@ def _srt_rows(path: Path) -> Iterator[Fix]:
 
 def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
     """Place, beginning in seconds and text of each subtitle."""
-    text = read_text(path, MeasurementError)
-    for match in re.finditer(r"^[^\n]*-->[^\n]*\n((?:(?![^\n]*-->)[^\n]*\n?)*)", text, re.MULTILINE):
-        where = f"{path}:{text.count(chr(10), 0, match.start()) + 1}"
-        line = match[0].split("\n", 1)[0]
+    where, begin, text = "", 0.0, ""
+    for number, line in enumerate(read_text(path, MeasurementError).split("\n"), start=1):
+        if "-->" not in line:
+            text += line + "\n"
+            if len(text) > MAX_LINE:
+                raise MeasurementError(f"{path}:{number}: a subtitle of more than {MAX_LINE} characters")
+            continue
         time = CUE.search(line)
-        if time is None or len(match[1]) > MAX_LINE:
-            raise MeasurementError(f"{where}: expected `00:00:01,000 --> 00:00:02,000`, got `{line[:100]}`")
+        if time is None:
+            raise MeasurementError(
+                f"{path}:{number}: expected `00:00:01,000 --> 00:00:02,000`, got `{line[:100]}`"
+            )
+        if where:
+            yield where, begin, text
         hours, minutes, seconds, parts = time.groups()
-        yield where, int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{parts}"), match[1]
+        begin = int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{parts}")
+        where, text = f"{path}:{number}", ""
+    if where:
+        yield where, begin, text
 
 
 def _srt_position(text: str) -> tuple[float, float, float] | None:
@@ -170,11 +180,11 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
             raise MeasurementError(
                 f"{where}: no time; a route that was planned says nothing about the images"
             )
-        numbers = [
+        latitude, longitude, altitude = (
             _number(text, where)
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
-        ]
-        yield Fix(where, *numbers, time=time)
+        )
+        yield Fix(where, latitude, longitude, altitude, time=time)
 
 
 def _tag(element: ElementTree.Element) -> str:
@@ -283,15 +293,16 @@ def _image_fix(path: Path) -> Fix | None:
             block = image.getexif().get_ifd(GPS_BLOCK)
         if LATITUDE not in block or LONGITUDE not in block:
             return None
-        degrees = [_exif_degrees(block[tag], block.get(tag - 1, "")) for tag in (LATITUDE, LONGITUDE)]
+        latitude, longitude = (
+            _exif_degrees(block[tag], block.get(tag - 1, "")) for tag in (LATITUDE, LONGITUDE)
+        )
         below = block.get(ALTITUDE - 1, 0) in (1, b"\x01")
         altitude = float(block[ALTITUDE]) * (-1 if below else 1) if ALTITUDE in block else math.nan
         error = float(block[HORIZONTAL_ERROR]) if HORIZONTAL_ERROR in block else math.nan
     except Exception as cause:  # a damaged block fails in any way
         raise MeasurementError(f"{path}: its EXIF block cannot be read: {cause}") from cause
-    return Fix(
-        str(path), *degrees, altitude, name=path.name, std=(error if error > 0 else math.nan, math.nan)
-    )
+    std = error if error > 0 else math.nan, math.nan
+    return Fix(str(path), latitude, longitude, altitude, name=path.name, std=std)
 
 
 def _exif_degrees(parts: tuple[float, ...], hemisphere: str) -> float:
@@ -309,5 +320,6 @@ def _read_oxts(folder: Path) -> Fixes:
     for packet in read_oxts(folder):
         accuracy = packet.numbers[OXTS_ACCURACY] if len(packet.numbers) > OXTS_ACCURACY else math.nan
         std = accuracy if accuracy > 0 else math.nan
-        rows.append(Fix(packet.where, *packet.numbers[:3], time=packet.time, std=(std, std)))
+        latitude, longitude, altitude = packet.numbers[:3]
+        rows.append(Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std)))
     return checked_fixes(folder, rows)

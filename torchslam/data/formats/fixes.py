@@ -98,13 +98,12 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
         said.append(f"{path}: left out {empty} rows without a position")
     if doubled:
         said.append(f"{path}: left out {doubled} positions of a time that another one has")
-    double = {"dtype": torch.float64, "device": "cpu"}
     times = [row.time for row in kept if row.time is not None]
     return Fixes(
         Path(path),
-        torch.tensor([row[1:4] for row in kept], **double),
-        torch.tensor([row.std for row in kept], **double),
-        torch.tensor(times, **double) if times else None,
+        torch.tensor([row[1:4] for row in kept], dtype=torch.float64, device="cpu"),
+        torch.tensor([row.std for row in kept], dtype=torch.float64, device="cpu"),
+        torch.tensor(times, dtype=torch.float64, device="cpu") if times else None,
         () if times else tuple(row.name for row in kept),
         tuple(said),
     )

@@ -55,8 +55,8 @@ def read_speeds(path: str | Path) -> Speeds:
         speeds.append(abs(speed))
     if len(times) < 2:
         raise MeasurementError(f"{path}: {len(times)} speeds, two are needed")
-    double = {"dtype": torch.float64, "device": "cpu"}
-    return Speeds(Path(path), torch.tensor(times, **double), torch.tensor(speeds, **double))
+    table = torch.tensor([times, speeds], dtype=torch.float64, device="cpu")
+    return Speeds(Path(path), table[0], table[1])
 
 
 def _rows(path: Path) -> list[tuple[str, float, float]]:
@@ -66,10 +66,10 @@ def _rows(path: Path) -> list[tuple[str, float, float]]:
         found = []
         for number, line in lines:
             where = f"{path}:{number}"
-            row = parse_floats(line, where, MeasurementError)
-            if len(row) != 2:
-                raise MeasurementError(f"{where}: expected a time and a speed, got {len(row)} numbers")
-            found.append((where, in_seconds(row[0], where, MeasurementError), row[1]))
+            numbers = parse_floats(line, where, MeasurementError)
+            if len(numbers) != 2:
+                raise MeasurementError(f"{where}: expected a time and a speed, got {len(numbers)} numbers")
+            found.append((where, in_seconds(numbers[0], where, MeasurementError), numbers[1]))
         return found
     found = []
     for row in read_csv(path, COLUMNS, MeasurementError):
