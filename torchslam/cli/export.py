@@ -321,7 +321,7 @@ def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
 
 
 def _ply(job: Job) -> dict[str, str]:
-    write_map_cloud(job.output, job.submap.map, job.session)
+    write_map_cloud(job.output, job.submap, job.session)
     keyframes = len(job.submap.map.keyframe_rows(job.session))
     return {"points": f"{job.submap.map.num_points}, and {keyframes} keyframes"}
 

@@ -9,7 +9,7 @@ of 5 to 10 %. What remains are the height and the roll.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -58,7 +58,7 @@ ALIKE, LEAST_SHARE = 0.7, 0.15
 CONTRAST = 2.0 / 255
 """Least standard deviation of the gray levels of a window."""
 MODEL_STD = 0.015
-"""Relative error that all frames share: the road is curved, the camera's height is known to a centimeter or two, and its
+"""Relative error that all frames share: the road is curved, the height is known to a centimeter or two, and the
 focal length to 1 %."""
 
 
@@ -115,8 +115,10 @@ def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
     windows = _Windows.of(view.camera.to("cpu"))
     rows = sorted({int(row) for row in torch.linspace(0, len(T_cw) - 1, FRAMES + 2, device="cpu").round()})
     guess = _guess(view, T_cw[rows])
-    found = []
-    for row in rows if guess is not None and windows is not None else ():
+    found = list[float]()
+    if guess is None or windows is None:
+        return np.array(found)
+    for row in rows:
         around = _path(centers_w, row, guess)
         if around is None:
             continue
@@ -240,7 +242,8 @@ class _PlaneFit:
     def height(self, guess: float) -> float | None:
         """The height of the camera above the plane that fits best; None where none fits."""
         heights = guess * np.exp(np.linspace(-math.log(RANGE), math.log(RANGE), STEPS))
-        quality = [self.quality(height, 0.0) for height in heights]
+        rough = replace(self, others=self.others[:1], T_oc=self.T_oc[:1])
+        quality = [rough.quality(height, 0.0) for height in heights]
         best = int(np.argmax(quality))
         if best in (0, STEPS - 1):
             return None

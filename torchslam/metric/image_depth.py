@@ -113,8 +113,8 @@ def _search(sweep: _Sweep, low: float, high: float, where: str) -> LocatedPixel 
     near = (single.argmax(dim=1) - best).abs() <= AGREEING
     if int(near.sum()) < max(LEAST_FRAMES, AGREEING_SHARE * len(single)):
         return f"the other frames disagree on the depth at {where}"
-    ends = coarse[max(best - AGREEING, 0)], coarse[min(best + AGREEING, PLANES - 1)]
-    fine = torch.linspace(*map(float, ends), REFINED, dtype=torch.float64, device="cpu")
+    start, end = coarse[max(best - AGREEING, 0)], coarse[min(best + AGREEING, PLANES - 1)]
+    fine = torch.linspace(float(start), float(end), REFINED, dtype=torch.float64, device="cpu")
     single = sweep.single_scores(np.zeros(2), fine)
     inverse_depth = _maximum(fine, _joint(single))
     # The clicks that a hand with the error of a pixel makes as well see other depths, most of all at an edge.

@@ -178,17 +178,17 @@ def _place(graph: RunGraph, group: list[Sighting], target: Target, identity: int
         return None, "is seen from too few places"
     if float(found.errors[good][mask[good]].median()) > MAX_ERROR_PX:
         return None, "is not in one place"
-    corner, view = torch.nonzero(mask[good], as_tuple=True)
-    sides = _sides_px(pixels, corners, target.size if target.squares[0] else None)
+    corner, seen_in = torch.nonzero(mask[good], as_tuple=True)
+    sides = _sides_px(pixels)
     return (
-        _Part(found.points_w[good], corners[good], frames[view], corner, pixels[good][corner, view], sides),
+        _Part(
+            found.points_w[good], corners[good], frames[seen_in], corner, pixels[good][corner, seen_in], sides
+        ),
         "",
     )
 
 
-def _sides_px(
-    pixels: Float[Tensor, "C F 2"], corners: Float[Tensor, "C 2"], square: float | None
-) -> Float[Tensor, " F"]:
+def _sides_px(pixels: Float[Tensor, "C F 2"]) -> Float[Tensor, " F"]:
     """Size of a target in each frame, pixels: root mean square distance of its corners from their center, as a side."""
     seen = pixels.isfinite().all(dim=-1)
     spread = []
