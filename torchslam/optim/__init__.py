@@ -20,6 +20,7 @@ from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bun
 from torchslam.optim.bundle._factors import (
     DepthPrior,
     FrameFactors,
+    displacement_error,
     log_distance_error,
     relative_pose_error,
 )
@@ -57,6 +58,7 @@ __all__ = [
     "RotationAverage",
     "SolverOptions",
     "SolverReason",
+    "displacement_error",
     "log_distance_error",
     "relative_pose_error",
     "solve_bundle",
