@@ -134,10 +134,7 @@ def _write(
         own = by_number[number].trajectory(session)  # an adjustment with markers has moved single poses
         write_trajectory(directory / name, own)
         if number == main:
-            results_of = (
-                aligned(read_trajectory(directory / ONLINE), S_mw) if len(results.trajectory) else own
-            )
-            write_trajectory(directory / ONLINE, results_of)
+            write_trajectory(directory / ONLINE, aligned(read_trajectory(directory / ONLINE), S_mw))
             write_trajectory(directory / KEYFRAMES, by_number[number].map.keyframe_trajectory(session))
             write_map_cloud(directory / POINT_CLOUD, by_number[number], session)
     write_atlas(directory / MAP, saved.atlas, saved.camera, saved.sessions)
