@@ -248,7 +248,8 @@ def _average(
     slow: bool,
 ) -> _Averaged | None:
     """The average over all covariances, or white noise alone; None where one does not determine the similarity."""
-    correlations = slow_correlations(groups.times)[: None if slow else 1]
+    # Every receiver wanders: white noise alone is for the rounds that reject, where it is good enough.
+    correlations = slow_correlations(groups.times)[slice(1, None) if slow else slice(1)]
     B = len(correlations)
     whitening, log_det = [], torch.zeros(B, dtype=torch.float64, device="cpu")
     eye = torch.eye(len(groups.times), dtype=torch.float64, device="cpu")
