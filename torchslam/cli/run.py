@@ -30,7 +30,7 @@ from torchslam.config import Config, load_config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found
 from torchslam.data.sequence import Calibrated
-from torchslam.errors import ConfigError, MeasurementError, ResultsError
+from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
 from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
@@ -295,7 +295,7 @@ def _map_recording(
 
 
 def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
-    """Bring the run into meters; wrong measurements and Ctrl-C leave it in an arbitrary unit, and say so."""
+    """Bring the run into meters; Ctrl-C leaves it in an arbitrary unit, and says so."""
     finished = attempt.finished
     try:
         if finished.interrupted and sources:
@@ -304,8 +304,6 @@ def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
     except KeyboardInterrupt:
         why = "interrupted; `torchslam align` measures later"
         return replace(attempt, finished=replace(finished, interrupted=True, unmeasured=(why,)))
-    except MeasurementError as error:
-        return replace(attempt, finished=replace(finished, unmeasured=(str(error),)))
 
 
 def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[Sequence, str]:
