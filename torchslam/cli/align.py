@@ -1,4 +1,4 @@
-"""Give meters to a finished run, from what is known of lengths: markers, a length, the camera's height, positions.
+"""Give meters to a finished run, from what is known of lengths: markers, clicked points, the camera's height.
 
 The options are those of `torchslam run`. Map, trajectories, metrics, plots and viewer of the results folder are written
 anew; exports that follow are in meters. Dense depth of the folder is removed: `torchslam densify` computes it again.
