@@ -9,6 +9,8 @@ import pytest
 import torch
 
 from tests.map.simulated import CAMERA, reprojection_errors, simulated_submap
+from torchslam.config import Config
+from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, sim3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import level_rotation
 from torchslam.map.file import read_atlas, write_atlas
@@ -16,6 +18,9 @@ from torchslam.map.unit import MetricUnit
 from torchslam.metric.meters import bring_into_meters
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.system.metric_run import run_in_meters
+from torchslam.system.run import Run
+from torchslam.types import State, StepResult
 
 
 class Fixed:
@@ -155,12 +160,7 @@ def test_merged_submaps_are_in_the_meters_of_the_one_that_has_them(metric_first:
     assert torch.allclose(merged.trajectory(1 - session).positions_w, moved, atol=1e-9)
 
 
-def test_what_was_returned_frame_by_frame_follows(monkeypatch: pytest.MonkeyPatch) -> None:
-    from torchslam.config import Config
-    from torchslam.system.metric_run import run_in_meters
-    from torchslam.system.run import Run
-    from torchslam.types import State, StepResult
-
+def test_what_was_returned_frame_by_frame_follows() -> None:
     submap = simulated_submap()
     T_cw = se3_exp(torch.tensor([0.1, 0.2, 0.3, 0.1, 0.0, 0.2], dtype=torch.float64))
     covariance = torch.eye(6, dtype=torch.float64)
@@ -183,3 +183,16 @@ def test_what_was_returned_frame_by_frame_follows(monkeypatch: pytest.MonkeyPatc
     )
     assert found.results[1] is results[1]  # of a submap that is no more
     assert run_in_meters(run, None, []) is run
+
+
+def test_a_wrong_measurement_loses_nothing_of_a_run() -> None:
+    class Wrong:
+        def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
+            raise MeasurementError("the clock runs backwards")
+
+    submap = simulated_submap()
+    before = submap.trajectory().T_wc
+    found = run_in_meters(Run((submap,), CAMERA, Config(), [], [], False, ""), None, [Wrong()])
+    assert found.unmeasured == ("the clock runs backwards",)
+    assert found.metric is None
+    assert torch.equal(found.trajectory.T_wc, before)

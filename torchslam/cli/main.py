@@ -37,7 +37,7 @@ COMMANDS = {
     ),
     "align": (
         "align",
-        "give meters to a finished run: from markers, known lengths, positions or an inertial sensor",
+        "give meters to a finished run, from what is known of lengths: markers, clicked points, the camera's height",
     ),
     "densify": (
         "densify",

@@ -26,11 +26,11 @@ from torchslam.calibration.find_camera import ROUGH_STD, find_camera, with_state
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
-from torchslam.config import Config
+from torchslam.config import Config, load_config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found
 from torchslam.data.sequence import Calibrated
-from torchslam.errors import ConfigError, MeasurementError, ResultsError
+from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
 from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
@@ -160,6 +160,8 @@ def execute(options: argparse.Namespace) -> int:
         options.config = options.config or (own if own.is_file() else None)
         options.map = options.map / MAP
     opened, config = _sequence(options), arguments.config(options)
+    if options.map is not None:  # what was measured belongs to the frames of the session before
+        config = replace(config, metric=load_config(None, arguments.overrides(options)).metric)
     if options.dense:
         map_size(options.resolution, opened.size)  # raises now rather than after the run
     if options.mapping == Mapping.GLOBAL.value and _mode(opened, options) is None:
@@ -293,7 +295,7 @@ def _map_recording(
 
 
 def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
-    """Bring the run into meters; wrong measurements and Ctrl-C leave it in an arbitrary unit, and say so."""
+    """Bring the run into meters; Ctrl-C leaves it in an arbitrary unit, and says so."""
     finished = attempt.finished
     try:
         if finished.interrupted and sources:
@@ -302,8 +304,6 @@ def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
     except KeyboardInterrupt:
         why = "interrupted; `torchslam align` measures later"
         return replace(attempt, finished=replace(finished, interrupted=True, unmeasured=(why,)))
-    except MeasurementError as error:
-        return replace(attempt, finished=replace(finished, unmeasured=(str(error),)))
 
 
 def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[Sequence, str]:

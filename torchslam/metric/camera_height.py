@@ -113,7 +113,12 @@ def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
     T_cw = view.T_cw.detach().cpu().double()
     centers_w = se3_inverse(T_cw)[:, :3, 3]
     windows = _Windows.of(view.camera.to("cpu"))
-    rows = sorted({int(row) for row in torch.linspace(0, len(T_cw) - 1, FRAMES + 2, device="cpu").round()})
+    rows = sorted(
+        {
+            int(row)
+            for row in torch.linspace(0, len(T_cw) - 1, FRAMES + 2, dtype=torch.float64, device="cpu").round()
+        }
+    )
     guess = _guess(view, T_cw[rows])
     found = list[float]()
     if guess is None or windows is None:

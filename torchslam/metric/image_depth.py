@@ -261,7 +261,7 @@ def _chosen(
     fits = torch.nonzero(seen & (angles >= ANGLES_DEG[0]) & (angles <= ANGLES_DEG[1]))[:, 0]
     if len(fits) <= FRAMES:
         return fits
-    return fits[torch.linspace(0, len(fits) - 1, FRAMES, device="cpu").round().long()]
+    return fits[torch.linspace(0, len(fits) - 1, FRAMES, dtype=torch.float64, device="cpu").round().long()]
 
 
 def _gray(view: SubmapView, frame_index: int) -> Float[np.ndarray, "H W"] | None:

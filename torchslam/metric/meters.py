@@ -44,7 +44,7 @@ def bring_into_meters(
         The similarity S_mw from the world before to the new one, and the sources that could not say anything.
 
     Raises:
-        TorchslamError: measurements are wrong.
+        MeasurementError: measurements are wrong.
     """
     submap = view.submap
     answers = [source.measure(view) for source in sources]

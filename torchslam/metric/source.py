@@ -87,6 +87,6 @@ class MetricSource(Protocol):
         """Measure the unit of a submap.
 
         Raises:
-            TorchslamError: the measurements themselves are wrong, for whatever submap. The run ends with its results in
-                an arbitrary unit, and with this message.
+            MeasurementError: the measurements themselves are wrong, for whatever submap. The run ends with its results
+                in an arbitrary unit, and with this message.
         """

@@ -8,6 +8,7 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
+from torchslam.errors import MeasurementError
 from torchslam.geometry import sim3_inverse, sim3_scale
 from torchslam.geometry.transforms import covariances_with_unit, without_scale
 from torchslam.metric.meters import bring_into_meters
@@ -19,15 +20,13 @@ from torchslam.types import StepResult
 def run_in_meters(run: Run, sequence: Images | None, sources: Iterable[MetricSource]) -> Run:
     """Bring every submap with measurements into meters; the others keep their unit.
 
-    The submaps are changed in place, the poses that were returned frame by frame follow the submap that they are in.
+    The submaps are changed in place, the poses that were returned frame by frame follow the submap that they are in. A
+    measurement that is wrong leaves the run as it is, with the reason in `Run.unmeasured`.
 
     Args:
         run: a finished run.
         sequence: its images; None where they are not at hand.
         sources: what measures.
-
-    Raises:
-        TorchslamError: measurements are wrong.
     """
     sources, results, unmeasured = list(sources), list(run.results), list[str]()
     if not sources:
@@ -35,7 +34,10 @@ def run_in_meters(run: Run, sequence: Images | None, sources: Iterable[MetricSou
     for submap in run.submaps:
         if not submap.posed_frames.count(run.session):
             continue
-        S_mw, silent = bring_into_meters(SubmapView(submap, run.camera, run.session, sequence), sources)
+        try:
+            S_mw, silent = bring_into_meters(SubmapView(submap, run.camera, run.session, sequence), sources)
+        except MeasurementError as error:
+            return replace(run, results=results, unmeasured=(str(error),))
         if submap is run.main:
             unmeasured = [f"{each.source}: {each.reason}" for each in silent]
         for row, result in enumerate(results):
