@@ -28,8 +28,10 @@ from torchslam.batch.task import configuration
 from torchslam.cli.main import main
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import open_sequence, parse_camera, read_calibration, read_trajectory
+from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_color, read_gray
+from torchslam.data.formats.speed_file import read_speeds
 from torchslam.data.sequence import Sequence
 from torchslam.dense import DepthMaps
 from torchslam.errors import CalibrationError, ConfigError, FrameError, InitializationError, ResultsError
@@ -152,6 +154,12 @@ def readers() -> dict[str, Reader]:
         Reader(f"calibration {kind}", partial(valid_inputs.CALIBRATIONS.__getitem__, kind), _calibration, 300)
         for kind in valid_inputs.CALIBRATIONS
     ]
+    for kind in valid_inputs.positions():
+        make = partial(_kind, valid_inputs.positions, kind)
+        name = "" if kind in ("exif", "oxts") else f"a.{kind.split()[0]}"
+        found.append(Reader(f"positions {kind}", make, partial(_fixes, name=name), 200))
+    speeds = {"v.csv": b"time_ms;speed_km_h\n0;3.6\n500;7.2\n1000;0\n"}
+    found.append(Reader("speeds", lambda: speeds, lambda root: _speeds(root / "v.csv"), 200))
     for kind in ("mp4", "avi"):
         make = partial(_kind, valid_inputs.videos, kind)
         found.append(Reader(f"video {kind}", make, partial(_sequence, name=f"v.{kind}"), 900))
@@ -160,6 +168,22 @@ def readers() -> dict[str, Reader]:
             Reader(f"bag {kind}", partial(_kind, valid_inputs.bags, kind), partial(_sequence, name=name), 700)
         )
     return {reader.name: reader for reader in found}
+
+
+def _fixes(root: Path, name: str) -> None:
+    """All positions are on the Earth, and times rise."""
+    fixes = read_fixes(root / name)
+    assert len(fixes) > 0
+    assert bool((fixes.geodetic[:, 0].abs() <= 90).all())
+    assert bool(fixes.geodetic[:, 1].isfinite().all())
+    assert fixes.timestamps is None or bool((fixes.timestamps.diff() > 0).all())
+    assert fixes.timestamps is None or bool(fixes.timestamps.isfinite().all())
+
+
+def _speeds(path: Path) -> None:
+    speeds = read_speeds(path)
+    assert bool(speeds.speeds.isfinite().all())
+    assert bool((speeds.timestamps.diff() > 0).all())
 
 
 def _kind(make: Callable[[], dict[str, Files]], kind: str) -> Files:

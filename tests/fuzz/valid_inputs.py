@@ -12,7 +12,9 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from PIL import Image
 
+from tests.data.formats.test_fix_files import GPX, MAVIC_3, MAVIC_PRO, MINI_2, NMEA, with_sums
 from tests.data.mp4 import write_mp4
 from tests.data.readers.test_bag import STAMPS, Recording
 from tests.data.readers.test_euroc import SENSOR
@@ -132,6 +134,29 @@ def icl_nuim() -> Files:
     return pictures([f"rgb/{index}.png" for index in (1, 2, 10)]) | {
         "livingRoom0.gt.freiburg": b"1 0.1 0.2 0.3 0 0 0 1\n10 1 2 3 0.6 0 0 0.8\n11 0 0 0 0 0 0 1\n"
     }
+
+
+@cache
+def positions() -> dict[str, Files]:
+    """Positions in every layout."""
+    table = "time,latitude,longitude,altitude,std_horizontal\n0,48.1,11.5,520,1.5\n1,48.2,11.5,,\n2,,,,\n"
+    found = {
+        "csv": {"a.csv": table.encode()},
+        "gpx": {"a.gpx": GPX.encode()},
+        "nmea": {"a.nmea": with_sums(NMEA).encode()},
+        "oxts": {f"oxts/{name.split('oxts/')[1]}": c for name, c in kitti_raw().items() if "oxts/" in name},
+        "exif": {"a.jpg": _with_position()},
+    }
+    layouts = {"brackets": MAVIC_3, "tuple": MAVIC_PRO, "mini": MINI_2}
+    return found | {f"srt {name}": {"a.srt": text.encode()} for name, text in layouts.items()}
+
+
+def _with_position() -> bytes:
+    image, content = Image.fromarray(picture(1)), io.BytesIO()
+    exif = image.getexif()
+    exif.get_ifd(0x8825).update({1: "N", 2: (48.0, 6.0, 1.5), 3: "E", 4: (11.0, 30.0, 0.0), 6: 520.5})
+    image.save(content, "JPEG", exif=exif)
+    return content.getvalue()
 
 
 def folder() -> Files:

@@ -23,6 +23,7 @@ from torchslam.optim import (
     LEAST_SQUARES_OPTIONS,
     BundleProblem,
     PosePrior,
+    displacement_error,
     log_distance_error,
     relative_pose_error,
     solve_bundle,
@@ -165,6 +166,11 @@ def estimator_cases() -> dict[str, Case]:
         "passes_gate": (geometry.passes_gate, (normal(9).square(), normal(9, seed=1))),
         "innovation_covariances": (geometry.innovation_covariances, (J, spd(6), torch.ones_like(J[:, 0, 0]))),
         "mahalanobis_squared": (geometry.mahalanobis_squared, (normal(2, 3), spd(3))),
+        "ecef_from_geodetic": (geometry.ecef_from_geodetic, (30 * normal(4, 3),)),
+        "geodetic_from_ecef": (geometry.geodetic_from_ecef, (4e6 + 1e5 * normal(4, 3),)),
+        "ecef_from_local": (geometry.ecef_from_local, (30 * normal(4, 3),)),
+        "enu_from_geodetic": (geometry.enu_from_geodetic, (30 * normal(4, 3), 30 * normal(3, seed=1))),
+        "geodetic_from_enu": (geometry.geodetic_from_enu, (1e3 * normal(4, 3), 30 * normal(3, seed=1))),
         "umeyama": (geometry.umeyama, (normal(9, 3), normal(9, 3, seed=1))),
         "ate": (by_name(evaluation.ate), (se3_exp(normal(9, 6)), se3_exp(normal(9, 6, seed=1)))),
         "rpe": (by_name(evaluation.rpe), (se3_exp(normal(9, 6)), se3_exp(normal(9, 6, seed=1)))),
@@ -226,6 +232,9 @@ def solver_cases() -> dict[str, Case]:
         ),
         "log_distance_error": (
             log_distance_error, (se3_exp(0.3 * normal(2, 6)), se3_exp(normal(2, 6, seed=4)), 1 + normal(2).square())
+        ),
+        "displacement_error": (
+            displacement_error, (se3_exp(0.3 * normal(2, 6)), se3_exp(normal(2, 6, seed=4)), normal(2, 2, 3))
         ),
         "solve_graph": (solve, (graph.pixels, graph.camera.params)),
         "solve_pose_graph": (

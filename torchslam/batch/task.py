@@ -24,7 +24,7 @@ from torchslam.batch.result_store import (
 )
 from torchslam.batch.rows import Row
 from torchslam.calibration.find_camera import find_camera, with_stated_std
-from torchslam.config import Config, load_config, to_toml
+from torchslam.config import Config, MetricConfig, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Calibrated
@@ -35,6 +35,8 @@ from torchslam.global_mapping.recording import map_recording
 from torchslam.io.report import compute_metrics
 from torchslam.io.results import source_of
 from torchslam.io.write_run import write_run
+from torchslam.metric.options import given_options, sources_of
+from torchslam.system.metric_run import run_in_meters
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 from torchslam.utils.text import without_credentials
@@ -166,15 +168,19 @@ def _run(task: Task, folder: Path) -> Columns:
     row, device = task.row, torch.device(task.device)
     config, sequence = settings_of(row), open_row(row)
     camera = ""
+    sources = sources_of(given_options(config.metric, sequence.measurements))
     start = time.process_time()
     if sequence.calibrated is not Calibrated.GIVEN:
         sequence, camera = find_camera(sequence, config, folder, device)
     config = with_stated_std(config, sequence)
-    finished = SLAM(sequence.camera.to(device), config).run(sequence)
+    # What measures does so once, in the map that is kept.
+    unmeasured = replace(config, metric=MetricConfig(own=False))
+    finished = SLAM(sequence.camera.to(device), unmeasured).run(sequence)
     if finished.interrupted:
         raise KeyboardInterrupt
     mapped = map_recording(sequence, finished, config, sequence.camera, device=device)
-    finished = mapped.run
+    finished = run_in_meters(mapped.run, sequence, sources)
+    finished = replace(finished, config=replace(finished.config, metric=config.metric))
     seconds = time.process_time() - start
     metrics = compute_metrics(finished, sequence, camera, mapped=mapped)
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}

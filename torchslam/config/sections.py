@@ -634,3 +634,46 @@ class DenseConfig(Settings, section="dense"):
         "Aggregation of matching costs; learned: a small network rates what the classical one found.",
         choices=("classical", "learned"),
     )
+
+
+@dataclass(frozen=True)
+class MetricConfig(Settings, section="metric"):
+    """What is known of the unit of the map; each setting is an option of the command line as well."""
+
+    own: bool = setting(
+        True, "Use the measurements that a dataset brings along, such as those of an inertial sensor."
+    )
+    marker: str = setting(
+        "",
+        "Printed markers in view and the length of their black squares in meters: apriltag-25h9:0.05, aruco-4x4:0.05, "
+        "charuco-7x5:0.04:0.03 or chessboard-7x5:0.04; with ,7=0.1 markers of the id 7 have another length.",
+    )
+    distance: str = setting(
+        "", "A known length: two image points, each as FRAME:X,Y, and the meters between them in the scene."
+    )
+    camera_height: float = setting(
+        0.0,
+        "Height of the camera above the ground that it moves over, in meters; 0: unknown.",
+        low=0,
+        high=MAX_FACTOR,
+    )
+    gps: str = setting(
+        "",
+        "Positions on the Earth: DJI's .srt, .gpx, .nmea, .csv with the columns time or name, latitude, longitude and "
+        "altitude, KITTI's oxts, or a folder of images whose EXIF blocks have them.",
+    )
+    gps_clock: str = setting(
+        "",
+        "The clock of those positions: seconds to add to their times to get those of the images, or the date and time "
+        "of the first image, such as 2024-05-01T10:00:00Z. Default: the same, with a difference that is found.",
+    )
+    speed: str = setting(
+        "",
+        "Speeds along the path, as of a wheel encoder: .csv with the columns time and speed, meters per second.",
+    )
+    speed_clock: str = setting("", "The clock of those speeds, as --gps-clock.")
+    odometry: str = setting(
+        "",
+        "Poses of another sensor in meters, as of wheels: a trajectory in TUM format, in a frame of its own.",
+    )
+    odometry_clock: str = setting("", "The clock of that odometry, as --gps-clock.")

@@ -17,6 +17,13 @@ from torchslam.geometry.gating import (
     passes_gate,
     squared_reprojection_errors,
 )
+from torchslam.geometry.geodesy import (
+    ecef_from_geodetic,
+    ecef_from_local,
+    enu_from_geodetic,
+    geodetic_from_ecef,
+    geodetic_from_enu,
+)
 from torchslam.geometry.homography import (
     decompose_homography,
     homography_from_matches,
@@ -74,12 +81,17 @@ __all__ = [
     "correct_matches",
     "decompose_essential",
     "decompose_homography",
+    "ecef_from_geodetic",
+    "ecef_from_local",
+    "enu_from_geodetic",
     "epipolar_offsets",
     "essential_from_pose",
     "estimate_absolute_pose",
     "estimate_relative_pose",
     "estimate_similarity",
     "five_point",
+    "geodetic_from_ecef",
+    "geodetic_from_enu",
     "homography_from_matches",
     "innovation_covariances",
     "mahalanobis_squared",

@@ -26,6 +26,7 @@ from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, rigid, transform
 from torchslam.geometry.rolling_shutter import MAX_READOUT, Readout
 from torchslam.global_mapping.saved_stages import delete_stages
+from torchslam.io.export.earth import GEOJSON, GPX, write_earth
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
 from torchslam.io.export.scene import ExampleFrame, ImageSource
 from torchslam.map.atlas import Submap
@@ -153,11 +154,15 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
         directory: the results folder, created if missing.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, DENSE_CLOUD, DEPTHS, MESH)]
+    stale = [
+        directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, DENSE_CLOUD, DEPTHS, MESH, GEOJSON, GPX)
+    ]
     stale += [*directory.glob(OTHER_TRAJECTORY.format("[0-9]*")), *(directory / PICTURES).glob(PICTURE_NAMES)]
     for old in stale:
         old.unlink(missing_ok=True)
     write_trajectory(directory / TRAJECTORY, run.trajectory)
+    if run.metric is not None:
+        write_earth(directory, run.trajectory, run.metric)
     write_trajectory(directory / ONLINE, run.online)
     for submap in run.submaps:
         if submap is not run.main and submap.posed_frames.count(run.session):
@@ -168,7 +173,7 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
     write_atlas(directory / MAP, run.submaps, run.camera, run.sessions)
-    write_map_cloud(directory / POINT_CLOUD, run.map, run.session)
+    write_map_cloud(directory / POINT_CLOUD, run.map, run.session, run.metric)
     if run.calibration is not None and not run.session:
         remark, std = str(metrics.get("camera", "")), run.calibration.focal_std
         write_calibration(directory / CALIBRATION, run.camera, [remark] if remark else [], std)
@@ -183,7 +188,7 @@ def read_results(directory: Path) -> Results:
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
     saved, metrics = read_atlas(directory / MAP), read_metrics(directory)
-    main = [submap.map for submap in saved.atlas if submap.number == metrics["submap"]]
+    main = [submap for submap in saved.atlas if submap.number == metrics["submap"]]
     paths = {submap.number: directory / OTHER_TRAJECTORY.format(submap.number) for submap in saved.atlas}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     cloud = directory / DENSE_CLOUD
@@ -192,13 +197,15 @@ def read_results(directory: Path) -> Results:
         keyframes=read_trajectory(directory / KEYFRAMES) if metrics["keyframes"] else Trajectory.empty(),
         groundtruth=read_trajectory(truth) if truth.exists() else None,
         others={number: read_trajectory(path) for number, path in paths.items() if path.exists()},
-        map=main[0] if main else Map(),
+        map=main[0].map if main else Map(),
         submaps=tuple(saved.atlas),
         camera=saved.camera,
         frames=read_frames(directory / FRAMES),
         metrics=metrics,
         example_image=read_gray(example, str(example))[0, 0] if example.exists() else None,
-        cloud=read_cloud(cloud, upright_from_map(main[0])) if main and cloud.exists() else None,
+        cloud=read_cloud(cloud, upright_from_map(main[0].map, main[0].metric))
+        if main and cloud.exists()
+        else None,
     )
 
 

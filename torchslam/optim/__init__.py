@@ -20,6 +20,7 @@ from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bun
 from torchslam.optim.bundle._factors import (
     DepthPrior,
     FrameFactors,
+    displacement_error,
     log_distance_error,
     relative_pose_error,
 )
@@ -61,6 +62,7 @@ __all__ = [
     "SolverOptions",
     "SolverReason",
     "camera_evidence",
+    "displacement_error",
     "log_distance_error",
     "relative_pose_error",
     "solve_bundle",

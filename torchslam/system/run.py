@@ -22,6 +22,7 @@ from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Atlas, Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
+from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions
 from torchslam.optim.camera_evidence import graph_evidence
@@ -81,6 +82,7 @@ class Run:
         readout: of a rolling shutter, given or found by the final adjustment; None: the final poses are those of a
             global one.
         shutter: what the residuals say of it; None where that was not tested.
+        unmeasured: one line for each source of meters that said nothing of the main submap.
     """
 
     submaps: tuple[Submap, ...]
@@ -98,6 +100,12 @@ class Run:
     camera_changes: tuple[CameraChange, ...] = ()
     readout: Readout | None = None
     shutter: RollingShutter | None = None
+    unmeasured: tuple[str, ...] = ()
+
+    @property
+    def metric(self) -> MetricUnit | None:
+        """How well the unit of the main submap is known to be a meter; None where it is arbitrary."""
+        return None if self.main is None else self.main.metric
 
     @property
     def main(self) -> Submap | None:

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.autograd import gradcheck
 
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, transform
 from torchslam.optim import (
@@ -11,6 +12,7 @@ from torchslam.optim import (
     LEAST_SQUARES_OPTIONS,
     DepthPrior,
     FrameFactors,
+    displacement_error,
     relative_pose_error,
     solve_bundle,
     solve_least_squares,
@@ -44,7 +46,7 @@ def centers(T_cw):
 
 
 @pytest.mark.parametrize("fixed", [(0,), ()])
-@pytest.mark.parametrize("kind", ["depths", "distances", "motions"])
+@pytest.mark.parametrize("kind", ["depths", "distances", "motions", "displacements"])
 def test_each_determines_the_scale(bundle_scene, kind, fixed):
     """With the truth 1.3 times as large, the map grows by as much; without, it keeps the scale of the start."""
     scene = bundle_scene(noise=0.0, frames=6, points=50, fixed_frames=fixed)
@@ -53,6 +55,9 @@ def test_each_determines_the_scale(bundle_scene, kind, fixed):
     long = (pairs[:, 1] - pairs[:, 0]).norm(dim=-1)
     T_21 = motions_of(scene.T_cw, frames)
     T_21[:, :3, 3] *= 1.3
+    lever = torch.tensor((0.1, -0.2, 0.05), dtype=torch.float64)
+    arms = (se3_inverse(scene.T_cw)[frames][..., :3, :3] @ lever[:, None]).squeeze(-1)
+    antennas = 1.3 * pairs + arms
     more = {
         "depths": {
             "depth_prior": DepthPrior(1.3 * depths_of(scene), torch.ones(len(scene.problem.pixels)).double())
@@ -63,6 +68,16 @@ def test_each_determines_the_scale(bundle_scene, kind, fixed):
         "motions": {
             "frame_factors": (
                 FrameFactors.relative_poses(frames, T_21, 1e4 * torch.eye(6).double().expand(2, 6, 6)),
+            )
+        },
+        "displacements": {
+            "frame_factors": (
+                FrameFactors.displacements(
+                    frames,
+                    antennas[:, 1] - antennas[:, 0],
+                    1e4 * torch.eye(3).double().expand(2, 3, 3),
+                    lever,
+                ),
             )
         },
     }[kind]
@@ -104,6 +119,18 @@ def mixed(scene, frames):
         return replace(problem, frame_factors=factors, depth_prior=depths, **options)
 
     return with_all, tensors
+
+
+def test_the_displacement_of_an_antenna():
+    """A camera that turns on the spot moves its antenna; gradients reach poses, displacement and lever arm."""
+    T_1w, T_2w = se3_exp(draw(2, 6)), se3_exp(draw(2, 6, seed=1))
+    turned = se3_exp(torch.tensor((0.0, 0, 0, 0, 0, torch.pi / 2), dtype=torch.float64))
+    measured = torch.tensor([[[0.0, 0, 0], [1, 0, 0]]], dtype=torch.float64)
+    expected = torch.tensor([[-1.0, -1, 0]], dtype=torch.float64)
+    start = torch.eye(4, dtype=torch.float64)[None]
+    torch.testing.assert_close(displacement_error(start, turned[None], measured), expected)
+    inputs = (T_1w.requires_grad_(), T_2w.requires_grad_(), draw(2, 2, 3, seed=2).requires_grad_())
+    assert gradcheck(displacement_error, inputs, atol=1e-6)
 
 
 def difference_of_heights(T_1w, T_2w, measured):

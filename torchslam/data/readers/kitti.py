@@ -7,9 +7,7 @@ Vision meets Robotics: The KITTI Dataset, IJRR 2013 (coordinate systems, Mercato
 
 from __future__ import annotations
 
-import datetime
 import math
-import re
 from pathlib import Path
 
 import torch
@@ -18,9 +16,10 @@ from torch import Tensor
 
 from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.frame_names import find_frames
+from torchslam.data.formats.oxts import Packet, read_day_times, read_oxts
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
-from torchslam.data.text_file import check_later, in_seconds, numbered_lines, parse_floats, read_text
+from torchslam.data.text_file import in_seconds, numbered_lines, parse_floats, read_text
 from torchslam.data.trajectories import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TorchslamError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
@@ -31,7 +30,6 @@ RAW_CAMERAS = ("image_00", "image_02")
 """The left cameras, gray and color."""
 CALIBRATION = "calib_cam_to_cam.txt"
 EARTH_RADIUS = 6378137.0  # meters
-TIME = re.compile(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,9})?")
 
 
 def _is_kitti(path: str) -> bool:
@@ -141,7 +139,7 @@ def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -
     """
     drive = Path(path)
     folder = _raw_camera(drive) or drive / RAW_CAMERAS[0]
-    times = _read_times(folder / "timestamps.txt", SequenceError)
+    times = read_day_times(folder / "timestamps.txt", SequenceError)
     found = find_frames(folder / "data")
     entries = []
     for file in found.frames:
@@ -166,23 +164,6 @@ def _raw_camera(drive: Path) -> Path | None:
 def _find_file(drive: Path, name: str) -> Path | None:
     """Return a file of the drive or of its recording day."""
     return next((path for path in (drive / name, drive.resolve().parent / name) if path.is_file()), None)
-
-
-def _read_times(path: Path, error: type[TorchslamError]) -> list[float]:
-    """Lines `2011-09-26 13:02:25.964389445`, as seconds since the beginning of the first one's day."""
-    times: list[float] = []
-    midnight: datetime.datetime | None = None
-    for number, line in numbered_lines(path, error):
-        found = TIME.fullmatch(line)
-        try:
-            moment = datetime.datetime.fromisoformat(found[1]) if found else None
-        except ValueError:
-            moment = None
-        if found is None or moment is None:
-            raise error(f"{path}:{number}: expected `2011-09-26 13:02:25.964389445`, got `{line}`")
-        midnight = midnight or moment.replace(hour=0, minute=0, second=0)
-        times.append((moment - midnight).total_seconds() + float(found[2] or 0))
-    return times
 
 
 def _read_rows(path: Path) -> dict[str, list[float]]:
@@ -227,10 +208,10 @@ def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajector
     ).view(3, 3)
     T_rect[0, 3] = P[3] / P[0]  # meters from camera 0 to this one
     T_ci = T_rect @ _read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo)
-    times = _read_times(drive / "oxts" / "timestamps.txt", TrajectoryError)
-    T_wi, kept = _read_packets(packets, times)
-    T_wc = checked_poses(T_wi @ se3_inverse(T_ci), packets)
-    return Trajectory(torch.tensor(kept, dtype=torch.float64, device="cpu"), T_wc)
+    oxts = read_oxts(drive / "oxts")
+    times = [packet.time for packet in oxts]
+    T_wc = checked_poses(_poses_of(oxts) @ se3_inverse(T_ci), packets)
+    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
 
 
 def _read_rigid(path: Path) -> Float[Tensor, "4 4"]:
@@ -242,24 +223,9 @@ def _read_rigid(path: Path) -> Float[Tensor, "4 4"]:
     return rigid(R.view(3, 3), t)
 
 
-def _read_packets(folder: Path, times: list[float]) -> tuple[Float[Tensor, "N 4 4"], list[float]]:
-    """T_wi of the GPS/INS and their times: east, north, up, by a Mercator projection, from the first one."""
-    rows: list[list[float]] = []
-    kept: list[float] = []
-    for file in sorted(folder.glob("*.txt")):
-        line = next((line for _, line in numbered_lines(file, TrajectoryError)), "")
-        row = parse_floats(line, str(file), TrajectoryError)
-        index = int(file.stem) if file.stem.isdecimal() else len(times)
-        if len(row) < 6 or index >= len(times) or not abs(row[0]) < 90:
-            raise TrajectoryError(
-                f"{file}: expected a line of latitude, longitude, altitude, roll, pitch, yaw, ..."
-            )
-        if kept:
-            check_later(times[index], kept[-1], str(file), TrajectoryError)
-        rows.append(row[:6])
-        kept.append(times[index])
-    if not rows:
-        raise TrajectoryError(f"{folder}: no packets")
+def _poses_of(packets: list[Packet]) -> Float[Tensor, "N 4 4"]:
+    """T_wi of the GPS/INS: east, north, up, by a Mercator projection, from the first one."""
+    rows = [packet.numbers[:6] for packet in packets]
     table = torch.tensor(rows, dtype=torch.float64, device="cpu")
     latitude, longitude = table[:, 0].deg2rad(), table[:, 1].deg2rad()
     scale = EARTH_RADIUS * math.cos(latitude[0])
@@ -271,7 +237,7 @@ def _read_packets(folder: Path, times: list[float]) -> tuple[Float[Tensor, "N 4 
             table[:, 3:].unbind(-1), torch.eye(3, dtype=torch.float64, device="cpu"), strict=True
         )
     )
-    return rigid(yaw @ pitch @ roll, positions - positions[0]), kept
+    return rigid(yaw @ pitch @ roll, positions - positions[0])
 
 
 KITTI = Reader("image_0/ or image_2/ with times.txt (KITTI odometry)", _is_kitti, _open_kitti)

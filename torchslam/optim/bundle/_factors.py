@@ -46,6 +46,27 @@ def log_distance_error(
     return (torch.linalg.vector_norm(between, dim=-1) / distances).log()[..., None]
 
 
+@full_precision
+def displacement_error(
+    T_1w: Float[Tensor, "*#batch 4 4"],
+    T_2w: Float[Tensor, "*#batch 4 4"],
+    measured: Float[Tensor, "*#batch 2 3"],
+) -> Float[Tensor, "*#batch 3"]:
+    """Difference between the displacement of an antenna and the measured one.
+
+    Args:
+        T_1w: first poses.
+        T_2w: second poses.
+        measured: the displacement in the world, then the position of the antenna in the camera, its lever arm.
+    """
+    displacement_w, lever_c = measured.unbind(-2)
+    first, second = (
+        T_wc[..., :3, 3] + (T_wc[..., :3, :3] @ lever_c[..., None]).squeeze(-1)
+        for T_wc in (se3_inverse(T_1w), se3_inverse(T_2w))
+    )
+    return second - first - displacement_w
+
+
 @dataclass(frozen=True)
 class FrameFactors:
     """F errors of one kind between pairs of frames; differentiable with respect to what is measured and information.
@@ -89,6 +110,27 @@ class FrameFactors:
             information: inverse variances of the logarithm, that is of the relative error.
         """
         return cls(frames, distances, information[..., None, None], log_distance_error)
+
+    @classmethod
+    def displacements(
+        cls,
+        frames: Int[Tensor, "F 2"],
+        displacements_w: Float[Tensor, "*batch F 3"],
+        information: Float[Tensor, "*batch F 3 3"],
+        lever_c: Float[Tensor, " 3"] | None = None,
+    ) -> FrameFactors:
+        """Measured displacements of an antenna, as between positions of a receiver, whose constant offset they are
+        free of; see `displacement_error`.
+
+        Args:
+            frames: pairs.
+            displacements_w: along the axes of the world, in the unit of the points.
+            information: inverse covariances.
+            lever_c: position of the antenna in the camera, in the unit of the points; None: at its center.
+        """
+        lever = torch.zeros_like(displacements_w[..., 0, :]) if lever_c is None else lever_c
+        measured = torch.stack((displacements_w, lever[..., None, :].expand_as(displacements_w)), dim=-2)
+        return cls(frames, measured, information, displacement_error)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,325 @@
+"""Files of positions: CSV with a header, GPX, NMEA, DJI's .SRT, the images' own EXIF, KITTI's oxts."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from xml.etree import ElementTree
+
+from PIL import Image
+
+from torchslam.data.formats.csv_tables import parse_moment, read_csv
+from torchslam.data.formats.fixes import Fix, Fixes, checked_fixes
+from torchslam.data.formats.frame_names import find_frames
+from torchslam.data.formats.image_file import MAX_BYTES, SUFFIXES
+from torchslam.data.formats.oxts import is_oxts, read_oxts
+from torchslam.data.text_file import MAX_LINE, read_text
+from torchslam.errors import MeasurementError
+from torchslam.utils.files import read_bytes
+
+GPS_BLOCK = 0x8825
+"""Tag of the block of the position (EXIF 2.32)."""
+LATITUDE, LONGITUDE, ALTITUDE = 2, 4, 6
+"""Tags in that block; the hemisphere, or whether it is below the sea, is the tag before each."""
+HORIZONTAL_ERROR = 31
+"""Tag of the horizontal error, meters."""
+XML_BYTES = 1 << 26
+"""Size limit of GPX files; half a million points, of which the parser makes objects of ten times the size."""
+POSITION_COLUMNS = {
+    "name": ("name", "image", "filename", "file"),
+    "latitude": ("latitude", "lat"),
+    "longitude": ("longitude", "lon", "lng"),
+    "altitude": ("altitude", "alt", "elevation", "ele"),
+    "std_horizontal": ("std_horizontal",),
+    "std_vertical": ("std_vertical",),
+}
+"""Kinds of columns and what they are called."""
+OXTS_ACCURACY = 23  # the place of `pos_accuracy` in a packet (dataformat.txt)
+
+
+def read_fixes(path: str | Path) -> Fixes:
+    """The positions of a file, by its suffix: .srt, .gpx, .nmea, .csv or .txt, a folder of images, or one of oxts.
+
+    Raises MeasurementError naming file and line.
+    """
+    path = Path(path)
+    if os.path.isdir(path):  # Path.is_dir raises for a name that is too long
+        return _read_oxts(path) if is_oxts(path) else read_image_fixes(path)
+    suffix = path.suffix.lower()
+    if suffix == ".srt":
+        return checked_fixes(path, _srt_rows(path))
+    if suffix == ".gpx":
+        return checked_fixes(path, _gpx_rows(path))
+    if suffix in SUFFIXES:
+        raise MeasurementError(
+            f"{path}: one image; give the folder of all whose EXIF blocks have the positions"
+        )
+    text = read_text(path, MeasurementError)
+    if suffix == ".nmea" or text.lstrip().startswith(("$G", "$B")):
+        return _read_nmea(path, text)
+    return checked_fixes(path, _csv_rows(path))
+
+
+def _csv_rows(path: Path) -> Iterator[Fix]:
+    for row in read_csv(path, POSITION_COLUMNS, MeasurementError):
+        if not row.time_column and "name" not in row.cells:
+            raise MeasurementError(f"{row.where}: neither a `time` nor the `name` of an image")
+        if "latitude" not in row.cells and "longitude" not in row.cells and "altitude" in row.cells:
+            raise MeasurementError(f"{row.where}: no `latitude` and `longitude`, in degrees")
+        yield Fix(
+            row.where,
+            row.number("latitude"),
+            row.number("longitude"),
+            row.number("altitude"),
+            row.time() if row.time_column else None,
+            row.cells.get("name", ""),
+            (row.number("std_horizontal"), row.number("std_vertical")),
+        )
+
+
+# --- DJI's subtitles -----------------------------------------------------------------------------------------
+
+CUE = re.compile(r"(\d{1,3}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
+_NUMBER = r"([-+]?\d{1,9}(?:\.\d{1,12})?)"
+BRACKETS = {
+    name: re.compile(rf"\b{word}\s*:\s*{_NUMBER}")
+    for name, word in (
+        ("latitude", "latitude"),
+        ("longitude", "longt?itude"),  # as some models write it
+        ("absolute", "abs_alt"),
+        ("altitude", "altitude"),
+        ("relative", "rel_alt"),
+    )
+}
+"""`[latitude: 59.30] [longitude: 18.20] [rel_alt: 1.3 abs_alt: 132.9]`."""
+TUPLE = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*(M)?\s*)?\)")
+"""`GPS(longitude,latitude,satellites or altitude)`; the Matrice's has latitude first and its altitude ends with M."""
+HEIGHT = re.compile(rf"\b(?:BAROMETER\s*:|H\s)\s*{_NUMBER}")
+"""Height over the start in those lines."""
+
+
+def _srt_rows(path: Path) -> Iterator[Fix]:
+    """A position for each cue in which it is another one, at its beginning, on the clock of the video.
+
+    A receiver has 1 to 10 positions a second, and each is repeated in the cues of all frames until the next.
+    """
+    before: tuple[float, ...] = ()
+    for where, time, text in _cues(path):
+        found = _srt_position(text)
+        if found is None or found == before:
+            continue
+        before = found
+        yield Fix(where, *found, time=time)
+
+
+def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
+    """Place, beginning in seconds and text of each subtitle."""
+    where, begin, text = "", 0.0, ""
+    for number, line in enumerate(read_text(path, MeasurementError).split("\n"), start=1):
+        if "-->" not in line:
+            text += line + "\n"
+            if len(text) > MAX_LINE:
+                raise MeasurementError(f"{path}:{number}: a subtitle of more than {MAX_LINE} characters")
+            continue
+        time = CUE.search(line)
+        if time is None:
+            raise MeasurementError(
+                f"{path}:{number}: expected `00:00:01,000 --> 00:00:02,000`, got `{line[:100]}`"
+            )
+        if where:
+            yield where, begin, text
+        hours, minutes, seconds, parts = time.groups()
+        begin = int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(f"0.{parts}")
+        where, text = f"{path}:{number}", ""
+    if where:
+        yield where, begin, text
+
+
+def _srt_position(text: str) -> tuple[float, float, float] | None:
+    """Latitude, longitude and altitude of a cue; None where it has none."""
+    values = {name: float(m[1]) for name, pattern in BRACKETS.items() if (m := pattern.search(text))}
+    if "latitude" in values and "longitude" in values:
+        altitude = next((values[n] for n in ("absolute", "altitude", "relative") if n in values), math.nan)
+        return values["latitude"], values["longitude"], altitude
+    found = TUPLE.search(text)
+    if found is None:
+        return None
+    first, second = float(found[1]), float(found[2])
+    height = HEIGHT.search(text)
+    if found[4]:
+        return first, second, float(found[3])
+    return second, first, float(height[1]) if height else float(found[3] or "nan")
+
+
+# --- GPX -----------------------------------------------------------------------------------------------------
+
+
+def _gpx_rows(path: Path) -> Iterator[Fix]:
+    """The points of all tracks, with their times. Source: GPX 1.1, www.topografix.com/GPX/1/1."""
+    text = read_text(path, MeasurementError, XML_BYTES)
+    if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may expand to any size
+        raise MeasurementError(f"{path}: a GPX file has no DOCTYPE")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as cause:
+        raise MeasurementError(f"{path}: not GPX: {cause}") from cause
+    points = [element for element in root.iter() if _tag(element) == "trkpt"]
+    if not points:
+        raise MeasurementError(
+            f"{path}: no points of a track (trkpt) in it; routes and waypoints have no times"
+        )
+    for number, point in enumerate(points, start=1):
+        where = f"{path}: point {number}"
+        children = {_tag(child): (child.text or "").strip() for child in point}
+        time = parse_moment(children.get("time", ""))
+        if time is None:
+            raise MeasurementError(
+                f"{where}: no time; a route that was planned says nothing about the images"
+            )
+        latitude, longitude, altitude = (
+            _number(text, where)
+            for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
+        )
+        yield Fix(where, latitude, longitude, altitude, time=time)
+
+
+def _tag(element: ElementTree.Element) -> str:
+    """The name of an element without its namespace."""
+    return element.tag.rpartition("}")[2]
+
+
+def _number(text: str, where: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise MeasurementError(f"{where}: `{text}` is not a number") from None
+
+
+# --- NMEA ----------------------------------------------------------------------------------------------------
+
+
+def _read_nmea(path: Path, text: str) -> Fixes:
+    """GGA, which has the altitude, with the date of the RMC of the same time. Source: NMEA 0183.
+
+    Without RMC the times are seconds since midnight, UTC. Lines with a wrong sum are left out, with a note.
+    """
+    rows: list[tuple[str, list[str]]] = []
+    damaged = 0
+    for number, line in enumerate(text.split("\n"), start=1):
+        line = line.strip()
+        if not line.startswith("$") or line[3:6] not in ("GGA", "RMC"):
+            continue
+        body, star, given = line[1:].partition("*")
+        total = 0
+        for byte in body.encode():
+            total ^= byte
+        if star and given[:2].upper() != f"{total:02X}":
+            damaged += 1
+            continue
+        rows.append((f"{path}:{number}", body.split(",")))
+    notes = [f"{path}: left out {damaged} lines with a wrong sum"] if damaged else []
+    return checked_fixes(path, _nmea_rows(rows), notes)
+
+
+def _nmea_rows(rows: list[tuple[str, list[str]]]) -> Iterator[Fix]:
+    has_altitudes = any(fields[0].endswith("GGA") for _, fields in rows)
+    dates = {fields[1]: fields[9] for _, fields in rows if fields[0].endswith("RMC") and len(fields) > 9}
+    midnight, last = 0.0, -math.inf
+    for where, fields in rows:
+        is_gga = fields[0].endswith("GGA")
+        if is_gga != has_altitudes:
+            continue
+        if len(fields) < 10 or not re.fullmatch(r"\d{6}(\.\d{1,9})?", fields[1]):
+            continue  # no fix yet, without a time
+        clock = int(fields[1][:2]) * 3600 + int(fields[1][2:4]) * 60 + float(fields[1][4:])
+        date = dates.get(fields[1], "")
+        if re.fullmatch(r"\d{6}", date):
+            moment = parse_moment(f"20{date[4:]}-{date[2:4]}-{date[:2]}")
+            if moment is None:
+                raise MeasurementError(f"{where}: `{date}` is not a date")
+            midnight = moment
+        elif midnight + clock < last:  # past midnight
+            midnight += 86400.0
+        has_fix = fields[6] not in ("", "0") if is_gga else fields[2] == "A"
+        at = 2 if is_gga else 3
+        last = midnight + clock
+        yield Fix(
+            where,
+            _degrees(fields[at], fields[at + 1], "NS", where) if has_fix else math.nan,
+            _degrees(fields[at + 2], fields[at + 3], "EW", where) if has_fix else math.nan,
+            _number(fields[9] or "nan", where) if is_gga else math.nan,
+            time=last,
+        )
+
+
+def _degrees(text: str, hemisphere: str, expected: str, where: str) -> float:
+    """Degrees of `4807.038` and `N`: 48 degrees, 7.038 minutes."""
+    found = re.fullmatch(r"(\d{1,3})(\d\d(?:\.\d{1,12})?)", text)
+    if found is None or hemisphere not in tuple(expected):
+        raise MeasurementError(f"{where}: `{text},{hemisphere}` is not a latitude or longitude of NMEA")
+    degrees = int(found[1]) + float(found[2]) / 60
+    return degrees if hemisphere == expected[0] else -degrees
+
+
+# --- EXIF ----------------------------------------------------------------------------------------------------
+
+
+def read_image_fixes(folder: Path) -> Fixes:
+    """The positions in the EXIF blocks of the images of a folder, by their names; others have none.
+
+    Raises MeasurementError where no image has one.
+    """
+    images = find_frames(folder).frames
+    if not images:
+        raise MeasurementError(
+            f"{folder}: neither images nor oxts/ of KITTI in it; positions are read from .srt, .gpx, .nmea and .csv"
+        )
+    rows = [_image_fix(image) for image in images]
+    found = [row for row in rows if row is not None]
+    if not found:
+        raise MeasurementError(f"{folder}: no image of {len(images)} has a position in its EXIF block")
+    missing = len(images) - len(found)
+    return checked_fixes(folder, found, [f"{folder}: {missing} images have no position"] if missing else [])
+
+
+def _image_fix(path: Path) -> Fix | None:
+    try:
+        content = read_bytes(path, MAX_BYTES, "an image that is read")
+        with Image.open(io.BytesIO(content)) as image:
+            block = image.getexif().get_ifd(GPS_BLOCK)
+        if LATITUDE not in block or LONGITUDE not in block:
+            return None
+        latitude, longitude = (
+            _exif_degrees(block[tag], block.get(tag - 1, "")) for tag in (LATITUDE, LONGITUDE)
+        )
+        below = block.get(ALTITUDE - 1, 0) in (1, b"\x01")
+        altitude = float(block[ALTITUDE]) * (-1 if below else 1) if ALTITUDE in block else math.nan
+        error = float(block[HORIZONTAL_ERROR]) if HORIZONTAL_ERROR in block else math.nan
+    except Exception as cause:  # a damaged block fails in any way
+        raise MeasurementError(f"{path}: its EXIF block cannot be read: {cause}") from cause
+    std = error if error > 0 else math.nan, math.nan
+    return Fix(str(path), latitude, longitude, altitude, name=path.name, std=std)
+
+
+def _exif_degrees(parts: tuple[float, ...], hemisphere: str) -> float:
+    """Degrees of degrees, minutes and seconds."""
+    degrees = sum(float(part) / 60**power for power, part in enumerate(parts))
+    return -degrees if str(hemisphere).strip("\0 ").upper() in ("S", "W") else degrees
+
+
+# --- KITTI ---------------------------------------------------------------------------------------------------
+
+
+def _read_oxts(folder: Path) -> Fixes:
+    """On the clock of KITTI's raw images, with the accuracy that the receiver states."""
+    rows = []
+    for packet in read_oxts(folder):
+        accuracy = packet.numbers[OXTS_ACCURACY] if len(packet.numbers) > OXTS_ACCURACY else math.nan
+        std = accuracy if accuracy > 0 else math.nan
+        latitude, longitude, altitude = packet.numbers[:3]
+        rows.append(Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std)))
+    return checked_fixes(folder, rows)

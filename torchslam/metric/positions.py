@@ -1,0 +1,270 @@
+"""Positions of the camera, as of a GPS receiver, that give a map its scale, its level and its place on the Earth."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from torchslam.data.formats.fix_files import read_fixes
+from torchslam.data.formats.fixes import Fixes
+from torchslam.data.formats.given_poses import rows_by_name
+from torchslam.errors import MeasurementError
+from torchslam.geometry import enu_from_geodetic, sim3_scale
+from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, on_clock_of_images
+from torchslam.metric.options import Given
+from torchslam.metric.position_fit import (
+    CLOCK_STD,
+    MIN_POSITIONS,
+    PositionFit,
+    PositionPairs,
+    fit_positions,
+    is_line,
+    start_distance,
+)
+from torchslam.metric.scale import ScaleMeasurement, ScaleSource
+from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+
+MIN_AGREEING = 0.5
+"""Part of the positions that must agree with the path: the start is right with up to half of them wrong."""
+MAX_RELATIVE_STD = 0.25
+"""Relative standard error from which on a scale is no measurement: positions then hardly differ beyond their noise."""
+SWAPPED = 3.0
+"""How much nearer a path must be to positions with latitude and longitude exchanged before it is said that they are."""
+UPSIDE_DOWN = -0.5
+"""Cosine between up and the cameras' up below which it is enough that they are nearer at all: a mirrored path that is
+level fits if it is turned over."""
+SEARCH_STEP = 0.25
+"""Seconds between the clocks that are tried: less than the time in which a vehicle changes its motion."""
+SEARCH_LIMIT = 20.0
+"""Seconds by which a clock may be off; GPS time is ahead of UTC by 18."""
+SEARCH_SHARE = 0.25
+"""Of the recording's duration: the most by which a clock may be off, so that most positions have a pose with any."""
+SEARCH_POSITIONS = 100
+"""Positions that clocks are tried with."""
+SEARCH_GAIN = 12.5
+"""Logarithm of the likelihood ratio from which on another clock is believed, as for a difference of five standard
+deviations."""
+SAID = 3.0
+"""Standard errors from which on a difference of clocks is mentioned."""
+SECOND_PASS = 0.1
+"""Seconds of a clock's error from which on the path is looked up again: it is straight for less."""
+LISTED = 3
+"""Positions that are named singly where they do not agree."""
+
+
+@dataclass(frozen=True)
+class PositionSource:
+    """The positions of one file.
+
+    Attributes:
+        fixes: the positions.
+        clock: what the user says about their clock.
+    """
+
+    fixes: Fixes
+    clock: Clock = field(default_factory=Clock)
+
+    def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
+        """The unit, the level and the place of a submap; see `MetricSource`."""
+        path = CameraPath.of(view)
+        if len(path.timestamps) < MIN_POSITIONS:
+            return _unmeasured(f"only {len(path.timestamps)} frames have a pose")
+        if self.fixes.timestamps is None:
+            if view.sequence is None:
+                return _unmeasured(f"{self.fixes.path} has positions of images, which are not at hand")
+            names = [view.sequence.file_name(index) for index in view.frame_index.tolist()]
+            found = self._by_names(names, path)
+        else:
+            found = self._by_times(path)
+        if isinstance(found, Unmeasured):
+            return found
+        pairs, fit, shift = found
+        return self._result(pairs, fit, shift)
+
+    # --- which position is whose -----------------------------------------------------------------------------
+
+    def _by_names(
+        self, names: list[str], path: CameraPath
+    ) -> tuple[PositionPairs, PositionFit, float] | Unmeasured:
+        rows = rows_by_name(self.fixes.names, names)
+        found = rows >= 0
+        if not bool(found.any()):
+            raise MeasurementError(
+                f"{self.fixes.path}: no image is called as those in it, such as {self.fixes.names[0]}"
+            )
+        positions_e, std, has_height = self._local(rows[found])
+        positions_w = path.T_wc[found, :3, 3]
+        still = torch.zeros_like(positions_w)
+        pairs = PositionPairs(path.timestamps[found], positions_w, still, positions_e, std, has_height)
+        fit = self._fitted(pairs, path, CLOCK_STD)
+        return fit if isinstance(fit, Unmeasured) else (pairs, fit, 0.0)
+
+    def _by_times(self, path: CameraPath) -> tuple[PositionPairs, PositionFit, float] | Unmeasured:
+        assert self.fixes.timestamps is not None
+        times = on_clock_of_images(self.fixes.timestamps, path, self.clock, self.fixes.path, "--gps-clock")
+        if bool((self.fixes.geodetic.nan_to_num() == self.fixes.geodetic[0].nan_to_num()).all()):
+            return _unmeasured(f"all {len(self.fixes)} positions are the same")
+        moved = torch.ones_like(times, dtype=torch.bool)
+        # Until it has a new position a receiver, or what writes its file, repeats the last one.
+        moved[1:] = (self.fixes.geodetic.diff(dim=0).nan_to_num() != 0).any(-1)
+        rows = torch.nonzero(moved)[:, 0]
+        positions_e, std, has_height = self._local(rows)
+        times = times[rows]
+
+        def fitted(shift: float) -> tuple[PositionPairs, PositionFit | Unmeasured]:
+            positions_w, velocities_w, known = path.at(times + shift)
+            pairs = PositionPairs(times, positions_w, velocities_w, positions_e, std, has_height)
+            return pairs.select(known), self._fitted(pairs.select(known), path, CLOCK_STD)
+
+        shift = self._search(path, times, positions_e, has_height) if self.clock.seconds is None else 0.0
+        pairs, fit = fitted(shift)
+        if isinstance(fit, PositionFit) and abs(fit.offset) > SECOND_PASS:
+            shift += fit.offset
+            pairs, fit = fitted(shift)
+        return fit if isinstance(fit, Unmeasured) else (pairs, fit, shift)
+
+    def _local(self, rows: Tensor) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 2"], Bool[Tensor, " M"]]:
+        """Positions east, north and up of the origin, their standard deviations, and which have a height."""
+        geodetic = self.fixes.geodetic[rows]
+        has_height = ~geodetic[:, 2].isnan()
+        origin = torch.tensor(self.origin, dtype=torch.float64, device="cpu")
+        level = torch.where(has_height, geodetic[:, 2], origin[2])
+        positions_e = enu_from_geodetic(torch.cat((geodetic[:, :2], level[:, None]), dim=1), origin)
+        return positions_e, self.fixes.std[rows], has_height
+
+    @property
+    def origin(self) -> tuple[float, float, float]:
+        """Latitude, longitude and altitude of the first position, the origin of east, north, up."""
+        latitude, longitude, _ = self.fixes.geodetic[0].tolist()
+        altitudes = self.fixes.geodetic[:, 2]
+        known = altitudes[~altitudes.isnan()]
+        return latitude, longitude, float(known[0]) if len(known) else 0.0
+
+    def _search(
+        self,
+        path: CameraPath,
+        times: Float[Tensor, " M"],
+        positions_e: Float[Tensor, "M 3"],
+        has_height: Bool[Tensor, " M"],
+    ) -> float:
+        """Seconds that the clock of the images is ahead, in steps; zero unless another one fits far better."""
+        duration = float(path.timestamps[-1] - path.timestamps[0])
+        count = int(min(SEARCH_LIMIT, SEARCH_SHARE * duration) / SEARCH_STEP)
+        inside = torch.nonzero(path.at(times)[2])[:, 0]
+        if count == 0 or len(inside) < 2 * MIN_POSITIONS:
+            return 0.0
+        rows = inside[torch.linspace(0, len(inside) - 1, min(len(inside), SEARCH_POSITIONS)).long()]
+        nan = torch.full((len(rows), 2), math.nan, dtype=torch.float64, device="cpu")
+        best, gain = 0.0, SEARCH_GAIN
+        reference = math.nan
+        for step in sorted(range(-count, count + 1), key=abs):
+            shift = step * SEARCH_STEP
+            positions_w, velocities_w, known = path.at(times[rows] + shift)
+            if int(known.sum()) < max(MIN_POSITIONS + 2, len(rows) // 2):
+                continue
+            pairs = PositionPairs(
+                times[rows], positions_w, velocities_w, positions_e[rows], nan, has_height[rows]
+            ).select(known)
+            cost = 2 * len(rows) * math.log(max(start_distance(pairs), 1e-6))
+            reference = cost if math.isnan(reference) else reference
+            if reference - cost > gain:
+                best, gain = shift, reference - cost
+        return best
+
+    # --- what it says ----------------------------------------------------------------------------------------
+
+    def _fitted(self, pairs: PositionPairs, path: CameraPath, clock_std: float) -> PositionFit | Unmeasured:
+        if len(pairs) < MIN_POSITIONS:
+            return _unmeasured(f"{len(pairs)} positions are at times with a pose, {MIN_POSITIONS} are needed")
+        extent = float((pairs.positions_e.amax(0) - pairs.positions_e.amin(0)).norm())
+        if extent == 0:
+            return _unmeasured(f"all {len(pairs)} positions are the same")
+        if not bool(pairs.positions_w.std(0).norm() > 0):
+            return _unmeasured("the camera does not move")
+        fit = fit_positions(pairs, path.up_w, clock_std)
+        if fit is None or float(fit.inliers.double().mean()) < MIN_AGREEING:
+            self._check_swapped(pairs)
+            return _unmeasured(f"the {len(pairs)} positions do not have the shape of the camera's path")
+        if fit.relative_std > MAX_RELATIVE_STD:
+            self._check_swapped(pairs)
+            return _unmeasured(
+                f"{len(pairs)} positions over {extent:.1f} m scatter by {fit.noise[0]:.1f} m about the camera's path: "
+                f"the scale is known to {fit.relative_std:.0%} only"
+            )
+        if float(fit.up_w @ path.up_w) < UPSIDE_DOWN:
+            self._check_swapped(pairs, better=1.0)
+        return fit
+
+    def _check_swapped(self, pairs: PositionPairs, better: float = SWAPPED) -> None:
+        """Raise MeasurementError where the path fits so much better with latitude and longitude exchanged."""
+        geodetic = self.fixes.geodetic
+        if not bool((geodetic[:, 1].abs() <= 90).all()):
+            return
+        at, swapped_at = (math.cos(math.radians(angle)) for angle in self.origin[:2])
+        east, north, up = pairs.positions_e.unbind(-1)
+        exchanged = torch.stack((north * swapped_at, east / at, up), dim=-1)
+        swapped = replace(pairs, positions_e=exchanged)
+        if better * start_distance(swapped) < start_distance(pairs):
+            raise MeasurementError(
+                f"{self.fixes.path}: the camera's path has the shape of its positions with latitude and longitude "
+                "exchanged: are they swapped in the file?"
+            )
+
+    def _result(self, pairs: PositionPairs, fit: PositionFit, shift: float) -> ScaleMeasurement:
+        line = is_line(fit.up_std)
+        return ScaleMeasurement(
+            ScaleSource.POSITION,
+            float(sim3_scale(fit.S_ew)),
+            fit.relative_std,
+            int(fit.inliers.sum()),
+            f"positions, {fit.noise[0]:.2g} m from the path",
+            tuple(_rejected(pairs, fit)),
+            up_w=None if line else fit.up_w,
+            up_std=fit.up_std,
+            S_ew=fit.S_ew,
+            origin=self.origin,
+            notes=tuple(self._notes(fit, shift, line)),
+        )
+
+    def _notes(self, fit: PositionFit, shift: float, line: bool) -> list[str]:
+        notes = list(self.fixes.notes)
+        offset = shift + fit.offset
+        if abs(offset) > SAID * fit.offset_std:
+            notes += clock_notes(self.fixes.path, offset, fit.offset_std)
+        if line:
+            notes.append(
+                f"{self.fixes.path}: the positions lie on a line: the turn about it is the one in which the images are "
+                "upright"
+            )
+        return notes
+
+
+def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:
+    """What does not agree, in a few lines."""
+    wrong = torch.nonzero(~fit.inliers)[:, 0]
+    if len(wrong) <= LISTED:
+        return [
+            f"the position at {float(pairs.times[row]):.1f} s is {float(fit.distances[row]):.1f} m from the path"
+            for row in wrong.tolist()
+        ]
+    distances = fit.distances[wrong]
+    return [
+        f"{len(wrong)} of {len(pairs)} positions, the first one at {float(pairs.times[wrong[0]]):.1f} s, are "
+        f"{float(distances.min()):.1f} to {float(distances.max()):.1f} m from the path"
+    ]
+
+
+def _unmeasured(reason: str) -> Unmeasured:
+    return Unmeasured(ScaleSource.POSITION, reason)
+
+
+def from_options(given: Given) -> list[MetricSource]:
+    """The sources of `--gps FILE`, with `--gps-clock` for each file or for all.
+
+    Raises MeasurementError for a file that is wrong.
+    """
+    return [PositionSource(read_fixes(file), clock) for file, clock in clocks_of(given, "gps")]
