@@ -41,6 +41,10 @@ class TrajectoryError(TorchslamError):
     """A trajectory file or object is malformed, or two of them have nothing in common."""
 
 
+class MeasurementError(TorchslamError):
+    """A measurement from outside of the images, or a file of them, is malformed or cannot be right."""
+
+
 class ResultsError(TorchslamError):
     """A results folder or a map file is missing, incomplete or not written by torchslam."""
 

@@ -6,10 +6,13 @@ torch is imported only where a sequence is opened or a device is named, so that 
 from __future__ import annotations
 
 import argparse
+import json
+from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from torchslam.config import CHOICES, Config, builtin_names, load_config
+from torchslam.config import CHOICES, Config, MetricConfig, builtin_names, load_config
+from torchslam.metric.options import KINDS, setting_of
 from torchslam.utils.console import say
 
 if TYPE_CHECKING:
@@ -158,7 +161,41 @@ def overrides(options: argparse.Namespace) -> list[str]:
         "scale": options.scale,
         "seed": options.seed,
     }
-    return [*options.overrides, *(f"{key}={value}" for key, value in named.items() if value is not None)]
+    given = [f"{key}={value}" for key, value in named.items() if value is not None]
+    return [*options.overrides, *given, *metric_overrides(options)]
+
+
+def add_metric(parser: argparse.ArgumentParser) -> None:
+    """Add the options that give the map meters: those of `metric.options.KINDS`."""
+    group = parser.add_argument_group("meters", "what is known of lengths; each can be repeated")
+    about = {each.name: each.metadata["about"] for each in fields(MetricConfig)}
+    for option in (option for kind in KINDS for option in kind.options):
+        words = about[option.name].replace("%", "%%")
+        group.add_argument(
+            option.flag,
+            dest=f"metric_{option.name}",
+            action="append",
+            nargs=len(option.words),
+            metavar=option.words,
+            help=f"{words[0].lower()}{words[1:].rstrip('.')} (metric.{option.name})",
+        )
+
+
+def metric_overrides(options: argparse.Namespace) -> list[str]:
+    """Return the changes that the arguments of `add_metric` make to the configuration, as `section.key=value`."""
+    given = {
+        option.name: getattr(options, f"metric_{option.name}", None)
+        for kind in KINDS
+        for option in kind.options
+    }
+    numbers = {each.name for each in fields(MetricConfig) if isinstance(each.default, float)}
+    changes = []
+    for name, times in given.items():
+        if times and name in numbers:
+            changes += [f"metric.{name}={words[0]}" for words in times]
+        elif times:
+            changes.append(f"metric.{name}={json.dumps(setting_of(times), ensure_ascii=False)}")
+    return changes
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

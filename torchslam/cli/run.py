@@ -30,7 +30,7 @@ from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found
 from torchslam.data.sequence import Calibrated
-from torchslam.errors import ConfigError, ResultsError
+from torchslam.errors import ConfigError, MeasurementError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
 from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
@@ -41,9 +41,12 @@ from torchslam.io.results import CALIBRATION, CHECKPOINT, CONFIG, MAP, prepare, 
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
+from torchslam.metric.options import given_options, sources_of
+from torchslam.metric.source import MetricSource
 from torchslam.parallel.workers import with_workers
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import source
+from torchslam.system.metric_run import run_in_meters
 from torchslam.system.run import Run, RunProgress, run_sequence
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
@@ -130,6 +133,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--dense", action="store_true", help="compute dense depth after the run, as `torchslam densify` does"
     )
     add_options(parser)
+    arguments.add_metric(parser)
     arguments.add_device(parser)
     arguments.add_processes(parser)
     arguments.add_config(parser)
@@ -204,6 +208,11 @@ class Attempt:
 
 def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
+    sources = sources_of(given_options(config.metric, sequence.measurements))
+    if sources and options.localize:
+        raise ConfigError(
+            "measurements of the unit cannot be combined with --localize: a map that is not changed keeps its unit"
+        )
     prepare(options.output, options.overwrite, options.resume)
     mode = _mode(sequence, options)
     check_replaceable(options.output / CALIBRATION)
@@ -211,6 +220,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         attempt = _attempt(sequence, config, options, stop_signals, viewers)
         if mode is not None and not attempt.finished.interrupted:
             attempt = _map_recording(attempt, mode, options.device, stop_signals)
+        attempt = _in_meters(attempt, sources)
         stop_signals.begin("when the results are written")
         metrics = _write(attempt, options)
         attempt.watching.end(attempt.finished)
@@ -280,6 +290,20 @@ def _map_recording(
     if mapped.why:
         say(f"mapped as a whole, since {mapped.why}; kept: {mapped.kept}")
     return replace(attempt, finished=mapped.run, mapped=mapped)
+
+
+def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
+    """Bring the run into meters; wrong measurements and Ctrl-C leave it in an arbitrary unit, and say so."""
+    finished = attempt.finished
+    try:
+        if finished.interrupted and sources:
+            raise KeyboardInterrupt
+        return replace(attempt, finished=run_in_meters(finished, attempt.sequence, sources))
+    except KeyboardInterrupt:
+        why = "interrupted; `torchslam align` measures later"
+        return replace(attempt, finished=replace(finished, interrupted=True, unmeasured=(why,)))
+    except MeasurementError as error:
+        return replace(attempt, finished=replace(finished, unmeasured=(str(error),)))
 
 
 def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[Sequence, str]:

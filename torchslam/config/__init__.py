@@ -23,6 +23,7 @@ from torchslam.config.sections import (
     MappingConfig,
     MatchingConfig,
     MeasurementConfig,
+    MetricConfig,
     PoseValidationConfig,
     RelocalizationConfig,
     SimulatedConfig,
@@ -46,6 +47,7 @@ __all__ = [
     "MappingConfig",
     "MatchingConfig",
     "MeasurementConfig",
+    "MetricConfig",
     "PoseValidationConfig",
     "RelocalizationConfig",
     "SimulatedConfig",
@@ -87,6 +89,7 @@ class Config(Settings):
     bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
     global_mapping: GlobalMappingConfig = field(default_factory=GlobalMappingConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
+    metric: MetricConfig = field(default_factory=MetricConfig)
 
     def for_size(self, size: tuple[int, int]) -> Config:
         """Return the configuration for images of a size (width, height).

@@ -617,3 +617,26 @@ class DenseConfig(Settings, section="dense"):
         "Aggregation of matching costs; learned: a small network rates what the classical one found.",
         choices=("classical", "learned"),
     )
+
+
+@dataclass(frozen=True)
+class MetricConfig(Settings, section="metric"):
+    """What is known of the unit of the map; each setting is an option of the command line as well."""
+
+    own: bool = setting(
+        True, "Use the measurements that a dataset brings along, such as those of an inertial sensor."
+    )
+    marker: str = setting(
+        "",
+        "Printed markers in view and the length of their black squares in meters: apriltag-25h9:0.05, aruco-4x4:0.05, "
+        "charuco-7x5:0.04:0.03 or chessboard-7x5:0.04; with ,7=0.1 markers of the id 7 have another length.",
+    )
+    distance: str = setting(
+        "", "A known length: two image points, each as FRAME:X,Y, and the meters between them in the scene."
+    )
+    camera_height: float = setting(
+        0.0,
+        "Height of the camera above the ground that it moves over, in meters; 0: unknown.",
+        low=0,
+        high=MAX_FACTOR,
+    )

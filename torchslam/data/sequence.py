@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from enum import Enum
 from fractions import Fraction
 from typing import Any, NamedTuple, Protocol
@@ -66,6 +66,7 @@ class Sequence(ABC):
         camera_std: relative standard deviation of the camera's focal length, if its calibration says so.
         pixel_aspect: width to height of a pixel; the fy / fx of a camera that is not known yet.
         counted_until: where images have no times and are counted at some rate, half an interval after the last one.
+        measurements: settings of the section `metric` that the dataset brings along, by name: files of its own sensors.
         as_stored: whether the orientation in the EXIF block of images is ignored, as the program did that calibrated.
     """
 
@@ -105,6 +106,7 @@ class Sequence(ABC):
         self.groundtruth = groundtruth
         self.notes = tuple(map(printable, notes))
         self.as_stored = False
+        self.measurements: Mapping[str, str] = {}
         self.counted_until: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
         self._T_cw: Tensor | None = None
@@ -344,7 +346,7 @@ class Transformed(Sequence):
             pixel_aspect=_resized_aspect(whole, size),
         )
         self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
-        self.counted_until = whole.counted_until
+        self.counted_until, self.measurements = whole.counted_until, whole.measurements
         self._whole = whole
         self._indices = indices
         self._same_pixels = camera is None and size in (None, whole.size)

@@ -131,8 +131,15 @@ def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
     down = T_wc[:, :3, 1].mean(dim=0) if len(T_wc) else T_wc.new_zeros(3)
     if float(down.norm()) < 1e-3:  # a unit vector in any but made-up cases
         down = T_wc.new_tensor((0.0, 1.0, 0.0))
-    up = -down / down.norm()
-    axis = T_wc.new_tensor((1.0, 0.0, 0.0) if abs(float(up[0])) < 0.9 else (0.0, 0.0, 1.0))
-    right = axis - (axis @ up) * up
+    return level_rotation(-down / down.norm())
+
+
+def level_rotation(up_w: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
+    """Rotation from the world to one whose z is the unit vector up_w and whose x is as close to the old x as possible.
+
+    Where up is nearly x, the world's z takes its place.
+    """
+    axis = up_w.new_tensor((1.0, 0.0, 0.0) if abs(float(up_w[0])) < 0.9 else (0.0, 0.0, 1.0))
+    right = axis - (axis @ up_w) * up_w
     right = right / right.norm()
-    return torch.stack((right, torch.linalg.cross(up, right), up))
+    return torch.stack((right, torch.linalg.cross(up_w, right), up_w))

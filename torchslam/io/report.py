@@ -16,6 +16,7 @@ from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, ate_apart, evaluate
 from torchslam.geometry import transform
 from torchslam.global_mapping.recording import MappedRecording
+from torchslam.metric.options import KINDS
 from torchslam.system.run import Run
 from torchslam.types import State, StepResult, Trajectory
 
@@ -88,6 +89,8 @@ def run_metrics(
     - `submap`: number of the main submap; `posed`, `keyframes`, `points` and `quality` refer to it.
     - `submaps`: counts of every submap, see `submap_counts`; `session`: number of the run on this map.
     - `fps`, `ms_median`, `ms_p95`: time of `SLAM.step`, without image decoding; `fps` is the inverse of the mean.
+    - `metric`: how well the unit of the main submap is known to be a meter, see `map.unit.MetricUnit`, or None;
+      `unmeasured`: why sources of meters said nothing.
     - With ground truth: the errors of the evaluation, and `online_ate_m`, that of the poses as reported online
       (see `evaluation.ate_apart`).
     """
@@ -115,6 +118,8 @@ def run_metrics(
         "skipped": run.skipped,
         "interrupted": run.interrupted,
         "failure": run.failure,
+        "metric": None if run.metric is None else run.metric.as_dict(),
+        "unmeasured": list(run.unmeasured),
     }
     if evaluation is not None:
         metrics |= evaluation.as_dict()
@@ -154,6 +159,7 @@ def result_warnings(metrics: Mapping[str, Any]) -> list[str]:
     """Return warnings about a successful run."""
     keyframes, posed = metrics["keyframes"], metrics["posed"]
     found = [shutter] if (shutter := metrics.get("rolling_shutter")) else []
+    found += [*(metrics.get("metric") or {}).get("remarks", ()), *metrics.get("unmeasured", ())]
     if posed < FEW or 2 * keyframes < posed or metrics.get("mapping") == "global":
         return found
     return [
@@ -230,7 +236,16 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
         "speed": f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
         f"{metrics['ms_p95']:.0f} ms (95th percentile)",
     }
-    return rows | accuracy(metrics)
+    return rows | accuracy(metrics) | {"unit": unit_words(metrics)}
+
+
+def unit_words(metrics: Mapping[str, Any]) -> str:
+    """Describe the unit of lengths in a line: how well it is known to be a meter, or what would tell."""
+    metric = metrics.get("metric")
+    if metric is not None:
+        return str(metric["sentence"])
+    flags = ", ".join(kind.options[0].flag for kind in KINDS)
+    return f"the unit is arbitrary; it is a meter with one of {flags}"
 
 
 def _describe_submaps(metrics: Mapping[str, Any]) -> dict[str, str]:

@@ -23,6 +23,7 @@ from torchslam.geometry.transforms import (
 )
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
+from torchslam.map.unit import MetricUnit
 from torchslam.types import PoseEstimate, Trajectory
 
 EMA_RATE = 0.1
@@ -83,6 +84,7 @@ class Submap:
         map: Keyframes and points.
         posed_frames: All frames with a pose in the map.
         num_cull_checked: Number of leading keyframes that keyframe culling has already checked.
+        metric: How well the unit is known to be a meter; None where it is arbitrary.
     """
 
     number: int
@@ -90,6 +92,7 @@ class Submap:
     map: Map = field(default_factory=Map)
     posed_frames: PosedFrames = field(default_factory=PosedFrames)
     num_cull_checked: int = 0
+    metric: MetricUnit | None = None
 
     @classmethod
     def empty(cls, number: int, like: Float[Tensor, "..."]) -> Submap:
@@ -141,9 +144,14 @@ class Submap:
     def merge(self, other: Submap, S_ab: Float[Tensor, "4 4"]) -> None:
         """Move everything of another submap into this one by a Sim(3) S_ab; the other is empty afterwards.
 
-        The other's rows of keyframes, points and frames are appended. The tracking state becomes that of the other.
+        The other's rows of keyframes, points and frames are appended. The tracking state becomes that of the other. If
+        the other alone is in meters, the whole is in its world.
         """
-        other.transform(S_ab)
+        if self.metric is None and other.metric is not None:
+            self.transform(sim3_inverse(S_ab))
+            self.metric = other.metric
+        else:
+            other.transform(S_ab)
         keyframes, points = self.map.append(other.map)
         self.posed_frames.append(other.posed_frames, keyframes, points)
         tracking = other.tracking

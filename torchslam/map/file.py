@@ -23,6 +23,7 @@ from torchslam.geometry import Camera
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.map.table import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema, Table
+from torchslam.map.unit import MetricUnit
 from torchslam.utils.files import check_regular, parse_json, write_whole
 
 FORMAT = 1
@@ -127,7 +128,8 @@ def pack_submaps(
         "num_created": max(numbers, default=-1) + 1 if num_created is None else num_created,
         "sessions": sessions,
     }
-    return tensors, about
+    metric = {str(submap.number): submap.metric.as_dict() for submap in submaps if submap.metric is not None}
+    return tensors, about | ({"metric": metric} if metric else {})
 
 
 def unpack_submaps(
@@ -166,6 +168,8 @@ def unpack_submaps(
         _check_keys([submap.map for submap in submaps])
         for submap, variance in zip(submaps, _noise_variances(about, len(submaps)), strict=True):
             submap.map.noise_variance = variance
+            unit = about.get("metric", {}).get(str(submap.number))
+            submap.metric = None if unit is None else MetricUnit.from_dict(unit)
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError) as error:
         what = f"{error} is missing" if isinstance(error, KeyError) else error
         raise ResultsError(f"{path}: not a whole torchslam map: {what}") from None

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.errors import TorchslamError
+from torchslam.errors import MeasurementError
 
 MAX_DISAGREEMENT = 3.0
 """Standard errors by which two measurements may differ before they count as a contradiction: .3 % of right pairs do."""
@@ -33,6 +33,8 @@ class ScaleSource(StrEnum):
     SPEED = "speed"
     ODOMETRY = "odometry"
     DEPTH = "depth"
+    MAP = "map"
+    """A map in meters that the session goes on with."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +47,14 @@ class ScaleMeasurement:
         relative_std: its relative standard error, the disagreement of the single measurements included.
         count: single measurements that count, such as markers or fixes.
         unit: what is counted, in the plural, such as "markers".
+        apart: relative standard deviation of the single measurements; None where it is not known.
         rejected: one line for each single measurement, or group of them, that contradicts the others.
         up_w: unit vector against gravity in the frame of the map; None where the source does not say.
         up_std: its standard error, radians.
         S_ew: similarity from the map to a metric frame of the source (east, north, up), scale in the rotation block;
             None where the source has no such frame.
+        origin: latitude and longitude in degrees and altitude in meters (WGS84) of the origin of that frame; None where
+            it is nowhere on earth.
     """
 
     source: ScaleSource
@@ -61,10 +66,12 @@ class ScaleMeasurement:
     up_w: Float[Tensor, " 3"] | None = None
     up_std: float = math.inf
     S_ew: Float[Tensor, "4 4"] | None = None
+    origin: tuple[float, float, float] | None = None
+    apart: float | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.meters_per_unit < math.inf and 0 < self.relative_std < math.inf):
-            raise TorchslamError(
+            raise MeasurementError(
                 f"a scale of {self.meters_per_unit} with an error of {self.relative_std} is no measurement"
             )
 
@@ -93,10 +100,10 @@ def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
     contradiction is named.
 
     Raises:
-        TorchslamError: there is no measurement.
+        MeasurementError: there is no measurement.
     """
     if not measurements:
-        raise TorchslamError("there is no measurement of the scale")
+        raise MeasurementError("there is no measurement of the scale")
     logs = torch.tensor(
         [math.log(m.meters_per_unit) for m in measurements], dtype=torch.float64, device="cpu"
     )

@@ -21,6 +21,7 @@ from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Atlas, Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
+from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress
 from torchslam.optim.run_graph import (
@@ -71,6 +72,7 @@ class Run:
         sessions: number of sessions of the map, without those that only localized.
         given: the given camera with its error, if the final adjustment changed it.
         calibration: `camera` with its error after the final adjustment.
+        unmeasured: one line for each source of meters that said nothing of the main submap.
     """
 
     submaps: tuple[Submap, ...]
@@ -85,6 +87,12 @@ class Run:
     sessions: int = 1
     given: CameraMeasurement | None = None
     calibration: CameraMeasurement | None = None
+    unmeasured: tuple[str, ...] = ()
+
+    @property
+    def metric(self) -> MetricUnit | None:
+        """How well the unit of the main submap is known to be a meter; None where it is arbitrary."""
+        return None if self.main is None else self.main.metric
 
     @property
     def main(self) -> Submap | None:

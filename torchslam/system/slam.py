@@ -8,7 +8,7 @@ check -> extract features -> mask out what does not belong to the static scene, 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -27,6 +27,8 @@ from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map, feature_mismatch, key_of
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.mapper import Mapper
+from torchslam.metric.options import given_options, sources_of
+from torchslam.metric.source import MetricSource
 from torchslam.parallel.workers import with_workers
 from torchslam.system.frame_log import FrameLog, FrameStatus
 from torchslam.system.front_end import (
@@ -38,6 +40,7 @@ from torchslam.system.front_end import (
     image_extractor,
     source,
 )
+from torchslam.system.metric_run import run_in_meters
 from torchslam.system.modes import Mode
 from torchslam.system.run import Run, run_sequence
 from torchslam.system.session import ActiveMap, Session, SystemContext
@@ -230,6 +233,7 @@ class SLAM:
         sequence: Sequence,
         progress: Callable[[StepResult], None] | None = None,
         processes: int | None = 1,
+        measurements: Iterable[MetricSource] = (),
     ) -> Run:
         """Process a sequence: bad frames are skipped and counted, the whole map is adjusted at the end.
 
@@ -237,10 +241,17 @@ class SLAM:
             sequence: The frames.
             progress: Called after every frame.
             processes: Number of processes, this one included; None: the best number. The result is the same.
+            measurements: Sources of meters, beside those of `config.metric` and those that the sequence brings along.
+                The submaps that they measure are in meters afterwards.
+
+        Raises:
+            MeasurementError: A measurement from outside is wrong; where a file is, before the first frame.
         """
+        measurements = [*sources_of(given_options(self.config.metric, sequence.measurements)), *measurements]
         sequence = source(sequence, self.config, self.camera)
         with with_workers(sequence, self, processes) as frames:
-            return run_sequence(self, sequence, progress, frames=frames)
+            finished = run_sequence(self, sequence, progress, frames=frames)
+        return run_in_meters(finished, sequence, measurements) if self.mapping else finished
 
     @torch.inference_mode()
     def warm_up(self) -> None:
