@@ -35,7 +35,6 @@ from torchslam.metric.inertial_rotation import (
     align_rotations,
     thinned,
 )
-from torchslam.optim import LEAST_SQUARES_OPTIONS, solve_least_squares
 
 GRAVITY, GRAVITY_STD = 9.807, 0.02
 """m/s^2: that of middle latitudes, and how it differs over the Earth (9.78 to 9.83)."""
@@ -71,6 +70,8 @@ WORST = 0.1
 """Relative standard error from which on a scale counts as not determined."""
 STILL_TURN, STILL_FORCE = 0.05, 0.15
 """rad/s and m/s^2: spread of rates and forces of a sensor that lies still. On a table 0.003 and 0.03, in a hand 0.1, 0.2."""
+GRAVITY_STEPS = 6
+"""Steps of Newton to gravity of the right length; from 2 % off, the third one changes it by 1e-6."""
 OUTLYING = 9.0
 """Mean squared residual of a stretch, in units of the median one, from which on it contradicts the others."""
 
@@ -192,6 +193,7 @@ def align_inertial(
     found = _with_gravity(equations, prior, counted)
     with torch.no_grad():
         relative_std, gravity_std = _errors(equations, prior, counted, found.detach())
+    gravity_std = math.hypot(gravity_std, float(rotation.R_std.norm()))
     scale = found[0]
     reason = InertialReason.MEASURED
     if not (bool(scale > 0) and relative_std < WORST):
@@ -402,19 +404,26 @@ def _with_gravity(equations: _Equations, prior: Tensor, counted: Tensor) -> Floa
     """The minimum with gravity of nearly the length that it has on Earth, differentiable."""
     hessian = (equations.hessian * counted[:, None, None]).sum(0) + torch.diag(prior)
     right = (equations.right * counted[:, None]).sum(0)
-    root = torch.linalg.cholesky(hessian)
-    white = torch.linalg.solve_triangular(root, right[:, None], upper=False).squeeze(-1)
-    start = torch.cholesky_solve(right[:, None], root).squeeze(-1).detach()
+    x = torch.linalg.solve(hessian, right).detach()
+    for step in range(GRAVITY_STEPS):
+        exact = step == GRAVITY_STEPS - 1  # whose gradient is that of the minimum
+        length = x[1:4].norm()
+        down = x[1:4] / length
+        gradient = hessian @ x - right
+        gradient = gradient + _in_gravity((length - GRAVITY) / GRAVITY_STD**2 * down)
+        curved = down[:, None] * down
+        if exact:
+            eye = torch.eye(3, dtype=x.dtype, device=x.device)
+            curved = curved + (1 - GRAVITY / length) * (eye - curved)
+        curved = _in_gravity(_in_gravity(curved / GRAVITY_STD**2).mT)
+        x = x - torch.linalg.solve(hessian + curved, gradient)
+        x = x if exact else x.detach()
+    return x
 
-    def residual(x: Tensor, root: Tensor, white: Tensor) -> Tensor:
-        linear = (root.mT @ x[..., None]).squeeze(-1) - white
-        length = (x[:, 1:4].norm(dim=-1, keepdim=True) - GRAVITY) / GRAVITY_STD
-        return torch.cat((linear, length), dim=-1)
 
-    solution = solve_least_squares(
-        residual, start[None], (root[None], white[None]), options=LEAST_SQUARES_OPTIONS
-    )
-    return solution.unknowns[0][0]
+def _in_gravity(x: Float[Tensor, "*rows 3"]) -> Float[Tensor, "*rows 13"]:
+    """Of the common unknowns, whose second to fourth ones are gravity."""
+    return torch.nn.functional.pad(x, (1, 9))
 
 
 def _errors(equations: _Equations, prior: Tensor, counted: Tensor, x: Tensor) -> tuple[float, float]:
@@ -424,7 +433,7 @@ def _errors(equations: _Equations, prior: Tensor, counted: Tensor, x: Tensor) ->
     """
     hessian = (equations.hessian * counted[:, None, None]).sum(0) + torch.diag(prior)
     down = x[1:4] / x[1:4].norm()
-    hessian[1:4, 1:4] += down[:, None] * down / GRAVITY_STD**2
+    hessian = hessian + _in_gravity(_in_gravity(down[:, None] * down / GRAVITY_STD**2).mT)
     covariance = torch.linalg.inv(hessian)
     growth = 1.0
     if int(counted.sum()) > 1:

@@ -72,6 +72,9 @@ KINDS: tuple[SourceKind, ...] = (
         (Option("distance", ("FRAME:X,Y", "FRAME:X,Y", "METERS")),), "torchslam.metric.distances:from_options"
     ),
     SourceKind((Option("camera_height", ("METERS",)),), "torchslam.metric.camera_height:from_options"),
+    SourceKind(
+        (Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))), "torchslam.metric.inertial_source:from_options"
+    ),
 )
 """All kinds, in the order in which they measure: markers, which also improve the poses, come first."""
 
