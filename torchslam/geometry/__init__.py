@@ -47,6 +47,14 @@ from torchslam.geometry.lie import (
     vee,
 )
 from torchslam.geometry.p3p import p3p
+from torchslam.geometry.preintegration import (
+    Increments,
+    InertialSteps,
+    compose_increments,
+    inertial_steps,
+    preintegrate,
+    with_bias_change,
+)
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
 from torchslam.geometry.similarity import Similarity, estimate_similarity, umeyama
 from torchslam.geometry.triangulation import (
@@ -63,6 +71,8 @@ __all__ = [
     "CHI_SQUARE_95",
     "AbsolutePose",
     "Camera",
+    "Increments",
+    "InertialSteps",
     "KeypointNoise",
     "MultiViewTriangulation",
     "RelativePose",
@@ -70,6 +80,7 @@ __all__ = [
     "Triangulation",
     "UndistortedKeypoints",
     "Undistortion",
+    "compose_increments",
     "correct_matches",
     "decompose_essential",
     "decompose_homography",
@@ -80,11 +91,13 @@ __all__ = [
     "estimate_similarity",
     "five_point",
     "homography_from_matches",
+    "inertial_steps",
     "innovation_covariances",
     "mahalanobis_squared",
     "matrix_from_quaternion",
     "p3p",
     "passes_gate",
+    "preintegrate",
     "quaternion_from_matrix",
     "rigid",
     "rotation_from_matches",
@@ -114,4 +127,5 @@ __all__ = [
     "triangulation_covariance",
     "umeyama",
     "vee",
+    "with_bias_change",
 ]

@@ -118,7 +118,7 @@ def preintegrate(
     axis = durations.ndim - 1
     while parts.duration.shape[axis] > 1:
         halves = [x.unflatten(axis, (-1, 2)).unbind(axis + 1) for x in parts]
-        parts = compose(*(Increments(*(half[side] for half in halves)) for side in (0, 1)))
+        parts = compose_increments(*(Increments(*(half[side] for half in halves)) for side in (0, 1)))
     return Increments(*(x.squeeze(axis) for x in parts))
 
 
@@ -161,12 +161,10 @@ def _single_steps(
 
 
 @full_precision
-def compose(first: Increments, second: Increments) -> Increments:
+def compose_increments(first: Increments, second: Increments) -> Increments:
     """The increments over two intervals, of which the second follows the first."""
     T, R = second.duration[..., None], first.R_ij
-    velocity, position = (
-        (R @ x[..., None]).squeeze(-1) for x in (second.velocity, second.position)
-    )
+    velocity, position = ((R @ x[..., None]).squeeze(-1) for x in (second.velocity, second.position))
     eye, zero = (x.expand_as(R) for x in (torch.eye(3, dtype=R.dtype, device=R.device), torch.zeros_like(R)))
     from_first = torch.cat(
         (

@@ -16,18 +16,19 @@ al., "Inertial-only optimization for visual-inertial initialization", 2020; incr
 
 from __future__ import annotations
 
+import itertools
 import math
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples
 from torchslam.geometry import se3_inverse, skew, so3_exp, so3_log
-from torchslam.geometry.preintegration import Increments, compose, inertial_steps, preintegrate
+from torchslam.geometry.preintegration import Increments, compose_increments, inertial_steps, preintegrate
 from torchslam.metric.inertial_rotation import (
     LARGEST_OFFSET,
     TURN_INTERVAL,
@@ -68,8 +69,11 @@ SENSOR_STD = 5e-3
 """Relative error of the accelerometer's scale factor, which nothing here can find: 0.4 % on a drone's (ADIS16448)."""
 WORST = 0.1
 """Relative standard error from which on a scale counts as not determined."""
-STILL_TURN, STILL_FORCE = 0.05, 0.15
-"""rad/s and m/s^2: spread of rates and forces of a sensor that lies still. On a table 0.003 and 0.03, in a hand 0.1, 0.2."""
+STILL_INTERVAL = 0.25
+"""Seconds over which rates and forces are averaged: a drone's motors shake it by 0.8 m/s^2 while it stands."""
+STILL_TURN, STILL_FORCE = 0.02, 0.1
+"""rad/s and m/s^2: spread of the averages of a sensor that does not move. A drone on the ground with its motors on has
+0.005 and 0.04, one that is carried 0.17 and 0.75 at least."""
 GRAVITY_STEPS = 6
 """Steps of Newton to gravity of the right length; from 2 % off, the third one changes it by 1e-6."""
 OUTLYING = 9.0
@@ -81,7 +85,7 @@ class InertialReason(StrEnum):
 
     MEASURED = "measured"
     NO_OVERLAP = "no three seconds of posed frames lie within the times of the samples"
-    STILL = "the camera does not move"
+    STILL = "the camera does not move: the sensor neither turns nor accelerates"
     NOT_DETERMINED = "the motion has too little acceleration"
 
 
@@ -217,13 +221,20 @@ def align_inertial(
 def lies_still(samples: InertialSamples, start: float, end: float) -> bool:
     """Whether the sensor neither turns nor is shaken between two times."""
     rows = (samples.timestamps >= start) & (samples.timestamps <= end)
-    if int(rows.sum()) < 2:
+    bins = ((samples.timestamps[rows] - start) / STILL_INTERVAL).long()
+    if len(bins.unique()) < 2:
         return False
-    turn, force = (x[rows].detach().std(dim=0).norm() for x in (samples.gyroscope, samples.accelerometer))
+    values = torch.cat((samples.gyroscope, samples.accelerometer), dim=-1).detach()[rows]
+    size = int(bins.max()) + 1
+    counts = torch.bincount(bins, minlength=size)
+    means = values.new_zeros(size, 6).index_add(0, bins, values)[counts > 0] / counts[counts > 0][:, None]
+    turn, force = (x.norm() for x in means.std(dim=0).split(3))
     return bool(turn < STILL_TURN) and bool(force < STILL_FORCE)
 
 
-def _nothing(reason: InertialReason, like: Tensor, rotation: InertialRotation | None = None) -> InertialAlignment:
+def _nothing(
+    reason: InertialReason, like: Tensor, rotation: InertialRotation | None = None
+) -> InertialAlignment:
     zero = like.new_zeros(3)
     return InertialAlignment(
         reason, like.new_ones(()), math.inf, zero, math.inf, zero, rotation, zero, math.inf, 0
@@ -260,10 +271,12 @@ def _stretch_rows(timestamps: Tensor, samples: InertialSamples, offset: float) -
     broken = broken | outside[1:] | outside[:-1]
     ends = [-1, *torch.nonzero(broken)[:, 0].tolist(), len(rows) - 1]
     stretches: list[list[int]] = []
-    for begin, end in zip(ends[:-1], ends[1:], strict=True):
+    for begin, end in itertools.pairwise(ends):
         duration = float(times[end] - times[begin + 1])
         count = max(1, round(duration / STRETCH))
-        limits = times[begin + 1] + duration / count * torch.arange(1, count, dtype=times.dtype, device="cpu").to(times)
+        limits = times[begin + 1] + duration / count * torch.arange(
+            1, count, dtype=times.dtype, device="cpu"
+        ).to(times)
         cuts = (torch.searchsorted(times[begin + 1 : end + 1], limits) + begin + 1).tolist()
         for first, last in zip([begin + 1, *cuts], [*cuts, end], strict=True):
             if float(times[last] - times[first]) >= SHORTEST_STRETCH and last + 1 - first >= FEWEST_NODES:
@@ -329,7 +342,7 @@ def _chained(
     total = total._replace(R_ij=total.R_ij + torch.eye(3, dtype=times.dtype, device=times.device))
     chain = [total]
     for node in range(times.shape[1] - 1):
-        total = compose(total, Increments(*(x[:, node] for x in each)))
+        total = compose_increments(total, Increments(*(x[:, node] for x in each)))
         chain.append(total)
     return Increments(*(torch.stack(x, dim=1) for x in zip(*chain, strict=True)))
 

@@ -20,7 +20,7 @@ from torchslam.geometry.robust import robustify
 TURN_INTERVAL = 0.25
 """Seconds over which turns are compared. With 0.05 to 0.5 s the bias changes by 1e-4 rad/s on a handheld drone."""
 LARGEST_OFFSET = 0.5
-"""Seconds by which the clocks may be apart. Larger ones come with clocks of different origins, which nothing relates."""
+"""Seconds by which the clocks may be apart. Clocks of different origins are farther apart."""
 OFFSET_STEP = 0.01
 """Seconds between offsets that are tried; the search by derivatives finds offsets that are 0.1 s away."""
 CONVINCING = 0.7
@@ -128,8 +128,8 @@ def _start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, give
     valid = inside[:, 1:] & inside[:, :-1]
     right = torch.searchsorted(samples.timestamps, at).clamp(1, len(speed) - 1)
     before, after = samples.timestamps[right - 1], samples.timestamps[right]
-    measured = total[right - 1].lerp(total[right], ((at - before) / (after - before)).clamp(0, 1)).diff(
-        dim=-1
+    measured = (
+        total[right - 1].lerp(total[right], ((at - before) / (after - before)).clamp(0, 1)).diff(dim=-1)
     )
     correlation = _correlation(measured, angles.expand_as(measured), valid)
     enough = valid.sum(-1) >= 0.5 * len(angles)

@@ -55,8 +55,8 @@ class InertialSource:
         first, last = float(timestamps[0]) + offset, float(timestamps[-1]) + offset
         if first > float(samples[-1]) or last < float(samples[0]):
             raise MeasurementError(
-                f"{self.samples.source}: samples from {float(samples[0]):.3f} to {float(samples[-1]):.3f} s, but images "
-                f"from {first:.3f} to {last:.3f} s: both need the same clock"
+                f"{self.samples.source}: samples from {float(samples[0]):.3f} to {float(samples[-1]):.3f} s, but "
+                f"images from {first:.3f} to {last:.3f} s: both need the same clock"
             )
 
 

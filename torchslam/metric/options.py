@@ -73,7 +73,8 @@ KINDS: tuple[SourceKind, ...] = (
     ),
     SourceKind((Option("camera_height", ("METERS",)),), "torchslam.metric.camera_height:from_options"),
     SourceKind(
-        (Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))), "torchslam.metric.inertial_source:from_options"
+        (Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))),
+        "torchslam.metric.inertial_source:from_options",
     ),
 )
 """All kinds, in the order in which they measure: markers, which also improve the poses, come first."""

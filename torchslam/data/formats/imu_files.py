@@ -35,7 +35,11 @@ RATE_UNITS = {
     **dict.fromkeys(("degs", "degsec", "degs1", "deg", "dps", "°s"), np.pi / 180),
 }
 STANDARD_GRAVITY = 9.80665
-FORCE_UNITS = {**dict.fromkeys(("ms2", "mss", "msec2"), 1.0), "g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY}
+FORCE_UNITS = {
+    **dict.fromkeys(("ms2", "mss", "msec2"), 1.0),
+    "g": STANDARD_GRAVITY,
+    "mg": 1e-3 * STANDARD_GRAVITY,
+}
 """Units by their letters and digits, in SI."""
 SHORTEST_PERIOD = 2e-4
 """Seconds; with a thousand times of it, 0.2 s, one unit of time alone is possible. Sensors have 1e-3 to 0.1 s."""
@@ -104,10 +108,16 @@ def read_imu(path: str | Path) -> InertialSamples:
 def _columns(names: list[str], path: Path) -> tuple[list[int], tuple[float | None, ...]]:
     """Where time, rates and forces are, and their units; None where they are not stated."""
     found: dict[str, tuple[int, float | None]] = {}
-    kinds = (("time", TIMES, TIME_UNITS), ("gyro", GYROSCOPES, RATE_UNITS), ("acc", ACCELEROMETERS, FORCE_UNITS))
+    kinds = (
+        ("time", TIMES, TIME_UNITS),
+        ("gyro", GYROSCOPES, RATE_UNITS),
+        ("acc", ACCELEROMETERS, FORCE_UNITS),
+    )
     for column, name in enumerate(names):
         for kind, words, known in kinds:
-            parsed = _parsed(name, words, known, with_axis=kind != "time", where=f"{path}: column `{name[:80]}`")
+            parsed = _parsed(
+                name, words, known, with_axis=kind != "time", where=f"{path}: column `{name[:80]}`"
+            )
             if parsed is not None:
                 found.setdefault(f"{kind}{parsed[0]}", (column, parsed[1]))
     wanted = ("time", *(f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in AXES))
@@ -119,7 +129,9 @@ def _columns(names: list[str], path: Path) -> tuple[list[int], tuple[float | Non
         )
     units = [{found[name][1] for name in group} for group in (wanted[:1], wanted[1:4], wanted[4:])]
     if any(len(each) > 1 for each in units):
-        raise MeasurementError(f"{path}: the axes of a sensor have different units: `{', '.join(names)[:200]}`")
+        raise MeasurementError(
+            f"{path}: the axes of a sensor have different units: `{', '.join(names)[:200]}`"
+        )
     return [found[name][0] for name in wanted], tuple(each.pop() for each in units)
 
 
@@ -178,7 +190,9 @@ def _unit_of_times(times: np.ndarray, path: Path) -> float:
     for unit in sorted(set(TIME_UNITS.values())):
         if SHORTEST_PERIOD <= period * unit < 1e3 * SHORTEST_PERIOD:
             return unit
-    raise MeasurementError(f"{path}: times are {period:g} apart, in no unit that a sensor has; write time [ms], for instance")
+    raise MeasurementError(
+        f"{path}: times are {period:g} apart, in no unit that a sensor has; write time [ms], for instance"
+    )
 
 
 def read_inertial_calibration(path: str | Path | None, imu: str | Path | None = None) -> InertialCalibration:
@@ -248,7 +262,7 @@ def _mounting(all_keys: list[Keys], path: Path) -> Float[Tensor, "4 4"]:
             if is_inverse:
                 R = T[:3, :3].mT
                 T = torch.cat((torch.cat((R, -R @ T[:3, 3:]), dim=-1), T[3:]))
-            if bool((T == torch.eye(4, dtype=T.dtype, device="cpu")).all()):
+            if torch.equal(T, torch.eye(4, dtype=T.dtype, device="cpu")):
                 raise MeasurementError(
                     f"{path}: the transformation between camera and body is the identity, as in the file of a sensor; "
                     "give the file of the camera"
@@ -269,6 +283,8 @@ def _rigid(numbers: list[float], path: Path) -> Float[Tensor, "4 4"]:
     if float(off) > ORTHOGONAL or float(torch.linalg.det(R)) < 0 or T[3].tolist() != [0, 0, 0, 1]:
         raise MeasurementError(f"{path}: the transformation between camera and body is not rigid")
     if float(T[:3, 3].norm()) > LONGEST_LEVER:
-        raise MeasurementError(f"{path}: {float(T[:3, 3].norm()):g} m between camera and body; is it in meters?")
+        raise MeasurementError(
+            f"{path}: {float(T[:3, 3].norm()):g} m between camera and body; is it in meters?"
+        )
     U, _, Vh = torch.linalg.svd(R)
     return torch.cat((torch.cat((U @ Vh, T[:3, 3:]), dim=-1), T[3:]))

@@ -1,4 +1,4 @@
-"""Folders of the EuRoC MAV dataset: `mav0/cam0/{data.csv,sensor.yaml,data/}`, the body's ground truth and inertial sensor.
+"""Folders of the EuRoC MAV dataset: `mav0/cam0/{data.csv,sensor.yaml,data/}`, the body's truth and inertial sensor.
 
 Source: https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets
 """
