@@ -61,9 +61,9 @@ def angle_of(R: Tensor) -> float:
 
 
 def test_stated_errors_contain_the_errors() -> None:
-    """Of 20 noisy ways, in standard errors: about one on average."""
+    """Of noisy ways, in standard errors: about one on average."""
     scales, tilts, offsets = [], [], []
-    for seed in range(20):
+    for seed in range(8):
         simulation = simulate(
             seconds=8, position_noise=2e-3, turn_noise=1e-3, sensor_noise=True, seed=seed, offset=0.01
         )
@@ -153,14 +153,20 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
             gyroscope=samples.gyroscope + 1e-2 * step[0] * directions[0],
             accelerometer=samples.accelerometer + 1e-1 * step[1] * directions[1],
         )
-        return aligned(simulation, samples=changed, T_cw=T_cw + 1e-3 * step[2] * along).meters_per_unit
+        moved = T_cw + 1e-3 * step[2] * along
+        return align_inertial(
+            simulation.timestamps, moved, changed, simulation.calibration, turn_std=1e-3, position_std=1e-3
+        ).meters_per_unit
 
     zero = torch.zeros(3, dtype=torch.float64, requires_grad=True)
     (gradient,) = torch.autograd.grad(scale(zero), zero)
     with torch.no_grad():
         eye = 1e-4 * torch.eye(3, dtype=torch.float64)
         expected = torch.stack([(scale(step) - scale(-step)) / 2e-4 for step in eye])
-    torch.testing.assert_close(gradient, expected, rtol=0.02, atol=0.02 * float(expected.abs().max()))
+    torch.testing.assert_close(gradient[1:], expected[1:], rtol=1e-5, atol=0)
+    torch.testing.assert_close(
+        gradient[0], expected[0], rtol=0.02, atol=0
+    )  # without the curvature of rotations
 
 
 def test_samples_are_checked() -> None:

@@ -154,6 +154,9 @@ def align_inertial(
     T_cw: Float[Tensor, "K 4 4"],
     samples: InertialSamples,
     calibration: InertialCalibration,
+    *,
+    turn_std: float | None = None,
+    position_std: float | None = None,
 ) -> InertialAlignment:
     """Scale and gravity of poses in an arbitrary unit. Differentiable in poses and samples.
 
@@ -162,10 +165,15 @@ def align_inertial(
         T_cw: poses of the camera.
         samples: of the sensor.
         calibration: what is known of it.
+        turn_std: rad, of the camera's turns over `TURN_INTERVAL`.
+        position_std: meters, of its positions. None: those of the residuals, which have no gradient.
 
     Returns:
         The alignment, or why there is none. The stated errors contain the noise of both sensors, the disagreement of
         stretches, and `SENSOR_STD`.
+
+    Raises:
+        MeasurementError: the rates are in another unit.
     """
     inside = (timestamps + calibration.offset > samples.timestamps[0] + LARGEST_OFFSET * 0.1) & (
         timestamps + calibration.offset < samples.timestamps[-1] - LARGEST_OFFSET * 0.1
@@ -175,25 +183,26 @@ def align_inertial(
         return _nothing(InertialReason.NO_OVERLAP, T_cw)
     if lies_still(samples, float(timestamps[0]), float(timestamps[-1])):
         return _nothing(InertialReason.STILL, T_cw)
-    rotation = align_rotations(timestamps, T_cw[:, :3, :3], samples, calibration)
-    rows = _stretch_rows(timestamps, samples, float(rotation.offset))
+    rotation = align_rotations(timestamps, T_cw[:, :3, :3], samples, calibration, turn_std)
+    rows = _stretch_rows(timestamps, samples, float(rotation.offset.detach()))
     if not rows:
         return _nothing(InertialReason.NO_OVERLAP, T_cw)
     stretches = _stretches(timestamps, T_cw, samples, calibration, rotation, rows)
     prior = _prior(calibration, rotation)
     counted = torch.ones(len(rows), dtype=torch.bool, device=T_cw.device)
-    position_std = POSITION_STD
-    for _ in range(WEIGHINGS):
+    std = POSITION_STD if position_std is None else position_std
+    for _ in range(WEIGHINGS if position_std is None else 1):
         with torch.no_grad():
-            equations = _equations(stretches, position_std)
+            equations = _equations(stretches, std)
             solution = _solved(equations, prior, counted)
             if solution is None:
                 return _nothing(InertialReason.NOT_DETERMINED, T_cw, rotation)
             mean = _squared(equations, solution) / equations.redundancy
             counted = mean <= OUTLYING * mean.median()
             total = (mean * equations.redundancy)[counted].sum() / equations.redundancy[counted].sum()
-            position_std = max(position_std * math.sqrt(float(total)), SMALLEST_POSITION_STD)
-    equations = _equations(stretches, position_std)
+            if position_std is None:
+                std = max(std * math.sqrt(float(total)), SMALLEST_POSITION_STD)
+    equations = _equations(stretches, std)
     found = _with_gravity(equations, prior, counted)
     with torch.no_grad():
         relative_std, gravity_std = _errors(equations, prior, counted, found.detach())
@@ -212,7 +221,7 @@ def align_inertial(
         found[4:7],
         rotation,
         _lever(calibration, rotation.R_bc) + found[10:],
-        position_std,
+        std,
         int(counted.sum()),
         tuple(starts[~counted].tolist()),
     )

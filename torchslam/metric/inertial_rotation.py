@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples
+from torchslam.errors import MeasurementError
 from torchslam.geometry import so3_exp, so3_log, umeyama
 from torchslam.geometry.lie import so3_left_jacobian_inverse
 from torchslam.geometry.preintegration import Increments, inertial_steps, preintegrate
@@ -25,14 +26,16 @@ OFFSET_STEP = 0.01
 """Seconds between offsets that are tried; the search by derivatives finds offsets that are 0.1 s away."""
 CONVINCING = 0.7
 """Correlation of the angular speeds from which another offset than the given one is believed. Right ones have 0.9."""
+LARGEST_RATIO = 10.0
+"""Of the speeds with which camera and sensor turn: radians and degrees differ by 57, a bias by less than 2."""
 OFFSET_STD = 0.01
 """Seconds, of the offset before it is measured: a camera that hardly turns leaves it where it was."""
 BIAS_STD = 0.1
 """rad/s, of the gyroscope's bias before it is measured: three times that of cheap sensors."""
 ROBUST_SCALE = 2.0
 """Of Cauchy's kernel, in standard errors of a turn, which leaves Gaussian errors 95 % of their information."""
-ROUNDS = 6
-"""Steps of Gauss and Newton. The fourth one moves the offset by less than a microsecond."""
+ROUNDS, WIDE_ROUNDS = 6, 3
+"""Steps, and those of them by reweighted least squares, which come from afar; those of Newton after them converge."""
 SMALLEST_TURN_STD = 1e-7
 """rad: turns of exact data."""
 TURN_PRIOR = 1e3
@@ -79,6 +82,7 @@ def align_rotations(
     R_cw: Float[Tensor, "K 3 3"],
     samples: InertialSamples,
     calibration: InertialCalibration,
+    turn_std: float | None = None,
 ) -> InertialRotation:
     """The bias of the gyroscope, the offset of the clocks and, if it is unknown, the rotation from camera to body.
 
@@ -89,6 +93,10 @@ def align_rotations(
         R_cw: rotations of the camera.
         samples: of the sensor.
         calibration: what is known.
+        turn_std: rad, of a turn over `TURN_INTERVAL`; None: that of the residuals, which has no gradient.
+
+    Raises:
+        MeasurementError: the rates are in another unit.
     """
     nodes = thinned(timestamps, TURN_INTERVAL)
     times, R_cw = timestamps[nodes], R_cw[nodes]
@@ -99,10 +107,10 @@ def align_rotations(
     start = torch.tensor(offset, dtype=times.dtype, device=times.device)
     prior, offset = start, start
     for step in range(ROUNDS):
-        exact = step == ROUNDS - 1
-        with torch.set_grad_enabled(torch.is_grad_enabled() and exact):
+        exact = step >= WIDE_ROUNDS
+        with torch.set_grad_enabled(torch.is_grad_enabled() and step == ROUNDS - 1):
             found = _refined(
-                times, turns_c, samples, R_bc, bias, offset, prior, calibration.T_bc is None, exact
+                times, turns_c, samples, R_bc, bias, offset, prior, calibration.T_bc is None, exact, turn_std
             )
         R_bc, bias, offset = (x.detach() for x in found[:3])
     return found
@@ -131,20 +139,28 @@ def _start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, give
     measured = (
         total[right - 1].lerp(total[right], ((at - before) / (after - before)).clamp(0, 1)).diff(dim=-1)
     )
-    correlation = _correlation(measured, angles.expand_as(measured), valid)
+    correlation, slope = _correlation(angles.expand_as(measured), measured, valid)
     enough = valid.sum(-1) >= 0.5 * len(angles)
     correlation = torch.where(enough, correlation, -1.0)
     best = int(correlation.argmax())
-    return float(offsets[best]) if float(correlation[best]) > CONVINCING else given
+    if float(correlation[best]) < CONVINCING:
+        return given
+    if not 1 / LARGEST_RATIO < float(slope[best]) < LARGEST_RATIO:
+        raise MeasurementError(
+            f"{samples.source}: the sensor turns {float(slope[best]):.2g} times as fast as the camera; state the unit "
+            "of its rates, as in gyro_x [deg/s]"
+        )
+    return float(offsets[best])
 
 
-def _correlation(a: Tensor, b: Tensor, valid: Tensor) -> Tensor:
-    """Of the valid columns of each row."""
+def _correlation(a: Tensor, b: Tensor, valid: Tensor) -> tuple[Tensor, Tensor]:
+    """Of the valid columns of each row: their correlation, and the slope of b in a."""
     count = valid.sum(-1, keepdim=True).clamp_min(1)
     a, b = (torch.where(valid, x, 0.0) for x in (a, b))
     a, b = (torch.where(valid, x - x.sum(-1, keepdim=True) / count, 0.0) for x in (a, b))
     tiny = torch.finfo(a.dtype).tiny
-    return (a * b).sum(-1) / (a.square().sum(-1) * b.square().sum(-1)).sqrt().clamp_min(tiny)
+    aa, ab, bb = (a * a).sum(-1).clamp_min(tiny), (a * b).sum(-1), (b * b).sum(-1).clamp_min(tiny)
+    return ab / (aa.sqrt() * bb.sqrt()), ab / aa
 
 
 def _start_rotation(
@@ -170,10 +186,11 @@ def _refined(
     prior: Tensor,
     rotation_free: bool,
     exact: bool,
+    turn_std: float | None,
 ) -> InertialRotation:
-    """One step of Gauss and Newton over rotation, bias and offset.
+    """One step over rotation, bias and offset: of reweighted least squares, or with the kernel's curvature as well.
 
-    With an exact Hessian, except for the curvature of rotations, its gradient at the minimum is that of the minimum.
+    At the minimum the gradient of the latter is that of the minimum, up to the curvature of rotations times the errors.
     """
     at = times + offset
     increments = _increments(at, samples, bias)
@@ -192,6 +209,7 @@ def _refined(
         (inverse @ turned, -from_right @ increments.jacobian[:, 6:, :3], -from_right @ shift), dim=-1
     )
     std = (1.4826 * error.detach().abs().median()).clamp_min(SMALLEST_TURN_STD)
+    std = std if turn_std is None else torch.full_like(std, turn_std)
     kernel = robustify((error / std).square().sum(-1), "cauchy", std.new_tensor(ROBUST_SCALE))
     weighted = (kernel.weight[:, None] * error / std**2)[..., None]
     if not rotation_free:

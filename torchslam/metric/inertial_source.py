@@ -29,7 +29,7 @@ class InertialSource:
         """Measure the unit of a submap and its vertical.
 
         Raises:
-            MeasurementError: the times of images and samples have nothing in common.
+            MeasurementError: images and samples have no time in common, or the rates another unit.
         """
         timestamps, T_cw = view.timestamps.cpu().double(), view.T_cw.cpu().double()
         self._check_times(timestamps)

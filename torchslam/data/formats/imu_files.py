@@ -142,7 +142,7 @@ def _parsed(
     bare, *brackets = re.split(r"[\[(]", name.lower(), maxsplit=1)
     bracket = "".join(brackets)
     parts = [part for part in re.split(r"[^a-z0-9µ°]+", bare) if part]
-    unit = re.sub(r"[^a-z0-9µ°]", "", bracket).replace("persecond", "s").replace("²", "2")
+    unit = re.sub(r"[^a-z0-9µ°]", "", bracket.replace("²", "2"))
     for length in range(len(parts), 0, -1):
         head, tail = "".join(parts[:length]), "".join(parts[length:])
         axis = ""
