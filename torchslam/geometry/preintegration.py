@@ -74,6 +74,7 @@ def inertial_steps(
         start: seconds; before the first sample and behind the last one, the line through two samples is extended.
         end: seconds, not before the start.
     """
+    timestamps = timestamps.contiguous()
     inner = torch.searchsorted(timestamps, start.detach(), right=True)
     count = (torch.searchsorted(timestamps, end.detach()) - inner).clamp_min(0)
     steps = (int(count.max()) if len(count) else 0) + 1
