@@ -105,10 +105,9 @@ def align_rotations(
     times, R_cw = timestamps[nodes], R_cw[nodes]
     turns_c = R_cw[:-1] @ R_cw[1:].mT  # from the camera at the end of an interval to that at its start
     with torch.no_grad():
-        offset = _start_offset(times, turns_c, samples, calibration.offset)
-        R_bc, bias = _start_rotation(times + offset, turns_c, samples, calibration.T_bc)
-    start = torch.tensor(offset, dtype=times.dtype, device=times.device)
-    prior, offset = start, start
+        prior = times.new_tensor(_start_offset(times, turns_c, samples, calibration.offset))
+        R_bc, bias = _start_rotation(times + prior, turns_c, samples, calibration.T_bc)
+    offset = prior
     for step in range(ROUNDS):
         exact = step >= WIDE_ROUNDS
         with torch.set_grad_enabled(torch.is_grad_enabled() and step == ROUNDS - 1):

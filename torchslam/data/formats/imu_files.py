@@ -30,17 +30,20 @@ GYROSCOPES = ("wrss", "gyro", "gyroscope", "gyr", "g", "w", "omega", "angularvel
 ACCELEROMETERS = ("arss", "acc", "accel", "accelerometer", "acceleration", "a", "linearacceleration")
 """Names of columns without their axis, in lower case, letters alone."""
 TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+"""Units of times by their letters, in seconds."""
 RATE_UNITS = {
     **dict.fromkeys(("rads", "radsec", "rads1", "rad"), 1.0),
     **dict.fromkeys(("degs", "degsec", "degs1", "deg", "dps", "°s"), np.pi / 180),
 }
+"""Units of rates by their letters and digits, in rad/s."""
 STANDARD_GRAVITY = 9.80665
+"""m/s^2, of which accelerometers in g count multiples, by definition (3rd CGPM, 1901)."""
 FORCE_UNITS = {
     **dict.fromkeys(("ms2", "mss", "msec2"), 1.0),
     "g": STANDARD_GRAVITY,
     "mg": 1e-3 * STANDARD_GRAVITY,
 }
-"""Units by their letters and digits, in SI."""
+"""Units by their letters and digits, in m/s^2."""
 SHORTEST_PERIOD = 2e-4
 """Seconds; with a thousand times of it, 0.2 s, one unit of time alone is possible. Sensors have 1e-3 to 0.1 s."""
 FORCE_RANGE = (7.0, 13.0)
@@ -99,10 +102,10 @@ def read_imu(path: str | Path) -> InertialSamples:
             f"{path}: the median of the forces is {force:.3g} m/s^2, not that of gravity, 9.81; state the unit, as in "
             "acc_x [g], and leave gravity in"
         )
-    return InertialSamples(
-        *(torch.from_numpy(np.ascontiguousarray(x)) for x in (table[:, 0] * unit, gyroscope, accelerometer)),
-        source=str(path),
+    seconds, rates, forces = (
+        torch.from_numpy(np.ascontiguousarray(x)) for x in (table[:, 0] * unit, gyroscope, accelerometer)
     )
+    return InertialSamples(seconds, rates, forces, str(path))
 
 
 def _columns(names: list[str], path: Path) -> tuple[list[int], tuple[float | None, ...]]:
