@@ -35,6 +35,10 @@ COMMANDS = {
         "refine",
         "refine the poses of another program from the images and write them in their original format",
     ),
+    "align": (
+        "align",
+        "give meters to a finished run: from markers, known lengths, positions or an inertial sensor",
+    ),
     "densify": (
         "densify",
         "compute dense depth of a run from its map and images: depth maps, a colored cloud and pictures",

@@ -156,7 +156,7 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
     write_atlas(directory / MAP, run.submaps, run.camera, run.sessions)
-    write_map_cloud(directory / POINT_CLOUD, run.map, run.session)
+    write_map_cloud(directory / POINT_CLOUD, run.main, run.session)
     if run.calibration is not None and not run.session:
         remark, std = str(metrics.get("camera", "")), run.calibration.focal_std
         write_calibration(directory / CALIBRATION, run.camera, [remark] if remark else [], std)
@@ -171,7 +171,7 @@ def read_results(directory: Path) -> Results:
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
     saved, metrics = read_atlas(directory / MAP), read_metrics(directory)
-    main = [submap.map for submap in saved.atlas if submap.number == metrics["submap"]]
+    main = [submap for submap in saved.atlas if submap.number == metrics["submap"]]
     paths = {submap.number: directory / OTHER_TRAJECTORY.format(submap.number) for submap in saved.atlas}
     truth, example = directory / GROUND_TRUTH, directory / EXAMPLE_IMAGE
     cloud = directory / DENSE_CLOUD
@@ -180,7 +180,7 @@ def read_results(directory: Path) -> Results:
         keyframes=read_trajectory(directory / KEYFRAMES) if metrics["keyframes"] else Trajectory.empty(),
         groundtruth=read_trajectory(truth) if truth.exists() else None,
         others={number: read_trajectory(path) for number, path in paths.items() if path.exists()},
-        map=main[0] if main else Map(),
+        map=main[0].map if main else Map(),
         submaps=tuple(saved.atlas),
         camera=saved.camera,
         frames=read_frames(directory / FRAMES),

@@ -121,7 +121,7 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
         S = evaluation.S_groundtruth_estimate
         trajectory, keyframes, truth = evaluation.aligned, aligned(keyframes, S), _truth(results)
         title += f", ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
-    unit = "" if truth is None else "m"
+    unit = "" if truth is None and not results.metrics.get("metric") else "m"
     ids = results.map.valid_points()
     points_w = transform(S, results.map.positions_w[ids])
     certainty = [

@@ -67,7 +67,7 @@ class SourceKind:
 
 
 KINDS: tuple[SourceKind, ...] = (
-    SourceKind((Option("marker", ("FAMILY:METERS",)),), "torchslam.metric.markers:from_options"),
+    SourceKind((Option("marker", ("FAMILY:METERS",)),), "torchslam.metric.markers.source:from_options"),
     SourceKind(
         (Option("distance", ("FRAME:X,Y", "FRAME:X,Y", "METERS")),), "torchslam.metric.distances:from_options"
     ),

@@ -9,10 +9,23 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera
 from torchslam.map.atlas import Submap
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
+
+
+class Images(Protocol):
+    """The images of a session by the indices of its frames, such as a `Sequence`."""
+
+    @property
+    def brings_features(self) -> bool:
+        """True if the frames come with features, and images are not used."""
+
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
+        """Return a gray image in [0, 1]. Raises FrameError if it cannot be read."""
+
+    def file_name(self, index: int) -> str:
+        """Return the file of a frame below the folder of all; empty if frames are no files."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +42,7 @@ class SubmapView:
     submap: Submap
     camera: Camera
     session: int = 0
-    sequence: Sequence | None = None
+    sequence: Images | None = None
 
     @property
     def rows(self) -> Int[Tensor, " K"]:

@@ -8,16 +8,15 @@ from dataclasses import replace
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.sequence import Sequence
 from torchslam.geometry import sim3_inverse, sim3_scale
 from torchslam.geometry.transforms import covariances_with_unit, without_scale
 from torchslam.metric.meters import bring_into_meters
-from torchslam.metric.source import MetricSource, SubmapView
+from torchslam.metric.source import Images, MetricSource, SubmapView
 from torchslam.system.run import Run
 from torchslam.types import StepResult
 
 
-def run_in_meters(run: Run, sequence: Sequence | None, sources: Iterable[MetricSource]) -> Run:
+def run_in_meters(run: Run, sequence: Images | None, sources: Iterable[MetricSource]) -> Run:
     """Bring every submap with measurements into meters; the others keep their unit.
 
     The submaps are changed in place, the poses that were returned frame by frame follow the submap that they are in.

@@ -251,6 +251,19 @@ class Images:
         is_same = pinhole is None or _is_same(camera, pinhole)
         self._undistort = None if is_same else Undistorter(camera, pinhole)
 
+    @property
+    def brings_features(self) -> bool:
+        """Images are there, whatever features a run used."""
+        return False
+
+    def image(self, frame_id: int) -> Float[Tensor, "1 1 H W"]:
+        """Return a gray image in [0, 1], as it is. Raises FrameError if it cannot be read."""
+        return self._sequence.image(self._rows[frame_id])
+
+    def file_name(self, frame_id: int) -> str:
+        """Return the file of a frame below the folder of all; empty if frames are no files."""
+        return self._sequence.file_name(self._rows[frame_id])
+
     def bgr(self, frame_id: int) -> UInt8[np.ndarray, "H W 3"]:
         """Return an image as OpenCV writes it: blue, green, red. Raises FrameError if it cannot be read."""
         image = cv2.cvtColor(

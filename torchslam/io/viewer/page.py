@@ -21,8 +21,10 @@ from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.geometry import Camera, se3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import upright_rotation
+from torchslam.io.export.ply import upright_from_map
 from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
+from torchslam.io.report import unit_words
 from torchslam.io.results import Results, aligned, aligned_poses
 from torchslam.map.atlas import Submap
 from torchslam.types import State, Trajectory
@@ -88,9 +90,10 @@ def page_data(results: Results) -> dict[str, Any]:
     shown.sort(key=lambda submap: submap.number != metrics["submap"])
     budget = MAX_POINTS / max(sum(submap.map.num_points for submap in shown), 1)
     accuracy = f" · ATE {metrics['ate_m']:.3g} m" if "ate_m" in metrics else ""
+    unit = f" · {unit_words(metrics)}" if metrics.get("metric") else ""
     return {
         "title": printable(Path(metrics.get("source") or "torchslam").name),
-        "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}",
+        "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}{unit}",
         "failure": printable(metrics.get("failure", "")),
         "corners": _corners(results.camera).tolist(),
         "reasons": reasons,
@@ -126,7 +129,7 @@ def decoded(packed: dict[str, str]) -> Shaped[np.ndarray, " N"]:
 def _submap(
     submap: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
 ) -> dict[str, Any]:
-    """Return the data of a submap: upright, centered on its box; aligned and in meters with ground truth.
+    """Return the data of a submap: upright, centered on its box; aligned with ground truth, which is in meters.
 
     Returns:
         S_shown_map: (4, 4) similarity from the map to the view
@@ -151,7 +154,10 @@ def _submap(
     )
     keyframes = submap.map.keyframe_trajectory(results.session)
     up = torch.eye(4, dtype=torch.float64, device="cpu")
-    up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
+    if evaluation is None:
+        up[:3, :3] = upright_from_map(submap)
+    else:
+        up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
     S = up @ S
     points_w, colors = _points(submap)
     box = torch.from_numpy(
@@ -174,7 +180,7 @@ def _submap(
     steps[[row - 1 for row in breaks]] = 0.0
     return {
         "name": f"{submap.number}" + (", the main one" if is_main else ""),
-        "unit": "" if evaluation is None else "m",
+        "unit": "" if evaluation is None and submap.metric is None else "m",
         "S_shown_map": S.tolist(),
         "frame": encoded(frame, "int32"),
         "poses": encoded(shown[:, :3], "float32"),

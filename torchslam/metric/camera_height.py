@@ -1,0 +1,291 @@
+"""The height of a camera above the ground that it moves over, as a source of meters.
+
+In each of some frames a plane below the camera is fitted to the images around it: small windows of the lower image are
+put into other frames by the homography of the plane, and look there as they should. The plane is parallel to the path
+of the camera, which keeps its height: a free pitch and the height have nearly the same effect on the images, and errors
+of 5 to 10 %. What remains are the height and the roll.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchslam.errors import FrameError, MeasurementError
+from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.metric.options import Given
+from torchslam.metric.scale import ScaleMeasurement, ScaleSource
+from torchslam.metric.source import SubmapView, Unmeasured
+
+FRAMES = 16
+"""Frames, evenly spread over a submap, in which a plane is sought: the error of one is 3 to 4 %."""
+LEAST_FRAMES = 4
+"""Frames with a plane without which there is no measurement."""
+LEAST_BASELINE = 0.4
+"""Distance from which on another frame is compared, in heights: nearer, the ground hardly moves in the image."""
+PATH = 1.0
+"""Distance, in heights, over which the direction of the path is taken to either side."""
+MAX_BEND_DEG = 15.0
+"""Largest angle of the path in a frame: in curves its direction is uncertain. On kitti07, 20 degrees did no harm."""
+BELOW_HORIZON = 0.12
+"""Least slope of the rays of a window, downward: beyond 8 heights the ground hardly moves in the image."""
+ROWS, COLUMNS = 14, 28
+"""Windows in the lower image."""
+RADIUS_X, RADIUS_Y = 3, 2
+"""Of a window, in samples: the ground is seen at a flat angle."""
+SAMPLE_SHARE = 1 / 600
+"""Distance of the samples of a window in widths of the image; at least a pixel."""
+RANGE, STEPS = 2.0, 32
+"""The search reaches from the guess by sparse points divided by RANGE to that times RANGE, in so many steps."""
+GUESS_QUANTILE = 0.85
+"""Of the heights of the map points below the camera: most of them lie between the ground and the camera."""
+LEAST_POINTS = 5
+"""Map points below the camera without which a frame gives no guess."""
+ROUNDS = 4
+"""Of the refinement, each with half the steps of the one before."""
+ROLL_STEP = 0.02
+"""First step of the roll, radians."""
+MAX_ROLL = 0.08
+"""Largest roll of a plane that is believed, radians: another surface has others."""
+ALIKE, LEAST_SHARE = 0.7, 0.15
+"""Correlation of a window that lies on the plane, and the least share of these windows."""
+CONTRAST = 2.0 / 255
+"""Least standard deviation of the gray levels of a window."""
+MODEL_STD = 0.015
+"""Relative error that all frames share: the road is curved, the height is known to a centimeter or two, and the
+focal length to 1 %."""
+
+
+def from_options(given: Given) -> list[CameraHeight]:
+    """The source of `--camera-height`.
+
+    Raises:
+        MeasurementError: it is given twice.
+    """
+    if len(given["camera_height"]) > 1:
+        raise MeasurementError("--camera-height is given twice: a camera has one")
+    return [CameraHeight(float(given["camera_height"][0][0]))]
+
+
+class CameraHeight:
+    """A camera that moves over the ground at a known height, upright."""
+
+    def __init__(self, meters: float) -> None:
+        """Take the height. Raises MeasurementError for an impossible one."""
+        if not 0 < meters < math.inf:
+            raise MeasurementError(f"--camera-height {meters}: no height in meters")
+        self._meters = meters
+
+    def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
+        """Measure the unit of a submap by the median height over its frames."""
+        if view.sequence is None or view.sequence.brings_features:
+            return Unmeasured(ScaleSource.CAMERA_HEIGHT, "there are no images to find the ground in")
+        heights = ground_heights(view)
+        if len(heights) < LEAST_FRAMES:
+            return Unmeasured(
+                ScaleSource.CAMERA_HEIGHT,
+                f"the ground is seen below the camera in {len(heights)} of {FRAMES} frames: it must move along it, and "
+                "look at it",
+            )
+        logs = np.log(heights)
+        middle = float(np.median(logs))
+        spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+        # The variance of a median is pi / 2 times that of a mean.
+        error = math.sqrt(math.pi / 2 / len(logs)) * spread
+        return ScaleMeasurement(
+            ScaleSource.CAMERA_HEIGHT,
+            self._meters / math.exp(middle),
+            math.hypot(error, MODEL_STD),
+            len(logs),
+            "frames above the ground",
+            apart=spread,
+        )
+
+
+def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
+    """Heights of the camera above the ground in the frames in which it was found, map units."""
+    T_cw = view.T_cw.detach().cpu().double()
+    centers_w = se3_inverse(T_cw)[:, :3, 3]
+    windows = _Windows.of(view.camera.to("cpu"))
+    rows = sorted({int(row) for row in torch.linspace(0, len(T_cw) - 1, FRAMES + 2, device="cpu").round()})
+    guess = _guess(view, T_cw[rows])
+    found = list[float]()
+    if guess is None or windows is None:
+        return np.array(found)
+    for row in rows:
+        around = _path(centers_w, row, guess)
+        if around is None:
+            continue
+        direction_c = T_cw[row, :3, :3] @ around.direction_w
+        images = [_gray(view, int(view.frame_index[each])) for each in (row, *around.others)]
+        reference, *others = images
+        kept = [each for each, image in zip(around.others, others, strict=True) if image is not None]
+        if reference is None or not kept:
+            continue
+        fit = _PlaneFit(
+            windows,
+            windows.sampled(reference, windows.pixels),
+            [image for image in others if image is not None],
+            T_cw[kept] @ se3_inverse(T_cw[row]),
+            direction_c,
+        )
+        height = fit.height(guess)
+        if height is not None:
+            found.append(height)
+    return np.array(found)
+
+
+def _guess(view: SubmapView, T_cw: Float[Tensor, "R 4 4"]) -> float | None:
+    """A guess of the height, by the map points below the camera in the images of some frames; None for too few."""
+    camera, points_w = view.camera.to("cpu"), view.submap.map.positions_w[view.submap.map.valid_points()]
+    points_c = transform(T_cw, points_w.detach().cpu().double())
+    pixels, seen = camera.project(points_c)
+    below = (points_c[..., 1] > BELOW_HORIZON * points_c[..., 2]) & seen & camera.in_image(pixels)
+    heights = [
+        float(points[near, 1].quantile(GUESS_QUANTILE))
+        for points, near in zip(points_c, below, strict=True)
+        if int(near.sum()) >= LEAST_POINTS
+    ]
+    return float(np.median(heights)) if heights else None
+
+
+@dataclass(frozen=True)
+class _Path:
+    """The path around a frame: its direction, and rows of other frames to compare with."""
+
+    direction_w: Float[Tensor, " 3"]
+    others: tuple[int, ...]
+
+
+def _path(centers_w: Float[Tensor, "K 3"], row: int, height: float) -> _Path | None:
+    """The path around a frame; None where it ends, or bends."""
+    distances = (centers_w - centers_w[row]).norm(dim=-1)
+
+    def nearest(rows: range, least: float) -> int | None:
+        return next((each for each in rows if float(distances[each]) >= least * height), None)
+
+    before, after = range(row - 1, -1, -1), range(row + 1, len(centers_w))
+    ends = nearest(before, PATH), nearest(after, PATH)
+    if ends[0] is None or ends[1] is None:
+        return None
+    parts = torch.stack((centers_w[row] - centers_w[ends[0]], centers_w[ends[1]] - centers_w[row]))
+    back, forth = torch.nn.functional.normalize(parts, dim=-1)
+    if float(back @ forth) < math.cos(math.radians(MAX_BEND_DEG)):
+        return None
+    others = nearest(before, LEAST_BASELINE), nearest(after, LEAST_BASELINE)
+    along = centers_w[ends[1]] - centers_w[ends[0]]
+    return _Path(along / along.norm(), tuple(each for each in others if each is not None))
+
+
+@dataclass(frozen=True)
+class _Windows:
+    """Windows in the lower image: pixels, and their rays with z = 1."""
+
+    camera: Camera
+    pixels: Float[Tensor, "W P 2"]
+    rays: Float[Tensor, "W P 3"]
+
+    @classmethod
+    def of(cls, camera: Camera) -> _Windows | None:
+        """The windows of a camera; None where it does not look at the ground at all."""
+        spacing = max(1.0, SAMPLE_SHARE * camera.width)
+        margin = 2 + spacing * max(RADIUS_X, RADIUS_Y)
+        fy, cy = float(camera.params[1]), float(camera.params[3])
+        top, bottom = max(cy + BELOW_HORIZON * fy, margin), camera.height - 1 - margin
+        if top >= bottom:
+            return None
+        y, x = np.meshgrid(
+            np.linspace(top, bottom, ROWS),
+            np.linspace(margin, camera.width - 1 - margin, COLUMNS),
+            indexing="ij",
+        )
+        v, u = np.meshgrid(
+            spacing * np.arange(-RADIUS_Y, RADIUS_Y + 1),
+            spacing * np.arange(-RADIUS_X, RADIUS_X + 1),
+            indexing="ij",
+        )
+        centers, offsets = (np.stack((a.ravel(), b.ravel()), axis=-1) for a, b in ((x, y), (u, v)))
+        pixels = torch.from_numpy(centers[:, None] + offsets)
+        rays = camera.unproject(pixels)
+        return cls(camera, pixels, rays / rays[..., 2:])
+
+    def sampled(
+        self, image: Float[np.ndarray, "H W"], pixels: Float[Tensor, "W P 2"]
+    ) -> Float[np.ndarray, "W P"]:
+        """Windows of an image, of mean zero and unit length; flat ones are nearly zero."""
+        x, y = pixels.numpy().astype(np.float32).transpose(2, 0, 1)
+        window = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+        window -= window.mean(axis=-1, keepdims=True)
+        least = CONTRAST * math.sqrt(window.shape[-1])
+        normalized: Float[np.ndarray, "W P"] = window / np.maximum(
+            np.linalg.norm(window, axis=-1, keepdims=True), least
+        )
+        return normalized
+
+
+@dataclass(frozen=True)
+class _PlaneFit:
+    """The windows of a frame, and the other frames in which a plane puts them somewhere."""
+
+    windows: _Windows
+    own: Float[np.ndarray, "W P"]
+    others: list[Float[np.ndarray, "H W"]]
+    T_oc: Float[Tensor, "F 4 4"]
+    direction_c: Float[Tensor, " 3"]
+
+    def height(self, guess: float) -> float | None:
+        """The height of the camera above the plane that fits best; None where none fits."""
+        heights = guess * np.exp(np.linspace(-math.log(RANGE), math.log(RANGE), STEPS))
+        rough = replace(self, others=self.others[:1], T_oc=self.T_oc[:1])
+        quality = [rough.quality(height, 0.0) for height in heights]
+        best = int(np.argmax(quality))
+        if best in (0, STEPS - 1):
+            return None
+        at = np.array((math.log(heights[best]), 0.0))
+        steps = np.array((math.log(heights[1] / heights[0]), ROLL_STEP))
+        for _ in range(ROUNDS):
+            for axis in (0, 1):
+                places = [at + shift * steps * (np.arange(2) == axis) for shift in (-1, 0, 1)]
+                left, middle, right = (self.quality(math.exp(height), roll) for height, roll in places)
+                bend = left - 2 * middle + right
+                shift = 0.5 * (left - right) / bend if bend < 0 else float(np.sign(right - left))
+                at[axis] += steps[axis] * max(-1.0, min(1.0, shift))
+            steps /= 2
+        share = float((self.scores(math.exp(at[0]), at[1]) > ALIKE).mean())
+        if share < LEAST_SHARE or abs(at[1]) > MAX_ROLL:
+            return None
+        return math.exp(at[0])
+
+    def quality(self, height: float, roll: float) -> float:
+        """Sum of the squared correlations of the windows with a plane: those that do not lie on it count little."""
+        return float(np.square(self.scores(height, roll).clip(0)).sum())
+
+    def scores(self, height: float, roll: float) -> Float[np.ndarray, " W"]:
+        """Mean correlation of each window with where the plane puts it, over the frames that show that, or 0."""
+        down_c = torch.tensor((math.sin(roll), math.cos(roll), 0.0), dtype=torch.float64, device="cpu")
+        normal_c = down_c - (down_c @ self.direction_c) * self.direction_c
+        inverse_depths = self.windows.rays @ (normal_c / normal_c.norm()) / height
+        points_c = self.windows.rays / inverse_depths.clamp(min=1e-9)[..., None]
+        total, count = np.zeros(len(self.own)), np.zeros(len(self.own))
+        for image, T_oc in zip(self.others, self.T_oc, strict=True):
+            pixels, seen = self.windows.camera.project(transform(T_oc, points_c))
+            inside = (seen & self.windows.camera.in_image(pixels, 1.0)).all(dim=-1).numpy()
+            other = self.windows.sampled(image, torch.where(seen[..., None], pixels, 0.0))
+            total += np.where(inside, (self.own * other).sum(axis=-1), 0.0)
+            count += inside
+        return total / np.maximum(count, 1)
+
+
+def _gray(view: SubmapView, frame_index: int) -> Float[np.ndarray, "H W"] | None:
+    """A gray image; None where it cannot be read."""
+    assert view.sequence is not None  # the caller's condition
+    try:
+        return view.sequence.image(frame_index)[0, 0].cpu().numpy()
+    except FrameError:
+        return None

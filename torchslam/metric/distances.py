@@ -1,0 +1,162 @@
+"""Known lengths as a source of meters: the user clicked two image points, and knows the meters between them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from torchslam.errors import MeasurementError
+from torchslam.metric.image_depth import LocatedPixel, locate_pixel
+from torchslam.metric.options import Given
+from torchslam.metric.scale import MAX_DISAGREEMENT, ScaleMeasurement, ScaleSource, combine_scales
+from torchslam.metric.source import SubmapView, Unmeasured
+
+MAX_METERS = 1e5
+"""Longest known length that is believed; the moon is not measured."""
+UNIT_STD = 0.01
+"""Relative standard deviation of the unit of a map from place to place, by its drift: two lengths in different places
+differ by about that much, however well their ends are found (redkitchen, against its depth images)."""
+MAX_RELATIVE_STD = 0.5
+"""Relative error of a length from which on it says nothing."""
+
+
+@dataclass(frozen=True)
+class Click:
+    """An image point.
+
+    Attributes:
+        frame: index of the frame.
+        pixel: x and y; (0, 0) is the center of the top left pixel.
+    """
+
+    frame: int
+    pixel: tuple[float, float]
+
+    def __str__(self) -> str:
+        return f"{self.frame}:{self.pixel[0]:g},{self.pixel[1]:g}"
+
+
+@dataclass(frozen=True)
+class Distance:
+    """A known length between two clicks, meters."""
+
+    first: Click
+    second: Click
+    meters: float
+
+    def __str__(self) -> str:
+        return f"{self.first} {self.second}"
+
+
+def from_options(given: Given) -> list[Distances]:
+    """The source of all `--distance`.
+
+    Raises:
+        MeasurementError: a click or a length is none.
+    """
+    return [Distances([parse_distance(words) for words in given["distance"]])]
+
+
+def parse_distance(words: Sequence[str]) -> Distance:
+    """Read `FRAME:X,Y FRAME:X,Y METERS`.
+
+    Raises:
+        MeasurementError: it is something else.
+    """
+    whole = f"--distance {' '.join(words)}"
+    first, second = (_click(word, whole) for word in words[:2])
+    try:
+        meters = float(words[2])
+    except ValueError:
+        meters = math.nan
+    if not 0 < meters <= MAX_METERS:
+        raise MeasurementError(f"{whole}: {words[2]} is no length in meters")
+    if first == second:
+        raise MeasurementError(f"{whole}: both points are the same")
+    return Distance(first, second, meters)
+
+
+def _click(word: str, whole: str) -> Click:
+    """Read `FRAME:X,Y`."""
+    frame, _, pixel = word.partition(":")
+    try:
+        x, y = map(float, pixel.split(","))
+        number = int(frame)
+    except ValueError:
+        raise MeasurementError(f"{whole}: write a point as FRAME:X,Y, not {word!r}") from None
+    if number < 0 or not math.isfinite(x) or not math.isfinite(y):
+        raise MeasurementError(f"{whole}: {word} is no point of an image")
+    return Click(number, (x, y))
+
+
+class Distances:
+    """Lengths between clicked points."""
+
+    def __init__(self, distances: Sequence[Distance]) -> None:
+        """Take the lengths."""
+        self._distances = tuple(distances)
+
+    def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
+        """Locate the clicked points of a submap, and compare their distances with the known ones.
+
+        Raises:
+            MeasurementError: a click is outside of the image.
+        """
+        if view.sequence is None or view.sequence.brings_features:
+            return Unmeasured(ScaleSource.DISTANCE, "there are no images to find the points in")
+        width, height = view.camera.size
+        for click in (click for each in self._distances for click in (each.first, each.second)):
+            x, y = click.pixel
+            if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+                raise MeasurementError(
+                    f"--distance {click}: outside of the image of {width} x {height} pixels"
+                )
+        found: list[tuple[Distance, ScaleMeasurement]] = []
+        failed = []
+        for each in self._distances:
+            ends = [locate_pixel(view, click.frame, click.pixel) for click in (each.first, each.second)]
+            wrong = [end for end in ends if isinstance(end, str)]
+            measured = (
+                None if wrong else _measured(each, *(end for end in ends if isinstance(end, LocatedPixel)))
+            )
+            if measured is None:
+                failed.append(wrong[0] if wrong else f"{each} is shorter than its error")
+            else:
+                found.append((each, measured))
+        if not found:
+            return Unmeasured(ScaleSource.DISTANCE, "; ".join(failed))
+        combined = combine_scales([measured for _, measured in found])
+        logs = torch.tensor(
+            [math.log(measured.meters_per_unit / combined.meters_per_unit) for _, measured in found],
+            dtype=torch.float64,
+            device="cpu",
+        )
+        rejected = [
+            f"the length {each} is {abs(log):.1%} ± {measured.relative_std:.1%} off the mean of all"
+            for (each, measured), log in zip(found, logs.tolist(), strict=True)
+            if len(found) > 1 and abs(log) > MAX_DISAGREEMENT * measured.relative_std
+        ]
+        return ScaleMeasurement(
+            ScaleSource.DISTANCE,
+            combined.meters_per_unit,
+            combined.relative_std,
+            len(found),
+            "known lengths" if len(found) > 1 else "known length",
+            (*rejected, *failed),
+            apart=float(logs.square().mean().sqrt()) if len(found) > 1 else None,
+        )
+
+
+def _measured(distance: Distance, first: LocatedPixel, second: LocatedPixel) -> ScaleMeasurement | None:
+    """The unit by one length; None where its error is too large."""
+    between_w = second.point_w - first.point_w
+    length = float(between_w.norm())
+    direction_w = between_w / max(length, 1e-12)
+    variance = float(direction_w @ (first.covariance_w + second.covariance_w) @ direction_w)
+    relative = math.hypot(math.sqrt(variance) / max(length, 1e-12), UNIT_STD)
+    if not relative < MAX_RELATIVE_STD:
+        return None
+    return ScaleMeasurement(ScaleSource.DISTANCE, distance.meters / length, relative, 1, "known length")

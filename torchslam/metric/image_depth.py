@@ -1,0 +1,289 @@
+"""Depth of a pixel of a posed frame: the same small window in frames around it, along the ray of the pixel.
+
+Every hypothesis of depth puts the window somewhere into the other images; the zero-mean normalized correlation says how
+alike they look there. One pixel costs a few hundredths of a second, a depth map seconds.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchslam.errors import FrameError
+from torchslam.geometry import se3_inverse, transform
+from torchslam.metric.source import SubmapView
+
+NEAREST = 30
+"""Observed points nearest to the pixel, whose depths bound the search."""
+NEARER, FARTHER = 0.5, 2.0
+"""The search reaches from so much of the least of these depths to so much of the largest."""
+PLANES = 128
+"""Hypotheses over the range, equally far in inverse depth: a step is about a pixel for a parallax of ten degrees."""
+REFINED = 65
+"""Hypotheses of the second search, over `AGREEING` steps of the first to either side."""
+BESIDE = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
+"""Directions of the clicks beside that of the user."""
+FRAMES = 12
+"""Other frames that are compared at most, spread over those with a fitting parallax."""
+ANGLES_DEG = (1.5, 15.0)
+"""Parallax of these frames: less says little of depth, more makes the window look different."""
+RADII = 4, 8, 12
+"""Of the windows, in samples: a larger one where a smaller one finds nothing, or several places."""
+SAMPLE_SHARE = 1 / 500
+"""Distance of the samples of the window in widths of the image; at least a pixel."""
+BEST_SHARE = 0.6
+"""Share of the frames that must match; the others may not see the point."""
+LEAST_FRAMES = 3
+"""Frames without which there is no depth."""
+LEAST_SCORE = 0.6
+"""Correlation below which nothing was found."""
+AGREEING = 3
+"""Steps of the first search by which the best depth of a single frame may differ."""
+AGREEING_SHARE = 0.4
+"""Least share of the frames whose own best depth is there: repeated and weak texture has others elsewhere."""
+RIVAL = 0.95
+"""A second maximum of so much of the correlation makes the depth ambiguous."""
+MATCH_STD_PX = 0.3
+"""Standard deviation of where a window matches in one image, pixels; noise and the slant of surfaces."""
+CLICK_STD_PX = 1.0
+"""Standard deviation of a click, pixels."""
+CONTRAST = 2.0 / 255
+"""Least standard deviation of the gray levels of a window."""
+
+
+@dataclass(frozen=True)
+class LocatedPixel:
+    """A pixel in the world.
+
+    Attributes:
+        point_w: where it is.
+        covariance_w: by the error of the depth and of the click.
+    """
+
+    point_w: Float[Tensor, " 3"]
+    covariance_w: Float[Tensor, "3 3"]
+
+
+def locate_pixel(view: SubmapView, frame_index: int, pixel: tuple[float, float]) -> LocatedPixel | str:
+    """Find the point of the scene that a pixel shows; or say why it was not found.
+
+    Args:
+        view: the submap, with images.
+        frame_index: of the frame in its sequence.
+        pixel: x and y.
+    """
+    frames = view.frame_index
+    row = torch.nonzero(frames == frame_index)[:, 0]
+    where = f"{pixel[0]:g},{pixel[1]:g} of frame {frame_index}"
+    if not len(row):
+        return f"frame {frame_index} has no pose in this submap"
+    T_cw, center = view.T_cw.detach().cpu().double(), int(row[0])
+    depths = _depths_around(view, int(view.rows[center]), pixel)
+    if not len(depths):
+        return f"no map points are near {where}"
+    sweep = _Sweep.of(view, T_cw, center, pixel, float(depths.median()))
+    if sweep is None:
+        return f"no other frames show {where} from a place {ANGLES_DEG[0]:g} degrees away"
+    low, high = 1 / (FARTHER * float(depths.max())), 1 / (NEARER * float(depths.min()))
+    found: LocatedPixel | str = ""
+    for radius in RADII:
+        found = _search(replace(sweep, radius=radius), low, high, where)
+        if isinstance(found, LocatedPixel):
+            break
+    return found
+
+
+def _search(sweep: _Sweep, low: float, high: float, where: str) -> LocatedPixel | str:
+    """Find the point between two inverse depths; or say why it was not found."""
+    coarse = torch.linspace(low, high, PLANES, dtype=torch.float64, device="cpu")
+    single = sweep.single_scores(np.zeros(2), coarse)
+    scores = _joint(single)
+    best = int(scores.argmax())
+    if float(scores[best]) < LEAST_SCORE:
+        return f"the window around {where} looks different in every other frame"
+    elsewhere = (torch.arange(PLANES, device="cpu") - best).abs() > AGREEING
+    if float(torch.where(elsewhere & _is_peak(scores), scores, -1.0).max()) > RIVAL * float(scores[best]):
+        return f"the depth at {where} is ambiguous: click where the image has more texture"
+    near = (single.argmax(dim=1) - best).abs() <= AGREEING
+    if int(near.sum()) < max(LEAST_FRAMES, AGREEING_SHARE * len(single)):
+        return f"the other frames disagree on the depth at {where}"
+    start, end = coarse[max(best - AGREEING, 0)], coarse[min(best + AGREEING, PLANES - 1)]
+    fine = torch.linspace(float(start), float(end), REFINED, dtype=torch.float64, device="cpu")
+    single = sweep.single_scores(np.zeros(2), fine)
+    inverse_depth = _maximum(fine, _joint(single))
+    # The clicks that a hand with the error of a pixel makes as well see other depths, most of all at an edge.
+    beside = [
+        _maximum(fine, _joint(sweep.single_scores(CLICK_STD_PX * np.array(offset), fine)))
+        for offset in BESIDE
+    ]
+    own = [_maximum(fine, scores) for scores in single[near]]
+    # Poses that lie together have one error: the mean of many frames is not much better than that of a few.
+    match = MATCH_STD_PX / sweep.pixels_per_inverse_depth(inverse_depth)
+    single_std = math.hypot(match, float(np.std(np.array(own))))
+    clicked = float(np.std(np.array([inverse_depth, *beside])))
+    return sweep.located(inverse_depth, math.hypot(clicked, single_std / math.sqrt(LEAST_FRAMES)))
+
+
+def _depths_around(view: SubmapView, frame_row: int, pixel: tuple[float, float]) -> Float[Tensor, " R"]:
+    """Depths, in a posed frame, of the observed points that are nearest to a pixel."""
+    frames, slam_map = view.submap.posed_frames, view.submap.map
+    rows = torch.nonzero(frames.observations["frame_row"] == frame_row)[:, 0]
+    points = slam_map.follow_merges(frames.observations["point_ids"][rows])
+    pixels = frames.observations["pixels"][rows].cpu().double()
+    nearest = (pixels - pixels.new_tensor(pixel)).norm(dim=-1).argsort()[:NEAREST]
+    T_cw = frames.T_cw(slam_map)[frame_row]
+    depths = transform(T_cw, slam_map.positions_w[points[nearest.to(points.device)]])[:, 2].cpu().double()
+    return depths[depths > 0]
+
+
+def _joint(single: Float[Tensor, "F D"]) -> Float[Tensor, " D"]:
+    """Mean of the scores of the frames that match best."""
+    count = min(max(LEAST_FRAMES, math.ceil(BEST_SHARE * len(single))), len(single))
+    return single.topk(count, dim=0).values.mean(dim=0)
+
+
+def _is_peak(scores: Float[Tensor, " N"]) -> Tensor:
+    """Where a score is larger than its neighbors."""
+    padded = torch.nn.functional.pad(scores, (1, 1), value=-1.0)
+    return (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+
+
+def _maximum(at: Float[Tensor, " N"], scores: Float[Tensor, " N"]) -> float:
+    """Place of the maximum, by a parabola through the samples beside it."""
+    best = int(scores[1:-1].argmax()) + 1
+    left, middle, right = scores[best - 1 : best + 2].tolist()
+    bend = left - 2 * middle + right
+    shift = 0.5 * (left - right) / bend if bend < 0 else 0.0
+    return float(at[best]) + max(-1.0, min(1.0, shift)) * float(at[1] - at[0])
+
+
+@dataclass(frozen=True)
+class _Sweep:
+    """A window of a frame, and the other frames in which it is looked for."""
+
+    view: SubmapView
+    T_cw: Float[Tensor, "4 4"]
+    pixel: tuple[float, float]
+    reference: Float[np.ndarray, "H W"]
+    others: list[Float[np.ndarray, "H W"]]
+    T_ow: Float[Tensor, "F 4 4"]
+    radius: int = RADII[0]
+
+    @classmethod
+    def of(
+        cls,
+        view: SubmapView,
+        T_cw: Float[Tensor, "K 4 4"],
+        center: int,
+        pixel: tuple[float, float],
+        depth: float,
+    ) -> _Sweep | None:
+        """Read the images of the frame and of others with parallax; None where there are too few."""
+        point_w = _point(view, T_cw[center], pixel, 1 / depth)
+        rows = _chosen(view, T_cw, center, point_w)
+        reference = _gray(view, int(view.frame_index[center]))
+        images = [_gray(view, int(view.frame_index[row])) for row in rows.tolist()]
+        kept = [number for number, image in enumerate(images) if image is not None]
+        if reference is None or len(kept) < LEAST_FRAMES:
+            return None
+        others = [image for image in images if image is not None]
+        return cls(view, T_cw[center], pixel, reference, others, T_cw[rows[kept]])
+
+    def single_scores(
+        self, offset: Float[np.ndarray, " 2"], inverse_depths: Float[Tensor, " D"]
+    ) -> Float[Tensor, "F D"]:
+        """Correlation, in each frame, of the window at the pixel and an offset; -1 where it is out of the image."""
+        spacing = max(1.0, SAMPLE_SHARE * self.reference.shape[1])
+        steps = spacing * np.arange(-self.radius, self.radius + 1)
+        window = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + np.array(self.pixel) + offset
+        own = _normalized(_sample(self.reference, window)[None])
+        camera = self.view.camera.to("cpu")
+        rays = camera.unproject(torch.from_numpy(window))
+        rays = rays / rays[:, 2:]
+        points_c = rays / inverse_depths[:, None, None]  # (D, P, 3)
+        scores = []
+        for image, T_ow in zip(self.others, self.T_ow, strict=True):
+            points_o = transform(T_ow @ se3_inverse(self.T_cw), points_c)
+            pixels, seen = camera.project(points_o)
+            inside = (seen & camera.in_image(pixels)).all(dim=-1)
+            other = _normalized(_sample(image, torch.where(seen[..., None], pixels, 0.0).numpy()))
+            alike = torch.from_numpy((own * other).sum(axis=-1))
+            scores.append(torch.where(inside, alike, -1.0))
+        return torch.stack(scores)
+
+    def pixels_per_inverse_depth(self, inverse_depth: float) -> float:
+        """How far the pixel moves in the other images with the inverse depth; the median."""
+        camera, step = self.view.camera.to("cpu"), 1e-4 * inverse_depth
+        points_w = torch.stack(
+            [_point(self.view, self.T_cw, self.pixel, inverse_depth + sign * step) for sign in (-1, 1)]
+        )
+        pixels, _ = camera.project(transform(self.T_ow, points_w))
+        return float((pixels[:, 1] - pixels[:, 0]).norm(dim=-1).median()) / (2 * step)
+
+    def located(self, inverse_depth: float, std: float) -> LocatedPixel:
+        """The point at an inverse depth with a standard deviation."""
+        point_w = _point(self.view, self.T_cw, self.pixel, inverse_depth)
+        center_w = se3_inverse(self.T_cw)[:3, 3]
+        ray_w = (point_w - center_w) / (point_w - center_w).norm()
+        distance = float((point_w - center_w).norm())
+        along = distance * std / inverse_depth
+        across = distance * CLICK_STD_PX / float(self.view.camera.focal)
+        outer = ray_w[:, None] * ray_w
+        eye = torch.eye(3, dtype=outer.dtype, device="cpu")
+        return LocatedPixel(point_w, along**2 * outer + across**2 * (eye - outer))
+
+
+def _point(
+    view: SubmapView, T_cw: Float[Tensor, "4 4"], pixel: tuple[float, float], inverse_depth: float
+) -> Float[Tensor, " 3"]:
+    """The point of a pixel at an inverse depth."""
+    ray = view.camera.to("cpu").unproject(torch.tensor([pixel], dtype=torch.float64, device="cpu"))
+    point_w: Tensor = transform(se3_inverse(T_cw), ray / (ray[:, 2:] * inverse_depth))[0]
+    return point_w
+
+
+def _chosen(
+    view: SubmapView, T_cw: Float[Tensor, "K 4 4"], center: int, point_w: Float[Tensor, " 3"]
+) -> Int[Tensor, " F"]:
+    """Frames that may see a point from another place, evenly over those with a fitting parallax."""
+    camera = view.camera.to("cpu")
+    pixels, seen = camera.project(transform(T_cw, point_w[None])[:, :1])
+    border = RADII[0] * max(1.0, SAMPLE_SHARE * camera.width)
+    seen = (seen & camera.in_image(pixels, border))[:, 0]
+    rays = torch.nn.functional.normalize(point_w - se3_inverse(T_cw)[:, :3, 3], dim=-1)
+    angles = torch.rad2deg(torch.acos((rays @ rays[center]).clamp(-1, 1)))
+    fits = torch.nonzero(seen & (angles >= ANGLES_DEG[0]) & (angles <= ANGLES_DEG[1]))[:, 0]
+    if len(fits) <= FRAMES:
+        return fits
+    return fits[torch.linspace(0, len(fits) - 1, FRAMES, device="cpu").round().long()]
+
+
+def _gray(view: SubmapView, frame_index: int) -> Float[np.ndarray, "H W"] | None:
+    """A gray image; None where it cannot be read."""
+    assert view.sequence is not None  # the caller's condition
+    try:
+        return view.sequence.image(frame_index)[0, 0].cpu().numpy()
+    except FrameError:
+        return None
+
+
+def _sample(
+    image: Float[np.ndarray, "H W"], pixels: Float[np.ndarray, "*shape 2"]
+) -> Float[np.ndarray, "*shape"]:
+    """Gray levels between pixels, beyond the image those of its border."""
+    x, y = (pixels[..., axis].astype(np.float32).reshape(-1, pixels.shape[-2]) for axis in (0, 1))
+    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled.reshape(pixels.shape[:-1])
+
+
+def _normalized(windows: Float[np.ndarray, "D P"]) -> Float[np.ndarray, "D P"]:
+    """Windows of mean zero and unit length; flat ones are nearly zero."""
+    centered = windows - windows.mean(axis=-1, keepdims=True)
+    least = CONTRAST * math.sqrt(windows.shape[-1])
+    return centered / np.maximum(np.linalg.norm(centered, axis=-1, keepdims=True), least)
