@@ -165,8 +165,8 @@ def test_the_gradient_is_that_of_finite_differences() -> None:
         expected = torch.stack([(scale(step) - scale(-step)) / 2e-4 for step in eye])
     torch.testing.assert_close(gradient[1:], expected[1:], rtol=1e-5, atol=0)
     torch.testing.assert_close(
-        gradient[0], expected[0], rtol=0.02, atol=0
-    )  # without the curvature of rotations
+        gradient[0], expected[0], rtol=5e-3, atol=0
+    )  # whose stated errors, held here, weigh its bias
 
 
 def test_samples_are_checked() -> None:

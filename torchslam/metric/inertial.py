@@ -44,8 +44,8 @@ POSITION_STD, SMALLEST_POSITION_STD = 5e-3, 1e-4
 WEIGHINGS = 5
 """Rounds that find the standard error of positions from 5 mm; the fifth one of 0.4 mm changes it by a percent."""
 SENSOR_STD = 1e-2
-"""Relative error of the accelerometer's scale factor, which nothing here can find. Data sheets of phones' sensors allow 3 %
-(MPU-6050: initial calibration tolerance). With the true poses of a drone, the scale of its better one is off by 0.5 %."""
+"""Relative error of the accelerometer's scale factor, which nothing here can find. Data sheets allow up to 3 % (initial
+calibration tolerance of the MPU-6050). With the true poses of a drone, the scale of its sensor is off by 0.5 %."""
 WORST = 0.1
 """Relative standard error from which on a scale counts as not determined."""
 STILL_INTERVAL = 0.25

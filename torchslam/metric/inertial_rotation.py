@@ -13,7 +13,7 @@ from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples
 from torchslam.errors import MeasurementError
-from torchslam.geometry import so3_exp, so3_log, umeyama
+from torchslam.geometry import skew, so3_exp, so3_log, umeyama
 from torchslam.geometry.lie import so3_left_jacobian_inverse
 from torchslam.geometry.preintegration import Increments, inertial_steps, preintegrate
 from torchslam.geometry.robust import robustify
@@ -217,13 +217,20 @@ def _refined(
     if not rotation_free:
         J = torch.cat((torch.zeros_like(J[..., :3]), J[..., 3:]), dim=-1)
     known = bias.new_tensor((*(TURN_PRIOR,) * 3, *(BIAS_STD,) * 3, OFFSET_STD)) ** -2
-    before = torch.cat((torch.zeros_like(bias), bias, (offset - prior)[None]))
-    gradient = (J.mT @ weighted).sum(0).squeeze(-1) + known * before
+    off = torch.cat((torch.zeros_like(bias), bias, (offset - prior)[None]))
+    gradient = (J.mT @ weighted).sum(0).squeeze(-1) + known * off
     normal = (J.mT @ (kernel.weight[:, None, None] * J)).sum(0) / std**2 + torch.diag(known)
     hessian = normal
     if exact:
         along = J.mT @ (error / std**2)[..., None]
         hessian = normal + 2 * (kernel.curvature[:, None, None] * along @ along.mT).sum(0)
+        # The rates change with the offset: noisy sensors bend the errors more than the turns themselves do.
+        slopes = ((samples.gyroscope[right] - samples.gyroscope[right - 1]) / (after - before)[:, None])[
+            ..., None
+        ]
+        bend = R_ij @ slopes[1:] - slopes[:-1] + skew(shift.squeeze(-1)) @ R_ij @ rates[1:, :, None]
+        bend = -(weighted * (from_right @ bend)).sum()
+        hessian = hessian + torch.nn.functional.pad(bend.view(1, 1), (6, 0, 6, 0))
     change = -torch.linalg.solve(hessian, gradient)
     stds = torch.linalg.inv(normal.detach()).diagonal().sqrt()
     return InertialRotation(
