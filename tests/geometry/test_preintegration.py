@@ -208,3 +208,34 @@ def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
     for part in found:
         assert (part.dtype, part.device.type) == (dtype, device.type)
         assert torch.isfinite(part).all()
+
+
+def test_agrees_with_gtsam() -> None:
+    """Increments, their covariances, and what a change of the biases makes of them; GTSAM gets small steps."""
+    gtsam = pytest.importorskip("gtsam")
+    data, parts = steps(1, 40), 50
+    bias, change = torch.tensor([0.02, -0.01, 0.03, 0.1, -0.2, 0.05], dtype=torch.float64), 1e-3
+
+    def constant(bias: Tensor) -> object:
+        return gtsam.imuBias.ConstantBias(bias[3:].numpy(), bias[:3].numpy())
+
+    params = gtsam.PreintegrationParams.MakeSharedU(0.0)
+    params.setGyroscopeCovariance(DENSITIES[0] ** 2 * torch.eye(3).double().numpy())
+    params.setAccelerometerCovariance(DENSITIES[1] ** 2 * torch.eye(3).double().numpy())
+    params.setIntegrationCovariance(torch.zeros(3, 3).double().numpy())
+    theirs = gtsam.PreintegratedImuMeasurements(params, constant(bias))
+    for dt, rate, force in zip(*(x[0].numpy() for x in data), strict=True):
+        for _ in range(parts):
+            theirs.integrateMeasurement(force, rate, float(dt) / parts)
+
+    ours = integrate(data, bias)
+    for moved, found in ((0.0, ours), (change, with_bias_change(ours, torch.full((6,), change).double()))):
+        state = theirs.predict(gtsam.NavState(), constant(bias + moved))
+        expected = (state.attitude().matrix(), state.velocity(), state.position())
+        for part, other in zip(found[1:4], expected, strict=True):
+            torch.testing.assert_close(part[0], torch.from_numpy(other.copy()), atol=5e-5, rtol=0)
+    order = torch.tensor([3, 4, 5, 6, 7, 8, 0, 1, 2])  # theirs are rotation, position, velocity
+    covariance = torch.from_numpy(theirs.preintMeasCov())[order][:, order]
+    scale = covariance.diagonal().sqrt()
+    scaled = [x / scale / scale[:, None] for x in (ours.covariance[0], covariance)]
+    torch.testing.assert_close(*scaled, atol=0.02, rtol=0)

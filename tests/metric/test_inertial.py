@@ -192,3 +192,18 @@ def test_a_camera_that_hardly_turns_keeps_the_offset_that_was_given() -> None:
     found = align_rotations(simulation.timestamps[:-10], R[:-10], samples, still)
     assert float(found.offset) == pytest.approx(0.1, abs=1e-6)
     torch.testing.assert_close(found.bias, torch.full((3,), 0.01).double(), atol=1e-4, rtol=0)
+
+
+@pytest.mark.parametrize("size", [0.02, 0.05])
+def test_a_motion_that_drowns_in_noise_has_no_scale(size: float) -> None:
+    simulation = simulate(seconds=20, size=size, position_noise=2e-3, turn_noise=1e-3, sensor_noise=True)
+    assert aligned(simulation).reason is InertialReason.NOT_DETERMINED
+
+
+def test_noise_of_the_map_does_not_make_the_scale_too_small() -> None:
+    """By least squares alone it is 5 % too small."""
+    errors = []
+    for seed in range(3):
+        simulation = simulate(size=0.2, position_noise=2e-3, turn_noise=1e-3, sensor_noise=True, seed=seed)
+        errors.append(float(aligned(simulation).meters_per_unit) / simulation.meters_per_unit - 1)
+    assert abs(sum(errors) / len(errors)) < 0.01
