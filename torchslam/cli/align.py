@@ -130,16 +130,13 @@ def _write(
     by_number = {submap.number: submap for submap in saved.atlas}
     session = results.session
     for number, S_mw in moved.items():
+        submap = by_number[number]
         name = TRAJECTORY if number == main else OTHER_TRAJECTORY.format(number)
-        own = by_number[number].trajectory(session)  # an adjustment with markers has moved single poses
-        write_trajectory(directory / name, own)
+        write_trajectory(directory / name, submap.trajectory(session))  # markers have moved single poses
         if number == main:
-            results_of = (
-                aligned(read_trajectory(directory / ONLINE), S_mw) if len(results.trajectory) else own
-            )
-            write_trajectory(directory / ONLINE, results_of)
-            write_trajectory(directory / KEYFRAMES, by_number[number].map.keyframe_trajectory(session))
-            write_map_cloud(directory / POINT_CLOUD, by_number[number], session)
+            write_trajectory(directory / ONLINE, aligned(read_trajectory(directory / ONLINE), S_mw))
+            write_trajectory(directory / KEYFRAMES, submap.map.keyframe_trajectory(session))
+            write_map_cloud(directory / POINT_CLOUD, submap.map, session, submap.metric)
     write_atlas(directory / MAP, saved.atlas, saved.camera, saved.sessions)
     gone = [directory / name for name in (DENSE_CLOUD, DEPTHS, MESH) if (directory / name).exists()]
     for path in [*gone, *(directory / PICTURES).glob(PICTURE_NAMES)]:

@@ -147,7 +147,7 @@ def densify_results(directory: Path, options: argparse.Namespace) -> dict[str, s
             if (options.processes or 1) > 1 and device.type != "cpu":
                 warnings.warn("--processes is for the CPU: a GPU computes in one process", stacklevel=2)
             found = densify(views, opened, folder, device, on_progress, count, aggregation == "learned")
-    write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap))
+    write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map, submap.metric))
     about = {"dense": _figures(found, size, aggregation, _cpu_seconds() - started)}
     write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
     if (directory / VIEW).exists():
@@ -160,7 +160,9 @@ def densify_results(directory: Path, options: argparse.Namespace) -> dict[str, s
         "dense": f"{directory / DENSE_CLOUD}, {folder}",
     }
     if options.mesh:
-        made = write_mesh(directory / MESH, directory / DEPTHS, upright_from_map(submap), opened)
+        made = write_mesh(
+            directory / MESH, directory / DEPTHS, upright_from_map(submap.map, submap.metric), opened
+        )
         rows["mesh"] = f"{directory / MESH}, {made.triangles} triangles, voxels of {made.voxel:.4g} map units"
     return rows
 

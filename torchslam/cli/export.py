@@ -103,7 +103,7 @@ class Job:
     @property
     def R_up(self) -> Float[torch.Tensor, "3 3"]:
         """Rotation from the map frame to the upright one, the same for every format."""
-        return upright_from_map(self.submap)
+        return upright_from_map(self.submap.map, self.submap.metric)
 
     @property
     def depths(self) -> Path | None:
@@ -321,7 +321,7 @@ def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
 
 
 def _ply(job: Job) -> dict[str, str]:
-    write_map_cloud(job.output, job.submap, job.session)
+    write_map_cloud(job.output, job.submap.map, job.session, job.submap.metric)
     keyframes = len(job.submap.map.keyframe_rows(job.session))
     return {"points": f"{job.submap.map.num_points}, and {keyframes} keyframes"}
 

@@ -26,7 +26,7 @@ from torchslam.calibration.find_camera import ROUGH_STD, find_camera, with_state
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
-from torchslam.config import Config
+from torchslam.config import Config, load_config
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found
 from torchslam.data.sequence import Calibrated
@@ -160,6 +160,8 @@ def execute(options: argparse.Namespace) -> int:
         options.config = options.config or (own if own.is_file() else None)
         options.map = options.map / MAP
     opened, config = _sequence(options), arguments.config(options)
+    if options.map is not None:  # what was measured belongs to the frames of the session before
+        config = replace(config, metric=load_config(None, arguments.overrides(options)).metric)
     if options.dense:
         map_size(options.resolution, opened.size)  # raises now rather than after the run
     if options.mapping == Mapping.GLOBAL.value and _mode(opened, options) is None:

@@ -156,7 +156,7 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
     if sequence.groundtruth is not None:
         write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
     write_atlas(directory / MAP, run.submaps, run.camera, run.sessions)
-    write_map_cloud(directory / POINT_CLOUD, run.main, run.session)
+    write_map_cloud(directory / POINT_CLOUD, run.map, run.session, run.metric)
     if run.calibration is not None and not run.session:
         remark, std = str(metrics.get("camera", "")), run.calibration.focal_std
         write_calibration(directory / CALIBRATION, run.camera, [remark] if remark else [], std)
@@ -186,7 +186,9 @@ def read_results(directory: Path) -> Results:
         frames=read_frames(directory / FRAMES),
         metrics=metrics,
         example_image=read_gray(example, str(example))[0, 0] if example.exists() else None,
-        cloud=read_cloud(cloud, upright_from_map(main[0])) if main and cloud.exists() else None,
+        cloud=read_cloud(cloud, upright_from_map(main[0].map, main[0].metric))
+        if main and cloud.exists()
+        else None,
     )
 
 

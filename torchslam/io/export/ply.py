@@ -17,8 +17,8 @@ from torchslam.dense.cloud import PointCloud
 from torchslam.errors import ResultsError
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import upright_rotation
-from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
+from torchslam.map.unit import MetricUnit
 from torchslam.utils.files import read_bytes, write_whole
 
 POSITION, NORMAL, COLOR = ("x", "y", "z"), ("nx", "ny", "nz"), ("red", "green", "blue")
@@ -33,23 +33,22 @@ MAX_BYTES = 1 << 33  # of a cloud that is read: 270 million points
 UNIT_TOLERANCE = 1e-3  # of the length of a normal
 
 
-def upright_from_map(submap: Submap) -> Float[Tensor, "3 3"]:
-    """Rotation from the world of a submap to the upright one of all exports, float64; none where gravity is known."""
-    T_wc = se3_inverse(submap.map.T_cw).double()
-    if submap.metric is not None and submap.metric.is_level:
+def upright_from_map(slam_map: Map, unit: MetricUnit | None = None) -> Float[Tensor, "3 3"]:
+    """Rotation from the world of a map to the upright one of all exports, float64; none if its unit knows gravity."""
+    T_wc = se3_inverse(slam_map.T_cw).double()
+    if unit is not None and unit.is_level:
         return torch.eye(3, dtype=T_wc.dtype, device=T_wc.device)
     return upright_rotation(T_wc)
 
 
-def write_map_cloud(path: str | Path, submap: Submap | None, session: int) -> None:
-    """Write the points of a submap in the colors of the images, and the keyframes of a session in red, z up."""
-    slam_map = Map() if submap is None else submap.map
-    if submap is None or slam_map.num_keyframes == 0:
+def write_map_cloud(path: str | Path, slam_map: Map, session: int, unit: MetricUnit | None = None) -> None:
+    """Write the points of a map in the colors of the images, and the keyframes of a session in red, z up."""
+    if slam_map.num_keyframes == 0:
         nothing = torch.zeros(0, 3, dtype=torch.float32, device="cpu")
         write_ply(path, nothing, nothing.byte(), nothing)
         return
     T_wc, points, alive = se3_inverse(slam_map.T_cw), slam_map.points, slam_map.valid_points()
-    R_up = upright_from_map(submap).to(T_wc)
+    R_up = upright_from_map(slam_map, unit).to(T_wc)
     write_ply(
         path,
         slam_map.positions_w[alive] @ R_up.mT,

@@ -155,7 +155,7 @@ def _submap(
     keyframes = submap.map.keyframe_trajectory(results.session)
     up = torch.eye(4, dtype=torch.float64, device="cpu")
     if evaluation is None:
-        up[:3, :3] = upright_from_map(submap)
+        up[:3, :3] = upright_from_map(submap.map, submap.metric)
     else:
         up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
     S = up @ S

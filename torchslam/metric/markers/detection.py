@@ -22,8 +22,8 @@ MAX_SHIFT_PX = 3.0
 """Largest distance between the corners by a threshold and those by the edges: else the edges are others."""
 MIN_SIDE_PX = 12.0
 """Shortest side of a marker that counts, pixels: below, a tenth of a pixel is a percent of its size."""
-SQUARE_SHARE = 0.25
-"""Window in which the corner of a board is refined, in squares: no other corner may lie in it."""
+FREE_SHARE = 0.75
+"""Window in which a corner of a ChArUco board is refined, in widths of the white around its markers."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,8 @@ class CharucoDetector:
         self._seen[family] += len(rows)
         pixels, rows = pixels.reshape(-1, 2).astype(np.float32), rows.ravel().astype(int)
         side = _side_px(pixels, self._target.corners(0)[rows], self._target.size)
-        half = max(2, round(SQUARE_SHARE * side))
+        free = (self._target.size - self._target.marker_size) / (2 * self._target.size)
+        half = max(2, int(FREE_SHARE * free * side))
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
         pixels = cv2.cornerSubPix(image, pixels[:, None].copy(), (half, half), (-1, -1), stop).reshape(-1, 2)
         return [Detection(0, rows, pixels.astype(float))]

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.errors import FrameError, MeasurementError
-from torchslam.geometry import Camera, transform
+from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.metric.markers.corners import GraphWithCorners, PlacedTarget, Sighting, add_corners
 from torchslam.metric.markers.detection import Detector, detector_of
 from torchslam.metric.markers.targets import Target, TargetKind, parse_target
@@ -173,12 +173,15 @@ def scale_of_targets(
 
     used, lines = _agreeing(targets, sizes, std)
     mean = sizes.mean(used)
+    # A bundle adjustment leaves the unit open: what has an error is the length of the path in meters.
+    centers_w = se3_inverse(solution.T_cw[with_corners.graph.is_keyframe])[:, :3, 3]
+    path = 0.5 * (centers_w - centers_w.mean(dim=0)).square().sum().log()
     deviations = (logs - mean).detach()[used]
     weights = information[used] / information[used].sum()
     side_px = float(
         torch.tensor([t.side_px for t in targets], dtype=torch.float64, device="cpu")[used.cpu()].median()
     )
-    formal = std(mean)
+    formal = std(mean + path)
     if len(deviations) > 1:
         apart = math.sqrt(float((weights * deviations.square()).sum()))
         # The error of a mean whose weights are those of the information, by the spread of what it is the mean of.
