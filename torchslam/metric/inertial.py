@@ -42,7 +42,7 @@ SHORTEST, FEWEST_FRAMES = 3.0, 12
 POSITION_STD, SMALLEST_POSITION_STD = 5e-3, 1e-4
 """Meters: the standard error of a position with which the search begins, and the least one."""
 WEIGHINGS = 5
-"""Rounds that find the standard error of positions from 5 mm; the fifth one of 0.4 mm changes it by a percent."""
+"""Rounds that find the standard error of positions from 5 mm; the fifth one changes 0.4 mm by 0.2 %."""
 SENSOR_STD = 1e-2
 """Relative error of the accelerometer's scale factor, which nothing here can find. Data sheets allow up to 3 % (initial
 calibration tolerance of the MPU-6050). With the true poses of a drone, the scale of its sensor is off by 0.5 %."""

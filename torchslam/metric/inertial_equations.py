@@ -31,7 +31,7 @@ ATTENUATION_STD = 0.5
 """Relative error of the share of noise in the scale. In a simulated motion of 3 cm with positions good to 2 mm and no
 drift, the share is taken to be 65 %, which makes the scale 56 % too large: it then counts as not determined."""
 NEWTON_STEPS = 10
-"""Steps to the minimum; from gravity of 2 % too much, the fourth one changes the scale by 1e-9."""
+"""Steps to the minimum; on a drone's recording the fourth one no longer changes the scale."""
 
 
 class Equations(NamedTuple):
