@@ -26,7 +26,7 @@ LARGEST_OFFSET = 0.5
 OFFSET_STEP = 0.01
 """Seconds between offsets that are tried; the search by derivatives finds offsets that are 0.1 s away."""
 CONVINCING = 0.7
-"""Correlation of the angular speeds from which another offset than the given one is believed. On a drone, 0.96 to 0.98."""
+"""Correlation of angular speeds from which another offset than the given one is believed. On a drone, 0.96 to 0.98."""
 LARGEST_RATIO = 10.0
 """Of the speeds with which camera and sensor turn: radians and degrees differ by 57, a bias by less than 2."""
 OFFSET_STD = 0.01
