@@ -31,7 +31,9 @@ from torchslam.data import open_sequence, parse_camera, read_calibration, read_t
 from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_color, read_gray
+from torchslam.data.formats.imu_files import read_imu, read_inertial_calibration
 from torchslam.data.formats.speed_file import read_speeds
+from torchslam.data.inertial import InertialSamples
 from torchslam.data.sequence import Sequence
 from torchslam.dense import DepthMaps
 from torchslam.errors import CalibrationError, ConfigError, FrameError, InitializationError, ResultsError
@@ -90,6 +92,7 @@ def readers() -> dict[str, Reader]:
     found = [
         Reader("tum", valid_inputs.tum, _sequence, 2200),
         Reader("euroc", valid_inputs.euroc, _sequence, 1700),
+        Reader("imu", valid_inputs.imu, _imu, 900),
         Reader("kitti", valid_inputs.kitti, _sequence, 1700),
         Reader("kitti raw", valid_inputs.kitti_raw, partial(_sequence, name="drive_sync"), 1700),
         Reader("7-scenes", valid_inputs.seven_scenes, partial(_sequence, camera=CAMERA), 1000),
@@ -213,6 +216,17 @@ def _some(kind: str, *names: str) -> Files:
 def _sequence(root: Path, name: str = "", camera: str | None = None, mask: str | None = None) -> Sequence:
     sequence = open_sequence(root / name, camera, mask=None if mask is None else root / mask)
     return _frames(sequence)
+
+
+def _imu(root: Path) -> InertialSamples:
+    samples = read_imu(root / "imu.csv")
+    calibration = read_inertial_calibration(root / "camera.yaml", root / "imu.csv")
+    assert calibration.T_bc is not None
+    assert bool(calibration.T_bc.isfinite().all())
+    for part in (samples.timestamps, samples.gyroscope, samples.accelerometer):
+        assert bool(part.isfinite().all())
+    assert bool((samples.timestamps.diff() > 0).all())
+    return samples
 
 
 def _frames(sequence: Sequence) -> Sequence:

@@ -92,6 +92,16 @@ def euroc() -> Files:
     }
 
 
+def imu() -> Files:
+    rows = "".join(f"{1000 + i / 200:.4f},0.1,-2e-3,0.3,0.2,9.8,-0.1\n" for i in range(6))
+    names = [f"gyro_{axis} [rad/s]" for axis in "xyz"] + [f"acc_{axis} [m/s^2]" for axis in "xyz"]
+    return {
+        "imu.csv": (",".join(["time [s]", *names]) + "\n" + rows).encode(),
+        "camera.yaml": SENSOR.encode(),
+        "imu.yaml": b"gyroscope_noise_density: 1.7e-4\naccelerometer_noise_density: 2e-3\n",
+    }
+
+
 def kitti() -> Files:
     return pictures([f"image_0/{index:06d}.png" for index in range(3)]) | {
         "times.txt": b"0.000000e+00\n1.037430e-01\n2.074860e-01\n",

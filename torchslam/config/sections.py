@@ -677,3 +677,13 @@ class MetricConfig(Settings, section="metric"):
         "Poses of another sensor in meters, as of wheels: a trajectory in TUM format, in a frame of its own.",
     )
     odometry_clock: str = setting("", "The clock of that odometry, as --gps-clock.")
+    imu: str = setting(
+        "",
+        "Samples of an inertial sensor that moves with the camera: EuRoC's imu0, or a CSV whose header names time, "
+        "gyro_x to gyro_z and acc_x to acc_z with their units, as in `gyro_x [deg/s]`.",
+    )
+    imu_camera: str = setting(
+        "",
+        "How that sensor is mounted on the camera: Kalibr's camchain-imucam, EuRoC's sensor.yaml of the camera, or "
+        "ORB-SLAM3's settings. Without it, the rotation between the two is found.",
+    )

@@ -54,6 +54,14 @@ from torchslam.geometry.lie import (
     vee,
 )
 from torchslam.geometry.p3p import p3p
+from torchslam.geometry.preintegration import (
+    Increments,
+    InertialSteps,
+    compose_increments,
+    inertial_steps,
+    preintegrate,
+    with_bias_change,
+)
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
 from torchslam.geometry.similarity import Similarity, estimate_similarity, umeyama
 from torchslam.geometry.triangulation import (
@@ -70,6 +78,8 @@ __all__ = [
     "CHI_SQUARE_95",
     "AbsolutePose",
     "Camera",
+    "Increments",
+    "InertialSteps",
     "KeypointNoise",
     "MultiViewTriangulation",
     "RelativePose",
@@ -78,6 +88,7 @@ __all__ = [
     "Triangulation",
     "UndistortedKeypoints",
     "Undistortion",
+    "compose_increments",
     "correct_matches",
     "decompose_essential",
     "decompose_homography",
@@ -93,11 +104,13 @@ __all__ = [
     "geodetic_from_ecef",
     "geodetic_from_enu",
     "homography_from_matches",
+    "inertial_steps",
     "innovation_covariances",
     "mahalanobis_squared",
     "matrix_from_quaternion",
     "p3p",
     "passes_gate",
+    "preintegrate",
     "quaternion_from_matrix",
     "rigid",
     "rotation_from_matches",
@@ -127,4 +140,5 @@ __all__ = [
     "triangulation_covariance",
     "umeyama",
     "vee",
+    "with_bias_change",
 ]

@@ -113,6 +113,14 @@ def so3_left_jacobian(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
 
 
 @full_precision
+def so3_double_integral(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
+    """The integral of exp(u omega) over u in [0, s], and that over s in [0, 1]; half the identity for no rotation."""
+    _, _, c, d = _rodrigues((omega * omega).sum(-1)[..., None, None])
+    W = skew(omega)
+    return 0.5 * torch.eye(3, dtype=omega.dtype, device=omega.device) + c * W + d * (W @ W)
+
+
+@full_precision
 def so3_left_jacobian_inverse(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Inverse of the left Jacobian, for angles below 2 pi."""
     _, b, c, d = _rodrigues((omega * omega).sum(-1)[..., None, None])

@@ -83,6 +83,10 @@ KINDS: tuple[SourceKind, ...] = (
         (Option("odometry", ("FILE",)), Option("odometry_clock", ("CLOCK",))),
         "torchslam.metric.odometry:from_options",
     ),
+    SourceKind(
+        (Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))),
+        "torchslam.metric.inertial_source:from_options",
+    ),
 )
 """All kinds, in the order in which they measure: markers, which also improve the poses, come first."""
 

@@ -8,8 +8,11 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchslam.config import MetricConfig
 from torchslam.data import Calibrated, open_sequence
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
+from torchslam.metric.inertial_source import InertialSource
+from torchslam.metric.options import given_options, sources_of
 
 SENSOR = """\
 %YAML:1.0
@@ -51,6 +54,23 @@ def folder(tmp_path: Path, write_picture: Callable) -> Path:
     rows = [f"{time + 1000},{index},0,0,1,0,0,0,9,9,9,9,9,9,9,9,9\n" for index, time in enumerate(times)]
     (truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], ...\n" + "".join(rows))
     return folder
+
+
+def test_brings_its_inertial_sensor_along(folder: Path) -> None:
+    assert open_sequence(folder).measurements == {}
+    sensor = folder / "mav0" / "imu0"
+    sensor.mkdir()
+    (sensor / "data.csv").write_text(
+        "#timestamp [ns],w_RS_S_x [rad s^-1],w_RS_S_y [rad s^-1],w_RS_S_z [rad s^-1],a_RS_S_x [m s^-2],"
+        "a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]\n"
+        "1403636579758555392,0.1,0.2,0.3,9.8,0.1,-0.2\n1403636579763555392,0.1,0.2,0.3,9.8,0.1,-0.2\n"
+    )
+    (source,) = sources_of(given_options(MetricConfig(), open_sequence(folder).measurements))
+    assert isinstance(source, InertialSource)
+    assert len(source.samples.timestamps) == 2
+    assert source.calibration.T_bc is not None
+    assert source.calibration.T_bc[:3, 3].tolist() == [0.1, 0.2, 0.3]
+    assert sources_of(given_options(MetricConfig(own=False), open_sequence(folder).measurements)) == []
 
 
 def test_reads_frames_camera_and_poses(folder: Path) -> None:

@@ -107,6 +107,15 @@ def read_matrix(path: Path, key: str, count: int) -> list[float]:
     return numbers
 
 
+def read_keys(path: Path) -> Iterator[Keys]:
+    """The keys of each mapping in a file, from the outermost one inward. Raises CalibrationError if there are none."""
+    tree = _tree(path, read_text(path, CalibrationError, MAX_BYTES))
+    if not tree:
+        raise CalibrationError(f"{path}: no keys in it; a YAML, XML or JSON file is needed")
+    for chain in _mappings(tree):
+        yield Keys(chain[-1], str(path))
+
+
 def _tree(path: Path, text: str) -> Tree | None:
     try:
         return read_tree(text, path.suffix)

@@ -1,10 +1,11 @@
-"""Folders of the EuRoC MAV dataset: `mav0/cam0/{data.csv,sensor.yaml,data/}` and the body's ground truth.
+"""Folders of the EuRoC MAV dataset: `mav0/cam0/{data.csv,sensor.yaml,data/}`, the body's truth and inertial sensor.
 
 Source: https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets
 """
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 
 import torch
@@ -23,6 +24,8 @@ from torchslam.types import Trajectory
 
 NANOSECONDS = 1_000_000_000
 """Unit of the times in the files, per second."""
+IMU = "imu0"
+"""Folder of the inertial sensor, whose frame is the body's."""
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 
@@ -47,7 +50,10 @@ def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> Im
         camera = camera if camera is not None else read_calibration(sensor)
         groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor)) if has_truth else None
     name = folder.resolve().parent.name if folder.name == "mav0" else folder.name
-    return ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth, notes)
+    sequence = ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth, notes)
+    if sensor.exists() and (root / IMU / "data.csv").is_file():
+        sequence.measurements = {"imu": shlex.quote(str(root / IMU)), "imu_camera": shlex.quote(str(sensor))}
+    return sequence
 
 
 def _root(path: Path) -> Path:
