@@ -42,6 +42,7 @@ from torchslam.io.results import (
     read_image_source,
     read_metrics,
     read_results,
+    readout_of,
 )
 from torchslam.io.viewer.page import write_view
 from torchslam.io.write_run import draw
@@ -85,7 +86,8 @@ def execute(options: argparse.Namespace) -> int:
         if not submap.posed_frames.count(session):
             continue
         images = _images(directory, metrics, saved, submap, options.images)
-        S_mw, silent = bring_into_meters(SubmapView(submap, saved.camera, session, images), sources)
+        view = SubmapView(submap, saved.camera, session, images, readout_of(metrics))
+        S_mw, silent = bring_into_meters(view, sources)
         moved |= {submap.number: S_mw} if submap.metric is not None else {}
         if submap.number == metrics["submap"]:
             unmeasured = [f"{each.source}: {each.reason}" for each in silent]

@@ -10,6 +10,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry import Camera
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.map.atlas import Submap
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 
@@ -37,12 +38,14 @@ class SubmapView:
         camera: of all frames.
         session: the session whose frames the measurements belong to.
         sequence: the images of the session; None where they are not at hand.
+        readout: of a rolling shutter; None: a global one.
     """
 
     submap: Submap
     camera: Camera
     session: int = 0
     sequence: Images | None = None
+    readout: Readout | None = None
 
     @property
     def rows(self) -> Int[Tensor, " K"]:

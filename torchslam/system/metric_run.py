@@ -35,7 +35,8 @@ def run_in_meters(run: Run, sequence: Images | None, sources: Iterable[MetricSou
         if not submap.posed_frames.count(run.session):
             continue
         try:
-            S_mw, silent = bring_into_meters(SubmapView(submap, run.camera, run.session, sequence), sources)
+            view = SubmapView(submap, run.camera, run.session, sequence, run.readout)
+            S_mw, silent = bring_into_meters(view, sources)
         except MeasurementError as error:
             return replace(run, results=results, unmeasured=(str(error),))
         if submap is run.main:

@@ -72,7 +72,7 @@ class Markers:
         if view.sequence is None or view.sequence.brings_features:
             return Unmeasured(ScaleSource.MARKER, "there are no images to find markers in")
         submap = view.submap
-        graph = submap.posed_frames.graph(submap.map, view.camera)
+        graph = submap.posed_frames.graph(submap.map, view.camera, readout=view.readout)
         detectors = [self._make_detector(target, view.camera) for target in self._targets]
         sightings = find_targets(graph, view.session, view.sequence, detectors)
         if not sightings:
