@@ -162,7 +162,7 @@ def test_the_first_tracked_frame_does_not_wait_for_the_undistortion_table() -> N
     slam = SLAM(
         Camera.fisheye(150, 150, width / 2, height / 2, 0.02, -0.01, 0, 0, size=(width, height)), CONFIG
     )
-    undistorted = slam.tracker.localizer.undistorted
+    undistorted = slam.shared_camera.undistortion
     assert "_table" not in vars(undistorted)
     with with_workers(sequence, slam, 1):
         assert "_table" in vars(undistorted)

@@ -31,6 +31,10 @@ from torchslam.utils.deprecation import OldCall
 
 OnFailure = Literal["raise", "skip"] | float
 
+CLIP_OPTIONS = GRAPH_OPTIONS.replace(kernel="huber", scale=2.45)
+"""95 % of the norms of two standard normal numbers lie below the scale. Not the tails of a finished run: while they
+learn, keypoints may be off by many times the noise of those that the graph was built with."""
+
 # Clips whose keypoints moved by 0.5 px need 5 to 70, by 1.5 px mostly below 200; 30 are too few for a third of them.
 _ITERATIONS = 300
 # Relative cost decrease that the last step predicts: gradients are then right to 2e-6; with 1e-10 to 1e-4. Rounding of
@@ -363,7 +367,7 @@ class ClipSLAM(nn.Module):
         solvable = [each for each in graphs if each is not None]
         found = iter(
             solve_graphs(
-                solvable, options=GRAPH_OPTIONS.replace(iterations=_ITERATIONS, tolerance=_TOLERANCE)
+                solvable, options=CLIP_OPTIONS.replace(iterations=_ITERATIONS, tolerance=_TOLERANCE)
             )
         )
         solutions = tuple(None if each is None else next(found) for each in graphs)
@@ -392,7 +396,11 @@ class ClipSLAM(nn.Module):
             for index, image in enumerate(images)
         ]
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
-        return None if run.main is None else run.main.posed_frames.graph(run.map, run.camera), run.failure
+        if run.main is None:
+            return None, run.failure
+        # With the stated noise: training moves the keypoints away from those of which a noise was found.
+        graph = run.main.posed_frames.graph(run.map, run.camera)
+        return replace(graph, weights=graph.weights * run.map.final_variance), run.failure
 
 
 def _per_clip(features: Features | Sequence[Features]) -> Sequence[Features]:
