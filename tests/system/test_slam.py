@@ -400,7 +400,7 @@ def test_the_gradient_of_the_error_reaches_camera_and_keypoints() -> None:
     assert fx.grad is not None
     assert pixels.grad is not None
     with torch.no_grad():
-        h = 1e-3
+        h = 1e-2  # far above what a minimum is off by
         numeric = (error(fx + h, pixels) - error(fx - h, pixels)) / (2 * h)
         assert float(fx.grad) == pytest.approx(float(numeric), rel=1e-3)
         direction = pixels.grad / pixels.grad.norm()

@@ -131,7 +131,9 @@ def test_weights_multiply_the_information_of_what_is_seen() -> None:
     assert len(run.trajectory) == len(WALK)
     weights, pixels = run.graph.weights * run.map.final_variance, run.graph.pixels
     right, left = weights[pixels[:, 0] >= 160], weights[pixels[:, 0] < 160]
-    assert float(right.isclose(right.new_tensor(4.0)).double().mean()) > 0.8  # half a scale, which is 1, and all of the weight
+    assert (
+        float(right.isclose(right.new_tensor(4.0)).double().mean()) > 0.8
+    )  # half a scale, which is 1, and all of the weight
     assert float(left.isclose(left.new_tensor(2.0)).double().mean()) > 0.8
 
 

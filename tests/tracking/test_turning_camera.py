@@ -49,7 +49,9 @@ def views_of(T_cw: Tensor, readout: float, noise: float = 0.2) -> list[FrameFeat
 
 def start(views: list[FrameFeatures], *overrides: str) -> tuple[TwoViewMap | None, list[Reason]]:
     """The first map, and why there was none before."""
-    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60", *overrides]))
+    initializer = Initializer(
+        SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60", *overrides])
+    )
     reasons = []
     for view in views:
         result = initializer.step(view)

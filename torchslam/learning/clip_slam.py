@@ -366,9 +366,7 @@ class ClipSLAM(nn.Module):
         )
         solvable = [each for each in graphs if each is not None]
         found = iter(
-            solve_graphs(
-                solvable, options=CLIP_OPTIONS.replace(iterations=_ITERATIONS, tolerance=_TOLERANCE)
-            )
+            solve_graphs(solvable, options=CLIP_OPTIONS.replace(iterations=_ITERATIONS, tolerance=_TOLERANCE))
         )
         solutions = tuple(None if each is None else next(found) for each in graphs)
         clips = [_posed(*one) for one in zip(graphs, solutions, seen, keypoint_weights, cameras, strict=True)]

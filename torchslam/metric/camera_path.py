@@ -164,7 +164,7 @@ def on_clock_of_images(
             )
         times = times - clock.start + path.first_image
     elif _is_absolute(times) and _is_absolute(own) and not _overlap(times, own):
-        as_gps = torch.tensor([utc_from_gps(time) for time in times.tolist()], dtype=torch.float64)
+        as_gps = times.new_tensor([utc_from_gps(time) for time in times.tolist()])
         times = as_gps if _overlap(as_gps, own) else times
     if _overlap(times, own):
         return times

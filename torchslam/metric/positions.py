@@ -157,7 +157,7 @@ class PositionSource:
         inside = torch.nonzero(path.at(times)[2])[:, 0]
         if count == 0 or len(inside) < 2 * MIN_POSITIONS:
             return 0.0
-        rows = inside[torch.linspace(0, len(inside) - 1, min(len(inside), SEARCH_POSITIONS)).long()]
+        rows = inside[:: max(1, len(inside) // SEARCH_POSITIONS)]
         nan = torch.full((len(rows), 2), math.nan, dtype=torch.float64, device="cpu")
         best, gain = 0.0, SEARCH_GAIN
         reference = math.nan

@@ -18,7 +18,7 @@ from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, solve_graph
 
 BEND = 2.45
-"""Of the Huber kernel, in standard deviations: that of `solve_graph`."""
+"""Of the Huber kernel, in standard deviations: 95 % of the norms of two standard normal numbers lie below it."""
 LEAST_VIEWS = 4
 """Keyframes of a point whose residuals are learned from: points that fewer see follow the noise of each."""
 USUAL = 8.0
@@ -79,7 +79,9 @@ def weighed(example: Example, model: NoiseModel) -> Example:
 
 def solved(example: Example) -> Example:
     """The run at the minimum of its graph."""
-    solution = solve_graph(example.graph, options=GRAPH_OPTIONS.replace(scale=BEND, backward="detached"))
+    solution = solve_graph(
+        example.graph, options=GRAPH_OPTIONS.replace(kernel="huber", scale=BEND, backward="detached")
+    )
     return replace(example, graph=replace(example.graph, T_cw=solution.T_cw, points_w=solution.points_w))
 
 
@@ -107,7 +109,7 @@ def residuals(example: Example, informed: Example) -> Residuals:
 
 
 def losses(model: NoiseModel, found: Residuals) -> Tensor:
-    """(n,) negative log-likelihoods but for a constant; the kernel of `solve_graph` is the logarithm of their density.
+    """(n,) negative log-likelihoods but for a constant; the kernel is the logarithm of their density.
 
     Of models without a level of the image: these say nothing of how large errors are.
     """
@@ -178,7 +180,8 @@ def fit_trajectories(model: NoiseModel, examples: Sequence[Example], settings: S
         for row, example in enumerate(now):
             informed = weighed(example, found)
             solution = solve_graph(
-                informed.graph, options=GRAPH_OPTIONS.replace(scale=BEND, iterations=10, tolerance=1e-8)
+                informed.graph,
+                options=GRAPH_OPTIONS.replace(kernel="huber", scale=BEND, iterations=10, tolerance=1e-8),
             )
             (position_error(example, solution).log() / len(now)).backward()
             # The next step starts where this one ended.

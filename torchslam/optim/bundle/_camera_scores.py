@@ -71,7 +71,10 @@ def camera_scores(
         return None
     none = factorized.equations.gradient
     none = BundleTangent(*(torch.zeros_like(part) for part in none))
-    columns = [factorized.solve(none._replace(cameras=unit[None])) for unit in torch.eye(n, dtype=directions.dtype, device=directions.device)]
+    columns = [
+        factorized.solve(none._replace(cameras=unit[None]))
+        for unit in torch.eye(n, dtype=directions.dtype, device=directions.device)
+    ]
     # The camera's block of the inverse, by which the steps of frames and points are those of a step by one.
     block = torch.linalg.inv(torch.stack([column.cameras[0] for column in columns], dim=-1))
     frames, points = (
