@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
-import sys
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int, Num, Shaped
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.data.trajectories import nearest
@@ -26,7 +23,8 @@ from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
 from torchslam.io.report import unit_words
 from torchslam.io.results import Results, aligned, aligned_poses, readout_of
-from torchslam.io.viewer.ruler import clearest_observations, error_factors
+from torchslam.io.viewer.arrays import encoded
+from torchslam.io.viewer.ruler import of_points
 from torchslam.map.atlas import Submap
 from torchslam.types import State, Trajectory
 from torchslam.utils.text import printable
@@ -68,7 +66,7 @@ def _asset(name: str) -> str:
 MAX_POINTS = 150_000  # of all submaps together: 42 bytes each in the page
 MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
 DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
-STEPS = 65535  # of a coordinate of the dense cloud, over the extent of the cloud; of a pixel, over the image
+STEPS = 65535  # of a coordinate of the dense cloud, over the extent of the cloud
 MAX_FRAMES = 20_000  # 100 bytes each in the page
 MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
 FRUSTUM = 0.035  # its depth, in radii of the scene
@@ -116,20 +114,6 @@ def page_data(results: Results) -> dict[str, Any]:
     }
 
 
-def encoded(values: Num[Tensor, "*shape"] | np.ndarray | list[Any], kind: str) -> dict[str, str]:
-    """Encode numbers as base64 of their little-endian bytes, row by row."""
-    array = np.ascontiguousarray(np.asarray(values, dtype=kind))
-    if sys.byteorder == "big":
-        array = array.byteswap()
-    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
-
-
-def decoded(packed: dict[str, str]) -> Shaped[np.ndarray, " N"]:
-    """Decode the result of `encoded` to a flat array."""
-    kind = np.dtype(packed["type"]).newbyteorder("<")
-    return np.frombuffer(base64.b64decode(packed["data"]), kind)
-
-
 def _submap(
     submap: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
 ) -> dict[str, Any]:
@@ -146,8 +130,7 @@ def _submap(
         level: whether z is known to be up
         points, colors: (P, 3); points without an observed image have no color
         points_total: number of points before thinning
-        seen_frame, seen_pixel: (P,), (P, 2) an observation of each, see `clearest_observations`; pixels in steps
-        error_step, error_factor: (P,), (P, 6) errors of the points, see `error_factors`
+        seen_frame, seen_pixel, error_step, error_factor: image points and errors of the points, see `of_points`
         dense: the dense cloud, see `_dense`; None if there is none
         box: (2, 3) lowest and highest corner around the scene
         radius: half the diagonal of the box
@@ -207,7 +190,7 @@ def _submap(
         "points": encoded(transform(S, points_w)[kept], "float32"),
         "colors": encoded(colors[kept] if bool(colors.any()) else colors[:0], "uint8"),
         "points_total": len(points_w),
-        **_for_ruler(submap, ids[kept], S, results),
+        **of_points(submap.map, ids[kept], S, results.session, results.camera.size),
         "dense": None if cloud is None else _dense(cloud, S, box),
         "box": box.tolist(),
         "radius": float((box[1] - box[0]).norm()) / 2,
@@ -267,27 +250,6 @@ def _points(submap: Submap) -> tuple[Float[Tensor, "N 3"], Int[Tensor, " N"]]:
     positions_w = submap.map.positions_w[ids].double()
     finite = positions_w.isfinite().all(dim=-1)
     return positions_w[finite], ids[finite]
-
-
-def _for_ruler(
-    submap: Submap, ids: Int[Tensor, " P"], S: Float[Tensor, "4 4"], results: Results
-) -> dict[str, Any]:
-    """Return the image point and the error of each point that is shown."""
-    if len(ids) == 0:
-        nothing = {"seen_frame": "int32", "seen_pixel": "uint16", "error_step": "uint16", "error_factor": "int8"}
-        return {name: encoded([], kind) for name, kind in nothing.items()}
-    size = results.camera.size
-    frames, pixels = clearest_observations(submap.map, ids, results.session, size)
-    steps = STEPS / (torch.tensor(size, dtype=torch.float64, device="cpu") - 1)
-    covariances = S[:3, :3] @ submap.map.points["covariances_w"][ids].double() @ S[:3, :3].mT
-    error_step, error_factor = error_factors(covariances)
-    return {
-        "seen_frame": encoded(frames, "int32"),
-        "seen_pixel": encoded((pixels * steps).round().clamp(0, STEPS), "uint16"),
-        # The upper half of a float32: eight bits of its fraction are left.
-        "error_step": encoded(error_step.bfloat16().view(torch.int16).numpy().view(np.uint16), "uint16"),
-        "error_factor": encoded(error_factor, "int8"),
-    }
 
 
 def _shown_rows(

@@ -2,15 +2,63 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchslam.io.viewer.arrays import encoded
 from torchslam.map.map import NO_POINT, Map
 from torchslam.map.observation_index import first_of_each
 
+PIXEL_STEPS = 65535
+"""Steps of a pixel over the image, of 16 bits: hundredths of a pixel."""
 FACTOR_STEPS = 127
 """Steps of an entry of the factor of a covariance, over the largest one of the point: half a percent is enough."""
+
+
+def of_points(
+    slam_map: Map,
+    point_ids: Int[Tensor, " P"],
+    S_shown_map: Float[Tensor, "4 4"],
+    session: int,
+    size: tuple[int, int],
+) -> dict[str, Any]:
+    """Return an image point and the error of each point, encoded for the page.
+
+    Args:
+        slam_map: the map.
+        point_ids: rows of the points that are shown.
+        S_shown_map: similarity from the map to the view.
+        session: number of the session whose frames are meant.
+        size: (width, height) of its images.
+
+    Returns:
+        seen_frame, seen_pixel: (P,), (P, 2) as by `clearest_observations`, pixels in steps
+        error_step, error_factor: (P,), (P, 6) as by `error_factors`; of the float32 of a step, the upper 16 bits
+    """
+    if len(point_ids) == 0:  # the table may have no columns yet
+        kinds = {
+            "seen_frame": "int32",
+            "seen_pixel": "uint16",
+            "error_step": "uint16",
+            "error_factor": "int8",
+        }
+        return {name: encoded([], kind) for name, kind in kinds.items()}
+    frames, pixels = clearest_observations(slam_map, point_ids, session, size)
+    steps = PIXEL_STEPS / (torch.tensor(size, dtype=torch.float64, device="cpu") - 1).clamp(min=1)
+    sR = S_shown_map[:3, :3]
+    error_step, error_factor = error_factors(
+        sR @ slam_map.points["covariances_w"][point_ids].double() @ sR.mT
+    )
+    return {
+        "seen_frame": encoded(frames, "int32"),
+        "seen_pixel": encoded((pixels * steps).round().clamp(0, PIXEL_STEPS), "uint16"),
+        "error_step": encoded(error_step.bfloat16().view(torch.int16).numpy().view(np.uint16), "uint16"),
+        "error_factor": encoded(error_factor, "int8"),
+    }
 
 
 def clearest_observations(
