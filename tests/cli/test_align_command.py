@@ -100,6 +100,15 @@ def test_wrong_measurements_are_one_line(
     assert what in capsys.readouterr().err
 
 
+def test_a_click_outside_of_the_image_stops_a_run_before_its_first_frame(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    output = tmp_path / "new"
+    assert main(["run", ROOM, "--output", str(output), "--distance", "1:2,3", "1:9999,4", "2"]) == 2
+    assert "--distance 1:9999,4: outside of the image" in capsys.readouterr().err
+    assert not output.exists()
+
+
 def test_a_map_that_is_only_localized_in_keeps_its_unit(
     results: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -94,3 +94,16 @@ def test_a_wrong_description_is_refused_before_the_run() -> None:
     for config in (MetricConfig(marker="apriltag-9h9:0.05"), MetricConfig(distance="1:2,3 1:2,3 4")):
         with pytest.raises(MeasurementError):
             sources_of(given_options(config))
+
+
+@pytest.mark.parametrize("word", ["165cm", "0", "-1.65", "nan", "inf", ""])
+def test_a_height_is_a_positive_number(word: str) -> None:
+    """0 is the setting of no height, and would be ignored."""
+    with pytest.raises(ConfigError, match=f"--camera-height {word}: write a number above 0"):
+        parsed("--camera-height", word)
+
+
+def test_a_height_is_given_once() -> None:
+    with pytest.raises(ConfigError, match="--camera-height is given 2 times"):
+        parsed("--camera-height", "1.6", "--camera-height", "1.7")
+    assert parsed("--camera-height", "1.65").metric.camera_height == 1.65

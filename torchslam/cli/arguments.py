@@ -7,11 +7,13 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchslam.config import CHOICES, Config, MetricConfig, builtin_names, load_config
+from torchslam.errors import ConfigError
 from torchslam.metric.options import KINDS, setting_of
 from torchslam.utils.console import say
 
@@ -200,19 +202,28 @@ def add_metric(parser: argparse.ArgumentParser) -> None:
 
 def metric_overrides(options: argparse.Namespace) -> list[str]:
     """Return the changes that the arguments of `add_metric` make to the configuration, as `section.key=value`."""
-    given = {
-        option.name: getattr(options, f"metric_{option.name}", None)
-        for kind in KINDS
-        for option in kind.options
-    }
     numbers = {each.name for each in fields(MetricConfig) if isinstance(each.default, float)}
     changes = []
-    for name, times in given.items():
-        if times and name in numbers:
-            changes += [f"metric.{name}={words[0]}" for words in times]
+    for option in (option for kind in KINDS for option in kind.options):
+        times = getattr(options, f"metric_{option.name}", None)
+        if times and option.name in numbers:
+            changes.append(f"metric.{option.name}={_given_once(option.flag, times)!r}")
         elif times:
-            changes.append(f"metric.{name}={json.dumps(setting_of(times), ensure_ascii=False)}")
+            changes.append(f"metric.{option.name}={json.dumps(setting_of(times), ensure_ascii=False)}")
     return changes
+
+
+def _given_once(flag: str, times: list[list[str]]) -> float:
+    """Return the positive number of an option; 0 would be the setting of an option that is not given."""
+    if len(times) > 1:
+        raise ConfigError(f"{flag} is given {len(times)} times: one number is needed")
+    try:
+        value = float(times[0][0])
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise ConfigError(f"{flag} {times[0][0]}: write a number above 0, without a unit")
+    return value
 
 
 def add_device(parser: argparse.ArgumentParser) -> None:

@@ -50,6 +50,7 @@ from torchslam.io.results import (
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
+from torchslam.metric.distances import Distances
 from torchslam.metric.options import given_options, sources_of
 from torchslam.metric.source import MetricSource
 from torchslam.parallel.workers import with_workers
@@ -225,6 +226,9 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         raise ConfigError(
             "measurements of the unit cannot be combined with --localize: a map that is not changed keeps its unit"
         )
+    for each in sources:
+        if isinstance(each, Distances):
+            each.check(sequence.size)
     prepare(options.output, options.overwrite, options.resume)
     mode = _mode(sequence, options)
     check_replaceable(options.output / CALIBRATION)

@@ -99,6 +99,20 @@ class Distances:
         """Take the lengths."""
         self._distances = tuple(distances)
 
+    def check(self, size: tuple[int, int]) -> None:
+        """Check that all clicks are in images of (width, height).
+
+        Raises:
+            MeasurementError: a click is outside.
+        """
+        width, height = size
+        for click in (click for each in self._distances for click in (each.first, each.second)):
+            x, y = click.pixel
+            if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+                raise MeasurementError(
+                    f"--distance {click}: outside of the image of {width} x {height} pixels"
+                )
+
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """Locate the clicked points of a submap, and compare their distances with the known ones.
 
@@ -107,13 +121,7 @@ class Distances:
         """
         if view.sequence is None or view.sequence.brings_features:
             return Unmeasured(ScaleSource.DISTANCE, "there are no images to find the points in")
-        width, height = view.camera.size
-        for click in (click for each in self._distances for click in (each.first, each.second)):
-            x, y = click.pixel
-            if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
-                raise MeasurementError(
-                    f"--distance {click}: outside of the image of {width} x {height} pixels"
-                )
+        self.check(view.camera.size)
         found: list[tuple[Distance, ScaleMeasurement]] = []
         failed = []
         for each in self._distances:

@@ -21,7 +21,8 @@ from torchslam.dense import PointCloud
 from torchslam.geometry import Camera, transform
 from torchslam.io.results import Results, read_results
 from torchslam.io.viewer import page as view_data
-from torchslam.io.viewer.page import decoded, encoded, page, write_view
+from torchslam.io.viewer.arrays import decoded, encoded
+from torchslam.io.viewer.page import page, write_view
 from torchslam.system.run import Run
 from torchslam.types import State, Trajectory
 

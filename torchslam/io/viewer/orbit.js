@@ -3,8 +3,13 @@
 const FIELD_OF_VIEW = Math.PI / 4; // from top to bottom
 const STEEPEST = Math.PI / 2 - 1e-3;
 
-/** The eye, moved by mouse, pen and fingers on the canvas; `changed` is called after each move, `moved` when by hand. */
-function createEye(canvas, changed, moved) {
+const STILL = 5; // pixels that a click may move; a finger twice as many
+
+/** The eye, moved by mouse, pen and fingers on the canvas.
+ *
+ * `changed` is called after each move, `moved` when the target moved by hand, `tapped` after a click that moved nothing.
+ */
+function createEye(canvas, changed, moved, tapped) {
   const eye = { yaw: 0, pitch: 0, distance: 1, target: [0, 0, 0] };
 
   eye.look = (view) => {
@@ -58,14 +63,24 @@ function createEye(canvas, changed, moved) {
   const middle = (points) => [0, 1].map((i) => points.reduce((sum, point) => sum + point[i], 0) / points.length);
   const spread = ([a, b]) => (b ? Math.hypot(a[0] - b[0], a[1] - b[1]) : 0);
 
+  let pressed = null; // where the only pointer went down, until it moves
+
   canvas.addEventListener("pointerdown", (event) => {
     canvas.setPointerCapture(event.pointerId);
     held.set(event.pointerId, [event.clientX, event.clientY]);
+    pressed = held.size === 1 && event.button === 0 && !event.shiftKey ? [event.clientX, event.clientY] : null;
   });
   for (const name of ["pointerup", "pointercancel"])
-    canvas.addEventListener(name, (event) => held.delete(event.pointerId));
+    canvas.addEventListener(name, (event) => {
+      held.delete(event.pointerId);
+      if (pressed && name === "pointerup") tapped(event);
+      pressed = null;
+    });
   canvas.addEventListener("pointermove", (event) => {
     if (!held.has(event.pointerId)) return;
+    const still = event.pointerType === "mouse" ? STILL : 2 * STILL;
+    if (pressed && spread([pressed, [event.clientX, event.clientY]]) <= still) return;
+    pressed = null;
     const before = [...held.values()];
     held.set(event.pointerId, [event.clientX, event.clientY]);
     const after = [...held.values()];

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import base64
 import html
 import json
-import sys
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from jaxtyping import Float, Int, Num, Shaped, UInt8
+from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.data.trajectories import nearest
@@ -26,12 +23,14 @@ from torchslam.io.export.recording import gaps
 from torchslam.io.plots.style import robust_box, thin
 from torchslam.io.report import unit_words
 from torchslam.io.results import Results, aligned, aligned_poses, readout_of
+from torchslam.io.viewer.arrays import encoded
+from torchslam.io.viewer.ruler import of_points
 from torchslam.map.atlas import Submap
 from torchslam.types import State, Trajectory
 from torchslam.utils.text import printable
 
 VIEW = "view.html"
-SCRIPTS = ("draw.js", "orbit.js", "scene.js", "view.js")  # in this order, all in one script
+SCRIPTS = ("draw.js", "orbit.js", "scene.js", "ruler.js", "view.js")  # in this order, all in one script
 
 
 def write_view(results: Results, directory: Path) -> Path:
@@ -64,7 +63,7 @@ def _asset(name: str) -> str:
     return (files("torchslam.io.viewer") / name).read_text(encoding="utf-8")
 
 
-MAX_POINTS = 150_000  # of all submaps together: 20 bytes each in the page
+MAX_POINTS = 150_000  # of all submaps together: 42 bytes each in the page
 MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
 DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
 STEPS = 65535  # of a coordinate of the dense cloud, over the extent of the cloud
@@ -98,6 +97,7 @@ def page_data(results: Results) -> dict[str, Any]:
         "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}{unit}{shutter}",
         "failure": printable(metrics.get("failure", "")),
         "corners": _corners(results.camera).tolist(),
+        "size": list(results.camera.size),
         "reasons": reasons,
         "frames": {
             "index": encoded([frame.index for frame in frames], "int32"),
@@ -114,20 +114,6 @@ def page_data(results: Results) -> dict[str, Any]:
     }
 
 
-def encoded(values: Num[Tensor, "*shape"] | np.ndarray | list[Any], kind: str) -> dict[str, str]:
-    """Encode numbers as base64 of their little-endian bytes, row by row."""
-    array = np.ascontiguousarray(np.asarray(values, dtype=kind))
-    if sys.byteorder == "big":
-        array = array.byteswap()
-    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
-
-
-def decoded(packed: dict[str, str]) -> Shaped[np.ndarray, " N"]:
-    """Decode the result of `encoded` to a flat array."""
-    kind = np.dtype(packed["type"]).newbyteorder("<")
-    return np.frombuffer(base64.b64decode(packed["data"]), kind)
-
-
 def _submap(
     submap: Submap, path: Trajectory, results: Results, times: Tensor, max_points: int
 ) -> dict[str, Any]:
@@ -140,8 +126,11 @@ def _submap(
         errors: (F,) meters, NaN if unknown
         breaks: rows before which the path is interrupted
         truth: (M, 3) true positions
+        unit_std: relative standard error of lengths in meters; 0 where the unit is none, or that of the ground truth
+        level: whether z is known to be up
         points, colors: (P, 3); points without an observed image have no color
         points_total: number of points before thinning
+        seen_frame, seen_pixel, error_step, error_factor: image points and errors of the points, see `of_points`
         dense: the dense cloud, see `_dense`; None if there is none
         box: (2, 3) lowest and highest corner around the scene
         radius: half the diagonal of the box
@@ -156,12 +145,15 @@ def _submap(
     )
     keyframes = submap.map.keyframe_trajectory(results.session)
     up = torch.eye(4, dtype=torch.float64, device="cpu")
+    level = submap.metric is not None and submap.metric.is_level
     if evaluation is None:
         up[:3, :3] = upright_from_map(submap.map, submap.metric)
+    elif level:
+        up[:3, :3] = S[:3, :3].mT / sim3_scale(S)  # the axes of the map
     else:
         up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
     S = up @ S
-    points_w, colors = _points(submap)
+    points_w, ids = _points(submap)
     box = torch.from_numpy(
         robust_box(aligned(path, S).positions_w.numpy(), transform(S, points_w).numpy()).T.copy()
     )
@@ -177,12 +169,15 @@ def _submap(
     frame, rows = _shown_rows(path.timestamps, times)
     keyframe, keyframe_rows = _shown_rows(keyframes.timestamps, times)
     shown, kept = aligned(path, S).T_wc[rows], torch.from_numpy(thin(len(points_w), max_points))
+    colors = submap.map.points["colors"][ids] if len(ids) else ids.new_zeros(0, 3)
     breaks = gaps(frame)
     steps = shown[:, :3, 3].diff(dim=0).norm(dim=-1)
     steps[[row - 1 for row in breaks]] = 0.0
     return {
         "name": f"{submap.number}" + (", the main one" if is_main else ""),
         "unit": "" if evaluation is None and submap.metric is None else "m",
+        "unit_std": submap.metric.relative_std if evaluation is None and submap.metric is not None else 0.0,
+        "level": level,
         "S_shown_map": S.tolist(),
         "frame": encoded(frame, "int32"),
         "poses": encoded(shown[:, :3], "float32"),
@@ -195,6 +190,7 @@ def _submap(
         "points": encoded(transform(S, points_w)[kept], "float32"),
         "colors": encoded(colors[kept] if bool(colors.any()) else colors[:0], "uint8"),
         "points_total": len(points_w),
+        **of_points(submap.map, ids[kept], S, results.session, results.camera.size),
         "dense": None if cloud is None else _dense(cloud, S, box),
         "box": box.tolist(),
         "radius": float((box[1] - box[0]).norm()) / 2,
@@ -245,16 +241,15 @@ def _during(results: Results, path: Trajectory) -> Trajectory:
     return Trajectory(truth.timestamps[during], truth.T_wc[during])
 
 
-def _points(submap: Submap) -> tuple[Float[Tensor, "N 3"], UInt8[Tensor, "N 3"]]:
-    """Return positions and colors of the valid points."""
+def _points(submap: Submap) -> tuple[Float[Tensor, "N 3"], Int[Tensor, " N"]]:
+    """Return positions and rows of the valid points."""
     if submap.map.num_points == 0:
-        return torch.zeros(0, 3, dtype=torch.float64, device="cpu"), torch.zeros(
-            0, 3, dtype=torch.uint8, device="cpu"
-        )
+        nothing = torch.zeros(0, 3, dtype=torch.float64, device="cpu")
+        return nothing, nothing[:, 0].long()
     ids = submap.map.valid_points()
     positions_w = submap.map.positions_w[ids].double()
     finite = positions_w.isfinite().all(dim=-1)
-    return positions_w[finite], submap.map.points["colors"][ids][finite]
+    return positions_w[finite], ids[finite]
 
 
 def _shown_rows(

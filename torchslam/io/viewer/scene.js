@@ -2,7 +2,7 @@
 
 const RAMP = [[42, 157, 143], [138, 190, 120], [233, 196, 106], [231, 140, 90], [209, 73, 91]]; // no error to the most
 const STATES = ["initializing", "tracking", "uncertain", "lost"];
-const TYPES = { float64: Float64Array, float32: Float32Array, int32: Int32Array, uint16: Uint16Array, uint8: Uint8Array };
+const TYPES = { float64: Float64Array, float32: Float32Array, int32: Int32Array, int8: Int8Array, uint16: Uint16Array, uint8: Uint8Array };
 
 /** The numbers of an array that was written as base64. */
 function decode({ type, data }) {
@@ -88,7 +88,7 @@ function length(value, unit) {
   if (!Number.isFinite(value)) return "unknown";
   if (unit === "m" && value < 0.01) return `${Number((1e3 * value).toPrecision(2))} mm`;
   if (unit === "m" && value < 1) return `${Number((1e2 * value).toPrecision(3))} cm`;
-  return `${Number(value.toPrecision(3))} ${unit || (value === 1 ? "unit" : "units")}`;
+  return `${Number(value.toPrecision(3))} ${unit || (value === 1 ? "map unit" : "map units")}`;
 }
 
 /** How many of the ascending values are not above a limit. */

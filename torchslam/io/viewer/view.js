@@ -6,9 +6,10 @@ const frames = data.frames;
 const last = frames.index.length - 1;
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const painter = createPainter($("scene"));
-const eye = createEye($("scene"), redraw, () => ($("follow").checked = false));
+const eye = createEye($("scene"), redraw, () => ($("follow").checked = false), takeAt);
+const ruler = createRuler(data.size, markRuler);
 const layers = {};
-const shown = { submap: null, frame: last, playing: false, clock: 0, pointSize: 1, waiting: false };
+const shown = { submap: null, frame: last, playing: false, clock: 0, pointSize: 1, waiting: false, hadPoints: true };
 
 const COVER = 1.5; // widths of a dense point, in distances between neighbors: surfaces are closed
 
@@ -44,6 +45,7 @@ function showSubmap(submap) {
     $("count-keyframes").textContent = number(submap.keyframe.length);
     build();
     resetView();
+    if (ruler.isOn) ruler.set(true, submap);
   }
   drawStrip();
   showFrame(shown.frame);
@@ -70,7 +72,8 @@ function build() {
   layers.keyframes = painter.lines(new Float32Array(edges), colors(edges.length / 6, rgb("keyframe"), 150));
   const grid = gridLines(submap.box);
   layers.grid = painter.lines(grid.ends, colors(grid.ends.length / 6, rgb("grid"), 140));
-  $("count-grid").textContent = length(grid.step, submap.unit);
+  $("count-grid").textContent = length(grid.step, submap.unit) + (submap.level ? ", level" : "");
+  markRuler();
   const byError = $("color").value === "error";
   $("ramp").hidden = !byError;
   $("states").hidden = byError;
@@ -140,6 +143,8 @@ function draw() {
     painter.draw(layers.keyframes, { ...view, width: scale, faded: 0.25, cut: 8 * countUpTo(submap.keyframe, shown.frame) });
   if (isOn("path")) painter.draw(layers.path, { ...view, width: 2.6 * scale, ...past });
   painter.draw(layers.camera, { ...view, width: 2 * scale, above: true });
+  painter.draw(layers.ruler, { ...view, width: 2.4 * scale, above: true });
+  painter.draw(layers.marks, { ...view, size: 0, limits: [9 * scale, 9 * scale], lift: [0, 0, 0, 0], above: true });
 }
 
 function resetView(pitch = 0.55) {
@@ -155,6 +160,52 @@ function resetView(pitch = 0.55) {
 function toggle(layer) {
   const box = document.querySelector(`[data-layer=${layer}]`);
   box.checked = !box.checked;
+  redraw();
+}
+
+// --- the ruler ----------------------------------------------------------------------------------------------------
+
+/** Switch the ruler on or off; the points that it measures between are shown. */
+function measure(isOn) {
+  if (!shown.submap || isOn === ruler.isOn) return;
+  const points = document.querySelector("[data-layer=points]");
+  if (isOn) shown.hadPoints = points.checked;
+  points.checked = isOn || shown.hadPoints;
+  $("measure").checked = isOn;
+  ruler.set(isOn, shown.submap);
+  if (isOn) $("scene").focus();
+}
+
+/** Row of the point at a pixel of the canvas. */
+function rowAt(pixel, reach) {
+  const { clientWidth, clientHeight } = $("scene");
+  return pointAt(shown.submap.points, eye.projection(), [clientWidth, clientHeight], pixel, reach);
+}
+
+function takeAt(event) {
+  if (ruler.isOn) ruler.take(rowAt([event.clientX, event.clientY], event.pointerType === "mouse" ? REACH : 2 * REACH));
+}
+
+/** Take the point at the cross in the middle of the view. */
+function takeMiddle() {
+  const { clientWidth, clientHeight } = $("scene");
+  if (ruler.isOn) ruler.take(rowAt([clientWidth / 2, clientHeight / 2], 2 * REACH));
+}
+
+/** Forget the points of the ruler; without any, put it away. */
+function cancelRuler() {
+  if (ruler.rows.length) ruler.set(true, shown.submap);
+  else measure(false);
+}
+
+/** Draw the marks of the ruler, and the line between them. */
+function markRuler() {
+  if (!painter || !shown.submap) return;
+  painter.remove(layers.ruler);
+  painter.remove(layers.marks);
+  const ends = Float32Array.from(ruler.marks().flatMap((row) => [...shown.submap.points.subarray(3 * row, 3 * row + 3)]));
+  layers.marks = painter.points(ends, Uint8Array.from(ends, (_, i) => rgb("mark")[i % 3]));
+  layers.ruler = ends.length === 6 ? painter.lines(ends, colors(1, rgb("mark"))) : null;
   redraw();
 }
 
@@ -247,10 +298,10 @@ const KEYS = {
   ArrowRight: (event) => seek(shown.frame + (event.shiftKey ? 10 : 1)),
   Home: () => seek(0),
   End: () => seek(last),
-  w: () => eye.turn(0, 0.06),
-  s: () => eye.turn(0, -0.06),
-  a: () => eye.turn(-0.08, 0),
-  d: () => eye.turn(0.08, 0),
+  w: (event) => (event.shiftKey ? eye.shift(0, -20) : eye.turn(0, 0.06)),
+  s: (event) => (event.shiftKey ? eye.shift(0, 20) : eye.turn(0, -0.06)),
+  a: (event) => (event.shiftKey ? eye.shift(-20, 0) : eye.turn(-0.08, 0)),
+  d: (event) => (event.shiftKey ? eye.shift(20, 0) : eye.turn(0.08, 0)),
   "+": () => eye.zoom(0.9),
   "=": () => eye.zoom(0.9),
   "-": () => eye.zoom(1 / 0.9),
@@ -263,6 +314,9 @@ const KEYS = {
   f: () => $("follow").click(),
   r: () => shown.submap && resetView(),
   t: () => shown.submap && resetView(STEEPEST),
+  m: () => measure(!ruler.isOn),
+  Enter: takeMiddle,
+  Escape: cancelRuler,
   "?": () => $("help").showModal(),
 };
 
@@ -278,6 +332,10 @@ function listen() {
   $("top").addEventListener("click", KEYS.t);
   $("help-open").addEventListener("click", KEYS["?"]);
   $("follow").addEventListener("change", () => showFrame(shown.frame));
+  $("measure").addEventListener("change", (event) => measure(event.target.checked));
+  $("scene").addEventListener("pointermove", (event) => {
+    if (ruler.isOn && event.buttons === 0) ruler.hover(rowAt([event.clientX, event.clientY], REACH));
+  });
   $("submap").addEventListener("change", (event) => showSubmap(data.submaps[event.target.value]));
   $("color").addEventListener("change", () => (build(), showFrame(shown.frame)));
   document.querySelectorAll("[data-layer]").forEach((box) => box.addEventListener("change", redraw));
@@ -286,8 +344,10 @@ function listen() {
   addEventListener("keydown", (event) => {
     const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
     const isTaken = event.ctrlKey || event.metaKey || event.altKey || $("help").open || event.target.tagName === "SELECT";
-    const presses = name === " " && /BUTTON|SUMMARY|INPUT/.test(event.target.tagName) && event.target.type !== "range";
-    if (isTaken || presses || !(name in KEYS)) return;
+    const isPressed = /BUTTON|SUMMARY|INPUT/.test(event.target.tagName) && event.target.type !== "range";
+    const presses = isPressed && (name === " " || name === "Enter");
+    const types = event.target.type === "text" && name !== "Escape";
+    if (isTaken || presses || types || !(name in KEYS)) return;
     event.preventDefault();
     KEYS[name](event);
   });
