@@ -60,16 +60,12 @@ def test_images_without_a_calibration_are_calibrated(
 def test_a_wrong_calibration_is_reported(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The summary names the better focal length, on the way to the true one of 500 px, and what helps."""
+    """The summary says that the images contradict 400 px, of so short a way without a better value, and what helps."""
     camera = "400,400,319.5,239.5"
     assert main(["run", str(folder), "-o", str(tmp_path / "results"), "--camera", camera, *FAST]) == 0
     said = json.loads((tmp_path / "results" / "metrics.json").read_text())["camera"]
     assert said in capsys.readouterr().out
-    found = re.search(
-        r"; the images agree better with a focal length of (\d+) px or more than with 400;", said
-    )
-    assert found is not None
-    assert abs(float(found[1]) - 500) < 50
+    assert "; the images contradict a focal length of 400 px and do not determine the right one;" in said
     assert said.endswith("--refine-camera looks for a better one")
 
 

@@ -23,6 +23,8 @@ Path = tuple[Any, ...]
 CLEAR = (ValueError, TypeError, TorchslamError)
 NO_TENSORS = {"extractor"}
 """Public functions without tensors."""
+OF_RECORDS = {"camera_evidence", "inertial_steps", "preintegrate", "compose_increments", "with_bias_change"}
+"""Functions of problems and of records of tensors, whose own tests have their types, devices and gradients."""
 WITH_WEIGHTS = {"XFeat", "ALIKED"}
 """Networks, whose weights are not at hand."""
 
@@ -125,7 +127,7 @@ def test_the_sweep_has_every_public_function() -> None:
             value = getattr(module, name)
             is_function = inspect.isfunction(value) and not name.startswith("_")
             if is_function or (inspect.isclass(value) and issubclass(value, nn.Module)):
-                assert name in CALLS or name in NO_TENSORS or name in WITH_WEIGHTS, (
+                assert name in CALLS or name in NO_TENSORS | OF_RECORDS | WITH_WEIGHTS, (
                     f"{name} is not in the sweep"
                 )
 

@@ -16,6 +16,7 @@ from tests.geometry.geometry_scenes import points_and_pixels, two_views
 from tests.optim.conftest import camera_of
 from tests.optim.pose_graph.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
+from tests.sweep.test_sweep import OF_RECORDS
 from torchslam import Features, evaluation, geometry
 from torchslam import optim as solvers
 from torchslam.geometry import Camera, rigid, se3_exp, sim3_exp, so3_exp
@@ -38,7 +39,7 @@ from torchslam.optim.run_graph import solve_graph
 Case = tuple[Callable[..., Any], tuple[Tensor, ...]]
 
 # They read files, or compare whole trajectories as float64 numbers without gradient; `clip_loss` is made of `ate`.
-OTHERS = {"load_config", "open_sequence", "evaluate", "clip_loss"}
+OTHERS = {"load_config", "open_sequence", "evaluate", "clip_loss"} | OF_RECORDS
 CAMERA_METHODS = (
     "normalize",
     "pixel_scale",
