@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,6 +24,10 @@ MAX_GAP = 0.5
 """Seconds between two poses up to which the path between them is known in any case. Cars turn within a second."""
 GAP_INTERVALS = 3.0
 """The same for slow recordings, in median intervals of the poses."""
+SEARCH_LIMIT = 20.0
+"""Seconds by which a clock may be off; GPS time is ahead of UTC by 18."""
+SEARCH_SHARE = 0.25
+"""Of the recording's duration: the most by which a clock may be off, so that most of a file has a pose with any."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,11 @@ class CameraPath:
         if len(times) > 1 and frames[-1] > frames[0]:  # images before the map, at the rate of those in it
             first -= float(frames[0] * (times[-1] - times[0]) / (frames[-1] - frames[0]))
         return CameraPath(times, T_wc, first)
+
+    @property
+    def duration(self) -> float:
+        """Seconds from the first pose to the last one."""
+        return float(self.timestamps[-1] - self.timestamps[0])
 
     @property
     def up_w(self) -> Float[Tensor, " 3"]:
@@ -177,6 +186,30 @@ def on_clock_of_images(
     raise MeasurementError(
         f"{file}: its times, from {_span(times)}, are not those of the images, from {_span(own)}; {advice}"
     )
+
+
+def found_shift(
+    cost_at: Callable[[float], float | None], duration: float, step: float, least_gain: float
+) -> float:
+    """Seconds that the clock of the images is ahead, in steps; zero unless another one fits far better.
+
+    Args:
+        cost_at: minus the logarithm of the likelihood, up to a constant, if it is so many seconds ahead; None where too
+            little is left to tell.
+        duration: of the recording, seconds.
+        step: between the clocks that are tried, seconds.
+        least_gain: logarithm of the likelihood ratio from which on another clock is believed.
+    """
+    count = int(min(SEARCH_LIMIT, SEARCH_SHARE * duration) / step)
+    best, gain, reference = 0.0, least_gain, math.nan
+    for shift in (step * number for number in sorted(range(-count, count + 1), key=abs)):
+        cost = cost_at(shift)
+        if cost is None:
+            continue
+        reference = cost if math.isnan(reference) else reference
+        if reference - cost > gain:
+            best, gain = shift, reference - cost
+    return best
 
 
 def _is_absolute(times: Sequence[float] | Tensor) -> bool:

@@ -24,7 +24,7 @@ from torchslam.metric.path_lengths import (
     MIN_STRETCHES,
     STRETCH,
     Stretches,
-    found_shift,
+    best_shift,
     measured,
     stretch_ends,
 )
@@ -71,8 +71,7 @@ class OdometrySource:
             lengths_w, lengths = (T[:, :3, 3].norm(dim=-1) for T in (camera_motions, motions))
             return Stretches(middles, lengths_w, lengths, known & seen)
 
-        duration = float(path.timestamps[-1] - path.timestamps[0])
-        shift = found_shift(at, duration) if self.clock.seconds is None else 0.0
+        shift = best_shift(at, path) if self.clock.seconds is None else 0.0
         motions, known = _motions(sensor, ends - shift)
         known = known & seen
         if int(known.sum()) < MIN_STRETCHES:

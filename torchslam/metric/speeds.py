@@ -15,8 +15,8 @@ from torchslam.metric.path_lengths import (
     MIN_STRETCHES,
     STRETCH,
     Stretches,
+    best_shift,
     camera_lengths,
-    found_shift,
     measured,
     stretch_ends,
 )
@@ -54,8 +54,7 @@ class SpeedSource:
             lengths, known = self._lengths(times + shift, ends)
             return Stretches(ends[:-1] + STRETCH / 2, lengths_w, lengths, known & seen)
 
-        duration = float(path.timestamps[-1] - path.timestamps[0])
-        shift = found_shift(at, duration) if self.clock.seconds is None else 0.0
+        shift = best_shift(at, path) if self.clock.seconds is None else 0.0
         return measured(at(shift), ScaleSource.SPEED, "the speeds", tuple(clock_notes(file, shift)))
 
     def _lengths(
