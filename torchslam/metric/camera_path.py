@@ -17,6 +17,7 @@ from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_interpolate, se3_inverse
 from torchslam.metric.options import Given
 from torchslam.metric.source import SubmapView
+from torchslam.utils.indexing import between_rows
 
 SINCE_1970 = 1e8
 """Seconds: times from here on (1973) count from 1970 or 1980, smaller ones from the start of a recording or a day."""
@@ -90,9 +91,8 @@ class CameraPath:
     ) -> tuple[Tensor, Float[Tensor, "*shape"], Bool[Tensor, "*shape"]]:
         """The row of the pose before, the part of the interval that has passed, and whether it is short enough."""
         own = self.timestamps
-        left = torch.searchsorted(own, times.contiguous(), right=True).clamp(1, len(own) - 1) - 1
+        left, part = between_rows(own, times)
         interval = own.diff()
-        part = (times - own[left]) / interval[left]
         longest = max(MAX_GAP, GAP_INTERVALS * float(interval.median()))
         known = (part >= 0) & (part <= 1) & (interval[left] <= longest)
         return left, part.clamp(0, 1), known

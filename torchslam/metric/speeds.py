@@ -22,6 +22,7 @@ from torchslam.metric.path_lengths import (
 )
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.utils.indexing import between_rows
 
 MAX_GAP = 2.5
 """Seconds between two speeds up to which the speed in between is known: a second or two is usual for cars, which change
@@ -64,8 +65,8 @@ class SpeedSource:
         speeds, steps = self.speeds.speeds, times.diff()
         driven = torch.zeros_like(times)
         driven[1:] = (steps * (speeds[1:] + speeds[:-1]) / 2).cumsum(0)
-        left = torch.searchsorted(times, ends, right=True).clamp(1, len(times) - 1) - 1
-        part = ((ends - times[left]) / steps[left]).clamp(0, 1)
+        left, part = between_rows(times, ends)
+        part = part.clamp(0, 1)
         gain = (speeds[left + 1] - speeds[left]) * part / 2
         at = driven[left] + part * steps[left] * (speeds[left] + gain)
         gaps = torch.zeros_like(times)
