@@ -13,13 +13,8 @@ from torch import Tensor
 
 from torchslam.geometry import Camera, so3_exp
 from torchslam.geometry.camera_measurement import with_radial_terms
-from torchslam.geometry.rotating_camera import (
-    READOUT_STD,
-    at_middle_row,
-    fit_rotating_camera,
-    rotation_between,
-    row_phases,
-)
+from torchslam.geometry.rolling_shutter import at_middle_row, row_fractions
+from torchslam.geometry.rotating_camera import READOUT_STD, fit_rotating_camera, rotation_between
 
 TRUE = Camera.pinhole(500.0, 500.0, 319.5, 239.5, size=(640, 480))
 BENT = Camera.radial_tangential(500.0, 500.0, 319.5, 239.5, -0.15, 0.0, 0.0, 0.0, size=(640, 480))
@@ -145,7 +140,7 @@ def rolled(pixels: Tensor, camera: Camera, turns: Tensor) -> Tensor:
     """Where a rolling shutter sees what a global one sees at pixels (1, N, 2); turns (1, 3) during the readout."""
     rays, seen = camera.unproject(pixels), pixels
     for _ in range(30):
-        R = so3_exp(row_phases(camera, seen)[..., None] * turns[:, None])
+        R = so3_exp(row_fractions(seen, camera.height)[..., None] * turns[:, None])
         seen = camera.project((R @ rays[..., None])[..., 0])[0]
     return seen
 
@@ -196,10 +191,11 @@ def test_pixels_of_the_middle_row_stay_and_others_move_with_the_turn() -> None:
     pixels = torch.tensor([[[319.5, 239.5], [319.5, 0.0], [319.5, 479.0]]], dtype=torch.float64)
     turn = torch.tensor([[0.0, 0.0, 0.2]], dtype=torch.float64)
     seen = at_middle_row(pixels, TRUE, turn)[0]
-    # The first row is exposed half a turn of 0.2 before the middle one, the last one half a turn after it.
-    shift = 239.5 * math.sin(0.1)
-    wanted = [[319.5, 239.5], [319.5 + shift, 239.5 - 239.5 * math.cos(0.1)]]
-    wanted.append([319.5 + shift, 239.5 + 239.5 * math.cos(0.1)])
+    # The middle of the first row is exposed half a turn of 0.2, less half a row, before the middle of the image.
+    angle = 0.1 * 479 / 480
+    shift = 239.5 * math.sin(angle)
+    wanted = [[319.5, 239.5], [319.5 + shift, 239.5 - 239.5 * math.cos(angle)]]
+    wanted.append([319.5 + shift, 239.5 + 239.5 * math.cos(angle)])
     torch.testing.assert_close(seen, torch.tensor(wanted, dtype=torch.float64), atol=1e-9, rtol=0)
 
 

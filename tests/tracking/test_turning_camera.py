@@ -11,7 +11,8 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene
 from torchslam import load_config
 from torchslam.geometry import SharedCamera, se3_inverse, so3_exp, so3_log
-from torchslam.geometry.rotating_camera import RotatingCamera, row_phases
+from torchslam.geometry.rolling_shutter import row_fractions
+from torchslam.geometry.rotating_camera import RotatingCamera
 from torchslam.tracking import initialization
 from torchslam.tracking.initialization import LEAVING_INTERVAL, Initializer
 from torchslam.tracking.matcher import make_matcher, run_matcher
@@ -40,7 +41,7 @@ def views_of(T_cw: Tensor, readout: float, noise: float = 0.2) -> list[FrameFeat
         turn = so3_log((after @ se3_inverse(before))[:3, :3]) / (2 if 0 < index < len(T_cw) - 1 else 1)
         rays, seen = CAMERA.unproject(view.keypoints), view.keypoints
         for _ in range(20):
-            R = so3_exp(readout * row_phases(CAMERA, seen)[:, None] * turn)
+            R = so3_exp(readout * row_fractions(seen, CAMERA.height)[:, None] * turn)
             seen = CAMERA.project((R @ rays[..., None])[..., 0])[0]
         mask = view.mask & CAMERA.in_image(seen)
         views.append(replace(view, keypoints=torch.where(mask[:, None], seen, 0.0), mask=mask))

@@ -5,7 +5,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchslam.utils.indexing import distinct, is_among, ranks_among, row_mask, true_indices
+from torchslam.utils.indexing import between_rows, distinct, is_among, ranks_among, row_mask, true_indices
 
 IDS = st.lists(st.integers(-20, 200), max_size=60)
 
@@ -60,3 +60,11 @@ def test_row_masks_of_ones_and_zeros_are_no_row_numbers() -> None:
     ):
         with pytest.raises(ValueError, match=message):
             row_mask("fixed", rows, like)
+
+
+def test_values_are_found_between_rows_and_beyond_the_ends() -> None:
+    times = torch.tensor([0.0, 1.0, 3.0], dtype=torch.float64)
+    values = torch.tensor([[-1.0, 0.0, 0.5], [1.0, 3.0, 5.0]], dtype=torch.float64)
+    left, share = between_rows(times, values)
+    assert left.tolist() == [[0, 0, 0], [1, 1, 1]]
+    assert share.tolist() == [[-1.0, 0.0, 0.5], [0.0, 1.0, 2.0]]

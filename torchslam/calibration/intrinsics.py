@@ -174,7 +174,11 @@ def _propagate_held_parameters(
 
 
 def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
-    """The disagreement of parts of the trajectory on the focal length, in formal standard errors; at least one."""
+    """The disagreement of parts of the trajectory on the focal length, in formal standard errors; at least one.
+
+    The stretches of `camera_evidence` would not do: a point belongs to one of them, so that they do not see that halves
+    of a trajectory disagree which observe the same points.
+    """
     keyframes = len(at.T_cw)
     count = min(NUM_PARTS, keyframes // PART_KEYFRAMES)
     if count < 2:
@@ -189,10 +193,10 @@ def _disagreement(at: BundleProblem, fitted: list[int]) -> float:
     return max(1.0, math.sqrt(sum(squares) / (count - 1)))
 
 
-KERNEL_SCALE = 2.45  # as in `solve_graph`: ends the quadratic part at 95 % of a Gaussian
-TOLERANCE = 1e-6
-"""Relative reduction of the cost at which the adjustment stops; far below `MIN_COST_DECREASE`."""
-ITERATIONS = 400  # 200 are needed if all depths change with a focal length that is far off
+OPTIONS = BUNDLE_OPTIONS.replace(scale=2.45, iterations=400, tolerance=1e-6, backward="detached")
+"""Huber's kernel finds the way from a focal length that is far off, where all depths change with it and 200 iterations
+are needed; its quadratic part ends where 95 % of Gaussian errors do. The tolerance is far below `MIN_COST_DECREASE`.
+Tried at these values only."""
 MIN_FRAMES = 24  # frames of the problem, if available
 
 
@@ -244,18 +248,7 @@ def frames_of(graph: ObservationGraph) -> Int[Tensor, " K"]:
     return frames[keyframes]
 
 
-def adjust_with_camera(
-    problem: BundleProblem, which: list[int], iterations: int = ITERATIONS
-) -> BundleSolution:
+def adjust_with_camera(problem: BundleProblem, which: list[int]) -> BundleSolution:
     """Minimize the robust cost over poses, points and the selected parameters of the camera."""
-    return solve_bundle(
-        problem,
-        free_camera=intrinsics_directions(problem.camera, which),
-        options=BUNDLE_OPTIONS.replace(
-            kernel="huber",
-            scale=KERNEL_SCALE,
-            iterations=iterations,
-            tolerance=TOLERANCE,
-            backward="detached",
-        ),
-    )
+    directions = intrinsics_directions(problem.camera, which)
+    return solve_bundle(problem, free_camera=directions, options=OPTIONS)

@@ -16,7 +16,7 @@ from torchslam.geometry.essential import sampson_errors
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
-from torchslam.geometry.robust import robustify
+from torchslam.geometry.robust import NORMAL_MEDIAN, robustify
 from torchslam.geometry.two_view import TwoViews, fit_homography, propose_homography, transfer_squared
 
 _ITERATIONS = 15
@@ -24,7 +24,6 @@ _ITERATIONS = 15
 _LEAST_NOISE = (
     0.1  # thresholds: SIFT keypoints that are exact to a tenth of a pixel are an accident of few matches
 )
-_MAD = 0.6745  # median of the absolute value of a standard normal variable
 _FREEDOMS = 7
 """Degrees of freedom of a fundamental matrix: nine numbers less the scale and the rank."""
 # Added to the information, relative to its mean: of a plane or a rotating camera, two directions have none, and their
@@ -214,7 +213,7 @@ def _uncertainty(
     robust = robustify((distance / threshold).square(), "cauchy", distance.new_tensor(1.0))
     weight = torch.where(mask, robust.weight, 0.0)
     count = mask.sum(-1).to(F.dtype)
-    middle = distance.abs().masked_fill(~mask, torch.nan).nanmedian(dim=-1).values / _MAD
+    middle = distance.abs().masked_fill(~mask, torch.nan).nanmedian(dim=-1).values / NORMAL_MEDIAN
     # The fit follows the noise of as many matches as it has parameters.
     noise = middle * (count / (count - _FREEDOMS).clamp_min(1.0)).sqrt()
     noise = noise.nan_to_num(threshold).clamp_min(_LEAST_NOISE * threshold)

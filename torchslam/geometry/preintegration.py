@@ -21,6 +21,7 @@ from torch import Tensor
 
 from torchslam.geometry.lie import skew, so3_double_integral, so3_exp, so3_left_jacobian
 from torchslam.geometry.precision import full_precision
+from torchslam.utils.indexing import between_rows
 
 
 class Increments(NamedTuple):
@@ -82,11 +83,9 @@ def inertial_steps(
     rows = (inner[:, None] + number - 1).clamp(0, len(timestamps) - 1)
     times = torch.where(number <= count[:, None], timestamps[rows], end[:, None])
     times = torch.where(number == 0, start[:, None], times)
-    right = torch.searchsorted(timestamps, times.detach().contiguous()).clamp(1, len(timestamps) - 1)
-    before, after = timestamps[right - 1], timestamps[right]
-    fraction = ((times - before) / (after - before))[..., None]
+    left, fraction = between_rows(timestamps, times)
     samples = torch.cat((gyroscope, accelerometer), dim=-1)
-    values = samples[right - 1].lerp(samples[right], fraction)
+    values = samples[left].lerp(samples[left + 1], fraction[..., None])
     means = 0.5 * (values[:, 1:] + values[:, :-1])
     return InertialSteps(times.diff(dim=-1), means[..., :3], means[..., 3:])
 

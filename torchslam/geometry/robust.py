@@ -119,6 +119,8 @@ def robustify(
     return _KERNELS[kernel](squared, scale)
 
 
+NORMAL_MEDIAN, NORMAL_MEDIAN_3D = 0.6745, 1.54
+"""Medians of the absolute value of a standard normal number, and of the length of three of them."""
 TAIL_SCALE = 4.0
 """Scale of Cauchy's kernel for observations of a run, in standard deviations of the middle of their errors.
 

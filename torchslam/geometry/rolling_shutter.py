@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import se3_exp, se3_inverse, se3_log, transform
+from torchslam.geometry.lie import se3_exp, se3_inverse, se3_log, so3_exp, transform
 from torchslam.geometry.precision import full_precision, without_autocast
 
 MAX_GAP = 1.5
@@ -113,6 +113,20 @@ def global_shutter_pixels(
     at_row, is_valid = camera.project(transform(motions, points_c[..., None, :])[..., 0, :])
     at_middle, is_valid_too = camera.project(points_c)
     return pixels + torch.where((is_valid & is_valid_too)[..., None], at_middle - at_row, 0.0)
+
+
+def at_middle_row(
+    pixels: Float[Tensor, "B N 2"], camera: Camera, turns: Float[Tensor, "B 3"]
+) -> Float[Tensor, "B N 2"]:
+    """Where a camera that only turns sees points of any distance while its middle row is exposed.
+
+    Args:
+        pixels: of the points, each seen while its own row is exposed.
+        camera: of the view.
+        turns: rotation vectors from the first row to the last one.
+    """
+    R = so3_exp(-row_fractions(pixels, camera.height)[..., None] * turns[:, None])
+    return camera.project((R @ camera.unproject(pixels)[..., None])[..., 0])[0]
 
 
 @without_autocast

@@ -19,6 +19,8 @@ from torchslam.geometry.lie import cayley_rotation, generators, so3_exp
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import robustify
+from torchslam.geometry.rolling_shutter import row_fractions
+from torchslam.geometry.similarity import nearest_rotation
 from torchslam.geometry.two_view import TwoViews, fit_rotation, propose_rotation
 
 _STARTS = 3  # focal lengths, over twice the standard deviation to both sides; the best result counts
@@ -138,14 +140,15 @@ def fit_rotating_camera(
     with torch.no_grad():
         B, focal = len(mask), torch.linspace(-2.0, 2.0, _STARTS, dtype=axes.dtype, device=axes.device)
         row_turns = [
-            row_phases(camera, pixels)[..., None] * turn[:, None]
+            row_fractions(pixels, camera.height)[..., None] * turn[:, None]
             for pixels, turn in zip((pixels_1, pixels_2), turns.unbind(1), strict=True)
         ]
         row_turns = [x.repeat_interleave(_STARTS, dim=0) for x in row_turns]
         pixels_1, pixels_2, mask = (x.repeat_interleave(_STARTS, dim=0) for x in (pixels_1, pixels_2, mask))
         change = torch.nn.functional.pad(focal.repeat(B)[:, None], (0, 1))
         at = changed(change)
-        R = _rotation_of_rays(at.unproject(pixels_1), at.unproject(pixels_2), mask)
+        rays_1, rays_2 = at.unproject(pixels_1), at.unproject(pixels_2)
+        R = nearest_rotation((rays_2 * mask[..., None]).mT @ rays_1)
         found, cost = levenberg_marquardt(
             (R, change, torch.zeros_like(change[:, :1])), evaluate, retract, _ITERATIONS
         )
@@ -181,33 +184,5 @@ def rotation_between(
         return R
 
 
-def at_middle_row(
-    pixels: Float[Tensor, "B N 2"], camera: Camera, turns: Float[Tensor, "B 3"]
-) -> Float[Tensor, "B N 2"]:
-    """Where a camera that turns sees points of any distance while its middle row is exposed.
-
-    Args:
-        pixels: of the points, each seen while its own row is exposed.
-        camera: of the view.
-        turns: rotation vectors from the first row to the last one.
-    """
-    R = so3_exp(-row_phases(camera, pixels)[..., None] * turns[:, None])
-    return camera.project(_rotated(R, camera.unproject(pixels)))[0]
-
-
-def row_phases(camera: Camera, pixels: Float[Tensor, "*batch N 2"]) -> Float[Tensor, "*batch N"]:
-    """When the row of a pixel is exposed: from -1/2 in the first row to 1/2 in the last one."""
-    return pixels[..., 1] / (camera.height - 1) - 0.5
-
-
 def _rotated(R: Float[Tensor, "B N 3 3"], rays: Float[Tensor, "B N 3"]) -> Float[Tensor, "B N 3"]:
     return (R @ rays[..., None])[..., 0]
-
-
-def _rotation_of_rays(
-    rays_1: Float[Tensor, "B N 3"], rays_2: Float[Tensor, "B N 3"], mask: Bool[Tensor, "B N"]
-) -> Float[Tensor, "B 3 3"]:
-    """The rotations that bring rays closest to rays, in the sense of least squares."""
-    U, _, Vh = torch.linalg.svd((rays_2 * mask[..., None]).mT @ rays_1)
-    signs = torch.nn.functional.pad(torch.linalg.det(U @ Vh)[:, None], (2, 0), value=1.0)
-    return (U * signs[:, None]) @ Vh

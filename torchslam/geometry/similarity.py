@@ -67,7 +67,7 @@ def umeyama(
     mean_source, mean_target = (w * source).sum(-2), (w * target).sum(-2)
     x, y = source - mean_source[..., None, :], target - mean_target[..., None, :]
     covariance = (w * y).mT @ x
-    R = _nearest_rotation(covariance)
+    R = nearest_rotation(covariance)
     if with_scale:
         variance = (w * x * x).sum((-2, -1))
         spread = variance > torch.finfo(w.dtype).tiny
@@ -90,7 +90,7 @@ def align_poses(T_ac: Float[Tensor, "N 4 4"], T_bc: Float[Tensor, "N 4 4"]) -> F
     Its rotation is the mean of those of the cameras, so that centers on a line, or close to each other, do not leave it
     open; its scale is the ratio of the spreads of the centers, one where all are at one place.
     """
-    R = _nearest_rotation((T_bc[:, :3, :3] @ T_ac[:, :3, :3].mT).sum(0))
+    R = nearest_rotation((T_bc[:, :3, :3] @ T_ac[:, :3, :3].mT).sum(0))
     a, b = T_ac[:, :3, 3], T_bc[:, :3, 3]
     mean_a, mean_b = a.mean(0), b.mean(0)
     spread_a, spread_b = ((x - m).square().sum().sqrt() for x, m in ((a, mean_a), (b, mean_b)))
@@ -102,7 +102,7 @@ def align_poses(T_ac: Float[Tensor, "N 4 4"], T_bc: Float[Tensor, "N 4 4"]) -> F
     return S_ba
 
 
-def _nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
+def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
     """The rotation that maximizes tr(R^T M), with a finite first-order gradient.
 
     At the maximum S = M R^T is symmetric; for a change of M the rotation moves by exp(omega) with

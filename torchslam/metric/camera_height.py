@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry.robust import NORMAL_MEDIAN
 from torchslam.metric.options import Given
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import SubmapView, Unmeasured
@@ -95,7 +96,7 @@ class CameraHeight:
             )
         logs = np.log(heights)
         middle = float(np.median(logs))
-        spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+        spread = float(np.median(np.abs(logs - middle))) / NORMAL_MEDIAN
         # The variance of a median is pi / 2 times that of a mean.
         error = math.sqrt(math.pi / 2 / len(logs)) * spread
         return ScaleMeasurement(

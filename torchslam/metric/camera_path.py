@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,6 +17,7 @@ from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_interpolate, se3_inverse
 from torchslam.metric.options import Given
 from torchslam.metric.source import SubmapView
+from torchslam.utils.indexing import between_rows
 
 SINCE_1970 = 1e8
 """Seconds: times from here on (1973) count from 1970 or 1980, smaller ones from the start of a recording or a day."""
@@ -24,6 +25,10 @@ MAX_GAP = 0.5
 """Seconds between two poses up to which the path between them is known in any case. Cars turn within a second."""
 GAP_INTERVALS = 3.0
 """The same for slow recordings, in median intervals of the poses."""
+SEARCH_LIMIT = 20.0
+"""Seconds by which a clock may be off; GPS time is ahead of UTC by 18."""
+SEARCH_SHARE = 0.25
+"""Of the recording's duration: the most by which a clock may be off, so that most of a file has a pose with any."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,11 @@ class CameraPath:
         return CameraPath(times, T_wc, first)
 
     @property
+    def duration(self) -> float:
+        """Seconds from the first pose to the last one."""
+        return float(self.timestamps[-1] - self.timestamps[0])
+
+    @property
     def up_w(self) -> Float[Tensor, " 3"]:
         """Mean direction that is up in the images, a unit vector."""
         up = -self.T_wc[:, :3, 1].mean(0)
@@ -81,9 +91,8 @@ class CameraPath:
     ) -> tuple[Tensor, Float[Tensor, "*shape"], Bool[Tensor, "*shape"]]:
         """The row of the pose before, the part of the interval that has passed, and whether it is short enough."""
         own = self.timestamps
-        left = torch.searchsorted(own, times.contiguous(), right=True).clamp(1, len(own) - 1) - 1
+        left, part = between_rows(own, times)
         interval = own.diff()
-        part = (times - own[left]) / interval[left]
         longest = max(MAX_GAP, GAP_INTERVALS * float(interval.median()))
         known = (part >= 0) & (part <= 1) & (interval[left] <= longest)
         return left, part.clamp(0, 1), known
@@ -177,6 +186,30 @@ def on_clock_of_images(
     raise MeasurementError(
         f"{file}: its times, from {_span(times)}, are not those of the images, from {_span(own)}; {advice}"
     )
+
+
+def found_shift(
+    cost_at: Callable[[float], float | None], duration: float, step: float, least_gain: float
+) -> float:
+    """Seconds that the clock of the images is ahead, in steps; zero unless another one fits far better.
+
+    Args:
+        cost_at: minus the logarithm of the likelihood, up to a constant, if it is so many seconds ahead; None where too
+            little is left to tell.
+        duration: of the recording, seconds.
+        step: between the clocks that are tried, seconds.
+        least_gain: logarithm of the likelihood ratio from which on another clock is believed.
+    """
+    count = int(min(SEARCH_LIMIT, SEARCH_SHARE * duration) / step)
+    best, gain, reference = 0.0, least_gain, math.nan
+    for shift in (step * number for number in sorted(range(-count, count + 1), key=abs)):
+        cost = cost_at(shift)
+        if cost is None:
+            continue
+        reference = cost if math.isnan(reference) else reference
+        if reference - cost > gain:
+            best, gain = shift, reference - cost
+    return best
 
 
 def _is_absolute(times: Sequence[float] | Tensor) -> bool:

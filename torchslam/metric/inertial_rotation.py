@@ -16,7 +16,8 @@ from torchslam.errors import MeasurementError
 from torchslam.geometry import skew, so3_exp, so3_log, umeyama
 from torchslam.geometry.lie import so3_left_jacobian_inverse
 from torchslam.geometry.preintegration import Increments, inertial_steps, preintegrate
-from torchslam.geometry.robust import robustify
+from torchslam.geometry.robust import NORMAL_MEDIAN, robustify
+from torchslam.utils.indexing import between_rows
 
 TURN_INTERVAL = 0.1
 """Seconds over which turns are compared. With 0.05, 0.1 and 0.25 s the offset of a drone's clocks is -0.2, -0.4 and 0.2
@@ -136,11 +137,8 @@ def _start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, give
     at = times + offsets[:, None]
     inside = (at >= samples.timestamps[0]) & (at <= samples.timestamps[-1])
     valid = inside[:, 1:] & inside[:, :-1]
-    right = torch.searchsorted(samples.timestamps.contiguous(), at).clamp(1, len(speed) - 1)
-    before, after = samples.timestamps[right - 1], samples.timestamps[right]
-    measured = (
-        total[right - 1].lerp(total[right], ((at - before) / (after - before)).clamp(0, 1)).diff(dim=-1)
-    )
+    left, part = between_rows(samples.timestamps, at)
+    measured = total[left].lerp(total[left + 1], part.clamp(0, 1)).diff(dim=-1)
     correlation, slope = _correlation(angles.expand_as(measured), measured, valid)
     enough = valid.sum(-1) >= 0.5 * len(angles)
     correlation = torch.where(enough, correlation, -1.0)
@@ -196,12 +194,8 @@ def _refined(
     """
     at = times + offset
     increments = _increments(at, samples, bias)
-    right = torch.searchsorted(samples.timestamps.contiguous(), at).clamp(1, len(samples.timestamps) - 1)
-    before, after = samples.timestamps[right - 1], samples.timestamps[right]
-    rates = samples.gyroscope[right - 1].lerp(
-        samples.gyroscope[right], ((at - before) / (after - before))[:, None]
-    )
-    rates = rates - bias
+    left, part = between_rows(samples.timestamps, at)
+    rates = samples.gyroscope[left].lerp(samples.gyroscope[left + 1], part[:, None]) - bias
     R_ij, turns_b = increments.R_ij, R_bc @ turns_c @ R_bc.mT
     error = so3_log(turns_b @ R_ij.mT)
     inverse, from_right = so3_left_jacobian_inverse(error), so3_left_jacobian_inverse(-error)
@@ -210,7 +204,7 @@ def _refined(
     J = torch.cat(
         (inverse @ turned, -from_right @ increments.jacobian[:, 6:, :3], -from_right @ shift), dim=-1
     )
-    std = (1.4826 * error.detach().abs().median()).clamp_min(SMALLEST_TURN_STD)
+    std = (error.detach().abs().median() / NORMAL_MEDIAN).clamp_min(SMALLEST_TURN_STD)
     std = std if turn_std is None else torch.full_like(std, turn_std)
     kernel = robustify((error / std).square().sum(-1), "cauchy", std.new_tensor(ROBUST_SCALE))
     weighted = (kernel.weight[:, None] * error / std**2)[..., None]
@@ -225,9 +219,8 @@ def _refined(
         along = J.mT @ (error / std**2)[..., None]
         hessian = normal + 2 * (kernel.curvature[:, None, None] * along @ along.mT).sum(0)
         # The rates change with the offset: noisy sensors bend the errors more than the turns themselves do.
-        slopes = ((samples.gyroscope[right] - samples.gyroscope[right - 1]) / (after - before)[:, None])[
-            ..., None
-        ]
+        periods = samples.timestamps[left + 1] - samples.timestamps[left]
+        slopes = ((samples.gyroscope[left + 1] - samples.gyroscope[left]) / periods[:, None])[..., None]
         bend = R_ij @ slopes[1:] - slopes[:-1] + skew(shift.squeeze(-1)) @ R_ij @ rates[1:, :, None]
         bend = -(weighted * (from_right @ bend)).sum()
         hessian = hessian + torch.nn.functional.pad(bend.view(1, 1), (6, 0, 6, 0))

@@ -18,13 +18,14 @@ from torch import Tensor
 
 from torchslam.data.trajectories import read_trajectory
 from torchslam.geometry import se3_inverse, so3_log, umeyama
+from torchslam.geometry.robust import NORMAL_MEDIAN, NORMAL_MEDIAN_3D
 from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, on_clock_of_images
 from torchslam.metric.options import Given
 from torchslam.metric.path_lengths import (
     MIN_STRETCHES,
     STRETCH,
     Stretches,
-    found_shift,
+    best_shift,
     measured,
     stretch_ends,
 )
@@ -71,8 +72,7 @@ class OdometrySource:
             lengths_w, lengths = (T[:, :3, 3].norm(dim=-1) for T in (camera_motions, motions))
             return Stretches(middles, lengths_w, lengths, known & seen)
 
-        duration = float(path.timestamps[-1] - path.timestamps[0])
-        shift = found_shift(at, duration) if self.clock.seconds is None else 0.0
+        shift = best_shift(at, path) if self.clock.seconds is None else 0.0
         motions, known = _motions(sensor, ends - shift)
         known = known & seen
         if int(known.sum()) < MIN_STRETCHES:
@@ -124,7 +124,7 @@ def hand_eye(
     """
     turns, camera_turns = so3_log(motions[:, :3, :3]), so3_log(camera_motions[:, :3, :3])
     turned = (turns.norm(dim=-1) - camera_turns.norm(dim=-1)).abs()
-    noise = (turned[known].median() / 0.6745).clamp_min(MIN_TURN_NOISE)
+    noise = (turned[known].median() / NORMAL_MEDIAN).clamp_min(MIN_TURN_NOISE)
     alike = turned <= GATE * noise
     used = known & alike
     lever = torch.zeros(3, dtype=torch.float64, device="cpu")
@@ -148,7 +148,7 @@ def hand_eye(
         scale = (weights[:, None] * rotated * target).sum() / (weights[:, None] * rotated.square()).sum()
         moved = scale * rotated
         residual = (moved - target).norm(dim=-1)
-        spread = (residual[used].median() / 1.54).clamp_min(1e-9)
+        spread = (residual[used].median() / NORMAL_MEDIAN_3D).clamp_min(1e-9)
         weights = used / (1 + (residual / (2.5 * spread)).square()).square()  # Geman and McClure
         # t_sensor + (R - I) lever = translation of the camera, with a prior for what no turn determines.
         root = weights.sqrt()[:, None, None] / spread

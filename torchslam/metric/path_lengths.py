@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry import so3_log
-from torchslam.metric.camera_path import CameraPath
+from torchslam.metric.camera_path import CameraPath, found_shift
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import SlowMean, slow_mean
 from torchslam.metric.source import Unmeasured
@@ -30,8 +30,6 @@ MAX_RELATIVE_STD = 0.25
 """Relative standard error from which on a scale is no measurement."""
 SEARCH_STEP = 0.1
 """Seconds between the clocks that are tried."""
-SEARCH_LIMIT, SEARCH_SHARE = 20.0, 0.25
-"""Seconds, and part of the recording's duration, by which a clock may be off."""
 SEARCH_GAIN = 18.0
 """Logarithm of the likelihood ratio from which on another clock is believed, as for a difference of six standard
 deviations. Of 20 trials over 15 s, 12.5 believed a wrong one with slipping wheels, and 25 missed one of .8 s."""
@@ -74,22 +72,19 @@ def camera_lengths(
     return (chords * arcs).sum(1), known.all(1)
 
 
-def found_shift(stretches_at: Callable[[float], Stretches], duration: float) -> float:
-    """Seconds that the clock of the images is ahead, in steps; zero unless another one fits far better."""
-    count = int(min(SEARCH_LIMIT, SEARCH_SHARE * duration) / SEARCH_STEP)
-    best, gain, reference = 0.0, SEARCH_GAIN, math.nan
-    for step in sorted(range(-count, count + 1), key=abs):
-        found = stretches_at(step * SEARCH_STEP)
+def best_shift(stretches_at: Callable[[float], Stretches], path: CameraPath) -> float:
+    """Seconds that the clock of the images is ahead; see `found_shift`."""
+
+    def cost_at(shift: float) -> float | None:
+        found = stretches_at(shift)
         lengths_w, lengths = found.lengths_w[found.known], found.lengths[found.known]
         if len(lengths) < 2 * MIN_STRETCHES or not bool((lengths_w > 0).any()):
-            continue
+            return None
         scale = lengths.sum() / lengths_w.sum()
         off = (lengths - scale * lengths_w).abs().median() / lengths.mean().clamp_min(1e-9)
-        cost = len(lengths) * math.log(max(float(off), 1e-6))
-        reference = cost if math.isnan(reference) else reference
-        if reference - cost > gain:
-            best, gain = step * SEARCH_STEP, reference - cost
-    return best
+        return len(lengths) * math.log(max(float(off), 1e-6))
+
+    return found_shift(cost_at, path.duration, SEARCH_STEP, SEARCH_GAIN)
 
 
 def measured(

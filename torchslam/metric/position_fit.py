@@ -14,6 +14,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry import sim3_scale, skew, transform, umeyama
+from torchslam.geometry.robust import NORMAL_MEDIAN_3D
 from torchslam.metric.slow_noise import averaged, group_means, group_rows, slow_correlations
 from torchslam.optim import LEAST_SQUARES_OPTIONS, solve_least_squares
 
@@ -160,8 +161,8 @@ def _robust_start(pairs: PositionPairs) -> tuple[Float[Tensor, "4 4"], Float[Ten
     best = int(half.argmin())
     S = torch.eye(4, dtype=torch.float64, device="cpu")
     S[:3, :3], S[:3, 3] = s[best] * R[best], t[best]
-    # The median length of three normal numbers is 1.54 of their standard deviation; few positions are overfitted.
-    std = half[best] / 1.54 * (1 + 5 / max(len(pairs) - 3, 1))
+    # Few positions are overfitted.
+    std = half[best] / NORMAL_MEDIAN_3D * (1 + 5 / max(len(pairs) - 3, 1))
     return S, std.clamp_min(1e-3).expand(len(pairs), 3)
 
 

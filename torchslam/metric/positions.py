@@ -14,7 +14,14 @@ from torchslam.data.formats.fixes import Fixes
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, sim3_scale
-from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, on_clock_of_images
+from torchslam.metric.camera_path import (
+    CameraPath,
+    Clock,
+    clock_notes,
+    clocks_of,
+    found_shift,
+    on_clock_of_images,
+)
 from torchslam.metric.options import Given
 from torchslam.metric.position_fit import (
     CLOCK_STD,
@@ -39,10 +46,6 @@ UPSIDE_DOWN = -0.5
 level fits if it is turned over."""
 SEARCH_STEP = 0.25
 """Seconds between the clocks that are tried: less than the time in which a vehicle changes its motion."""
-SEARCH_LIMIT = 20.0
-"""Seconds by which a clock may be off; GPS time is ahead of UTC by 18."""
-SEARCH_SHARE = 0.25
-"""Of the recording's duration: the most by which a clock may be off, so that most positions have a pose with any."""
 SEARCH_POSITIONS = 100
 """Positions that clocks are tried with."""
 SEARCH_GAIN = 12.5
@@ -151,29 +154,23 @@ class PositionSource:
         positions_e: Float[Tensor, "M 3"],
         has_height: Bool[Tensor, " M"],
     ) -> float:
-        """Seconds that the clock of the images is ahead, in steps; zero unless another one fits far better."""
-        duration = float(path.timestamps[-1] - path.timestamps[0])
-        count = int(min(SEARCH_LIMIT, SEARCH_SHARE * duration) / SEARCH_STEP)
+        """Seconds that the clock of the images is ahead; see `found_shift`."""
         inside = torch.nonzero(path.at(times)[2])[:, 0]
-        if count == 0 or len(inside) < 2 * MIN_POSITIONS:
+        if len(inside) < 2 * MIN_POSITIONS:
             return 0.0
         rows = inside[:: max(1, len(inside) // SEARCH_POSITIONS)]
         nan = torch.full((len(rows), 2), math.nan, dtype=torch.float64, device="cpu")
-        best, gain = 0.0, SEARCH_GAIN
-        reference = math.nan
-        for step in sorted(range(-count, count + 1), key=abs):
-            shift = step * SEARCH_STEP
+
+        def cost_at(shift: float) -> float | None:
             positions_w, velocities_w, known = path.at(times[rows] + shift)
             if int(known.sum()) < max(MIN_POSITIONS + 2, len(rows) // 2):
-                continue
+                return None
             pairs = PositionPairs(
                 times[rows], positions_w, velocities_w, positions_e[rows], nan, has_height[rows]
             ).select(known)
-            cost = 2 * len(rows) * math.log(max(start_distance(pairs), 1e-6))
-            reference = cost if math.isnan(reference) else reference
-            if reference - cost > gain:
-                best, gain = shift, reference - cost
-        return best
+            return 2 * len(rows) * math.log(max(start_distance(pairs), 1e-6))
+
+        return found_shift(cost_at, path.duration, SEARCH_STEP, SEARCH_GAIN)
 
     # --- what it says ----------------------------------------------------------------------------------------
 

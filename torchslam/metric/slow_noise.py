@@ -13,6 +13,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from torchslam.geometry.robust import NORMAL_MEDIAN
+
 STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviations of the slow noise, in those of the white noise; beyond the last one the white noise does not
 matter."""
@@ -117,8 +119,7 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
     for _ in range(ROUNDS):
         before = inliers
         whitened = (values - mean).abs() / stds
-        # The median of the absolute value of a standard normal number is .6745; rounding is no scatter.
-        scale = (whitened.median() / 0.6745).clamp_min(1e-9)
+        scale = (whitened.median() / NORMAL_MEDIAN).clamp_min(1e-9)  # rounding is no scatter
         inliers = whitened <= GATE * scale
         weights = inliers / stds.square()
         mean = (weights * values).sum() / weights.sum()

@@ -15,13 +15,14 @@ from torchslam.metric.path_lengths import (
     MIN_STRETCHES,
     STRETCH,
     Stretches,
+    best_shift,
     camera_lengths,
-    found_shift,
     measured,
     stretch_ends,
 )
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.utils.indexing import between_rows
 
 MAX_GAP = 2.5
 """Seconds between two speeds up to which the speed in between is known: a second or two is usual for cars, which change
@@ -54,8 +55,7 @@ class SpeedSource:
             lengths, known = self._lengths(times + shift, ends)
             return Stretches(ends[:-1] + STRETCH / 2, lengths_w, lengths, known & seen)
 
-        duration = float(path.timestamps[-1] - path.timestamps[0])
-        shift = found_shift(at, duration) if self.clock.seconds is None else 0.0
+        shift = best_shift(at, path) if self.clock.seconds is None else 0.0
         return measured(at(shift), ScaleSource.SPEED, "the speeds", tuple(clock_notes(file, shift)))
 
     def _lengths(
@@ -65,8 +65,8 @@ class SpeedSource:
         speeds, steps = self.speeds.speeds, times.diff()
         driven = torch.zeros_like(times)
         driven[1:] = (steps * (speeds[1:] + speeds[:-1]) / 2).cumsum(0)
-        left = torch.searchsorted(times, ends, right=True).clamp(1, len(times) - 1) - 1
-        part = ((ends - times[left]) / steps[left]).clamp(0, 1)
+        left, part = between_rows(times, ends)
+        part = part.clamp(0, 1)
         gain = (speeds[left + 1] - speeds[left]) * part / 2
         at = driven[left] + part * steps[left] * (speeds[left] + gain)
         gaps = torch.zeros_like(times)

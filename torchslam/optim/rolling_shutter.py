@@ -29,11 +29,11 @@ from torchslam.geometry.lie import skew
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import robustify
 from torchslam.geometry.rolling_shutter import frame_velocities
+from torchslam.optim._core.options import GRAPH_OPTIONS
 from torchslam.optim.run_graph import ObservationGraph
 
 MIN_FRAMES, MAX_FRAMES = 12, 60
 """Frames of a test, evenly distributed over a run; more would take longer than they tell."""
-KERNEL_SCALE = 2.45  # as in `solve_graph`
 PARTS, PART_FRAMES = 10, 5
 """Stretches of a run whose disagreement gives the standard error, and the frames of one: errors of neighboring frames
 are alike."""
@@ -227,7 +227,8 @@ def _robust_whitening(
         weights = weights[:, None, None] * torch.eye(2, dtype=weights.dtype, device=weights.device)
     W = whitening(weights)
     squared = (W @ (graph.pixels[rows] - pixels)[..., None]).square().sum((1, 2))
-    factors = robustify(squared, "huber", squared.new_tensor(KERNEL_SCALE)).weight.sqrt()
+    scale = squared.new_tensor(GRAPH_OPTIONS.scale)
+    factors = robustify(squared, GRAPH_OPTIONS.kernel, scale).weight.sqrt()
     return W * torch.where(valid, factors, 0.0)[:, None, None]
 
 

@@ -32,6 +32,7 @@ from torchslam.geometry.camera_measurement import (
     intrinsics_directions,
     with_radial_terms,
 )
+from torchslam.geometry.similarity import nearest_rotation
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, choose_held_back, choose_images
 from torchslam.global_mapping.rounds import (
@@ -322,9 +323,7 @@ def _similarity(T_wc: Float[Tensor, "F 4 4"], given: Float[Tensor, "F 4 4"]) -> 
     x, y = source - source.mean(0), target - target.mean(0)
     extent = (x.square().sum() * y.square().sum()).sqrt()
     M = (given[:, :3, :3] @ T_wc[:, :3, :3].mT).mean(0) + (y.mT @ x) / extent.clamp(min=1e-300)
-    U, _, Vh = torch.linalg.svd(M)
-    U[:, 2] *= torch.linalg.det(U @ Vh).sign()
-    R = U @ Vh
+    R = nearest_rotation(M)
     scale = (y * (x @ R.mT)).sum() / x.square().sum() if float(extent) > 0 else x.new_ones(())
     S = torch.eye(4, dtype=x.dtype, device=x.device)
     S[:3, :3] = scale * R

@@ -304,7 +304,8 @@ class FinalAdjustment:
 
     Attributes:
         camera: the camera of the adjusted maps.
-        given: the given camera with its error; None until it is adjusted, and where it is exact.
+        given: the given camera with its error, along the directions that the images agree on, as the final adjustment
+            has it as its prior; None until then, and where the camera is exact.
         calibration: `camera` with its error; None as `given`.
         readout: of a rolling shutter, by which the keypoints are corrected; None: a global shutter.
         shutter: what the residuals say of it; None where that was not tested.

@@ -26,7 +26,7 @@ from torchslam.geometry import (
     transform,
     triangulate,
 )
-from torchslam.geometry.robust import Kernel
+from torchslam.geometry.robust import NORMAL_MEDIAN, Kernel
 from torchslam.map.atlas import Submap
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.tracking.matcher import make_matcher, run_matcher
@@ -218,7 +218,7 @@ class Initializer:
         inliers = relative.inliers[0]
         # The noise of both views is in the distance from an epipolar line.
         across = self._offsets(relative.T_21[0], matches.of(inliers)).median()
-        noise = min(max(float(across) / (math.sqrt(2) * 0.6745), LEAST_NOISE), 1.0)
+        noise = min(max(float(across) / (math.sqrt(2) * NORMAL_MEDIAN), LEAST_NOISE), 1.0)
         if self.turning.explains(turned, inliers, NOISE_SIGMAS * noise):
             return None
         found = self._triangulate(matches.of(inliers), relative.T_21[0], settings.min_good_ratio, noise)

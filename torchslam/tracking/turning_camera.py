@@ -16,12 +16,8 @@ from torch import Tensor
 from torchslam.config import CameraConfig, Config
 from torchslam.geometry import SharedCamera
 from torchslam.geometry.lie import so3_log
-from torchslam.geometry.rotating_camera import (
-    RotatingCamera,
-    at_middle_row,
-    fit_rotating_camera,
-    rotation_between,
-)
+from torchslam.geometry.rolling_shutter import at_middle_row
+from torchslam.geometry.rotating_camera import RotatingCamera, fit_rotating_camera, rotation_between
 from torchslam.geometry.two_view import TRANSFER_WIDTH
 from torchslam.tracking.matcher import run_matcher
 from torchslam.types import FrameFeatures, Matcher

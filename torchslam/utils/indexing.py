@@ -1,6 +1,6 @@
-"""Set operations on dense row numbers, by a flag per number between the lowest and the highest.
+"""Set operations on dense row numbers, by a flag per number between the lowest and the highest; places in a table.
 
-For dense numbers this is several times faster than the sorting of `torch.unique` and `torch.isin`.
+For dense numbers flags are several times faster than the sorting of `torch.unique` and `torch.isin`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 
@@ -26,6 +26,22 @@ def distinct(ids: Int[Tensor, " N"]) -> Int[Tensor, " R"]:
         return ids
     low, flags = _flags(ids)
     return true_indices(flags) + low
+
+
+def between_rows(
+    ascending: Float[Tensor, " M"], values: Float[Tensor, "*shape"]
+) -> tuple[Int[Tensor, "*shape"], Float[Tensor, "*shape"]]:
+    """Return the row before each value, and how far the value is from there to the next row, 0 to 1.
+
+    Beyond the ends it is the first or the last interval, and the share is below 0 or above 1. Differentiable.
+
+    Args:
+        ascending: two or more distinct numbers, such as times.
+        values: to be found between them.
+    """
+    found = torch.searchsorted(ascending.detach().contiguous(), values.detach().contiguous(), right=True)
+    left = found.clamp(1, len(ascending) - 1) - 1
+    return left, (values - ascending[left]) / (ascending[left + 1] - ascending[left])
 
 
 def ranks_among(ids: Int[Tensor, " N"], ascending: Int[Tensor, " M"]) -> Int[Tensor, " N"]:

@@ -17,10 +17,12 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.formats.calibration_files import Keys, read_keys
+from torchslam.data.formats.csv_tables import UNITS
 from torchslam.data.inertial import InertialCalibration, InertialSamples
 from torchslam.data.text_file import parse_floats, read_text
 from torchslam.data.trajectories import ORTHOGONAL
 from torchslam.errors import CalibrationError, MeasurementError
+from torchslam.geometry.lie import rigid, se3_inverse
 
 DELIMITERS = (",", ";", "\t")
 """Between columns, in the order in which they are looked for; spaces otherwise."""
@@ -29,7 +31,7 @@ AXES = ("x", "y", "z")
 GYROSCOPES = ("wrss", "gyro", "gyroscope", "gyr", "g", "w", "omega", "angularvelocity", "rotationrate")
 ACCELEROMETERS = ("arss", "acc", "accel", "accelerometer", "acceleration", "a", "linearacceleration")
 """Names of columns without their axis, in lower case, letters alone."""
-TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
+TIME_UNITS = {**UNITS, "sec": 1.0, "µs": 1e-6}
 """Units of times by their letters, in seconds."""
 RATE_UNITS = {
     **dict.fromkeys(("rads", "radsec", "rads1", "rad"), 1.0),
@@ -263,8 +265,7 @@ def _mounting(all_keys: list[Keys], path: Path) -> Float[Tensor, "4 4"]:
                 raise MeasurementError(str(error)) from error
             T = _rigid(numbers, path)
             if is_inverse:
-                R = T[:3, :3].mT
-                T = torch.cat((torch.cat((R, -R @ T[:3, 3:]), dim=-1), T[3:]))
+                T = se3_inverse(T)
             if torch.equal(T, torch.eye(4, dtype=T.dtype, device="cpu")):
                 raise MeasurementError(
                     f"{path}: the transformation between camera and body is the identity, as in the file of a sensor; "
@@ -290,4 +291,4 @@ def _rigid(numbers: list[float], path: Path) -> Float[Tensor, "4 4"]:
             f"{path}: {float(T[:3, 3].norm()):g} m between camera and body; is it in meters?"
         )
     U, _, Vh = torch.linalg.svd(R)
-    return torch.cat((torch.cat((U @ Vh, T[:3, 3:]), dim=-1), T[3:]))
+    return rigid(U @ Vh, T[:3, 3])
