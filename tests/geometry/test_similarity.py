@@ -25,7 +25,7 @@ from torchslam.geometry import (
     transform,
     umeyama,
 )
-from torchslam.geometry.similarity import _inverse, _Problem, _View, align_poses
+from torchslam.geometry.similarity import _inverse, _Problem, _View, align_poses, in_place_of
 from torchslam.geometry.transforms import without_scale
 
 
@@ -392,6 +392,10 @@ def test_poses_are_aligned_with_their_rotations(line: bool) -> None:
     S_ba = sim3_exp(torch.tensor([0.3, -1.0, 2.0, 0.4, -0.7, 0.2, 0.5], dtype=torch.float64))
     T_bc = se3_inverse(without_scale(se3_inverse(T_ac) @ sim3_inverse(S_ba)))
     torch.testing.assert_close(align_poses(T_ac, T_bc), S_ba, rtol=0, atol=1e-12)
+    points_a = torch.randn(5, 3, generator=generator, dtype=torch.float64)
+    T_cb, points_b = in_place_of(se3_inverse(T_bc), se3_inverse(T_ac), points_a)
+    torch.testing.assert_close(T_cb, se3_inverse(T_bc), rtol=0, atol=1e-12)
+    torch.testing.assert_close(points_b, transform(S_ba, points_a), rtol=0, atol=1e-12)
 
 
 def test_poses_at_one_place_keep_their_unit() -> None:

@@ -54,3 +54,13 @@ def test_an_impossible_noise_is_refused(tmp_path, value: float) -> None:
     write_atlas(tmp_path / "map.safetensors", [submap], CAMERA)
     with pytest.raises(ResultsError, match=r"noise_variances|not a torchslam map"):
         read_atlas(tmp_path / "map.safetensors")
+
+
+def test_a_finished_map_sets_it_at_once_within_the_same_bounds() -> None:
+    for factor, expected in ((0.1, 1.0), (2.0, 2.0), (100.0, _MAX_NOISE_VARIANCE)):
+        slam_map = Map()
+        slam_map.noise_variance = 3.0
+        slam_map.set_noise(torch.full((9,), factor * _ADJUSTED_SQUARED_ERROR, dtype=torch.float64))
+        assert slam_map.noise_variance == pytest.approx(expected)
+    slam_map.set_noise(torch.zeros(0))
+    assert slam_map.noise_variance == _MAX_NOISE_VARIANCE

@@ -173,3 +173,40 @@ def test_a_camera_that_nothing_determines_has_no_evidence() -> None:
     still = walk(0, frames=2)
     empty = replace(still, pixels=torch.full_like(still.pixels, float("nan")))
     assert camera_evidence(empty, off_by(1.0), OPTIONS) is None
+
+
+def test_the_order_of_the_rows_does_not_matter() -> None:
+    given = off_by(1.01)
+    problem = solved(walk(3), given)
+    order = torch.randperm(len(problem.T_cw), generator=torch.Generator().manual_seed(1))
+    rank = torch.argsort(order)
+    (first,) = problem.fixed_frames
+    shuffled = replace(
+        problem,
+        T_cw=problem.T_cw[order],
+        frame_index=rank[problem.frame_index],
+        fixed_frames=[int(rank[first])],
+    )
+    plain = camera_evidence(problem, given, OPTIONS)
+    ordered = camera_evidence(shuffled, given, OPTIONS, when=2.5 * order)
+    mixed = camera_evidence(shuffled, given, OPTIONS)
+    assert plain is not None
+    assert ordered is not None
+    assert mixed is not None
+    torch.testing.assert_close(ordered.scores, plain.scores, rtol=1e-5, atol=1e-5)
+    assert not torch.allclose(mixed.scores, plain.scores, rtol=1e-2)
+
+
+def test_a_departure_is_from_the_camera_that_is_asked_for() -> None:
+    given = off_by(1.02)
+    evidence = camera_evidence(solved(walk(3), given), given, OPTIONS)
+    assert evidence is not None
+    estimate = evidence.estimate(3)
+    assert estimate.departure == estimate.departure_from(given.camera)
+    found = given.camera.with_params(given.camera.params + given.directions @ estimate.step)
+    assert estimate.departure_from(found) < 1e-6
+    # One direction, by one standard error of the images.
+    alone = evidence.estimate(1)
+    step = alone.step + alone.covariance[0].sqrt()
+    moved = given.camera.with_params(given.camera.params + given.directions[:, :1] @ step)
+    assert alone.departure_from(moved) == pytest.approx(1.0, rel=1e-6)

@@ -25,9 +25,7 @@ def unadjusted() -> Run:
 
 def adjusted(run: Run, settled: bool) -> Atlas:
     atlas = Atlas(run.camera.params, deepcopy(run.submaps))
-    FinalAdjustment(run.camera, load_config(None, [*SETTINGS, "camera.std=0"])).adjust(
-        atlas, 0, settled=settled
-    )
+    FinalAdjustment(run.camera, load_config(None, SETTINGS), None).adjust(atlas, 0, settled=settled)
     return atlas
 
 

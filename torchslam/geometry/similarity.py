@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.estimate_gradients import first_order, needs_gradient, refuse_transforms
-from torchslam.geometry.lie import cayley_rotation, rigid, so3_exp, transform, vee
+from torchslam.geometry.lie import cayley_rotation, rigid, se3_inverse, sim3_inverse, so3_exp, transform, vee
 from torchslam.geometry.precision import check_positive, full_precision
 from torchslam.geometry.projections import squared_projections
 from torchslam.geometry.ransac import (
@@ -29,6 +29,7 @@ from torchslam.geometry.ransac import (
     truncated_rows,
     truncated_score,
 )
+from torchslam.geometry.transforms import without_scale
 from torchslam.utils.deprecation import OldCall
 
 
@@ -100,6 +101,14 @@ def align_poses(T_ac: Float[Tensor, "N 4 4"], T_bc: Float[Tensor, "N 4 4"]) -> F
     S_ba[:3, :3] = scale * R
     S_ba[:3, 3] = mean_b - scale * R @ mean_a
     return S_ba
+
+
+def in_place_of(
+    T_cb: Float[Tensor, "N 4 4"], T_ca: Float[Tensor, "N 4 4"], points_a: Float[Tensor, "P 3"]
+) -> tuple[Float[Tensor, "N 4 4"], Float[Tensor, "P 3"]]:
+    """Poses T_ca and points with the place and the unit that poses T_cb of the same cameras have, see `align_poses`."""
+    S_ba = align_poses(se3_inverse(T_ca), se3_inverse(T_cb))
+    return without_scale(T_ca @ sim3_inverse(S_ba)), transform(S_ba, points_a)
 
 
 def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:

@@ -270,7 +270,7 @@ class GlobalMapper:
         mapped = {view.index: view for view in views}
         frames = range(len(self.sequence)) if frames is None else frames
         results = poser.pose(submap, self._all_views(frames, mapped), given_cw)
-        final = FinalAdjustment(self.camera, with_camera_std(self.config, 0.0), self.given)
+        final = FinalAdjustment(self.camera, self.config, self.given)
         final.camera = found.camera
         if not keep:
             final.adjust(
@@ -347,11 +347,6 @@ class GlobalMapper:
         ]
         run = Run((), self.camera, self.config, results, self.skipped, False, reason)
         return GlobalMap(run, views, pairs, frozenset())
-
-
-def with_camera_std(config: Config, std: float) -> Config:
-    """The configuration with another error of the given camera."""
-    return replace(config, camera=replace(config.camera, std=std))
 
 
 def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:

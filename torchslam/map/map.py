@@ -382,18 +382,21 @@ class Map:
         A moving average of medians: a tenth of outliers does not matter. The first adjustments weigh more; the prior,
         that the feature extractor states the truth, counts as much as `_PRIOR_ADJUSTMENTS` of them.
         """
-        if len(squared_errors) == 0:
-            return
-        found = float(squared_errors.median()) / _ADJUSTED_SQUARED_ERROR
-        rate = 1 / (_PRIOR_ADJUSTMENTS + min(self.num_keyframes, _REMEMBERED_ADJUSTMENTS))
-        variance = self.noise_variance + rate * (found - self.noise_variance)
-        self.noise_variance = min(max(variance, 1.0), _MAX_NOISE_VARIANCE)
+        self._move_noise(
+            squared_errors, 1 / (_PRIOR_ADJUSTMENTS + min(self.num_keyframes, _REMEMBERED_ADJUSTMENTS))
+        )
 
     def set_noise(self, squared_errors: Float[Tensor, " O"]) -> None:
         """Set the variance of keypoints by the squared errors of a map at its minimum, within the same bounds."""
-        if len(squared_errors):
-            found = float(squared_errors.median()) / _ADJUSTED_SQUARED_ERROR
-            self.noise_variance = min(max(found, 1.0), _MAX_NOISE_VARIANCE)
+        self._move_noise(squared_errors, 1.0)
+
+    def _move_noise(self, squared_errors: Float[Tensor, " O"], rate: float) -> None:
+        """Move the variance of keypoints by a share of the way to what squared errors show."""
+        if len(squared_errors) == 0:
+            return
+        found = float(squared_errors.median()) / _ADJUSTED_SQUARED_ERROR
+        variance = self.noise_variance + rate * (found - self.noise_variance)
+        self.noise_variance = min(max(variance, 1.0), _MAX_NOISE_VARIANCE)
 
     def mark_renumbered(self) -> None:
         """Rebuild the index on the next query and raise the version, after rows were renumbered."""

@@ -32,6 +32,8 @@ LOCAL_TOLERANCE = 1e-4
 """Predicted relative reduction of the cost that ends a local adjustment; the next keyframe moves the map by more."""
 HUBER = CHI_SQUARE_95**0.5
 """Whitened residual at which the kernel leaves its quadratic part: the 95 % quantile for two dimensions, 2.45."""
+MAP_OPTIONS = BUNDLE_OPTIONS.replace(kernel="huber", scale=HUBER, backward="detached")
+"""Of adjustments of a whole map."""
 
 
 @dataclass(frozen=True)
@@ -132,13 +134,7 @@ def solve_window(
         free_camera=free,
         progress=progress,
         check=False,
-        options=BUNDLE_OPTIONS.replace(
-            kernel="huber",
-            scale=HUBER,
-            iterations=settings.global_iterations,
-            tolerance=tolerance,
-            backward="detached",
-        ),
+        options=MAP_OPTIONS.replace(iterations=settings.global_iterations, tolerance=tolerance),
     )
 
 

@@ -12,18 +12,20 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, SharedCamera, se3_inverse, sim3_inverse, transform
+from torchslam.geometry import Camera, SharedCamera
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
-from torchslam.geometry.similarity import align_poses
-from torchslam.geometry.transforms import without_scale
+from torchslam.geometry.similarity import in_place_of
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.mapping.local_bundle import adjust_all, apply_solution, build_window, solve_window
-from torchslam.optim import BundleProblem
-from torchslam.optim.camera_evidence import CameraEstimate, camera_evidence
+from torchslam.mapping.local_bundle import (
+    MAP_OPTIONS,
+    adjust_all,
+    apply_solution,
+    build_window,
+    solve_window,
+)
+from torchslam.optim import camera_evidence
 
 FIRST_KEYFRAMES, MAX_KEYFRAMES, GROWTH = 6, 100, 1.3
 """Keyframes of the map at the first check and the last one, and their ratio from check to check. Tried from 6 to 8 and
@@ -89,18 +91,17 @@ class OnlineCamera:
             return False
         found = solve_window(window.problem, self.settings, calibration=self.given)
         at = replace(window.problem, T_cw=found.T_cw, points_w=found.points_w, camera=found.camera)
-        evidence = camera_evidence(_by_time(at, submap.map.keys), self.given)
+        evidence = camera_evidence(at, self.given, MAP_OPTIONS, submap.map.keys[window.keyframes])
         if evidence is None:
             return False
         estimate = evidence.estimate()
-        departure = _departure(estimate, self.camera.current)
+        departure = estimate.departure_from(self.camera.current)
         if departure < MIN_DEPARTURE:
             return False
         found = solve_window(at, self.settings, calibration=estimate.prior)
         # In place and unit of the map as it was: with them go the frames in between, and the poses that follow.
-        S_ba = align_poses(se3_inverse(found.T_cw), se3_inverse(submap.map.T_cw[window.keyframes]))
-        T_cw = without_scale(found.T_cw @ sim3_inverse(S_ba))
-        apply_solution(submap.map, window, T_cw, transform(S_ba, found.points_w), found.camera)
+        T_cw, points_w = in_place_of(submap.map.T_cw[window.keyframes], found.T_cw, found.points_w)
+        apply_solution(submap.map, window, T_cw, points_w, found.camera)
         self.camera.replace(found.camera)
         self.changes.append(CameraChange(_newest_frame(submap), found.camera, departure))
         for other in self.atlas:
@@ -113,26 +114,3 @@ def _newest_frame(submap: Submap) -> int:
     """Index of the newest posed frame."""
     posed = submap.posed_frames
     return int(posed.frames["frame_index"][posed.keys.argmax()])
-
-
-def _by_time(problem: BundleProblem, keys: Int[Tensor, " K"]) -> BundleProblem:
-    """The same problem with its keyframes in the order of time; those of frames tracked backward have later rows."""
-    order = torch.argsort(keys)
-    rank = torch.argsort(order)
-    assert isinstance(problem.fixed_frames, Tensor)
-    return replace(
-        problem,
-        T_cw=problem.T_cw[order],
-        frame_index=rank[problem.frame_index],
-        fixed_frames=problem.fixed_frames[order],
-    )
-
-
-def _departure(estimate: CameraEstimate, camera: Camera) -> float:
-    """By how many standard errors of the images a camera is off, along the directions that are free."""
-    directions: Float[Tensor, "P f"] = estimate.prior.directions
-    if directions.shape[1] == 0:
-        return 0.0
-    off = with_radial_terms(camera).params - estimate.prior.camera.params
-    step = estimate.step - torch.linalg.pinv(directions) @ off
-    return float((step @ torch.linalg.solve(estimate.covariance, step)).sqrt())

@@ -256,9 +256,7 @@ def finish(
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
     with torch.inference_mode():
         slam.finalize()
-    std = slam.config.camera.std
-    given = CameraMeasurement.of(slam.camera, std) if std else None
-    final = FinalAdjustment(slam.shared_camera.current, slam.config, given)
+    final = FinalAdjustment(slam.shared_camera.current, slam.config, slam.online_camera.given)
     try:
         if slam.session.mapping:
             final.adjust(slam.session.atlas, slam.session.number, adjusting)
@@ -311,11 +309,9 @@ class FinalAdjustment:
         shutter: what the residuals say of it; None where that was not tested.
     """
 
-    def __init__(self, camera: Camera, config: Config, measured: CameraMeasurement | None = None) -> None:
-        """Create the adjustment; `measured`: the given camera with its error, that of the configuration if None."""
+    def __init__(self, camera: Camera, config: Config, measured: CameraMeasurement | None) -> None:
+        """Create the adjustment; `measured`: the given camera with its error, None if it is exact."""
         self.camera, self.settings = camera, config.bundle_adjustment
-        if measured is None and config.camera.std:
-            measured = CameraMeasurement.of(camera, config.camera.std)
         self._measured = measured
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
