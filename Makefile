@@ -28,7 +28,7 @@ INSTALLED_BENCHMARKS := $(VENV)/.torchslam-installed-benchmarks
 INSTALLED_RELEASE := $(VENV)/.torchslam-installed-release
 PYTHONS := 3.11 3.12 3.13 3.14
 
-.PHONY: help demo test test-docs fuzz mutation lint types pythons format docs docs-serve benchmarks profile report wheel lock \
+.PHONY: help demo test test-slow test-docs fuzz mutation lint types pythons format docs docs-serve benchmarks profile report wheel lock \
 	sbom audit clean distclean
 .DEFAULT_GOAL := help
 
@@ -40,6 +40,9 @@ demo: $(INSTALLED)  ## render a room, run SLAM on it, evaluate, draw and print a
 
 test: lint  ## lint, then the tests
 	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile $(PYTEST_ARGS)
+
+test-slow: $(INSTALLED_DEV)  ## the tests that `make test` leaves out: half an hour
+	$(BIN)/python -m pytest --numprocesses logical --maxprocesses 8 --dist loadfile -m slow $(PYTEST_ARGS)
 
 test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## execute the code blocks of the documentation, all tutorials included
 	$(BIN)/python -m pytest tests/docs -m 'slow or not slow' $(PYTEST_ARGS)

@@ -47,7 +47,7 @@ def test_a_run_its_gradient_and_its_covariances(device: torch.device) -> None:
         torch.testing.assert_close(found, expected[name], **TOLERANCE)
 
 
-@pytest.mark.parametrize("kind", ["orb", "opencv-orb"])
+@pytest.mark.parametrize("kind", ["orb", pytest.param("opencv-orb", marks=pytest.mark.slow)])
 def test_images(device: torch.device, kind: str) -> None:
     sequence = open_sequence("synthetic:room").part(0, 12, 2)
     config = load_config(None, [f"features.kind={kind}", "features.num_keypoints=300"])

@@ -109,6 +109,7 @@ def test_the_same_bytes_again_and_after_an_interruption(
         assert (results / name).read_bytes() == (run / name).read_bytes()
 
 
+@pytest.mark.slow
 def test_the_same_bytes_with_any_number_of_processes(run: Path, results: Path) -> None:
     assert densify(results, processes=3) == 0
     for name in (DEPTHS, DENSE_CLOUD):

@@ -343,7 +343,7 @@ VALID = st.builds(
 KEYS = [(kind, name, key) for name, kind in {"": Config, **SECTIONS}.items() for key in _settings(kind)]
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=25, deadline=None)
 @given(config=VALID)
 def test_any_valid_configuration_reads_back(tmp_path_factory: pytest.TempPathFactory, config: Config) -> None:
     file = tmp_path_factory.mktemp("valid") / "config.toml"

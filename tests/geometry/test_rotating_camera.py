@@ -46,7 +46,7 @@ def everything(pixels: Tensor) -> Tensor:
     return torch.ones_like(pixels[..., 0], dtype=torch.bool)
 
 
-@settings(deadline=None, max_examples=40)
+@settings(deadline=None, max_examples=15)
 @given(
     factor=st.floats(1 / 2.5, 2.5),
     axis=st.floats(0, 2 * math.pi),

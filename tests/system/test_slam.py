@@ -344,10 +344,10 @@ def test_real_images_are_tracked(data_dir: object, name: str, frames: int, ate_m
     ("name", "frames", "precision_m"),
     [
         ("shelf_bin", 50, 0.0005),
-        ("machine_hall", 320, 0.0005),
+        pytest.param("machine_hall", 320, 0.0005, marks=pytest.mark.slow),
         ("fr2_desk_20", 20, 0.0005),
-        ("kitti07", 160, 0.02),
-        ("redkitchen", 300, 0.01),
+        pytest.param("kitti07", 160, 0.02, marks=pytest.mark.slow),
+        pytest.param("redkitchen", 300, 0.01, marks=pytest.mark.slow),
     ],
 )
 def test_the_final_trajectory_is_not_worse_than_the_online_one(
