@@ -29,7 +29,7 @@ from torchslam.optim.pose_graph._sparse_cholesky import (
     factorize_sparse,
 )
 
-SPARSE_FRAMES = 2
+SPARSE_FRAMES = 200
 """Free frames from which on the reduced system is factorized as blocks of covisible pairs."""
 MOST_CAMERAS = 16
 """Cameras up to which the border that they form is narrow."""
