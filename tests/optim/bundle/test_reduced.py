@@ -65,6 +65,7 @@ def solved(monkeypatch):
 
     def solve(problem, by_blocks, task=solve_bundle, **options):
         monkeypatch.setattr(schur, "SPARSE_FRAMES", 2 if by_blocks else 1000)
+        monkeypatch.setattr(schur, "_TILE_POINTS", 16)
         found = []
         factorized = schur.NormalEquations.factorized
 
@@ -112,6 +113,7 @@ CASES = {
     "no loop": lambda: walk(loop=False),
     "no fixed frame": lambda: walk(fixed_frames=()),
     "two fixed frames": lambda: walk(fixed_frames=(0, 1)),
+    "ten fixed frames, which see points alone": lambda: walk(fixed_frames=range(10)),
     "fixed points": lambda: walk(fixed_frames=(), fixed_points=(0, 1, 2, 3, 4)),
     "factors": lambda: with_factors(walk()),
     "two positions, which hold all but a turn": lambda: with_priors(walk()),

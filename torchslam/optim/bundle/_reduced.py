@@ -30,9 +30,12 @@ from torchslam.optim.pose_graph._sparse_cholesky import (
 )
 
 SPARSE_FRAMES = 200
-"""Free frames from which on the reduced system is factorized as blocks of covisible pairs."""
+"""Free frames from which on the reduced system is factorized as blocks of covisible pairs. With points in 8 images the
+blocks are faster from 150 frames on, with points in 40 images from 250 on; with points in 100 images neither is up to
+400. Tried from 60 to 400 frames; local maps, of some ten frames, are far below."""
 MOST_CAMERAS = 16
-"""Cameras up to which the border that they form is narrow."""
+"""Cameras up to which the border that they form is narrow: with a camera per frame it would be as wide as the system.
+Tried with 1 to 3 cameras."""
 
 
 class Inverse(Protocol):

@@ -332,7 +332,8 @@ class NormalEquations:
             number = pairs.number(*torch.meshgrid(members, members, indexing="ij"))
             is_upper = number < most
             products = A[:, :width].mT @ A
-            of_frames = products[:, :width].unflatten(0, (-1, dims)).unflatten(2, (-1, dims)).transpose(1, 2)
+            shape = len(members), dims, len(members), dims
+            of_frames = products[:, :width].reshape(shape).transpose(1, 2)
             blocks.index_add_(0, number[is_upper], of_frames[is_upper], alpha=-1)
             if size:
                 border, of_cameras = A[:, width:], rows[width:] - split
