@@ -18,7 +18,8 @@ def test_a_walk_sees_points_again_in_the_next_lap():
 
 
 def test_both_ways_reach_the_same_cost(monkeypatch):
-    monkeypatch.setattr(schur, "SPARSE_FRAMES", schur.SPARSE_FRAMES)  # `measure` sets it
+    for name in ("SPARSE_FRAMES", "MOST_COVISIBLE"):  # `measure` sets them
+        monkeypatch.setattr(schur, name, getattr(schur, name))
     threads = torch.get_num_threads()
     dense, blocks = (measure(60, by_blocks) for by_blocks in (False, True))
     torch.set_num_threads(threads)

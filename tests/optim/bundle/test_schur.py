@@ -65,6 +65,7 @@ def height(request, monkeypatch):
         monkeypatch.setattr(schur, "_TILE_POINTS", 2)
     if request.param == "blocks of pairs":
         monkeypatch.setattr(schur, "SPARSE_FRAMES", 2)
+        monkeypatch.setattr(schur, "MOST_COVISIBLE", 1.0)
 
 
 @pytest.fixture(params=[1, 2, 6], ids=["one camera", "two cameras", "a camera per frame"])

@@ -25,6 +25,7 @@ from torchslam.optim._core.linear import diagonal_floor, factorize
 from torchslam.optim.bundle._factors import FrameBlocks
 from torchslam.optim.bundle._reduced import (
     MOST_CAMERAS,
+    MOST_COVISIBLE,
     SPARSE_FRAMES,
     BlockReduced,
     Border,
@@ -190,7 +191,8 @@ def build_structure(
             if len(columns.members)
         )
         none = frame_slots.new_zeros(0, 2)
-        pairs = covisible_pairs(num_frames, frame_dims, seen, none if joined is None else joined)
+        joined = none if joined is None else joined
+        pairs = covisible_pairs(num_frames, frame_dims, seen, joined, MOST_COVISIBLE)
     return Structure(
         num_points,
         frame_ends,
@@ -329,12 +331,12 @@ class NormalEquations:
         for tile, (_, rows, A) in zip(self.structure.tiles, tiles, strict=True):
             members = tile.frames.members
             width = dims * len(members)
-            number = pairs.number(*torch.meshgrid(members, members, indexing="ij"))
-            is_upper = number < most
+            row, column = torch.triu_indices(len(members), len(members), device=members.device)
+            number = pairs.number(members[row], members[column])
+            row, column, number = (part[number < most] for part in (row, column, number))
             products = A[:, :width].mT @ A
-            shape = len(members), dims, len(members), dims
-            of_frames = products[:, :width].reshape(shape).transpose(1, 2)
-            blocks.index_add_(0, number[is_upper], of_frames[is_upper], alpha=-1)
+            of_frames = products[:, :width].reshape(len(members), dims, len(members), dims)
+            blocks.index_add_(0, number, of_frames[row, :, column], alpha=-1)
             if size:
                 border, of_cameras = A[:, width:], rows[width:] - split
                 columns.index_put_((rows[:width, None], of_cameras), -products[:, width:], accumulate=True)
