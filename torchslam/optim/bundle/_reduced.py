@@ -38,8 +38,8 @@ MOST_CAMERAS = 16
 Tried with 1 to 3 cameras."""
 
 MOST_COVISIBLE = 0.5
-"""Share of all pairs of frames up to which blocks are worth it. Of a camera that stays in one room, 87 % of the pairs of
-1,000 frames share a point: blocks then take as long as the dense matrix, and a third more memory. Walks have a few
+"""Share of all pairs of frames up to which blocks are worth it. Of a camera that stays in one room, 87 % of the pairs
+of 1,000 frames share a point: blocks then take as long as the dense matrix, and a third more memory. Walks have a few
 percent. Tried at this value only."""
 
 
