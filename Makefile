@@ -80,6 +80,7 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## timing and accuracy tables against other
 	$(BIN)/python -m experiments.benchmarks.solvers
 	$(BIN)/python -m experiments.benchmarks.pose_graph
 	$(BIN)/python -m experiments.benchmarks.bundle
+	$(BIN)/python -m experiments.benchmarks.long_bundle
 	$(BIN)/python -m experiments.benchmarks.bal
 	$(BIN)/python -m experiments.benchmarks.relative_pose
 	$(BIN)/python -m experiments.benchmarks.mapping

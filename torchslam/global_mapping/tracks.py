@@ -254,12 +254,15 @@ def make_map(
     first = torch.searchsorted(tracks.track, torch.arange(tracks.count, device=points_w.device))
     first_view = tracks.view[first]
     ids = torch.full_like(first_view, -1)
-    for row, view in enumerate(views):
-        own = torch.nonzero(first_view == row)[:, 0]
+    for row, (view, own) in enumerate(zip(views, _rows_of(first_view, len(views)), strict=True)):
         descriptors = view.descriptors[tracks.keypoint[first[own]]]
         ids[own] = made.add_points(points_w[own], descriptors, row)
-    for row in range(len(views)):
-        own = torch.nonzero(tracks.view == row)[:, 0]
+    for row, own in enumerate(_rows_of(tracks.view, len(views))):
         made.add_observations(row, tracks.keypoint[own], ids[tracks.track[own]])
     made.update_appearance(torch.arange(len(views), device=points_w.device))
     return made
+
+
+def _rows_of(view: Int[Tensor, " O"], views: int) -> tuple[Int[Tensor, " n"], ...]:
+    """The rows of each of `views` images, ascending."""
+    return torch.argsort(view, stable=True).split(torch.bincount(view, minlength=views).tolist())

@@ -217,7 +217,9 @@ class _Part:
         views, view = torch.unique(view[rows], return_inverse=True)
         points, point = torch.unique(point[rows], return_inverse=True)
         rays, frames, marks = (torch.ones_like(x, dtype=torch.bool) for x in (rows, views, points))
-        layout = build_sparse_layout(view, point, rays, frames, marks, torch.zeros_like(views), 1)
+        layout = build_sparse_layout(
+            view, point, rays, frames, marks, torch.zeros_like(views), 1, frame_dims=3
+        )
         placed = torch.cat((views, num_views + points[layout.point_order]))
         return _Part(rows[layout.observations], placed, layout)
 

@@ -59,10 +59,13 @@ def of_each(A, B):
     return torch.einsum("amo,ano->mno", A, B)
 
 
-@pytest.fixture(params=["one tile", "many tiles"])
+@pytest.fixture(params=["one tile", "many tiles", "blocks of pairs"])
 def height(request, monkeypatch):
-    if request.param == "many tiles":
+    if request.param != "one tile":
         monkeypatch.setattr(schur, "_TILE_POINTS", 2)
+    if request.param == "blocks of pairs":
+        monkeypatch.setattr(schur, "SPARSE_FRAMES", 2)
+        monkeypatch.setattr(schur, "MOST_COVISIBLE", 1.0)
 
 
 @pytest.fixture(params=[1, 2, 6], ids=["one camera", "two cameras", "a camera per frame"])

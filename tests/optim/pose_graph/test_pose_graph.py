@@ -530,6 +530,10 @@ def test_sparse_factorization_solves_the_dense_system(kind: str) -> None:
     assert factor.definite.all()
     expected = torch.linalg.solve(dense, right.view(2, -1, 1)).view_as(right)
     torch.testing.assert_close(factor.solve(right), expected, rtol=1e-9, atol=1e-11)
+    inverse = torch.linalg.inv(dense).view(2, K, D, K, D).transpose(2, 3)
+    of_nodes, of_pairs = factor.inverse_blocks()
+    torch.testing.assert_close(of_nodes, inverse.diagonal(dim1=1, dim2=2).movedim(-1, 1))
+    torch.testing.assert_close(of_pairs, inverse[:, index[:, 0], index[:, 1]])
 
     diagonal[1, K // 2] *= -1.0
     broken = factorize_sparse(structure, diagonal, across)
@@ -537,6 +541,8 @@ def test_sparse_factorization_solves_the_dense_system(kind: str) -> None:
     solution = broken.solve(right)
     torch.testing.assert_close(solution[0], expected[0], rtol=1e-9, atol=1e-11)
     assert (solution[1] == 0).all()
+    for blocks in broken.inverse_blocks():
+        assert (blocks[1] == 0).all()
 
 
 def test_fronts_of_a_trajectory_stay_small() -> None:

@@ -305,11 +305,11 @@ class BundleMinimization:
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""
         if self._last is None or not torch.equal(self._last[0], given.counted):
             moving = select_moving(given, self.kinds)
-            self._last = given.counted, moving, _parts(given, moving)
+            self._last = given.counted, moving, _parts(given, moving, self.kinds)
         return self._last[1:]
 
 
-def _parts(given: BundleData, moving: MovingParts) -> list[BatchPart]:
+def _parts(given: BundleData, moving: MovingParts, kinds: Sequence[FactorKind] = ()) -> list[BatchPart]:
     """Split a batch into parts: dense, as many problems at once as fit, or sparse, one at a time."""
     batch = len(given.T_cw)
     use_dense = batch > 1 and suits_dense(given, moving)
@@ -317,6 +317,7 @@ def _parts(given: BundleData, moving: MovingParts) -> list[BatchPart]:
     if use_dense:
         cells = _MAX_CELLS_CPU if given.T_cw.device.type == "cpu" else _MAX_CELLS_GPU
         size = max(1, cells // (moving.frames.shape[1] * moving.points.shape[1]))
+    joined = torch.cat([kind.frames for kind in kinds]) if kinds else None
     parts = []
     for start in range(0, batch, size):
         rows = slice(start, min(start + size, batch))
@@ -327,7 +328,8 @@ def _parts(given: BundleData, moving: MovingParts) -> list[BatchPart]:
         counted, frames, points = (mask[0] for mask in of_part)
         index = given.frame_index[start], given.point_index[start]
         cameras = given.camera_index[start], given.params.shape[1]
-        parts.append(BatchPart(rows, build_sparse_layout(*index, counted, frames, points, *cameras)))
+        layout = build_sparse_layout(*index, counted, frames, points, *cameras, joined=joined)
+        parts.append(BatchPart(rows, layout))
     return parts
 
 

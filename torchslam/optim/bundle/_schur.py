@@ -1,11 +1,11 @@
 """The sparse normal equations of a bundle adjustment, solved by the Schur complement on its points.
 
 Poses form 6x6 blocks, points 3x3 blocks, free cameras n x n blocks, and an observation joins one pose, one camera and
-one point. Eliminating the points leaves a dense system over the free poses and cameras, which is fine up to several
-hundred keyframes. What makes the elimination sparse are *tiles*: runs of points, ordered by the first and last frame
-that see them, with the few frames that see any of them, and their cameras. Within a tile the coupling is one dense
-matrix, so that the Schur complement is a few large matrix products instead of very many small ones, and a sum in a
-fixed order: the same bytes on every run.
+one point. Eliminating the points leaves a system over the free poses and cameras: a dense matrix for few frames, blocks
+of covisible pairs for many (`_reduced`). What makes the elimination sparse are *tiles*: runs of points, ordered by the
+first and last frame that see them, with the few frames that see any of them, and their cameras. Within a tile the
+coupling is one dense matrix, so that the Schur complement is a few large matrix products instead of very many small
+ones, and a sum in a fixed order: the same bytes on every run.
 Source: Triggs et al., "Bundle adjustment: a modern synthesis", 1999, section 6.
 """
 
@@ -21,8 +21,20 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
+from torchslam.optim._core.linear import diagonal_floor, factorize
 from torchslam.optim.bundle._factors import FrameBlocks
+from torchslam.optim.bundle._reduced import (
+    MOST_CAMERAS,
+    MOST_COVISIBLE,
+    SPARSE_FRAMES,
+    BlockReduced,
+    Border,
+    CovisiblePairs,
+    DenseReduced,
+    Reduced,
+    covisible_pairs,
+    factorize_blocks,
+)
 
 # Small enough for a tile's coupling to stay in the cache, large enough for its product to be worth the call. Where many
 # frames see a place again and again, a tile has a column for each of them: fewer points share them better.
@@ -82,6 +94,7 @@ class Structure:
         pair_counts: number of observations of each pair that there is of a point and a camera
         coupling: of the observations by free frames
         camera_coupling: of those pairs
+        pairs: the covisible pairs of frames; None where the reduced system is dense
     """
 
     num_points: int
@@ -96,6 +109,7 @@ class Structure:
     coupling: Coupling
     camera_coupling: Coupling
     tiles: list[Tile]
+    pairs: CovisiblePairs | None = None
 
     @property
     def num_frames(self) -> int:
@@ -145,6 +159,8 @@ def build_structure(
     cameras: Int[Tensor, " K"],
     camera_of: Int[Tensor, " O"],
     num_cameras: int,
+    frame_dims: int = 6,
+    joined: Int[Tensor, "M 2"] | None = None,
 ) -> Structure:
     """The structure of observations (O,) in the order of `Structure`.
 
@@ -152,6 +168,8 @@ def build_structure(
         frame_slots: slot of the observing frame, K for all fixed ones.
         cameras: of the free frames
         camera_of: of the observations
+        frame_dims: numbers by which a frame moves
+        joined: free frames that factors join
     """
     num_frames = len(cameras)
     frame_ends = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames].cumsum(0).tolist()
@@ -164,6 +182,17 @@ def build_structure(
     of_pairs = pairs % num_cameras, pairs // num_cameras
     camera_coupling, cameras_of = _stored(*of_pairs, num_cameras, num_points, height)
     runs = [slice(start, min(start + height, num_points)) for start in range(0, num_points, height)]
+    pairs = None
+    if num_frames >= SPARSE_FRAMES and num_cameras <= MOST_CAMERAS:
+        counts = coupling.stored(torch.ones(linked, 3, 1, device=frame_slots.device)).squeeze(-1)
+        seen = (
+            (columns.members, counts[columns.storage].view(run.stop - run.start, 3, -1)[:, 0])
+            for run, columns in zip(runs, frames_of, strict=True)
+            if len(columns.members)
+        )
+        none = frame_slots.new_zeros(0, 2)
+        joined = none if joined is None else joined
+        pairs = covisible_pairs(num_frames, frame_dims, seen, joined, MOST_COVISIBLE)
     return Structure(
         num_points,
         frame_ends,
@@ -177,6 +206,7 @@ def build_structure(
         coupling,
         camera_coupling,
         [Tile(*parts) for parts in zip(runs, frames_of, cameras_of, strict=True)],
+        pairs,
     )
 
 
@@ -260,25 +290,73 @@ class NormalEquations:
         """
         root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
         root = torch.where(self.free_points[:, None, None], root, 0.0)
-        reduced = self._frames_and_cameras(damping)
         tiles = [self._whitened(tile, root) for tile in self.structure.tiles]
+        directions = None if gauge is None else gauge.flatten(0, 1)
+        find = self._dense if self.structure.pairs is None else self._blocks
+        return FactorizedEquations(self, root, tiles, find(tiles, damping, directions))
+
+    def _dense(self, tiles: list[WhitenedTile], damping: Tensor | None, gauge: Tensor | None) -> DenseReduced:
+        """The reduced system as one matrix."""
+        reduced = self._frames_and_cameras(damping)
         for _, rows, A in tiles:
             reduced.index_put_((rows[:, None], rows[None, :]), -(A.mT @ A), accumulate=True)
         if gauge is not None:
-            c = gauge.flatten(0, 1) * reduced.diagonal().mean().sqrt()
+            c = gauge * reduced.diagonal().mean().sqrt()
             reduced[: len(c), : len(c)] += c @ c.mT
-        return FactorizedEquations(self, root, tiles, factorize(reduced, strict=damping is None))
+        factor = factorize(reduced, strict=damping is None)
+        return DenseReduced(factor, self.frame_dims, self.structure.num_frames)
+
+    def _blocks(
+        self, tiles: list[WhitenedTile], damping: Tensor | None, gauge: Tensor | None
+    ) -> BlockReduced:
+        """The reduced system as blocks of covisible pairs, with the cameras as a border."""
+        pairs, dims = self.structure.pairs, self.frame_dims
+        assert pairs is not None
+        frame_rows, camera_rows = self.rows
+        split, size = frame_rows.numel(), camera_rows.numel()
+        count = len(frame_rows)
+        most = count + len(pairs.keys) - 1
+        blocks = self.frames.new_zeros(most, dims, dims)
+        blocks[:count] = self._own_frames(damping)
+        if self.between is not None:
+            first, second, between = self.between
+            between = torch.where((first < second)[:, None, None], between, between.mT)
+            number = pairs.number(torch.minimum(first, second), torch.maximum(first, second))
+            blocks.index_add_(0, number, between)
+        columns, own = self.frames.new_zeros(split, size), self.frames.new_zeros(size, size)
+        if size:
+            of_cameras = camera_rows - split
+            own[_at(of_cameras, of_cameras)] = _damped(self.cameras, damping)
+            columns[_at(frame_rows, of_cameras[self.structure.cameras])] = self.frames_cameras
+        for tile, (_, rows, A) in zip(self.structure.tiles, tiles, strict=True):
+            members = tile.frames.members
+            width = dims * len(members)
+            row, column = torch.triu_indices(len(members), len(members), device=members.device)
+            number = pairs.number(members[row], members[column])
+            row, column, number = (part[number < most] for part in (row, column, number))
+            products = A[:, :width].mT @ A
+            of_frames = products[:, :width].reshape(len(members), dims, len(members), dims)
+            blocks.index_add_(0, number, of_frames[row, :, column], alpha=-1)
+            if size:
+                border, of_cameras = A[:, width:], rows[width:] - split
+                columns.index_put_((rows[:width, None], of_cameras), -products[:, width:], accumulate=True)
+                own.index_put_((of_cameras[:, None], of_cameras), -(border.mT @ border), accumulate=True)
+        return factorize_blocks(pairs, blocks, Border(columns, own), gauge, strict=damping is None)
+
+    def _own_frames(self, damping: Tensor | None) -> Tensor:
+        """The blocks (K, D, D) of the frames before elimination."""
+        frames = _damped(self.frames, damping)
+        if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
+            eye = torch.eye(self.frame_dims, dtype=frames.dtype, device=frames.device)
+            frames = frames + diagonal_floor(frames.dtype) * eye
+        return frames
 
     def _frames_and_cameras(self, damping: Tensor | None) -> Tensor:
         """The reduced system before elimination, (6 K + C n, 6 K + C n)."""
         frame_rows, camera_rows = self.rows
         size = frame_rows.numel() + camera_rows.numel()
         reduced = self.frames.new_zeros(size, size)
-        frames = _damped(self.frames, damping)
-        if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
-            eye = torch.eye(self.frame_dims, dtype=frames.dtype, device=frames.device)
-            frames = frames + diagonal_floor(frames.dtype) * eye
-        reduced[_at(frame_rows, frame_rows)] = frames
+        reduced[_at(frame_rows, frame_rows)] = self._own_frames(damping)
         if self.between is not None:
             first, second, blocks = self.between
             first, second = frame_rows[first], frame_rows[second]
@@ -342,7 +420,7 @@ class FactorizedEquations:
     equations: NormalEquations
     points_root: Float[Tensor, "N 3 3"]
     tiles: list[WhitenedTile]
-    reduced: DefiniteFactor
+    reduced: Reduced
 
     def solve(self, right: BundleTangent) -> BundleTangent:
         """H^-1 right; all zero where the reduced system is not definite."""
@@ -360,21 +438,14 @@ class FactorizedEquations:
 
     def marginals(self) -> Marginals:
         """The diagonal blocks of H^-1."""
-        size = self.reduced.factor.shape[-1]
-        inverse = self.reduced.solve(
-            torch.eye(size, dtype=self.points_root.dtype, device=self.points_root.device)
-        )
-        eye = torch.eye(3, dtype=inverse.dtype, device=inverse.device)
+        inverse = self.reduced.inverse()
+        eye = torch.eye(3, dtype=self.points_root.dtype, device=self.points_root.device)
         blocks = []
-        for points, rows, A in self.tiles:
-            moved = (A @ inverse[rows[:, None], rows[None, :]]).unflatten(0, (-1, 3))
+        for tile, (points, rows, A) in zip(self.equations.structure.tiles, self.tiles, strict=True):
+            moved = (A @ inverse.among(tile.frames.members, rows)).unflatten(0, (-1, 3))
             root = self.points_root[points]
             blocks.append(root.mT @ (eye + moved @ A.unflatten(0, (-1, 3)).mT) @ root)
-        dims = self.equations.frame_dims
-        split = dims * self.equations.structure.num_frames
-        frames = inverse[:split, :split].unflatten(0, (-1, dims)).unflatten(-1, (-1, dims))
-        frames = frames.diagonal(dim1=0, dim2=2).movedim(-1, 0)
-        return Marginals(frames, torch.cat(blocks) if blocks else self.points_root, inverse[split:, split:])
+        return Marginals(inverse.frames, torch.cat(blocks) if blocks else self.points_root, inverse.cameras)
 
 
 class Marginals(NamedTuple):

@@ -93,8 +93,15 @@ def build_sparse_layout(
     free_points: Bool[Tensor, " N"],
     camera_index: Int[Tensor, " K"],
     num_cameras: int,
+    frame_dims: int = 6,
+    joined: Int[Tensor, "M 2"] | None = None,
 ) -> SparseLayout:
-    """Order the observations (O,) that count; frames (K,) and points (N,) are free or fixed as in `MovingParts`."""
+    """Order the observations (O,) that count; frames (K,) and points (N,) are free or fixed as in `MovingParts`.
+
+    Args:
+        frame_dims: numbers by which a frame moves
+        joined: frames that factors join
+    """
     num_points = len(free_points)
     count = int(free_frames.sum())
     slots = torch.where(free_frames, free_frames.cumsum(0) - 1, count)
@@ -110,8 +117,17 @@ def build_sparse_layout(
     points = point_rank[point_index[rows]]
     free = free_frames.nonzero().squeeze(-1)
     frames = frame_index[rows]
+    if joined is not None:
+        joined = slots[joined[free_frames[joined].all(-1)]]
     structure = build_structure(
-        slots[frames], points, num_points, camera_index[free], camera_index[frames], num_cameras
+        slots[frames],
+        points,
+        num_points,
+        camera_index[free],
+        camera_index[frames],
+        num_cameras,
+        frame_dims,
+        joined,
     )
     return SparseLayout(
         rows,

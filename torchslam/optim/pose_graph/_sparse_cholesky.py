@@ -206,7 +206,11 @@ class SparseFactor:
 
     def solve(self, right: Float[Tensor, "B K D"]) -> Float[Tensor, "B K D"]:
         """matrix^-1 right, zero where the matrix is not definite."""
-        x = (self.scale * right.flatten(1))[..., None]
+        return self.solve_columns(right.flatten(1)[..., None]).squeeze(-1).view_as(right)
+
+    def solve_columns(self, right: Float[Tensor, "B KD m"]) -> Float[Tensor, "B KD m"]:
+        """matrix^-1 right for several right sides at once, zero where the matrix is not definite."""
+        x = self.scale[..., None] * right
         halves = []
         for front, (lower, below) in zip(self.structure.fronts, self.factors, strict=True):
             own, boundary = front.rows.tensor_split((front.size[0],))
@@ -220,8 +224,44 @@ class SparseFactor:
             own, boundary = front.rows.tensor_split((front.size[0],))
             half = half - below.mT @ x.index_select(1, boundary)
             x = x.index_copy(1, own, torch.linalg.solve_triangular(lower.mT, half, upper=True))
-        solution = self.scale * x.squeeze(-1)
-        return torch.where(self.definite[:, None], solution, 0.0).view_as(right)
+        return torch.where(self.definite[:, None, None], self.scale[..., None] * x, 0.0)
+
+    def inverse_blocks(self) -> tuple[Float[Tensor, "B K D D"], Float[Tensor, "B L D D"]]:
+        """The blocks of the inverse at the nodes and at the pairs, zero where the matrix is not definite.
+
+        From the last front to the first: a front's rows of the inverse follow from those of the nodes that it is joined
+        with, which its parent knows. The rest of the inverse, which is dense, is not computed.
+        Source: Erisman and Tinney, "On computing certain elements of the inverse of a sparse matrix", 1975.
+        """
+        structure, dims = self.structure, self.structure.dims
+        children: dict[int, list[int]] = defaultdict(list)
+        for index, front in enumerate(structure.fronts):
+            children[front.parent].append(index)
+        count = structure.num_nodes + 2 * len(structure.pairs)
+        blocks = self.scale.new_zeros(len(self.scale), count, dims, dims)
+        given: dict[int, Tensor] = {}  # the inverse among the nodes that a front is joined with
+        for index in reversed(range(len(structure.fronts))):
+            front, (lower, below) = structure.fronts[index], self.factors[index]
+            eye = torch.eye(front.size[0], dtype=lower.dtype, device=lower.device)
+            root = torch.linalg.solve_triangular(lower, eye.expand_as(lower), upper=False)
+            carried = below @ root
+            boundary = given.pop(index, carried.new_zeros(len(carried), 0, 0))
+            across = -(boundary @ carried)
+            own = root.mT @ root - carried.mT @ across
+            whole = torch.cat((torch.cat((own, across.mT), -1), torch.cat((across, boundary), -1)), dim=-2)
+            for child in children[index]:
+                rows = structure.fronts[child].parent_rows
+                given[child] = whole[:, rows[:, None], rows]
+            cells = whole.unflatten(1, (-1, dims)).unflatten(3, (-1, dims)).transpose(2, 3)
+            blocks[:, front.entries] = cells[:, front.places[0], front.places[1]]
+        blocks = torch.where(self.definite[:, None, None, None], blocks, 0.0)
+        diagonal, across, _ = blocks.split((structure.num_nodes, *2 * (len(structure.pairs),)), dim=1)
+        scale = self.scale.view(len(self.scale), -1, dims)
+        first, second = (scale.index_select(1, nodes) for nodes in structure.pairs.unbind(-1))
+        return (
+            scale[..., :, None] * diagonal * scale[..., None, :],
+            first[..., :, None] * across * second[..., None, :],
+        )
 
 
 def factorize_sparse(
