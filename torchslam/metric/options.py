@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 SEPARATOR = ";"
 """A word between the times that an option is given, in a setting: `marker = "aruco-4x4:0.1 ; aruco-5x5:0.2"`."""
 
+FILES = frozenset({"FILE", "FOLDER[:SCALE]", "CAMERA"})
+"""Words of options that may be names of files."""
 AUTO = "auto"
 """A word in place of a file: the one that the dataset brings along, as in `--depth auto`."""
 
@@ -134,6 +136,20 @@ def given_options(config: MetricConfig, brought: Mapping[str, str] | None = None
             option.name: _times(option, own[option.name]) for option in kind.options if own[option.name]
         }
     return given
+
+
+def given_files(config: MetricConfig) -> list[tuple[str, str]]:
+    """The names of options that a configuration sets, each with a word that may be the name of a file.
+
+    Raises:
+        ConfigError: an option has another number of words than it needs.
+    """
+    found = []
+    for option in (option for kind in KINDS for option in kind.options):
+        text = _text(getattr(config, option.name))
+        for words in _times(option, text) if text and text != AUTO else ():
+            found += [(option.name, w) for w, what in zip(words, option.words, strict=True) if what in FILES]
+    return found
 
 
 def setting_of(times: Iterable[Iterable[str]]) -> str:
