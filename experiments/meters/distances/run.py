@@ -107,7 +107,10 @@ def main() -> None:
     view = SubmapView(submap, saved.camera, int(metrics["session"]), sequence)
     sensor = Sensor(options.depth, view.frame_index, view.T_cw)
     T_cs, meters = registered(view, sensor)
-    kinds: dict[str, list[tuple[float, float] | None]] = {"both ends on surfaces": [], "an end near an edge": []}
+    kinds: dict[str, list[tuple[float, float] | None]] = {
+        "both ends on surfaces": [],
+        "an end near an edge": [],
+    }
     for row in range(EVERY, len(view.rows), options.every):
         frame = int(view.frame_index[row])
         depth = sensor.depth(frame, view.T_cw[row], view.camera, T_cs, meters).numpy()
