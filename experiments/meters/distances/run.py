@@ -31,7 +31,7 @@ CLICK_STD_PX = 1.0
 LEAST_M = 0.3
 """Shortest length."""
 SURE_PX, NEAR_PX = 2, 12
-"""Around a click, true depth is the same within the first radius; where it is not within the second, an edge is near."""
+"""Around a click, true depth is the same within the first radius; where it is not in the second, an edge is near."""
 SAME = 1.03
 """Range of depth, largest to smallest, of one surface."""
 HEADER = (
