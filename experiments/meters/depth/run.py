@@ -60,7 +60,7 @@ def main() -> None:
         evaluate(Trajectory(trajectory.timestamps[part], trajectory.T_wc[part]), sequence.groundtruth).scale
         for part in np.array_split(np.arange(len(trajectory)), PARTS)
     ]
-    truth = "truth: " + ", ".join(f"{each:.3f}" for each in parts)
+    truth = ", ".join(f"{each:.3f}" for each in parts)
     print(f"meters per unit by the ground truth: {scale:.3f}; of {PARTS} parts {truth}")
     publish(table(HEADER, rows), options, __file__)
 
