@@ -1,7 +1,7 @@
-"""`synthetic:marked`: the furnished room with AprilTags, a ChArUco board and a chessboard; importing this adds it.
+"""Furnished rooms with printed targets; importing this module adds the scenes.
 
-Four tags of the family 36h11 with sides of 0.16 m, numbered 0 to 3, and tag 9 with sides of 0.2 m; boards of 7 x 5
-squares of 0.08 m, the ChArUco board with markers of 0.06 m.
+`synthetic:tags` has four AprilTags of the family 36h11 with sides of 0.16 m, numbered 0 to 3, and tag 9 with sides of
+0.2 m; `synthetic:charuco` and `synthetic:chessboard` have a board of 7 x 5 squares of 0.12 m, markers of 0.09 m.
 """
 
 from __future__ import annotations
@@ -30,38 +30,41 @@ TAG_PLACES: dict[int, tuple[Vector, float, float]] = {
 """Center in meters, turn about the vertical and tilt in radians, by id."""
 LARGE_TAG = 9
 TAG_SIDE, LARGE_SIDE = 0.16, 0.2
-CHARUCO_PLACE = (-0.55, 0.1, 1.6), 0.3, 0.15
-CHESSBOARD_PLACE = (0.95, 0.25, 1.7), -0.35, -0.1
+BOARD_PLACE = (0.1, 0.1, 1.5), 0.35, 0.2
 SQUARES = (7, 5)
-SQUARE_SIDE, MARKER_SIDE = 0.08, 0.06
+SQUARE_SIDE, MARKER_SIDE = 0.12, 0.09
 
 
-def marked_room(seed: int) -> list[Rectangle]:
-    """The room with the targets in front of its furniture."""
+def room_with_tags(seed: int) -> list[Rectangle]:
+    """The room with tags in front of its furniture."""
     tags = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_APRILTAG_36h11)
     rectangles = room(seed)
     for identity, place in TAG_PLACES.items():
         drawn = cv2.aruco.generateImageMarker(tags, identity, 8 * CELL)
         side = LARGE_SIDE if identity == LARGE_TAG else TAG_SIDE
-        rectangles.append(_panel(drawn, side / (8 * CELL), CELL, *place))
-    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
-    board = cv2.aruco.CharucoBoard(SQUARES, SQUARE_SIDE, MARKER_SIDE, family)
-    columns, rows = SQUARES
-    charuco = board.generateImage((columns * SQUARE, rows * SQUARE))
-    squares = np.indices((rows * SQUARE, columns * SQUARE)) // SQUARE
-    chessboard = np.where(squares.sum(axis=0) % 2, 255, 0)
-    texel = SQUARE_SIDE / SQUARE
-    rectangles.append(_panel(charuco, texel, CELL, *CHARUCO_PLACE))
-    rectangles.append(_panel(chessboard, texel, CELL, *CHESSBOARD_PLACE))
+        rectangles.append(_panel(drawn, side / (8 * CELL), *place))
     return rectangles
 
 
-def _panel(
-    drawn: np.ndarray, texel: float, margin: int, center: Vector, turn: float, tilt: float
-) -> Rectangle:
-    """A print with a white margin of so many texels, each of so many meters."""
+def room_with_charuco(seed: int) -> list[Rectangle]:
+    """The room with a ChArUco board."""
+    family = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_250)
+    board = cv2.aruco.CharucoBoard(SQUARES, SQUARE_SIDE, MARKER_SIDE, family)
+    drawn = board.generateImage((SQUARES[0] * SQUARE, SQUARES[1] * SQUARE))
+    return [*room(seed), _panel(drawn, SQUARE_SIDE / SQUARE, *BOARD_PLACE)]
+
+
+def room_with_chessboard(seed: int) -> list[Rectangle]:
+    """The room with a chessboard."""
+    squares = np.indices((SQUARES[1] * SQUARE, SQUARES[0] * SQUARE)) // SQUARE
+    drawn = np.where(squares.sum(axis=0) % 2, 255, 0)
+    return [*room(seed), _panel(drawn, SQUARE_SIDE / SQUARE, *BOARD_PLACE)]
+
+
+def _panel(drawn: np.ndarray, texel: float, center: Vector, turn: float, tilt: float) -> Rectangle:
+    """A print of so many meters a texel, with a white margin."""
     padded = cv2.copyMakeBorder(
-        np.where(drawn > 127, WHITE, BLACK).astype(np.uint8), *[margin] * 4, cv2.BORDER_CONSTANT, value=WHITE
+        np.where(drawn > 127, WHITE, BLACK).astype(np.uint8), *[CELL] * 4, cv2.BORDER_CONSTANT, value=WHITE
     )
     axis_u = np.array((math.cos(turn), 0.0, math.sin(turn)))
     ahead = np.array((-math.sin(turn), 0.0, math.cos(turn)))
@@ -71,4 +74,6 @@ def _panel(
     return Rectangle(origin, axis_u, axis_v, size, padded)
 
 
-SCENES["marked"] = Scene(marked_room, loop)
+SCENES["tags"] = Scene(room_with_tags, loop)
+SCENES["charuco"] = Scene(room_with_charuco, loop)
+SCENES["chessboard"] = Scene(room_with_chessboard, loop)
