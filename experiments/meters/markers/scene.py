@@ -63,9 +63,7 @@ def room_with_chessboard(seed: int) -> list[Rectangle]:
 
 def _panel(drawn: np.ndarray, texel: float, center: Vector, turn: float, tilt: float) -> Rectangle:
     """A print of so many meters a texel, with a white margin."""
-    padded = cv2.copyMakeBorder(
-        np.where(drawn > 127, WHITE, BLACK).astype(np.uint8), *[CELL] * 4, cv2.BORDER_CONSTANT, value=WHITE
-    )
+    padded = np.pad(np.where(drawn > 127, WHITE, BLACK).astype(np.uint8), CELL, constant_values=WHITE)
     axis_u = np.array((math.cos(turn), 0.0, math.sin(turn)))
     ahead = np.array((-math.sin(turn), 0.0, math.cos(turn)))
     axis_v = np.array((0.0, math.cos(tilt), 0.0)) + math.sin(tilt) * ahead
