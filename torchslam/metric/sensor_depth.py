@@ -108,7 +108,8 @@ class SensorDepth:
         if len(rows) < LEAST_IMAGES:
             why = f"points of the map have depth in {len(rows)} of {len(chosen)} depth images"
             return Unmeasured(ScaleSource.DEPTH, "; ".join([why, *notes]))
-        times, values = view.timestamps[rows].cpu().double(), torch.tensor(logs, dtype=torch.float64)
+        times = view.timestamps[rows].cpu().double()
+        values = torch.tensor(logs, dtype=torch.float64, device="cpu")
         mean = slow_mean(times, values, torch.ones_like(values))
         if mean.std > MAX_RELATIVE_STD or float(mean.inliers.double().mean()) < 0.5:
             return Unmeasured(ScaleSource.DEPTH, f"depth images differ by {mean.scatter:.0%} from each other")
