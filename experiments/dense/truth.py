@@ -43,8 +43,13 @@ class Sensor:
         depth: Float[Tensor, "K H W"],
         T_cw: Float[Tensor, "K 4 4"],
         camera: Camera,
+        sample: int = SAMPLE,
     ) -> tuple[Float[Tensor, "4 4"], float]:
         """Find the pose of the sensor and the length of a map unit from estimated depth, by a robust fit.
+
+        Args:
+            frames, depth, T_cw, camera: estimated depth, 0 where it is not known.
+            sample: every so many known pixels are used.
 
         Returns:
             T_cs, sensor to camera, in meters, and meters per map unit: one of each for all frames.
@@ -52,7 +57,7 @@ class Sensor:
         points, images = [], []
         rays = camera.normalize(_pixels(*camera.size))
         for index, z, pose in zip(frames, depth.double(), T_cw, strict=True):
-            kept = torch.nonzero(z.flatten() > 0)[::SAMPLE, 0]
+            kept = torch.nonzero(z.flatten() > 0)[::sample, 0]
             points_c = F.pad(rays[kept], (0, 1), value=1.0) * z.flatten()[kept, None]
             points.append(transform(self._near(index)[1] @ se3_inverse(pose), points_c))
             images.append(self._image(self._near(index)[0]))

@@ -16,9 +16,11 @@ import pytest
 
 from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch, content, table, task
 from tests.cli.test_cli import write_tum_folder
+from tests.fuzz import valid_inputs
 from torchslam.batch import Engine, Row, Task, run_batch, run_row
 from torchslam.batch import results_table as tables
 from torchslam.batch.result_store import ERRORS, RECORD, RUNS, hash_files
+from torchslam.batch.task import _input
 from torchslam.cli.main import main
 from torchslam.errors import ConfigError
 
@@ -168,6 +170,30 @@ def test_files_of_a_sequence_are_fingerprinted_by_name_size_and_time(tmp_path: P
     assert hash_files([str(folder)]) not in (first, second)
     assert hash_files([str(folder / "rgb" / "*.png")]) != hash_files([str(folder / "rgb" / "0*.png")])
     assert hash_files(["synthetic:room"]) != hash_files(["synthetic:planar"])
+
+
+def test_files_with_measurements_are_fingerprinted(tmp_path: Path) -> None:
+    """Those of depth images that a list names as well, and what lies beside the samples of an inertial sensor."""
+    for name, data in valid_inputs.depth_images().items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    (tmp_path / "v.csv").write_text("0 1\n1 1\n")
+
+    def found(*settings: str) -> str:
+        row = Row("mine", ROOM, overrides=(*SETTINGS, *settings))
+        return _input(Task(row, str(tmp_path)))
+
+    options = {
+        "v.csv": [f'metric.speed="{tmp_path / "v.csv"}"'],
+        "depth/1.png": [f'metric.depth="{tmp_path}:5000"'],
+        "imu.yaml": [f'metric.imu="{tmp_path / "v.csv"}"'],
+    }
+    for name, settings in options.items():
+        first = found(*settings)
+        assert first not in (found(), found("metric.depth=auto"))
+        (tmp_path / name).write_text("other")
+        assert found(*settings) != first
+    assert found("metric.depth=auto") == found()
 
 
 # --- shards, kills -------------------------------------------------------------------------------------------

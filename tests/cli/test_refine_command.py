@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from tests.cli.test_align_command import Known
 from tests.cli.test_cli import FAST, write_tum_folder
 from tests.refine.test_refine import disturbed
 from torchslam.cli.main import main
@@ -114,6 +115,41 @@ def test_refined_poses_keep_the_format_of_the_input(
         assert content["applied_scale"] == 2.0
         assert content["frames"][0]["sharpness"] == 7
         assert "camera_angle_x" not in content
+
+
+def test_refined_poses_are_in_meters_where_a_length_is_known(
+    folder: Path,
+    given: Tensor,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(
+        "torchslam.cli.arguments.sources_of",
+        lambda given: [Known(3.0)] if "camera_height" in given else [],
+    )
+    poses = write("tum", given, tmp_path)
+    call = [
+        "refine",
+        str(folder),
+        "--poses",
+        str(poses),
+        "-o",
+        str(tmp_path / "a"),
+        *FAST,
+        "--camera-height",
+        "1",
+    ]
+    assert main([*call, "--camera", "500,500,319.5,239.5"]) == 0
+    assert "scale 1.000 ± 0.010 (1 known length)" in capsys.readouterr().out
+    refined = read_poses(tmp_path / "a" / "refined" / "phone.txt")
+    grown = extent(refined.T_cw) / extent(given[:-1])
+    assert grown == pytest.approx(3.0, rel=0.02)
+    assert json.loads((tmp_path / "a" / "metrics.json").read_text())["metric"]["relative_std"] == 0.01
+
+
+def extent(T_cw: Tensor) -> float:
+    return float(torch.pdist(se3_inverse(T_cw)[:, :3, 3]).sum())
 
 
 def test_a_rendered_sequence_takes_the_camera_of_the_poses(

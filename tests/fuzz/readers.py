@@ -28,6 +28,7 @@ from torchslam.batch.task import configuration
 from torchslam.cli.main import main
 from torchslam.config import Config, load_config, to_toml
 from torchslam.data import open_sequence, parse_camera, read_calibration, read_trajectory
+from torchslam.data.formats.depth_images import find_depth_images, read_depth
 from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_color, read_gray
@@ -163,6 +164,7 @@ def readers() -> dict[str, Reader]:
         found.append(Reader(f"positions {kind}", make, partial(_fixes, name=name), 200))
     speeds = {"v.csv": b"time_ms;speed_km_h\n0;3.6\n500;7.2\n1000;0\n"}
     found.append(Reader("speeds", lambda: speeds, lambda root: _speeds(root / "v.csv"), 200))
+    found.append(Reader("depth", valid_inputs.depth_images, _depth, 300))
     for kind in ("mp4", "avi"):
         make = partial(_kind, valid_inputs.videos, kind)
         found.append(Reader(f"video {kind}", make, partial(_sequence, name=f"v.{kind}"), 900))
@@ -187,6 +189,14 @@ def _speeds(path: Path) -> None:
     speeds = read_speeds(path)
     assert bool(speeds.speeds.isfinite().all())
     assert bool((speeds.timestamps.diff() > 0).all())
+
+
+def _depth(root: Path) -> None:
+    """Times rise, and depths are numbers."""
+    images = find_depth_images(root)
+    assert images.timestamps is None or bool((images.timestamps.diff() > 0).all())
+    for path in images.paths[:FRAMES]:
+        assert bool(torch.from_numpy(read_depth(path, images.units_per_meter)).isfinite().all())
 
 
 def _kind(make: Callable[[], dict[str, Files]], kind: str) -> Files:

@@ -129,6 +129,14 @@ def kitti_raw() -> Files:
     )
 
 
+def depth_images() -> Files:
+    """TUM's list, of images of 16 bits."""
+    names = [f"depth/{index}.png" for index in range(3)]
+    listing = "# timestamp filename\n" + "".join(f"{1000 + i / 10:.6f} {n}\n" for i, n in enumerate(names))
+    values = {name: encoded(20 * picture(index).astype(np.uint16)) for index, name in enumerate(names)}
+    return values | {"depth.txt": listing.encode()}
+
+
 def seven_scenes() -> Files:
     poses = {f"frame-{i:06d}.pose.txt": f"1 0 0 {i}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n".encode() for i in range(3)}
     return pictures([f"frame-{index:06d}.color.png" for index in range(3)]) | poses

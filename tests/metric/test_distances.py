@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import statistics
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from tests.map.simulated import CAMERA
 from tests.metric.plane_world import PlaneWorld
 from tests.scene import sideways
 from torchslam.errors import MeasurementError
+from torchslam.geometry import se3_inverse
 from torchslam.metric.distances import Click, Distance, Distances, parse_distance
 from torchslam.metric.image_depth import LocatedPixel, locate_pixel
 from torchslam.metric.scale import ScaleMeasurement
@@ -47,6 +49,47 @@ def test_a_pixel_is_located_within_its_error(world: PlaneWorld, view: SubmapView
         assert (
             float(off_w @ torch.linalg.solve(found.covariance_w, off_w)) < 12
         )  # 99 % of three normal numbers
+
+
+class Step(PlaneWorld):
+    """A wall, and on its left side another one in front of it."""
+
+    FRONT = 0.85
+    """Of the distance of the wall behind."""
+
+    def points_w(self, index: int, pixels: torch.Tensor) -> torch.Tensor:
+        behind_w = super().points_w(index, pixels)
+        center_w = se3_inverse(self.T_cw[index])[:3, 3]
+        front_w = center_w + (behind_w - center_w) * (
+            (self.FRONT * self.offset - self.normal_w @ center_w)
+            / ((behind_w - center_w) @ self.normal_w)[:, None]
+        )
+        return torch.where(front_w[:, :1] < 0, front_w, behind_w)
+
+
+def test_the_error_at_an_edge_has_both_surfaces_in_it() -> None:
+    world = Step(sideways(9), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64), 4.5)
+    view, frame = world.view(), 4
+    width, height = CAMERA.size
+    y = torch.tensor([0.3, 0.4, 0.6]) * height
+    across = torch.stack(torch.meshgrid(torch.arange(width).double(), y.double(), indexing="ij"), dim=-1)
+    front = world.points_w(frame, across.flatten(0, 1))[:, 2].reshape(width, len(y)) < 4.2
+    edge = front.sum(dim=0)  # the first column of the wall behind, of each row
+    whitened, stated = [], {2: list[float](), 40: list[float]()}
+    for off in (-40, -2, 2, 40):
+        for row, column in enumerate(edge.tolist()):
+            pixel = (float(column + off), float(y[row]))
+            found = locate_pixel(view, frame, pixel)
+            if not isinstance(found, LocatedPixel):
+                continue
+            true_w = world.points_w(frame, torch.tensor([pixel], dtype=torch.float64))[0]
+            std = float(found.covariance_w[2, 2].sqrt())
+            whitened.append(float((found.point_w - true_w)[2].abs()) / std)
+            stated[abs(off)].append(std)
+    assert len(stated[40]) >= 4
+    assert len(stated[2]) >= 2
+    assert max(whitened) < 4
+    assert statistics.median(stated[2]) > 3 * max(stated[40])
 
 
 def test_a_length_gives_the_unit(world: PlaneWorld, view: SubmapView) -> None:

@@ -90,6 +90,18 @@ def test_what_a_dataset_brings_counts_unless_the_user_gives_its_kind() -> None:
     assert given_options(replace(MetricConfig(), own=False), brought) == {}
 
 
+def test_what_is_used_on_request_alone() -> None:
+    """A recording with depth images stays one of a single camera, unless they are asked for."""
+    brought = {"depth": "'my scan/depth.txt'", "depth_camera": "585,585,320,240"}
+    assert given_options(MetricConfig(), brought) == {}
+    asked = {"depth": (("my scan/depth.txt",),), "depth_camera": (("585,585,320,240",),)}
+    assert given_options(MetricConfig(depth="auto"), brought) == asked
+    assert given_options(MetricConfig(depth="auto", own=False), brought) == asked
+    assert given_options(MetricConfig(depth="other:5000"), brought) == {"depth": (("other:5000",),)}
+    with pytest.raises(ConfigError, match="--depth auto: the recording brings none along"):
+        given_options(MetricConfig(depth="auto"))
+
+
 def test_a_wrong_description_is_refused_before_the_run() -> None:
     for config in (MetricConfig(marker="apriltag-9h9:0.05"), MetricConfig(distance="1:2,3 1:2,3 4")):
         with pytest.raises(MeasurementError):

@@ -12,6 +12,7 @@ from torch import Tensor
 from torchslam import evaluation, features, geometry, optim
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import Camera, se3_exp, se3_inverse, so3_exp, transform
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.types import Features, Trajectory
 
 F64 = torch.float64
@@ -139,8 +140,32 @@ def calls() -> dict[str, Call]:
     def decision(function: Callable[..., Any], **arguments: Any) -> Call:
         return Call(function, arguments, vmap=False, gradient=False)
 
+    steps = g.InertialSteps(0.01 + 0.002 * rand(B, 7), rand(B, 7, 3), 9.8 * rand(B, 7, 3))
+    increments = g.preintegrate(steps, 0.1 * rand(B, 6), 1e-3, 2e-2)
     undistorted = g.UndistortedKeypoints.of(v["pixels_2"][0], CAMERA)
     return {
+        "inertial_steps": Call(
+            g.inertial_steps,
+            {
+                "timestamps": torch.arange(N, dtype=F64) / 100,
+                "gyroscope": rand(N, 3),
+                "accelerometer": rand(N, 3),
+                "start": torch.tensor([0.012, 0.05], dtype=F64),
+                "end": torch.tensor([0.2, 0.31], dtype=F64),
+            },
+            vmap=False,
+        ),
+        "preintegrate": Call(
+            g.preintegrate,
+            {
+                "steps": steps,
+                "bias": 0.1 * rand(B, 6),
+                "gyroscope_density": 1e-3,
+                "accelerometer_density": 2e-2,
+            },
+        ),
+        "compose_increments": of(g.compose_increments, first=increments, second=increments),
+        "with_bias_change": of(g.with_bias_change, increments=increments, change=0.01 * rand(B, 6)),
         "skew": of(g.skew, v=xi[:, :3]),
         "vee": of(g.vee, W=g.skew(xi[:, :3])),
         "rigid": of(g.rigid, R=R, t=xi[:, :3]),
@@ -277,6 +302,9 @@ def calls() -> dict[str, Call]:
             inputs=(rand(B, N), ones),
             weights=ones,
             mask=v["mask"],
+        ),
+        "camera_evidence": decision(
+            o.camera_evidence, problem=bundle(), given=CameraMeasurement.of(CAMERA, 0.02)
         ),
         "relative_pose_error": of(o.relative_pose_error, T_1w=T, T_2w=T_2, T_21=T),
         "log_distance_error": of(o.log_distance_error, T_1w=T, T_2w=T_2, distances=1 + rand(B)),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import glob
 import json
 import time
 import warnings
@@ -26,6 +27,7 @@ from torchslam.batch.rows import Row
 from torchslam.calibration.find_camera import find_camera, with_stated_std
 from torchslam.config import Config, MetricConfig, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
+from torchslam.data.formats.depth_images import find_depth_images, parse_depth_folder
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
@@ -35,7 +37,7 @@ from torchslam.global_mapping.recording import map_recording
 from torchslam.io.report import compute_metrics
 from torchslam.io.results import source_of
 from torchslam.io.write_run import write_run
-from torchslam.metric.options import given_options, sources_of
+from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.metric_run import run_in_meters
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
@@ -132,7 +134,22 @@ def _input(task: Task) -> str:
     row, settings = task.row, settings_of(task.row)
     names = [row.sequence, row.groundtruth, row.mask, row.camera]
     weights = [settings.features.weights, settings.matching.weights]
-    return hash_files([*(row.resolve(name) for name in names if name), *filter(None, weights)])
+    measured = _measured(settings.metric)
+    return hash_files([*(row.resolve(name) for name in names if name), *filter(None, weights), *measured])
+
+
+def _measured(config: MetricConfig) -> list[str]:
+    """The files with measurements, and those that belong to them."""
+    found = list[str]()
+    for option, name in given_files(config):
+        if option == "depth":
+            images = find_depth_images(*parse_depth_folder(name))
+            found += [str(images.source), *map(str, images.paths)]
+        else:
+            found.append(name)
+        if option == "imu":  # how its numbers are to be read may be in a file beside it
+            found.append(str(Path(glob.escape(str(Path(name).parent)), "*.yaml")))
+    return found
 
 
 def open_row(row: Row) -> Sequence:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from torchslam.config import CHOICES, Config, MetricConfig, builtin_names, load_config
 from torchslam.errors import ConfigError
-from torchslam.metric.options import KINDS, setting_of
+from torchslam.metric.options import KINDS, given_options, setting_of, sources_of
 from torchslam.utils.console import say
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from torchslam.data import Sequence
     from torchslam.data.calibration import Calibration
+    from torchslam.metric.source import MetricSource
 
 SEQUENCE_HELP = (
     "folder (ETH3D, TUM, KITTI, KITTI raw, EuRoC, 7-Scenes, TartanAir, ICL-NUIM, or images), pattern of images, "
@@ -211,6 +212,21 @@ def metric_overrides(options: argparse.Namespace) -> list[str]:
         elif times:
             changes.append(f"metric.{option.name}={json.dumps(setting_of(times), ensure_ascii=False)}")
     return changes
+
+
+def metric_sources(config: MetricConfig, sequence: Sequence) -> list[MetricSource]:
+    """Make the sources that measure the unit of a sequence's map.
+
+    Raises:
+        TorchslamError: an option or a file that it names is wrong, or does not fit the sequence.
+    """
+    from torchslam.metric.distances import Distances
+
+    sources = sources_of(given_options(config, sequence.measurements))
+    for each in sources:
+        if isinstance(each, Distances):
+            each.check(sequence.size)
+    return sources
 
 
 def _given_once(flag: str, times: list[list[str]]) -> float:

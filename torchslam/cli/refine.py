@@ -2,8 +2,9 @@
 
 The input is a COLMAP model, a transforms.json or a TUM trajectory, for example of a phone, a network or another SLAM
 system. Features are matched and triangulated; then poses, points and, where the images contradict it, the focal length
-are adjusted. The results are those of `torchslam run`, in the frame and unit of the given poses; refined/ has the poses
-in their original format, with covariances. Images without a pose and poses without an image are ignored.
+are adjusted. The results are those of `torchslam run`, in the frame and unit of the given poses, or in meters where one
+of the options says what is known of lengths; refined/ has the poses in their original format, with covariances. Images
+without a pose and poses without an image are ignored.
 
 Exit status: 0 done, 2 an error, 3 no map could be built from the images.
 """
@@ -11,6 +12,7 @@ Exit status: 0 done, 2 an error, 3 no map could be built from the images.
 from __future__ import annotations
 
 import argparse
+from dataclasses import replace
 from typing import Any
 
 import torch
@@ -29,6 +31,7 @@ from torchslam.io.results import CALIBRATION, prepare, source_of
 from torchslam.io.write_run import write_run
 from torchslam.refine import CameraChoice, RefinementResult, refine_poses
 from torchslam.refine.files import write_refined
+from torchslam.system.metric_run import run_in_meters
 from torchslam.types import Trajectory
 from torchslam.utils.console import say, table, warn
 
@@ -60,6 +63,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--refine-distortion", action="store_true", help="also refine k1 and k2, if the images require them"
     )
+    arguments.add_metric(parser)
     arguments.add_device(parser)
     arguments.add_config(parser)
 
@@ -83,9 +87,12 @@ def execute(options: argparse.Namespace) -> int:
         choice = CameraChoice.FIXED
     radial = RADIAL if options.refine_distortion or (is_guess and not options.fix_camera) else 0
     config = arguments.config(options)
+    # What a dataset brings along counts where it is asked for alone: the unit of the given poses stays otherwise.
+    sources = arguments.metric_sources(replace(config.metric, own=False), sequence)
     prepare(options.output, options.overwrite, resume=False)
     check_replaceable(options.output / CALIBRATION)
     refined = refine_poses(sequence, given, config, choice, radial, options.device, on_progress=say)
+    refined = replace(refined, run=run_in_meters(refined.run, sequence, sources))
     metrics = _write(refined, sequence, options)
     written = (
         {} if refined.run.failure else {"refined": str(write_refined(options.output / REFINED, refined))}
@@ -95,6 +102,8 @@ def execute(options: argparse.Namespace) -> int:
     if "online ATE" in rows:
         rows["ATE as given"] = rows.pop("online ATE")
     print(f"\n{sequence.name}\n{table(rows)}")
+    for line in [*(metrics["metric"] or {}).get("remarks", ()), *metrics.get("unmeasured", ())]:
+        warn(line)
     if refined.run.failure:
         say(refined.run.failure)
         return NO_MAP

@@ -50,8 +50,6 @@ from torchslam.io.results import (
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
-from torchslam.metric.distances import Distances
-from torchslam.metric.options import given_options, sources_of
 from torchslam.metric.source import MetricSource
 from torchslam.parallel.workers import with_workers
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
@@ -221,14 +219,11 @@ class Attempt:
 
 def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
-    sources = sources_of(given_options(config.metric, sequence.measurements))
+    sources = arguments.metric_sources(config.metric, sequence)
     if sources and options.localize:
         raise ConfigError(
             "measurements of the unit cannot be combined with --localize: a map that is not changed keeps its unit"
         )
-    for each in sources:
-        if isinstance(each, Distances):
-            each.check(sequence.size)
     prepare(options.output, options.overwrite, options.resume)
     mode = _mode(sequence, options)
     check_replaceable(options.output / CALIBRATION)

@@ -687,3 +687,12 @@ class MetricConfig(Settings, section="metric"):
         "How that sensor is mounted on the camera: Kalibr's camchain-imucam, EuRoC's sensor.yaml of the camera, or "
         "ORB-SLAM3's settings. Without it, the rotation between the two is found.",
     )
+    depth: str = setting(
+        "",
+        "Depth images of 16 bits that were taken with the images: a folder or TUM's depth.txt, and after a colon the "
+        "units per meter if they are not those of the dataset or 1000; auto: those that the dataset has.",
+    )
+    depth_camera: str = setting(
+        "",
+        "The camera of those depth images, as --camera; without it they are registered to the color images.",
+    )

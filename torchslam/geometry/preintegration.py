@@ -74,7 +74,12 @@ def inertial_steps(
         accelerometer: m/s^2.
         start: seconds; before the first sample and behind the last one, the line through two samples is extended.
         end: seconds, not before the start.
+
+    Raises:
+        ValueError: there are fewer than two samples.
     """
+    if len(timestamps) < 2:
+        raise ValueError(f"timestamps must be of two samples or more, not of {len(timestamps)}")
     timestamps = timestamps.contiguous()
     inner = torch.searchsorted(timestamps, start.detach(), right=True)
     count = (torch.searchsorted(timestamps, end.detach()) - inner).clamp_min(0)

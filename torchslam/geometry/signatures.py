@@ -221,12 +221,17 @@ def _argument(name: str, hint: Any) -> _Argument | None:
     """What a type hint says about tensors; None where it says nothing."""
     options = [each for each in _alternatives(hint) if each is not NoneType]
     arrays = [each for each in options if isinstance(each, type) and issubclass(each, AbstractArray)]
-    classes = tuple(each for each in options if isinstance(each, type) and is_dataclass(each))
+    classes = tuple(each for each in options if isinstance(each, type) and _is_record(each))
     holds = tuple(_fields(classes[0], name)) if classes else ()
     if not (arrays or holds):
         return None
     is_open = len(options) > len(arrays) + len(classes)
     return _Argument(name, tuple(_Form.of(each) for each in arrays), classes, holds, is_open)
+
+
+def _is_record(cls: type) -> bool:
+    """Whether a class has fields: a dataclass, or a named tuple."""
+    return is_dataclass(cls) or (issubclass(cls, tuple) and hasattr(cls, "_fields"))
 
 
 def _listed(classes: tuple[type, ...]) -> str:
@@ -235,10 +240,11 @@ def _listed(classes: tuple[type, ...]) -> str:
 
 def _fields(cls: type, name: str) -> Iterator[tuple[str, _Argument]]:
     hints = get_type_hints(cls)
-    for field in fields(cls):
-        argument = _argument(f"{name}.{field.name}", hints[field.name])
-        if argument is not None and not field.name.startswith("_"):
-            yield field.name, argument
+    names = [field.name for field in fields(cls)] if is_dataclass(cls) else cls._fields  # type: ignore[attr-defined]
+    for field in names:
+        argument = _argument(f"{name}.{field}", hints[field])
+        if argument is not None and not field.startswith("_"):
+            yield field, argument
 
 
 @cache

@@ -125,13 +125,9 @@ class Distances:
         found: list[tuple[Distance, ScaleMeasurement]] = []
         failed = []
         for each in self._distances:
-            ends = [locate_pixel(view, click.frame, click.pixel) for click in (each.first, each.second)]
-            wrong = [end for end in ends if isinstance(end, str)]
-            measured = (
-                None if wrong else _measured(each, *(end for end in ends if isinstance(end, LocatedPixel)))
-            )
-            if measured is None:
-                failed.append(wrong[0] if wrong else f"{each} is shorter than its error")
+            measured = measure_distance(view, each)
+            if isinstance(measured, str):
+                failed.append(measured)
             else:
                 found.append((each, measured))
         if not found:
@@ -158,13 +154,19 @@ class Distances:
         )
 
 
-def _measured(distance: Distance, first: LocatedPixel, second: LocatedPixel) -> ScaleMeasurement | None:
-    """The unit by one length; None where its error is too large."""
+def measure_distance(view: SubmapView, distance: Distance) -> ScaleMeasurement | str:
+    """The unit of a submap by one length; or say why it says nothing."""
+    first = locate_pixel(view, distance.first.frame, distance.first.pixel)
+    if not isinstance(first, LocatedPixel):
+        return first
+    second = locate_pixel(view, distance.second.frame, distance.second.pixel)
+    if not isinstance(second, LocatedPixel):
+        return second
     between_w = second.point_w - first.point_w
     length = float(between_w.norm())
     direction_w = between_w / max(length, 1e-12)
     variance = float(direction_w @ (first.covariance_w + second.covariance_w) @ direction_w)
     relative = math.hypot(math.sqrt(variance) / max(length, 1e-12), UNIT_STD)
     if not relative < MAX_RELATIVE_STD:
-        return None
+        return f"{distance} is shorter than its error"
     return ScaleMeasurement(ScaleSource.DISTANCE, distance.meters / length, relative, 1, "known length")

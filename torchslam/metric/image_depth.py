@@ -1,7 +1,7 @@
 """Depth of a pixel of a posed frame: the same small window in frames around it, along the ray of the pixel.
 
 Every hypothesis of depth puts the window somewhere into the other images; the zero-mean normalized correlation says how
-alike they look there. One pixel costs a few hundredths of a second, a depth map seconds.
+alike they look there. One pixel costs some tenths of a second, a depth map seconds.
 """
 
 from __future__ import annotations
@@ -28,7 +28,9 @@ PLANES = 128
 REFINED = 65
 """Hypotheses of the second search, over `AGREEING` steps of the first to either side."""
 BESIDE = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
-"""Directions of the clicks beside that of the user."""
+"""Directions of the clicks beside that of the user; two and two are opposite."""
+LAYER_EVERY = 2
+"""Every so many hypotheses are tried for the windows that have the pixel on their border."""
 FRAMES = 12
 """Other frames that are compared at most, spread over those with a fitting parallax."""
 ANGLES_DEG = (1.5, 15.0)
@@ -127,7 +129,27 @@ def _search(sweep: _Sweep, low: float, high: float, where: str) -> LocatedPixel 
     match = MATCH_STD_PX / sweep.pixels_per_inverse_depth(inverse_depth)
     single_std = math.hypot(match, float(np.std(np.array(own))))
     clicked = float(np.std(np.array([inverse_depth, *beside])))
-    return sweep.located(inverse_depth, math.hypot(clicked, single_std / math.sqrt(LEAST_FRAMES)))
+    layers = _layer_std(sweep, coarse[::LAYER_EVERY], inverse_depth)
+    return sweep.located(inverse_depth, math.hypot(clicked, layers, single_std / math.sqrt(LEAST_FRAMES)))
+
+
+def _layer_std(sweep: _Sweep, coarse: Float[Tensor, " D"], inverse_depth: float) -> float:
+    """Standard deviation of an inverse depth by a second surface in the window.
+
+    Two windows on opposite sides, with the pixel on their common border, see the mean of its inverse depth where the
+    surface is a plane, however slanted. At the edge of an object they differ from that by half of the step between both
+    surfaces, and the pixel lies on either one.
+    """
+    steps = [0.0]
+    for one, other in zip(BESIDE[::2], BESIDE[1::2], strict=True):
+        joint = [
+            _joint(sweep.single_scores(sweep.radius * sweep.spacing * np.array(each), coarse))
+            for each in (one, other)
+        ]
+        if min(float(scores.max()) for scores in joint) >= LEAST_SCORE:
+            mean = sum(_maximum(coarse, scores) for scores in joint) / 2
+            steps.append(2 * abs(mean - inverse_depth))
+    return max(steps) / math.sqrt(2)
 
 
 def _depths_around(view: SubmapView, frame_row: int, pixel: tuple[float, float]) -> Float[Tensor, " R"]:
@@ -175,6 +197,11 @@ class _Sweep:
     T_ow: Float[Tensor, "F 4 4"]
     radius: int = RADII[0]
 
+    @property
+    def spacing(self) -> float:
+        """Pixels from one sample of the window to the next."""
+        return max(1.0, SAMPLE_SHARE * self.reference.shape[1])
+
     @classmethod
     def of(
         cls,
@@ -199,8 +226,7 @@ class _Sweep:
         self, offset: Float[np.ndarray, " 2"], inverse_depths: Float[Tensor, " D"]
     ) -> Float[Tensor, "F D"]:
         """Correlation, in each frame, of the window at the pixel and an offset; -1 where it is out of the image."""
-        spacing = max(1.0, SAMPLE_SHARE * self.reference.shape[1])
-        steps = spacing * np.arange(-self.radius, self.radius + 1)
+        steps = self.spacing * np.arange(-self.radius, self.radius + 1)
         window = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + np.array(self.pixel) + offset
         own = _normalized(_sample(self.reference, window)[None])
         camera = self.view.camera.to("cpu")

@@ -21,6 +21,11 @@ if TYPE_CHECKING:
 SEPARATOR = ";"
 """A word between the times that an option is given, in a setting: `marker = "aruco-4x4:0.1 ; aruco-5x5:0.2"`."""
 
+FILES = frozenset({"FILE", "FOLDER[:SCALE]", "CAMERA"})
+"""Words of options that may be names of files."""
+AUTO = "auto"
+"""A word in place of a file: the one that the dataset brings along, as in `--depth auto`."""
+
 Given = Mapping[str, tuple[tuple[str, ...], ...]]
 """By the name of an option: its words, for each time that it was given. Options that were not given are missing."""
 
@@ -50,10 +55,12 @@ class SourceKind:
     Attributes:
         options: the first one makes a source, the others are its details.
         make: `module:function`, which makes the sources of `Given`; called if the first option is given.
+        on_request: what a dataset brings of this kind counts only where the user writes `AUTO`.
     """
 
     options: tuple[Option, ...]
     make: str
+    on_request: bool = False
 
     def sources(self, given: Given) -> list[MetricSource]:
         """Make the sources.
@@ -87,6 +94,11 @@ KINDS: tuple[SourceKind, ...] = (
         (Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))),
         "torchslam.metric.inertial_source:from_options",
     ),
+    SourceKind(
+        (Option("depth", ("FOLDER[:SCALE]",)), Option("depth_camera", ("CAMERA",))),
+        "torchslam.metric.sensor_depth:from_options",
+        on_request=True,
+    ),
 )
 """All kinds, in the order in which they measure: markers, which also improve the poses, come first."""
 
@@ -97,17 +109,25 @@ def given_options(config: MetricConfig, brought: Mapping[str, str] | None = None
     Args:
         config: the settings.
         brought: settings by name, as `Sequence.measurements`; those of a kind that the configuration sets itself do not
-            count, and none if `config.own` is False.
+            count. If `config.own` is False, only those count for which the configuration says `AUTO`.
 
     Raises:
-        ConfigError: an option has another number of words than it needs, or the option that it belongs to is missing.
+        ConfigError: an option has another number of words than it needs, the option that it belongs to is missing, or
+            nothing is there for `AUTO`.
     """
     given: dict[str, tuple[tuple[str, ...], ...]] = {}
-    brought = brought if brought is not None and config.own else {}
+    brought = brought if brought is not None else {}
     for kind in KINDS:
         own = {option.name: _text(getattr(config, option.name)) for option in kind.options}
         first, *details = kind.options
-        if not own[first.name] and first.name in brought:
+        is_asked = own[first.name] == AUTO
+        if is_asked and first.name not in brought:
+            raise ConfigError(
+                f"{first.flag} {AUTO}: the recording brings none along; name the file or folder"
+            )
+        is_taken = is_asked or (not own[first.name] and config.own and not kind.on_request)
+        if is_taken and first.name in brought:
+            own[first.name] = ""
             own = {name: text or brought.get(name, "") for name, text in own.items()}
         alone = [option.flag for option in details if own[option.name] and not own[first.name]]
         if alone:
@@ -116,6 +136,20 @@ def given_options(config: MetricConfig, brought: Mapping[str, str] | None = None
             option.name: _times(option, own[option.name]) for option in kind.options if own[option.name]
         }
     return given
+
+
+def given_files(config: MetricConfig) -> list[tuple[str, str]]:
+    """The names of options that a configuration sets, each with a word that may be the name of a file.
+
+    Raises:
+        ConfigError: an option has another number of words than it needs.
+    """
+    found = []
+    for option in (option for kind in KINDS for option in kind.options):
+        text = _text(getattr(config, option.name))
+        for words in _times(option, text) if text and text != AUTO else ():
+            found += [(option.name, w) for w, what in zip(words, option.words, strict=True) if what in FILES]
+    return found
 
 
 def setting_of(times: Iterable[Iterable[str]]) -> str:

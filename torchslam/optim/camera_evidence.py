@@ -19,6 +19,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
+from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim.bundle._camera_scores import camera_scores
 from torchslam.optim.bundle._problem import BundleProblem
@@ -169,6 +170,7 @@ class CameraEvidence:
         return (usual * eye + count * whitened @ whitened.mT) / (USUAL_STRETCHES + count - 1)
 
 
+@full_precision
 def camera_evidence(
     problem: BundleProblem,
     given: CameraMeasurement,
@@ -188,7 +190,13 @@ def camera_evidence(
 
     Returns:
         The evidence; None where the images do not determine the camera.
+
+    Raises:
+        ValueError: the directions are of another number of parameters than the camera has.
     """
+    parameters = problem.camera.params.shape[-1]
+    if len(given.directions) != parameters:
+        raise ValueError(f"given.directions must have {parameters} rows, not {len(given.directions)}")
     found = camera_scores(problem, given.directions, options)
     if found is None or len(problem.T_cw) < 2:
         return None

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import math
 import re
+import shlex
 from pathlib import Path
 
 import torch
@@ -20,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.calibration import PRESETS, GivenCamera
+from torchslam.data.formats.depth_images import DEPTH_LIST, SEVEN_SCENES_DEPTH
 from torchslam.data.formats.frame_names import find_frames, match_pattern
 from torchslam.data.readers.image_sequence import (
     DEFAULT_RATE,
@@ -41,6 +43,8 @@ ICL_MIRROR = (1.0, -1.0, 1.0, 1.0)
 """Frames are numbered, in place of times. The published camera has a negative fy, since its y axis points up; here it
 points down, so that camera and world are mirrored."""
 SEVEN_SCENES_COLOR = "frame-*.color.png"
+SEVEN_SCENES_DEPTH_CAMERA = "585,585,320,240"
+"""Of the depth images, which are not registered to the color images; the page of the dataset has it."""
 ORTHOGONAL = 0.05
 """Tolerated deviation of R R^T from the identity; fused poses are printed with few digits."""
 TARTANAIR_CAMERAS = ("left", "lcam_front")
@@ -67,7 +71,17 @@ def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> Imag
         camera = PRESETS[f"tum-fr{robot[1]}"]
     truth = folder / "groundtruth.txt"
     groundtruth = read_trajectory(truth) if truth.is_file() else None
-    return ImageSequence(folder.name, "ETH3D or TUM folder", entries, camera, groundtruth)
+    sequence = ImageSequence(folder.name, "ETH3D or TUM folder", entries, camera, groundtruth)
+    return _with_depth(sequence, folder / DEPTH_LIST)
+
+
+def _with_depth(sequence: ImageSequence, path: Path, camera: str = "") -> ImageSequence:
+    """The sequence with its depth images, if they are there, for `--depth auto`."""
+    if path.exists():
+        sequence.measurements = {"depth": shlex.quote(str(path))} | (
+            {"depth_camera": camera} if camera else {}
+        )
+    return sequence
 
 
 def read_image_list(path: Path) -> list[ImageEntry]:
@@ -110,7 +124,8 @@ def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) ->
     mirror = torch.diag(torch.tensor(ICL_MIRROR, dtype=torch.float64, device="cpu"))
     groundtruth = Trajectory(numbered.timestamps / rate, mirror @ numbered.T_wc @ mirror)
     camera = PRESETS["icl"] if camera is None else camera
-    return ImageSequence(folder.name, "ICL-NUIM folder", entries, camera, groundtruth, found.notes)
+    sequence = ImageSequence(folder.name, "ICL-NUIM folder", entries, camera, groundtruth, found.notes)
+    return _with_depth(sequence, folder / "depth")
 
 
 def _is_seven_scenes(path: str) -> bool:
@@ -140,7 +155,9 @@ def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None
         groundtruth = Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), torch.stack(poses))
     camera = PRESETS["7-scenes"] if camera is None else camera
     name = f"{folder.resolve().parent.name}/{folder.name}" if folder.name.startswith("seq-") else folder.name
-    return ImageSequence(name, "7-Scenes folder", entries, camera, groundtruth, found.notes)
+    sequence = ImageSequence(name, "7-Scenes folder", entries, camera, groundtruth, found.notes)
+    has_depth = next(folder.glob(SEVEN_SCENES_DEPTH), None) is not None
+    return _with_depth(sequence, folder, SEVEN_SCENES_DEPTH_CAMERA) if has_depth else sequence
 
 
 def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:

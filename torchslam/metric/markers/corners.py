@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchslam.geometry import triangulate_many
 from torchslam.metric.markers.detection import Detection
-from torchslam.metric.markers.targets import Target
+from torchslam.metric.markers.targets import Target, TargetKind
 from torchslam.optim.run_graph import ObservationGraph, RunGraph
 
 CORNER_STD_PX = 0.15
@@ -99,6 +99,8 @@ def add_corners(
         if len(set(frames)) < len(frames):
             dropped.append(f"{target.name(identity)} is there twice: not used")
             continue
+        if target.kind is TargetKind.CHESSBOARD:
+            group = _from_one_end(graph, group)
         part, why = _place(graph, group, target, identity)
         if part is None:
             dropped.append(f"{target.name(identity)} {why}: not used")
@@ -158,6 +160,26 @@ class _Part:
     point_index: Int[Tensor, " O"]
     pixels: Float[Tensor, "O 2"]
     side_px: Float[Tensor, " F"]
+
+
+def _from_one_end(graph: RunGraph, group: list[Sighting]) -> list[Sighting]:
+    """Count the corners of a chessboard from the same end in all frames: nothing on it says which one is the first.
+
+    From one sighting to the next in time, the direction from the first to the last corner changes by less than a right
+    angle in the world.
+    """
+    group = sorted(group, key=lambda sighting: int(graph.frame_ids[sighting.frame]))
+    turned, before_w = list[Sighting](), None
+    for sighting in group:
+        ends = torch.from_numpy(sighting.detection.pixels[[0, -1]]).to(graph.points_w)
+        first, last = torch.nn.functional.normalize(graph.camera.unproject(ends), dim=-1)
+        across_w = graph.T_cw[sighting.frame, :3, :3].mT @ (last - first)
+        if before_w is not None and float(across_w @ before_w) < 0:
+            detection = replace(sighting.detection, pixels=sighting.detection.pixels[::-1].copy())
+            sighting, across_w = replace(sighting, detection=detection), -across_w
+        turned.append(sighting)
+        before_w = across_w
+    return turned
 
 
 def _place(graph: RunGraph, group: list[Sighting], target: Target, identity: int) -> tuple[_Part | None, str]:

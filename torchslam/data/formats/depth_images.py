@@ -1,0 +1,179 @@
+"""Depth images of a second sensor: files of 16 bits, in folders or lists of several datasets.
+
+TUM, ETH3D   `depth.txt`, lines of `timestamp file`, 5000 units per meter:
+             https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
+ICL-NUIM     `depth/`, 5000 units per meter: https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html
+7-Scenes     `frame-000000.depth.png`, millimeters:
+             https://www.microsoft.com/en-us/research/project/rgb-d-dataset-7-scenes/
+ScanNet, Open3D, RealSense   a folder of images, millimeters
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchslam.data.formats.frame_names import MAX_FILES, in_order, times_in_names
+from torchslam.data.formats.image_file import read_pixels
+from torchslam.data.text_file import check_later, in_seconds, numbered_lines
+from torchslam.errors import MeasurementError, SequenceError
+
+DEPTH_LIST = "depth.txt"
+SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm"})
+"""Of images that can have 16 bits."""
+SEVEN_SCENES_DEPTH = "frame-*.depth.png"
+FIVE_THOUSANDTHS, MILLIMETERS = 5000.0, 1000.0
+"""Units per meter, of TUM and ICL-NUIM, and of most others."""
+FAR = 65535
+"""A value that says, as 0, that nothing was measured; it is the largest one."""
+BOUNDS_M = 0.05, 200.0
+"""Meters that the middle depth of an image may have; beyond, its unit is another one. Sensors see .2 to 20 m, rendered
+scenes more."""
+
+
+@dataclass(frozen=True)
+class DepthImages:
+    """Files of depth images.
+
+    Attributes:
+        source: the list or the folder, for messages.
+        paths: of the files, in the order of their names or times.
+        timestamps: seconds; None where only the names say to which image each belongs.
+        units_per_meter: of their values.
+        said: whether the user or the layout of the dataset says the unit.
+    """
+
+    source: Path
+    paths: tuple[Path, ...]
+    timestamps: Float[Tensor, " N"] | None
+    units_per_meter: float
+    said: bool = True
+
+
+def parse_depth_folder(text: str) -> tuple[str, float | None]:
+    """Read `FOLDER` or `FOLDER:SCALE`, with the units per meter; a folder whose name has a colon is one.
+
+    Raises:
+        MeasurementError: the scale is none.
+    """
+    folder, colon, scale = text.rpartition(":")
+    if not colon or Path(text).exists() or not folder or re.search(r"[/\\]", scale):
+        return text, None
+    try:
+        units = float(scale)
+    except ValueError:
+        units = math.nan
+    if not 0 < units < math.inf:
+        raise MeasurementError(
+            f"--depth {text}: {scale} is no number of units per meter, such as 1000 for millimeters"
+        )
+    return folder, units
+
+
+def find_depth_images(path: str | Path, units_per_meter: float | None = None) -> DepthImages:
+    """The depth images of a list, of a folder, or of a dataset whose folder has them.
+
+    Args:
+        path: `depth.txt`, a folder of images, or the folder of a dataset.
+        units_per_meter: of their values; None: those of the dataset, or millimeters.
+
+    Raises:
+        MeasurementError: there are none, or a list is wrong, naming file and line.
+    """
+    path = Path(path)
+    if path.is_dir():
+        for listed in (path / DEPTH_LIST, path.parent / DEPTH_LIST):
+            if listed.is_file() and (listed.parent == path or path.name == "depth"):
+                return _read_list(listed, units_per_meter)
+        files = _files(path)
+        if not files and (path / "depth").is_dir():
+            path = path / "depth"
+            files = _files(path)
+        if not files:
+            raise MeasurementError(f"{path}: no depth images: no {DEPTH_LIST} and no .png, .tif or .pgm")
+        is_icl = next(path.parent.glob("*.gt.freiburg"), None) is not None
+        is_known = is_icl or files[0].match(SEVEN_SCENES_DEPTH)
+        units = units_per_meter or (FIVE_THOUSANDTHS if is_icl else MILLIMETERS)
+        return DepthImages(
+            path, tuple(files), _times_of(files), units, is_known or units_per_meter is not None
+        )
+    if not path.exists():
+        raise MeasurementError(f"{path}: no such folder of depth images")
+    return _read_list(path, units_per_meter)
+
+
+def _files(folder: Path) -> list[Path]:
+    """The depth images in a folder: those of 7-Scenes are beside the color images."""
+    found: list[Path] = []
+    for file in folder.iterdir():
+        if file.suffix.lower() in SUFFIXES and not file.name.startswith("."):
+            found.append(file)
+        if len(found) > MAX_FILES:
+            raise MeasurementError(f"{folder}: more than {MAX_FILES} depth images")
+    beside = [file for file in found if file.match(SEVEN_SCENES_DEPTH)]
+    try:
+        return in_order(beside or found)
+    except SequenceError as error:
+        raise MeasurementError(str(error)) from None
+
+
+def _times_of(files: list[Path]) -> Float[Tensor, " N"] | None:
+    times = times_in_names(files)
+    if times is None or any(after <= before for before, after in itertools.pairwise(times)):
+        return None
+    return torch.tensor(times, dtype=torch.float64, device="cpu")
+
+
+def _read_list(path: Path, units_per_meter: float | None) -> DepthImages:
+    """The lines `timestamp file` of TUM's list."""
+    times: list[float] = []
+    files: list[Path] = []
+    for number, line in numbered_lines(path, MeasurementError):
+        where = f"{path}:{number}"
+        words = line.split(maxsplit=1)
+        try:
+            time = float(words[0])
+        except ValueError:
+            time = math.nan
+        if len(words) != 2 or not math.isfinite(time):
+            raise MeasurementError(f"{where}: expected `timestamp file`, got `{line[:200]}`")
+        time = in_seconds(time, where, MeasurementError)
+        if times:
+            check_later(time, times[-1], where, MeasurementError)
+        times.append(time)
+        files.append(path.parent / words[1])
+        if len(files) > MAX_FILES:
+            raise MeasurementError(f"{path}: more than {MAX_FILES} depth images")
+    if not files:
+        raise MeasurementError(f"{path}: no depth images are listed")
+    table = torch.tensor(times, dtype=torch.float64, device="cpu")
+    return DepthImages(path, tuple(files), table, units_per_meter or FIVE_THOUSANDTHS)
+
+
+def read_depth(path: Path, units_per_meter: float) -> Float[np.ndarray, "H W"]:
+    """Depth along the optical axis in meters, float32; 0 where it was not measured.
+
+    Raises:
+        FrameError: the file cannot be read.
+        MeasurementError: it has no 16 bits, or another unit.
+    """
+    values = read_pixels(path, str(path), as_stored=True)
+    if values.dtype != np.uint16 or values.ndim != 2:
+        raise MeasurementError(f"{path}: not of 16 bits: no depth image with numbers per meter")
+    depth = np.where(values == FAR, 0, values).astype(np.float32) / np.float32(units_per_meter)
+    known = depth[depth > 0]
+    middle = float(np.median(known)) if known.size else math.nan
+    if known.size and not BOUNDS_M[0] < middle < BOUNDS_M[1]:
+        raise MeasurementError(
+            f"{path}: its middle depth is {middle:.3g} m with {units_per_meter:g} units per meter: give the right "
+            "number, as in --depth FOLDER:1000"
+        )
+    return depth

@@ -1,0 +1,248 @@
+"""Depth images of a sensor beside the camera as a source of meters: how deep it says that the points of the map are.
+
+The depths of a point in a frame, by the sensor and by the map, have the ratio of their units. The sensor is assumed at
+the place of the camera, with its axes; what it is aside, some centimeters, is part of the stated error.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from torchslam.data.camera_argument import parse_calibration
+from torchslam.data.formats.depth_images import DepthImages, find_depth_images, parse_depth_folder, read_depth
+from torchslam.data.transforms import scale_camera
+from torchslam.errors import FrameError, MeasurementError
+from torchslam.geometry import Camera, transform
+from torchslam.metric.options import Given
+from torchslam.metric.scale import ScaleMeasurement, ScaleSource
+from torchslam.metric.slow_noise import SlowMean, slow_mean
+from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+
+IMAGES = 60
+"""Depth images that are read at most, evenly over the recording; with 20 and with 100 redkitchen's scale is the same to
+.1 %."""
+LEAST_IMAGES = 3
+"""Images without which nothing says how far they are apart."""
+LEAST_POINTS = 10
+"""Points of an image without which it says nothing."""
+PATCH = 5
+"""Pixels of the side of the patch around a point, of which all must have depth, and one depth."""
+NOISE = 1.5e-3
+"""Standard deviation of depth, meters at one meter; it grows with the square of the depth (Khoshelham and Elberink,
+"Accuracy and resolution of Kinect depth data", 2012, figure 10). Rendered depth has none, which only weighs it
+otherwise."""
+EDGE = 0.03
+"""Relative range of the depths of a patch beyond which, and beyond its noise, it has an edge, where a pixel aside is
+another surface. With .01 to .2 redkitchen's scale changes by .1 to .6 %."""
+POINT_STD = 0.02
+"""Relative standard deviation of the depth of a map point; on redkitchen single points scatter by 1.6 to 3 %."""
+SENSOR_STD = 0.015
+"""Relative error that all images share: of the sensor's own calibration (TUM corrected its three Kinects by 3.5, 3.1
+and 0 %), of its place and of its axis."""
+MAX_RELATIVE_STD = 0.25
+"""Relative standard error from which on a scale is no measurement."""
+
+
+def from_options(given: Given) -> list[MetricSource]:
+    """The sources of `--depth FOLDER[:SCALE]`, with `--depth-camera` for all.
+
+    Raises:
+        MeasurementError: there are no depth images, or a list is wrong.
+        CalibrationError: the camera is none.
+    """
+    cameras = [words[0] for words in given.get("depth_camera", ())]
+    if len(cameras) > 1:
+        raise MeasurementError("--depth-camera is given twice: it is that of all depth images")
+    for text in cameras:
+        parse_calibration(text, "--depth-camera")
+    found = [find_depth_images(*parse_depth_folder(words[0])) for words in given["depth"]]
+    return [SensorDepth(images, *cameras) for images in found]
+
+
+@dataclass(frozen=True)
+class SensorDepth:
+    """Depth images that were taken with the images.
+
+    Attributes:
+        images: the files.
+        camera: of the depth images, as `--camera` is written; empty: they are registered to the color images, each of
+            their pixels shows what the same place of the color image does.
+    """
+
+    images: DepthImages
+    camera: str = ""
+
+    def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
+        """The unit of a submap by the depths of its points.
+
+        Raises:
+            MeasurementError: a file has no depth, or in another unit.
+        """
+        pairs = self._pairs(view)
+        if isinstance(pairs, str):
+            return Unmeasured(ScaleSource.DEPTH, pairs)
+        chosen = sorted(
+            {round(place) for place in np.linspace(0, len(pairs) - 1, min(IMAGES, len(pairs))).tolist()}
+        )
+        rows, logs, unreadable = list[int](), list[float](), list[str]()
+        for row, path in (pairs[place] for place in chosen):
+            try:
+                depth = read_depth(path, self.images.units_per_meter)
+            except FrameError as error:
+                unreadable.append(str(error))
+                continue
+            found = frame_ratio(view, row, depth, self._camera(view.camera, depth))
+            if found is not None:
+                rows.append(row)
+                logs.append(found)
+        notes = self._notes(unreadable)
+        if len(rows) < LEAST_IMAGES:
+            why = f"points of the map have depth in {len(rows)} of {len(chosen)} depth images"
+            return Unmeasured(ScaleSource.DEPTH, "; ".join([why, *notes]))
+        times = view.timestamps[rows].cpu().double()
+        values = torch.tensor(logs, dtype=torch.float64, device="cpu")
+        mean = slow_mean(times, values, torch.ones_like(values))
+        if mean.std > MAX_RELATIVE_STD or float(mean.inliers.double().mean()) < 0.5:
+            return Unmeasured(ScaleSource.DEPTH, f"depth images differ by {mean.scatter:.0%} from each other")
+        return ScaleMeasurement(
+            ScaleSource.DEPTH,
+            math.exp(mean.mean),
+            math.hypot(mean.std, SENSOR_STD),
+            int(mean.inliers.sum()),
+            "depth images",
+            _rejected(view.frame_index[rows], values, mean),
+            apart=mean.scatter,
+            notes=notes,
+        )
+
+    def _camera(self, camera: Camera, depth: Float[np.ndarray, "H W"]) -> Camera:
+        """The camera of a depth image."""
+        size = (depth.shape[1], depth.shape[0])
+        if self.camera:
+            return parse_calibration(self.camera, "--depth-camera").camera(size).to(torch.float64)
+        return scale_camera(camera.to("cpu").to(torch.float64), size)
+
+    def _notes(self, unreadable: list[str]) -> tuple[str, ...]:
+        units = self.images.units_per_meter
+        notes = []
+        if not self.images.said:
+            notes.append(
+                f"{self.images.source} is taken to have {units:g} units per meter; --depth FOLDER:SCALE says otherwise"
+            )
+        if unreadable:
+            notes.append(f"{len(unreadable)} depth images cannot be read, the first one: {unreadable[0]}")
+        return tuple(notes)
+
+    def _pairs(self, view: SubmapView) -> list[tuple[int, Path]] | str:
+        """The frames that have a depth image, by their row in the view, and its file; or why there are none."""
+        images, times = self.images, view.timestamps.cpu().double()
+        near = None if images.timestamps is None else nearest_times(times, images.timestamps)
+        if near is not None and bool((near >= 0).any()):
+            return [(row, images.paths[place]) for row, place in enumerate(near.tolist()) if place >= 0]
+        by_name = {_numbers(path.name): path for path in images.paths}
+        names = [] if view.sequence is None else [_numbers(name) for name in _file_names(view)]
+        named = [(row, by_name[key]) for row, key in enumerate(names) if key and key in by_name]
+        if named:
+            return named
+        if images.timestamps is None or not len(times):
+            return f"{images.source}: its names, as {images.paths[0].name}, are neither times nor those of the images"
+        own = images.timestamps
+        return (
+            f"{images.source}: no depth image is within half a frame of an image: they are from {float(own[0]):.3f} to "
+            f"{float(own[-1]):.3f} s, images from {float(times[0]):.3f} to {float(times[-1]):.3f} s"
+        )
+
+
+def nearest_times(times: Float[Tensor, " N"], others: Float[Tensor, " M"]) -> Int[Tensor, " N"]:
+    """The index of the nearest one of other times, both ascending; -1 where it is half an interval or more away.
+
+    The shorter one of both median intervals counts: in between, another image would have been nearer.
+    """
+    after = torch.searchsorted(others, times).clamp_max(len(others) - 1)
+    before = (after - 1).clamp_min(0)
+    nearest = torch.where((times - others[before]).abs() < (others[after] - times).abs(), before, after)
+    intervals = [each.diff().median() for each in (times, others) if len(each) > 1]
+    limit = min(map(float, intervals), default=0.0) / 2
+    return torch.where((others[nearest] - times).abs() <= limit, nearest, -1)
+
+
+def _file_names(view: SubmapView) -> list[str]:
+    assert view.sequence is not None  # the caller's condition
+    return [Path(view.sequence.file_name(index)).name for index in view.frame_index.tolist()]
+
+
+def _numbers(name: str) -> tuple[int, ...]:
+    """The numbers in the name of a file, which those of an image and of its depth share: `frame-000010.depth.png`."""
+    return tuple(map(int, re.findall(r"\d{1,18}", Path(name).stem)))
+
+
+def frame_ratio(view: SubmapView, row: int, depth: Float[np.ndarray, "H W"], camera: Camera) -> float | None:
+    """The logarithm of meters per unit by the points that a frame observes; None for too few.
+
+    Args:
+        view: the submap.
+        row: of the frame, as in `view.timestamps`.
+        depth: of a sensor, meters, 0 where it is not known.
+        camera: of the depth image, at the place of the camera and with its axes.
+    """
+    pixels, z = _observed(view, row)
+    rays = view.camera.to("cpu").to(torch.float64).unproject(pixels)
+    seen, valid = camera.project(rays / rays[:, 2:])
+    near, far, mean = (
+        filtered(depth, np.ones((PATCH, PATCH), np.uint8)) for filtered in (cv2.erode, cv2.dilate, _mean)
+    )
+    border = PATCH // 2
+    place = seen.round().long()
+    height, width = depth.shape
+    inside = valid & (z > 0) & (place >= border).all(dim=-1)
+    inside &= (place[:, 0] < width - border) & (place[:, 1] < height - border)
+    x, y = place[inside].T.numpy()
+    low, high, middle = (torch.from_numpy(each[y, x]).double() for each in (near, far, mean))
+    is_one = (low > 0) & (high <= low * (1 + EDGE + 3 * NOISE * low))
+    if int(is_one.sum()) < LEAST_POINTS:
+        return None
+    z, middle = z[inside][is_one], middle[is_one]
+    weights = 1 / (POINT_STD**2 + (NOISE * middle).square())
+    return _weighted_median((middle / z).log(), weights)
+
+
+def _observed(view: SubmapView, row: int) -> tuple[Float[Tensor, "R 2"], Float[Tensor, " R"]]:
+    """The pixels at which a frame observes points of the map, and their depths in map units."""
+    frames, slam_map = view.submap.posed_frames, view.submap.map
+    own = torch.nonzero(frames.observations["frame_row"] == view.rows[row])[:, 0]
+    points = slam_map.follow_merges(frames.observations["point_ids"][own])
+    z = transform(view.T_cw[row], slam_map.positions_w[points])[:, 2]
+    return frames.observations["pixels"][own].detach().cpu().double(), z.detach().cpu().double()
+
+
+def _mean(depth: Float[np.ndarray, "H W"], patch: np.ndarray) -> np.ndarray:
+    return cv2.blur(depth, patch.shape)
+
+
+def _weighted_median(values: Float[Tensor, " N"], weights: Float[Tensor, " N"]) -> float:
+    """The value with half of the weight on either side."""
+    order = values.argsort()
+    passed = weights[order].cumsum(0)
+    return float(values[order][int(torch.searchsorted(passed, passed[-1] / 2))])
+
+
+def _rejected(frames: Int[Tensor, " N"], logs: Float[Tensor, " N"], mean: SlowMean) -> tuple[str, ...]:
+    wrong = ~mean.inliers & (
+        (logs - mean.mean).abs() > SENSOR_STD
+    )  # where all others agree, .1 % are many errors
+    if not bool(wrong.any()):
+        return ()
+    off = (logs[wrong] - mean.mean).exp() - 1
+    return (
+        f"{int(wrong.sum())} of {len(logs)} depth images, the first one that of frame {int(frames.cpu()[wrong][0])}, "
+        f"are {float(off.min()):+.0%} to {float(off.max()):+.0%} off",
+    )
