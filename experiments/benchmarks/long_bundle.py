@@ -103,7 +103,7 @@ class Cost(NamedTuple):
 def measure(images: int, by_blocks: bool) -> Cost:
     """Adjust a walk. For a process of its own."""
     torch.set_num_threads(1)
-    schur.SPARSE_FRAMES, schur.MOST_COVISIBLE = 2 if by_blocks else images + 1, 1.0  # type: ignore[misc]
+    schur.SPARSE_FRAMES, schur.MOST_COVISIBLE = 2 if by_blocks else images + 1, 1.0
     problem = walk(images)
     options = BUNDLE_OPTIONS.replace(
         kernel="geman_mcclure", scale=5.0, iterations=ITERATIONS, tolerance=0.0, backward="detached"

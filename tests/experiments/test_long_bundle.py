@@ -7,7 +7,7 @@ from experiments.benchmarks.long_bundle import measure, walk
 from torchslam.optim.bundle import _schur as schur
 
 
-def test_a_walk_sees_points_again_in_the_next_lap():
+def test_a_walk_sees_points_again_in_the_next_lap() -> None:
     problem = walk(120)
     first = torch.full((len(problem.points_w),), 120).scatter_reduce(
         0, problem.point_index, problem.frame_index, "amin"
@@ -17,7 +17,7 @@ def test_a_walk_sees_points_again_in_the_next_lap():
     assert torch.bincount(problem.point_index).min() >= 3
 
 
-def test_both_ways_reach_the_same_cost(monkeypatch):
+def test_both_ways_reach_the_same_cost(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in ("SPARSE_FRAMES", "MOST_COVISIBLE"):  # `measure` sets them
         monkeypatch.setattr(schur, name, getattr(schur, name))
     threads = torch.get_num_threads()
