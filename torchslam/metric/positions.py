@@ -32,6 +32,7 @@ from torchslam.metric.position_fit import (
     is_line,
     start_distance,
 )
+from torchslam.metric.path_measurements import PathPositions
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
 
@@ -225,6 +226,7 @@ class PositionSource:
             S_ew=fit.S_ew,
             origin=self.origin,
             notes=tuple(self._notes(fit, shift, line)),
+            parts=_parts(pairs, fit, shift),
         )
 
     def _notes(self, fit: PositionFit, shift: float, line: bool) -> list[str]:
@@ -238,6 +240,13 @@ class PositionSource:
                 "upright"
             )
         return notes
+
+
+def _parts(pairs: PositionPairs, fit: PositionFit, shift: float) -> PathPositions:
+    """The positions that agree, on the clock of the images."""
+    kept = pairs.select(fit.inliers)
+    times = kept.times + shift + fit.offset * (kept.velocities_w != 0).any(-1)
+    return PathPositions(times, kept.positions_e, fit.white[fit.inliers], fit.slow, fit.single)
 
 
 def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:
