@@ -12,14 +12,16 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
+from torchslam.map.map import Map
 from torchslam.metric.camera_path import CameraPath
 from torchslam.metric.path_measurements import Keyframes, whole_path
 from torchslam.metric.scale import ScaleMeasurement
 from torchslam.metric.source import SubmapView
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.measurements import MeasuredLengths, MeasuredPositions, Measurement
+from torchslam.optim.measurements import Measurement
 from torchslam.optim.run_graph import POSE_ITERATIONS, GraphSolution, RunGraph, solve_graph
 
 HELD_BACK = 5
@@ -31,6 +33,10 @@ LEAST_GAIN = 3.0
 GAUGE_SHARE = 1e-4
 """Part of their information that measurements keep where they do not correct the map: they determine the unit and the
 place, which images leave open, and the shape stays that of the images."""
+GATE = 4.0
+"""Standard deviations from the corrected path from which on a measurement is wrong."""
+ROUNDS = 3
+"""Of corrections, each without the measurements that are wrong by the one before."""
 OPTIONS = GRAPH_OPTIONS.replace(iterations=POSE_ITERATIONS, backward="detached")
 
 
@@ -59,35 +65,71 @@ def correct_drift(
         measurements: of its unit. The first one with a frame of its own has given the submap its world.
         meters_per_unit: of the submap as it was when they were made.
     """
-    submap = view.submap
+    submap, factor = view.submap, view.observation_variance
     keyframes = Keyframes.of(CameraPath.of(view), submap.map, view.session, meters_per_unit)
     framed = next((each for each in measurements if each.S_ew is not None), None)
-    found, parts = list[Measurement](), list[Measurement]()
+    parts, others = list[Measurement](), list[Measurement]()
     for each in measurements:
-        own = None
+        own: Measurement | None = None
         # Positions are in the world of the source that has given the submap its frame.
         if each.parts is not None and (each.S_ew is None or each is framed):
             own = each.parts.on(keyframes)
-        if own is not None and len(own.frames) >= LEAST_PARTS:
-            parts.append(own)
-        own = whole_path(keyframes, each.meters_per_unit, each.relative_std) if own is None else own
         if own is not None:
-            found.append(own.weighed(view.observation_variance))
-    gauge = Correction(tuple(each.weighed(GAUGE_SHARE) for each in found))
+            (parts if len(own.frames) >= LEAST_PARTS else others).append(own)
+        elif (whole := whole_path(keyframes, each.meters_per_unit, each.relative_std)) is not None:
+            others.append(whole)
+    gauge = tuple(each.weighed(GAUGE_SHARE * factor) for each in (*parts, *others))
     if not parts:
-        return gauge
+        return Correction(gauge)
     graph = submap.posed_frames.graph(submap.map, view.camera, readout=view.readout)
-    trial = _solved(graph, [given_part(each).weighed(view.observation_variance) for each in parts])
+    parts, trial = _trial(graph, parts, others, factor)
     if trial is None:
-        return gauge
-    gain = sum(held_back_cost(each, graph.T_cw) - held_back_cost(each, trial.T_cw) for each in parts)
+        return Correction(gauge)
+    gain = float(sum(held_back_cost(each, graph.T_cw) - held_back_cost(each, trial.T_cw) for each in parts))
     if gain < LEAST_GAIN:
-        return gauge._replace(gain=gain)
-    solution = _solved(graph, found, trial)
+        return Correction(gauge, gain)
+    found = tuple(each.weighed(factor) for each in (*parts, *others))
+    before = _move(submap.map, graph, trial)
+    # The frames between keyframes have followed theirs: from where they were they would not find their poses.
+    graph = submap.posed_frames.graph(submap.map, view.camera, readout=view.readout)
+    solution = _solved(graph, found)
     if solution is None:
-        return gauge._replace(gain=gain)
+        submap.map.keyframes["T_cw"][:], submap.map.points["positions_w"][:] = before
+        return Correction(gauge, gain)
     submap.posed_frames.apply_solution(solution, graph, submap.map)
-    return Correction(tuple(found), gain, is_taken=True)
+    return Correction(found, gain, is_taken=True)
+
+
+def _move(slam_map: Map, graph: RunGraph, solution: GraphSolution) -> tuple[Tensor, Tensor]:
+    """Move keyframes and points to a solution, and return where all of them were."""
+    T_cw, positions_w = slam_map.keyframes["T_cw"], slam_map.points["positions_w"]
+    before = T_cw.clone(), positions_w.clone()
+    T_cw[:] = solution.T_cw[: slam_map.num_keyframes]
+    positions_w[graph.point_ids] = solution.points_w
+    return before
+
+
+def _trial(
+    graph: RunGraph, parts: list[Measurement], others: Sequence[Measurement], factor: float
+) -> tuple[list[Measurement], GraphSolution | None]:
+    """The minimum with all but what is held back, and the parts that agree with it, held back or not.
+
+    It is None where it is not determined, or where too few of the parts agree.
+    """
+    solution: GraphSolution | None = None
+    counts = [len(each.frames) for each in parts]
+    for _ in range(ROUNDS):
+        given = [given_part(each) for each in parts]
+        solution = _solved(graph, [each.weighed(factor) for each in (*given, *others)], solution)
+        if solution is None:
+            return parts, None
+        agreeing = [each.deviations(solution.T_cw) <= GATE for each in parts]
+        if all(bool(kept.all()) for kept in agreeing):
+            break
+        parts = [each.select(kept) for each, kept in zip(parts, agreeing, strict=True)]
+        if any(len(each.frames) < max(LEAST_PARTS, count / 2) for each, count in zip(parts, counts, strict=True)):
+            return parts, None
+    return parts, solution
 
 
 def _solved(
@@ -101,33 +143,11 @@ def _solved(
     return solution if bool(solution.keyframes[0].success) else None
 
 
-def held_back(count: int) -> Tensor:
-    """Which of so many measurements are held back."""
-    return torch.arange(count, device="cpu") % HELD_BACK == HELD_BACK // 2
-
-
 def given_part(measured: Measurement) -> Measurement:
     """Measurements without those that are held back."""
-    kept = ~held_back(len(measured.frames))
-    if isinstance(measured, MeasuredLengths):
-        return MeasuredLengths(measured.frames[kept], measured.lengths[kept], measured.information[kept])
-    covariances = torch.linalg.inv(measured.information)[:, kept][..., kept]
-    return MeasuredPositions(
-        measured.frames[kept],
-        measured.points_c[kept],
-        measured.positions_w[kept],
-        torch.linalg.inv(covariances),
-    )
+    return measured.select(torch.arange(len(measured.frames), device="cpu") % HELD_BACK != HELD_BACK // 2)
 
 
-def held_back_cost(measured: Measurement, T_cw: Tensor) -> float:
+def held_back_cost(measured: Measurement, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, ""]:
     """Minus the logarithm of the likelihood of what is held back, given the rest, up to a constant."""
-    return whitened_cost(measured, T_cw) - whitened_cost(given_part(measured), T_cw)
-
-
-def whitened_cost(measured: Measurement, T_cw: Tensor) -> float:
-    """Half of the whitened squared errors of measurements at poses."""
-    errors = measured.errors(T_cw.to(measured.information))
-    if isinstance(measured, MeasuredLengths):
-        return 0.5 * float((measured.information * errors.square()).sum())
-    return 0.5 * float(torch.einsum("na,anm,ma->", errors, measured.information, errors))
+    return measured.cost(T_cw) - given_part(measured).cost(T_cw)

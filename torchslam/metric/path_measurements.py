@@ -16,7 +16,8 @@ from torch import Tensor
 
 from torchslam.geometry import transform
 from torchslam.map.map import Map
-from torchslam.metric.slow_noise import SlowNoise, group_means
+from torchslam.metric.receiver_noise import slow_covariances
+from torchslam.metric.slow_noise import group_means
 from torchslam.optim.measurements import MeasuredLengths, MeasuredPositions, Measurement
 
 MAX_POSITIONS = 1000
@@ -82,21 +83,17 @@ class PathMeasurement(Protocol):
 
 @dataclass(frozen=True)
 class PathPositions:
-    """N positions that agree with a path.
+    """N positions along a path.
 
     Attributes:
         times: on the clock of the images, seconds, ascending.
         positions_e: in the frame that the map in meters has: east, north, up.
-        white: standard deviations of their white noise along the axes.
-        slow: the noise that wanders.
-        single: standard deviations of the white noise of one position along the axes, which `slow` is relative to.
+        white: standard deviations of their white noise along the axes, meters.
     """
 
     times: Float[Tensor, " N"]
     positions_e: Float[Tensor, "N 3"]
     white: Float[Tensor, "N 3"]
-    slow: SlowNoise
-    single: Float[Tensor, " 3"]
 
     def on(self, keyframes: Keyframes) -> MeasuredPositions | None:
         """See `PathMeasurement`. Positions that are nearest to the same keyframe are averaged."""
@@ -113,11 +110,9 @@ class PathPositions:
         count = size.double()
         # The way from the keyframe to the moment of the position turns with the keyframe.
         points_c = transform(keyframes.T_cw[numbers[group]], at_w[rows, None])[:, 0]
-        white = (group_means(self.white[rows].square(), group, count) / count[:, None]).sqrt()
-        correlations = self.slow.correlations(group_means(self.times[rows], group, count))
-        covariances = correlations * self.single.square()[:, None, None] + torch.diag_embed(
-            white.mT.square()
-        )
+        variances = group_means(self.white[rows].square(), group, count) / count[:, None]
+        times = group_means(self.times[rows], group, count)
+        covariances = slow_covariances(times, self.white[rows]) + torch.diag_embed(variances.mT)
         return MeasuredPositions(
             keyframes.rows[numbers],
             group_means(points_c, group, count),

@@ -15,14 +15,7 @@ from torch import Tensor
 
 from torchslam.geometry import sim3_scale, skew, transform, umeyama
 from torchslam.geometry.robust import NORMAL_MEDIAN_3D
-from torchslam.metric.slow_noise import (
-    SlowNoise,
-    averaged,
-    group_means,
-    group_rows,
-    slow_correlations,
-    slow_noises,
-)
+from torchslam.metric.slow_noise import averaged, group_means, group_rows, slow_correlations
 from torchslam.optim import LEAST_SQUARES_OPTIONS, solve_least_squares
 
 MIN_POSITIONS = 4
@@ -57,12 +50,8 @@ class PositionFit:
         offset: seconds that the clock of the images is ahead of that of the positions, beyond what was removed before.
         offset_std: its standard error.
         inliers: positions that agree.
-        distances: of each position from the path, meters.
+        residuals: of each position from the path, meters, zero where a coordinate was not measured.
         noise: standard deviations along one axis, horizontal and vertical, that the path leaves over, meters.
-        white: standard deviations of the white noise of each position along the axes, meters; where no height was
-            measured, those of a level path.
-        single: those of a usual position.
-        slow: the noise that wanders, as it explains the positions best.
     """
 
     S_ew: Float[Tensor, "4 4"]
@@ -72,11 +61,13 @@ class PositionFit:
     offset: float
     offset_std: float
     inliers: Bool[Tensor, " N"]
-    distances: Float[Tensor, " N"]
+    residuals: Float[Tensor, "N 3"]
     noise: tuple[float, float]
-    white: Float[Tensor, "N 3"]
-    single: Float[Tensor, " 3"]
-    slow: SlowNoise
+
+    @property
+    def distances(self) -> Float[Tensor, " N"]:
+        """Of each position from the path, meters."""
+        return self.residuals.norm(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -144,7 +135,7 @@ def fit_positions(
     noise = float((0.5 * (left[0] + left[1])).sqrt()), float(left[2].sqrt())
     return PositionFit(
         S_ew, fit.relative_std, fit.up_w, fit.up_std, fit.offset, fit.offset_std, inliers,
-        residuals.norm(dim=-1), noise, _white(pairs, stds), kept.single, fit.slow,
+        residuals, noise,
     )  # fmt: skip
 
 
@@ -224,7 +215,7 @@ def _grouped(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> _Groups:
         return group_means(values, group, size)
 
     white = (mean(stds.square()) / size[:, None]).sqrt()
-    level = (mean((~pairs.has_height).double()) > 0) * _level_std(pairs)
+    level = (mean((~pairs.has_height).double()) > 0) * level_std(pairs)
     white[:, 2] = (white[:, 2].square() + level.square()).sqrt()
     return _Groups(
         mean(pairs.times),
@@ -236,17 +227,12 @@ def _grouped(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> _Groups:
     )
 
 
-def _white(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> Float[Tensor, "N 3"]:
-    """Standard deviations of the white noise of each position; of a path that is level where no height is known."""
-    level = ~pairs.has_height * _level_std(pairs)
-    return torch.cat((stds[:, :2], torch.hypot(stds[:, 2:], level[:, None])), dim=1)
-
-
 LEVEL = 0.05
 """Where heights were not measured the path is taken for level, with this part of its extent as standard deviation."""
 
 
-def _level_std(pairs: PositionPairs) -> float:
+def level_std(pairs: PositionPairs) -> float:
+    """Standard deviation of heights that were not measured, meters."""
     extent = (pairs.positions_e.amax(0) - pairs.positions_e.amin(0))[:2].norm()
     return LEVEL * float(extent)
 
@@ -259,7 +245,6 @@ class _Averaged:
     up_std: float
     offset: float
     offset_std: float
-    slow: SlowNoise
 
 
 def _average(
@@ -317,7 +302,6 @@ def _average(
         float(torch.linalg.eigvalsh(tilt)[-1].sqrt()),
         float(delay),
         float(models.variance(offset[:, 0], covariance[:, 7, 7]).sqrt()),
-        slow_noises(groups.times)[best + 1 if slow else 0],
     )
 
 

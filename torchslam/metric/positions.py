@@ -30,9 +30,11 @@ from torchslam.metric.position_fit import (
     PositionPairs,
     fit_positions,
     is_line,
+    level_std,
     start_distance,
 )
 from torchslam.metric.path_measurements import PathPositions
+from torchslam.metric.receiver_noise import NEIGHBORS, receiver_noise
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
 
@@ -242,11 +244,17 @@ class PositionSource:
         return notes
 
 
-def _parts(pairs: PositionPairs, fit: PositionFit, shift: float) -> PathPositions:
-    """The positions that agree, on the clock of the images."""
-    kept = pairs.select(fit.inliers)
-    times = kept.times + shift + fit.offset * (kept.velocities_w != 0).any(-1)
-    return PathPositions(times, kept.positions_e, fit.white[fit.inliers], fit.slow, fit.single)
+def _parts(pairs: PositionPairs, fit: PositionFit, shift: float) -> PathPositions | None:
+    """The positions that agree with their neighbors, on the clock of the images; None if they are too few to tell.
+
+    They need not agree with the path, which may have drifted.
+    """
+    if len(pairs) <= NEIGHBORS:
+        return None
+    white, agrees = receiver_noise(fit.residuals, pairs.std, pairs.has_height)
+    white[:, 2] = torch.hypot(white[:, 2], ~pairs.has_height * level_std(pairs))
+    times = pairs.times + shift + fit.offset * (pairs.velocities_w != 0).any(-1)
+    return PathPositions(times[agrees], pairs.positions_e[agrees], white[agrees])
 
 
 def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:

@@ -30,38 +30,15 @@ ROUNDS = 20
 """Rejections until nothing changes; two to four are usual."""
 
 
-class SlowNoise(NamedTuple):
-    """Noise that wanders.
-
-    Attributes:
-        strength: its standard deviation, in those of the white noise of one value.
-        duration: seconds after which it is forgotten.
-    """
-
-    strength: float
-    duration: float
-
-    def correlations(self, times: Float[Tensor, " N"]) -> Float[Tensor, "N N"]:
-        """Its covariance at times, in units of the variance of the white noise of one value."""
-        return self.strength**2 * torch.exp(-(times[:, None] - times).abs() / self.duration)
-
-
-def slow_noises(
-    times: Float[Tensor, " G"], durations: tuple[float, ...] = DURATIONS
-) -> tuple[SlowNoise, ...]:
-    """The noises that are tried over a recording; none at all is the first."""
-    span = max(float(times[-1] - times[0]), 1e-9)
-    return (
-        SlowNoise(0.0, span),
-        *(SlowNoise(strength, duration * span) for strength in STRENGTHS for duration in durations),
-    )
-
-
 def slow_correlations(
     times: Float[Tensor, " G"], durations: tuple[float, ...] = DURATIONS
 ) -> Float[Tensor, "B G G"]:
     """Covariances of slow noise in units of the variance of white noise; none at all is the first."""
-    return torch.stack([noise.correlations(times) for noise in slow_noises(times, durations)])
+    span = (times[-1] - times[0]).clamp_min(1e-9)
+    apart = (times[:, None] - times).abs() / span
+    pairs = [(0.0, 1.0), *((strength, duration) for strength in STRENGTHS for duration in durations)]
+    strength, duration = torch.tensor(pairs, dtype=torch.float64, device="cpu").T[..., None, None]
+    return strength.square() * torch.exp(-apart / duration)
 
 
 class Averaged(NamedTuple):

@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Self
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.lie import se3_inverse, transform
@@ -115,6 +115,27 @@ class MeasuredPositions:
             pairs, measured, torch.diag_embed(torch.cat((own[alone], between))), fixed_point_error
         )
 
+    def select(self, kept: Bool[Tensor, " N"]) -> Self:
+        """Some of them, whose covariances are those of the whole."""
+        covariances = torch.linalg.inv(self.information)[:, kept][..., kept]
+        return replace(
+            self,
+            frames=self.frames[kept],
+            points_c=self.points_c[kept],
+            positions_w=self.positions_w[kept],
+            information=torch.linalg.inv(covariances),
+        )
+
+    def deviations(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, " N"]:
+        """The largest error along an axis of each, in its standard deviations."""
+        stds = torch.linalg.inv(self.information).diagonal(dim1=-2, dim2=-1).sqrt()
+        return (self.errors(T_cw).abs() / stds.mT).amax(-1)
+
+    def cost(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, ""]:
+        """Half of the whitened squared errors."""
+        errors = self.errors(T_cw)
+        return 0.5 * torch.einsum("na,anm,ma->", errors, self.information, errors)
+
     def errors(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, "N 3"]:
         """Positions of the points at poses of all frames of the graph, less the measured ones."""
         at_w = transform(se3_inverse(T_cw[self.frames]), self.points_c[:, None])[:, 0]
@@ -146,6 +167,23 @@ class MeasuredLengths:
     def factors(self) -> FrameFactors:
         """The factors of a bundle adjustment."""
         return FrameFactors.distances(self.frames, self.lengths, self.information)
+
+    def select(self, kept: Bool[Tensor, " F"]) -> Self:
+        """Some of them."""
+        return replace(
+            self,
+            frames=self.frames[kept],
+            lengths=self.lengths[kept],
+            information=self.information[kept],
+        )
+
+    def deviations(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, " F"]:
+        """The error of each in its standard deviations."""
+        return self.errors(T_cw).abs() * self.information.sqrt()
+
+    def cost(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, ""]:
+        """Half of the whitened squared errors."""
+        return 0.5 * (self.information * self.errors(T_cw).square()).sum()
 
     def errors(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, " F"]:
         """Logarithms of the distances at poses of all frames of the graph, less those of the measured ones."""
