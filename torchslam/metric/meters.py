@@ -67,7 +67,17 @@ def bring_into_meters(
     S_mw = similarity_to_meters(scale, vertical, centers_w)
     submap.transform(S_mw.to(submap.map.T_cw))
     submap.metric = unit_record(scale, vertical, S_mw)
-    return S_mw, silent, correct_drift(view, measurements, scale.meters_per_unit)
+    correction = correct_drift(view, measurements, scale.meters_per_unit)
+    if correction.is_taken:
+        line = "the drift of the map along the path was corrected: it explains what was held back better"
+        submap.metric = replace(
+            submap.metric,
+            sources=tuple(
+                source if measured.parts is None else replace(source, notes=(*source.notes, line))
+                for source, measured in zip(submap.metric.sources, measurements, strict=True)
+            ),
+        )
+    return S_mw, silent, correction
 
 
 def combine_verticals(measurements: Sequence[ScaleMeasurement]) -> Vertical | None:
