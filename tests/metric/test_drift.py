@@ -98,7 +98,9 @@ def scales_of(T_ec: Tensor, times: Tensor, submap: Submap, noise: float) -> Scal
     logs = (true / found).log() + noise * normal(len(true))
     std = noise / math.sqrt(len(logs))
     parts = PathScales.of_mean(starts, ends, logs.exp(), torch.ones_like(logs), std)
-    return ScaleMeasurement(ScaleSource.SPEED, math.exp(float(logs.mean())), std, len(logs), "stretches", parts=parts)
+    return ScaleMeasurement(
+        ScaleSource.SPEED, math.exp(float(logs.mean())), std, len(logs), "stretches", parts=parts
+    )
 
 
 class Fixed:
@@ -144,8 +146,13 @@ def test_parts_find_their_keyframes() -> None:
     stds = torch.tensor((0.1, 0.2)).double()
     found = PathScales(starts, ends, torch.tensor((2.0, 2.2)).double(), stds).on(keyframes)
     assert found is not None
-    assert found.frames.tolist() == [[0, 4], [2, 4]]  # the second part has one keyframe: those beside it count
-    chords = (se3_inverse(submap.map.T_cw)[[4, 4], :3, 3] - se3_inverse(submap.map.T_cw)[[0, 2], :3, 3]).norm(dim=-1)
+    assert found.frames.tolist() == [
+        [0, 4],
+        [2, 4],
+    ]  # the second part has one keyframe: those beside it count
+    chords = (se3_inverse(submap.map.T_cw)[[4, 4], :3, 3] - se3_inverse(submap.map.T_cw)[[0, 2], :3, 3]).norm(
+        dim=-1
+    )
     torch.testing.assert_close(found.lengths, chords * torch.tensor((1.0, 1.1)).double())
     torch.testing.assert_close(found.information, stds**-2)
     # Positions half a second after a keyframe are on the path there, and two of one keyframe are averaged.
@@ -171,7 +178,9 @@ def test_the_error_of_a_mean_is_in_its_parts() -> None:
     [
         lambda keyframes: whole_path(keyframes, 1.0, 0.1),
         lambda keyframes: PathScales(*(torch.ones(4, 2).double())).on(keyframes),
-        lambda keyframes: PathPositions(*(torch.ones(2).double(), *torch.ones(2, 2, 3).double())).on(keyframes),
+        lambda keyframes: PathPositions(*(torch.ones(2).double(), *torch.ones(2, 2, 3).double())).on(
+            keyframes
+        ),
     ],
 )
 def test_one_keyframe_has_no_length(make: Callable[[Keyframes], object]) -> None:

@@ -64,7 +64,11 @@ def lengths_on(graph: RunGraph, factor: float = 1.0) -> MeasuredLengths:
 
 
 def test_the_error_has_right_derivatives() -> None:
-    T_1w, T_2w, measured = se3_exp(0.3 * draw(5, 6, seed=2)), se3_exp(0.3 * draw(5, 6, seed=3)), measured_rows()
+    T_1w, T_2w, measured = (
+        se3_exp(0.3 * draw(5, 6, seed=2)),
+        se3_exp(0.3 * draw(5, 6, seed=3)),
+        measured_rows(),
+    )
     steps = torch.zeros(2, 5, 6, dtype=torch.float64, requires_grad=True)
 
     def error(steps: Tensor, measured: Tensor) -> Tensor:
@@ -155,7 +159,9 @@ def test_measurements_are_kept_in_files_and_in_joined_graphs(graph: RunGraph, tm
         assert torch.equal(after.frames, before.frames + len(graph.T_cw))
     together = solve_graphs([whole, graph])
     torch.testing.assert_close(together[0].T_cw, solve_graph(whole).T_cw)
-    torch.testing.assert_close(solve_graph(joined).T_cw[len(graph.T_cw) :], together[0].T_cw, atol=1e-6, rtol=0)
+    torch.testing.assert_close(
+        solve_graph(joined).T_cw[len(graph.T_cw) :], together[0].T_cw, atol=1e-6, rtol=0
+    )
 
 
 @pytest.mark.parametrize(

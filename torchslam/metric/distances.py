@@ -160,9 +160,7 @@ class Distances:
         )
 
 
-def _parts(
-    view: SubmapView, found: Sequence[tuple[Distance, ScaleMeasurement]], std: float
-) -> PathScales:
+def _parts(view: SubmapView, found: Sequence[tuple[Distance, ScaleMeasurement]], std: float) -> PathScales:
     """The unit where the camera took the images of each length."""
     times, frames = view.timestamps.detach().cpu().double(), view.frame_index.detach().cpu()
 

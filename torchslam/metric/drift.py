@@ -36,8 +36,11 @@ place, which images leave open, and the shape stays that of the images, to 3e-5 
 1e-3 on, solvers need more than 200 iterations to find the unit."""
 GATE = 4.0
 """Standard deviations from the corrected path from which on a measurement is wrong."""
+SOFT_ROUNDS = 2
+"""Corrections in which a measurement counts the less the farther it is from the one before (weights of Cauchy): what is
+wrong for a while would bend the path toward itself."""
 ROUNDS = 3
-"""Of corrections, each without the measurements that are wrong by the one before."""
+"""Corrections after these, each without the measurements that are wrong by the one before."""
 OPTIONS = GRAPH_OPTIONS.replace(iterations=POSE_ITERATIONS, backward="detached")
 
 
@@ -119,16 +122,23 @@ def _trial(
     """
     solution: GraphSolution | None = None
     counts = [len(each.frames) for each in parts]
-    for _ in range(ROUNDS):
+    for number in range(SOFT_ROUNDS + ROUNDS):
         given = [given_part(each) for each in parts]
+        if number < SOFT_ROUNDS:
+            T_cw = graph.T_cw if solution is None else solution.T_cw
+            given = [each.softened(T_cw) for each in given]
         solution = _solved(graph, [each.weighed(factor) for each in (*given, *others)], solution)
         if solution is None:
             return parts, None
+        if number + 1 < SOFT_ROUNDS:
+            continue
         agreeing = [each.deviations(solution.T_cw) <= GATE for each in parts]
-        if all(bool(kept.all()) for kept in agreeing):
+        if number >= SOFT_ROUNDS and all(bool(kept.all()) for kept in agreeing):
             break
         parts = [each.select(kept) for each, kept in zip(parts, agreeing, strict=True)]
-        if any(len(each.frames) < max(LEAST_PARTS, count / 2) for each, count in zip(parts, counts, strict=True)):
+        if any(
+            len(each.frames) < max(LEAST_PARTS, count / 2) for each, count in zip(parts, counts, strict=True)
+        ):
             return parts, None
     return parts, solution
 

@@ -69,7 +69,7 @@ class Keyframes:
 
     def nearest(self, times: Float[Tensor, " N"]) -> Int[Tensor, " N"]:
         """The number of the keyframe that is nearest in time."""
-        after = torch.searchsorted(self.timestamps, times).clamp(1, len(self.timestamps) - 1)
+        after = torch.searchsorted(self.timestamps, times.contiguous()).clamp(1, len(self.timestamps) - 1)
         is_before = times - self.timestamps[after - 1] < self.timestamps[after] - times
         return after - is_before.long()
 
@@ -154,7 +154,9 @@ class PathScales:
             relative: standard deviations of the parts relative to each other.
             std: of the mean of their logarithms, weighted by information.
         """
-        return cls(starts, ends, meters_per_unit, std * relative * relative.square().reciprocal().sum().sqrt())
+        return cls(
+            starts, ends, meters_per_unit, std * relative * relative.square().reciprocal().sum().sqrt()
+        )
 
     def on(self, keyframes: Keyframes) -> MeasuredLengths | None:
         """See `PathMeasurement`: the distance between the keyframes that are nearest to both ends of a part.

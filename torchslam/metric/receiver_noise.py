@@ -68,8 +68,9 @@ def receiver_noise(
     near = off.abs() <= GATE * math.sqrt(1 + math.pi / 2 / NEIGHBORS) * spread
     near[:, 2] |= ~has_height[middle]
     agrees[middle] = near.all(-1)
-    squared = _bends(whitened[agrees]).square()
-    horizontal, vertical = squared[:, :2].mean().sqrt(), squared[:, 2].mean().sqrt()
+    # A median: what is wrong for a while agrees with its neighbors, but jumps at both ends.
+    bends = _bends(whitened[agrees]).abs()
+    horizontal, vertical = bends[:, :2].median() / NORMAL_MEDIAN, bends[:, 2].median() / NORMAL_MEDIAN
     factors = torch.stack((horizontal, horizontal, vertical))
     return ReceiverNoise((factors * stds).clamp_min(LEAST_STD), agrees)
 

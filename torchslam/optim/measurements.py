@@ -126,6 +126,11 @@ class MeasuredPositions:
             information=torch.linalg.inv(covariances),
         )
 
+    def softened(self, T_cw: Float[Tensor, "K 4 4"]) -> Self:
+        """The same with the squared errors at poses added to the variances: those that are far count little."""
+        far = torch.diag_embed(self.errors(T_cw).square().mT)
+        return replace(self, information=torch.linalg.inv(torch.linalg.inv(self.information) + far))
+
     def deviations(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, " N"]:
         """The largest error along an axis of each, in its standard deviations."""
         stds = torch.linalg.inv(self.information).diagonal(dim1=-2, dim2=-1).sqrt()
@@ -176,6 +181,10 @@ class MeasuredLengths:
             lengths=self.lengths[kept],
             information=self.information[kept],
         )
+
+    def softened(self, T_cw: Float[Tensor, "K 4 4"]) -> Self:
+        """The same with the squared errors at poses added to the variances: those that are far count little."""
+        return replace(self, information=1 / (1 / self.information + self.errors(T_cw).square()))
 
     def deviations(self, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, " F"]:
         """The error of each in its standard deviations."""

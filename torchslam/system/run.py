@@ -177,9 +177,7 @@ class Run:
         return concatenate_graphs([self._graph_of(submap) for submap in self.submaps])
 
     def _graph_of(self, submap: Submap) -> RunGraph:
-        graph = submap.posed_frames.graph(
-            submap.map, self.camera, submap.number, self.given, self.readout
-        )
+        graph = submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given, self.readout)
         return replace(graph, measurements=self.measurements.get(submap.number, ()))
 
 
