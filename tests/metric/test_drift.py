@@ -140,7 +140,7 @@ def keyframes_of(submap: Submap, meters_per_unit: float = 1.0) -> Keyframes:
 
 
 def test_parts_find_their_keyframes() -> None:
-    submap, times, T_ec = drifting_submap(count=12)
+    submap, _, _ = drifting_submap(count=12)
     keyframes = keyframes_of(submap, 2.0)
     starts, ends = torch.tensor((0.1, 3.0)).double(), torch.tensor((3.9, 3.1)).double()
     stds = torch.tensor((0.1, 0.2)).double()

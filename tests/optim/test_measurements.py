@@ -12,9 +12,9 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from tests.metric.drifting import CAMERA, drifting_submap
-from torchslam.metric.drift import GAUGE_SHARE
 from torchslam.errors import TorchslamError
 from torchslam.geometry import se3_exp, se3_inverse, transform
+from torchslam.metric.drift import GAUGE_SHARE
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.measurements import MeasuredLengths, MeasuredPositions, fixed_point_error
 from torchslam.optim.run_graph import RunGraph, concatenate_graphs, solve_graph, solve_graphs

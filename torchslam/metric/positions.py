@@ -23,6 +23,7 @@ from torchslam.metric.camera_path import (
     on_clock_of_images,
 )
 from torchslam.metric.options import Given
+from torchslam.metric.path_measurements import PathPositions
 from torchslam.metric.position_fit import (
     CLOCK_STD,
     MIN_POSITIONS,
@@ -33,7 +34,6 @@ from torchslam.metric.position_fit import (
     level_std,
     start_distance,
 )
-from torchslam.metric.path_measurements import PathPositions
 from torchslam.metric.receiver_noise import NEIGHBORS, receiver_noise
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured

@@ -368,8 +368,8 @@ def solve_graph(
     """Minimize the robust reprojection errors of a run's graph: keyframes and points, then the other frames.
 
     Every submap is solved on its own. Its first keyframe and its scale stay those of the start, unless measurements
-    determine them; a loss should not depend on them (aligned trajectory errors do not). A camera that is free is found in the submap with most keyframes;
-    the others are solved with it.
+    determine them; a loss should not depend on them (aligned trajectory errors do not). A camera that is free is found
+    in the submap with most keyframes; the others are solved with it.
 
     With `graph.readout`, the minimum is that of the keypoints that its own poses, points and camera correct. The
     implicit gradient passes `GRADIENT_ROUNDS` rounds of correction and solution there, and is right to 1e-5; it also
