@@ -78,11 +78,11 @@ def correct_drift(
         # Positions are in the world of the source that has given the submap its frame.
         if each.parts is not None and (each.S_ew is None or each is framed):
             own = each.parts.on(keyframes)
+        own = whole_path(keyframes, each.meters_per_unit, each.relative_std) if own is None else own
         if own is not None:
+            own = own.to(submap.map.T_cw)
             (parts if len(own.frames) >= LEAST_PARTS else others).append(own)
-        elif (whole := whole_path(keyframes, each.meters_per_unit, each.relative_std)) is not None:
-            others.append(whole)
-    gauge = tuple(each.weighed(GAUGE_SHARE * factor) for each in (*parts, *others))
+    gauge = tuple(_near(each, submap.map.T_cw).weighed(GAUGE_SHARE * factor) for each in (*parts, *others))
     if not parts:
         return Correction(gauge)
     graph = submap.posed_frames.graph(submap.map, view.camera, readout=view.readout)
@@ -102,6 +102,12 @@ def correct_drift(
         return Correction(gauge, gain)
     submap.posed_frames.apply_solution(solution, graph, submap.map)
     return Correction(found, gain, is_taken=True)
+
+
+def _near(measured: Measurement, T_cw: Float[Tensor, "K 4 4"]) -> Measurement:
+    """Measurements that agree with poses; all where most do not, as where their noise is not known."""
+    near = measured.deviations(T_cw) <= GATE
+    return measured.select(near) if 2 * int(near.sum()) > len(near) else measured
 
 
 def _move(slam_map: Map, graph: RunGraph, solution: GraphSolution) -> tuple[Tensor, Tensor]:
@@ -156,7 +162,8 @@ def _solved(
 
 def given_part(measured: Measurement) -> Measurement:
     """Measurements without those that are held back."""
-    return measured.select(torch.arange(len(measured.frames), device="cpu") % HELD_BACK != HELD_BACK // 2)
+    rows = torch.arange(len(measured.frames), device=measured.frames.device)
+    return measured.select(rows % HELD_BACK != HELD_BACK // 2)
 
 
 def held_back_cost(measured: Measurement, T_cw: Float[Tensor, "K 4 4"]) -> Float[Tensor, ""]:

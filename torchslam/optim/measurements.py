@@ -154,6 +154,11 @@ class MeasuredPositions:
         """The same with so many times the information."""
         return replace(self, information=factor * self.information)
 
+    def to(self, like: Float[Tensor, "..."]) -> Self:
+        """The same on the device and of the type of `like`."""
+        values = {each.name: getattr(self, each.name).to(like) for each in fields(self)}
+        return replace(self, **values | {"frames": self.frames.to(like.device)})
+
 
 @dataclass(frozen=True)
 class MeasuredLengths:
@@ -206,6 +211,11 @@ class MeasuredLengths:
     def weighed(self, factor: float) -> Self:
         """The same with so many times the information."""
         return replace(self, information=factor * self.information)
+
+    def to(self, like: Float[Tensor, "..."]) -> Self:
+        """The same on the device and of the type of `like`."""
+        values = {each.name: getattr(self, each.name).to(like) for each in fields(self)}
+        return replace(self, **values | {"frames": self.frames.to(like.device)})
 
 
 Measurement = MeasuredPositions | MeasuredLengths
