@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
 from torchslam.data.formats.imu_files import read_imu, read_inertial_calibration
@@ -46,6 +48,7 @@ class InertialSource:
             tuple(f"the stretch from {time:.2f} s on contradicts the others" for time in found.rejected),
             up_w=-down,
             up_std=found.gravity_std,
+            notes=_notes(found),
         )
 
     def _check_times(self, timestamps: torch.Tensor) -> None:
@@ -58,6 +61,18 @@ class InertialSource:
                 f"{self.samples.source}: samples from {float(samples[0]):.3f} to {float(samples[-1]):.3f} s, but "
                 f"images from {first:.3f} to {last:.3f} s: both need the same clock"
             )
+
+
+def _notes(found: InertialAlignment) -> tuple[str, ...]:
+    """What was found of the sensor."""
+    if found.rotation is None:
+        return ()
+    turn = math.degrees(float(found.rotation.bias.norm()))
+    return (
+        f"inertial sensor: bias of the gyroscope {turn:.3f} degrees/s, of the accelerometer "
+        f"{float(found.accelerometer_bias.norm()):.3f} m/s^2; its clock differs by "
+        f"{1e3 * float(found.rotation.offset):+.1f} ms; it is {float(found.lever_c.norm()):.3f} m from the camera",
+    )
 
 
 def reason_of(found: InertialAlignment) -> str:

@@ -92,6 +92,9 @@ class OdometrySource:
                 f"{float(middles[strange][0]):.1f} s, turn otherwise than the camera and do not count"
             )
         notes += clock_notes(self.path, shift)
+        notes.append(
+            f"{self.path}: the camera is {float(lever.norm()):.2f} m from the sensor, as its turns show"
+        )
         stretches = Stretches(middles, lengths_w, lengths, known & turned_alike)
         return measured(stretches, ScaleSource.ODOMETRY, "the odometry", tuple(notes))
 

@@ -50,7 +50,7 @@ class PositionFit:
         offset: seconds that the clock of the images is ahead of that of the positions, beyond what was removed before.
         offset_std: its standard error.
         inliers: positions that agree.
-        distances: of each position from the path, meters.
+        residuals: of each position from the path, meters, zero where a coordinate was not measured.
         noise: standard deviations along one axis, horizontal and vertical, that the path leaves over, meters.
     """
 
@@ -61,8 +61,13 @@ class PositionFit:
     offset: float
     offset_std: float
     inliers: Bool[Tensor, " N"]
-    distances: Float[Tensor, " N"]
+    residuals: Float[Tensor, "N 3"]
     noise: tuple[float, float]
+
+    @property
+    def distances(self) -> Float[Tensor, " N"]:
+        """Of each position from the path, meters."""
+        return self.residuals.norm(dim=-1)
 
 
 @dataclass(frozen=True)
@@ -130,7 +135,7 @@ def fit_positions(
     noise = float((0.5 * (left[0] + left[1])).sqrt()), float(left[2].sqrt())
     return PositionFit(
         S_ew, fit.relative_std, fit.up_w, fit.up_std, fit.offset, fit.offset_std, inliers,
-        residuals.norm(dim=-1), noise,
+        residuals, noise,
     )  # fmt: skip
 
 
@@ -210,7 +215,7 @@ def _grouped(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> _Groups:
         return group_means(values, group, size)
 
     white = (mean(stds.square()) / size[:, None]).sqrt()
-    level = (mean((~pairs.has_height).double()) > 0) * _level_std(pairs)
+    level = (mean((~pairs.has_height).double()) > 0) * level_std(pairs)
     white[:, 2] = (white[:, 2].square() + level.square()).sqrt()
     return _Groups(
         mean(pairs.times),
@@ -226,7 +231,8 @@ LEVEL = 0.05
 """Where heights were not measured the path is taken for level, with this part of its extent as standard deviation."""
 
 
-def _level_std(pairs: PositionPairs) -> float:
+def level_std(pairs: PositionPairs) -> float:
+    """Standard deviation of heights that were not measured, meters."""
     extent = (pairs.positions_e.amax(0) - pairs.positions_e.amin(0))[:2].norm()
     return LEVEL * float(extent)
 

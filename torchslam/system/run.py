@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -26,6 +26,7 @@ from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions
 from torchslam.optim.camera_evidence import graph_evidence
+from torchslam.optim.measurements import Measurement
 from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
@@ -83,6 +84,7 @@ class Run:
             global one.
         shutter: what the residuals say of it; None where that was not tested.
         unmeasured: one line for each source of meters that said nothing of the main submap.
+        measurements: by the number of a submap, those from outside in its graph.
     """
 
     submaps: tuple[Submap, ...]
@@ -101,6 +103,7 @@ class Run:
     readout: Readout | None = None
     shutter: RollingShutter | None = None
     unmeasured: tuple[str, ...] = ()
+    measurements: Mapping[int, tuple[Measurement, ...]] = field(default_factory=dict)
 
     @property
     def metric(self) -> MetricUnit | None:
@@ -171,12 +174,11 @@ class Run:
         """
         if not self.submaps:
             raise InitializationError(self.failure)
-        return concatenate_graphs(
-            [
-                submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given, self.readout)
-                for submap in self.submaps
-            ]
-        )
+        return concatenate_graphs([self._graph_of(submap) for submap in self.submaps])
+
+    def _graph_of(self, submap: Submap) -> RunGraph:
+        graph = submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given, self.readout)
+        return replace(graph, measurements=self.measurements.get(submap.number, ()))
 
 
 @dataclass
