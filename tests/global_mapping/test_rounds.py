@@ -335,7 +335,7 @@ def test_a_fifth_of_wrong_observations_is_left_out(coarse: bool, distance: float
     assert off < 0.1
     assert float(NOISY.observed.errors(found)[RIGHT].median()) < 1
     assert torch.equal(found.camera.params, CAMERA.params)
-    before = [f"{kernel} {scale:g}" for kernel, scale in COARSE] if coarse else []
+    before = [f"{kernel} {scale:g}" for kernel, scale, _ in COARSE] if coarse else []
     fine = len(words) - len(before)
     assert [line.split(":")[0] for line in words] == before + [f"round {row + 1}" for row in range(fine)]
     assert words[-1] == f"round {fine}: {int(RIGHT.sum())} observations agree, 0.0% changed"
@@ -415,7 +415,9 @@ def test_the_kernel_narrows_from_round_to_round(monkeypatch: pytest.MonkeyPatch)
     """And the gate with it; coarse rounds have the longest tracks, and pass on poses and camera."""
     steps = Steps(monkeypatch, lambda number: 1000)
     monkeypatch.setattr(rounds, "COARSE_TRACKS", 20)
-    monkeypatch.setattr(rounds, "COARSE", (("cauchy", 20.0), ("cauchy", 6.0), ("geman_mcclure", 4.0)))
+    monkeypatch.setattr(
+        rounds, "COARSE", (("cauchy", 20.0, 1e-6), ("cauchy", 6.0, 1e-6), ("geman_mcclure", 4.0, 1e-6))
+    )
     found = adjust_in_rounds(SCENE.observed, SCENE.T_cw, None, CAMERA)
     assert steps.done == [
         ("triangulate", 20, 60.0),
@@ -467,7 +469,7 @@ def test_rounds_end_when_little_changes(
 def test_the_coarse_rounds_say_what_they_keep() -> None:
     words: list[str] = []
     adjust_in_rounds(NOISY.observed, NOISY.T_cw, None, CAMERA, log=words.append)
-    kernel, scale = COARSE[-1]
+    kernel, scale, _ = COARSE[-1]
     assert words[len(COARSE) - 1] == f"{kernel} {scale:g}: {int(RIGHT.sum())} of 800 observations agree"
 
 

@@ -16,8 +16,10 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -57,9 +59,9 @@ from torchslam.parallel.workers import with_workers
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import source
 from torchslam.system.metric_run import run_in_meters
-from torchslam.system.run import Run, RunProgress, run_sequence
+from torchslam.system.run import Run, RunProgress, finish, run_frames
 from torchslam.system.slam import SLAM
-from torchslam.types import StepResult
+from torchslam.types import State, StepResult
 from torchslam.utils.console import say, table, warn
 
 DONE = 0
@@ -209,6 +211,7 @@ class Attempt:
         latencies: milliseconds from capture to pose, of a live source.
         watching: the viewers, open until the results are written.
         mapped: the check, and whether the recording was mapped as a whole; None where it is no recording.
+        end: where the run stopped since tracking was lost: processes the other frames, or none of them, and ends it.
     """
 
     finished: Run
@@ -217,6 +220,7 @@ class Attempt:
     latencies: list[float]
     watching: FrameViewers
     mapped: MappedRecording | None = None
+    end: Callable[[bool], Run] | None = None
 
 
 def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
@@ -277,20 +281,53 @@ def _attempt(
     watching = viewers.enter_context(_watching(slam, sequence, options))
     latencies: list[float] = []
     may_go_on = _mode(sequence, options) not in (None, Mapping.ONLINE)
-    bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
-    with bar as progress:
 
-        def after_frame(result: StepResult) -> None:
-            if sequence.is_live:
-                latencies.append(1e3 * (time.time() - result.timestamp))
-            is_last = may_go_on and result.index + 1 == sequence.known_length
-            checkpoints.offer(at_once=stop_signals.is_wanted or is_last)
-            watching.show(result)
-            progress.update(result)
+    def frames_to(end: bool) -> Run | None:
+        """The run, finished; None if it stopped, which it may before the end, where tracking was lost."""
+        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
+        with bar as progress:
 
-        with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
-            finished = run_sequence(slam, watching.sequence, after_frame, so_far, progress.adjusting, frames)
+            def after_frame(result: StepResult) -> None:
+                if sequence.is_live:
+                    latencies.append(1e3 * (time.time() - result.timestamp))
+                is_last = result.index + 1 == sequence.known_length or (
+                    result.state is State.LOST and not end
+                )
+                checkpoints.offer(at_once=stop_signals.is_wanted or (may_go_on and is_last))
+                watching.show(result)
+                progress.update(result)
+
+            interrupted = False
+            with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
+                try:
+                    if not run_frames(slam, watching.sequence, so_far, after_frame, frames, not end):
+                        return None
+                except KeyboardInterrupt:
+                    interrupted = True
+                return finish(slam, so_far.results, so_far.skipped, interrupted, progress.adjusting)
+
+    whole: list[Run] = []  # once it has ended
+
+    def ended(go_on: bool) -> Run:
+        if not whole:
+            found = frames_to(end=True) if go_on else None
+            whole.append(found or finish(slam, so_far.results, so_far.skipped, interrupted=True))
+        return whole[0]
+
+    is_watched = options.view or options.video
+    finished = frames_to(end=is_watched or not may_go_on or not _all_are_mapped(sequence, config))
+    if finished is None:
+        begun = Run(
+            tuple(slam.atlas), slam.camera, slam.config, so_far.results, so_far.skipped, False, failure=""
+        )
+        return Attempt(begun, sequence, found, latencies, watching, end=ended)
     return Attempt(finished, sequence, found, latencies, watching)
+
+
+def _all_are_mapped(sequence: Sequence, config: Config) -> bool:
+    """Whether global mapping takes all frames of a recording, whatever becomes of them online."""
+    length = sequence.known_length
+    return length is not None and length <= config.global_mapping.max_images
 
 
 def _map_recording(
@@ -310,8 +347,10 @@ def _map_recording(
                 options.device,
                 bar.update,
                 stages,
+                None if attempt.end is None else partial(attempt.end, True),
             )
     except KeyboardInterrupt:
+        online = online if attempt.end is None else attempt.end(False)
         return replace(attempt, finished=replace(online, interrupted=True))
     if mapped.why:
         say(f"mapped as a whole, since {mapped.why}; kept: {mapped.kept}")
