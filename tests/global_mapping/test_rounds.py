@@ -406,7 +406,14 @@ class Steps:
             steps.triangulated += 1
             return Reconstruction(T_cw, camera, SCENE.points_w[: self.tracks.count], agrees)
 
+        def completed(self: ObservedTracks, found: Reconstruction, gate: float) -> Reconstruction:
+            steps.done.append(("complete", self.tracks.count, gate))
+            agrees = torch.arange(len(self.tracks)) < agreeing(steps.triangulated)
+            steps.triangulated += 1
+            return replace(found, agrees=agrees)
+
         monkeypatch.setattr(rounds, "adjust", adjusted)
+        monkeypatch.setattr(ObservedTracks, "complete", completed)
         monkeypatch.setattr(ObservedTracks, "filter", filtered)
         monkeypatch.setattr(ObservedTracks, "triangulate", triangulated)
 
@@ -428,8 +435,8 @@ def test_the_kernel_narrows_from_round_to_round(monkeypatch: pytest.MonkeyPatch)
         ("adjust", 20, "geman_mcclure", 4.0, 1e-6),
         ("filter", 20, 15.0),
         ("triangulate", 100, 12.0),
-        ("adjust", 100, "geman_mcclure", 5.0, 1e-7),
-        ("triangulate", 100, 8.0),
+        ("adjust", 100, "geman_mcclure", 5.0, 1e-6),
+        ("complete", 100, 8.0),
     ]
     torch.testing.assert_close(found.T_cw, SCENE.T_cw + 4)
     torch.testing.assert_close(found.camera.params, CAMERA.params + 4)
@@ -457,13 +464,25 @@ def test_rounds_end_when_little_changes(
     steps = Steps(monkeypatch, lambda number: totals[number])
     words: list[str] = []
     found = adjust_in_rounds(SCENE.observed, SCENE.T_cw, None, CAMERA, False, words.append)
-    assert [step[0] for step in steps.done] == ["triangulate", *["adjust", "triangulate"] * done]
+    assert [step[0] for step in steps.done] == ["triangulate", *["adjust", "complete"] * done]
     assert int(found.agrees.sum()) == totals[done]
     assert (
         words[-1]
         == f"round {done}: {totals[done]} observations agree, {changes[done - 1] / 1000:.1%} changed"
     )
     assert len(words) == done
+
+
+def test_points_are_found_anew_only_where_more_observations_agree_with_that() -> None:
+    observed = SCENE.observed
+    points_w = SCENE.points_w.clone()
+    points_w[1:] += 1e-3  # adjusted by something else than rays
+    points_w[0] += 1.0
+    none = torch.zeros(len(observed.tracks), dtype=torch.bool)
+    found = observed.complete(Reconstruction(SCENE.T_cw, CAMERA, points_w, none), 8.0)
+    assert bool(found.agrees.all())
+    assert torch.equal(found.points_w[1:], points_w[1:])
+    torch.testing.assert_close(found.points_w[0], SCENE.points_w[0])
 
 
 def test_the_coarse_rounds_say_what_they_keep() -> None:

@@ -25,6 +25,7 @@ from pathlib import Path
 import torch
 
 from torchslam.calibration.find_camera import ROUGH_STD, find_camera, with_stated_std
+from torchslam.calibration.from_pairs import NUM_KEYPOINTS
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
@@ -35,6 +36,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
+from torchslam.global_mapping.mapper import features_to_keep
 from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
@@ -57,7 +59,7 @@ from torchslam.metric.options import given_options, sources_of
 from torchslam.metric.source import MetricSource
 from torchslam.parallel.workers import with_workers
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
-from torchslam.system.front_end import source
+from torchslam.system.front_end import KeptFeatures, source
 from torchslam.system.metric_run import run_in_meters
 from torchslam.system.run import Run, RunProgress, finish, run_frames
 from torchslam.system.slam import SLAM
@@ -211,6 +213,7 @@ class Attempt:
         latencies: milliseconds from capture to pose, of a live source.
         watching: the viewers, open until the results are written.
         mapped: the check, and whether the recording was mapped as a whole; None where it is no recording.
+        kept: features of frames that the search for the camera has used.
         end: where the run stopped since tracking was lost: processes the other frames, or none of them, and ends it.
     """
 
@@ -220,6 +223,7 @@ class Attempt:
     latencies: list[float]
     watching: FrameViewers
     mapped: MappedRecording | None = None
+    kept: KeptFeatures | None = None
     end: Callable[[bool], Run] | None = None
 
 
@@ -269,7 +273,9 @@ def _attempt(
     viewers: ExitStack,
 ) -> Attempt:
     """Find the camera, if it is not given, and run."""
-    sequence, found = _with_camera(sequence, config, options)
+    may_go_on = _mode(sequence, options) not in (None, Mapping.ONLINE)
+    kept = features_to_keep(config, sequence.size, NUM_KEYPOINTS, options.device) if may_go_on else None
+    sequence, found = _with_camera(sequence, config, options, kept)
     if options.camera_std is None:
         config = with_stated_std(config, sequence)
     slam, so_far = _begin(sequence, config, options)
@@ -280,7 +286,6 @@ def _attempt(
     )  # the viewers need the images in this process
     watching = viewers.enter_context(_watching(slam, sequence, options))
     latencies: list[float] = []
-    may_go_on = _mode(sequence, options) not in (None, Mapping.ONLINE)
 
     def frames_to(end: bool) -> Run | None:
         """The run, finished; None if it stopped, which it may before the end, where tracking was lost."""
@@ -320,8 +325,8 @@ def _attempt(
         begun = Run(
             tuple(slam.atlas), slam.camera, slam.config, so_far.results, so_far.skipped, False, failure=""
         )
-        return Attempt(begun, sequence, found, latencies, watching, end=ended)
-    return Attempt(finished, sequence, found, latencies, watching)
+        return Attempt(begun, sequence, found, latencies, watching, kept=kept, end=ended)
+    return Attempt(finished, sequence, found, latencies, watching, kept=kept)
 
 
 def _all_are_mapped(sequence: Sequence, config: Config) -> bool:
@@ -348,6 +353,7 @@ def _map_recording(
                 bar.update,
                 stages,
                 None if attempt.end is None else partial(attempt.end, True),
+                attempt.kept,
             )
     except KeyboardInterrupt:
         online = online if attempt.end is None else attempt.end(False)
@@ -369,7 +375,9 @@ def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
         return replace(attempt, finished=replace(finished, interrupted=True, unmeasured=(why,)))
 
 
-def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[Sequence, str]:
+def _with_camera(
+    sequence: Sequence, config: Config, options: argparse.Namespace, extract: KeptFeatures | None
+) -> tuple[Sequence, str]:
     """Return the sequence with the camera of the run, and a remark on the camera if it was estimated."""
     is_guess = sequence.calibrated is Calibrated.GUESSED and not sequence.is_live
     if options.map is not None or not (options.refine_camera or is_guess):
@@ -386,6 +394,7 @@ def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace
         options.device,
         goes_on,
         lambda words: say(f"camera: {words}"),
+        extract,
     )
 
 
