@@ -73,7 +73,7 @@ def map_recording(
     progress: Progress = lambda stage, done, most: None,
     stages: Path | None = None,
     go_on: Callable[[], Run] | None = None,
-    kept: KeptFeatures | None = None,
+    features: KeptFeatures | None = None,
 ) -> MappedRecording:
     """Check an online run, and map its recording as a whole where that is wanted or needed.
 
@@ -89,7 +89,7 @@ def map_recording(
             they are not saved.
         go_on: processes the other frames and returns the finished run, where `online` stopped; None: it is finished.
             It is called only where the map of the whole is not right: no run that was lost is better than a right one.
-        kept: features that were extracted before, by `features_to_keep`; None: there are none.
+        features: those that were extracted before, by `features_to_keep`; None: there are none.
     """
     check = None
     why = _loss(online) if go_on is None else f"tracking was lost at frame {online.results[-1].index}"
@@ -102,7 +102,7 @@ def map_recording(
         return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
     saved = SavedStages(stages, sequence, config, device)
-    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress, saved=saved, kept=kept)
+    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress, saved=saved, kept=features)
     made = mapper.run(online.results)
     reduction = mapper.scaled.features.reduction(camera.size)
 
