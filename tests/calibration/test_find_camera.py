@@ -25,7 +25,8 @@ from torchslam.data.sequence import Calibrated, Sequence
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
 from torchslam.geometry.view_graph_focal import ViewGraphFocal
-from torchslam.system.front_end import Simulated, true_poses
+from torchslam.global_mapping.mapper import features_to_keep
+from torchslam.system.front_end import KeptFeatures, Simulated, true_poses
 
 CAMERA = Camera.pinhole(200.0, 200.0, 159.5, 119.5, size=(320, 240))
 CPU = torch.device("cpu")
@@ -60,6 +61,34 @@ def test_pairs_of_images_give_the_focal_length(searched: ViewGraphFocal) -> None
     assert float(searched.focal) == pytest.approx(500.0, rel=0.05)
     assert abs(float(searched.focal) - 500.0) < 4 * float(searched.std) * 500.0
     assert from_pairs.PLACES < len(searched.errors) <= from_pairs.MAX_PAIRS
+
+
+def test_features_of_mapping_give_the_same_focal_length(room: Sequence, searched: ViewGraphFocal) -> None:
+    """The strongest of them, extracted once."""
+    kept = features_to_keep(Config(), room.size, from_pairs.NUM_KEYPOINTS)
+    assert kept is not None
+    found = search_focal(room, Config(), CPU, lambda done, most: None, kept)
+    assert found is not None
+    assert float(found.focal) == float(searched.focal)
+    read: list[int] = []
+    again = KeptFeatures(lambda frame: read.append(frame.index) or kept(frame))  # type: ignore[func-returns-value]
+    frame = room[3]
+    assert again(frame) is again(frame)
+    assert len(again(frame).mask[0]) == Config().global_mapping.num_keypoints
+    assert read == [3]
+
+
+@pytest.mark.parametrize(
+    ("settings", "size"),
+    [
+        (["features.kind=simulated"], (640, 480)),
+        (["global_mapping.num_keypoints=1499"], (640, 480)),
+        ([], (1920, 1080)),  # the search reduces them more
+        (["global_mapping.max_image_pixels=40000"], (640, 480)),
+    ],
+)
+def test_other_features_are_not_shared(settings: list[str], size: tuple[int, int]) -> None:
+    assert features_to_keep(load_config(None, settings), size, from_pairs.NUM_KEYPOINTS) is None
 
 
 def test_the_camera_is_written_with_its_error_and_read_again(

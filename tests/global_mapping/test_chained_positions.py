@@ -117,7 +117,8 @@ def test_uncertain_ratios_count_less(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = Recording.of(line(3), wall(40, 0.5), noise_px=2.0)
     pair_lengths(noisy.pairs(1, 2), noisy.views, CAMERA)
     one, other = noisy.pairs(1)
-    depths = [module.PairDepths.of(pair.T_21, noisy.views, pair, CAMERA) for pair in (one, other)]
+    rays = module.ViewRays.by(CAMERA, noisy.views)
+    depths = [module.PairDepths.of(pair.T_21, rays, pair) for pair in (one, other)]
     ratio = module.depth_ratio(depths[0], 1, depths[1], 0)
     assert ratio is not None
     assert ratio.std > 0.01

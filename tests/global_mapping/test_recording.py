@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from types import SimpleNamespace
 from typing import Any
@@ -92,7 +93,13 @@ class World:
         monkeypatch.setattr(recording, "poses_of", lambda run, views: (run, "known"))
         monkeypatch.setattr(recording, "check_map", lambda run, *more: world.checks[run is world.whole])
 
-    def map(self, online: Run, mapping: Mapping = Mapping.AUTO, *overrides: str) -> MappedRecording:
+    def map(
+        self,
+        online: Run,
+        mapping: Mapping = Mapping.AUTO,
+        *overrides: str,
+        go_on: Callable[[], Run] | None = None,
+    ) -> MappedRecording:
         """Map a recording with this online run."""
         return map_recording(
             None,  # type: ignore[arg-type]
@@ -101,6 +108,7 @@ class World:
             CAMERA,
             mapping,
             progress=lambda stage, done, most: self.stages.append(stage),
+            go_on=go_on,
         )
 
 
@@ -203,6 +211,35 @@ def test_a_recording_without_a_whole_map_keeps_the_online_run(world: World) -> N
     assert world.checked_online == 1
     world.map(a_run(), Mapping.GLOBAL)
     assert world.checked_online == 2
+
+
+def test_a_run_that_was_lost_goes_on_only_where_the_whole_map_is_not_right(world: World) -> None:
+    """Not right: the check contradicts it, frames have no pose, or there is no map; then both are compared."""
+    begun = a_run(posed=9, frames=10)
+    begun.results[-1] = replace(begun.results[-1], state=State.LOST)
+    ended = a_run(posed=60)
+    asked: list[Run] = []
+
+    def go_on() -> Run:
+        asked.append(ended)
+        return ended
+
+    kept = world.map(begun, go_on=go_on)
+    assert (kept.run, kept.check, kept.kept) == (world.whole, world.checks[True], Mapping.GLOBAL)
+    assert kept.why == "tracking was lost at frame 9"
+    assert (asked, world.mapped, world.checked_online) == ([], [begun.results], 0)
+    world.whole = a_run(posed=99)
+    kept = world.map(begun, go_on=go_on)
+    assert (kept.run, kept.why) == (world.whole, "60 of 100 frames are posed in one map")
+    assert asked == [ended]
+    world.whole = a_run()
+    world.checks = {True: a_check(0.7), False: a_check(0.9)}
+    kept = world.map(begun, go_on=go_on)
+    assert (kept.run, kept.check, kept.kept) == (ended, world.checks[False], Mapping.ONLINE)
+    world.whole = a_run(posed=0, failure="no map: 2 images are too few")
+    kept = world.map(begun, go_on=go_on)
+    assert (kept.run, kept.check) == (ended, world.online_check)
+    assert len(asked) == 3
 
 
 def test_the_camera_is_given_with_its_error(world: World) -> None:

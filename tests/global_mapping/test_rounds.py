@@ -335,7 +335,7 @@ def test_a_fifth_of_wrong_observations_is_left_out(coarse: bool, distance: float
     assert off < 0.1
     assert float(NOISY.observed.errors(found)[RIGHT].median()) < 1
     assert torch.equal(found.camera.params, CAMERA.params)
-    before = [f"{kernel} {scale:g}" for kernel, scale in COARSE] if coarse else []
+    before = [f"{kernel} {scale:g}" for kernel, scale, _ in COARSE] if coarse else []
     fine = len(words) - len(before)
     assert [line.split(":")[0] for line in words] == before + [f"round {row + 1}" for row in range(fine)]
     assert words[-1] == f"round {fine}: {int(RIGHT.sum())} observations agree, 0.0% changed"
@@ -406,7 +406,14 @@ class Steps:
             steps.triangulated += 1
             return Reconstruction(T_cw, camera, SCENE.points_w[: self.tracks.count], agrees)
 
+        def completed(self: ObservedTracks, found: Reconstruction, gate: float) -> Reconstruction:
+            steps.done.append(("complete", self.tracks.count, gate))
+            agrees = torch.arange(len(self.tracks)) < agreeing(steps.triangulated)
+            steps.triangulated += 1
+            return replace(found, agrees=agrees)
+
         monkeypatch.setattr(rounds, "adjust", adjusted)
+        monkeypatch.setattr(ObservedTracks, "complete", completed)
         monkeypatch.setattr(ObservedTracks, "filter", filtered)
         monkeypatch.setattr(ObservedTracks, "triangulate", triangulated)
 
@@ -415,7 +422,9 @@ def test_the_kernel_narrows_from_round_to_round(monkeypatch: pytest.MonkeyPatch)
     """And the gate with it; coarse rounds have the longest tracks, and pass on poses and camera."""
     steps = Steps(monkeypatch, lambda number: 1000)
     monkeypatch.setattr(rounds, "COARSE_TRACKS", 20)
-    monkeypatch.setattr(rounds, "COARSE", (("cauchy", 20.0), ("cauchy", 6.0), ("geman_mcclure", 4.0)))
+    monkeypatch.setattr(
+        rounds, "COARSE", (("cauchy", 20.0, 1e-6), ("cauchy", 6.0, 1e-6), ("geman_mcclure", 4.0, 1e-6))
+    )
     found = adjust_in_rounds(SCENE.observed, SCENE.T_cw, None, CAMERA)
     assert steps.done == [
         ("triangulate", 20, 60.0),
@@ -426,8 +435,8 @@ def test_the_kernel_narrows_from_round_to_round(monkeypatch: pytest.MonkeyPatch)
         ("adjust", 20, "geman_mcclure", 4.0, 1e-6),
         ("filter", 20, 15.0),
         ("triangulate", 100, 12.0),
-        ("adjust", 100, "geman_mcclure", 5.0, 1e-7),
-        ("triangulate", 100, 8.0),
+        ("adjust", 100, "geman_mcclure", 5.0, 1e-6),
+        ("complete", 100, 8.0),
     ]
     torch.testing.assert_close(found.T_cw, SCENE.T_cw + 4)
     torch.testing.assert_close(found.camera.params, CAMERA.params + 4)
@@ -455,7 +464,7 @@ def test_rounds_end_when_little_changes(
     steps = Steps(monkeypatch, lambda number: totals[number])
     words: list[str] = []
     found = adjust_in_rounds(SCENE.observed, SCENE.T_cw, None, CAMERA, False, words.append)
-    assert [step[0] for step in steps.done] == ["triangulate", *["adjust", "triangulate"] * done]
+    assert [step[0] for step in steps.done] == ["triangulate", *["adjust", "complete"] * done]
     assert int(found.agrees.sum()) == totals[done]
     assert (
         words[-1]
@@ -464,10 +473,22 @@ def test_rounds_end_when_little_changes(
     assert len(words) == done
 
 
+def test_points_are_found_anew_only_where_more_observations_agree_with_that() -> None:
+    observed = SCENE.observed
+    points_w = SCENE.points_w.clone()
+    points_w[1:] += 1e-3  # adjusted by something else than rays
+    points_w[0] += 1.0
+    none = torch.zeros(len(observed.tracks), dtype=torch.bool)
+    found = observed.complete(Reconstruction(SCENE.T_cw, CAMERA, points_w, none), 8.0)
+    assert bool(found.agrees.all())
+    assert torch.equal(found.points_w[1:], points_w[1:])
+    torch.testing.assert_close(found.points_w[0], SCENE.points_w[0])
+
+
 def test_the_coarse_rounds_say_what_they_keep() -> None:
     words: list[str] = []
     adjust_in_rounds(NOISY.observed, NOISY.T_cw, None, CAMERA, log=words.append)
-    kernel, scale = COARSE[-1]
+    kernel, scale, _ = COARSE[-1]
     assert words[len(COARSE) - 1] == f"{kernel} {scale:g}: {int(RIGHT.sum())} of 800 observations agree"
 
 

@@ -19,6 +19,7 @@ from torchslam.errors import ConfigError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.view_graph_focal import ViewGraphFocal
+from torchslam.system.front_end import Extractor
 from torchslam.system.run import Run
 
 LEAST_STD = 0.05
@@ -38,6 +39,7 @@ def find_camera(
     device: torch.device,
     resume: bool = False,
     on_progress: Callable[[str], None] = lambda words: None,
+    extract: Extractor | None = None,
 ) -> tuple[Sequence, str]:
     """Find the focal length of an unknown camera from pairs of images, and write the calibration file.
 
@@ -48,6 +50,7 @@ def find_camera(
         device: Of torch.
         resume: Use the camera of the resumed run, if there is one.
         on_progress: Receives messages.
+        extract: As in `search_focal`.
 
     Returns:
         The sequence with its camera and the error of this, and a description of the camera.
@@ -60,7 +63,7 @@ def find_camera(
         known = read_numbers(path)
         return sequence.with_camera(known.camera(sequence.size), std=known.std), f"from {path}"
     sequence = sequence.with_guess()
-    search = search_focal(sequence, config, device)
+    search = search_focal(sequence, config, device, lambda done, most: None, extract)
     camera, std = sequence.camera, GUESS_STD
     if search is not None and search.success:
         ratio = search.focal.detach().to(camera.params) / camera.fx
@@ -112,6 +115,8 @@ def camera_remark(finished: Run, found: str) -> str:
         if found:
             return f"{found}; over all frames {described}"
         described += f" (given {float(given.camera.focal):.1f} px)"
+        if not _may_contradict(given, finished.calibration):
+            return described
         freely = estimate_intrinsics(finished.graph)  # without the prior
         words = contradiction(given.camera, freely) if given.departure(freely.camera) > MIN_SIGMAS else ""
         return f"{described}; {words}; {REMEDY}" if words else described
@@ -121,6 +126,16 @@ def camera_remark(finished: Run, found: str) -> str:
     if found:
         return "; but over all frames ".join(filter(None, (found, against)))
     return f"{against}; {REMEDY}" if against else ""
+
+
+def _may_contradict(given: CameraMeasurement, found: CameraMeasurement) -> bool:
+    """Whether images that were free of the given camera might be off from it by `MIN_SIGMAS`.
+
+    What they found together with it is in between, nearer to the one that is better known. To find it freely takes as
+    long as the rounds of global mapping.
+    """
+    share = 1 - (found.focal_std / given.focal_std) ** 2 if given.focal_std > 0 else 0.0
+    return given.departure(found.camera) > LEAST_DEPARTURE * MIN_SIGMAS * share
 
 
 def describe_calibration(found: CameraMeasurement) -> str:
@@ -134,6 +149,9 @@ def describe_calibration(found: CameraMeasurement) -> str:
 # The images contradict a given focal length if it is off by this many standard errors and this ratio, or by a larger
 # ratio with a relative cost decrease. Tried at these values only.
 MIN_SIGMAS, MIN_RATIO = 3.0, 0.01
+LEAST_DEPARTURE = 0.5
+"""Departure, as a ratio of the one that a contradiction needs, from which on that is looked for. Tried at this value
+only."""
 LARGE_RATIO, MIN_COST_RATIO = 0.03, 0.02  # the larger ratio and the decrease
 REMEDY = "--refine-camera looks for a better one"
 CONSEQUENCE = "poses and map may be badly wrong with it"

@@ -20,7 +20,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError
 from torchslam.geometry import Camera
 from torchslam.geometry.view_graph_focal import ViewGraphFocal, focal_from_pairs
-from torchslam.system.front_end import image_extractor
+from torchslam.system.front_end import Extractor, image_extractor
 from torchslam.tracking.data_association import match_views
 from torchslam.types import FrameFeatures
 
@@ -45,6 +45,7 @@ def search_focal(
     config: Config,
     device: torch.device | str = "cpu",
     progress: Callable[[int, int], None] = lambda done, most: None,
+    extract: Extractor | None = None,
 ) -> ViewGraphFocal | None:
     """Find the focal length by pairs of images; unreadable images are left out, the run itself reports them.
 
@@ -53,13 +54,17 @@ def search_focal(
         config: of the run.
         device: of torch.
         progress: called with the number of images done, and of all.
+        extract: extracts SIFT features of an image, at least `NUM_KEYPOINTS`, the strongest first; None: so many.
 
     Returns:
         fx with its standard error, and `success` if the pairs determine it; None if no two images could be matched.
     """
     settings = replace(config.features, kind="sift", num_keypoints=NUM_KEYPOINTS)
     config = replace(config, features=settings)
-    extract = None if sequence.brings_features else image_extractor(config, device)
+    if sequence.brings_features:
+        extract = None
+    elif extract is None:
+        extract = image_extractor(config, device)
     last = max(len(sequence) - 1 - OFFSETS[-1], 0)
     starts = sorted({round(last * place / max(PLACES - 1, 1)) for place in range(PLACES)})
     wanted = sorted(
@@ -75,6 +80,8 @@ def search_focal(
         with torch.inference_mode():
             features = frame.features if extract is None else extract(frame)
         assert features is not None
+        if extract is not None:
+            features = features.rows(slice(NUM_KEYPOINTS))
         views[index] = FrameFeatures.of(frame, features, sequence.camera.params.double())
     matched: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]] = {}
     scale = config.features.reduction(sequence.camera.size)

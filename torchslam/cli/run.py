@@ -16,13 +16,16 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
 
 from torchslam.calibration.find_camera import ROUGH_STD, find_camera, with_stated_std
+from torchslam.calibration.from_pairs import NUM_KEYPOINTS
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
@@ -33,6 +36,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
+from torchslam.global_mapping.mapper import features_to_keep
 from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
@@ -53,11 +57,11 @@ from torchslam.io.write_run import write_run
 from torchslam.metric.source import MetricSource
 from torchslam.parallel.workers import with_workers
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
-from torchslam.system.front_end import source
+from torchslam.system.front_end import KeptFeatures, source
 from torchslam.system.metric_run import run_in_meters
-from torchslam.system.run import Run, RunProgress, run_sequence
+from torchslam.system.run import Run, RunProgress, finish, run_frames
 from torchslam.system.slam import SLAM
-from torchslam.types import StepResult
+from torchslam.types import State, StepResult
 from torchslam.utils.console import say, table, warn
 
 DONE = 0
@@ -207,6 +211,8 @@ class Attempt:
         latencies: milliseconds from capture to pose, of a live source.
         watching: the viewers, open until the results are written.
         mapped: the check, and whether the recording was mapped as a whole; None where it is no recording.
+        kept: features of frames that the search for the camera has used.
+        end: where the run stopped since tracking was lost: processes the other frames, or none of them, and ends it.
     """
 
     finished: Run
@@ -215,6 +221,8 @@ class Attempt:
     latencies: list[float]
     watching: FrameViewers
     mapped: MappedRecording | None = None
+    kept: KeptFeatures | None = None
+    end: Callable[[bool], Run] | None = None
 
 
 def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
@@ -260,7 +268,9 @@ def _attempt(
     viewers: ExitStack,
 ) -> Attempt:
     """Find the camera, if it is not given, and run."""
-    sequence, found = _with_camera(sequence, config, options)
+    may_go_on = _mode(sequence, options) not in (None, Mapping.ONLINE)
+    kept = features_to_keep(config, sequence.size, NUM_KEYPOINTS, options.device) if may_go_on else None
+    sequence, found = _with_camera(sequence, config, options, kept)
     if options.camera_std is None:
         config = with_stated_std(config, sequence)
     slam, so_far = _begin(sequence, config, options)
@@ -271,21 +281,53 @@ def _attempt(
     )  # the viewers need the images in this process
     watching = viewers.enter_context(_watching(slam, sequence, options))
     latencies: list[float] = []
-    may_go_on = _mode(sequence, options) not in (None, Mapping.ONLINE)
-    bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
-    with bar as progress:
 
-        def after_frame(result: StepResult) -> None:
-            if sequence.is_live:
-                latencies.append(1e3 * (time.time() - result.timestamp))
-            is_last = may_go_on and result.index + 1 == sequence.known_length
-            checkpoints.offer(at_once=stop_signals.is_wanted or is_last)
-            watching.show(result)
-            progress.update(result)
+    def frames_to(end: bool) -> Run | None:
+        """The run, finished; None if it stopped, which it may before the end, where tracking was lost."""
+        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
+        with bar as progress:
 
-        with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
-            finished = run_sequence(slam, watching.sequence, after_frame, so_far, progress.adjusting, frames)
-    return Attempt(finished, sequence, found, latencies, watching)
+            def after_frame(result: StepResult) -> None:
+                if sequence.is_live:
+                    latencies.append(1e3 * (time.time() - result.timestamp))
+                is_last = result.index + 1 == sequence.known_length or (
+                    result.state is State.LOST and not end
+                )
+                checkpoints.offer(at_once=stop_signals.is_wanted or (may_go_on and is_last))
+                watching.show(result)
+                progress.update(result)
+
+            interrupted = False
+            with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
+                try:
+                    if not run_frames(slam, watching.sequence, so_far, after_frame, frames, not end):
+                        return None
+                except KeyboardInterrupt:
+                    interrupted = True
+                return finish(slam, so_far.results, so_far.skipped, interrupted, progress.adjusting)
+
+    whole: list[Run] = []  # once it has ended
+
+    def ended(go_on: bool) -> Run:
+        if not whole:
+            found = frames_to(end=True) if go_on else None
+            whole.append(found or finish(slam, so_far.results, so_far.skipped, interrupted=True))
+        return whole[0]
+
+    is_watched = options.view or options.video
+    finished = frames_to(end=is_watched or not may_go_on or not _all_are_mapped(sequence, config))
+    if finished is None:
+        begun = Run(
+            tuple(slam.atlas), slam.camera, slam.config, so_far.results, so_far.skipped, False, failure=""
+        )
+        return Attempt(begun, sequence, found, latencies, watching, kept=kept, end=ended)
+    return Attempt(finished, sequence, found, latencies, watching, kept=kept)
+
+
+def _all_are_mapped(sequence: Sequence, config: Config) -> bool:
+    """Whether global mapping takes all frames of a recording, whatever becomes of them online."""
+    length = sequence.known_length
+    return length is not None and length <= config.global_mapping.max_images
 
 
 def _map_recording(
@@ -305,8 +347,11 @@ def _map_recording(
                 options.device,
                 bar.update,
                 stages,
+                None if attempt.end is None else partial(attempt.end, True),
+                attempt.kept,
             )
     except KeyboardInterrupt:
+        online = online if attempt.end is None else attempt.end(False)
         return replace(attempt, finished=replace(online, interrupted=True))
     if mapped.why:
         say(f"mapped as a whole, since {mapped.why}; kept: {mapped.kept}")
@@ -325,7 +370,9 @@ def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
         return replace(attempt, finished=replace(finished, interrupted=True, unmeasured=(why,)))
 
 
-def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[Sequence, str]:
+def _with_camera(
+    sequence: Sequence, config: Config, options: argparse.Namespace, extract: KeptFeatures | None
+) -> tuple[Sequence, str]:
     """Return the sequence with the camera of the run, and a remark on the camera if it was estimated."""
     is_guess = sequence.calibrated is Calibrated.GUESSED and not sequence.is_live
     if options.map is not None or not (options.refine_camera or is_guess):
@@ -342,6 +389,7 @@ def _with_camera(sequence: Sequence, config: Config, options: argparse.Namespace
         options.device,
         goes_on,
         lambda words: say(f"camera: {words}"),
+        extract,
     )
 
 

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.robust import robustify
-from torchslam.global_mapping.depth_ratios import DepthRatio, PairDepths, depth_ratio
+from torchslam.global_mapping.depth_ratios import DepthRatio, PairDepths, ViewRays, depth_ratio
 from torchslam.global_mapping.view_graph import Relation, ViewPair
 from torchslam.optim.pose_graph._problem import Groups
 from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, factorize_sparse
@@ -66,7 +66,8 @@ def pair_lengths(
     pairs: Sequence[ViewPair], views: Sequence[FrameFeatures], camera: Camera
 ) -> Float[Tensor, " P"]:
     """The lengths of the baselines of pairs, in a common unit; 1 for pairs that nothing ties to others."""
-    depths = [PairDepths.of(pair.T_21, views, pair, camera) for pair in pairs]
+    rays = ViewRays.by(camera, views)
+    depths = [PairDepths.of(pair.T_21, rays, pair) for pair in pairs]
     around: dict[int, list[tuple[int, int]]] = {}
     for row, pair in enumerate(pairs):
         around.setdefault(pair.first, []).append((row, 0))

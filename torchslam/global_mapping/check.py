@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.global_mapping.depth_ratios import MIN_PARALLAX_SIGMAS, PairDepths, depth_ratio
+from torchslam.global_mapping.depth_ratios import MIN_PARALLAX_SIGMAS, PairDepths, ViewRays, depth_ratio
 from torchslam.global_mapping.view_graph import FAR, THRESHOLD_PX, ViewPair
 from torchslam.types import FrameFeatures
 
@@ -175,15 +175,20 @@ def check_map(
     """
     posed = known.tolist()
     T_cw = T_cw.to(camera.params)
+    rays = ViewRays.by(camera, views)
+    ends = torch.tensor(
+        [(pair.first, pair.second) for pair in pairs], dtype=torch.int64, device=T_cw.device
+    ).view(-1, 2)
+    T_21 = T_cw[ends[:, 1]] @ se3_inverse(T_cw)[ends[:, 0]]
     depths = {
-        row: PairDepths.of(T_cw[pair.second] @ se3_inverse(T_cw[pair.first]), views, pair, camera)
+        row: PairDepths.of(T_21[row], rays, pair)
         for row, pair in enumerate(pairs)
         if posed[pair.first] and posed[pair.second]
     }
     depth = _median_depth(depths.values())
     limit = AGREE_PX * reduction
     distances = [
-        _distance_px(T_cw, views, pair, camera, 1 / (NEAREST * depth)) if row in depths else math.inf
+        _distance_px(T_21[row], rays, pair, 1 / (NEAREST * depth)) if row in depths else math.inf
         for row, pair in enumerate(pairs)
     ]
     agrees = [distance < limit for distance in distances]
@@ -206,18 +211,15 @@ def check_map(
     )
 
 
-def _distance_px(
-    T_cw: Tensor, views: Sequence[FrameFeatures], pair: ViewPair, camera: Camera, most: float
-) -> float:
+def _distance_px(T_21: Tensor, rays: ViewRays, pair: ViewPair, most: float) -> float:
     """Median distance of matches from the epipolar line, from inverse depth 0 to `most`, in pixels."""
-    T_21 = T_cw[pair.second] @ se3_inverse(T_cw[pair.first])
-    x_1 = camera.unproject(views[pair.first].keypoints[pair.keypoints_1]) @ T_21[:3, :3].mT
-    x_2 = camera.unproject(views[pair.second].keypoints[pair.keypoints_2])
+    x_1, x_2 = rays.of(pair)
+    x_1 = x_1 @ T_21[:3, :3].mT
     across, along = torch.linalg.cross(x_2, T_21[:3, 3].expand_as(x_2)), torch.linalg.cross(x_2, x_1)
     inverse = (-(along * across).sum(-1) / across.square().sum(-1).clamp(min=1e-30)).clamp(0.0, most)
     seen = x_1 + inverse[:, None] * T_21[:3, 3]
     angles = torch.atan2(torch.linalg.cross(x_2, seen).norm(dim=-1), (x_2 * seen).sum(-1))
-    return float(angles.median()) * float(camera.focal)
+    return float(angles.median()) * rays.focal
 
 
 def _median_depth(depths: Collection[PairDepths]) -> float:

@@ -40,6 +40,28 @@ class DepthRatio:
 
 
 @dataclass(frozen=True)
+class ViewRays:
+    """The directions of all keypoints of images, computed once: an image is in many pairs.
+
+    Attributes:
+        views: unit directions in the camera, by image.
+        focal: focal length of the camera, pixels.
+    """
+
+    views: Sequence[Float[Tensor, "_ 3"]]
+    focal: float
+
+    @classmethod
+    def by(cls, camera: Camera, views: Sequence[FrameFeatures]) -> ViewRays:
+        """The directions by a camera."""
+        return cls([camera.unproject(view.keypoints) for view in views], float(camera.focal))
+
+    def of(self, pair: ViewPair) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+        """The directions of the matches of a pair, in either camera."""
+        return self.views[pair.first][pair.keypoints_1], self.views[pair.second][pair.keypoints_2]
+
+
+@dataclass(frozen=True)
 class PairDepths:
     """Inverse depths of the matches of a pair, as seen from its first and from its second image.
 
@@ -52,17 +74,14 @@ class PairDepths:
     sigma: tuple[Array, Array]
 
     @classmethod
-    def of(
-        cls, T_21: Float[Tensor, "4 4"], views: Sequence[FrameFeatures], pair: ViewPair, camera: Camera
-    ) -> PairDepths:
+    def of(cls, T_21: Float[Tensor, "4 4"], rays: ViewRays, pair: ViewPair) -> PairDepths:
         """The depths by a relative pose, in its unit."""
-        x_1 = camera.unproject(views[pair.first].keypoints[pair.keypoints_1])
-        x_2 = camera.unproject(views[pair.second].keypoints[pair.keypoints_2])
-        sigma = SIGMA_PX / float(camera.focal)
+        x_1, x_2 = rays.of(pair)
+        sigma = SIGMA_PX / rays.focal
         tables = []
         for T, own, other, keypoints, count in (
-            (T_21, x_1, x_2, pair.keypoints_1, len(views[pair.first].mask)),
-            (se3_inverse(T_21), x_2, x_1, pair.keypoints_2, len(views[pair.second].mask)),
+            (T_21, x_1, x_2, pair.keypoints_1, len(rays.views[pair.first])),
+            (se3_inverse(T_21), x_2, x_1, pair.keypoints_2, len(rays.views[pair.second])),
         ):
             # other x (R own + inverse t) = 0, by least squares.
             along = torch.linalg.cross(other, own @ T[:3, :3].mT)

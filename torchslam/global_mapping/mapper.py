@@ -40,7 +40,14 @@ from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.rotation_averaging import solve_rotations
-from torchslam.system.front_end import Extractor, FeatureExtractor, check_size, image_extractor, source
+from torchslam.system.front_end import (
+    Extractor,
+    FeatureExtractor,
+    KeptFeatures,
+    check_size,
+    image_extractor,
+    source,
+)
 from torchslam.system.run import FinalAdjustment, Run
 from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, Reason, State, StepResult
@@ -104,6 +111,20 @@ def mapping_config(config: Config) -> Config:
     )
 
 
+def features_to_keep(
+    config: Config, size: tuple[int, int], least: int, device: torch.device | str = "cpu"
+) -> KeptFeatures | None:
+    """The features of global mapping for images of a size, where the search for a camera can use them as well.
+
+    None where features are not SIFT's, fewer than `least`, or of reduced images, which both reduce to different sizes.
+    """
+    mapping = mapping_config(config)
+    reductions = {settings.features.reduction(size) for settings in (config, mapping)}
+    if mapping.features.kind != "sift" or mapping.features.num_keypoints < least or reductions != {1.0}:
+        return None
+    return KeptFeatures(image_extractor(mapping, device))
+
+
 def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
     """The frames that are mapped: evenly over the recording, and all where tracking was lost or doubtful.
 
@@ -133,6 +154,7 @@ class GlobalMapper:
         matcher: of two views; the configured one if None.
         progress: receives stages.
         saved: the costly stages of a run that was ended, and of this one; None: they are not saved.
+        kept: features that were extracted before, by `features_to_keep`; None: there are none.
     """
 
     def __init__(
@@ -146,6 +168,7 @@ class GlobalMapper:
         matcher: Matcher | None = None,
         progress: Progress = lambda stage, done, most: None,
         saved: SavedStages | None = None,
+        kept: KeptFeatures | None = None,
     ) -> None:
         self.camera = camera.to(device).to(torch.float64)
         self.config = mapping_config(config)
@@ -154,7 +177,7 @@ class GlobalMapper:
         self.sequence = source(sequence, self.config, self.camera)
         self.extract: Extractor | None = None
         if not self.sequence.brings_features:
-            self.extract = image_extractor(self.config, device, extractor)
+            self.extract = kept or image_extractor(self.config, device, extractor)
         self.matcher = make_matcher(self.scaled.matching, matcher, camera.size, self.scaled.features.kind)
         self.progress = progress
         self.saved = saved or SavedStages(None, self.sequence, config)

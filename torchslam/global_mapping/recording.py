@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -18,6 +19,7 @@ from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
+from torchslam.system.front_end import KeptFeatures
 from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
@@ -70,12 +72,14 @@ def map_recording(
     device: torch.device | str = "cpu",
     progress: Progress = lambda stage, done, most: None,
     stages: Path | None = None,
+    go_on: Callable[[], Run] | None = None,
+    features: KeptFeatures | None = None,
 ) -> MappedRecording:
     """Check an online run, and map its recording as a whole where that is wanted or needed.
 
     Args:
         sequence: the recording.
-        online: a finished first session over it.
+        online: a finished first session over it, or one that stopped when tracking was lost.
         config: of the run.
         camera: the given camera, with the error `config.camera.std`.
         mapping: when to map as a whole.
@@ -83,9 +87,12 @@ def map_recording(
         progress: receives the stages.
         stages: folder in which features and pairs of images are saved, so that a run that is ended can go on; None:
             they are not saved.
+        go_on: processes the other frames and returns the finished run, where `online` stopped; None: it is finished.
+            It is called only where the map of the whole is not right: no run that was lost is better than a right one.
+        features: those that were extracted before, by `features_to_keep`; None: there are none.
     """
     check = None
-    why = _loss(online)
+    why = _loss(online) if go_on is None else f"tracking was lost at frame {online.results[-1].index}"
     if not why or mapping is Mapping.ONLINE:
         progress("check", 0, 1)
         check = check_run(online)
@@ -95,24 +102,26 @@ def map_recording(
         return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
     saved = SavedStages(stages, sequence, config, device)
-    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress, saved=saved)
+    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress, saved=saved, kept=features)
     made = mapper.run(online.results)
-    if made.run.failure:
+    reduction = mapper.scaled.features.reduction(camera.size)
+
+    def checked(run: Run) -> MapCheck:
+        own = run.camera.to(camera.params)
+        poses = poses_of(run, made.views)
+        return check_map(*poses, made.views, made.pairs, own, made.held_back, reduction)
+
+    whole = None if made.run.failure else checked(made.run)
+    if go_on is not None:
+        is_whole = len(made.run.trajectory) == len(made.run.results)
+        if whole is not None and whole.is_right and is_whole:
+            return MappedRecording(with_doubts(made.run, whole), whole, Mapping.GLOBAL, why)
+        online = go_on()
+        why = _loss(online) or why
+    if whole is None:
         check = check_run(online) if check is None else check
         return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, why)
-    reduction = mapper.scaled.features.reduction(camera.size)
-    checks = [
-        check_map(
-            *poses_of(run, made.views),
-            made.views,
-            made.pairs,
-            run.camera.to(camera.params),
-            made.held_back,
-            reduction,
-        )
-        for run in (made.run, online)
-    ]
-    whole, before = checks
+    before = checked(online)
     if online.failure and not whole.is_right:
         # A camera that only turns, with a wrong focal length, makes maps that contradict themselves.
         return MappedRecording(online, None, Mapping.ONLINE, why)

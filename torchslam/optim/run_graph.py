@@ -66,6 +66,9 @@ _READOUT = "readout"
 MAX_ROUNDS, SETTLED_PX = 12, 2e-3
 """Most rounds with a rolling shutter, and the change of the keypoints, as a root mean square, that ends them. A round
 leaves a tenth to a third of the change of the one before."""
+FIRST_TOLERANCE = 1e-6
+"""Tolerance of the first of these rounds: with that of the last it takes as long as all others. Tried at this value
+only."""
 GRADIENT_ROUNDS = 8
 """Rounds with a rolling shutter that gradients pass: each leaves a tenth to a third of the gradient's error."""
 
@@ -397,32 +400,39 @@ def solve_graph(
     frame_factors = (*(measured.factors() for measured in graph.measurements), *frame_factors)
     _check_factors(graph, frame_factors)
 
-    def solved(graph: ObservationGraph) -> GraphSolution:
+    def solved(graph: ObservationGraph, options: SolverOptions) -> GraphSolution:
         return _solve_global_shutter(graph, free_camera, options, progress, frame_factors, depth_prior)
 
-    solution = solved(graph) if graph.readout is None else _solve_in_rounds(graph, solved, options)
+    solution = solved(graph, options) if graph.readout is None else _solve_in_rounds(graph, solved, options)
     if strict:
         check_minimum(solution.success, solution.converged, "frames")
     return solution
 
 
 def _solve_in_rounds(
-    graph: ObservationGraph, solved: Callable[[ObservationGraph], GraphSolution], options: SolverOptions
+    graph: ObservationGraph,
+    solved: Callable[[ObservationGraph, SolverOptions], GraphSolution],
+    options: SolverOptions,
 ) -> GraphSolution:
     """Correct the keypoints of a rolling shutter and solve the graph of a global one, until they stay where they are.
 
-    With gradients, the number of rounds is fixed, and all of them are differentiated.
+    With gradients, the number of rounds is fixed, and all of them are differentiated. Without, the first round, of
+    which the keypoints are not the last ones, ends at `FIRST_TOLERANCE`.
     """
     at, before = graph, graph.pixels
     passes_gradient = options.backward != "detached"
+    first = options
+    if not passes_gradient:
+        first = options.replace(tolerance=max(options.tolerance, FIRST_TOLERANCE))
     for number in range(MAX_ROUNDS):
         corrected = at.global_shutter()
-        solution = solved(corrected)
+        solution = solved(corrected, options if number else first)
         at = replace(at, T_cw=solution.T_cw, points_w=solution.points_w, camera=solution.camera)
         if passes_gradient and number + 1 == GRADIENT_ROUNDS:
             break
         change = (corrected.pixels - before).detach().square().sum(-1).mean().sqrt()
-        if not passes_gradient and bool(change < SETTLED_PX):
+        is_rough = number == 0 and first != options
+        if not passes_gradient and not is_rough and bool(change < SETTLED_PX):
             break
         before = corrected.pixels
     return solution

@@ -70,6 +70,24 @@ def image_extractor(
     return extract
 
 
+class KeptFeatures:
+    """The features of frames by their index, extracted once: who finds the camera and who maps use the same.
+
+    Args:
+        extract: extracts the features of a frame.
+    """
+
+    def __init__(self, extract: Extractor) -> None:
+        self._extract = extract
+        self._of: dict[int, Features] = {}
+
+    def __call__(self, frame: Frame) -> Features:
+        """The features of a frame; another frame of the same index has the same ones."""
+        if frame.index not in self._of:
+            self._of[frame.index] = self._extract(frame)
+        return self._of[frame.index]
+
+
 def checked_extractor(config: Config, camera: Camera) -> Extractor:
     """Create the configured extractor, for frames that `check_size` accepts."""
     extract = image_extractor(config)

@@ -1,0 +1,118 @@
+"""Where tracking is lost, `torchslam run` maps the recording as a whole at once, and goes on online only if it must."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from tests.walks import Walk, arc
+from torchslam import SLAM, Frame, State, StepResult, load_config
+from torchslam.cli import arguments
+from torchslam.cli import run as command
+from torchslam.cli.main import main
+from torchslam.data import read_trajectory
+from torchslam.global_mapping.check import MapCheck
+from torchslam.system.run import RunProgress, finish, run_frames, run_sequence
+
+SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
+SETTINGS += ["simulated.noise_px=0.05"]
+FRAMES, LOST = 26, 17
+WALK = Walk(arc(45)[:FRAMES])
+
+Run = Callable[..., dict[str, Any]]
+
+
+@pytest.fixture(autouse=True)
+def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """The frames that were processed online; one is said to be lost."""
+    processed, step = list[int](), SLAM.step
+
+    def recorded(slam: SLAM, frame: Frame) -> StepResult:
+        processed.append(frame.index)
+        result = step(slam, frame)
+        return replace(result, state=State.LOST) if frame.index == LOST else result
+
+    monkeypatch.setattr(SLAM, "step", recorded)
+    return processed
+
+
+@pytest.fixture
+def run(steps: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Run:
+    """Runs the command; returns its metrics."""
+    monkeypatch.setattr(arguments, "sequence", lambda options: WALK)
+
+    def execute(folder: str, *more: str) -> dict[str, Any]:
+        steps.clear()
+        settings = [part for setting in SETTINGS for part in ("--set", setting)]
+        status = main(["run", "walk", "--output", str(tmp_path / folder), *settings, *more])
+        assert status == 0
+        metrics: dict[str, Any] = json.loads((tmp_path / folder / "metrics.json").read_text())
+        return metrics
+
+    return execute
+
+
+def test_frames_until_one_is_lost_and_the_others_later_are_the_whole_run() -> None:
+    config = load_config(None, SETTINGS)
+    whole = run_sequence(SLAM(WALK.camera, config), WALK)
+    slam, so_far = SLAM(WALK.camera, config), RunProgress()
+    seen: list[int] = []
+    assert not run_frames(slam, WALK, so_far, lambda result: seen.append(result.index), until_lost=True)
+    assert seen == list(range(LOST + 1))
+    assert so_far.next == LOST + 1
+    assert not run_frames(slam, WALK, so_far, until_lost=True)  # it was lost before
+    assert so_far.next == LOST + 1
+    assert run_frames(slam, WALK, so_far)
+    parts = finish(slam, so_far.results, so_far.skipped, interrupted=False)
+    assert len(parts.results) == FRAMES
+    assert torch.equal(parts.trajectory.T_wc, whole.trajectory.T_wc)
+
+
+def test_a_right_map_of_the_whole_needs_no_other_frames_online(run: Run, steps: list[int]) -> None:
+    found = run("auto")
+    assert (found["mapping"], found["mapping_reason"]) == ("global", f"tracking was lost at frame {LOST}")
+    assert steps == list(range(LOST + 1))
+    assert found["posed"] == FRAMES
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--mapping", "online"),
+        ("--video",),  # which shows every frame
+        ("--set", f"global_mapping.max_images={FRAMES - 1}"),  # which are chosen by what is lost
+    ],
+)
+def test_all_frames_are_processed_online_where_they_count(
+    run: Run, steps: list[int], options: tuple[str, ...]
+) -> None:
+    run("every", *options)
+    assert steps == list(range(FRAMES))
+
+
+def test_where_the_map_of_the_whole_is_not_right_the_run_goes_on(
+    run: Run, steps: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(MapCheck, "is_right", False)
+    found = run("auto")
+    assert steps == list(range(FRAMES))
+    assert found["mapping_reason"] == "tracking was lost in 1 frames"
+
+
+def test_ctrl_c_keeps_the_frames_so_far(
+    run: Run, steps: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def stop(*given: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "map_recording", stop)
+    found = run("auto")
+    assert steps == list(range(LOST + 1))
+    assert found["interrupted"]
+    assert len(read_trajectory(tmp_path / "auto" / "trajectory.txt")) == LOST + 1
