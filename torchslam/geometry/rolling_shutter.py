@@ -49,6 +49,16 @@ class Readout:
         """A prior, before images say more."""
         return cls(torch.tensor(seconds, dtype=torch.float64, device="cpu"), std, seconds, std)
 
+    @property
+    def is_given(self) -> bool:
+        """Whether there is a rolling shutter by what was known."""
+        return self.prior != 0
+
+    @property
+    def is_sought(self) -> bool:
+        """Whether images may say that there is one, of which nothing was known."""
+        return self.prior == 0 and self.prior_std > 0
+
     def updated(self, seconds: float, std: float) -> Self:
         """The mean of the prior and of what images say, weighted by their information."""
         if not math.isfinite(std) or not self.prior_std:

@@ -139,11 +139,18 @@ def solve_window(
 
 
 def build_window(
-    slam_map: Map, free: Int[Tensor, " K"], fixed: Int[Tensor, " R"], camera: Camera
+    slam_map: Map,
+    free: Int[Tensor, " K"],
+    fixed: Int[Tensor, " R"],
+    camera: Camera,
+    seen: Observations | None = None,
 ) -> BundleWindow | None:
-    """Build the problem of free keyframes, their points and the fixed keyframes; None if nothing is observed."""
+    """Build the problem of free keyframes, their points and the fixed keyframes; None if nothing is observed.
+
+    `seen` are the observations by these keyframes; None: as the map has them.
+    """
     keyframes = torch.sort(torch.cat([free, fixed])).values
-    seen = slam_map.observations(keyframes)
+    seen = slam_map.observations(keyframes) if seen is None else seen
     rows = true_indices(is_among(seen.point_index, slam_map.observed_points(free)))
     ids = seen.point_index.index_select(0, rows)
     which = ranks_among(ids, distinct(ids))

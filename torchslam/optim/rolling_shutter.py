@@ -28,7 +28,7 @@ from torchslam.geometry.gating import whitening
 from torchslam.geometry.lie import skew
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import robustify
-from torchslam.geometry.rolling_shutter import frame_velocities
+from torchslam.geometry.rolling_shutter import Readout, frame_velocities
 from torchslam.optim._core.options import GRAPH_OPTIONS
 from torchslam.optim.run_graph import ObservationGraph
 
@@ -209,6 +209,18 @@ def find_rolling_shutter(graph: ObservationGraph) -> RollingShutter | None:
     readout += start / interval
     size_of_shift = abs(readout) * float(typical)
     return RollingShutter(interval * readout, interval * std, interval, size_of_shift, *ratios)
+
+
+def find_readout(graph: ObservationGraph, known: Readout) -> tuple[Readout | None, RollingShutter | None]:
+    """The readout of a run, by what was known of it and the residuals at its solution, and what these say.
+
+    A given readout is improved; none is found where the residuals do not show a rolling shutter: then it is None. See
+    `find_rolling_shutter` for the point of linearization.
+    """
+    found = find_rolling_shutter(graph)
+    if found is not None and (known.is_given or found.is_read_out):
+        return known.updated(found.readout, found.readout_std), found
+    return known if known.is_given else None, found
 
 
 def _shared_rows(graph: ObservationGraph, rank: Int[Tensor, " K"]) -> Int[Tensor, " R"]:

@@ -4,28 +4,37 @@ The given camera is a measurement with an error. Each time the keyframes of the 
 its bundle adjustment frees the camera, with the given one as its prior. Where what it finds contradicts the camera in
 use by more than the errors that stretches of the recording show, the map takes it over, and the next frames are tracked
 with it. The prior stays the given camera, so that no evidence counts twice.
+
+A rolling shutter bends images as another lens would. So before the camera is moved, the residuals are tested for a
+readout; where they show one, or where one is given, the camera is judged by keypoints that are corrected to the middle
+row.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 
-from torchslam.config import Config
+from torchslam.config import CameraConfig, Config
 from torchslam.geometry import Camera, SharedCamera
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.geometry.similarity import in_place_of
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import (
     MAP_OPTIONS,
+    BundleWindow,
     adjust_all,
     apply_solution,
     build_window,
     solve_window,
 )
-from torchslam.optim import camera_evidence
+from torchslam.optim import BundleProblem, camera_evidence
+from torchslam.optim.camera_evidence import CameraEstimate
+from torchslam.optim.rolling_shutter import find_readout
 
 FIRST_KEYFRAMES, MAX_KEYFRAMES, GROWTH = 6, 100, 1.3
 """Keyframes of the map at the first check and the last one, and their ratio from check to check. Tried from 6 to 8 and
@@ -52,6 +61,15 @@ class CameraChange:
     departure: float
 
 
+class _Judged(NamedTuple):
+    """What the active map says of its camera: a window of all its keyframes, solved, and the camera by it."""
+
+    window: BundleWindow
+    solved: BundleProblem
+    estimate: CameraEstimate
+    departure: float
+
+
 class OnlineCamera:
     """Checks the camera in use by the active map, and replaces it.
 
@@ -63,6 +81,7 @@ class OnlineCamera:
     def __init__(self, camera: SharedCamera, config: Config, atlas: Atlas) -> None:
         self.camera, self.settings, self.atlas = camera, config.bundle_adjustment, atlas
         self.given = CameraMeasurement.of(camera.current, config.camera.std) if config.camera.std else None
+        self.known_readout = given_readout(config.camera)
         self.changes: list[CameraChange] = []
         self.next_check = FIRST_KEYFRAMES
 
@@ -85,19 +104,15 @@ class OnlineCamera:
         if self.given is None or not self.settings.local or not self.next_check <= keyframes <= MAX_KEYFRAMES:
             return False
         self.next_check = math.ceil(keyframes * GROWTH)
-        everyone = torch.arange(keyframes, device=submap.map.T_cw.device)
-        window = build_window(submap.map, everyone[1:], everyone[:1], with_radial_terms(self.camera.current))
-        if window is None:
+        known = self.known_readout
+        judged = self._judged(submap, known if known.is_given else None)
+        if judged is not None and judged.departure >= MIN_DEPARTURE and known.is_sought:
+            graph = submap.posed_frames.graph(submap.map, self.camera.current)
+            readout, _ = find_readout(graph, known)
+            judged = judged if readout is None else self._judged(submap, readout)
+        if judged is None or judged.departure < MIN_DEPARTURE:
             return False
-        found = solve_window(window.problem, self.settings, calibration=self.given)
-        at = replace(window.problem, T_cw=found.T_cw, points_w=found.points_w, camera=found.camera)
-        evidence = camera_evidence(at, self.given, MAP_OPTIONS, submap.map.keys[window.keyframes])
-        if evidence is None:
-            return False
-        estimate = evidence.estimate()
-        departure = estimate.departure_from(self.camera.current)
-        if departure < MIN_DEPARTURE:
-            return False
+        window, at, estimate, departure = judged
         found = solve_window(at, self.settings, calibration=estimate.prior)
         # In place and unit of the map as it was: with them go the frames in between, and the poses that follow.
         T_cw, points_w = in_place_of(submap.map.T_cw[window.keyframes], found.T_cw, found.points_w)
@@ -108,6 +123,33 @@ class OnlineCamera:
             if other is not submap:
                 adjust_all(other.map, found.camera, self.settings)
         return True
+
+    def _judged(self, submap: Submap, readout: Readout | None) -> _Judged | None:
+        """Adjust all keyframes with a free camera; None where they do not determine it.
+
+        With a readout, the keypoints are corrected to the middle row by the motion of the map as it is.
+        """
+        assert self.given is not None
+        seen = submap.map.observations()
+        if readout is not None:
+            seen = submap.posed_frames.global_shutter(seen, submap.map, self.camera.current, readout)
+        everyone = torch.arange(submap.map.num_keyframes, device=submap.map.T_cw.device)
+        camera = with_radial_terms(self.camera.current)
+        window = build_window(submap.map, everyone[1:], everyone[:1], camera, seen)
+        if window is None:
+            return None
+        found = solve_window(window.problem, self.settings, calibration=self.given)
+        at = replace(window.problem, T_cw=found.T_cw, points_w=found.points_w, camera=found.camera)
+        evidence = camera_evidence(at, self.given, MAP_OPTIONS, submap.map.keys[window.keyframes])
+        if evidence is None:
+            return None
+        estimate = evidence.estimate()
+        return _Judged(window, at, estimate, estimate.departure_from(self.camera.current))
+
+
+def given_readout(settings: CameraConfig) -> Readout:
+    """What the settings say of the readout."""
+    return Readout.known(1e-3 * settings.readout, 1e-3 * settings.readout_std)
 
 
 def _newest_frame(submap: Submap) -> int:
