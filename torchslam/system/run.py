@@ -26,7 +26,7 @@ from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions
 from torchslam.optim.camera_evidence import graph_evidence
-from torchslam.optim.rolling_shutter import RollingShutter, find_readout
+from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter, readout_by
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
     GraphSolution,
@@ -394,7 +394,8 @@ class FinalAdjustment:
             return camera
         for _ in range(READOUT_ROUNDS):
             graph = submap.posed_frames.graph(submap.map, camera, readout=self.readout)
-            self.readout, self.shutter = find_readout(graph, self._known)
+            self.shutter = find_rolling_shutter(graph)
+            self.readout = readout_by(self.shutter, self._known)
             if self.readout is None and graph.readout is None:
                 break
             camera = self._solve(submap, camera, given, progress, ROUGH, once=True).camera
