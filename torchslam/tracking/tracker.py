@@ -116,15 +116,16 @@ class Tracker:
             is_sure: True if the last poses are certain: a pose near the predicted one is tried first.
         """
         prior_T_cw = self.predict(submap) if prior_T_cw is None else prior_T_cw
-        view = self._at_middle_row(submap, view)
+        view = self.at_middle_row(submap, view)
         candidates = self._candidates(submap, view, prior_T_cw)
         near = prior_T_cw if is_sure else None
         return self.localizer.locate(submap.map, view, candidates, submap.tracking.local_points, near)
 
-    def _at_middle_row(self, submap: Submap, view: FrameFeatures) -> FrameFeatures:
+    def at_middle_row(self, submap: Submap, view: FrameFeatures) -> FrameFeatures:
         """The view with keypoints as a global shutter would have seen them, by the last velocity.
 
         All of them are corrected, as at the median depth of the local map, since it is not known yet what they see.
+        Without a readout it is the view itself.
         """
         camera, readout, tracking = self.camera.current, self.camera.readout, submap.tracking
         if readout is None or tracking.velocity is None or not tracking.interval:
