@@ -14,7 +14,13 @@ from rolling_scene import CAMERA, FRAME_RATE, NOISE_PX, recording
 from torchslam.geometry import transform
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.rolling_shutter import RollingShutter, _Block, find_rolling_shutter, project_out
+from torchslam.optim.rolling_shutter import (
+    RollingShutter,
+    _Block,
+    find_rolling_shutter,
+    project_out,
+    readout_by,
+)
 from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs, solve_graph
 
 
@@ -54,6 +60,32 @@ def test_a_global_shutter_is_not_named() -> None:
     found = estimated(adjusted(recording(0.0)))
     assert not found.is_read_out
     assert not found.is_shaken
+
+
+def test_a_test_of_fewer_frames_says_the_same_of_the_readout() -> None:
+    graph = adjusted(recording(0.9))
+    whole, quick = estimated(graph), find_rolling_shutter(graph, 20, for_shaking=False)
+    assert quick is not None
+    assert quick.is_read_out
+    assert quick.readout * FRAME_RATE == pytest.approx(0.9, abs=0.09)
+    assert math.isnan(quick.by_row)
+    assert not quick.is_shaken
+    same = find_rolling_shutter(graph, for_shaking=False)
+    assert same is not None
+    assert (same.readout, same.readout_std) == (whole.readout, whole.readout_std)
+
+
+def test_a_readout_is_what_was_given_or_what_residuals_show() -> None:
+    """One that is given is improved by any evidence; one that is sought needs a rolling shutter."""
+    shown, unsure = estimated(recording(0.9)), estimated(adjusted(recording(0.0)))
+    sought, given = Readout.known(0.0, 0.2), Readout.known(0.03, 0.001)
+    assert (sought.is_sought, sought.is_given) == (True, False)
+    assert (given.is_sought, given.is_given) == (False, True)
+    assert not Readout.known(0.0, 0.0).is_sought
+    assert readout_by(None, sought) is readout_by(unsure, sought) is None
+    assert readout_by(None, given) is given
+    for found, known in ((shown, sought), (shown, given), (unsure, given)):
+        assert readout_by(found, known) == known.updated(found.readout, found.readout_std)
 
 
 def test_more_than_a_frame_interval_is_no_readout() -> None:

@@ -49,6 +49,33 @@ class Readout:
         """A prior, before images say more."""
         return cls(torch.tensor(seconds, dtype=torch.float64, device="cpu"), std, seconds, std)
 
+    @classmethod
+    def from_numbers(cls, numbers: Tensor) -> Self:
+        """Read the four numbers of a file, as `numbers` has them. Raises ValueError for numbers that are none."""
+        if numbers.shape != (4,) or numbers.dtype != torch.float64:
+            raise ValueError(f"the readout is {tuple(numbers.shape)} of {numbers.dtype}, not four float64")
+        if not bool(numbers.isfinite().all()) or bool((numbers[[0, 2]].abs() > MAX_READOUT).any()):
+            raise ValueError(f"the readout is not finite, or above {MAX_READOUT:g} s")
+        if bool((numbers[[1, 3]] < 0).any()):
+            raise ValueError("the readout has a negative standard deviation")
+        return cls(numbers[0].clone(), *numbers[1:].tolist())
+
+    @property
+    def numbers(self) -> Float[Tensor, " 4"]:
+        """Seconds, standard error, prior and its standard deviation, as files have them."""
+        numbers = float(self.seconds), self.std, self.prior, self.prior_std
+        return torch.tensor(numbers, dtype=torch.float64, device="cpu")
+
+    @property
+    def is_given(self) -> bool:
+        """Whether there is a rolling shutter by what was known."""
+        return self.prior != 0
+
+    @property
+    def is_sought(self) -> bool:
+        """Whether images may say that there is one, of which nothing was known."""
+        return self.prior == 0 and self.prior_std > 0
+
     def updated(self, seconds: float, std: float) -> Self:
         """The mean of the prior and of what images say, weighted by their information."""
         if not math.isfinite(std) or not self.prior_std:

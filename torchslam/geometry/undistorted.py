@@ -12,6 +12,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import KeypointNoise, whitening
+from torchslam.geometry.rolling_shutter import Readout
 
 _NODES = 2**17  # of a table, at most: a node every two pixels of an image of 752 x 480
 _LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some thousandths of one
@@ -126,10 +127,12 @@ class SharedCamera:
 
     Attributes:
         current: The camera of the map as it is now.
+        readout: Of its rolling shutter; None: a global shutter, as far as is known.
         undistortion: Of the keypoints of its images.
     """
 
     def __init__(self, camera: Camera) -> None:
+        self.readout: Readout | None = None
         self.replace(camera)
 
     def replace(self, camera: Camera) -> None:

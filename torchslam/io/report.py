@@ -58,7 +58,11 @@ def compute_metrics(
         "rolling_shutter": shake_remark(finished),
         "readout": readout_metrics(finished),
     }
-    changes = [{"frame": c.frame, "focal_px": float(c.camera.focal)} for c in finished.camera_changes]
+    changes = [
+        {"frame": change.frame, "focal_px": float(change.camera.focal)}
+        | ({} if change.readout is None else {"readout_ms": 1e3 * float(change.readout.seconds)})
+        for change in finished.camera_changes
+    ]
     return (
         metrics | remarks | check_metrics(mapped) | {"camera_changes": changes, "dropped": sequence.dropped}
     )

@@ -45,6 +45,8 @@ class TrackingState:
         local_points: Points of the local map: those that the local keyframes observe.
         error: Moving average of the median squared error of the matches in units of their variance.
         explained_ratio: Moving average of the ratio of image cells with keypoints in which some agree with the map.
+        timestamp: Of the last frame, seconds; None if unknown.
+        interval: Seconds that `velocity` takes, negative backward in time; 0 if unknown.
     """
 
     T_cr: Float[Tensor, "4 4"]
@@ -56,6 +58,8 @@ class TrackingState:
     local_points: Int[Tensor, " L"]
     error: float = 0.0
     explained_ratio: float = 1.0
+    timestamp: float | None = None
+    interval: float = 0.0
 
     @classmethod
     def empty(cls, like: Float[Tensor, "..."]) -> TrackingState:

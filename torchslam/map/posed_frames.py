@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -14,7 +15,7 @@ from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
-from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
+from torchslam.types import FrameFeatures, Observations, PoseEstimate, Trajectory
 
 # Twice the distance of the gate: the final adjustment moves frames by less.
 _OUTLIER_CHI_SQUARE = 4.0 * CHI_SQUARE_95
@@ -228,6 +229,29 @@ class PosedFrames:
             pixels = global_shutter_pixels(pixels, T_cw[frame], velocities[frame], points_w, camera, seconds)
         noise = KeypointNoise(seen["scales"], seen["information"])
         return passes_gate(noise.squared_reprojection(points_c, pixels, camera), chi_square)
+
+    def global_shutter(
+        self, seen: Observations, slam_map: Map, camera: Camera, readout: Readout
+    ) -> Observations:
+        """Observations by keyframes, with the keypoints where a global shutter would have seen them.
+
+        The velocity of a keyframe is that of its frame among all posed frames.
+        """
+        T_cw, times = self.T_cw(slam_map), self.frames["timestamp"]
+        velocities, _ = frame_velocities(T_cw, times, self.frames["session"])
+        keys, order = self.keys.sort()
+        row = order[torch.searchsorted(keys, slam_map.keys).clamp_max(len(keys) - 1)]
+        is_posed = self.keys[row] == slam_map.keys
+        velocities = torch.where(is_posed[:, None], velocities[row], 0.0)[seen.keyframe_index]
+        pixels = global_shutter_pixels(
+            seen.pixels,
+            slam_map.T_cw[seen.keyframe_index],
+            velocities,
+            slam_map.positions_w[seen.point_index],
+            camera,
+            readout.seconds.to(seen.pixels),
+        )
+        return replace(seen, pixels=pixels)
 
     def graph(
         self,

@@ -29,7 +29,7 @@ from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import OBSERVATION_VARIANCE, CameraMeasurement
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.rolling_shutter import MAX_READOUT, Readout, frame_velocities, global_shutter_pixels
+from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
 from torchslam.optim._core.levenberg_marquardt import Progress, check_minimum
 from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.tangent import CameraPrior
@@ -166,9 +166,7 @@ class ObservationGraph:
             parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
             tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
         if self.readout is not None:
-            known = self.readout
-            numbers = float(known.seconds), known.std, known.prior, known.prior_std
-            tensors[_READOUT] = torch.tensor(numbers, dtype=torch.float64, device="cpu")
+            tensors[_READOUT] = self.readout.numbers
         tensors |= measurement_tensors(self.measurements)
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
@@ -205,7 +203,7 @@ class ObservationGraph:
                 variance = float(metadata.get(_VARIANCE, OBSERVATION_VARIANCE))
                 calibration = CameraMeasurement(camera.with_params(params), directions, variance)
             columns = {name: tensors[name] for name in names}
-            readout = _readout(tensors[_READOUT]) if shutter else None
+            readout = Readout.from_numbers(tensors[_READOUT]) if shutter else None
             measurements = measurements_of({name: tensors[name] for name in outside}, len(tensors["T_cw"]))
             graph = cls(
                 camera=camera, calibration=calibration, readout=readout, measurements=measurements, **columns
@@ -298,17 +296,6 @@ class RunGraph(ObservationGraph):
         "point_ids": ("N", (), int),
         "keypoint_index": ("O", (), int),
     }
-
-
-def _readout(numbers: Tensor) -> Readout:
-    """The readout of a file. Raises ValueError for numbers that are none."""
-    if numbers.shape != (4,) or numbers.dtype != torch.float64:
-        raise ValueError(f"the readout is {tuple(numbers.shape)} of {numbers.dtype}, not four float64")
-    if not bool(numbers.isfinite().all()) or bool((numbers[[0, 2]].abs() > MAX_READOUT).any()):
-        raise ValueError(f"the readout is not finite, or above {MAX_READOUT:g} s")
-    if bool((numbers[[1, 3]] < 0).any()):
-        raise ValueError("the readout has a negative standard deviation")
-    return Readout(numbers[0].clone(), *numbers[1:].tolist())
 
 
 Graph = TypeVar("Graph", bound=ObservationGraph)

@@ -22,6 +22,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import with_radial_terms
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import TrackingState
 from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_submaps, write_tensors
@@ -68,10 +69,12 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
         "due": slam.mapper.adjustment.due,
         "loop_precheck": slam.loop_closer.loop_precheck,
         "camera_changes": [
-            [change.frame, change.camera.params.tolist(), change.departure]
+            [change.frame, change.camera.params.tolist(), change.departure, _plain_readout(change.readout)]
             for change in slam.online_camera.changes
         ],
         "next_camera_check": slam.online_camera.next_check,
+        "next_readout_check": slam.online_camera.next_readout_check,
+        "readout": _plain_readout(slam.shared_camera.readout),
         "loop_closures": [astuple(closure) for closure in slam.loop_closer.loop_closures],
     }
     write_tensors(
@@ -162,20 +165,35 @@ def _restore(
         None if precheck is None else (int(precheck[0]), bool(precheck[1])),
     )
     changes = [_camera_change(saved.camera, *change) for change in run["camera_changes"]]
-    slam.online_camera.restore(changes, int(run["next_camera_check"]))
+    next_checks = int(run["next_camera_check"]), int(run["next_readout_check"])
+    slam.online_camera.restore(changes, next_checks, _readout(run["readout"]))
     slam.scene_filter.static_overlay.restore(tensors["run.evidence"])
     if run["adjustment"]:  # around the newest keyframe, where the map is as it was at the request
         due = None if run["due"] is None else int(run["due"])
         slam.mapper.adjustment.request(submap.map, submap.map.num_keyframes - 1, due)
 
 
-def _camera_change(given: Camera, frame: int, params: list[float], departure: float) -> CameraChange:
+def _plain_readout(readout: Readout | None) -> list[float] | None:
+    """A readout as JSON has it."""
+    return None if readout is None else readout.numbers.tolist()
+
+
+def _readout(plain: list[float] | None) -> Readout | None:
+    """Invert `_plain_readout`; raise ValueError or TypeError for anything else."""
+    if plain is None:
+        return None
+    return Readout.from_numbers(torch.tensor(plain, dtype=torch.float64, device="cpu"))
+
+
+def _camera_change(
+    given: Camera, frame: int, params: list[float], departure: float, readout: list[float] | None
+) -> CameraChange:
     """Raises ValueError where the parameters are no camera's."""
     camera = with_radial_terms(given)
     found = camera.params.new_tensor(params)
     if found.shape != camera.params.shape or not bool(found.isfinite().all() and (found[:2] > 0).all()):
         raise ValueError(f"the parameters of the camera are {params}")
-    return CameraChange(int(frame), camera.with_params(found), float(departure))
+    return CameraChange(int(frame), camera.with_params(found), float(departure), _readout(readout))
 
 
 def _check_tracking(tracking: TrackingState) -> None:

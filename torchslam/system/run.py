@@ -27,7 +27,7 @@ from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squa
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions
 from torchslam.optim.camera_evidence import graph_evidence
 from torchslam.optim.measurements import Measurement
-from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter
+from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter, readout_by
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
     GraphSolution,
@@ -36,7 +36,7 @@ from torchslam.optim.run_graph import (
     solve_graph,
 )
 from torchslam.system.front_end import source
-from torchslam.system.online_camera import CameraChange, OnlineCamera
+from torchslam.system.online_camera import CameraChange, OnlineCamera, given_readout
 from torchslam.system.session import Session
 from torchslam.types import Frame, Observations, Reason, State, StepResult, Trajectory
 
@@ -353,7 +353,7 @@ class FinalAdjustment:
         self._measured = measured
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
-        self._known = Readout.known(1e-3 * config.camera.readout, 1e-3 * config.camera.readout_std)
+        self._known = given_readout(config.camera)
         self.readout: Readout | None = None
         self.shutter: RollingShutter | None = None
 
@@ -429,16 +429,12 @@ class FinalAdjustment:
 
         Each round is a Gauss-Newton step of the readout, with everything else eliminated, and one of the solution.
         """
-        known = self._known
-        is_given = known.prior != 0
-        if not (is_given or known.prior_std):
+        if not (self._known.is_given or self._known.is_sought):
             return camera
         for _ in range(READOUT_ROUNDS):
             graph = submap.posed_frames.graph(submap.map, camera, readout=self.readout)
-            found = self.shutter = find_rolling_shutter(graph)
-            self.readout = known if is_given else None
-            if found is not None and (is_given or found.is_read_out):
-                self.readout = known.updated(found.readout, found.readout_std)
+            self.shutter = find_rolling_shutter(graph)
+            self.readout = readout_by(self.shutter, self._known)
             if self.readout is None and graph.readout is None:
                 break
             camera = self._solve(submap, camera, given, progress, ROUGH, once=True).camera

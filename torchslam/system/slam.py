@@ -140,6 +140,7 @@ class SLAM:
         self.loop_closer = LoopCloser(self.shared_camera, self.scaled_config, self.atlas, self.matcher)
         self.scene_filter = SceneFilter(self.shared_camera, self.scaled_config)
         self.online_camera = OnlineCamera(self.shared_camera, self.config, self.atlas)
+        self.mapper.adjustment.observe = self.loop_closer.observe = self.online_camera.observations
         self._context = SystemContext(
             camera=self.shared_camera,
             config=self.scaled_config,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from torchslam.map.atlas import Submap
 from torchslam.mapping.culling import remove_masked_observations
@@ -75,7 +75,9 @@ class StateMachine:
         estimate, verdict = located
         motion = NO_MOVEMENT
         if verdict.certainty is Certainty.CERTAIN:
-            motion = self.context.scene_filter.detect_independent_motion(filtered, estimate)
+            whole = self.context.tracker.at_middle_row(submap, filtered.without_overlays)
+            corrected = replace(filtered, without_overlays=whole)
+            motion = self.context.scene_filter.detect_independent_motion(corrected, estimate)
             verdict = Verdict(motion.rejection)
         if verdict.certainty is Certainty.CERTAIN and self.active_map.doubted is None:
             return self._map(filtered, estimate, motion.note)

@@ -11,7 +11,9 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import SharedCamera, se3_inverse
+from torchslam.geometry import SharedCamera, se3_inverse, transform
+from torchslam.geometry.lie import se3_log
+from torchslam.geometry.rolling_shutter import global_shutter_pixels
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
@@ -33,6 +35,7 @@ class Tracker:
     def __init__(
         self, camera: SharedCamera, config: Config, matcher: Matcher | None = None, counts: bool = True
     ) -> None:
+        self.camera = camera
         self.localizer = Localizer(camera, config)
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.settings = config.tracking
@@ -64,6 +67,8 @@ class Tracker:
             last_inlier_points=tracking.last_inlier_points,
             error=tracking.error,
             explained_ratio=tracking.explained_ratio,
+            timestamp=tracking.timestamp,
+            interval=tracking.interval,
         )
 
     def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Float[Tensor, "4 4"]) -> TrackingState:
@@ -111,9 +116,32 @@ class Tracker:
             is_sure: True if the last poses are certain: a pose near the predicted one is tried first.
         """
         prior_T_cw = self.predict(submap) if prior_T_cw is None else prior_T_cw
+        view = self.at_middle_row(submap, view)
         candidates = self._candidates(submap, view, prior_T_cw)
         near = prior_T_cw if is_sure else None
         return self.localizer.locate(submap.map, view, candidates, submap.tracking.local_points, near)
+
+    def at_middle_row(self, submap: Submap, view: FrameFeatures) -> FrameFeatures:
+        """The view with keypoints as a global shutter would have seen them, by the last velocity.
+
+        All of them are corrected, as at the median depth of the local map, since it is not known yet what they see.
+        Without a readout it is the view itself.
+        """
+        camera, readout, tracking = self.camera.current, self.camera.readout, submap.tracking
+        if readout is None or tracking.velocity is None or not tracking.interval:
+            return view
+        depths = transform(submap.T_cw, submap.map.positions_w[tracking.local_points])[:, 2]
+        depths = depths[depths > 0]
+        if len(depths) == 0:
+            return view
+        rays = self.camera.undistortion.normalize(view.keypoints)
+        points_c = depths.median() * torch.cat((rays, torch.ones_like(rays[:, :1])), dim=-1)
+        still = torch.eye(4, dtype=rays.dtype, device=rays.device)[None]
+        velocity = se3_log(tracking.velocity) / tracking.interval
+        seconds = readout.seconds.to(rays)
+        pixels, points_c = view.keypoints[:, None], points_c[:, None]
+        corrected = global_shutter_pixels(pixels, still, velocity[None], points_c, camera, seconds)
+        return replace(view, keypoints=corrected[:, 0])
 
     def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
         """Sets of matches by ever wider search: near the predicted pixels, in a wider window, in the whole image."""
@@ -142,12 +170,14 @@ class Tracker:
         if estimate is None:
             submap.tracking.velocity = None
             return
-        slam_map = submap.map
+        slam_map, before = submap.map, submap.tracking.timestamp
         velocity = estimate.T_cw @ se3_inverse(submap.T_cw)
         tracking = replace(
             submap.tracking.averaged_with(estimate),
             velocity=velocity,
             last_inlier_points=estimate.point_ids,
+            timestamp=view.timestamp,
+            interval=0.0 if before is None else view.timestamp - before,
         )
         self._update_last_seen(slam_map, view, estimate)
         shared = slam_map.count_observed(estimate.point_ids, tracking.local_keyframes)
@@ -165,6 +195,7 @@ class Tracker:
             self._at_keyframe(submap.map, best, estimate.T_cw),
             velocity=None,
             last_inlier_points=estimate.point_ids,
+            timestamp=view.timestamp,
         )
 
     def count_visible(self, slam_map: Map, estimate: PoseEstimate) -> None:
