@@ -9,7 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from experiments.learned_weights.noise.consistency import aligned_covariance, nees
+from experiments.learned_weights.noise.consistency import (
+    aligned_covariance,
+    inverse_information,
+    nees,
+    reduced_information,
+)
 from experiments.learned_weights.noise.densities import (
     at_number,
     interval,
@@ -101,7 +106,8 @@ def test_nees_is_one_where_the_stated_noise_is_the_true_one() -> None:
 
 def test_aligned_covariances_have_no_variance_along_a_similarity() -> None:
     example = solved(simulated(3))
-    covariance = aligned_covariance(example.graph, example.known, BEND)
+    of_poses = inverse_information(reduced_information(example.graph, BEND))
+    covariance = aligned_covariance(example.graph.T_cw, example.known, of_poses)
     count = len(example.known)
     shift = torch.eye(3, dtype=torch.float64).repeat(count, 1)
     assert float((covariance @ shift).abs().max()) < 1e-9 * float(covariance.diagonal().max())

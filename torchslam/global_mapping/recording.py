@@ -102,7 +102,9 @@ def map_recording(
         return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
     saved = SavedStages(stages, sequence, config, device)
-    mapper = GlobalMapper(sequence, camera, config, given, device, progress=progress, saved=saved, kept=features)
+    mapper = GlobalMapper(
+        sequence, camera, config, given, device, progress=progress, saved=saved, kept=features
+    )
     made = mapper.run(online.results)
     reduction = mapper.scaled.features.reduction(camera.size)
 

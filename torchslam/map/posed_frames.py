@@ -313,16 +313,13 @@ class PosedFrames:
         )
 
     def apply_solution(self, solution: GraphSolution, graph: RunGraph, slam_map: Map) -> None:
-        """Move map and frames to the solution of their own graph, and store the covariances in the map.
+        """Move map and frames to the solution of their own graph.
 
         More frames may have been solved as keyframes, and further points that came after those of the graph.
         """
-        (bundle,) = solution.keyframes
         count, own = slam_map.num_keyframes, range(len(graph.point_ids))
         slam_map.keyframes["T_cw"][:] = solution.T_cw[:count]
         slam_map.points["positions_w"][graph.point_ids] = solution.points_w[: len(own)]
-        keyframes = torch.arange(count, device=graph.point_ids.device)
-        slam_map.set_covariances(keyframes, graph.point_ids, bundle.covariance(range(count), own))
         keys = key_of(graph.sessions, graph.frame_ids)
         order = torch.argsort(keys)
         solved = order[torch.searchsorted(keys[order], self.keys)]

@@ -24,6 +24,7 @@ from torchslam.optim.bundle._factors import (
     log_distance_error,
     relative_pose_error,
 )
+from torchslam.optim.bundle._pose_covariance import pose_covariance
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.camera_evidence import CameraEstimate, CameraEvidence, camera_evidence
 from torchslam.optim.global_positioning import GlobalPositions, solve_positions
@@ -64,6 +65,7 @@ __all__ = [
     "camera_evidence",
     "displacement_error",
     "log_distance_error",
+    "pose_covariance",
     "relative_pose_error",
     "solve_bundle",
     "solve_least_squares",

@@ -24,7 +24,7 @@ from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
-from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions
+from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
 from torchslam.optim.camera_evidence import graph_evidence
 from torchslam.optim.measurements import Measurement
 from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter, readout_by
@@ -33,6 +33,7 @@ from torchslam.optim.run_graph import (
     GraphSolution,
     RunGraph,
     concatenate_graphs,
+    keyframe_problem,
     solve_graph,
 )
 from torchslam.system.front_end import source
@@ -329,6 +330,9 @@ takes 1.2 times as long."""
 SETTLED = FINAL.replace(tolerance=1e-8)
 """For the map of a whole recording: its loops and far points make Gauss-Newton slow, 20 of 30 iterations on courthouse
 lower the cost from 1e-8 to 1e-10 of it, by a hundredth of what tells two poses apart."""
+MOST_JOINT_FRAMES = 600
+"""Keyframes of which the joint covariance is computed for their own ones: its four matrices take .4 GB then, and grow
+with the square. Maps of more keep the covariances of the normal matrix. Tried with 4 to 152 keyframes."""
 READOUT_ROUNDS = 2
 """Steps of the readout: the second one changes it by a thirtieth, a third one by less than a hundredth."""
 LEAST_RATIO = 0.3
@@ -407,16 +411,29 @@ class FinalAdjustment:
         find_final_variance(submap.map, self._observations(submap, camera)[1], camera)
         if not settled:
             self.camera = camera = self._solve(submap, camera, given, progress, ROUGH).camera
-        final = SETTLED if settled else FINAL
-        if given is None:
-            self.camera = self._solve(submap, camera, None, progress, final).camera
-            return
-        measured, evidence = given, graph_evidence(self._graph(submap, camera), given)
+        measured, evidence = given, None
+        if given is not None:
+            evidence = graph_evidence(self._graph(submap, camera), given)
         if evidence is not None:
             found = evidence.estimate()
             camera, given, measured = found.prior.nearest(camera), found.prior, found.measured
-        self.camera = self._solve(submap, camera, given, progress, final).camera
-        self.given, self.calibration = given, replace(measured, camera=self.camera)
+        solution = self._solve(submap, camera, given, progress, SETTLED if settled else FINAL)
+        self.camera = solution.camera
+        if measured is not None:
+            self.given, self.calibration = given, replace(measured, camera=self.camera)
+        self._store_covariances(submap, solution)
+
+    def _store_covariances(self, submap: Submap, solution: GraphSolution) -> None:
+        """Store how exact keyframes and points are; the error of the camera is one of the keyframes."""
+        graph = self._graph(submap, self.camera)
+        errors = None if self.calibration is None else self.calibration.directions
+        keyframes, *_, problem = keyframe_problem(graph, 0)
+        (bundle,) = solution.keyframes
+        found = bundle.covariance()
+        if len(keyframes) <= MOST_JOINT_FRAMES:
+            joint = pose_covariance(problem, FINAL, errors).unflatten(0, (-1, 6)).unflatten(-1, (-1, 6))
+            found = found._replace(frames=joint.diagonal(dim1=0, dim2=2).movedim(-1, 0))
+        submap.map.set_covariances(keyframes, graph.point_ids, found)
 
     def _find_readout(
         self,

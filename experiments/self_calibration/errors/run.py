@@ -14,7 +14,7 @@ import random
 
 import torch
 
-from experiments.common import available, parser_of, place_of
+from experiments.common import available, parser_of, place_of, publish, table
 from torchslam import SLAM, Config, Run, open_sequence
 from torchslam.geometry import Camera
 from torchslam.optim.camera_evidence import graph_evidence
@@ -56,12 +56,23 @@ def apart(one: Found, other: Found) -> float:
     return (one[0] - other[0]) / math.hypot(one[1], other[1])
 
 
+def px(found: Found) -> str:
+    """A focal length with its error, if it has one."""
+    return f"{found[0]:.1f}" if found[1] == 0 else f"{found[0]:.1f} ± {found[1]:.1f}"
+
+
 def main() -> None:
-    """Run all, print a line each and the shares."""
-    parser = parser_of(__doc__)
-    parser.parse_args()
+    """Run all, and write a line each and the shares into the README."""
+    parser = parser_of(__doc__, readme=True)
+    options = parser.parse_args()
     torch.set_num_threads(1)
-    rng, errors = random.Random(0), list[tuple[float, float]]()
+    rng, errors, rows = random.Random(0), list[tuple[float, float]](), list[list[str]]()
+
+    def compare(name: str, one: tuple[Found, Found], other: tuple[Found, Found]) -> None:
+        errors.append((apart(one[0], other[0]), apart(one[1], other[1])))
+        rows.append([name, px(one[0]), px(other[0]), f"{errors[-1][0]:+.2f}"])
+        print(*rows[-1], sep=" | ", flush=True)
+
     for number in range(2 * ROOMS):
         scene = ("room", "loop")[number % 2]
         noise = (3, 5, 8)[number % 3]
@@ -69,23 +80,19 @@ def main() -> None:
         sequence = open_sequence(place_of(name))
         truth = float(sequence.camera.focal), 0.0
         run = SLAM(scaled(sequence.camera, math.exp(rng.gauss(0, OFF))), Config()).run(sequence)
-        final, alone = found(run)
-        errors.append((apart(final, truth), apart(alone, truth)))
-        print(f"| {name} | {final[0]:.1f} ± {final[1]:.1f} | {truth[0]:.1f} | {errors[-1][0]:+.2f} |")
+        compare(f"{scene}, seed {number + 1}, noise {noise}", found(run), (truth, truth))
     for name in available(HALVES):
         first, middle, end = HALVES[name]
         halves = []
         for start, stop in ((first, middle), (middle, end)):
             sequence = open_sequence(place_of(name), start=start, stop=stop)
             halves.append(found(SLAM(sequence.camera, Config()).run(sequence)))
-        (one, one_alone), (other, other_alone) = halves
-        errors.append((apart(one, other), apart(one_alone, other_alone)))
-        print(
-            f"| {name} | {one[0]:.1f} ± {one[1]:.1f} | {other[0]:.1f} ± {other[1]:.1f} | {errors[-1][0]:+.2f} |"
-        )
-    for column, what in enumerate(("final adjustment", "images alone")):
+        compare(f"{name}, halves", *halves)
+    text = table("check | f (px) | truth, or other half (px) | z", rows)
+    for column, what in enumerate(("Final adjustment", "Images alone")):
         within = [sum(abs(error[column]) < limit for error in errors) for limit in (1, 2)]
-        print(f"{what}: {within[0]} of {len(errors)} within one stated error, {within[1]} within two")
+        text += f"\n{what}: {within[0]} of {len(errors)} within one stated error, {within[1]} within two.\n"
+    publish(text, options, __file__)
 
 
 if __name__ == "__main__":

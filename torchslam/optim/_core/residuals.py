@@ -315,13 +315,8 @@ def variance_factor(
     with Huber's correction for small samples; for least squares this is the variance of unit weight. One where there is
     no redundancy. Source: Huber, "Robust statistics", 1981, section 7.6.
     """
-    weights = observations.factors
-    counted = (linearization.weight > 0) & (weights > 0)
-    variance = torch.where(counted, 1 / torch.where(counted, weights, 1.0), 0.0)
+    across, along, variance, components = _slopes(observations, linearization)
     squared = linearization.residual.square().sum(-1)
-    across = linearization.weight * variance  # the slope of psi across the residual and along it
-    along = across + linearization.curvature_term * squared * variance
-    components = 2 * counted.sum(-1)
     mean_slope = (across + along).sum(-1) / components
     redundant = (components > num_parameters) & (mean_slope > 0)
     mean_slope = torch.where(redundant, mean_slope, 1.0)
@@ -332,3 +327,29 @@ def variance_factor(
     mean_weight = 2 * across.sum(-1) / components
     factor = correction.square() * psi_squared * mean_weight / mean_slope.square()
     return torch.where(redundant, factor, 1.0)
+
+
+def flatness(observations: ReprojectionData, linearization: Linearization) -> Float[Tensor, "*batch"]:
+    """Mean weight over the mean slope of psi = rho' r: how much flatter the cost is than its reweighted normal matrix.
+
+    1 for least squares, more under a robust kernel, whose weights fall with the residual. The inverse reweighted normal
+    matrix, multiplied with it, is that of the expected Hessian. Source: as of `variance_factor`.
+    """
+    across, along, _, components = _slopes(observations, linearization)
+    mean_slope = (across + along).sum(-1) / components
+    determined = (components > 0) & (mean_slope > 0)
+    mean_weight = 2 * across.sum(-1) / components
+    return torch.where(determined, mean_weight / torch.where(determined, mean_slope, 1.0), 1.0)
+
+
+def _slopes(
+    observations: ReprojectionData, linearization: Linearization
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The slope of psi across each residual (*batch, N) and along it, the stated variances, and how many components
+    count (*batch,)."""
+    weights = observations.factors
+    counted = (linearization.weight > 0) & (weights > 0)
+    variance = torch.where(counted, 1 / torch.where(counted, weights, 1.0), 0.0)
+    across = linearization.weight * variance
+    along = across + linearization.curvature_term * linearization.residual.square().sum(-1) * variance
+    return across, along, variance, 2 * counted.sum(-1)

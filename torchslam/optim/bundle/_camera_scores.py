@@ -57,14 +57,7 @@ def camera_scores(
     Returns:
         The scores; None where the observations do not determine the directions.
     """
-    problem = replace(problem, camera_prior=None, pose_prior=None, depth_prior=None, frame_factors=())
-    given = sanitized(problem, options.scale)
-    minimization = BundleMinimization(
-        problem.camera, options.kernel, directions, 0, 0.0, None, False, given.weights.ndim > 3
-    )
-    ((_, bundle),) = minimization.formulations(BundleData(*given))
-    assert isinstance(bundle, SparseBundle), "one problem is solved by sparse algebra"
-    estimate = bundle.ordered(BundleEstimate(given.T_cw, given.points_w, given.params))
+    bundle, estimate = observations_alone(problem, directions, options)
     lin, J, rays_w, factorized = bundle.linear_system(estimate)
     layout, n = bundle.layout, directions.shape[1]
     if not bool(factorized.reduced.definite):
@@ -95,3 +88,19 @@ def camera_scores(
         layout.point_order[layout.point_index],
         variance_factor(bundle.observations, lin, unknowns),
     )
+
+
+def observations_alone(
+    problem: BundleProblem, directions: Float[Tensor, "P n"] | None, options: SolverOptions
+) -> tuple[SparseBundle, BundleEstimate]:
+    """One bundle adjustment with one camera without what it has of priors and factors, and its start, both in the
+    order of the layout; directions: in which the camera's parameters may move."""
+    problem = replace(problem, camera_prior=None, pose_prior=None, depth_prior=None, frame_factors=())
+    given = sanitized(problem, options.scale)
+    free = False if directions is None else directions
+    minimization = BundleMinimization(
+        problem.camera, options.kernel, free, 0, 0.0, None, False, given.weights.ndim > 3
+    )
+    ((_, bundle),) = minimization.formulations(BundleData(*given))
+    assert isinstance(bundle, SparseBundle), "one problem is solved by sparse algebra"
+    return bundle, bundle.ordered(BundleEstimate(given.T_cw, given.points_w, given.params))
