@@ -306,6 +306,7 @@ def calls() -> dict[str, Call]:
         "camera_evidence": decision(
             o.camera_evidence, problem=bundle(), given=CameraMeasurement.of(CAMERA, 0.02)
         ),
+        "pose_covariance": decision(o.pose_covariance, problem=bundle()),
         "relative_pose_error": of(o.relative_pose_error, T_1w=T, T_2w=T_2, T_21=T),
         "log_distance_error": of(o.log_distance_error, T_1w=T, T_2w=T_2, distances=1 + rand(B)),
         "displacement_error": of(o.displacement_error, T_1w=T, T_2w=T_2, measured=rand(B, 2, 3)),

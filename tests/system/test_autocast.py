@@ -39,7 +39,7 @@ Case = tuple[Callable[..., Any], tuple[Tensor, ...]]
 
 # They read files, or compare whole trajectories as float64 numbers without gradient; `clip_loss` is made of `ate`, and
 # the evidence of a minimum is detached.
-OTHERS = {"load_config", "open_sequence", "evaluate", "clip_loss", "camera_evidence"}
+OTHERS = {"load_config", "open_sequence", "evaluate", "clip_loss", "camera_evidence", "pose_covariance"}
 CAMERA_METHODS = (
     "normalize",
     "pixel_scale",

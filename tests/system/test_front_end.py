@@ -14,7 +14,7 @@ from torchslam.config.schema import scale_pixel_settings
 from torchslam.data import open_sequence
 from torchslam.data.transforms import resize
 from torchslam.features import match
-from torchslam.system.front_end import WithFeatures, image_extractor
+from torchslam.system.front_end import WithFeatures, image_extractor, reduced
 from torchslam.system.run import Run
 from torchslam.types import Features, Frame
 
@@ -39,6 +39,17 @@ def test_only_much_larger_images_are_reduced(size: tuple[int, int], factor: floa
     assert FeaturesConfig(max_image_pixels=0).reduction(size) == 1
     assert FeaturesConfig(kind="simulated").reduction(size) == 1
     assert FeaturesConfig(max_image_pixels=1280 * 960).reduction((1920, 1440)) == pytest.approx(1.5)
+
+
+def test_reduction_does_not_alias() -> None:
+    """Stripes finer than the pixels of the reduced image become gray; a mask stays one."""
+    image = (torch.arange(64) % 2).float().expand(1, 1, 48, 64)
+    small, mask = reduced(image, torch.ones(1, 1, 48, 64, dtype=torch.bool), 2.0)
+    assert small.shape == (1, 1, 24, 32)
+    assert float((small[..., 2:-2] - 0.5).abs().max()) < 0.05
+    assert mask is not None
+    assert mask.dtype == torch.bool
+    assert bool(mask.all())
 
 
 def test_pixel_settings_grow_with_the_image() -> None:

@@ -139,3 +139,19 @@ def test_a_new_start_has_the_given_camera_again() -> None:
     slam.reset()
     assert torch.equal(slam.shared_camera.current.params, slam.camera.params)
     assert slam.online_camera.changes == []
+
+
+def test_a_map_is_checked_once_it_has_grown() -> None:
+    slam, _ = half()
+    (submap,) = slam.atlas
+    count = submap.map.num_keyframes
+    assert slam.online_camera.next_check > count
+    assert not slam.online_camera.check(submap)
+    assert slam.online_camera.next_check > count
+
+
+def test_the_stated_error_of_the_camera_is_a_prior(corrected: Run) -> None:
+    """The surer the given camera, the less the images move it."""
+    sure = run(1.04, "camera.std=0.002")
+    last = sure.camera_changes[-1].camera if sure.camera_changes else given(1.04)
+    assert focal_error(last) > 2 * focal_error(corrected.camera_changes[-1].camera)
