@@ -63,6 +63,7 @@ def test_pairs_of_images_give_the_focal_length(searched: ViewGraphFocal) -> None
     assert from_pairs.PLACES < len(searched.errors) <= from_pairs.MAX_PAIRS
 
 
+@pytest.mark.slow
 def test_features_of_mapping_give_the_same_focal_length(room: Sequence, searched: ViewGraphFocal) -> None:
     """The strongest of them, extracted once."""
     kept = features_to_keep(Config(), room.size, from_pairs.NUM_KEYPOINTS)

@@ -85,7 +85,7 @@ def test_a_right_map_of_the_whole_needs_no_other_frames_online(run: Run, steps: 
     "options",
     [
         ("--mapping", "online"),
-        ("--video",),  # which shows every frame
+        pytest.param(("--video",), marks=pytest.mark.slow),  # which shows every frame
         ("--set", f"global_mapping.max_images={FRAMES - 1}"),  # which are chosen by what is lost
     ],
 )

@@ -51,7 +51,13 @@ def run_of(submap: Submap) -> Run:
     return Run((submap,), CAMERA, Config(), [], [], False, "")
 
 
-@pytest.mark.parametrize("wrong", [slice(0), slice(50, 56), slice(60, None, 13)])
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        slice(50, 56),
+        *(pytest.param(each, marks=pytest.mark.slow) for each in (slice(0), slice(60, None, 13))),
+    ],
+)
 def test_positions_correct_a_map_that_drifts(wrong: slice) -> None:
     submap, times, T_ec = drifting_submap(seed=2, **DRIFTS)
     truth = Trajectory(times, T_ec)

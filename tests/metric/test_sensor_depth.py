@@ -191,6 +191,7 @@ def test_the_nearest_time_is_less_than_half_an_interval_away() -> None:
     assert nearest_times(times, others[1:2]).tolist() == [-1, 0, -1, -1]
 
 
+@pytest.mark.slow
 def test_a_sensor_beside_the_camera(data_dir: Path) -> None:
     """A Kinect's depth that is not registered to the color images. Poses by its fusion are 2 to 5 cm off, over half a
     meter: by them the unit of this map is from 1.79 to 2.04 m along the recording, by depth images 1.91 to 1.92."""

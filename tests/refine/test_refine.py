@@ -184,6 +184,7 @@ def _first(count: int) -> Trajectory:
 
 
 @pytest.mark.data
+@pytest.mark.slow
 def test_a_real_sequence_is_refined(data_dir: Path) -> None:
     """Twenty real images, one in eight: the true poses are right to 1 to 3 cm, the focal length is 540 to 1 %."""
     sequence = open_sequence(data_dir / "redkitchen", limit=20, stride=8)

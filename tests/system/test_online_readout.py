@@ -34,6 +34,7 @@ def found() -> tuple[SLAM, Run]:
     return run()
 
 
+@pytest.mark.slow
 def test_a_readout_is_found_while_the_run_goes_on(found: tuple[SLAM, Run]) -> None:
     """It is taken for no lens, and the poses that follow are better."""
     slam, corrected = found

@@ -84,7 +84,7 @@ def run_on(data_dir: Path, name: str, edit: Edit) -> Run:
 
 
 @pytest.mark.data
-@pytest.mark.parametrize("wave_px", [0.0, 6.0])
+@pytest.mark.parametrize("wave_px", [0.0, pytest.param(6.0, marks=pytest.mark.slow)])
 def test_waves_in_real_images_are_named(data_dir: Path, wave_px: float) -> None:
     """The images of shelf_bin have none; here a sine along the rows shifts them."""
     said = shake_remark(run_on(data_dir, "shelf_bin", rolling(wave_px)))

@@ -193,7 +193,7 @@ def test_an_initialization_must_explain_the_frames_since_its_reference(
     assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
 
 
-@pytest.mark.parametrize("explained", [True, False])
+@pytest.mark.parametrize("explained", [pytest.param(True, marks=pytest.mark.slow), False])
 def test_a_contradicting_initialization_replaces_a_provisional_map(
     explained: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -516,6 +516,7 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
     assert 2 in waits
 
 
+@pytest.mark.slow
 def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -17,7 +17,11 @@ from torchslam.system.slam import SLAM
 
 
 @pytest.mark.parametrize(
-    ("scene", "text"), [("charuco", "charuco-7x5:0.12:0.09"), ("chessboard", "chessboard-7x5:0.12")]
+    ("scene", "text"),
+    [
+        ("charuco", "charuco-7x5:0.12:0.09"),
+        pytest.param("chessboard", "chessboard-7x5:0.12", marks=pytest.mark.slow),
+    ],
 )
 def test_a_board_gives_meters(scene: str, text: str) -> None:
     """OpenCV counts the chessboard from either end, as the camera goes past it."""
