@@ -70,7 +70,9 @@ def open_links(observed: ObservedTracks, found: Reconstruction) -> list[tuple[li
     """The links that a map does not hold: the images nearest before each, ascending, and after it."""
     rows = range(len(found.T_cw))
     few = torch.nonzero(points_across(observed, found) < HELD)[:, 0].tolist()
-    return [(list(rows[max(at + 1 - ACROSS, 0) : at + 1]), list(rows[at + 1 : at + 1 + ACROSS])) for at in few]
+    return [
+        (list(rows[max(at + 1 - ACROSS, 0) : at + 1]), list(rows[at + 1 : at + 1 + ACROSS])) for at in few
+    ]
 
 
 def points_across(observed: ObservedTracks, found: Reconstruction) -> Int[Tensor, " M"]:
@@ -100,9 +102,13 @@ def with_learned(
     for pair in pairs:
         matched[pair.first][pair.keypoints_1] = True
         matched[pair.second][pair.keypoints_2] = True
-    begin = {row: 1 + int(torch.nonzero(views[row].mask).amax()) if views[row].mask.any() else 0 for row in learned}
+    begin = {
+        row: 1 + int(torch.nonzero(views[row].mask).amax()) if views[row].mask.any() else 0 for row in learned
+    }
     place = {row: begin[row] - 1 + chosen.cumsum(0) for row, chosen in matched.items()}
-    count = max([len(view.mask) for view in views] + [begin[row] + int(matched[row].sum()) for row in learned])
+    count = max(
+        [len(view.mask) for view in views] + [begin[row] + int(matched[row].sum()) for row in learned]
+    )
     more = [_in_rows(view, count) for view in views]
     for row, own in learned.items():
         more[row] = _filled(more[row], own, matched[row], begin[row])

@@ -18,6 +18,7 @@ from torchslam.errors import FrameError
 from torchslam.geometry import Camera, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.chained_positions import chained_positions
+from torchslam.global_mapping.check import check_map
 from torchslam.global_mapping.frames_between import FramePoser
 from torchslam.global_mapping.learned_links import (
     MIN_LEARNED_MATCHES,
@@ -98,6 +99,10 @@ class GlobalMap:
     views: list[FrameFeatures]
     pairs: list[ViewPair]
     held_back: frozenset[int]
+
+
+Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
+"""Rows of the views that have a pose, the tracks in all views, and what was found."""
 
 
 def mapping_config(config: Config) -> Config:
@@ -206,17 +211,34 @@ class GlobalMapper:
             return self._failed(found, views, pairs)
         learned = self._learned(views, open_links(*found[1:]))
         if learned is not None:
-            not_used = choose_held_back(learned.pairs)
-            used_learned = [pair for row, pair in enumerate(learned.pairs) if row not in not_used]
-            tied = self.reconstruct(views, used, LearnedPairs(learned.views, used_learned))
-            if not isinstance(tied, str) and len(tied[0]) >= len(found[0]):
-                found, views = tied, learned.views
-                held_back |= {len(pairs) + row for row in not_used}
-                pairs = pairs + learned.pairs
+            every, left_out = pairs + learned.pairs, choose_held_back(learned.pairs)
+            kept = [pair for row, pair in enumerate(learned.pairs) if row not in left_out]
+            left_out = held_back | {len(pairs) + row for row in left_out}
+            tied = self.reconstruct(views, used, LearnedPairs(learned.views, kept))
+            scores = [self._score(made, learned.views, every, left_out) for made in (found, tied)]
+            if not isinstance(tied, str) and scores[1] > scores[0]:
+                found, views, pairs, held_back = tied, learned.views, every, left_out
         run = self.finish(views, *found)
         return GlobalMap(run, views, pairs, held_back)
 
-    def _learned(self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]]) -> LearnedPairs | None:
+    def _score(
+        self,
+        made: Reconstructed | str,
+        views: list[FrameFeatures],
+        pairs: list[ViewPair],
+        held_back: frozenset[int],
+    ) -> float:
+        """How well pairs of images agree with a reconstruction; see `MapCheck.score`."""
+        if isinstance(made, str):
+            return 0.0
+        rows, _, found = made
+        known = torch.zeros(len(views), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
+        reduction = self.scaled.features.reduction(self.camera.size)
+        return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction).score
+
+    def _learned(
+        self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]]
+    ) -> LearnedPairs | None:
         """Views and pairs with learned features around links; None without weights, or if nothing holds."""
         config = learned_config(self.config)
         if config is None or self.extract is None or not links:
@@ -237,7 +259,7 @@ class GlobalMapper:
 
     def reconstruct(
         self, views: list[FrameFeatures], pairs: list[ViewPair], learned: LearnedPairs | None = None
-    ) -> tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction] | str:
+    ) -> Reconstructed | str:
         """Rotations, positions and rounds of adjustment of the largest connected set of views.
 
         Args:

@@ -184,7 +184,9 @@ def build_structure(
     runs = [slice(start, min(start + height, num_points)) for start in range(0, num_points, height)]
     pairs = None
     if num_frames >= SPARSE_FRAMES and num_cameras <= MOST_CAMERAS:
-        counts = coupling.stored(torch.ones(linked, 3, 1, dtype=torch.float32, device=frame_slots.device)).squeeze(-1)
+        counts = coupling.stored(
+            torch.ones(linked, 3, 1, dtype=torch.float32, device=frame_slots.device)
+        ).squeeze(-1)
         seen = (
             (columns.members, counts[columns.storage].view(run.stop - run.start, 3, -1)[:, 0])
             for run, columns in zip(runs, frames_of, strict=True)
