@@ -10,7 +10,7 @@ import jaxtyping
 import pytest
 import torch
 
-from tests import accelerator
+from tests import accelerator, shapes
 
 # Two torch threads on two busy cores wait for each other at barriers.
 torch.set_num_threads(1)
@@ -22,6 +22,10 @@ WHOLE_RUNS = ("batch", "calibration", "cli", "docs", "experiments", "io", "paral
 """Folders of tests that run the whole system many times."""
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+def pytest_runtest_setup() -> None:
+    shapes.start_test()
 
 
 @pytest.fixture(params=["cpu", "sim", pytest.param("cuda", marks=pytest.mark.gpu)])
