@@ -1,4 +1,4 @@
-"""Links that SIFT does not hold, tied by learned features: XFeat, matched by LightGlue, where their weights are at hand.
+"""Links that SIFT does not hold, tied by learned features: XFeat, matched by LightGlue, where their weights are.
 
 Their keypoints are other points than those of SIFT. So images near such a link get them in addition, with the noise of
 their own, and the points that they see have tracks of their own in the same map.

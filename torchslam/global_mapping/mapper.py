@@ -248,7 +248,9 @@ class GlobalMapper:
         found: dict[int, FrameFeatures] = {}
         for row in sorted({row for pair in ends for row in pair}):
             self.progress("learned features", len(found), len(views))
-            found |= {row: view for view in own.views([views[row].index]) if view is not None}
+            view = next(own.views([views[row].index]))
+            if view is not None:
+                found[row] = view
         matcher = PairMatcher(
             [found.get(row, view) for row, view in enumerate(views)], self.camera, own.matcher, own.scaled
         )
