@@ -18,7 +18,15 @@ from torchslam.errors import FrameError
 from torchslam.geometry import Camera, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.chained_positions import chained_positions
+from torchslam.global_mapping.check import check_map
 from torchslam.global_mapping.frames_between import FramePoser
+from torchslam.global_mapping.learned_links import (
+    MIN_LEARNED_MATCHES,
+    LearnedPairs,
+    learned_config,
+    open_links,
+    with_learned,
+)
 from torchslam.global_mapping.rounds import (
     MIN_VIEWS,
     ObservedTracks,
@@ -35,7 +43,7 @@ from torchslam.global_mapping.view_graph import (
     build_view_graph,
     connected_views,
 )
-from torchslam.global_mapping.weak_links import strengthen
+from torchslam.global_mapping.weak_links import pairs_across, strengthen
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
@@ -82,7 +90,7 @@ class GlobalMap:
 
     Attributes:
         run: a run like any other; without a submap where `run.failure` says why.
-        views: features of the images that were mapped, by row.
+        views: features of the images that were mapped, by row, learned ones included.
         pairs: all verified pairs of them.
         held_back: rows of the pairs that mapping did not use.
     """
@@ -91,6 +99,10 @@ class GlobalMap:
     views: list[FrameFeatures]
     pairs: list[ViewPair]
     held_back: frozenset[int]
+
+
+Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
+"""Rows of the views that have a pose, the tracks in all views, and what was found."""
 
 
 def mapping_config(config: Config) -> Config:
@@ -193,22 +205,78 @@ class GlobalMapper:
         matcher = self.saved.matcher(PairMatcher(views, self.camera, self.matcher, self.scaled))
         pairs = build_view_graph(matcher, lambda done, most: self.progress("matches", done, most))
         held_back = choose_held_back(pairs)
-        found = self.reconstruct(views, [pair for row, pair in enumerate(pairs) if row not in held_back])
+        used = [pair for row, pair in enumerate(pairs) if row not in held_back]
+        found = self.reconstruct(views, used)
         if isinstance(found, str):
             return self._failed(found, views, pairs)
+        learned = self._learned(views, open_links(*found[1:]))
+        if learned is not None:
+            every, left_out = pairs + learned.pairs, choose_held_back(learned.pairs)
+            kept = [pair for row, pair in enumerate(learned.pairs) if row not in left_out]
+            left_out = held_back | {len(pairs) + row for row in left_out}
+            tied = self.reconstruct(views, used, LearnedPairs(learned.views, kept))
+            scores = [self._score(made, learned.views, every, left_out) for made in (found, tied)]
+            if not isinstance(tied, str) and scores[1] > scores[0]:
+                found, views, pairs, held_back = tied, learned.views, every, left_out
         run = self.finish(views, *found)
         return GlobalMap(run, views, pairs, held_back)
 
+    def _score(
+        self,
+        made: Reconstructed | str,
+        views: list[FrameFeatures],
+        pairs: list[ViewPair],
+        held_back: frozenset[int],
+    ) -> float:
+        """How well pairs of images agree with a reconstruction; see `MapCheck.score`."""
+        if isinstance(made, str):
+            return 0.0
+        rows, _, found = made
+        known = torch.zeros(len(views), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
+        reduction = self.scaled.features.reduction(self.camera.size)
+        return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction).score
+
+    def _learned(
+        self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]]
+    ) -> LearnedPairs | None:
+        """Views and pairs with learned features around links; None without weights, or if nothing holds."""
+        config = learned_config(self.config)
+        if config is None or self.extract is None or not links:
+            return None
+        own = GlobalMapper(self.sequence, self.camera, config, self.given, self.camera.params.device)
+        ends = pairs_across(links)
+        found: dict[int, FrameFeatures] = {}
+        for row in sorted({row for pair in ends for row in pair}):
+            self.progress("learned features", len(found), len(views))
+            view = next(own.views([views[row].index]))
+            if view is not None:
+                found[row] = view
+        matcher = PairMatcher(
+            [found.get(row, view) for row, view in enumerate(views)], self.camera, own.matcher, own.scaled
+        )
+        self.progress("learned matches", 0, 1)
+        pairs = matcher.match((one, other) for one, other in ends if one in found and other in found)
+        pairs = [pair for pair in pairs if len(pair) >= MIN_LEARNED_MATCHES]
+        return with_learned(views, found, pairs) if pairs else None
+
     def reconstruct(
-        self, views: list[FrameFeatures], pairs: list[ViewPair]
-    ) -> tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction] | str:
+        self, views: list[FrameFeatures], pairs: list[ViewPair], learned: LearnedPairs | None = None
+    ) -> Reconstructed | str:
         """Rotations, positions and rounds of adjustment of the largest connected set of views.
+
+        Args:
+            views: features of the images.
+            pairs: verified pairs of them.
+            learned: more keypoints of the same images, with verified pairs.
 
         Returns:
             Rows of the views that have a pose, the tracks in all views, and what was found; or why there is no map.
         """
         self.progress("rotations", 0, 1)
         device = self.camera.params.device
+        own, plain = len(pairs), views
+        if learned is not None:
+            views, pairs = learned.views, pairs + learned.pairs
         ends = [(pair.first, pair.second) for pair in pairs]
         edges = torch.tensor(ends, dtype=torch.int64, device=device).view(-1, 2)
         if len(edges) == 0:
@@ -220,9 +288,9 @@ class GlobalMapper:
             edges, R_21, len(views), weights, options=ROTATION_OPTIONS.replace(backward="detached")
         )
         off = so3_log(R_21 @ average.R_cw[edges[:, 0]] @ average.R_cw[edges[:, 1]].mT).norm(dim=-1)
-        pairs = [
-            pair for pair, angle in zip(pairs, off.tolist(), strict=True) if angle < MAX_ROTATION_ERROR_RAD
-        ]
+        held = (off < MAX_ROTATION_ERROR_RAD).tolist()
+        own = sum(held[:own])
+        pairs = [pair for pair, holds in zip(pairs, held, strict=True) if holds]
         general = sum(pair.relation is Relation.GENERAL for pair in pairs)
         if general < MIN_GENERAL * len(pairs):
             return (
@@ -231,6 +299,7 @@ class GlobalMapper:
             )
         rows = connected_views(pairs, len(views))
         connected = set(rows.tolist())
+        own = sum(pair.first in connected for pair in pairs[:own])
         pairs = [pair for pair in pairs if pair.first in connected]
         observed = self._tracks(pairs, views)
         if observed.tracks.count == 0:
@@ -247,9 +316,10 @@ class GlobalMapper:
             self.progress(words, 0, 1)
 
         coarse = adjust_coarsely(observed, T_cw, self.given, camera, log)
-        matcher = PairMatcher(views, self.camera, self.matcher, self.scaled)
+        matcher = PairMatcher(plain, self.camera, self.matcher, self.scaled)
         self.progress("weak links", 0, 1)
-        observed = self._tracks(strengthen(matcher, pairs, coarse.T_cw, coarse.camera), views)
+        stronger = strengthen(matcher, pairs[:own], coarse.T_cw, coarse.camera)
+        observed = self._tracks(stronger + pairs[own:], views)
         found = adjust_in_rounds(observed, coarse.T_cw, self.given, coarse.camera, False, log)
         seen = torch.unique(observed.tracks.view[found.agrees])
         if len(seen) < MIN_VIEWS:

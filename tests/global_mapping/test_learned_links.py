@@ -1,0 +1,137 @@
+"""Learned keypoints come after those that an image has, and tie what nothing else holds."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.global_mapping.synthetic import CAMERA, Recording, line, wall
+from torchslam.config import Config, load_config
+from torchslam.data import open_sequence
+from torchslam.global_mapping.learned_links import (
+    HELD,
+    LearnedPairs,
+    learned_config,
+    open_links,
+    points_across,
+    with_learned,
+)
+from torchslam.global_mapping.mapper import GlobalMapper, mapping_config
+from torchslam.global_mapping.rounds import ObservedTracks, Reconstruction
+from torchslam.global_mapping.tracks import Tracks, join_matches
+from torchslam.types import FrameFeatures
+
+COUNT = 10
+BREAK = 5  # nothing but learned features goes from the images before this one to those from it on
+
+
+def explicit(recording: Recording, weight: float) -> list[FrameFeatures]:
+    return [
+        replace(view, information=torch.full((len(view.mask), 1), weight, dtype=torch.float64))
+        for view in recording.views
+    ]
+
+
+WALK = Recording.of(line(COUNT), wall(300, 2.5), noise_px=0.3, first=0)
+OTHER = Recording.of(line(COUNT), wall(120, 2.5, seed=9), noise_px=0.3, seed=1, first=0)
+VIEWS, LEARNED = explicit(WALK, 4.0), explicit(OTHER, 1.0)
+NEAR = range(BREAK - 3, BREAK + 3)
+PAIRS = [pair for pair in WALK.pairs(1, 2, 3) if (pair.first < BREAK) == (pair.second < BREAK)]
+ACROSS = [pair for pair in OTHER.pairs(1, 2, 3) if pair.first in NEAR and pair.second in NEAR]
+TIED = with_learned(VIEWS, {row: LEARNED[row] for row in NEAR}, ACROSS)
+
+
+def tracks_of(*pairs: LearnedPairs) -> Tracks:
+    every = [pair for each in pairs for pair in each.pairs]
+    return join_matches(every, COUNT, len(pairs[0].views[0].mask))
+
+
+def test_keypoints_are_appended_and_pairs_point_to_them() -> None:
+    for before, after in zip(ACROSS, TIED.pairs, strict=True):
+        assert len(before) == len(after)
+        for row, old, new in (
+            (before.first, before.keypoints_1, after.keypoints_1),
+            (before.second, before.keypoints_2, after.keypoints_2),
+        ):
+            view, own = TIED.views[row], LEARNED[row]
+            torch.testing.assert_close(view.keypoints[new], own.keypoints[old], rtol=0, atol=0)
+            assert bool(view.mask[new].all())
+            assert bool((view.information[new] == 1.0).all())
+            assert not bool(VIEWS[row].mask[new[new < len(VIEWS[row].mask)]].any())
+
+
+def test_keypoints_of_an_image_stay() -> None:
+    lengths = {len(view.mask) for view in TIED.views}
+    assert len(lengths) == 1
+    for row, (before, after) in enumerate(zip(VIEWS, TIED.views, strict=True)):
+        was = before.mask
+        for name in ("keypoints", "scales", "angles", "descriptors", "information"):
+            old, new = getattr(before, name), getattr(after, name)
+            assert torch.equal(new[: len(was)][was], old[was]), name
+        added = int(after.mask.sum() - was.sum())
+        assert (added > 0) == (row in NEAR)
+        matched = {
+            int(at)
+            for pair in ACROSS
+            for end, found in ((pair.first, pair.keypoints_1), (pair.second, pair.keypoints_2))
+            if end == row
+            for at in found
+        }
+        assert added == len(matched)
+
+
+def test_descriptors_of_another_width_are_filled_with_zeros() -> None:
+    narrow = {row: replace(LEARNED[row], descriptors=LEARNED[row].descriptors[:, :16]) for row in NEAR}
+    tied = with_learned(VIEWS, narrow, ACROSS)
+    pair = tied.pairs[0]
+    found = tied.views[pair.first].descriptors[pair.keypoints_1]
+    assert found.shape[1] == 64
+    assert bool((found[:, 16:] == 0).all())
+    assert bool((found[:, :16] != 0).any())
+
+
+def reconstruction(tracks: Tracks) -> tuple[ObservedTracks, Reconstruction]:
+    """The true map, which all observations agree with."""
+    observed = ObservedTracks.of(tracks, TIED.views)
+    points_w = torch.zeros(tracks.count, 3, dtype=torch.float64)
+    agrees = torch.ones_like(tracks.track, dtype=torch.bool)
+    return observed, Reconstruction(WALK.T_cw, CAMERA, points_w, agrees)
+
+
+def test_a_link_is_open_where_few_points_go_across() -> None:
+    observed, found = reconstruction(tracks_of(LearnedPairs(TIED.views, PAIRS)))
+    across = points_across(observed, found)
+    assert len(across) == COUNT - 1
+    assert int(across[BREAK - 1]) == 0
+    assert int(across[torch.arange(COUNT - 1) != BREAK - 1].min()) >= HELD
+    assert open_links(observed, found) == [([2, 3, 4], [5, 6, 7])]
+    few = replace(found, agrees=found.agrees & (observed.tracks.view != 8))  # image 8 agrees on nothing
+    assert int(points_across(observed, few)[7]) > 0  # others see past it
+    tied, found = reconstruction(tracks_of(LearnedPairs(TIED.views, PAIRS), TIED))
+    assert open_links(tied, found) == []
+
+
+def test_learned_pairs_hold_a_map_together() -> None:
+    sequence = open_sequence("synthetic:room?frames=10")
+    mapper = GlobalMapper(sequence, CAMERA, Config(), None)
+    apart = mapper.reconstruct(VIEWS, PAIRS)
+    assert not isinstance(apart, str)
+    assert len(apart[0]) == COUNT - BREAK
+    tied = mapper.reconstruct(VIEWS, PAIRS, TIED)
+    assert not isinstance(tied, str)
+    assert tied[0].tolist() == list(range(COUNT))
+    steps = tied[2].T_cw[:, :3, 3].diff(dim=0).norm(dim=-1)
+    assert float((steps / steps.mean() - 1).abs().max()) < 0.05
+
+
+def test_weights_decide_whether_links_are_tied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.global_mapping.learned_links.find_weights", lambda _: None)
+    assert learned_config(mapping_config(Config())) is None
+    monkeypatch.setattr("torchslam.global_mapping.learned_links.find_weights", lambda _: tmp_path)
+    found = learned_config(mapping_config(Config()))
+    assert found is not None
+    assert (found.features.kind, found.matching.matcher) == ("xfeat", "lightglue")
+    assert learned_config(load_config(None, ["features.kind=orb"])) is None
