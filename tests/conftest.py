@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import jaxtyping
 import pytest
 import torch
@@ -22,6 +23,10 @@ WHOLE_RUNS = ("batch", "calibration", "cli", "docs", "experiments", "io", "paral
 """Folders of tests that run the whole system many times."""
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
+
+
+hypothesis.settings.register_profile("short", max_examples=40)  # others in each run
+hypothesis.settings.load_profile("short")
 
 
 def pytest_runtest_setup() -> None:
