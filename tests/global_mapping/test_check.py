@@ -580,3 +580,11 @@ def test_breaks_are_in_the_order_of_time() -> None:
     found = check(recording, bent(recording.T_cw, 16, 1.5), [*recording.pairs(*NEAR), *loops])
     assert {BreakKind.LOOP, BreakKind.SCALE} <= {each.kind for each in found.breaks}
     assert [each.before for each in found.breaks] == sorted(each.before for each in found.breaks)
+
+
+def test_frames_can_be_doubted() -> None:
+    check = MapCheck(5, 4, 4, 3, 3, 1.0, 0.2, (), (0, 2, 4, 6), (8,))
+    doubted = check.doubting({4, 8, 10})
+    assert (doubted.certain, doubted.uncertain) == ((0, 2, 6), (4, 8))
+    assert doubted.score == pytest.approx(3 / 4 * check.score)
+    assert check.doubting(frozenset()) == check

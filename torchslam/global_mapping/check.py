@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from itertools import pairwise, product
 from typing import Any
@@ -130,6 +130,15 @@ class MapCheck:
     def weak_links(self) -> int:
         """Number of moments at which nothing tells whether the scale is the same."""
         return sum(each.kind is BreakKind.UNKNOWN for each in self.breaks)
+
+    def doubting(self, frames: Collection[int]) -> MapCheck:
+        """The same check with these frames among those that are not certain."""
+        doubted = sorted(set(self.certain) & set(frames))
+        return replace(
+            self,
+            certain=tuple(frame for frame in self.certain if frame not in doubted),
+            uncertain=tuple(sorted([*self.uncertain, *doubted])),
+        )
 
     def sentence(self) -> str:
         """The check in a sentence."""

@@ -18,7 +18,7 @@ from torchslam.errors import FrameError
 from torchslam.geometry import Camera, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.chained_positions import chained_positions
-from torchslam.global_mapping.check import check_map
+from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.frames_between import FramePoser
 from torchslam.global_mapping.learned_links import (
     MIN_LEARNED_MATCHES,
@@ -93,12 +93,14 @@ class GlobalMap:
         views: features of the images that were mapped, by row, learned ones included.
         pairs: all verified pairs of them.
         held_back: rows of the pairs that mapping did not use.
+        doubtful: frames of images that only learned features hold, in a map that pairs contradict somewhere.
     """
 
     run: Run
     views: list[FrameFeatures]
     pairs: list[ViewPair]
     held_back: frozenset[int]
+    doubtful: frozenset[int] = frozenset()
 
 
 Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
@@ -209,32 +211,34 @@ class GlobalMapper:
         found = self.reconstruct(views, used)
         if isinstance(found, str):
             return self._failed(found, views, pairs)
+        doubtful: frozenset[int] = frozenset()
         learned = self._learned(views, open_links(*found[1:]))
         if learned is not None:
             every, left_out = pairs + learned.pairs, choose_held_back(learned.pairs)
             kept = [pair for row, pair in enumerate(learned.pairs) if row not in left_out]
             left_out = held_back | {len(pairs) + row for row in left_out}
             tied = self.reconstruct(views, used, LearnedPairs(learned.views, kept))
-            scores = [self._score(made, learned.views, every, left_out) for made in (found, tied)]
-            if not isinstance(tied, str) and scores[1] > scores[0]:
-                found, views, pairs, held_back = tied, learned.views, every, left_out
+            if not isinstance(tied, str):
+                before, after = (self._check(made, learned.views, every, left_out) for made in (found, tied))
+                if after.score > before.score:
+                    added = set(tied[0].tolist()) - set(found[0].tolist())
+                    doubtful = frozenset() if after.is_right else frozenset(views[row].index for row in added)
+                    found, views, pairs, held_back = tied, learned.views, every, left_out
         run = self.finish(views, *found)
-        return GlobalMap(run, views, pairs, held_back)
+        return GlobalMap(run, views, pairs, held_back, doubtful)
 
-    def _score(
+    def _check(
         self,
-        made: Reconstructed | str,
+        made: Reconstructed,
         views: list[FrameFeatures],
         pairs: list[ViewPair],
         held_back: frozenset[int],
-    ) -> float:
-        """How well pairs of images agree with a reconstruction; see `MapCheck.score`."""
-        if isinstance(made, str):
-            return 0.0
+    ) -> MapCheck:
+        """What pairs of images say of a reconstruction."""
         rows, _, found = made
         known = torch.zeros(len(views), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
         reduction = self.scaled.features.reduction(self.camera.size)
-        return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction).score
+        return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction)
 
     def _learned(
         self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]]

@@ -113,7 +113,7 @@ def map_recording(
         poses = poses_of(run, made.views)
         return check_map(*poses, made.views, made.pairs, own, made.held_back, reduction)
 
-    whole = None if made.run.failure else checked(made.run)
+    whole = None if made.run.failure else checked(made.run).doubting(made.doubtful)
     if go_on is not None:
         is_whole = len(made.run.trajectory) == len(made.run.results)
         if whole is not None and whole.is_right and is_whole:
