@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -135,3 +136,36 @@ def test_weights_decide_whether_links_are_tied(tmp_path: Path, monkeypatch: pyte
     assert found is not None
     assert (found.features.kind, found.matching.matcher) == ("xfeat", "lightglue")
     assert learned_config(load_config(None, ["features.kind=orb"])) is None
+
+
+@pytest.mark.parametrize(
+    ("scores", "is_right", "views", "doubtful"),
+    [
+        ((0.5, 0.9), True, TIED.views, set()),
+        ((0.5, 0.9), False, TIED.views, {5, 6, 7, 8, 9}),
+        ((0.9, 0.5), True, VIEWS, set()),
+        ((0.9, 0.9), True, VIEWS, set()),
+    ],
+)
+def test_learned_links_are_kept_where_pairs_prefer_the_map(
+    scores: tuple[float, float],
+    is_right: bool,
+    views: list[FrameFeatures],
+    doubtful: set[int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Images that only they hold are doubted where pairs contradict that map."""
+    mapper = GlobalMapper(open_sequence("synthetic:room?frames=10"), CAMERA, Config(), None)
+    none = torch.zeros(0, dtype=torch.int64)
+    maps = iter([(torch.arange(BREAK), none, none), (torch.arange(COUNT), none, none)])
+    checks = iter(SimpleNamespace(score=score, is_right=is_right) for score in scores)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.build_view_graph", lambda *_: PAIRS)
+    monkeypatch.setattr("torchslam.global_mapping.mapper.open_links", lambda *_: [([4], [5])])
+    monkeypatch.setattr(mapper, "_saved_views", lambda _: VIEWS)
+    monkeypatch.setattr(mapper, "_learned", lambda *_: TIED)
+    monkeypatch.setattr(mapper, "reconstruct", lambda *_: next(maps))
+    monkeypatch.setattr(mapper, "_check", lambda *_: next(checks))
+    monkeypatch.setattr(mapper, "finish", lambda *_: None)
+    made = mapper.run()
+    assert made.views is views
+    assert made.doubtful == doubtful

@@ -67,6 +67,7 @@ class World:
             False: a_check(),
         }  # by whether it is the whole map
         self.online_check: MapCheck | None = a_check()
+        self.doubtful: frozenset[int] = frozenset()
         self.mapped: list[Any] = []
         self.given: Any = "not asked"
         self.checked_online = 0
@@ -82,7 +83,13 @@ class World:
 
             def run(self, results: Any) -> SimpleNamespace:
                 world.mapped.append(results)
-                return SimpleNamespace(run=world.whole, views=[], pairs=["pair"], held_back=frozenset({0}))
+                return SimpleNamespace(
+                    run=world.whole,
+                    views=[],
+                    pairs=["pair"],
+                    held_back=frozenset({0}),
+                    doubtful=world.doubtful,
+                )
 
         def check_online(run: Run) -> MapCheck | None:
             world.checked_online += 1
@@ -248,6 +255,16 @@ def test_the_camera_is_given_with_its_error(world: World) -> None:
     assert torch.equal(world.given.camera.params[:4], CAMERA.params.double())
     world.map(a_run(posed=1), Mapping.GLOBAL, "camera.std=0")
     assert world.given is None
+
+
+def test_frames_that_the_mapper_doubts_are_uncertain(world: World) -> None:
+    world.doubtful, world.checks[False] = frozenset({7, 8}), a_check(0.5)
+    made = world.map(a_run(lost=3))
+    assert made.kept is Mapping.GLOBAL
+    states = [result.state for result in made.run.results]
+    assert [row for row, state in enumerate(states) if state is State.UNCERTAIN] == [7, 8]
+    assert made.check is not None
+    assert made.check.uncertain == (7, 8)
 
 
 def test_doubted_frames_are_uncertain() -> None:

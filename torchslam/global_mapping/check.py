@@ -134,6 +134,8 @@ class MapCheck:
     def doubting(self, frames: Collection[int]) -> MapCheck:
         """The same check with these frames among those that are not certain."""
         doubted = sorted(set(self.certain) & set(frames))
+        if not doubted:
+            return self
         return replace(
             self,
             certain=tuple(frame for frame in self.certain if frame not in doubted),
