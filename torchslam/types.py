@@ -130,6 +130,8 @@ class FrameFeatures:
         information: as in `KeypointNoise`, of the keypoints; (N, 0) if the feature extractor gives none.
         image: gray, if the matcher wants it.
         backlog: as in `Frame`.
+        detected: pixels at which the extractor found the keypoints. They differ from `keypoints` where a rolling
+            shutter was corrected, see `torchslam.geometry.SensorModel`; `keypoints` themselves if omitted.
     """
 
     index: int
@@ -146,9 +148,14 @@ class FrameFeatures:
     )
     image: Float[Tensor, "1 1 H W"] | None = None
     backlog: int = 0
+    detected: Float[Tensor, "N 2"] = field(
+        default_factory=lambda: torch.zeros(0, 2, dtype=torch.float32, device="cpu")
+    )
 
     def __post_init__(self) -> None:
         _fill_information(self)
+        if len(self.detected) != len(self.keypoints):
+            object.__setattr__(self, "detected", self.keypoints)
 
     @classmethod
     def of(cls, frame: Frame, features: Features, like: Tensor) -> FrameFeatures:

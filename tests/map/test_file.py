@@ -141,8 +141,8 @@ def test_missing_damaged_and_unknown_files_are_named(path: Path) -> None:
         ({"torchslam": "format 4"}, "not a torchslam map"),
         ({"torchslam": "[3]"}, "not a torchslam map"),
         ({"torchslam": '{"size": 3}'}, "not a torchslam map"),
-        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 1"),
-        ({"torchslam": '{"format": 2}'}, "map format 2, this version reads format 1"),
+        ({"torchslam": '{"format": 99}'}, "map format 99, this version reads format 2"),
+        ({"torchslam": '{"format": 1}'}, "map format 1, this version reads format 2"),
     ],
 )
 def test_other_programs_and_formats_are_refused(

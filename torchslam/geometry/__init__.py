@@ -63,6 +63,7 @@ from torchslam.geometry.preintegration import (
     with_bias_change,
 )
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
+from torchslam.geometry.sensor import SensorModel, SharedCamera
 from torchslam.geometry.similarity import Similarity, estimate_similarity, umeyama
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
@@ -72,7 +73,7 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
-from torchslam.geometry.undistorted import SharedCamera, UndistortedKeypoints, Undistortion
+from torchslam.geometry.undistorted import UndistortedKeypoints, Undistortion
 
 __all__ = [
     "CHI_SQUARE_95",
@@ -83,6 +84,7 @@ __all__ = [
     "KeypointNoise",
     "MultiViewTriangulation",
     "RelativePose",
+    "SensorModel",
     "SharedCamera",
     "Similarity",
     "Triangulation",

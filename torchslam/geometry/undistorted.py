@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import KeypointNoise, whitening
-from torchslam.geometry.rolling_shutter import Readout
 
 _NODES = 2**17  # of a table, at most: a node every two pixels of an image of 752 x 480
 _LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some thousandths of one
@@ -120,21 +119,3 @@ class Undistortion:
         inverse = torch.where(is_within[:, None, None], inverse, 0.0)
         inverse = inverse.permute(2, 1, 0)
         return torch.cat((exact.xy, exact.slope.flatten(0, 1), inverse.flatten(0, 1))).mT.contiguous()
-
-
-class SharedCamera:
-    """The camera that the components of a running system share; it changes where the run finds a better one.
-
-    Attributes:
-        current: The camera of the map as it is now.
-        readout: Of its rolling shutter; None: a global shutter, as far as is known.
-        undistortion: Of the keypoints of its images.
-    """
-
-    def __init__(self, camera: Camera) -> None:
-        self.readout: Readout | None = None
-        self.replace(camera)
-
-    def replace(self, camera: Camera) -> None:
-        """Use another camera from now on."""
-        self.current, self.undistortion = camera, Undistortion(camera)

@@ -80,7 +80,7 @@ def _add_colors(total: Tensor, slam_map: Map, keyframe: int, sequence: Sequence)
         return
     ids = slam_map.keyframes["point_ids"][keyframe]
     height, width = image.shape[:2]
-    pixels = slam_map.keyframes["keypoints"][keyframe][ids >= 0].round().long()
+    pixels = slam_map.keyframes["detected"][keyframe][ids >= 0].round().long()
     colors = image[pixels[:, 1].clamp(0, height - 1), pixels[:, 0].clamp(0, width - 1)].long()
     ones = torch.ones_like(colors[:, :1])
     total.index_add_(0, ids[ids >= 0], torch.cat((colors, ones), dim=1))

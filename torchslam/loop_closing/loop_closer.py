@@ -19,7 +19,7 @@ from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecor
 from torchslam.loop_closing.relative_sim3 import neighborhood
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
-from torchslam.mapping.local_bundle import Observe, adjust_all
+from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import match_in_keyframes, merge_points
 from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
 from torchslam.tracking.relocalization import Candidate
@@ -41,7 +41,6 @@ class LoopCloser:
     Attributes:
         loop_closures: records of all loop closures and merges so far.
         loop_precheck: key of the last keyframe of `precheck`, and whether a loop was detected.
-        observe: the observations by keyframes, as the adjustment of the whole map uses them.
     """
 
     def __init__(
@@ -50,7 +49,6 @@ class LoopCloser:
         self.camera = camera
         self.config = config
         self.atlas = atlas
-        self.observe: Observe = Map.observations
         self.keyframe_database = KeyframeDatabase()
         self.loop_detector = LoopDetector(camera, config, atlas, self.keyframe_database, matcher)
         self.loop_closures: list[LoopClosureRecord] = []
@@ -104,20 +102,18 @@ class LoopCloser:
         """Close a loop or merge two submaps; return the submap and the row of the keyframe in it."""
         self.loop_closures.append(found.closure)
         if found.is_loop:
-            close_loop(found, self.camera.current, self.config, self.observe)
+            close_loop(found, self.camera.current, self.config)
             return found.submap, found.keyframe
-        submap, keyframe = merge_maps(found, self.camera.current, self.config, self.observe)
+        submap, keyframe = merge_maps(found, self.camera.current, self.config)
         self.atlas.remove(found.submap if submap is found.matched_submap else found.matched_submap)
         return submap, keyframe
 
 
-def close_loop(
-    found: LoopCandidate, camera: Camera, config: Config, observe: Observe = Map.observations
-) -> None:
+def close_loop(found: LoopCandidate, camera: Camera, config: Config) -> None:
     """Correct the drift of a submap by a pose graph, then fuse landmarks; the first keyframe stays."""
     submap = found.submap
     submap.apply_sim3_correction(essential_graph_solution(found))
-    fuse_and_adjust(submap, found.keyframe, found.matched_keyframe, camera, config, observe)
+    fuse_and_adjust(submap, found.keyframe, found.matched_keyframe, camera, config)
 
 
 def essential_graph_solution(found: LoopCandidate) -> Float[Tensor, "K 4 4"]:
@@ -136,9 +132,7 @@ def essential_graph_solution(found: LoopCandidate) -> Float[Tensor, "K 4 4"]:
     ).S_cw
 
 
-def merge_maps(
-    found: LoopCandidate, camera: Camera, config: Config, observe: Observe = Map.observations
-) -> tuple[Submap, int]:
+def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Submap, int]:
     """Merge the newer of two submaps into the older one; return it and the row of the keyframe in it.
 
     The tracking state stays that of the keyframe's submap.
@@ -147,13 +141,13 @@ def merge_maps(
     if other.number < submap.number:
         offset = other.map.num_keyframes
         other.merge(submap, relation.S_21)
-        fuse_and_adjust(other, found.keyframe + offset, found.matched_keyframe, camera, config, observe)
+        fuse_and_adjust(other, found.keyframe + offset, found.matched_keyframe, camera, config)
         return other, found.keyframe + offset
     offset = submap.map.num_keyframes
     tracking = submap.tracking
     submap.merge(other, sim3_inverse(relation.S_21))
     submap.tracking = tracking
-    fuse_and_adjust(submap, found.keyframe, found.matched_keyframe + offset, camera, config, observe)
+    fuse_and_adjust(submap, found.keyframe, found.matched_keyframe + offset, camera, config)
     return submap, found.keyframe
 
 
@@ -163,7 +157,6 @@ def fuse_and_adjust(
     matched_keyframe: int,
     camera: Camera,
     config: Config,
-    observe: Observe = Map.observations,
 ) -> None:
     """Fuse landmarks between the neighborhoods of two keyframes, and adjust the whole map, twice.
 
@@ -173,9 +166,9 @@ def fuse_and_adjust(
     there = neighborhood(submap.map, matched_keyframe, _VISIT_KEYFRAMES)
     fuse_landmarks(submap.map, here, there, camera, config)
     if config.loop_closing.global_bundle_adjustment and config.bundle_adjustment.local:
-        adjust_all(submap.map, camera, config.bundle_adjustment, observe=observe)
+        adjust_all(submap.map, camera, config.bundle_adjustment)
         fuse_landmarks(submap.map, here, there, camera, config)
-        adjust_all(submap.map, camera, config.bundle_adjustment, observe=observe)
+        adjust_all(submap.map, camera, config.bundle_adjustment)
 
 
 def fuse_with_earlier_visits(submap: Submap, keyframe: int, camera: Camera, config: Config) -> None:

@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.geometry import sim3_inverse, sim3_scale
+from torchslam.geometry import SensorModel, sim3_inverse, sim3_scale
 from torchslam.geometry.transforms import (
     carry_points,
     covariances_with_unit,
@@ -115,6 +115,11 @@ class Submap:
     def fork(self) -> Submap:
         """Return a submap that shares map and posed frames but has a tracking state of its own."""
         return replace(self, tracking=replace(self.tracking))
+
+    def correct_keyframes(self, sensor: SensorModel, newest: int | None = None) -> None:
+        """Set the keypoints of keyframes to those of a global shutter; `newest`: how many of them, None: all."""
+        rows = None if newest is None else torch.argsort(self.map.keys, descending=True)[:newest]
+        self.posed_frames.correct_keyframes(self.map, sensor, rows)
 
     def apply_sim3_correction(self, S_cw: Float[Tensor, "K 4 4"]) -> None:
         """Move every keyframe to the pose of its Sim(3) S_cw, world to camera.

@@ -26,7 +26,7 @@ from torchslam.map.table import FRAMES, KEYFRAMES, OBSERVATIONS, POINTS, Schema,
 from torchslam.map.unit import MetricUnit
 from torchslam.utils.files import check_regular, parse_json, write_whole
 
-FORMAT = 1
+FORMAT = 2
 """Number of the file format; docs/versions.md says which version reads which."""
 TABLES: dict[str, Schema] = {
     "points": POINTS,
@@ -47,7 +47,7 @@ Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; none if a table is empty."""
 
 _POSES = "T_cw", "T_cr"
-_LENGTHS = "positions_w", "keypoints", "pixels", "scales", "scale_distance", "timestamp"
+_LENGTHS = "positions_w", "keypoints", "detected", "pixels", "scales", "scale_distance", "timestamp"
 
 
 @dataclass(frozen=True)

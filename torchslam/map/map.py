@@ -166,6 +166,7 @@ class Map:
             frame_index=torch.tensor([view.index], device=T_cw.device),
             timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=T_cw.device),
             keypoints=view.keypoints[None],
+            detected=view.detected[None],
             scales=view.scales[None],
             angles=view.angles[None],
             descriptors=view.descriptors[None],
@@ -264,8 +265,16 @@ class Map:
     def _count(self, point_ids: Tensor, step: int) -> None:
         self.points["times_observed"].index_add_(0, point_ids, torch.full_like(point_ids, step))
 
-    def observations(self, keyframes: Int[Tensor, " B"] | None = None) -> Observations:
-        """Return all observations by the given keyframes, or by all."""
+    def observations(
+        self, keyframes: Int[Tensor, " B"] | None = None, as_detected: bool = False
+    ) -> Observations:
+        """Return all observations by the given keyframes, or by all.
+
+        Args:
+            keyframes: Rows; None: all.
+            as_detected: Whether the pixels are those at which keypoints were found, in place of those of a global
+                shutter.
+        """
         if keyframes is None:
             keyframes = torch.arange(self.num_keyframes, device=self.T_cw.device)
         table = self.keyframes["point_ids"][keyframes]
@@ -275,7 +284,7 @@ class Map:
             keyframe,
             keypoint,
             table[row, keypoint],
-            self.keyframes["keypoints"][keyframe, keypoint],
+            self.keyframes["detected" if as_detected else "keypoints"][keyframe, keypoint],
             self.keyframes["scales"][keyframe, keypoint],
             self.keyframes["information"][keyframe, keypoint],
         )
@@ -299,7 +308,7 @@ class Map:
     def frame_features(self, keyframe: int) -> FrameFeatures:
         """Return the features of a keyframe."""
         row = {name: column[keyframe] for name, column in self.keyframes.columns().items()}
-        names = ("keypoints", "scales", "angles", "descriptors", "mask", "information")
+        names = ("keypoints", "detected", "scales", "angles", "descriptors", "mask", "information")
         return FrameFeatures(
             index=int(row["frame_index"]),
             timestamp=float(row["timestamp"]),

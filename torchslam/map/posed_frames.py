@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry import CHI_SQUARE_95, Camera, KeypointNoise, passes_gate, se3_inverse, transform
+from torchslam.geometry import (
+    CHI_SQUARE_95,
+    Camera,
+    KeypointNoise,
+    SensorModel,
+    passes_gate,
+    se3_inverse,
+    transform,
+)
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
-from torchslam.types import FrameFeatures, Observations, PoseEstimate, Trajectory
+from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
 
 # Twice the distance of the gate: the final adjustment moves frames by less.
 _OUTLIER_CHI_SQUARE = 4.0 * CHI_SQUARE_95
@@ -52,7 +59,7 @@ class PosedFrames:
             frame_row=row.expand(estimate.inliers),
             point_ids=estimate.point_ids,
             keypoint_index=estimate.keypoints,
-            pixels=view.keypoints[estimate.keypoints],
+            pixels=view.detected[estimate.keypoints],
             scales=view.scales[estimate.keypoints],
             information=view.information[estimate.keypoints],
         )
@@ -133,7 +140,7 @@ class PosedFrames:
         )
         is_kept = torch.zeros(len(self), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
         row_of = rows.new_full((len(kept),), -1).index_copy(0, keyframes, rows)
-        seen = slam_map.observations(keyframes)
+        seen = slam_map.observations(keyframes, as_detected=True)
         self._overwrite(
             torch.nonzero(is_kept[self.observations["frame_row"]])[:, 0],
             frame_row=row_of[seen.keyframe_index],
@@ -230,28 +237,36 @@ class PosedFrames:
         noise = KeypointNoise(seen["scales"], seen["information"])
         return passes_gate(noise.squared_reprojection(points_c, pixels, camera), chi_square)
 
-    def global_shutter(
-        self, seen: Observations, slam_map: Map, camera: Camera, readout: Readout
-    ) -> Observations:
-        """Observations by keyframes, with the keypoints where a global shutter would have seen them.
+    def correct_keyframes(
+        self, slam_map: Map, sensor: SensorModel, keyframes: Int[Tensor, " R"] | None = None
+    ) -> None:
+        """Set the keypoints of keyframes to those of a global shutter, by the velocities of their frames.
 
-        The velocity of a keyframe is that of its frame among all posed frames.
+        Keypoints without a point count as at the median depth of the others.
+
+        Args:
+            slam_map: the map.
+            sensor: by which the keypoints are corrected.
+            keyframes: rows; None: all.
         """
-        T_cw, times = self.T_cw(slam_map), self.frames["timestamp"]
-        velocities, _ = frame_velocities(T_cw, times, self.frames["session"])
-        keys, order = self.keys.sort()
-        row = order[torch.searchsorted(keys, slam_map.keys).clamp_max(len(keys) - 1)]
-        is_posed = self.keys[row] == slam_map.keys
-        velocities = torch.where(is_posed[:, None], velocities[row], 0.0)[seen.keyframe_index]
-        pixels = global_shutter_pixels(
-            seen.pixels,
-            slam_map.T_cw[seen.keyframe_index],
-            velocities,
-            slam_map.positions_w[seen.point_index],
-            camera,
-            readout.seconds.to(seen.pixels),
+        table = slam_map.keyframes
+        rows = torch.arange(len(table), device=slam_map.T_cw.device) if keyframes is None else keyframes
+        detected, ids = table["detected"][rows], table["point_ids"][rows]
+        if sensor.readout is None:
+            table["keypoints"][rows] = detected
+            return
+        velocities, _ = frame_velocities(
+            self.T_cw(slam_map), self.frames["timestamp"], self.frames["session"]
         )
-        return replace(seen, pixels=pixels)
+        keys, order = self.keys.sort()
+        frame = order[torch.searchsorted(keys, slam_map.keys[rows]).clamp_max(len(keys) - 1)]
+        is_posed = self.keys[frame] == slam_map.keys[rows]
+        velocities = torch.where(is_posed[:, None], velocities[frame], 0.0)
+        depths = transform(slam_map.T_cw[rows], slam_map.positions_w[ids.clamp_min(0)])[..., 2]
+        depths = torch.where((ids >= 0) & (depths > 0), depths, torch.nan)
+        depths = torch.where(depths.isnan(), depths.nanmedian(dim=1, keepdim=True).values, depths)
+        corrected = sensor.at_middle_row(detected, velocities, depths)
+        table["keypoints"][rows] = torch.where(corrected.isfinite(), corrected, detected)
 
     def graph(
         self,
@@ -273,7 +288,7 @@ class PosedFrames:
             calibration: the given camera with its error; None: `camera` is exact.
             readout: of a rolling shutter; None: a global one.
         """
-        seen = slam_map.observations()
+        seen = slam_map.observations(as_detected=True)
         point_ids = torch.unique(seen.point_index)
         between = torch.nonzero(~torch.isin(self.keys, slam_map.keys))[:, 0]
         slot = torch.full((len(self),), -1, device=point_ids.device)

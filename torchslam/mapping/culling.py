@@ -100,5 +100,5 @@ def remove_masked_observations(
 ) -> None:
     """Remove observations of the local keyframes at pixels for which `is_masked` is true."""
     slam_map = submap.map
-    seen = slam_map.observations(torch.sort(submap.tracking.local_keyframes).values)
+    seen = slam_map.observations(torch.sort(submap.tracking.local_keyframes).values, as_detected=True)
     slam_map.remove_masked_observations(seen, is_masked(seen.pixels))

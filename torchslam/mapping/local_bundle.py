@@ -59,8 +59,6 @@ PendingSolution = Callable[[], Solution]
 """Waits for the solution of a started adjustment."""
 Solver = Callable[[BundleProblem, int], PendingSolution]
 """Starts a local bundle adjustment, given its problem and the number of iterations."""
-Observe = Callable[[Map, Int[Tensor, " K"]], Observations]
-"""The observations of a map by some of its keyframes, with the keypoints that an adjustment uses."""
 
 
 def select_window(
@@ -68,7 +66,6 @@ def select_window(
     keyframe: int,
     camera: Camera,
     settings: BundleAdjustmentConfig,
-    observe: Observe = Map.observations,
 ) -> BundleWindow | None:
     """Select a keyframe, the keyframes most covisible with it and their points; None if there is nothing to adjust.
 
@@ -80,7 +77,7 @@ def select_window(
     shared = slam_map.count_observed(slam_map.observed_points(free))
     shared[free] = 0
     fixed = top_rows(shared, settings.max_fixed_keyframes, least=1)
-    return build_window(slam_map, free, fixed, camera, observe)
+    return build_window(slam_map, free, fixed, camera)
 
 
 def solve_local(problem: BundleProblem, iterations: int) -> Solution:
@@ -101,7 +98,6 @@ def adjust_all(
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
     tolerance: float = BUNDLE_OPTIONS.tolerance,
-    observe: Observe = Map.observations,
 ) -> Camera:
     """Run a global bundle adjustment with the first keyframe fixed.
 
@@ -112,13 +108,12 @@ def adjust_all(
         progress: Called before each iteration; if it raises, the map stays as it was.
         calibration: The given camera with its error: the camera is adjusted as well; None: it is exact.
         tolerance: Predicted relative reduction of the cost that ends it.
-        observe: The observations by its keyframes.
 
     Returns:
         The camera of the adjusted map.
     """
     everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
-    window = build_window(slam_map, everyone[1:], everyone[:1], camera, observe)
+    window = build_window(slam_map, everyone[1:], everyone[:1], camera)
     if window is None:
         return camera
     solution = solve_window(window.problem, settings, progress, calibration, tolerance)
@@ -152,11 +147,10 @@ def build_window(
     free: Int[Tensor, " K"],
     fixed: Int[Tensor, " R"],
     camera: Camera,
-    observe: Observe = Map.observations,
 ) -> BundleWindow | None:
     """Build the problem of free keyframes, their points and the fixed keyframes; None if nothing is observed."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
-    seen = observe(slam_map, keyframes)
+    seen = slam_map.observations(keyframes)
     rows = true_indices(is_among(seen.point_index, slam_map.observed_points(free)))
     ids = seen.point_index.index_select(0, rows)
     which = ranks_among(ids, distinct(ids))
@@ -261,16 +255,12 @@ class AsyncBundleAdjustment:
 
     Args:
         solver: solver of the problem; default: in this process
-
-    Attributes:
-        observe: the observations by the keyframes of a window.
     """
 
     def __init__(
         self, camera: SharedCamera, settings: BundleAdjustmentConfig, solver: Solver = solve_here
     ) -> None:
         self.camera, self.settings, self.solver = camera, settings, solver
-        self.observe: Observe = Map.observations
         self._pending: _Adjustment | None = None
 
     @contextmanager
@@ -316,9 +306,7 @@ class AsyncBundleAdjustment:
         pending = self._pending
         if pending is None or pending.window is not None:
             return
-        window = select_window(
-            pending.slam_map, pending.keyframe, self.camera.current, self.settings, self.observe
-        )
+        window = select_window(pending.slam_map, pending.keyframe, self.camera.current, self.settings)
         if window is not None:
             pending.window = window
             pending.solution = self.solver(window.problem, self.settings.local_iterations)

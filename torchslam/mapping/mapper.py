@@ -188,6 +188,7 @@ class MapInitializer:
 
     def _explains(self, submap: Submap, view: FrameFeatures) -> bool:
         """Pose a frame from before the map was initialized; return whether most of its matches are inliers."""
+        view = self.tracker.at_middle_row(submap, view)
         estimate = self.tracker.track(submap, view)
         self.tracker.commit(submap, view, estimate)
         if estimate is None:

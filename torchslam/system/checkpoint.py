@@ -74,7 +74,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
         ],
         "next_camera_check": slam.online_camera.next_check,
         "next_readout_check": slam.online_camera.next_readout_check,
-        "readout": _plain_readout(slam.shared_camera.readout),
+        "readout": _plain_readout(slam.shared_camera.model.readout),
         "loop_closures": [astuple(closure) for closure in slam.loop_closer.loop_closures],
     }
     write_tensors(

@@ -44,6 +44,10 @@ class LocalMapping:
             context.tracker.reset_to_keyframe(submap, keyframe)
         context.tracker.count_found(submap.map, estimate)
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
+        if reason and context.camera.model.readout is not None:
+            submap.correct_keyframes(
+                context.camera.model, newest=2
+            )  # the frame after the one before is known now
         return reason
 
     def add_tentative_keyframe(
@@ -140,7 +144,8 @@ class BackwardTracking:
         doubted: Savepoint | None = None
         failures = 0
         with context.clock("backwards"):
-            for view in reversed(log.unposed(before)):
+            for unposed in reversed(log.unposed(before)):
+                view = context.tracker.at_middle_row(submap, unposed)
                 found = locate(context, submap, view, is_sure=doubted is None)
                 if found is None or found[1].certainty is Certainty.WRONG or found[1].is_jump:
                     failures += 1

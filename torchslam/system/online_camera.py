@@ -7,7 +7,7 @@ with it. The prior stays the given camera, so that no evidence counts twice.
 
 A rolling shutter bends images as another lens would. So the residuals are tested for a readout as well, and always
 before the camera is moved. Where they show one, or where one is given, the camera is judged, the map adjusted and
-frames tracked by keypoints that are corrected to the middle row. The map keeps them as they were found.
+frames tracked by keypoints that are corrected to the middle row.
 """
 
 from __future__ import annotations
@@ -17,16 +17,13 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
-from jaxtyping import Int
-from torch import Tensor
 
 from torchslam.config import CameraConfig, Config
-from torchslam.geometry import Camera, SharedCamera
+from torchslam.geometry import Camera, SensorModel, SharedCamera
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.geometry.similarity import in_place_of
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import (
     MAP_OPTIONS,
     BundleWindow,
@@ -38,7 +35,6 @@ from torchslam.mapping.local_bundle import (
 from torchslam.optim import BundleProblem, camera_evidence
 from torchslam.optim.camera_evidence import CameraEstimate
 from torchslam.optim.rolling_shutter import ONLINE_FRAMES, find_rolling_shutter, readout_by
-from torchslam.types import Observations
 
 FIRST_KEYFRAMES, MAX_KEYFRAMES, GROWTH = 6, 100, 1.3
 """Keyframes of the map at the first check and the last one, and their ratio from check to check. Tried from 6 to 8 and
@@ -101,7 +97,7 @@ class OnlineCamera:
         self.camera, self.settings, self.atlas = camera, config.bundle_adjustment, atlas
         self.given = CameraMeasurement.of(camera.current, config.camera.std) if config.camera.std else None
         self.given_readout = given_readout(config.camera)
-        camera.readout = self.given_readout if self.given_readout.is_given else None
+        camera.use(SensorModel(camera.current, self.given_readout if self.given_readout.is_given else None))
         self.changes: list[CameraChange] = []
         self.next_check, self.next_readout_check = FIRST_KEYFRAMES, FIRST_READOUT_KEYFRAMES
 
@@ -109,18 +105,9 @@ class OnlineCamera:
         self, changes: list[CameraChange], next_checks: tuple[int, int], readout: Readout | None
     ) -> None:
         """Go on where a checkpoint was written; the checks are the next ones of the camera and of a readout."""
-        self.changes, self.camera.readout = changes, readout
+        self.changes = changes
         self.next_check, self.next_readout_check = next_checks
-        if changes:
-            self.camera.replace(changes[-1].camera)
-
-    def observations(self, slam_map: Map, keyframes: Int[Tensor, " K"]) -> Observations:
-        """The observations by keyframes of a map, with the keypoints of a global shutter."""
-        seen, readout = slam_map.observations(keyframes), self.camera.readout
-        if readout is None:
-            return seen
-        (posed,) = (submap.posed_frames for submap in self.atlas if submap.map is slam_map)
-        return posed.global_shutter(seen, slam_map, self.camera.current, readout)
+        self.camera.use(SensorModel(changes[-1].camera if changes else self.camera.current, readout))
 
     def check(self, submap: Submap) -> bool:
         """Check the camera if the map has grown enough, and take over a better one.
@@ -135,16 +122,16 @@ class OnlineCamera:
         if self.given is None or not self.settings.local or not self.next_check <= keyframes <= MAX_KEYFRAMES:
             return False
         self.next_check = math.ceil(keyframes * GROWTH)
-        before, is_tested = self.camera.readout, False
+        before, is_tested = self.camera.model.readout, False
         if before is not None or keyframes >= self.next_readout_check:
             self.next_readout_check, is_tested = math.ceil(keyframes * READOUT_GROWTH), True
             self._find_readout(submap)
         judged = self._judged(submap)
         if judged is not None and judged.departure >= MIN_DEPARTURE and not is_tested:
             self._find_readout(submap)
-            judged = judged if self.camera.readout is None else self._judged(submap)
+            judged = judged if self.camera.model.readout is None else self._judged(submap)
         is_off = judged is not None and judged.departure >= MIN_DEPARTURE
-        if judged is None or not (is_off or (before is None and self.camera.readout is not None)):
+        if judged is None or not (is_off or (before is None and self.camera.model.readout is not None)):
             return False
         window, at, estimate, departure = judged
         if is_off:
@@ -155,29 +142,32 @@ class OnlineCamera:
         T_cw, points_w = in_place_of(submap.map.T_cw[window.keyframes], found.T_cw, found.points_w)
         apply_solution(submap.map, window, T_cw, points_w, found.camera)
         self.camera.replace(found.camera)
-        change = CameraChange(_newest_frame(submap), found.camera, departure, self.camera.readout)
+        change = CameraChange(_newest_frame(submap), found.camera, departure, self.camera.model.readout)
         self.changes.append(change)
         for other in self.atlas:
             if other is not submap:
-                adjust_all(other.map, found.camera, self.settings, observe=self.observations)
+                other.correct_keyframes(self.camera.model)
+                adjust_all(other.map, found.camera, self.settings)
         return True
 
     def _find_readout(self, submap: Submap) -> None:
         """Test the residuals for a readout, unless one is given, and use what they show from here on."""
         if not self.given_readout.is_sought:
             return
-        graph = submap.posed_frames.graph(submap.map, self.camera.current, readout=self.camera.readout)
+        graph = submap.posed_frames.graph(submap.map, self.camera.current, readout=self.camera.model.readout)
         found = find_rolling_shutter(graph, ONLINE_FRAMES, for_shaking=False)
         is_sure = found is not None and abs(found.readout) > READOUT_SIGMAS * found.readout_std
-        if is_sure or self.camera.readout is not None:
-            self.camera.readout = readout_by(found, self.given_readout) or self.camera.readout
+        if is_sure or self.camera.model.readout is not None:
+            readout = readout_by(found, self.given_readout) or self.camera.model.readout
+            self.camera.use(replace(self.camera.model, readout=readout))
+            submap.correct_keyframes(self.camera.model)
 
     def _judged(self, submap: Submap) -> _Judged | None:
         """Adjust all keyframes with a free camera; None where they do not determine it."""
         assert self.given is not None
         everyone = torch.arange(submap.map.num_keyframes, device=submap.map.T_cw.device)
         camera = with_radial_terms(self.camera.current)
-        window = build_window(submap.map, everyone[1:], everyone[:1], camera, self.observations)
+        window = build_window(submap.map, everyone[1:], everyone[:1], camera)
         if window is None:
             return None
         found = solve_window(window.problem, self.settings, calibration=self.given, tolerance=CHECK_TOLERANCE)

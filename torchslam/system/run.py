@@ -13,7 +13,7 @@ import torch
 from torchslam.config import Config
 from torchslam.data.sequence import EndOfSequence, Frames, Sequence
 from torchslam.errors import FrameError, InitializationError, TorchslamError
-from torchslam.geometry import Camera, SharedCamera, se3_inverse
+from torchslam.geometry import Camera, SensorModel, SharedCamera, se3_inverse
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
 from torchslam.geometry.gating import passes_gate
 from torchslam.geometry.rolling_shutter import Readout
@@ -39,7 +39,7 @@ from torchslam.optim.run_graph import (
 from torchslam.system.front_end import source
 from torchslam.system.online_camera import CameraChange, OnlineCamera, given_readout
 from torchslam.system.session import Session
-from torchslam.types import Frame, Observations, Reason, State, StepResult, Trajectory
+from torchslam.types import Frame, Reason, State, StepResult, Trajectory
 
 
 class _System(Protocol):
@@ -399,16 +399,17 @@ class FinalAdjustment:
         if is_main:
             # Before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
             self.camera = camera = self._find_readout(submap, camera, given, progress)
+        submap.correct_keyframes(SensorModel(camera, self.readout))
         if not settled:
             # Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map
             # have removed that already, and what holds a weak link is often less exact than the rest.
-            seen, corrected = self._observations(submap, camera)
-            wrong = ~passes_gate(squared_errors(submap.map, corrected, camera), FINAL_CHI_SQUARE)
+            seen = submap.map.observations()
+            wrong = ~passes_gate(squared_errors(submap.map, seen, camera), FINAL_CHI_SQUARE)
             submap.map.remove_masked_observations(seen, wrong)
             submap.posed_frames.remove_outliers(
                 submap.map, camera, FINAL_CHI_SQUARE, LEAST_RATIO, self.readout
             )
-        find_final_variance(submap.map, self._observations(submap, camera)[1], camera)
+        find_final_variance(submap.map, submap.map.observations(), camera)
         if not settled:
             self.camera = camera = self._solve(submap, camera, given, progress, ROUGH).camera
         measured, evidence = given, None
@@ -419,6 +420,7 @@ class FinalAdjustment:
             camera, given, measured = found.prior.nearest(camera), found.prior, found.measured
         solution = self._solve(submap, camera, given, progress, SETTLED if settled else FINAL)
         self.camera = solution.camera
+        submap.correct_keyframes(SensorModel(self.camera, self.readout))
         if measured is not None:
             self.given, self.calibration = given, replace(measured, camera=self.camera)
         self._store_covariances(submap, solution)
@@ -456,14 +458,6 @@ class FinalAdjustment:
                 break
             camera = self._solve(submap, camera, given, progress, ROUGH, once=True).camera
         return camera
-
-    def _observations(self, submap: Submap, camera: Camera) -> tuple[Observations, Observations]:
-        """The observations by all keyframes, and the same with the keypoints of a global shutter."""
-        seen = submap.map.observations()
-        if self.readout is None:
-            return seen, seen
-        graph = self._graph(submap, camera)
-        return seen, replace(seen, pixels=graph.pixels[: len(seen)])  # those of keyframes come first
 
     def _graph(self, submap: Submap, camera: Camera) -> RunGraph:
         """The graph of a submap, with the keypoints of a global shutter as its poses are now."""

@@ -21,7 +21,7 @@ from torchslam.config import Config
 from torchslam.data.formats.image_file import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
-from torchslam.geometry import Camera, SharedCamera
+from torchslam.geometry import Camera, SensorModel, SharedCamera
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map, feature_mismatch, key_of
@@ -95,7 +95,7 @@ class SLAM:
 
     def reset(self) -> None:
         """Forget all submaps, and wait for a new initialization."""
-        self.shared_camera.replace(self.camera)
+        self.shared_camera.use(SensorModel(self.camera))
         self.start_session(Session(self.camera, Atlas(self.camera.params)))
 
     @classmethod
@@ -140,7 +140,6 @@ class SLAM:
         self.loop_closer = LoopCloser(self.shared_camera, self.scaled_config, self.atlas, self.matcher)
         self.scene_filter = SceneFilter(self.shared_camera, self.scaled_config)
         self.online_camera = OnlineCamera(self.shared_camera, self.config, self.atlas)
-        self.mapper.adjustment.observe = self.loop_closer.observe = self.online_camera.observations
         self._context = SystemContext(
             camera=self.shared_camera,
             config=self.scaled_config,

@@ -67,7 +67,9 @@ class StateMachine:
     def _track(self, filtered: FilteredView) -> FrameOutcome:
         """Maintain the map, track the frame, and do with it what its pose is good for."""
         self.maintenance.before_frame()
-        submap, view = self.active_map.current, filtered.view
+        submap = self.active_map.current
+        filtered = self._at_middle_row(submap, filtered)
+        view = filtered.view
         with self.context.clock("tracking"):
             located = locate(self.context, submap, view, is_sure=self.active_map.doubted is None)
         if located is None:
@@ -75,13 +77,23 @@ class StateMachine:
         estimate, verdict = located
         motion = NO_MOVEMENT
         if verdict.certainty is Certainty.CERTAIN:
-            whole = self.context.tracker.at_middle_row(submap, filtered.without_overlays)
-            corrected = replace(filtered, without_overlays=whole)
-            motion = self.context.scene_filter.detect_independent_motion(corrected, estimate)
+            motion = self.context.scene_filter.detect_independent_motion(filtered, estimate)
             verdict = Verdict(motion.rejection)
         if verdict.certainty is Certainty.CERTAIN and self.active_map.doubted is None:
             return self._map(filtered, estimate, motion.note)
         return self._hold(view, estimate, verdict)
+
+    def _at_middle_row(self, submap: Submap, filtered: FilteredView) -> FilteredView:
+        """The frame with the keypoints of a global shutter, by the velocity before it.
+
+        Static overlays are found in the image as it is.
+        """
+        correct = self.context.tracker.at_middle_row
+        return replace(
+            filtered,
+            view=correct(submap, filtered.view),
+            without_overlays=correct(submap, filtered.without_overlays),
+        )
 
     def confirm_map(self) -> None:
         """Confirm a provisional map as it is, with the frames that are held back."""

@@ -13,7 +13,6 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import SharedCamera, se3_inverse, transform
 from torchslam.geometry.lie import se3_log
-from torchslam.geometry.rolling_shutter import global_shutter_pixels
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
@@ -111,12 +110,11 @@ class Tracker:
 
         Args:
             submap: The submap with the tracking state.
-            view: The frame.
+            view: The frame, see `at_middle_row`.
             prior_T_cw: The pose around which matches are searched for; the predicted one if None.
             is_sure: True if the last poses are certain: a pose near the predicted one is tried first.
         """
         prior_T_cw = self.predict(submap) if prior_T_cw is None else prior_T_cw
-        view = self.at_middle_row(submap, view)
         candidates = self._candidates(submap, view, prior_T_cw)
         near = prior_T_cw if is_sure else None
         return self.localizer.locate(submap.map, view, candidates, submap.tracking.local_points, near)
@@ -127,21 +125,18 @@ class Tracker:
         All of them are corrected, as at the median depth of the local map, since it is not known yet what they see.
         Without a readout it is the view itself.
         """
-        camera, readout, tracking = self.camera.current, self.camera.readout, submap.tracking
-        if readout is None or tracking.velocity is None or not tracking.interval:
+        tracking = submap.tracking
+        if self.camera.model.readout is None or tracking.velocity is None or not tracking.interval:
             return view
         depths = transform(submap.T_cw, submap.map.positions_w[tracking.local_points])[:, 2]
         depths = depths[depths > 0]
         if len(depths) == 0:
             return view
-        rays = self.camera.undistortion.normalize(view.keypoints)
-        points_c = depths.median() * torch.cat((rays, torch.ones_like(rays[:, :1])), dim=-1)
-        still = torch.eye(4, dtype=rays.dtype, device=rays.device)[None]
-        velocity = se3_log(tracking.velocity) / tracking.interval
-        seconds = readout.seconds.to(rays)
-        pixels, points_c = view.keypoints[:, None], points_c[:, None]
-        corrected = global_shutter_pixels(pixels, still, velocity[None], points_c, camera, seconds)
-        return replace(view, keypoints=corrected[:, 0])
+        velocity = se3_log(tracking.velocity)[None] / tracking.interval
+        depth = depths.median().expand(1, len(view.detected))
+        return replace(
+            view, keypoints=self.camera.model.at_middle_row(view.detected[None], velocity, depth)[0]
+        )
 
     def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
         """Sets of matches by ever wider search: near the predicted pixels, in a wider window, in the whole image."""

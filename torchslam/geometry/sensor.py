@@ -1,0 +1,78 @@
+"""The sensor model: what turns a point of the scene into a keypoint.
+
+Camera, readout of the shutter and noise of the keypoints are one value, replaced as a whole. A frame asks it once what
+its keypoints mean (`SensorModel.at_middle_row`); from then on every stage works with the keypoints of a global shutter.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from torchslam.geometry.camera import Camera
+from torchslam.geometry.lie import se3_exp, transform
+from torchslam.geometry.rolling_shutter import Readout, row_fractions
+from torchslam.geometry.undistorted import Undistortion
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """Camera, shutter and noise of the images of a recording.
+
+    Attributes:
+        camera: of all frames.
+        readout: of a rolling shutter; None: a global shutter.
+    """
+
+    camera: Camera
+    readout: Readout | None = None
+
+    def at_middle_row(
+        self,
+        detected: Float[Tensor, "K N 2"],
+        velocities: Float[Tensor, "K 6"],
+        depths: Float[Tensor, "K N"],
+    ) -> Float[Tensor, "K N 2"]:
+        """Where a global shutter would have seen the keypoints of K frames, while their middle rows were exposed.
+
+        Args:
+            detected: pixels at which keypoints were found.
+            velocities: left perturbations of the poses of the frames per second, translation first.
+            depths: of the points that the keypoints see, along the optical axis.
+        """
+        if self.readout is None:
+            return detected
+        rays = self.camera.normalize(detected)
+        points_row = depths[..., None] * torch.cat((rays, torch.ones_like(rays[..., :1])), dim=-1)
+        elapsed = row_fractions(detected, self.camera.height) * self.readout.seconds.to(rays)
+        motions = se3_exp(-elapsed[..., None] * velocities[:, None])
+        pixels, is_valid = self.camera.project(transform(motions, points_row[..., None, :])[..., 0, :])
+        return torch.where(is_valid[..., None], pixels, detected)
+
+
+class SharedCamera:
+    """The sensor model that the components of a running system share; it changes where the run finds a better one.
+
+    Attributes:
+        model: The sensor model of the map as it is now.
+        undistortion: Of the keypoints of its images.
+    """
+
+    def __init__(self, camera: Camera, readout: Readout | None = None) -> None:
+        self.use(SensorModel(camera, readout))
+
+    @property
+    def current(self) -> Camera:
+        """The camera of the model."""
+        return self.model.camera
+
+    def use(self, model: SensorModel) -> None:
+        """Use another sensor model from now on."""
+        self.model, self.undistortion = model, Undistortion(model.camera)
+
+    def replace(self, camera: Camera) -> None:
+        """Use another camera with the same shutter from now on."""
+        self.use(replace(self.model, camera=camera))
