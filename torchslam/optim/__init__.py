@@ -8,7 +8,6 @@ from torchslam.optim._core.options import (
     LEAST_SQUARES_OPTIONS,
     POSE_GRAPH_OPTIONS,
     POSE_OPTIONS,
-    POSITION_OPTIONS,
     ROTATION_OPTIONS,
     UNWEIGHTED_ROTATION_OPTIONS,
     SolverOptions,
@@ -27,7 +26,6 @@ from torchslam.optim.bundle._factors import (
 from torchslam.optim.bundle._pose_covariance import pose_covariance
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.camera_evidence import CameraEstimate, CameraEvidence, camera_evidence
-from torchslam.optim.global_positioning import GlobalPositions, solve_positions
 from torchslam.optim.pose._refinement import RefinedPose, solve_pose
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, solve_pose_graph
 from torchslam.optim.rotation_averaging import RotationAverage, solve_rotations
@@ -38,7 +36,6 @@ __all__ = [
     "LEAST_SQUARES_OPTIONS",
     "POSE_GRAPH_OPTIONS",
     "POSE_OPTIONS",
-    "POSITION_OPTIONS",
     "ROTATION_OPTIONS",
     "UNWEIGHTED_ROTATION_OPTIONS",
     "Backward",
@@ -50,7 +47,6 @@ __all__ = [
     "Convergence",
     "DepthPrior",
     "FrameFactors",
-    "GlobalPositions",
     "LeastSquaresSolution",
     "Manifold",
     "Marginals",
@@ -71,6 +67,5 @@ __all__ = [
     "solve_least_squares",
     "solve_pose",
     "solve_pose_graph",
-    "solve_positions",
     "solve_rotations",
 ]
