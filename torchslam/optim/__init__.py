@@ -14,7 +14,6 @@ from torchslam.optim._core.options import (
 )
 from torchslam.optim._core.tangent import CameraPrior, PosePrior
 from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, solve_least_squares
-from torchslam.optim._old_names import bundle_adjust, minimize, pose_graph_optimize, refine_pose  # noqa: F401
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import (
     DepthPrior,

@@ -44,7 +44,6 @@ from torchslam.optim.measurements import (
 )
 from torchslam.optim.pose._refinement import solve_pose
 from torchslam.types import Trajectory
-from torchslam.utils.deprecation import OldCall
 from torchslam.utils.files import check_regular
 
 POSE_ITERATIONS = 30
@@ -341,10 +340,6 @@ class GraphSolution:
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
-@OldCall(
-    "graph kernel scale free_camera backward iterations tolerance progress strict frame_factors depth_prior",
-    GRAPH_OPTIONS,
-).accepted
 @full_precision
 def solve_graph(
     graph: ObservationGraph,
@@ -609,7 +604,6 @@ class _GraphSubmap(NamedTuple):
         return len(self.problem.T_cw) * len(self.points)
 
 
-@OldCall("graphs kernel scale backward iterations tolerance strict", GRAPH_OPTIONS).accepted
 @full_precision
 def solve_graphs(
     graphs: Sequence[ObservationGraph], *, options: SolverOptions = GRAPH_OPTIONS
