@@ -36,7 +36,8 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
-from torchslam.global_mapping.mapper import features_to_keep
+from torchslam.global_mapping.learned_links import learned_config
+from torchslam.global_mapping.mapper import features_to_keep, mapping_config
 from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
@@ -232,8 +233,10 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         raise ConfigError(
             "measurements of the unit cannot be combined with --localize: a map that is not changed keeps its unit"
         )
-    prepare(options.output, options.overwrite, options.resume)
     mode = _mode(sequence, options)
+    if mode not in (None, Mapping.ONLINE):
+        learned_config(mapping_config(config))  # raises now rather than after the online run
+    prepare(options.output, options.overwrite, options.resume)
     check_replaceable(options.output / CALIBRATION)
     with StopSignals() as stop_signals, ExitStack() as viewers:
         attempt = _attempt(sequence, config, options, stop_signals, viewers)
