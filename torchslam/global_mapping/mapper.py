@@ -201,7 +201,9 @@ class GlobalMapper:
     def run(self, results: Rows[StepResult] = ()) -> GlobalMap:
         """Map the recording; `results`: of an online run over it, whose doubtful frames are mapped as well."""
         if learned_config(self.config) is not None and self.extract is None:
-            raise ConfigError("global_mapping.learned_links requires images; the recording brings its features")
+            raise ConfigError(
+                "global_mapping.learned_links requires images; the recording brings its features"
+            )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
         views = self._saved_views(images)
         if len(views) < MIN_VIEWS:
