@@ -96,7 +96,6 @@ _HOMES = {
     "torchslam.system.run": "Run",
     "torchslam.system.slam": "SLAM",
     "torchslam.optim": "BundleProblem SolverOptions solve_bundle solve_least_squares solve_pose",
-    "torchslam.optim._old_names": "bundle_adjust minimize refine_pose",
     "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve_graph",
     "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }

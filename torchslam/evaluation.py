@@ -21,7 +21,6 @@ from torchslam.geometry.lie import rigid, se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.similarity import umeyama
 from torchslam.types import Trajectory, check_ascending
-from torchslam.utils.deprecation import OldCall
 
 Association = Literal["interpolate", "nearest"]
 
@@ -183,7 +182,6 @@ def _compared(estimate: Trajectory, groundtruth: Trajectory) -> int:
     return int(_associate(truth, times, "interpolate", TOLERANCE)[1].sum())
 
 
-@OldCall("T_cw T_cw_groundtruth mask with_scale").accepted
 @full_precision
 def ate(
     *,
@@ -217,7 +215,6 @@ def ate(
     return torch.where(known, error, torch.nan)
 
 
-@OldCall("T_cw T_cw_groundtruth delta mask with_scale").accepted
 @full_precision
 def rpe(
     *,

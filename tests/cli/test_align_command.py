@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchslam.cli import align
+from torchslam.cli import align, arguments
 from torchslam.cli.main import main
 from torchslam.data import read_trajectory
 from torchslam.map.file import read_atlas
@@ -75,6 +75,21 @@ def test_a_finished_run_gets_meters(
     assert main(["align", str(results), *MARKER]) == 0
     assert "map and distance contradict each other" in capsys.readouterr().err
     assert torch.equal(read_trajectory(results / "trajectory.txt").positions_w, after)
+
+
+def test_align_gives_what_the_run_gives(
+    results: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(align, "sources_of", lambda given: [Known(3.0)])
+    assert main(["align", str(results), *MARKER]) == 0
+    monkeypatch.setattr(arguments, "metric_sources", lambda config, sequence: [Known(3.0)])
+    direct = tmp_path / "direct"
+    assert main(["run", ROOM, "--output", str(direct), *FAST, *MARKER]) == 0
+    for name in ("trajectory.txt", "keyframes.txt"):
+        later, at_once = (read_trajectory(folder / name).T_wc for folder in (results, direct))
+        torch.testing.assert_close(later, at_once, atol=1e-8, rtol=0)
+    later, at_once = (json.loads((folder / "metrics.json").read_text()) for folder in (results, direct))
+    assert later["metric"] == at_once["metric"]
 
 
 def test_where_nothing_measures_nothing_is_changed(results: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 import threading
 from functools import partial
 from http.server import SimpleHTTPRequestHandler, ThreadingHTTPServer
@@ -22,6 +23,7 @@ from torchslam.config import load_config
 from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.map.file import read_map
+from torchslam.utils.usage import cpu_seconds, peak_memory_mb
 
 ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
@@ -78,6 +80,9 @@ def test_run_writes_all_results(finished: Path) -> None:
     assert len(read_trajectory(finished / "keyframes.txt")) == figures["keyframes"]
     assert read_map(finished / "map.safetensors")[0].num_points == figures["points"]
     assert figures["ate_m"] < 0.05 * figures["path_length_m"]
+    if sys.platform != "win32":
+        assert 0.1 < figures["cpu_s"] < cpu_seconds()
+        assert 50 < figures["peak_memory_mb"] <= peak_memory_mb()
 
 
 def test_resolved_configuration_reads_back(finished: Path) -> None:

@@ -79,6 +79,10 @@ def test_a_right_map_of_the_whole_needs_no_other_frames_online(run: Run, steps: 
     assert (found["mapping"], found["mapping_reason"]) == ("global", f"tracking was lost at frame {LOST}")
     assert steps == list(range(LOST + 1))
     assert found["posed"] == FRAMES
+    # The times are those of the frames that were processed online.
+    assert found["stage_ms"]["total"]["frames"] == LOST + 1
+    assert 0 < found["ms_median"] <= found["ms_p95"]
+    assert found["fps"] == pytest.approx(1e3 / found["stage_ms"]["total"]["mean"])
 
 
 @pytest.mark.parametrize(

@@ -10,8 +10,10 @@ import pytest
 import torch
 
 from tests.global_mapping.synthetic import CAMERA, Recording, line, wall
+from torchslam.cli.main import main
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
+from torchslam.errors import ConfigError
 from torchslam.global_mapping.learned_links import (
     HELD,
     LearnedPairs,
@@ -128,14 +130,43 @@ def test_learned_pairs_hold_a_map_together() -> None:
     assert float((steps / steps.mean() - 1).abs().max()) < 0.05
 
 
-def test_weights_decide_whether_links_are_tied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("torchslam.global_mapping.learned_links.find_weights", lambda _: None)
+ASKED = "global_mapping.learned_links=true"
+
+
+def test_no_weights_are_looked_for_unless_links_are_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    looked_for: list[str] = []
+    monkeypatch.setattr("torchslam.features.weights.find_weights", looked_for.append)
     assert learned_config(mapping_config(Config())) is None
-    monkeypatch.setattr("torchslam.global_mapping.learned_links.find_weights", lambda _: tmp_path)
-    found = learned_config(mapping_config(Config()))
+    assert looked_for == []
+    with pytest.raises(ConfigError):
+        learned_config(mapping_config(load_config(None, [ASKED])))
+    assert looked_for == ["xfeat-lighterglue"]
+
+
+def test_learned_links_that_are_asked_for_are_used(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "xfeat-lighterglue.safetensors").touch()
+    monkeypatch.setenv("TORCHSLAM_WEIGHTS", str(tmp_path))
+    found = learned_config(mapping_config(load_config(None, [ASKED])))
     assert found is not None
     assert (found.features.kind, found.matching.matcher) == ("xfeat", "lightglue")
-    assert learned_config(load_config(None, ["features.kind=orb"])) is None
+    assert learned_config(found) is None  # the mapper of the learned features has none of its own
+
+
+def test_learned_links_without_weights_or_sift_are_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TORCHSLAM_WEIGHTS", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    config = load_config(None, [ASKED])
+    mapper = GlobalMapper(open_sequence("synthetic:room?frames=10"), CAMERA, config, None)
+    with pytest.raises(ConfigError, match="torchslam download xfeat-lighterglue"):
+        mapper.run()
+    output = tmp_path / "results"
+    assert main(["run", "synthetic:room?frames=10", "--output", str(output), "--set", ASKED]) == 2
+    assert "learned_links: the weights xfeat-lighterglue are not on this machine" in capsys.readouterr().err
+    assert not output.exists()
+    with pytest.raises(ConfigError, match="not orb and descriptors"):
+        learned_config(load_config(None, ["features.kind=orb", ASKED]))
 
 
 @pytest.mark.parametrize(

@@ -154,6 +154,25 @@ def test_a_recording_with_lost_frames_is_mapped_as_a_whole(world: World, online:
     assert world.checked_online == (not why)
 
 
+def timed(run: FakeRun) -> FakeRun:
+    """The run with other times for each frame."""
+    return replace(run, results=[replace(each, stage_ms={"total": 1.0 + each.index}) for each in run.results])
+
+
+def test_the_times_of_a_whole_map_are_those_of_the_online_run(world: World) -> None:
+    """By frame; frames that were not processed online have none."""
+    begun, ended = timed(a_run(posed=9, frames=10, lost=1)), timed(a_run(posed=60))
+    world.whole = replace(a_run(posed=97), results=a_run().results[3:])  # three could not be read
+    kept = world.map(begun, go_on=lambda: ended)
+    assert kept.kept is Mapping.GLOBAL
+    expected = [{"total": 1.0 + index} if index < 10 else {} for index in range(3, 100)]
+    assert [result.stage_ms for result in kept.run.results] == expected
+    world.whole = a_run(posed=99)  # one frame has no pose: the run goes on, and its times are those of all
+    kept = world.map(begun, go_on=lambda: ended)
+    assert kept.kept is Mapping.GLOBAL
+    assert [result.stage_ms for result in kept.run.results] == [each.stage_ms for each in ended.results]
+
+
 def test_a_run_that_the_check_contradicts_is_mapped_as_a_whole(world: World) -> None:
     world.online_check = a_check(is_broken=True)
     world.checks[False] = a_check(0.9)

@@ -40,7 +40,7 @@ def scale_of(meters: float, std: float = 0.01, **more: object) -> Fixed:
 def test_the_unit_of_a_submap_becomes_a_meter() -> None:
     submap = simulated_submap()
     path_w, errors = submap.trajectory().positions_w, reprojection_errors(submap)
-    S_mw, silent, _ = bring_into_meters(
+    S_mw, silent = bring_into_meters(
         SubmapView(submap, CAMERA), [scale_of(2.5), Fixed(Unmeasured(ScaleSource.SPEED, "it stands still"))]
     )
     assert torch.allclose(submap.trajectory().positions_w, 2.5 * path_w)
@@ -53,6 +53,17 @@ def test_the_unit_of_a_submap_becomes_a_meter() -> None:
     assert not submap.metric.is_level
 
 
+def test_one_similarity_changes_all_poses_and_points() -> None:
+    submap, same = simulated_submap(), simulated_submap()
+    S_ew = sim3_exp(torch.tensor([5.0, -2.0, 1.0, 0.3, 0.2, -0.4, math.log(2.0)], dtype=torch.float64))
+    positions = scale_of(2.0, 0.05, S_ew=S_ew, up_std=0.02, origin=(48.0, 11.0, 500.0))
+    S_mw, _ = bring_into_meters(SubmapView(submap, CAMERA), [scale_of(2.1), positions])
+    same.transform(S_mw)
+    assert torch.equal(submap.map.T_cw, same.map.T_cw)
+    assert torch.equal(submap.trajectory().T_wc, same.trajectory().T_wc)
+    assert torch.equal(submap.map.points["positions_w"], same.map.points["positions_w"])
+
+
 def test_without_measurements_nothing_changes() -> None:
     submap, same = simulated_submap(), simulated_submap()
     bring_into_meters(SubmapView(submap, CAMERA), [Fixed(Unmeasured(ScaleSource.SPEED, "none"))])
@@ -63,7 +74,7 @@ def test_without_measurements_nothing_changes() -> None:
 def test_z_is_up_where_gravity_is_known() -> None:
     submap = simulated_submap()
     up_w = torch.nn.functional.normalize(torch.tensor([0.1, -1.0, 0.2], dtype=torch.float64), dim=0)
-    S_mw, _, _ = bring_into_meters(SubmapView(submap, CAMERA), [scale_of(2.0, up_w=up_w, up_std=0.01)])
+    S_mw, _ = bring_into_meters(SubmapView(submap, CAMERA), [scale_of(2.0, up_w=up_w, up_std=0.01)])
     assert torch.allclose(S_mw[:3, :3] @ up_w, torch.tensor([0.0, 0.0, 2.0], dtype=torch.float64))
     assert float(torch.linalg.det(S_mw[:3, :3])) == pytest.approx(8.0)
     assert submap.metric is not None
@@ -84,7 +95,7 @@ def test_the_frame_of_a_source_is_the_world_whatever_others_say_of_the_scale() -
     middle_w = submap.trajectory().positions_w.mean(dim=0)
     S_ew = sim3_exp(torch.tensor([5.0, -2.0, 1.0, 0.3, 0.2, -0.4, math.log(2.0)], dtype=torch.float64))
     positions = scale_of(2.0, S_ew=S_ew, up_std=0.02, origin=(48.0, 11.0, 500.0))
-    S_mw, _, _ = bring_into_meters(SubmapView(submap, CAMERA), [scale_of(2.02), positions])
+    S_mw, _ = bring_into_meters(SubmapView(submap, CAMERA), [scale_of(2.02), positions])
     assert float(sim3_scale(S_mw)) == pytest.approx(math.sqrt(2.0 * 2.02))
     assert torch.allclose(transform(S_mw, middle_w[None]), transform(S_ew, middle_w[None]))
     assert submap.metric is not None
@@ -135,7 +146,7 @@ def test_a_further_session_is_compared_with_a_map_in_meters() -> None:
     submap = simulated_submap()
     bring_into_meters(SubmapView(submap, CAMERA), [scale_of(2.0)])
     before = submap.trajectory().T_wc
-    S_mw, _, _ = bring_into_meters(SubmapView(submap, CAMERA), [scale_of(1.3)])
+    S_mw, _ = bring_into_meters(SubmapView(submap, CAMERA), [scale_of(1.3)])
     assert torch.equal(submap.trajectory().T_wc, before)
     assert torch.equal(S_mw, torch.eye(4, dtype=torch.float64))
     assert submap.metric is not None

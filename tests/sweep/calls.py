@@ -123,10 +123,6 @@ def calls() -> dict[str, Call]:
     covariance = torch.eye(3, dtype=F64).expand(B, 3, 3).contiguous()
     estimate, truth = trajectories()
     R_cw = so3_exp(0.4 * rand(4, 3))
-    generator = _generator()
-    positions = torch.randn(18, 3, dtype=F64, generator=generator)
-    positions[6:, 2] += 6  # the points are in front
-    seen = torch.cartesian_prod(torch.arange(6), torch.arange(12))
     edges = torch.tensor([(0, 1), (1, 2), (2, 3), (3, 0)])
     bits = binary_features()
     g, o = geometry, optim
@@ -278,20 +274,6 @@ def calls() -> dict[str, Call]:
                 "R_ji": R_cw[edges[:, 1]] @ R_cw[edges[:, 0]].mT @ so3_exp(0.01 * rand(4, 3)),
                 "num_views": 4,
                 "weights": torch.ones(4, dtype=F64),
-            },
-            vmap=False,
-        ),
-        "solve_positions": Call(
-            o.solve_positions,
-            {
-                "view_index": seen[:, 0],
-                "point_index": seen[:, 1],
-                "rays_w": torch.nn.functional.normalize(
-                    positions[6 + seen[:, 1]] - positions[seen[:, 0]] + 0.002 * rand(72, 3), dim=-1
-                ),
-                "num_views": 6,
-                "num_points": 12,
-                "weights": torch.ones(72, dtype=F64),
             },
             vmap=False,
         ),

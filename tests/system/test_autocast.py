@@ -30,7 +30,6 @@ from torchslam.optim import (
     solve_least_squares,
     solve_pose,
     solve_pose_graph,
-    solve_positions,
     solve_rotations,
 )
 from torchslam.optim.run_graph import solve_graph
@@ -271,10 +270,6 @@ def solver_cases() -> dict[str, Case]:
         ),
         "solve_rotations": (
             lambda R: solve_rotations(torch.tensor(((0, 1), (1, 2), (0, 2))), R, 3), (so3_exp(0.1 * normal(3, 3)),)
-        ),
-        "solve_positions": (
-            lambda rays_w: solve_positions(*torch.cartesian_prod(torch.arange(4), torch.arange(9)).T, rays_w, 4, 9),
-            ((4 * unit(9, 3) - normal(4, 1, 3, seed=1)).flatten(0, 1),),
         ),
     }  # fmt: skip
 

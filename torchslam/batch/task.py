@@ -33,6 +33,8 @@ from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
 from torchslam.data.transforms import WithGroundTruth
 from torchslam.errors import SequenceError
+from torchslam.global_mapping.learned_links import learned_config
+from torchslam.global_mapping.mapper import mapping_config
 from torchslam.global_mapping.recording import map_recording
 from torchslam.io.report import compute_metrics
 from torchslam.io.results import source_of
@@ -186,6 +188,7 @@ def _run(task: Task, folder: Path) -> Columns:
     config, sequence = settings_of(row), open_row(row)
     camera = ""
     sources = sources_of(given_options(config.metric, sequence.measurements))
+    learned_config(mapping_config(config))  # raises now rather than after the online run
     start = time.process_time()
     if sequence.calibrated is not Calibrated.GIVEN:
         sequence, camera = find_camera(sequence, config, folder, device)

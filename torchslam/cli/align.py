@@ -87,7 +87,7 @@ def execute(options: argparse.Namespace) -> int:
             continue
         images = _images(directory, metrics, saved, submap, options.images)
         view = SubmapView(submap, saved.camera, session, images, readout_of(metrics))
-        S_mw, silent, _ = bring_into_meters(view, sources)
+        S_mw, silent = bring_into_meters(view, sources)
         moved |= {submap.number: S_mw} if submap.metric is not None else {}
         if submap.number == metrics["submap"]:
             unmeasured = [f"{each.source}: {each.reason}" for each in silent]

@@ -36,7 +36,8 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
-from torchslam.global_mapping.mapper import features_to_keep
+from torchslam.global_mapping.learned_links import learned_config
+from torchslam.global_mapping.mapper import features_to_keep, mapping_config
 from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
@@ -63,6 +64,7 @@ from torchslam.system.run import Run, RunProgress, finish, run_frames
 from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult
 from torchslam.utils.console import say, table, warn
+from torchslam.utils.usage import cpu_seconds, peak_memory_mb
 
 DONE = 0
 """Exit status with a map."""
@@ -227,13 +229,16 @@ class Attempt:
 
 def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
     """Run, evaluate, write, draw, report; returns the exit status."""
+    before_s = cpu_seconds()
     sources = arguments.metric_sources(config.metric, sequence)
     if sources and options.localize:
         raise ConfigError(
             "measurements of the unit cannot be combined with --localize: a map that is not changed keeps its unit"
         )
-    prepare(options.output, options.overwrite, options.resume)
     mode = _mode(sequence, options)
+    if mode not in (None, Mapping.ONLINE):
+        learned_config(mapping_config(config))  # raises now rather than after the online run
+    prepare(options.output, options.overwrite, options.resume)
     check_replaceable(options.output / CALIBRATION)
     with StopSignals() as stop_signals, ExitStack() as viewers:
         attempt = _attempt(sequence, config, options, stop_signals, viewers)
@@ -241,7 +246,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
             attempt = _map_recording(attempt, mode, options, stop_signals)
         attempt = _in_meters(attempt, sources)
         stop_signals.begin("when the results are written")
-        metrics = _write(attempt, options)
+        metrics = _write(attempt, options, before_s)
         attempt.watching.end(attempt.finished)
     finished = attempt.finished
     written = {"results": options.output, "view": options.output / VIEW}
@@ -429,8 +434,14 @@ def _describe(camera: Camera) -> str:
     return f"{camera.model} {numbers} of {camera.width} x {camera.height} pixels"
 
 
-def _write(attempt: Attempt, options: argparse.Namespace) -> dict[str, object]:
-    """Evaluate and write the run; returns the metrics."""
+def _write(attempt: Attempt, options: argparse.Namespace, before_s: float | None) -> dict[str, object]:
+    """Evaluate and write the run; returns the metrics.
+
+    Args:
+        attempt: the finished run.
+        options: of the command line.
+        before_s: `cpu_seconds` when the run began.
+    """
     finished, sequence, latencies = attempt.finished, attempt.sequence, attempt.latencies
     metrics = compute_metrics(
         finished,
@@ -446,6 +457,17 @@ def _write(attempt: Attempt, options: argparse.Namespace) -> dict[str, object]:
             .tolist()
         )
         metrics["latency_ms"] = {"median": median, "p95": p95}
-    metrics |= source_of(options.path, options.fps, sequence)
+    metrics |= _usage(before_s) | source_of(options.path, options.fps, sequence)
     write_run(finished, sequence, metrics, options.output)
     return metrics
+
+
+def _usage(before_s: float | None) -> dict[str, float]:
+    """CPU time since `before_s` and peak memory, for metrics.json; empty on Windows, which does not count them.
+
+    The workers of the run have ended, so that their time is included; that of live viewers is not.
+    """
+    now_s, peak_mb = cpu_seconds(), peak_memory_mb()
+    if before_s is None or now_s is None or peak_mb is None:
+        return {}
+    return {"cpu_s": now_s - before_s, "peak_memory_mb": peak_mb}

@@ -623,6 +623,11 @@ class GlobalMappingConfig(Settings, section="global_mapping"):
         low=3,
         high=MAX_COUNT,
     )
+    learned_links: bool = setting(
+        False,
+        "Connect images that too few SIFT tracks connect by XFeat and LightGlue. Requires their weights: "
+        "`torchslam download xfeat-lighterglue`.",
+    )
 
 
 @dataclass(frozen=True)

@@ -44,7 +44,6 @@ from torchslam.geometry.ransac import (
     valid_first,
 )
 from torchslam.geometry.undistorted import UndistortedKeypoints
-from torchslam.utils.deprecation import OldCall
 
 FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
 CANDIDATES = 2  # hypotheses of each round that are optimized
@@ -71,7 +70,6 @@ class AbsolutePose:
     score: Float[Tensor, " B"]
 
 
-@OldCall("points_w pixels camera threshold mask seed confidence max_samples").accepted
 @full_precision
 def estimate_absolute_pose(
     points_w: Float[Tensor, "B N 3"],

@@ -31,7 +31,6 @@ from torchslam.geometry.relative_pose_search import (
 )
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.geometry.two_view import TwoViews, tangent_basis
-from torchslam.utils.deprecation import OldCall
 
 _MODELS, _KERNELS = get_args(Model), get_args(Kernel)
 
@@ -75,7 +74,6 @@ class RelativePose:
         return tuple(MODELS[index] for index in self.model_index.tolist())
 
 
-@OldCall("pixels_1 pixels_2 camera_1 camera_2 threshold mask seed confidence max_samples").accepted
 @full_precision
 def estimate_relative_pose(
     pixels_1: Float[Tensor, "B N 2"],

@@ -30,7 +30,6 @@ from torchslam.geometry.ransac import (
     truncated_score,
 )
 from torchslam.geometry.transforms import without_scale
-from torchslam.utils.deprecation import OldCall
 
 
 @full_precision
@@ -164,10 +163,6 @@ class Similarity:
     score: Float[Tensor, " B"]
 
 
-@OldCall(
-    "points_1 points_2 pixels_1 pixels_2 camera_1 camera_2 sigmas_1 sigmas_2 threshold depth_sigma mask seed "
-    "with_scale confidence max_samples"
-).accepted
 @full_precision
 def estimate_similarity(
     points_1: Float[Tensor, "B N 3"],

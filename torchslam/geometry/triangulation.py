@@ -12,7 +12,6 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import inverse_2x2, whitening
 from torchslam.geometry.lie import se3_inverse, skew, transform
 from torchslam.geometry.precision import full_precision
-from torchslam.utils.deprecation import OldCall
 
 
 @dataclass(frozen=True)
@@ -57,7 +56,6 @@ class MultiViewTriangulation:
     mask: Bool[Tensor, "*batch N"]
 
 
-@OldCall("T_1w T_2w pixels_1 pixels_2 camera_1 camera_2 mask normalized").accepted
 @full_precision
 def triangulate(
     pixels_1: Float[Tensor, "*#batch N 2"],
@@ -193,7 +191,6 @@ def correct_matches(
     return x_1 - step * moved_1, x_2 - step * moved_2
 
 
-@OldCall("T_cw pixels camera mask iterations").accepted
 @full_precision
 def triangulate_many(
     pixels: Float[Tensor, "*#batch N V 2"],

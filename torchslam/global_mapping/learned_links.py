@@ -1,4 +1,4 @@
-"""Links that SIFT does not hold, tied by learned features: XFeat, matched by LightGlue, where their weights are.
+"""Links that SIFT does not hold, tied by learned features where asked for: XFeat, matched by LightGlue.
 
 Their keypoints are other points than those of SIFT. So images near such a link get them in addition, with the noise of
 their own, and the points that they see have tracks of their own in the same map.
@@ -18,7 +18,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from torchslam.config import Config
-from torchslam.features.weights import find_weights
+from torchslam.errors import ConfigError
+from torchslam.features.weights import weights_file
 from torchslam.global_mapping.rounds import ObservedTracks, Reconstruction
 from torchslam.global_mapping.view_graph import FAR, ViewPair
 from torchslam.global_mapping.weak_links import ACROSS
@@ -53,15 +54,28 @@ class LearnedPairs:
 
 
 def learned_config(config: Config) -> Config | None:
-    """The configuration of global mapping with learned features in place of SIFT.
+    """The configuration of global mapping with learned features in place of SIFT; None if they are not asked for.
 
-    None if the features are not SIFT with its own matcher, or the weights are not on this machine.
+    Args:
+        config: of global mapping, see `mapping_config`.
+
+    Raises:
+        ConfigError: the weights are not on this machine, or the features are not SIFT with its own matcher.
     """
-    is_sift = config.features.kind == "sift" and config.matching.matcher == "descriptors"
-    if not is_sift or find_weights(WEIGHTS) is None:
+    if not config.global_mapping.learned_links:
         return None
+    if config.features.kind != "sift" or config.matching.matcher != "descriptors":
+        raise ConfigError(
+            "global_mapping.learned_links requires the default features and matcher, not "
+            f"{config.features.kind} and {config.matching.matcher}"
+        )
+    try:
+        weights_file(WEIGHTS)
+    except ConfigError as error:
+        raise ConfigError(f"global_mapping.learned_links: {error}") from None
     return replace(
         config,
+        global_mapping=replace(config.global_mapping, learned_links=False),
         features=replace(config.features, kind="xfeat", weights=WEIGHTS, num_keypoints=NUM_KEYPOINTS),
         matching=replace(config.matching, matcher="lightglue", weights=WEIGHTS),
     )

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
-from torchslam.errors import FrameError
+from torchslam.errors import ConfigError, FrameError
 from torchslam.geometry import Camera, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping.chained_positions import chained_positions
@@ -200,6 +200,10 @@ class GlobalMapper:
     @torch.no_grad()
     def run(self, results: Rows[StepResult] = ()) -> GlobalMap:
         """Map the recording; `results`: of an online run over it, whose doubtful frames are mapped as well."""
+        if learned_config(self.config) is not None and self.extract is None:
+            raise ConfigError(
+                "global_mapping.learned_links requires images; the recording brings its features"
+            )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
         views = self._saved_views(images)
         if len(views) < MIN_VIEWS:
@@ -243,9 +247,9 @@ class GlobalMapper:
     def _learned(
         self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]]
     ) -> LearnedPairs | None:
-        """Views and pairs with learned features around links; None without weights, or if nothing holds."""
+        """Views and pairs with learned features around links; None if not asked for, or if nothing holds."""
         config = learned_config(self.config)
-        if config is None or self.extract is None or not links:
+        if config is None or not links:
             return None
         own = GlobalMapper(self.sequence, self.camera, config, self.given, self.camera.params.device)
         ends = pairs_across(links)

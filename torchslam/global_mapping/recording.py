@@ -117,7 +117,8 @@ def map_recording(
     if go_on is not None:
         is_whole = len(made.run.trajectory) == len(made.run.results)
         if whole is not None and whole.is_right and is_whole:
-            return MappedRecording(with_doubts(made.run, whole), whole, Mapping.GLOBAL, why)
+            run = with_times(with_doubts(made.run, whole), online)
+            return MappedRecording(run, whole, Mapping.GLOBAL, why)
         online = go_on()
         why = _loss(online) or why
     if whole is None:
@@ -130,8 +131,10 @@ def map_recording(
     is_better = whole.score > before.score - LITTLE_BETTER
     if abs(whole.score - before.score) < LITTLE_BETTER:
         is_better = len(made.run.trajectory) >= len(online.trajectory)
-    run, check, kept = (made.run, whole, Mapping.GLOBAL) if is_better else (online, before, Mapping.ONLINE)
-    return MappedRecording(with_doubts(run, check), check, kept, why or "as asked")
+    if is_better:
+        run = with_times(with_doubts(made.run, whole), online)
+        return MappedRecording(run, whole, Mapping.GLOBAL, why or "as asked")
+    return MappedRecording(with_doubts(online, before), before, Mapping.ONLINE, why or "as asked")
 
 
 def _is_doubtful(run: Run) -> bool:
@@ -193,4 +196,13 @@ def with_doubts(run: Run, check: MapCheck | None) -> Run:
         if doubted and result.state is State.TRACKING:
             result = replace(result, state=State.UNCERTAIN, reasons=(Explanation(Reason.WEAK_LINK),))
         results.append(result)
+    return replace(run, results=results)
+
+
+def with_times(run: Run, online: Run) -> Run:
+    """The run with the times of an online run over the same frames."""
+    times = {result.index: result.stage_ms for result in online.results if result.stage_ms}
+    if not times:
+        return run
+    results = [replace(result, stage_ms=times.get(result.index, {})) for result in run.results]
     return replace(run, results=results)

@@ -116,6 +116,7 @@ def run_metrics(
     - `submap`: number of the main submap; `posed`, `keyframes`, `points` and `quality` refer to it.
     - `submaps`: counts of every submap, see `submap_counts`; `session`: number of the run on this map.
     - `fps`, `ms_median`, `ms_p95`: time of `SLAM.step`, without image decoding; `fps` is the inverse of the mean.
+      Those of the online stage where the global map was kept; 0 if no frame was processed online.
     - `metric`: how well the unit of the main submap is known to be a meter, see `map.unit.MetricUnit`, or None;
       `unmeasured`: why sources of meters said nothing.
     - With ground truth: the errors of the evaluation, and `online_ate_m`, that of the poses as reported online

@@ -27,7 +27,6 @@ from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graphs
 from torchslam.system.run import finish
 from torchslam.system.slam import SLAM
 from torchslam.types import Features, Frame
-from torchslam.utils.deprecation import OldCall
 
 OnFailure = Literal["raise", "skip"] | float
 
@@ -126,7 +125,6 @@ class ClipLoss(NamedTuple):
     failure_rate: float
 
 
-@OldCall("poses T_cw_groundtruth error on_failure").accepted
 def clip_loss(
     poses: ClipPoses,
     *,

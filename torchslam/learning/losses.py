@@ -29,7 +29,6 @@ from torchslam.geometry import (
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.learning.clip_slam import ClipPoses
-from torchslam.utils.deprecation import OldCall
 
 __all__ = [
     "ate",
@@ -51,7 +50,6 @@ def path_length(T_cw: Float[Tensor, "*batch N 4 4"]) -> Float[Tensor, "*batch"]:
     return se3_inverse(T_cw)[..., :3, 3].diff(dim=-2).norm(dim=-1).sum(-1)
 
 
-@OldCall("T_cw T_cw_groundtruth mask").accepted
 @full_precision
 def relative_ate(
     *,
@@ -76,7 +74,6 @@ def relative_ate(
     return torch.where(length > 0, share, torch.nan)
 
 
-@OldCall("T_cw T_cw_groundtruth").accepted
 @full_precision
 def pose_errors(
     *, T_cw: Float[Tensor, "*#batch 4 4"], T_cw_groundtruth: Float[Tensor, "*#batch 4 4"]
@@ -110,7 +107,6 @@ def motion_difference(
     return torch.stack((rotation, direction), dim=-2)
 
 
-@OldCall("T_cw T_cw_groundtruth covariance mask").accepted
 @full_precision
 def pose_nll(
     *,

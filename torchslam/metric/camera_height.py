@@ -21,7 +21,6 @@ from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.geometry.robust import NORMAL_MEDIAN
 from torchslam.metric.options import Given
-from torchslam.metric.path_measurements import PathScales
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import SubmapView, Unmeasured
 
@@ -88,7 +87,7 @@ class CameraHeight:
         """Measure the unit of a submap by the median height over its frames."""
         if view.sequence is None or view.sequence.brings_features:
             return Unmeasured(ScaleSource.CAMERA_HEIGHT, "there are no images to find the ground in")
-        rows, heights = ground_heights(view)
+        heights = ground_heights(view)
         if len(heights) < LEAST_FRAMES:
             return Unmeasured(
                 ScaleSource.CAMERA_HEIGHT,
@@ -107,22 +106,11 @@ class CameraHeight:
             len(logs),
             "frames above the ground",
             apart=spread,
-            parts=self._parts(view, rows, heights, math.hypot(error, MODEL_STD)),
         )
 
-    def _parts(
-        self, view: SubmapView, rows: list[int], heights: Float[np.ndarray, " R"], std: float
-    ) -> PathScales:
-        """The unit along the stretch around each frame, half of the way to the next one that was looked at."""
-        times, at = view.timestamps.detach().cpu().double(), torch.tensor(rows, device="cpu")
-        half = max(1, len(times) // (2 * (FRAMES + 1)))
-        starts, ends = (times[(at + step).clamp(0, len(times) - 1)] for step in (-half, half))
-        meters_per_unit = self._meters / torch.from_numpy(heights)
-        return PathScales.of_mean(starts, ends, meters_per_unit, torch.ones_like(meters_per_unit), std)
 
-
-def ground_heights(view: SubmapView) -> tuple[list[int], Float[np.ndarray, " R"]]:
-    """Rows of the view in which the ground was found, and the heights of the camera above it, map units."""
+def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
+    """Heights of the camera above the ground in the frames in which it was found, map units."""
     T_cw = view.T_cw.detach().cpu().double()
     centers_w = se3_inverse(T_cw)[:, :3, 3]
     windows = _Windows.of(view.camera.to("cpu"))
@@ -134,9 +122,8 @@ def ground_heights(view: SubmapView) -> tuple[list[int], Float[np.ndarray, " R"]
     )
     guess = _guess(view, T_cw[rows])
     found = list[float]()
-    found_in = list[int]()
     if guess is None or windows is None:
-        return found_in, np.array(found)
+        return np.array(found)
     for row in rows:
         around = _path(centers_w, row, guess)
         if around is None:
@@ -157,8 +144,7 @@ def ground_heights(view: SubmapView) -> tuple[list[int], Float[np.ndarray, " R"]
         height = fit.height(guess)
         if height is not None:
             found.append(height)
-            found_in.append(row)
-    return found_in, np.array(found)
+    return np.array(found)
 
 
 def _guess(view: SubmapView, T_cw: Float[Tensor, "R 4 4"]) -> float | None:

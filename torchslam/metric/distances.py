@@ -11,7 +11,6 @@ import torch
 from torchslam.errors import MeasurementError
 from torchslam.metric.image_depth import LocatedPixel, locate_pixel
 from torchslam.metric.options import Given
-from torchslam.metric.path_measurements import PathScales
 from torchslam.metric.scale import MAX_DISAGREEMENT, ScaleMeasurement, ScaleSource, combine_scales
 from torchslam.metric.source import SubmapView, Unmeasured
 
@@ -152,24 +151,7 @@ class Distances:
             "known lengths" if len(found) > 1 else "known length",
             (*rejected, *failed),
             apart=float(logs.square().mean().sqrt()) if len(found) > 1 else None,
-            parts=_parts(view, found, combined.relative_std),
         )
-
-
-def _parts(view: SubmapView, found: Sequence[tuple[Distance, ScaleMeasurement]], std: float) -> PathScales:
-    """The unit where the camera took the images of each length."""
-    times, frames = view.timestamps.detach().cpu().double(), view.frame_index.detach().cpu()
-
-    def at(frame: int) -> int:
-        return int(torch.argmin((frames - frame).abs()))
-
-    rows = [sorted((at(each.first.frame), at(each.second.frame))) for each, _ in found]
-    stds = torch.tensor([measured.relative_std for _, measured in found], dtype=torch.float64, device="cpu")
-    meters_per_unit = torch.tensor(
-        [measured.meters_per_unit for _, measured in found], dtype=torch.float64, device="cpu"
-    )
-    starts, ends = (times[[pair[end] for pair in rows]] for end in (0, 1))
-    return PathScales.of_mean(starts, ends, meters_per_unit, stds, std)
 
 
 def measure_distance(view: SubmapView, distance: Distance) -> ScaleMeasurement | str:

@@ -13,7 +13,6 @@ from torch import Tensor
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import level_rotation
 from torchslam.map.unit import MetricUnit, UnitSource
-from torchslam.metric.drift import Correction, correct_drift
 from torchslam.metric.scale import CombinedScale, ScaleMeasurement, ScaleSource, combine_scales
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
 
@@ -34,16 +33,15 @@ class Vertical:
 @torch.no_grad()
 def bring_into_meters(
     view: SubmapView, sources: Iterable[MetricSource]
-) -> tuple[Float[Tensor, "4 4"], tuple[Unmeasured, ...], Correction]:
-    """Measure the unit of a submap, and change its world so that the unit is a meter; correct its drift.
+) -> tuple[Float[Tensor, "4 4"], tuple[Unmeasured, ...]]:
+    """Measure the unit of a submap, and change its world by one similarity so that the unit is a meter.
 
     Where the vertical is known, z of the new world is up; where a source has a frame of its own, such as east, north
     and up, the new world is that. Otherwise its axes and origin stay. A submap that is in meters already stays so;
     the measurements are then compared with its unit.
 
     Returns:
-        The similarity S_mw from the world before to the new one, the sources that could not say anything, and what the
-        measurements of parts of the path have corrected.
+        The similarity S_mw from the world before to the new one, and the sources that could not say anything.
 
     Raises:
         MeasurementError: measurements are wrong.
@@ -54,30 +52,20 @@ def bring_into_meters(
     measurements = [answer for answer in answers if not isinstance(answer, Unmeasured)]
     eye = torch.eye(4, dtype=torch.float64, device="cpu")
     if not measurements:
-        return eye, silent, Correction()
+        return eye, silent
     if submap.metric is not None:
         before = ScaleMeasurement(ScaleSource.MAP, 1.0, submap.metric.relative_std, 1, "map in meters")
         contradictions = combine_scales([before, *measurements]).contradictions
         submap.metric = replace(
             submap.metric, contradictions=(*submap.metric.contradictions, *contradictions)
         )
-        return eye, silent, Correction()
+        return eye, silent
     scale, vertical = combine_scales(measurements), combine_verticals(measurements)
     centers_w = se3_inverse(view.T_cw)[:, :3, 3].to(eye)
     S_mw = similarity_to_meters(scale, vertical, centers_w)
     submap.transform(S_mw.to(submap.map.T_cw))
     submap.metric = unit_record(scale, vertical, S_mw)
-    correction = correct_drift(view, measurements, scale.meters_per_unit)
-    if correction.is_taken:
-        line = "the drift of the map along the path was corrected: it explains what was held back better"
-        submap.metric = replace(
-            submap.metric,
-            sources=tuple(
-                source if measured.parts is None else replace(source, notes=(*source.notes, line))
-                for source, measured in zip(submap.metric.sources, measurements, strict=True)
-            ),
-        )
-    return S_mw, silent, correction
+    return S_mw, silent
 
 
 def combine_verticals(measurements: Sequence[ScaleMeasurement]) -> Vertical | None:

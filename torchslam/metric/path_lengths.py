@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchslam.geometry import so3_log
 from torchslam.metric.camera_path import CameraPath, found_shift
-from torchslam.metric.path_measurements import PathScales
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import SlowMean, slow_mean
 from torchslam.metric.source import Unmeasured
@@ -124,13 +123,6 @@ def measured(
         tuple(_rejected(times, logs, mean)),
         apart=mean.scatter,
         notes=notes,
-        parts=PathScales.of_mean(
-            times[mean.inliers] - STRETCH / 2,
-            times[mean.inliers] + STRETCH / 2,
-            logs[mean.inliers].exp(),
-            relative[mean.inliers].clamp_min(1e-3),
-            max(mean.std, 1e-6),
-        ),
     )
 
 

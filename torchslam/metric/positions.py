@@ -23,7 +23,6 @@ from torchslam.metric.camera_path import (
     on_clock_of_images,
 )
 from torchslam.metric.options import Given
-from torchslam.metric.path_measurements import PathPositions
 from torchslam.metric.position_fit import (
     CLOCK_STD,
     MIN_POSITIONS,
@@ -31,10 +30,8 @@ from torchslam.metric.position_fit import (
     PositionPairs,
     fit_positions,
     is_line,
-    level_std,
     start_distance,
 )
-from torchslam.metric.receiver_noise import NEIGHBORS, receiver_noise
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
 
@@ -228,7 +225,6 @@ class PositionSource:
             S_ew=fit.S_ew,
             origin=self.origin,
             notes=tuple(self._notes(fit, shift, line)),
-            parts=_parts(pairs, fit, shift),
         )
 
     def _notes(self, fit: PositionFit, shift: float, line: bool) -> list[str]:
@@ -242,19 +238,6 @@ class PositionSource:
                 "upright"
             )
         return notes
-
-
-def _parts(pairs: PositionPairs, fit: PositionFit, shift: float) -> PathPositions | None:
-    """The positions that agree with their neighbors, on the clock of the images; None if they are too few to tell.
-
-    They need not agree with the path, which may have drifted.
-    """
-    if len(pairs) <= NEIGHBORS:
-        return None
-    white, agrees = receiver_noise(fit.residuals, pairs.std, pairs.has_height)
-    white[:, 2] = torch.hypot(white[:, 2], ~pairs.has_height * level_std(pairs))
-    times = pairs.times + shift + fit.offset * (pairs.velocities_w != 0).any(-1)
-    return PathPositions(times[agrees], pairs.positions_e[agrees], white[agrees])
 
 
 def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:

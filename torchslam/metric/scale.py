@@ -17,7 +17,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.errors import MeasurementError
-from torchslam.metric.path_measurements import PathMeasurement
 
 MAX_DISAGREEMENT = 3.0
 """Standard errors by which two measurements may differ before they count as a contradiction: .3 % of right pairs do."""
@@ -57,8 +56,6 @@ class ScaleMeasurement:
         origin: latitude and longitude in degrees and altitude in meters (WGS84) of the origin of that frame; None where
             it is nowhere on earth.
         notes: remarks for the user, one line each.
-        parts: what is known of single parts of the path, so that it can correct the drift of the map; None where the
-            source says nothing of them.
     """
 
     source: ScaleSource
@@ -73,7 +70,6 @@ class ScaleMeasurement:
     origin: tuple[float, float, float] | None = None
     apart: float | None = None
     notes: tuple[str, ...] = ()
-    parts: PathMeasurement | None = None
 
     def __post_init__(self) -> None:
         if not (0 < self.meters_per_unit < math.inf and 0 < self.relative_std < math.inf):

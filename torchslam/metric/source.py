@@ -39,8 +39,6 @@ class SubmapView:
         session: the session whose frames the measurements belong to.
         sequence: the images of the session; None where they are not at hand.
         readout: of a rolling shutter; None: a global one.
-        observation_variance: of the observations as far as they tell something about the shape of the map, in units of
-            the stated one; see `CameraMeasurement`.
     """
 
     submap: Submap
@@ -48,7 +46,6 @@ class SubmapView:
     session: int = 0
     sequence: Images | None = None
     readout: Readout | None = None
-    observation_variance: float = 1.0
 
     @property
     def rows(self) -> Int[Tensor, " K"]:

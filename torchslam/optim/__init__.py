@@ -8,14 +8,12 @@ from torchslam.optim._core.options import (
     LEAST_SQUARES_OPTIONS,
     POSE_GRAPH_OPTIONS,
     POSE_OPTIONS,
-    POSITION_OPTIONS,
     ROTATION_OPTIONS,
     UNWEIGHTED_ROTATION_OPTIONS,
     SolverOptions,
 )
 from torchslam.optim._core.tangent import CameraPrior, PosePrior
 from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, solve_least_squares
-from torchslam.optim._old_names import bundle_adjust, minimize, pose_graph_optimize, refine_pose  # noqa: F401
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import (
     DepthPrior,
@@ -27,7 +25,6 @@ from torchslam.optim.bundle._factors import (
 from torchslam.optim.bundle._pose_covariance import pose_covariance
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.camera_evidence import CameraEstimate, CameraEvidence, camera_evidence
-from torchslam.optim.global_positioning import GlobalPositions, solve_positions
 from torchslam.optim.pose._refinement import RefinedPose, solve_pose
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, solve_pose_graph
 from torchslam.optim.rotation_averaging import RotationAverage, solve_rotations
@@ -38,7 +35,6 @@ __all__ = [
     "LEAST_SQUARES_OPTIONS",
     "POSE_GRAPH_OPTIONS",
     "POSE_OPTIONS",
-    "POSITION_OPTIONS",
     "ROTATION_OPTIONS",
     "UNWEIGHTED_ROTATION_OPTIONS",
     "Backward",
@@ -50,7 +46,6 @@ __all__ = [
     "Convergence",
     "DepthPrior",
     "FrameFactors",
-    "GlobalPositions",
     "LeastSquaresSolution",
     "Manifold",
     "Marginals",
@@ -71,6 +66,5 @@ __all__ = [
     "solve_least_squares",
     "solve_pose",
     "solve_pose_graph",
-    "solve_positions",
     "solve_rotations",
 ]

@@ -35,16 +35,8 @@ from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
-from torchslam.optim.measurements import (
-    MeasuredPositions,
-    Measurement,
-    are_measurements,
-    measurement_tensors,
-    measurements_of,
-)
 from torchslam.optim.pose._refinement import solve_pose
 from torchslam.types import Trajectory
-from torchslam.utils.deprecation import OldCall
 from torchslam.utils.files import check_regular
 
 POSE_ITERATIONS = 30
@@ -91,7 +83,6 @@ class ObservationGraph:
         submap: submap of each frame, 0 if omitted. Submaps share nothing but the camera.
         calibration: the given camera with its error, from which `camera` was found; None: `camera` is exact.
         readout: of a rolling shutter, for which `pixels` are not corrected; None: a global shutter.
-        measurements: of keyframes from outside, such as of a receiver; they determine the unit.
     """
 
     timestamps: Float[Tensor, " K"]
@@ -106,7 +97,6 @@ class ObservationGraph:
     submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64, device="cpu"))
     calibration: CameraMeasurement | None = None
     readout: Readout | None = None
-    measurements: tuple[Measurement, ...] = ()
 
     _SCHEMA: ClassVar[Schema] = {
         "timestamps": ("K", (), float),
@@ -167,7 +157,6 @@ class ObservationGraph:
             tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
         if self.readout is not None:
             tensors[_READOUT] = self.readout.numbers
-        tensors |= measurement_tensors(self.measurements)
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
         if self.calibration is not None:
@@ -191,10 +180,7 @@ class ObservationGraph:
                 names = [name for name in cls.columns() if name in known or name != "submap"]
                 given = _CALIBRATION if set(_CALIBRATION) <= known else ()
                 shutter = (_READOUT,) if _READOUT in known else ()
-                outside = tuple(filter(are_measurements, known))
-                tensors = {
-                    name: file.get_tensor(name) for name in (*names, "camera", *given, *shutter, *outside)
-                }
+                tensors = {name: file.get_tensor(name) for name in (*names, "camera", *given, *shutter)}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
             calibration = None
@@ -204,10 +190,7 @@ class ObservationGraph:
                 calibration = CameraMeasurement(camera.with_params(params), directions, variance)
             columns = {name: tensors[name] for name in names}
             readout = Readout.from_numbers(tensors[_READOUT]) if shutter else None
-            measurements = measurements_of({name: tensors[name] for name in outside}, len(tensors["T_cw"]))
-            graph = cls(
-                camera=camera, calibration=calibration, readout=readout, measurements=measurements, **columns
-            )
+            graph = cls(camera=camera, calibration=calibration, readout=readout, **columns)
             graph._check()
             return graph
         except (
@@ -260,8 +243,8 @@ class ObservationGraph:
 
     @classmethod
     def columns(cls) -> list[str]:
-        """The names of all tensors but those of the camera, its calibration and readout, and of measurements."""
-        others = "camera", "calibration", "readout", "measurements"
+        """The names of all tensors but those of the camera, its calibration and readout."""
+        others = "camera", "calibration", "readout"
         return [column.name for column in fields(cls) if column.name not in others]
 
 
@@ -341,10 +324,6 @@ class GraphSolution:
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
-@OldCall(
-    "graph kernel scale free_camera backward iterations tolerance progress strict frame_factors depth_prior",
-    GRAPH_OPTIONS,
-).accepted
 @full_precision
 def solve_graph(
     graph: ObservationGraph,
@@ -357,9 +336,9 @@ def solve_graph(
 ) -> GraphSolution:
     """Minimize the robust reprojection errors of a run's graph: keyframes and points, then the other frames.
 
-    Every submap is solved on its own. Its first keyframe and its scale stay those of the start, unless measurements
-    determine them; a loss should not depend on them (aligned trajectory errors do not). A camera that is free is found
-    in the submap with most keyframes; the others are solved with it.
+    Every submap is solved on its own. Its first keyframe and its scale stay those of the start, unless
+    `frame_factors` or `depth_prior` determine the scale; a loss should not depend on them (aligned trajectory errors do
+    not). A camera that is free is found in the submap with most keyframes; the others are solved with it.
 
     With `graph.readout`, the minimum is that of the keypoints that its own poses, points and camera correct. The
     implicit gradient passes `GRADIENT_ROUNDS` rounds of correction and solution there, and is right to 1e-5; it also
@@ -372,7 +351,7 @@ def solve_graph(
         options: how to minimize; gradients reach pixels, weights and camera, or the calibration where that is a prior.
         progress: called before each iteration of a bundle adjustment.
         frame_factors: measured motions or distances between keyframes of one submap, or errors of one's own, with rows
-            of the graph's frames; beside those of `graph.measurements`.
+            of the graph's frames.
         depth_prior: depths of the observations. Those of frames that are not keyframes do not count.
 
     Returns:
@@ -384,7 +363,6 @@ def solve_graph(
         ConvergenceError: with `options.strict`.
     """
     strict, options = options.strict, options.replace(strict=False)
-    frame_factors = (*(measured.factors() for measured in graph.measurements), *frame_factors)
     _check_factors(graph, frame_factors)
 
     def solved(graph: ObservationGraph, options: SolverOptions) -> GraphSolution:
@@ -486,11 +464,7 @@ def _with_factors(
     if depth_prior is not None:
         rows = submap.rows
         depth_prior = DepthPrior(depth_prior.depths[rows], depth_prior.information[rows])
-    problem = replace(submap.problem, frame_factors=tuple(own), depth_prior=depth_prior)
-    for measured in graph.measurements:
-        if isinstance(measured, MeasuredPositions) and bool((slots[measured.frames] >= 0).any()):
-            return replace(problem, fixed_frames=())  # they know the axes and the place
-    return problem
+    return replace(submap.problem, frame_factors=tuple(own), depth_prior=depth_prior)
 
 
 def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
@@ -586,11 +560,6 @@ def concatenate_graphs(graphs: Sequence[Graph]) -> Graph:
             starts = frames if name == "frame_index" else points
             parts = [part + start for part, start in zip(parts, starts, strict=True)]
         columns[name] = torch.cat(parts)
-    columns["measurements"] = tuple(
-        measured.moved(start)
-        for graph, start in zip(graphs, frames, strict=True)
-        for measured in graph.measurements
-    )
     return replace(graphs[0], **columns)
 
 
@@ -609,7 +578,6 @@ class _GraphSubmap(NamedTuple):
         return len(self.problem.T_cw) * len(self.points)
 
 
-@OldCall("graphs kernel scale backward iterations tolerance strict", GRAPH_OPTIONS).accepted
 @full_precision
 def solve_graphs(
     graphs: Sequence[ObservationGraph], *, options: SolverOptions = GRAPH_OPTIONS
@@ -632,8 +600,8 @@ def solve_graphs(
             graph.camera.params.device,
             graph.weights.ndim,
         )
-        if graph.calibration is not None or graph.readout is not None or graph.measurements:
-            kind = (row,)  # directions, rounds, or factors of its own
+        if graph.calibration is not None or graph.readout is not None:
+            kind = (row,)  # directions or rounds of its own
         alike.setdefault(kind, []).append(row)
     solved: dict[int, GraphSolution] = {}
     found: Sequence[GraphSolution]

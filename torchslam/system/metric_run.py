@@ -13,7 +13,6 @@ from torchslam.geometry import sim3_inverse, sim3_scale
 from torchslam.geometry.transforms import covariances_with_unit, without_scale
 from torchslam.metric.meters import bring_into_meters
 from torchslam.metric.source import Images, MetricSource, SubmapView
-from torchslam.optim.measurements import Measurement
 from torchslam.system.run import Run
 from torchslam.types import StepResult
 
@@ -30,25 +29,22 @@ def run_in_meters(run: Run, sequence: Images | None, sources: Iterable[MetricSou
         sources: what measures.
     """
     sources, results, unmeasured = list(sources), list(run.results), list[str]()
-    variance = 1.0 if run.given is None else run.given.observation_variance
-    measurements: dict[int, tuple[Measurement, ...]] = {}
     if not sources:
         return run
     for submap in run.submaps:
         if not submap.posed_frames.count(run.session):
             continue
         try:
-            view = SubmapView(submap, run.camera, run.session, sequence, run.readout, variance)
-            S_mw, silent, correction = bring_into_meters(view, sources)
+            view = SubmapView(submap, run.camera, run.session, sequence, run.readout)
+            S_mw, silent = bring_into_meters(view, sources)
         except MeasurementError as error:
-            return replace(run, results=results, unmeasured=(str(error),), measurements=measurements)
-        measurements[submap.number] = correction.measurements
+            return replace(run, results=results, unmeasured=(str(error),))
         if submap is run.main:
             unmeasured = [f"{each.source}: {each.reason}" for each in silent]
         for row, result in enumerate(results):
             if result.submap == submap.number and result.T_cw is not None:
                 results[row] = _moved(result, S_mw)
-    return replace(run, results=results, unmeasured=tuple(unmeasured), measurements=measurements)
+    return replace(run, results=results, unmeasured=tuple(unmeasured))
 
 
 def _moved(result: StepResult, S_mw: Float[Tensor, "4 4"]) -> StepResult:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Protocol
 
@@ -26,7 +26,6 @@ from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
 from torchslam.optim.camera_evidence import graph_evidence
-from torchslam.optim.measurements import Measurement
 from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter, readout_by
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
@@ -85,7 +84,6 @@ class Run:
             global one.
         shutter: what the residuals say of it; None where that was not tested.
         unmeasured: one line for each source of meters that said nothing of the main submap.
-        measurements: by the number of a submap, those from outside in its graph.
     """
 
     submaps: tuple[Submap, ...]
@@ -104,7 +102,6 @@ class Run:
     readout: Readout | None = None
     shutter: RollingShutter | None = None
     unmeasured: tuple[str, ...] = ()
-    measurements: Mapping[int, tuple[Measurement, ...]] = field(default_factory=dict)
 
     @property
     def metric(self) -> MetricUnit | None:
@@ -178,8 +175,7 @@ class Run:
         return concatenate_graphs([self._graph_of(submap) for submap in self.submaps])
 
     def _graph_of(self, submap: Submap) -> RunGraph:
-        graph = submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given, self.readout)
-        return replace(graph, measurements=self.measurements.get(submap.number, ()))
+        return submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given, self.readout)
 
 
 @dataclass

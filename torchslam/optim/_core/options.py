@@ -80,10 +80,6 @@ UNWEIGHTED_ROTATION_OPTIONS = ROTATION_OPTIONS.replace(scale=math.radians(5.0))
 """Without weights the scale is in radians, as COLMAP's: relative rotations of two views are right to a degree or two,
 or wrong."""
 
-POSITION_OPTIONS = SolverOptions("huber", 0.1, iterations=100, tolerance=1e-5)
-"""As in GLOMAP (Pan et al., 2024): the scale is the sine of 6 degrees, which rays of right matches are off by less even
-with averaged rotations; a bundle adjustment follows, to which more digits are of no use."""
-
 GRAPH_OPTIONS = SolverOptions("cauchy", TAIL_SCALE, tolerance=1e-10)
 """A run has rejected wrong matches before, but errors of right ones have heavy tails. The weights of its graph are by
 the noise that the run found, which mostly is a half to a fifth of a pixel of the level."""

@@ -41,6 +41,8 @@ from torchslam.optim.bundle._reduced import (
 _TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 64
 _MANY_FRAMES = 64
 """Frames from which on the tiles are smaller."""
+FRAME_DIMS = 6
+"""Unknowns of a frame: translation and rotation."""
 
 
 class Columns(NamedTuple):
@@ -159,7 +161,6 @@ def build_structure(
     cameras: Int[Tensor, " K"],
     camera_of: Int[Tensor, " O"],
     num_cameras: int,
-    frame_dims: int = 6,
     joined: Int[Tensor, "M 2"] | None = None,
 ) -> Structure:
     """The structure of observations (O,) in the order of `Structure`.
@@ -168,7 +169,6 @@ def build_structure(
         frame_slots: slot of the observing frame, K for all fixed ones.
         cameras: of the free frames
         camera_of: of the observations
-        frame_dims: numbers by which a frame moves
         joined: free frames that factors join
     """
     num_frames = len(cameras)
@@ -194,7 +194,7 @@ def build_structure(
         )
         none = frame_slots.new_zeros(0, 2)
         joined = none if joined is None else joined
-        pairs = covisible_pairs(num_frames, frame_dims, seen, joined, MOST_COVISIBLE)
+        pairs = covisible_pairs(num_frames, FRAME_DIMS, seen, joined, MOST_COVISIBLE)
     return Structure(
         num_points,
         frame_ends,
@@ -306,13 +306,13 @@ class NormalEquations:
             c = gauge * reduced.diagonal().mean().sqrt()
             reduced[: len(c), : len(c)] += c @ c.mT
         factor = factorize(reduced, strict=damping is None)
-        return DenseReduced(factor, self.frame_dims, self.structure.num_frames)
+        return DenseReduced(factor, FRAME_DIMS, self.structure.num_frames)
 
     def _blocks(
         self, tiles: list[WhitenedTile], damping: Tensor | None, gauge: Tensor | None
     ) -> BlockReduced:
         """The reduced system as blocks of covisible pairs, with the cameras as a border."""
-        pairs, dims = self.structure.pairs, self.frame_dims
+        pairs, dims = self.structure.pairs, FRAME_DIMS
         assert pairs is not None
         frame_rows, camera_rows = self.rows
         split, size = frame_rows.numel(), camera_rows.numel()
@@ -349,7 +349,7 @@ class NormalEquations:
         """The blocks (K, D, D) of the frames before elimination."""
         frames = _damped(self.frames, damping)
         if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
-            eye = torch.eye(self.frame_dims, dtype=frames.dtype, device=frames.device)
+            eye = torch.eye(FRAME_DIMS, dtype=frames.dtype, device=frames.device)
             frames = frames + diagonal_floor(frames.dtype) * eye
         return frames
 
@@ -374,14 +374,9 @@ class NormalEquations:
     @cached_property
     def rows(self) -> tuple[Int[Tensor, "K D"], Int[Tensor, "C n"]]:
         """Rows of the reduced system that belong to each frame, and to each camera."""
-        split, (num_cameras, num_free) = self.frame_dims * self.structure.num_frames, self.cameras.shape[:2]
+        split, (num_cameras, num_free) = FRAME_DIMS * self.structure.num_frames, self.cameras.shape[:2]
         rows = torch.arange(split + num_cameras * num_free, device=self.frames.device)
-        return rows[:split].view(-1, self.frame_dims), rows[split:].view(num_cameras, num_free)
-
-    @property
-    def frame_dims(self) -> int:
-        """Numbers by which a frame moves: six, or three where the rotations are fixed."""
-        return self.frames.shape[-1]
+        return rows[:split].view(-1, FRAME_DIMS), rows[split:].view(num_cameras, num_free)
 
     def _whitened(self, tile: Tile, root: Tensor) -> WhitenedTile:
         """A tile's coupling times the inverse root of its points' blocks."""

@@ -93,13 +93,11 @@ def build_sparse_layout(
     free_points: Bool[Tensor, " N"],
     camera_index: Int[Tensor, " K"],
     num_cameras: int,
-    frame_dims: int = 6,
     joined: Int[Tensor, "M 2"] | None = None,
 ) -> SparseLayout:
     """Order the observations (O,) that count; frames (K,) and points (N,) are free or fixed as in `MovingParts`.
 
     Args:
-        frame_dims: numbers by which a frame moves
         joined: frames that factors join
     """
     num_points = len(free_points)
@@ -126,7 +124,6 @@ def build_sparse_layout(
         camera_index[free],
         camera_index[frames],
         num_cameras,
-        frame_dims,
         joined,
     )
     return SparseLayout(
