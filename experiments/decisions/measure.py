@@ -21,7 +21,7 @@ from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
-from torchslam.geometry import Camera, se3_inverse, transform, umeyama
+from torchslam.geometry import Camera, se3_inverse, umeyama
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.check import MapCheck
 from torchslam.global_mapping.recording import check_run, with_doubts

@@ -1,4 +1,4 @@
-"""Rendered sequences with random scenes, motions and cameras: the scenes, and the path of a camera as a function of time."""
+"""Rendered sequences: the scenes, random paths of a camera as functions of time, and their images."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from torchslam.data import Sequence
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.synthetic.paths import poses
 from torchslam.data.synthetic.renderer import Renderer
-from torchslam.data.synthetic.scene import Painter, Rectangle, X, Y, Z, room, wall
+from torchslam.data.synthetic.scene import Painter, Rectangle, room, wall
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.types import Trajectory
 

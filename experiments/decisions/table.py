@@ -102,13 +102,13 @@ def exact_changed_finally(case: Columns) -> Outcome:
     return error is not None and error > CHANGED
 
 
-def no_readout_found_online(case: Columns) -> Outcome:
+def global_found_online(case: Columns) -> Outcome:
     if case["truth"]["readout_ms"] != 0:
         return None
     return any(change["readout_ms"] is not None for change in case["changes"])
 
 
-def no_readout_found_finally(case: Columns) -> Outcome:
+def global_found_finally(case: Columns) -> Outcome:
     if case["truth"]["readout_ms"] != 0 or case["failure"]:
         return None
     return case["final"]["readout_ms"] is not None
@@ -231,7 +231,7 @@ def ended_worse(case: Columns) -> Outcome:
     return case["errors"]["ate_final"] > WORSE * case["errors"]["ate_online"]
 
 
-def ended_worse_right(case: Columns) -> Outcome:
+def ended_worse_not_right(case: Columns) -> Outcome:
     """The same for maps that are not right at the end."""
     return ended_worse(case) if _is_judged(case) and not is_right(case) else None
 
@@ -297,31 +297,33 @@ ROWS: dict[str, Callable[[Sequence[Columns]], Counted]] = {
     "no map": of_cases(no_map, True),
     "fewer than half of the frames posed": of_cases(half_lost, True),
     "exact camera changed online": of_cases(exact_changed_online, True),
-    "... by more than 1 %": of_cases(exact_changed_online_much, True),
-    "exact camera off by more than 1 % at the end": of_cases(exact_changed_finally, True),
-    "readout of a global shutter found online": of_cases(no_readout_found_online, True),
-    "... at the end": of_cases(no_readout_found_finally, True),
+    "exact camera changed online by more than 1 %": of_cases(exact_changed_online_much, True),
+    "exact camera changed by more than 1 % at the end": of_cases(exact_changed_finally, True),
+    "global shutter: readout found online": of_cases(global_found_online, True),
+    "global shutter: readout found at the end": of_cases(global_found_finally, True),
     "camera off by 3 % and more: corrected online": of_cases(off_corrected_online, False),
-    "... within 1.5 % at the end": of_cases(off_found, False),
+    "camera off by 3 % and more: within 1.5 % at the end": of_cases(off_found, False),
     "readout of 15 ms and more: found online": of_cases(rolling_found_online, False),
-    "... at the end": of_cases(rolling_found, False),
-    "... and right to 3 ms": of_cases(rolling_right, False),
+    "readout of 15 ms and more: found at the end": of_cases(rolling_found, False),
+    "readout of 15 ms and more, found: right to 3 ms": of_cases(rolling_right, False),
     "true focal length within one stated error": of_cases(focal_within(1.0), False),
-    "... within two": of_cases(focal_within(2.0), False),
+    "true focal length within two": of_cases(focal_within(2.0), False),
     "true readout within one stated error": of_cases(readout_within(1.0), False),
-    "... within two": of_cases(readout_within(2.0), False),
+    "true readout within two": of_cases(readout_within(2.0), False),
     "map wrong": of_cases(map_wrong, True),
-    "right map that the check calls not right": of_cases(right_called_wrong, True),
-    "right map with frames that the check calls uncertain": of_cases(right_doubted, True),
-    "frames of right maps that are uncertain": uncertain_frames,
-    "wrong map that the check calls not right": of_cases(wrong_called_wrong, False),
-    "map bent by 2 % of its extent and more: found": bent_found(RIGHT),
-    "... keyframes of its wrong half uncertain": bent_keyframes,
-    "map bent by 1 to 2 %: found": bent_found(0.01, RIGHT),
+    "right map: called not right by the check": of_cases(right_called_wrong, True),
+    "right map: some frames called uncertain by the check": of_cases(right_doubted, True),
+    "right map: frames that are uncertain": uncertain_frames,
+    "wrong map: called not right by the check": of_cases(wrong_called_wrong, False),
+    "map bent by 2 % of its extent and more: called not right": bent_found(RIGHT),
+    "map bent by 2 % of its extent and more: keyframes of the wrong half uncertain": bent_keyframes,
+    "map bent by 1 to 2 % of its extent: called not right": bent_found(0.01, RIGHT),
     "final ATE worse than online by more than 5 %": of_cases(ended_worse, True),
-    "... of maps that are not right": of_cases(ended_worse_right, True),
+    "final ATE worse than online by more than 5 %, of maps that are not right": of_cases(
+        ended_worse_not_right, True
+    ),
 }
-"""What is counted; rows with `found`, `corrected`, `within` and `right` should be high, the others low."""
+"""What is counted. The rows of `of_cases` with False, and those of bent maps, should be high, the others low."""
 
 
 def columns_of(cases: Sequence[Columns]) -> dict[str, list[Columns]]:
