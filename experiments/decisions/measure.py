@@ -24,7 +24,7 @@ from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera, se3_inverse, umeyama
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.check import MapCheck
-from torchslam.global_mapping.recording import check_run, with_doubts
+from torchslam.global_mapping.recording import KeyframePairs, check_run, keyframe_pairs, with_doubts
 from torchslam.system.online_camera import CameraChange
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
@@ -68,7 +68,8 @@ def measured(case: Case) -> Columns:
     run = SLAM(sequence.camera, Config()).run(sequence, after_frame)
     seconds["final"] = time.process_time() - tracked
     seconds["online"] = clock.lap() - seconds["final"]
-    check = None if run.failure else check_run(run)
+    pairs = None if run.failure else keyframe_pairs(run)
+    check = None if pairs is None else check_run(run, pairs)
     seconds["check"] = clock.lap()
     given = sequence.camera
     columns = {
@@ -103,7 +104,7 @@ def measured(case: Case) -> Columns:
         "check": check_columns(run, check),
     }
     clock.lap()
-    columns["bent"] = bent_columns(run) if check is not None else {}
+    columns["bent"] = {} if pairs is None else bent_columns(run, pairs)
     seconds["bent"] = clock.lap()
     return columns | {"seconds": {name: round(value, 3) for name, value in seconds.items()}}
 
@@ -192,7 +193,7 @@ def check_columns(run: Run, check: MapCheck | None) -> Columns | None:
     }
 
 
-def bent_columns(run: Run) -> Columns:
+def bent_columns(run: Run, pairs: KeyframePairs) -> Columns:
     """By scale, the check of the map bent by it; empty for a map of too few keyframes.
 
     `deformation`: RMS distance of the bent keyframes from the others after alignment, as a share of the extent;
@@ -206,9 +207,8 @@ def bent_columns(run: Run) -> Columns:
     found = {}
     for name, factor in BENDS.items():
         with bent(run, factor) as deformation:
-            check = check_run(run)
-        if check is None:
-            continue
+            check = check_run(run, pairs)
+        assert check is not None
         uncertain = set(check.uncertain)
         found[name] = {
             "is_right": check.is_right,

@@ -151,8 +151,9 @@ class Path:
     def T_wc(self, time: np.ndarray) -> Float[Tensor, "N 4 4"]:
         """The poses at times (N,) in frames."""
         progress = np.interp(time, np.arange(len(self.progress)) / WARP_STEPS - 1.0, self.progress)
-        x, y, z, yaw, pitch, roll = (sum(wave(progress) for wave in some) for some in self.waves)
-        yaw = yaw + sum(event.yaw(time) for event in self.events)
+        x, y, z, yaw, pitch, roll = (np.sum([wave(progress) for wave in some], axis=0) for some in self.waves)
+        for event in self.events:
+            yaw = yaw + event.yaw(time)
         z = z + self.forward * progress
         numbers = (x + self.origin[0], y + self.origin[1], z + self.origin[2], yaw, pitch, roll)
         return poses(*(torch.from_numpy(np.asarray(each, dtype=np.float64)) for each in numbers))
@@ -223,7 +224,7 @@ class RenderedSequence(Sequence):
         for index in range(frames):
             T_wc = path.T_wc(index + 1e-3 * readout_ms * FRAME_RATE * rows)
             image = cv2.GaussianBlur(renderer.render(se3_inverse(T_wc).numpy()), (0, 0), blur)
-            image += noise * rng.standard_normal(image.shape, dtype=np.float32)
+            image += np.float32(noise) * rng.standard_normal(image.shape, dtype=np.float32)
             self._images.append(image.round().clip(0, 255).astype(np.uint8))
 
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
