@@ -224,7 +224,7 @@ class RenderedSequence(Sequence):
         for index in range(frames):
             T_wc = path.T_wc(index + 1e-3 * readout_ms * FRAME_RATE * rows)
             image = cv2.GaussianBlur(renderer.render(se3_inverse(T_wc).numpy()), (0, 0), blur)
-            image += np.float32(noise) * rng.standard_normal(image.shape, dtype=np.float32)
+            image = image + np.float32(noise) * rng.standard_normal(image.shape, dtype=np.float32)
             self._images.append(image.round().clip(0, 255).astype(np.uint8))
 
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
