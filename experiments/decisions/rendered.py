@@ -55,7 +55,7 @@ def street(seed: int) -> list[Rectangle]:
 BUILDERS = {"room": room, "wall": wall, "street": street}
 MOTIONS = ("smooth", "pause", "pan", "turn", "all")
 """What happens on the way: nothing; the camera stands still; it only rotates; it rotates fast; all of it."""
-_MAX_YAW = {"room": 0.35, "wall": 0.15, "street": 0.12}
+_MAX_YAW = {"room": 0.5, "wall": 0.15, "street": 0.12}
 """Radians: maximum amplitude of the slow rotation about the vertical axis. The wall stays in view."""
 _PAN = {"room": (0.2, 0.7), "wall": (0.1, 0.25), "street": (0.2, 0.6)}
 """Radians: range of the angle of a pan or a fast turn. The wall stays in view."""
@@ -125,9 +125,9 @@ class Path:
         """Draw a path through a scene of `BUILDERS`, with what a motion of `MOTIONS` has on the way."""
         is_street = scene == "street"
         ranges = (  # of the amplitudes
-            (0.05, 0.25) if is_street else (0.3, 0.9),
-            (0.01, 0.05) if is_street else (0.05, 0.2),
-            (0.0, 0.02) if is_street else (0.1, 0.5),
+            (0.05, 0.25) if is_street else (0.4, 1.1),
+            (0.01, 0.05) if is_street else (0.1, 0.25),
+            (0.0, 0.02) if is_street else (0.2, 0.5),
             (0.03, _MAX_YAW[scene]),
             (0.02, 0.08),
             (0.01, 0.05),
@@ -136,13 +136,13 @@ class Path:
         strength = rng.uniform(0.0, 1.0)
         waves = tuple(
             (
-                Wave(rng.uniform(*limits), rng.uniform(60, 180), rng.uniform(0, 2 * math.pi)),
+                Wave(rng.uniform(*limits), rng.uniform(45, 140), rng.uniform(0, 2 * math.pi)),
                 Wave(strength * shake, rng.uniform(7, 15), rng.uniform(0, 2 * math.pi)),
             )
             for limits, shake in zip(ranges, shakes, strict=True)
         )
         origin = {"room": (0.0, -0.1, -0.7), "wall": (0.0, 0.0, 0.0), "street": (0.0, -0.1, 0.4)}[scene]
-        forward = rng.uniform(0.02, 0.07) if is_street else 0.0
+        forward = rng.uniform(0.03, 0.1) if is_street else 0.0
         events = _events(rng, scene, motion, frames)
         time = np.arange(-WARP_STEPS, (frames + 1) * WARP_STEPS) / WARP_STEPS
         speed = np.prod([np.ones_like(time), *(event.speed(time) for event in events)], axis=0)
