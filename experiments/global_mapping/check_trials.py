@@ -146,10 +146,11 @@ def is_alarm(found: MapCheck) -> bool:
     return not found.is_right or bool(found.uncertain)
 
 
-def scaled(T_cw: Float[Tensor, "K 4 4"], factor: float) -> Float[Tensor, "K 4 4"]:
-    """The second half of the poses with another scale, around its first camera."""
+def scaled(T_cw: Float[Tensor, "K 4 4"], factor: float, about: int | None = None) -> Float[Tensor, "K 4 4"]:
+    """The second half of the poses with another scale, around a camera; None: its first one."""
     T_wc, half = se3_inverse(T_cw), len(T_cw) // 2
-    T_wc[half:, :3, 3] = T_wc[half, :3, 3] + factor * (T_wc[half:, :3, 3] - T_wc[half, :3, 3])
+    center = T_wc[half if about is None else about, :3, 3].clone()
+    T_wc[half:, :3, 3] = center + factor * (T_wc[half:, :3, 3] - center)
     return se3_inverse(T_wc)
 
 

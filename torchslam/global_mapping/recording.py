@@ -34,6 +34,9 @@ CHECKED_DISTANCES = 1, 2, 4
 LITTLE_BETTER = 0.01
 """Difference of two scores that does not tell which map is better."""
 
+KeyframePairs = tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]]
+"""Poses and features of keyframes, and their verified pairs."""
+
 
 class Mapping(StrEnum):
     """How a recording is mapped."""
@@ -154,19 +157,22 @@ def _loss(run: Run) -> str:
     return f"tracking was lost in {lost} frames" if lost else ""
 
 
-def check_run(run: Run) -> MapCheck | None:
-    """Check the main submap of a run by pairs of its keyframes, matched anew; None if there is nothing to check."""
-    found = keyframe_pairs(run)
+def check_run(run: Run, matched: KeyframePairs | None = None) -> MapCheck | None:
+    """Check the main submap of a run by pairs of its keyframes; None if there is nothing to check.
+
+    matched: `keyframe_pairs` of the run, whatever its poses were then; None: the keyframes are matched now.
+    """
+    found = keyframe_pairs(run) if matched is None else matched
     if found is None:
         return None
-    T_cw, views, pairs = found
+    T_cw, views, pairs = run.map.T_cw[run.map.keyframe_rows(run.session)], *found[1:]
     known = torch.ones(len(views), dtype=torch.bool, device="cpu")
     reduction = run.config.for_size(run.camera.size).features.reduction(run.camera.size)
     return check_map(T_cw, known, views, pairs, run.camera, None, reduction)
 
 
 @torch.no_grad()
-def keyframe_pairs(run: Run) -> tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]] | None:
+def keyframe_pairs(run: Run) -> KeyframePairs | None:
     """Poses and features of the keyframes of the main submap, and their verified pairs; None for fewer than three."""
     rows = run.map.keyframe_rows(run.session).tolist()
     if len(rows) < 3 or run.config.features.kind == "simulated":

@@ -53,7 +53,7 @@ class Renderer:
             T_cw: (4, 4), or (H, 4, 4): a pose for each row, as of a rolling shutter.
         """
         T_cw = T_cw.reshape(-1, 4, 4)
-        forms = np.stack([self._linear_forms(pose) for pose in T_cw])
+        forms = self._linear_forms(T_cw)
         some = np.linspace(0, len(T_cw) - 1, ROWS_OF_BOUNDS).round().astype(int)
         bounds = np.stack([self._bounds(pose) for pose in T_cw[some if len(T_cw) > 1 else [0]]])
         bounds = np.concatenate((bounds[..., :2].min(0), bounds[..., 2:].max(0)), axis=1)
@@ -86,13 +86,16 @@ class Renderer:
         return np.where(hit, image, 0.0).astype(np.float32)
 
     def _linear_forms(self, T_cw: np.ndarray) -> np.ndarray:
-        """Return (R, 3, 3): (u, v, 1) / z of each rectangle, in meters, as linear forms of the pixel (x, y, 1)."""
-        R, t = T_cw[:3, :3], T_cw[:3, 3]
-        M = np.stack((self._axes_u @ R.T, self._axes_v @ R.T, self._origins @ R.T + t), axis=-1)
+        """Return (N, R, 3, 3): (u, v, 1) / z of each rectangle, in meters, as linear forms of the pixel (x, y, 1).
+
+        T_cw: (N, 4, 4)
+        """
+        R_wc, t = T_cw[:, :3, :3].transpose(0, 2, 1), T_cw[:, None, :3, 3]
+        M = np.stack((self._axes_u @ R_wc, self._axes_v @ R_wc, self._origins @ R_wc + t), axis=-1)
         # A rectangle seen exactly edge-on has no inverse and is invisible: forms of zero never win.
-        edge_on = np.abs(np.linalg.det(M)) < 1e-9
-        forms = np.linalg.inv(np.where(edge_on[:, None, None], np.eye(3), M)) @ np.linalg.inv(self._K)
-        return np.where(edge_on[:, None, None], 0.0, forms)
+        edge_on = np.abs(np.linalg.det(M))[..., None, None] < 1e-9
+        forms = np.linalg.inv(np.where(edge_on, np.eye(3), M)) @ np.linalg.inv(self._K)
+        return np.where(edge_on, 0.0, forms)
 
     def _nearest(self, forms: np.ndarray, bounds: np.ndarray) -> np.ndarray:
         """Return (H, W) int64: the rectangle seen at each pixel, -1 for none; forms (1, R, 3, 3) or (H, R, 3, 3)."""
