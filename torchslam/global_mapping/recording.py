@@ -52,12 +52,15 @@ class MappedRecording:
 
     Attributes:
         run: the run.
-        check: the check of its map; None without a map, or without image pairs.
+        online: the run frame by frame, which is `run` itself, or came before it; shorter if it stopped when tracking
+            was lost.
+        check: the check of the map of `run`; None without a map, or without image pairs.
         kept: which mapping it is from.
         why: why the recording was mapped as a whole; empty if it was not.
     """
 
     run: Run
+    online: Run
     check: MapCheck | None
     kept: Mapping
     why: str
@@ -99,7 +102,7 @@ def map_recording(
         if check is not None and (not check.is_right or (check.weak_links and _is_doubtful(online))):
             why = f"the check says: {check.sentence()}"
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
-        return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
+        return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, "")
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
     saved = SavedStages(stages, sequence, config, device)
     mapper = GlobalMapper(
@@ -117,21 +120,21 @@ def map_recording(
     if go_on is not None:
         is_whole = len(made.run.trajectory) == len(made.run.results)
         if whole is not None and whole.is_right and is_whole:
-            return MappedRecording(with_doubts(made.run, whole), whole, Mapping.GLOBAL, why)
+            return MappedRecording(with_doubts(made.run, whole), online, whole, Mapping.GLOBAL, why)
         online = go_on()
         why = _loss(online) or why
     if whole is None:
         check = check_run(online) if check is None else check
-        return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, why)
+        return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, why)
     before = checked(online)
     if online.failure and not whole.is_right:
         # A camera that only turns, with a wrong focal length, makes maps that contradict themselves.
-        return MappedRecording(online, None, Mapping.ONLINE, why)
+        return MappedRecording(online, online, None, Mapping.ONLINE, why)
     is_better = whole.score > before.score - LITTLE_BETTER
     if abs(whole.score - before.score) < LITTLE_BETTER:
         is_better = len(made.run.trajectory) >= len(online.trajectory)
     run, check, kept = (made.run, whole, Mapping.GLOBAL) if is_better else (online, before, Mapping.ONLINE)
-    return MappedRecording(with_doubts(run, check), check, kept, why or "as asked")
+    return MappedRecording(with_doubts(run, check), online, check, kept, why or "as asked")
 
 
 def _is_doubtful(run: Run) -> bool:
