@@ -5,11 +5,13 @@ from __future__ import annotations
 import argparse
 import os
 import statistics
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -200,6 +202,30 @@ def check(found: Iterable[Columns]) -> None:
 
 def _log(columns: Columns) -> None:
     print(columns["name"], columns["status"], columns.get("ate_m", ""), sep="\t", file=sys.stderr, flush=True)
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a command and its children used: processor and elapsed seconds, and the memory of the largest process."""
+
+    cpu_s: float
+    wall_s: float
+    peak_mb: float
+
+
+def run_command(
+    line: Sequence[str],
+    stdout: IO[str],
+    stderr: IO[str] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> tuple[int, Usage]:
+    """Run a command to its end; return its exit status and what it used."""
+    start = time.perf_counter()
+    child = subprocess.Popen(line, stdout=stdout, stderr=stderr, env=environment)
+    _, status, used = os.wait4(child.pid, 0)
+    child.returncode = os.waitstatus_to_exitcode(status)
+    usage = Usage(used.ru_utime + used.ru_stime, time.perf_counter() - start, used.ru_maxrss / 1024)
+    return child.returncode, usage
 
 
 def timed(call: Callable[[], T]) -> tuple[T, float]:
