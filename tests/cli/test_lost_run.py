@@ -79,6 +79,8 @@ def test_a_right_map_of_the_whole_needs_no_other_frames_online(run: Run, steps: 
     assert (found["mapping"], found["mapping_reason"]) == ("global", f"tracking was lost at frame {LOST}")
     assert steps == list(range(LOST + 1))
     assert found["posed"] == FRAMES
+    assert 0 < found["online_posed"] <= LOST
+    assert found["ms_longest"] > 0
 
 
 @pytest.mark.parametrize(
