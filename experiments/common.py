@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import statistics
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -204,6 +206,16 @@ def _log(columns: Columns) -> None:
     print(columns["name"], columns["status"], columns.get("ate_m", ""), sep="\t", file=sys.stderr, flush=True)
 
 
+# Linux counts the memory of the process that starts a command as the command's own, so a small process starts it.
+_LAUNCHER = """
+import json, os, sys
+process = os.spawnvp(os.P_NOWAIT, sys.argv[2], sys.argv[2:])
+_, status, used = os.wait4(process, 0)
+with open(sys.argv[1], "w") as file:
+    json.dump([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss], file)
+"""
+
+
 @dataclass(frozen=True)
 class Usage:
     """What a command and its children used: processor and elapsed seconds, and the memory of the largest process."""
@@ -220,12 +232,13 @@ def run_command(
     environment: Mapping[str, str] | None = None,
 ) -> tuple[int, Usage]:
     """Run a command to its end; return its exit status and what it used."""
-    start = time.perf_counter()
-    child = subprocess.Popen(line, stdout=stdout, stderr=stderr, env=environment)
-    _, status, used = os.wait4(child.pid, 0)
-    child.returncode = os.waitstatus_to_exitcode(status)
-    usage = Usage(used.ru_utime + used.ru_stime, time.perf_counter() - start, used.ru_maxrss / 1024)
-    return child.returncode, usage
+    with tempfile.NamedTemporaryFile("r") as found:
+        launcher = [sys.executable, "-I", "-S", "-c", _LAUNCHER, found.name, *line]
+        start = time.perf_counter()
+        subprocess.run(launcher, stdout=stdout, stderr=stderr, env=environment, check=True)
+        wall_s = time.perf_counter() - start
+        status, cpu_s, peak_kb = json.load(found)
+    return status, Usage(cpu_s, wall_s, peak_kb / 1024)
 
 
 def timed(call: Callable[[], T]) -> tuple[T, float]:
