@@ -47,7 +47,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         raise SystemExit("no recording is available: nothing to report")
     worse = [] if earlier is None else compare(report, earlier)
     report |= {"worse": worse} if worse else {}
-    report |= {"accepted": options.accept} if options.accept else {}
+    report |= {"accepted": options.accept} if worse and options.accept else {}
     if options.write or not options.names:
         record.write(report)
         tables.write(report)
