@@ -3,12 +3,14 @@
 #   PYTHON=python  the interpreter that creates it
 #   SAMPLE=200 SEED=0  number and seed of the mutants of `make mutation`; SAMPLE=0 tries all of them (hours)
 #   RESULTS=path   results folder that `make profile` reads
-#   REPORT_ARGS="..."  arguments for experiments.report.run, e.g. REPORT_ARGS="shelf_bin --accept 'a stricter gate'"
+#   PEERS=path     environment of ORB-SLAM3 and pycolmap, which `make report` compares with
+#   REPORT_ARGS="..."  arguments for experiments.report.run, e.g. REPORT_ARGS="--accept 'a stricter gate'"
 #   PYTEST_ARGS="..."  further arguments for pytest, e.g. PYTEST_ARGS="tests/geometry -x"
 
 PYTHON ?= python3
 VENV ?= .venv
 PYTEST_ARGS ?=
+PEERS ?=
 REPORT_ARGS ?=
 SAMPLE ?= 200
 SEED ?= 0
@@ -89,8 +91,8 @@ benchmarks: $(INSTALLED_BENCHMARKS)  ## timing and accuracy tables against other
 profile: $(INSTALLED)  ## milliseconds per stage of the run in RESULTS (results/demo)
 	$(BIN)/python -m experiments.benchmarks.slam.stages $(RESULTS)
 
-report: $(INSTALLED_BENCHMARKS)  ## run all sequences and the quick benchmarks, append to docs/figures/history.jsonl and redraw it
-	$(BIN)/python -m experiments.report.run $(REPORT_ARGS)
+report: $(INSTALLED)  ## run the default command on all recordings, write docs/figures/report.json and its tables: 15 minutes
+	$(BIN)/python -m experiments.report.run $(if $(PEERS),--peers $(PEERS)) $(REPORT_ARGS)
 
 wheel: $(INSTALLED_RELEASE)  ## build wheel and source distribution in dist/ and check them
 	rm -rf build dist/torchslam-*

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import statistics
+import subprocess
 import sys
+import tempfile
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import torch
 from torch import Tensor
@@ -200,6 +204,41 @@ def check(found: Iterable[Columns]) -> None:
 
 def _log(columns: Columns) -> None:
     print(columns["name"], columns["status"], columns.get("ate_m", ""), sep="\t", file=sys.stderr, flush=True)
+
+
+# Linux counts the memory of the process that starts a command as the command's own, so a small process starts it.
+_LAUNCHER = """
+import json, os, sys
+process = os.spawnvp(os.P_NOWAIT, sys.argv[2], sys.argv[2:])
+_, status, used = os.wait4(process, 0)
+with open(sys.argv[1], "w") as file:
+    json.dump([os.waitstatus_to_exitcode(status), used.ru_utime + used.ru_stime, used.ru_maxrss], file)
+"""
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a command and its children used: processor and elapsed seconds, and the memory of the largest process."""
+
+    cpu_s: float
+    wall_s: float
+    peak_mb: float
+
+
+def run_command(
+    line: Sequence[str],
+    stdout: IO[str],
+    stderr: IO[str] | None = None,
+    environment: Mapping[str, str] | None = None,
+) -> tuple[int, Usage]:
+    """Run a command to its end; return its exit status and what it used."""
+    with tempfile.NamedTemporaryFile("r") as found:
+        launcher = [sys.executable, "-I", "-S", "-c", _LAUNCHER, found.name, *line]
+        start = time.perf_counter()
+        subprocess.run(launcher, stdout=stdout, stderr=stderr, env=environment, check=True)
+        wall_s = time.perf_counter() - start
+        status, cpu_s, peak_kb = json.load(found)
+    return status, Usage(cpu_s, wall_s, peak_kb / 1024)
 
 
 def timed(call: Callable[[], T]) -> tuple[T, float]:

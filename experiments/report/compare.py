@@ -1,93 +1,66 @@
-"""Compare a report with earlier ones: metrics that got worse by more than a tenth."""
+"""Compare a report with an earlier one: what got worse."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
+from typing import Any
 
-from experiments.report.record import Record, is_quiet
+from experiments.report.record import Report
 
-WORSE = 1.1
-TIMES = ("cpu_s", "ms_median", "ms")  # the 95th percentile is of too few frames to compare
-ERRORS = ("ate", "error")
+ERROR, USAGE = 1.05, 1.1
+"""Ratios to the earlier figure beyond which errors, and CPU time or memory, count as worse."""
+UNCERTAIN = 0.01
+"""Share of the frames by which more uncertain ones, or more wrong ones that are not called so, count as worse."""
 NOTHING = 1e-9
-"""An error below this is rounding and is not compared."""
+"""An error below this is rounding."""
+COUNTS = {"uncertain": "uncertain frames", "certain_wrong": "wrong frames that are not called uncertain"}
+USAGES = {"cpu_s": "CPU time (s)", "peak_mb": "memory (MB)"}
+
+Row = dict[str, Any]
 
 
-def compare(record: Record, history: Sequence[Record]) -> list[str]:
-    """A line for every metric that is worse by a tenth than the last one that was not itself worse.
-
-    Errors and posed frames are compared across machines, times only on the same machine when it was idle both times.
-    A regression is reported again until it is accepted.
-    """
+def compare(report: Report, earlier: Report) -> list[str]:
+    """A line for each figure that got worse; CPU time and memory are compared on the same machine only."""
+    is_same = report["machine"] == earlier["machine"]
     found = []
-    for kind in ("sequences", "benchmarks"):
-        for name, figures in record[kind].items():
-            for earlier in _before(record, history, kind, name):
-                old = earlier[kind][name]
-                found += [f"{name}: {words}, {_where(earlier)}" for words in _accuracy(figures, old)]
-                break
-            for earlier in _before(record, history, kind, name, is_timed=True):
-                old = earlier[kind][name]
-                found += [f"{name}: {words}, {_where(earlier)}" for words in _times(figures, old)]
-                break
+    for name, new in report["rows"].items():
+        if (old := earlier["rows"].get(name)) is None:
+            continue
+        lines = [*_results(new, old), *(_usage(new, old) if is_same else ())]
+        found += [f"{name}: {line}" for line in lines]
     return found
 
 
-def missing(record: Record, history: Sequence[Record]) -> list[str]:
-    """Sequences of the last complete report that this one lacks."""
-    known = {name for earlier in history[-1:] for name in earlier["sequences"]}
-    return sorted(known - record["sequences"].keys())
-
-
-def same_bytes(record: Record, history: Sequence[Record]) -> dict[str, bool]:
-    """For every sequence in the history, whether the trajectory has the same bytes as last time."""
-    found = {}
-    for name, figures in record["sequences"].items():
-        for earlier in _before(record, history, "sequences", name):
-            found[name] = earlier["sequences"][name]["trajectory"] == figures["trajectory"]
-            break
-    return found
-
-
-def _before(
-    record: Record, history: Sequence[Record], kind: str, name: str, is_timed: bool = False
-) -> Iterator[Record]:
-    """The records that a metric is compared with, newest first."""
-    for earlier in reversed(history):
-        is_bad = any(words.startswith(f"{name}: ") for words in earlier.get("worse", ()))
-        if name not in earlier[kind] or (is_bad and not earlier.get("accepted")):
+def _results(new: Row, old: Row) -> Iterator[str]:
+    if new["exit_status"] != old["exit_status"]:
+        yield f"exit status {new['exit_status']}, was {old['exit_status']}"
+    if "frames" not in new or "frames" not in old:
+        return
+    if new["posed"] < old["posed"]:
+        yield f"posed {new['posed']} of {new['frames']} frames, was {old['posed']}"
+    if old["posed"] == 0 < new["posed"]:
+        yield f"posed {new['posed']} frames of a recording without a map"
+    for label, before, after in _errors(new, old):
+        if before is None:
             continue
-        if is_timed and not (
-            earlier["machine"] == record["machine"] and is_quiet(earlier) and is_quiet(record)
-        ):
-            continue
-        yield earlier
+        if after is None:
+            yield f"{label} is undefined, was {before:.4g}"
+        elif after > ERROR * before + NOTHING:
+            yield f"{label} {after:.4g}, was {before:.4g} ({after / max(before, NOTHING):.2f} times)"
+    for count, label in COUNTS.items():
+        if new.get(count, 0) - old.get(count, new.get(count, 0)) > UNCERTAIN * new["frames"]:
+            yield f"{new[count]} {label}, was {old[count]}"
 
 
-def _accuracy(new: Record, old: Record) -> Iterator[str]:
-    if "posed" in old:
-        if new["posed"] * WORSE < old["posed"] * new["frames"] / old["frames"]:
-            yield f"posed {new['posed']} of {new['frames']}, was {old['posed']} of {old['frames']}"
-        if old["posed"] == 0 < new["posed"]:
-            yield f"posed {new['posed']} frames of a sequence without a map, was 0"
-    for figure in ERRORS:
-        if figure not in old:
-            continue
-        if figure not in new:
-            yield f"{figure} is undefined, was {old[figure]:.6g}"
-        elif new[figure] > WORSE * old[figure] + NOTHING:
-            yield f"{figure} {new[figure]:.6g}, was {old[figure]:.6g} ({_times_as_much(new[figure], old[figure])})"
+def _errors(new: Row, old: Row) -> Iterator[tuple[str, float | None, float | None]]:
+    """Label, earlier and new value of each error."""
+    yield "online ATE", old.get("online_ate"), new.get("online_ate")
+    yield "ATE", old.get("ate"), new.get("ate")
+    if "peer" in new and "peer" in old:
+        yield "median difference to pycolmap", old["peer"].get("median"), new["peer"].get("median")
 
 
-def _times(new: Record, old: Record) -> Iterator[str]:
-    for figure in TIMES:
-        if figure in new and figure in old and new[figure] > WORSE * old[figure]:
-            yield f"{figure} {new[figure]:g}, was {old[figure]:g} ({_times_as_much(new[figure], old[figure])})"
-
-
-def _times_as_much(new: float, old: float) -> str:
-    return f"{new / max(old, NOTHING):.2f} times"
-
-
-def _where(earlier: Record) -> str:
-    return f"at {earlier['commit'][:10]} of {earlier['time'][:10]} on {earlier['machine']}"
+def _usage(new: Row, old: Row) -> Iterator[str]:
+    for usage, label in USAGES.items():
+        if new[usage] > USAGE * old[usage]:
+            yield f"{label} {new[usage]:g}, was {old[usage]:g} ({new[usage] / old[usage]:.2f} times)"

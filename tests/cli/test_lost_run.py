@@ -83,6 +83,8 @@ def test_a_right_map_of_the_whole_needs_no_other_frames_online(run: Run, steps: 
     assert found["stage_ms"]["total"]["frames"] == LOST + 1
     assert 0 < found["ms_median"] <= found["ms_p95"]
     assert found["fps"] == pytest.approx(1e3 / found["stage_ms"]["total"]["mean"])
+    assert 0 < found["online_posed"] <= LOST
+    assert found["ms_longest"] > 0
 
 
 @pytest.mark.parametrize(

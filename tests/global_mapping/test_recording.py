@@ -214,6 +214,7 @@ def test_the_map_with_the_better_score_is_kept(
     made = world.map(online, Mapping.GLOBAL)
     assert made.kept is kept
     assert made.run is (world.whole if kept is Mapping.GLOBAL else online)
+    assert made.online is online
     assert made.check is world.checks[kept is Mapping.GLOBAL]
 
 

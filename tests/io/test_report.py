@@ -90,7 +90,7 @@ def test_every_image_of_a_global_map_may_be_a_keyframe(run: Run) -> None:
 
 def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
     check = MapCheck(9, 4, 3, 10, 9, 0.8, 0.5, (Break(3, 4, BreakKind.SCALE, 1.2),), (0, 1, 2), (4, 5))
-    mapped = MappedRecording(run, check, Mapping.GLOBAL, "tracking was lost in 3 frames")
+    mapped = MappedRecording(run, run, check, Mapping.GLOBAL, "tracking was lost in 3 frames")
     found = check_metrics(mapped)
     assert found["mapping"] == "global"
     assert found["mapping_reason"] == "tracking was lost in 3 frames"
@@ -107,7 +107,7 @@ def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
         "mapped as a whole: 75% of 4 image pairs that mapping did not use agree, and 90% of 10"
     )
     assert check_metrics(None) == {}
-    assert check_metrics(MappedRecording(run, None, Mapping.ONLINE, ""))["check"] is None
+    assert check_metrics(MappedRecording(run, run, None, Mapping.ONLINE, ""))["check"] is None
 
 
 def test_a_readout_is_a_row_of_the_summary(run: Run) -> None:
@@ -199,6 +199,18 @@ def test_ground_truth_adds_errors(run: Run, trajectory: Trajectory) -> None:
         "2.0000 true meters",
     ):
         assert part in words
+
+
+def test_times_and_online_poses_are_of_the_run_frame_by_frame(run: Run) -> None:
+    times = [{"total": 100.0 if result.index == 2 else float(result.index)} for result in run.results]
+    timed = [replace(result, stage_ms=each) for result, each in zip(run.results, times, strict=True)]
+    online = replace(run, results=timed[:20])
+    whole = replace(run, results=[replace(result, stage_ms={}) for result in run.results])
+    figures = run_metrics(whole, online=online)
+    assert figures["ms_longest"] == 19.0  # not of frame 2, which came before the map
+    assert figures["ms_median"] == 10.5
+    assert figures["online_posed"] == len(online.online) < run_metrics(run)["online_posed"]
+    assert figures["frames"] == 31
 
 
 def test_a_run_without_a_map(run: Run) -> None:

@@ -46,7 +46,7 @@ from torchslam.system.slam import SLAM
 from torchslam.utils.text import without_credentials
 
 TIMES = "times.json"
-TIMED = ("fps", "ms_median", "ms_p95", "stage_ms")
+TIMED = ("fps", "ms_median", "ms_p95", "ms_longest", "stage_ms")
 """Metrics that vary between runs. Only `times.json` has them, with `cpu_s`: processor seconds of the run including
 reading of images and calibration, without evaluation and writing."""
 
@@ -206,7 +206,15 @@ def _run(task: Task, folder: Path) -> Columns:
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
     metrics |= source_of(row.resolve(row.sequence), row.fps, sequence)
-    write_run(_without_times(finished), sequence, metrics, folder, plots=task.plots, viewer=task.plots)
+    write_run(
+        _without_times(finished),
+        sequence,
+        metrics,
+        folder,
+        online=mapped.online,
+        plots=task.plots,
+        viewer=task.plots,
+    )
     return {
         "sequence": without_credentials(row.sequence),
         "status": NO_MAP if finished.failure else DONE,

@@ -458,7 +458,8 @@ def _write(attempt: Attempt, options: argparse.Namespace, before_s: float | None
         )
         metrics["latency_ms"] = {"median": median, "p95": p95}
     metrics |= _usage(before_s) | source_of(options.path, options.fps, sequence)
-    write_run(finished, sequence, metrics, options.output)
+    online = None if attempt.mapped is None else attempt.mapped.online
+    write_run(finished, sequence, metrics, options.output, online=online)
     return metrics
 
 

@@ -55,12 +55,15 @@ class MappedRecording:
 
     Attributes:
         run: the run.
-        check: the check of its map; None without a map, or without image pairs.
+        online: the run frame by frame, which is `run` itself, or came before it; shorter if it stopped when tracking
+            was lost.
+        check: the check of the map of `run`; None without a map, or without image pairs.
         kept: which mapping it is from.
         why: why the recording was mapped as a whole; empty if it was not.
     """
 
     run: Run
+    online: Run
     check: MapCheck | None
     kept: Mapping
     why: str
@@ -102,7 +105,7 @@ def map_recording(
         if check is not None and (not check.is_right or (check.weak_links and _is_doubtful(online))):
             why = f"the check says: {check.sentence()}"
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
-        return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, "")
+        return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, "")
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
     saved = SavedStages(stages, sequence, config, device)
     mapper = GlobalMapper(
@@ -120,24 +123,21 @@ def map_recording(
     if go_on is not None:
         is_whole = len(made.run.trajectory) == len(made.run.results)
         if whole is not None and whole.is_right and is_whole:
-            run = with_times(with_doubts(made.run, whole), online)
-            return MappedRecording(run, whole, Mapping.GLOBAL, why)
+            return MappedRecording(with_doubts(made.run, whole), online, whole, Mapping.GLOBAL, why)
         online = go_on()
         why = _loss(online) or why
     if whole is None:
         check = check_run(online) if check is None else check
-        return MappedRecording(with_doubts(online, check), check, Mapping.ONLINE, why)
+        return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, why)
     before = checked(online)
     if online.failure and not whole.is_right:
         # A camera that only turns, with a wrong focal length, makes maps that contradict themselves.
-        return MappedRecording(online, None, Mapping.ONLINE, why)
+        return MappedRecording(online, online, None, Mapping.ONLINE, why)
     is_better = whole.score > before.score - LITTLE_BETTER
     if abs(whole.score - before.score) < LITTLE_BETTER:
         is_better = len(made.run.trajectory) >= len(online.trajectory)
-    if is_better:
-        run = with_times(with_doubts(made.run, whole), online)
-        return MappedRecording(run, whole, Mapping.GLOBAL, why or "as asked")
-    return MappedRecording(with_doubts(online, before), before, Mapping.ONLINE, why or "as asked")
+    run, check, kept = (made.run, whole, Mapping.GLOBAL) if is_better else (online, before, Mapping.ONLINE)
+    return MappedRecording(with_doubts(run, check), online, check, kept, why or "as asked")
 
 
 def _is_doubtful(run: Run) -> bool:
@@ -202,13 +202,4 @@ def with_doubts(run: Run, check: MapCheck | None) -> Run:
         if doubted and result.state is State.TRACKING:
             result = replace(result, state=State.UNCERTAIN, reasons=(Explanation(Reason.WEAK_LINK),))
         results.append(result)
-    return replace(run, results=results)
-
-
-def with_times(run: Run, online: Run) -> Run:
-    """The run with the times of an online run over the same frames."""
-    times = {result.index: result.stage_ms for result in online.results if result.stage_ms}
-    if not times:
-        return run
-    results = [replace(result, stage_ms=times.get(result.index, {})) for result in run.results]
     return replace(run, results=results)

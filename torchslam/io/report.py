@@ -39,8 +39,10 @@ def compute_metrics(
         mapped: how the recording was mapped, and the check of its map.
     """
 
-    def measured(measure: Callable[[Trajectory], Errors]) -> Errors | None:
-        if sequence.groundtruth is None or finished.failure:
+    online = finished if mapped is None else mapped.online
+
+    def measured(run: Run, measure: Callable[[Trajectory], Errors]) -> Errors | None:
+        if sequence.groundtruth is None or run.failure:
             return None
         try:
             return measure(sequence.groundtruth)
@@ -50,8 +52,9 @@ def compute_metrics(
 
     metrics = run_metrics(
         finished,
-        measured(lambda truth: evaluate(finished.trajectory, truth)),
-        measured(lambda truth: ate_apart(finished.online_parts, truth)),
+        measured(finished, lambda truth: evaluate(finished.trajectory, truth)),
+        measured(online, lambda truth: ate_apart(online.online_parts, truth)),
+        online,
     )
     remarks = {
         "camera": camera_remark(finished, camera),
@@ -106,7 +109,10 @@ FEW = 10
 
 
 def run_metrics(
-    run: Run, evaluation: Evaluation | None = None, online_ate_m: float | None = None
+    run: Run,
+    evaluation: Evaluation | None = None,
+    online_ate_m: float | None = None,
+    online: Run | None = None,
 ) -> dict[str, Any]:
     """Compute the metrics of a run, the content of metrics.json.
 
@@ -115,18 +121,27 @@ def run_metrics(
     - `initialized_at`: index of the frame that initialized the map, or None.
     - `submap`: number of the main submap; `posed`, `keyframes`, `points` and `quality` refer to it.
     - `submaps`: counts of every submap, see `submap_counts`; `session`: number of the run on this map.
+    - `online_posed`: frames with a pose in the main submap when it was reported frame by frame.
     - `fps`, `ms_median`, `ms_p95`: time of `SLAM.step`, without image decoding; `fps` is the inverse of the mean.
       Those of the online stage where the global map was kept; 0 if no frame was processed online.
+      `ms_longest`: the longest time of a frame after the one that initialized the map.
     - `metric`: how well the unit of the main submap is known to be a meter, see `map.unit.MetricUnit`, or None;
       `unmeasured`: why sources of meters said nothing.
     - With ground truth: the errors of the evaluation, and `online_ate_m`, that of the poses as reported online
       (see `evaluation.ate_apart`).
+
+    `online_posed`, `online_ate_m` and the times are of `online`, the run frame by frame, if `run` is a global map.
     """
-    totals = [result.stage_ms["total"] for result in run.results if "total" in result.stage_ms]
+    online = run if online is None else online
+    first = None if online.failure else _start(online.results)
+    timed = [result for result in online.results if "total" in result.stage_ms]
+    totals = [result.stage_ms["total"] for result in timed]
+    later = [] if first is None else [each.stage_ms["total"] for each in timed if each.index > first.index]
     start = None if run.failure else _start(run.results)
     metrics: dict[str, Any] = {
         "frames": len(run.results) + len(run.skipped),
         "posed": len(run.trajectory),
+        "online_posed": len(online.online),
         "posed_ratio_after_initialization": _posed_ratio(run, start),
         "uncertain": sum(result.state is State.UNCERTAIN for result in run.results),
         "lost": sum(result.state is State.LOST for result in run.results),
@@ -142,7 +157,8 @@ def run_metrics(
         "ms_p95": float(torch.tensor(totals, dtype=torch.float32, device="cpu").quantile(0.95))
         if totals
         else 0.0,
-        "stage_ms": stage_times(run.results),
+        "ms_longest": max(later, default=0.0),
+        "stage_ms": stage_times(online.results),
         "skipped": run.skipped,
         "interrupted": run.interrupted,
         "failure": run.failure,

@@ -144,7 +144,9 @@ def delete_unfinished(folder: Path) -> None:
     delete_stages(folder / STAGES)
 
 
-def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path) -> None:
+def write_results(
+    run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path, online: Run | None = None
+) -> None:
     """Write the results of a run, except plots and viewer, into a folder; existing results are replaced.
 
     Args:
@@ -152,6 +154,7 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
         sequence: its images.
         metrics: the content of metrics.json.
         directory: the results folder, created if missing.
+        online: the run frame by frame, if `run` is a global map.
     """
     directory.mkdir(parents=True, exist_ok=True)
     stale = [
@@ -163,7 +166,7 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
     write_trajectory(directory / TRAJECTORY, run.trajectory)
     if run.metric is not None:
         write_earth(directory, run.trajectory, run.metric)
-    write_trajectory(directory / ONLINE, run.online)
+    write_trajectory(directory / ONLINE, (run if online is None else online).online)
     for submap in run.submaps:
         if submap is not run.main and submap.posed_frames.count(run.session):
             write_trajectory(

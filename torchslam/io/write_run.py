@@ -31,6 +31,7 @@ def write_run(
     metrics: dict[str, Any],
     folder: Path,
     *,
+    online: Run | None = None,
     plots: bool = True,
     viewer: bool = True,
 ) -> None:
@@ -41,11 +42,12 @@ def write_run(
         sequence: the images of the run.
         metrics: the content of metrics.json, as by `compute_metrics`.
         folder: the results folder.
+        online: the run frame by frame, if `run` is a global map.
         plots: whether to draw the plots.
         viewer: whether to write the viewer page.
     """
     colorize_points([submap.map for submap in run.submaps], sequence, run.session)
-    write_results(run, sequence, metrics, folder)
+    write_results(run, sequence, metrics, folder, online)
     if not (plots or viewer):
         return
     results = read_results(folder)

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from experiments.benchmarks.problems import PEERS
-from experiments.common import DATA_DIR, parser_of, table, write_between
+from experiments.common import DATA_DIR, parser_of, run_command, table, write_between
 from torchslam.data import open_sequence
 from torchslam.data.trajectories import read_trajectory
 from torchslam.errors import TrajectoryError
@@ -148,13 +148,11 @@ def with_cpu_time(line: list[str]) -> tuple[str, float]:
     """Run a command; return its output and the processor seconds of it and its children."""
     environment = os.environ | {"OMP_NUM_THREADS": "1"}
     with tempfile.TemporaryFile("w+") as printed:
-        child = subprocess.Popen(line, stdout=printed, env=environment)
-        _, status, used = os.wait4(child.pid, 0)
-        child.returncode = os.waitstatus_to_exitcode(status)
-        if child.returncode:
-            raise SystemExit(f"{' '.join(line)}: ended with {child.returncode}")
+        status, used = run_command(line, printed, environment=environment)
+        if status:
+            raise SystemExit(f"{' '.join(line)}: ended with {status}")
         printed.seek(0)
-        return printed.read(), used.ru_utime + used.ru_stime
+        return printed.read(), used.cpu_s
 
 
 def accuracy(path: Path, source: Path, frames: int) -> tuple[float | None, int]:
