@@ -1,9 +1,10 @@
 """A check of a map from outside: image pairs, matched and verified by themselves, and triplets of images.
 
-A verified pair tells where each match must lie if the map's relative pose is right: on the part of its epipolar line
-in front of both cameras. Two pairs that share an image tell the ratio of their baselines, by the depths of keypoints of
-the shared image, each computed by the map's poses from one pair alone: the same depth if the map's scale is one. So
-the triplets around an image tell whether the map before and after it fits together.
+A verified pair determines where each match must lie if the map's relative pose is right: on the part of its epipolar
+line in front of both cameras. Two pairs that share an image determine the ratio of their baselines, by the depths of
+keypoints of the shared image, each computed by the map's poses from one pair alone: the same depth if the scale of the
+map is one. So pairs and triplets contradict a map, or do not. Whether the map ties its parts follows from its own
+information (`torchslam.optim.scale_links`): where it does not, the moment is a weak link.
 """
 
 from __future__ import annotations
@@ -22,8 +23,15 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.global_mapping.depth_ratios import MIN_PARALLAX_SIGMAS, PairDepths, ViewRays, depth_ratio
+from torchslam.global_mapping.depth_ratios import (
+    MIN_PARALLAX_SIGMAS,
+    Array,
+    PairDepths,
+    ViewRays,
+    depth_ratio,
+)
 from torchslam.global_mapping.view_graph import FAR, THRESHOLD_PX, ViewPair
+from torchslam.optim.scale_links import ScaleLinks
 from torchslam.types import FrameFeatures
 
 AGREE_PX = 2 * THRESHOLD_PX
@@ -38,9 +46,9 @@ MAX_SCALE_ERROR = math.log(1.08)
 and 50 %: 20 % is found, and right maps depart by 1 to 3 %."""
 MIN_SPANNING = 3
 """Least number of pairs or triplets that tell whether the map fits together at a moment."""
-STRONG_MATCHES = 100
-"""Matches of a pair across a moment that keep the scale, although no ratio of scales could be told: a camera that
-hardly moves has many and no parallax, a weak link has few."""
+MAX_LINK_STD = 0.02
+"""Standard deviation of the logarithm of the scale across a moment, by the map, from which on it is a weak link: four
+of them are as much as `MAX_SCALE_ERROR`. Right maps have up to 0.004 but for their first and last keyframes."""
 MIN_AGREEING = 0.5
 """Least share of them that agree; single ones may be wrong themselves, by repetitive structure."""
 
@@ -48,6 +56,14 @@ TIED = 0.9
 """Least share of the matches, and of the triplets, between two stretches that must agree so that both are one, as by
 loops, or where few told of the break. On a right map of courthouse 98 % and more agree across two breaks, on garden
 98 %; where maps were bent by hand by 20 % and more, the halves stay apart."""
+
+PAIR_STD_PX, CHANCE_PX = 1.0, 100.0
+"""Standard deviation of the median distance of a pair's matches from where a right map allows them, and the range in
+which that of a wrong one lies, in pixels at the size at which features are found. Tried at these values only."""
+RATIO_STD, CHANCE_LOG_RATIO = 0.03, 2.0
+"""The same of the logarithm of a ratio of scales, besides its own error: right maps depart by 1 to 3 %."""
+BY_CHANCE = 0.05
+"""Share of pairs and ratios that are wrong themselves. Tried at this value only."""
 
 MIN_SCORE = 0.8
 """Score below which a map counts as wrong even without a break; right ones have 0.98 and more."""
@@ -58,7 +74,7 @@ class BreakKind(Enum):
 
     POSE = "image pairs contradict the poses"
     SCALE = "the scale differs"
-    UNKNOWN = "nothing tells whether the scale is the same"
+    UNKNOWN = "weak link: the map does not determine the scale"
     LOOP = "images of one place contradict the poses"
 
 
@@ -96,6 +112,8 @@ class MapCheck:
         consistent: number of those that agree with the map.
         used_agreeing: share of all pairs, used or not, that agree.
         distance_px: median distance of the matches of pairs that mapping did not use from where the map allows them.
+        evidence: of each of these pairs, the logarithm of how much better than chance the map predicts its matches and
+            the ratios of scales that it is part of; 0 where it does not.
         breaks: moments at which the map does not fit together, or may not, in the order of time.
         certain: frames of the images in the largest part that nothing contradicts, ascending.
         uncertain: frames of the other images that have a pose.
@@ -108,6 +126,7 @@ class MapCheck:
     consistent: int
     used_agreeing: float
     distance_px: float
+    evidence: Float[Tensor, " U"]
     breaks: tuple[Break, ...]
     certain: tuple[int, ...]
     uncertain: tuple[int, ...]
@@ -124,7 +143,7 @@ class MapCheck:
     @property
     def is_right(self) -> bool:
         """Whether nothing contradicts the map."""
-        return self.weak_links == len(self.breaks) and self.score > MIN_SCORE
+        return not self.breaks and self.score > MIN_SCORE
 
     @property
     def weak_links(self) -> int:
@@ -161,7 +180,9 @@ class _Triplet:
     middle: int
     last: int
     log_ratio: float  # of scales, later pair to earlier one
+    std: float
     agrees: bool
+    pairs: tuple[int, int]
 
 
 def check_map(
@@ -172,6 +193,7 @@ def check_map(
     camera: Camera,
     held_back: Collection[int] | None = None,
     reduction: float = 1.0,
+    links: ScaleLinks | None = None,
 ) -> MapCheck:
     """Check the poses of images by verified pairs of them.
 
@@ -183,6 +205,7 @@ def check_map(
         camera: of all images.
         held_back: rows of the pairs that mapping did not use; None: all.
         reduction: factor by which images are reduced before features are found.
+        links: how well the map ties the scale across its moments; None: weak links are not sought.
     """
     posed = known.tolist()
     T_cw = T_cw.to(camera.params)
@@ -205,7 +228,8 @@ def check_map(
     agrees = [distance < limit for distance in distances]
     unused = range(len(pairs)) if held_back is None else sorted(held_back)
     triplets, untold = _triplets(depths, pairs, posed, agrees)
-    breaks, parts = _breaks(posed, pairs, agrees, triplets, views)
+    breaks, parts = _breaks(posed, pairs, agrees, triplets, views, links)
+    evidence = _evidence(np.array(distances) / reduction, triplets)
     largest = max(parts, key=len, default=[])
     others = [row for part in parts if part is not largest for row in part]
     return MapCheck(
@@ -216,6 +240,7 @@ def check_map(
         sum(triplet.agrees for triplet in triplets),
         sum(agrees) / len(agrees) if agrees else 0.0,
         float(np.median([distances[row] for row in unused])) if len(unused) else 0.0,
+        torch.from_numpy(evidence[list(unused)]),
         breaks,
         tuple(views[row].index for row in largest),
         tuple(views[row].index for row in others),
@@ -261,8 +286,35 @@ def _triplets(
             ratio = depth_ratio(depths[one], 1, depths[other], 0) if agrees[one] and agrees[other] else None
             if ratio is not None and ratio.std < MAX_RATIO_STD:
                 is_one = abs(ratio.log_ratio) < MAX_SCALE_ERROR + 2 * ratio.std
-                found.append(_Triplet(pairs[one].first, middle, pairs[other].second, ratio.log_ratio, is_one))
+                spans = pairs[one].first, middle, pairs[other].second
+                found.append(_Triplet(*spans, ratio.log_ratio, ratio.std, is_one, (one, other)))
     return found, untold
+
+
+def _evidence(distances_px: Array, triplets: Sequence[_Triplet]) -> Array:
+    """For each pair, how much better than chance a map predicts it: logarithms of likelihood ratios, 0 at least.
+
+    Args:
+        distances_px: median distances of the matches of pairs from where the map allows them; infinite without a pose.
+        triplets: that tell a ratio of scales.
+    """
+    found = _likelihood_ratio(distances_px, PAIR_STD_PX, CHANCE_PX)
+    sums, counts = np.zeros_like(found), np.zeros_like(found)
+    for each in triplets:
+        ratio = _likelihood_ratio(np.array(each.log_ratio), math.hypot(RATIO_STD, each.std), CHANCE_LOG_RATIO)
+        for row in each.pairs:
+            sums[row] += ratio
+            counts[row] += 1
+    return found + sums / np.maximum(counts, 1)
+
+
+def _likelihood_ratio(errors: Array, std: float, chance: float) -> Array:
+    """Logarithm of the likelihood of normal errors among some by chance, to that of errors by chance alone.
+
+    chance: width of the range in which errors by chance are equally probable
+    """
+    normal = np.exp(-0.5 * np.square(errors / std)) / (math.sqrt(2 * math.pi) * std)
+    return np.log1p(normal * chance * (1 - BY_CHANCE) / BY_CHANCE)
 
 
 def _breaks(
@@ -271,6 +323,7 @@ def _breaks(
     agrees: Sequence[bool],
     triplets: Sequence[_Triplet],
     views: Sequence[FrameFeatures],
+    links: ScaleLinks | None,
 ) -> tuple[tuple[Break, ...], list[list[int]]]:
     """The moments at which pairs or triplets disagree, and the posed images in the parts between them."""
     rows = [row for row, known in enumerate(posed) if known]
@@ -287,7 +340,6 @@ def _breaks(
     def disagree(chosen: NDArray[np.bool_], agreeing: NDArray[np.bool_]) -> bool:
         return bool(np.count_nonzero(chosen) >= MIN_SPANNING and agreeing[chosen].mean() < MIN_AGREEING)
 
-    breaks: list[Break] = []
     apart: list[tuple[int, Break]] = []
     stretches = [[rows[0]]] if rows else []
     for before, after in pairwise(rows):
@@ -298,24 +350,17 @@ def _breaks(
         kind, ratio = None, 1.0
         if disagree(crossing, good):
             kind = BreakKind.POSE
-        elif not (crossing & good).any():
+        elif links is not None and links.weakest(views[before].index, views[after].index) > MAX_LINK_STD:
             kind = BreakKind.UNKNOWN
-        elif np.count_nonzero(around) < MIN_SPANNING:
-            kind = BreakKind.UNKNOWN if sizes[crossing & good].max(initial=0) < STRONG_MATCHES else None
         elif disagree(around, right):
             kind, ratio = BreakKind.SCALE, math.exp(float(np.median(ratios[around])))
         if kind is None:
             stretches[-1].append(after)
             continue
-        found = Break(views[before].index, views[after].index, kind, ratio)
-        if kind is BreakKind.UNKNOWN and (crossing & good).any():  # weak, but nothing contradicts it
-            stretches[-1].append(after)
-            breaks.append(found)
-        else:
-            stretches.append([after])
-            apart.append((len(stretches) - 1, found))
+        stretches.append([after])
+        apart.append((len(stretches) - 1, Break(views[before].index, views[after].index, kind, ratio)))
     label = _tied(stretches, len(posed), ends, good * sizes, sizes, spans, right)
-    breaks += [found for later, found in apart if label[later - 1] != label[later]]
+    breaks = [found for later, found in apart if label[later - 1] != label[later]]
     if disagree(~near, good):
         first, last = ends[~near & ~good][0].tolist()
         breaks.append(Break(views[first].index, views[last].index, BreakKind.LOOP))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 from functools import partial
@@ -47,6 +47,7 @@ from torchslam.global_mapping.weak_links import pairs_across, strengthen
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
+from torchslam.optim.model_choice import predictive_gain
 from torchslam.optim.rotation_averaging import solve_rotations
 from torchslam.system.front_end import (
     Extractor,
@@ -101,6 +102,22 @@ class GlobalMap:
     pairs: list[ViewPair]
     held_back: frozenset[int]
     doubtful: frozenset[int] = frozenset()
+
+    @property
+    def held_back_times(self) -> Float[Tensor, " U"]:
+        """The middle of the two images of each pair that mapping did not use, seconds."""
+        return middle_times(self.views, self.pairs, self.held_back)
+
+
+def middle_times(
+    views: Rows[FrameFeatures], pairs: Rows[ViewPair], chosen: Collection[int]
+) -> Float[Tensor, " U"]:
+    """The middle between the times of the two images of chosen pairs, seconds, in the order of their rows."""
+    times = [
+        0.5 * (views[pairs[row].first].timestamp + views[pairs[row].second].timestamp)
+        for row in sorted(chosen)
+    ]
+    return torch.tensor(times, dtype=torch.float64, device="cpu")
 
 
 Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
@@ -224,7 +241,8 @@ class GlobalMapper:
             tied = self.reconstruct(views, used, LearnedPairs(learned.views, kept))
             if not isinstance(tied, str):
                 before, after = (self._check(made, learned.views, every, left_out) for made in (found, tied))
-                if after.score > before.score:
+                times = middle_times(learned.views, every, left_out)
+                if predictive_gain(after.evidence, before.evidence, times).is_sure:
                     added = set(tied[0].tolist()) - set(found[0].tolist())
                     doubtful = frozenset() if after.is_right else frozenset(views[row].index for row in added)
                     found, views, pairs, held_back = tied, learned.views, every, left_out

@@ -19,6 +19,8 @@ from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
+from torchslam.optim.model_choice import SURE, predictive_gain
+from torchslam.optim.scale_links import scale_links
 from torchslam.system.front_end import KeptFeatures
 from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher
@@ -26,14 +28,8 @@ from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResul
 
 FEW_POSED = 0.98
 """Share of the frames with a pose in the main submap below which a recording is mapped as a whole as well."""
-FEW_CERTAIN = 0.05
-"""Share of frames with an uncertain pose from which on weak links count as doubt: 11 % on office_loop, which is wrong,
-none on machine_hall and redkitchen, which have weak links too and are right."""
 CHECKED_DISTANCES = 1, 2, 4
 """Distances, in keyframes, of the pairs that check an online run."""
-LITTLE_BETTER = 0.01
-"""Difference of two scores that does not tell which map is better."""
-
 KeyframePairs = tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]]
 """Poses and features of keyframes, and their verified pairs."""
 
@@ -102,7 +98,7 @@ def map_recording(
     if not why or mapping is Mapping.ONLINE:
         progress("check", 0, 1)
         check = check_run(online)
-        if check is not None and (not check.is_right or (check.weak_links and _is_doubtful(online))):
+        if check is not None and not check.is_right:
             why = f"the check says: {check.sentence()}"
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
         return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, "")
@@ -117,7 +113,9 @@ def map_recording(
     def checked(run: Run) -> MapCheck:
         own = run.camera.to(camera.params)
         poses = poses_of(run, made.views)
-        return check_map(*poses, made.views, made.pairs, own, made.held_back, reduction)
+        links = None if run.failure else scale_links(run.graph, run.session)
+        views = run.at_middle_row(made.views)
+        return check_map(*poses, views, made.pairs, own, made.held_back, reduction, links)
 
     whole = None if made.run.failure else checked(made.run).doubting(made.doubtful)
     if go_on is not None:
@@ -133,17 +131,12 @@ def map_recording(
     if online.failure and not whole.is_right:
         # A camera that only turns, with a wrong focal length, makes maps that contradict themselves.
         return MappedRecording(online, online, None, Mapping.ONLINE, why)
-    is_better = whole.score > before.score - LITTLE_BETTER
-    if abs(whole.score - before.score) < LITTLE_BETTER:
-        is_better = len(made.run.trajectory) >= len(online.trajectory)
+    gain = predictive_gain(whole.evidence, before.evidence, made.held_back_times)
+    is_better = len(made.run.trajectory) >= len(online.trajectory)
+    if abs(gain.sigmas) > SURE:
+        is_better = gain.total > 0
     run, check, kept = (made.run, whole, Mapping.GLOBAL) if is_better else (online, before, Mapping.ONLINE)
     return MappedRecording(with_doubts(run, check), online, check, kept, why or "as asked")
-
-
-def _is_doubtful(run: Run) -> bool:
-    """Whether tracking was uncertain so often that weak links are no accident of the check."""
-    uncertain = sum(result.state is State.UNCERTAIN for result in run.results)
-    return uncertain > FEW_CERTAIN * len(run.results)
 
 
 def _loss(run: Run) -> str:
@@ -168,7 +161,8 @@ def check_run(run: Run, matched: KeyframePairs | None = None) -> MapCheck | None
     T_cw, views, pairs = run.map.T_cw[run.map.keyframe_rows(run.session)], *found[1:]
     known = torch.ones(len(views), dtype=torch.bool, device="cpu")
     reduction = run.config.for_size(run.camera.size).features.reduction(run.camera.size)
-    return check_map(T_cw, known, views, pairs, run.camera, None, reduction)
+    links = scale_links(run.graph, run.session)
+    return check_map(T_cw, known, views, pairs, run.camera, None, reduction, links)
 
 
 @torch.no_grad()

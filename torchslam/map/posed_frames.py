@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -267,6 +268,37 @@ class PosedFrames:
         depths = torch.where(depths.isnan(), depths.nanmedian(dim=1, keepdim=True).values, depths)
         corrected = sensor.at_middle_row(detected, velocities, depths)
         table["keypoints"][rows] = torch.where(corrected.isfinite(), corrected, detected)
+
+    def at_middle_row(
+        self, views: Sequence[FrameFeatures], slam_map: Map, sensor: SensorModel
+    ) -> list[FrameFeatures]:
+        """Views with the keypoints of a global shutter, at the median depth of what their frames see.
+
+        Views of other frames stay as they are.
+
+        Args:
+            views: of frames by their index, keypoints as they were detected.
+            slam_map: the map.
+            sensor: by which the keypoints are corrected.
+        """
+        if sensor.readout is None:
+            return list(views)
+        T_cw = self.T_cw(slam_map)
+        velocities, _ = frame_velocities(T_cw, self.frames["timestamp"], self.frames["session"])
+        points_w = slam_map.positions_w[slam_map.follow_merges(self.observations["point_ids"])]
+        seen_by = self.observations["frame_row"]
+        depths = transform(T_cw[seen_by], points_w[:, None])[:, 0, 2]
+        row_of = {key: row for row, key in enumerate(self.keys.tolist())}
+        corrected = []
+        for view in views:
+            row = row_of.get(int(key_of(torch.tensor(view.session), torch.tensor(view.index))))
+            own = depths[:0] if row is None else depths[seen_by == row]
+            if row is not None and len(own):
+                depth = own.median().expand(1, len(view.detected))
+                pixels = sensor.at_middle_row(view.detected[None], velocities[row : row + 1], depth)[0]
+                view = replace(view, keypoints=pixels)
+            corrected.append(view)
+        return corrected
 
     def graph(
         self,

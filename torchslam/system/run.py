@@ -38,7 +38,7 @@ from torchslam.optim.run_graph import (
 from torchslam.system.front_end import source
 from torchslam.system.online_camera import CameraChange, OnlineCamera, given_readout
 from torchslam.system.session import Session
-from torchslam.types import Frame, Reason, State, StepResult, Trajectory
+from torchslam.types import Frame, FrameFeatures, Reason, State, StepResult, Trajectory
 
 
 class _System(Protocol):
@@ -151,6 +151,17 @@ class Run:
         for number in numbers:
             numbers += sorted(set[int]().union(*(pair for pair in joined if number in pair)) - set(numbers))
         return [part for number in numbers if len(part := self._given_in(number))]
+
+    @property
+    def sensor(self) -> SensorModel:
+        """Camera and shutter of all frames."""
+        return SensorModel(self.camera, self.readout)
+
+    def at_middle_row(self, views: list[FrameFeatures]) -> list[FrameFeatures]:
+        """Views of frames of the main submap with the keypoints of a global shutter; others as they are."""
+        if self.main is None:
+            return views
+        return self.posed_frames.at_middle_row(views, self.map, self.sensor)
 
     def _given_in(self, number: int) -> Trajectory:
         """The poses that were returned in the submap of a number."""
