@@ -30,6 +30,7 @@ from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import robustify
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities
 from torchslam.optim._core.options import GRAPH_OPTIONS
+from torchslam.optim.model_choice import Gain
 from torchslam.optim.run_graph import ObservationGraph
 
 MIN_FRAMES, MAX_FRAMES = 12, 60
@@ -45,8 +46,6 @@ ITERATIONS, TOLERANCE = 30, 1e-8
 RIDGE = 1e-9  # of normalized derivatives, whose squares may be singular for a point seen along its ray
 MIN_INFORMATION = 1.0
 """Of the readout: less is a formal standard error of more than one frame interval, as of a camera at rest."""
-MIN_SIGMAS = 5.0
-"""A readout of columns in place of rows, which no camera has, reaches 4 standard errors on real sequences."""
 MIN_SHIFT = 0.05
 """Median shift worth naming, as a ratio of the median residual: in fast turns it is several times as large."""
 MAX_RATIO = 1.2
@@ -66,6 +65,7 @@ class RollingShutter:
         readout_std: Standard error of it; infinite, and the readout zero, if the camera hardly moves.
         interval: Frame interval, seconds.
         shift: Median shift by the readout, as a ratio of the median residual.
+        gain: How much better stretches are predicted by the readout that all others find than by a global shutter.
         by_row: Ratio of the squared residuals without the readout that smooth functions of the row explain, one for
             each frame; NaN if that was not tested.
         by_column: The same for the column.
@@ -75,13 +75,14 @@ class RollingShutter:
     readout_std: float
     interval: float
     shift: float
+    gain: Gain
     by_row: float
     by_column: float
 
     @property
     def is_read_out(self) -> bool:
         """Whether the motion of the camera shows a rolling shutter."""
-        is_certain = abs(self.readout) > MIN_SIGMAS * self.readout_std and self.shift > MIN_SHIFT
+        is_certain = self.gain.is_worth and self.shift > MIN_SHIFT
         return is_certain and abs(self.readout) < MAX_RATIO * self.interval
 
     @property
@@ -207,7 +208,7 @@ def find_rolling_shutter(
     ]
     poses = _Block.of(J_poses, frame, count)
     left, shift = project_out(torch.cat((residuals, row * flow), dim=-1), [poses, *others]).split(1, dim=-1)
-    readout, std = _regress(left[..., 0], shift[..., 0], frame, count)
+    readout, std, gain = _regress(left[..., 0], shift[..., 0], frame, count, start / interval)
     left = left - readout * shift
     ratios = [] if for_shaking else [math.nan, math.nan]
     for place in (row, column) if for_shaking else ():
@@ -218,7 +219,7 @@ def find_rolling_shutter(
     typical = (row * flow)[..., 0].norm(dim=-1).median() / residuals[..., 0].norm(dim=-1).median()
     readout += start / interval
     size_of_shift = abs(readout) * float(typical)
-    return RollingShutter(interval * readout, interval * std, interval, size_of_shift, *ratios)
+    return RollingShutter(interval * readout, interval * std, interval, size_of_shift, gain, *ratios)
 
 
 def readout_by(found: RollingShutter | None, known: Readout) -> Readout | None:
@@ -262,15 +263,26 @@ def _curves(place: Float[Tensor, "*batch"]) -> list[Float[Tensor, "*batch"]]:
 
 
 def _regress(
-    left: Float[Tensor, "O 2"], shift: Float[Tensor, "O 2"], frame: Int[Tensor, " O"], frames: int
-) -> tuple[float, float]:
-    """The coefficient of residuals on shifts and its standard error, the larger of two.
+    left: Float[Tensor, "O 2"],
+    shift: Float[Tensor, "O 2"],
+    frame: Int[Tensor, " O"],
+    frames: int,
+    start: float,
+) -> tuple[float, float, Gain]:
+    """The coefficient of residuals on shifts, its standard error, the larger of two, and the gain over no readout.
 
     Errors count as independent between frames, which are in order of time, and between stretches of the run.
+
+    Args:
+        left: residuals, corrected by `start` times the shifts.
+        shift: by a readout of one.
+        frame: of each observation.
+        frames: number of frames.
+        start: the coefficient by which residuals are corrected already.
     """
     information = shift.square().sum()
     if not bool(information > MIN_INFORMATION):
-        return 0.0, math.inf
+        return 0.0, math.inf, Gain(0.0, math.inf, 0)
     readout = (shift * left).sum() / information
     scores = (shift * (left - readout * shift)).sum(-1)
     parts = max(2, min(PARTS, frames // PART_FRAMES))
@@ -280,4 +292,12 @@ def _regress(
         / information
         for groups in (frames, parts)
     ]
-    return float(readout), float(torch.stack(stds).max())
+    part = frame * parts // frames
+    products, squares = (
+        shift.new_zeros(parts).index_add(0, part, (shift * each).sum(-1))
+        for each in (left + start * shift, shift)
+    )
+    others = (products.sum() - products) / (squares.sum() - squares).clamp_min(MIN_INFORMATION)
+    variance = (left - readout * shift).square().mean()
+    gain = Gain.of_stretches((others * products - 0.5 * others.square() * squares) / variance)
+    return float(readout), float(torch.stack(stds).max()), gain
