@@ -129,7 +129,10 @@ def test_few_frames_are_requested_ahead() -> None:
         assert sorted(frames._requested) == [*range(12, 20)]
 
 
-def test_a_worker_that_has_not_started_is_not_waited_for(sequence: Sequence) -> None:
+def test_a_worker_that_has_not_started_is_not_waited_for(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
     with ahead(sequence) as frames:
         start = time.monotonic()
         assert not check_same(frames, sequence, 0)
@@ -182,6 +185,42 @@ def test_one_or_two_processes_give_the_same_bytes(tmp_path: Path, capsys: pytest
     for name in ("trajectory.txt", "online.txt", "keyframes.txt", "map.safetensors", "map.ply"):
         assert (outputs[0] / name).read_bytes() == (outputs[1] / name).read_bytes(), name
     assert multiprocessing.active_children() == []
+
+
+RUN = """
+import sys, threading
+from multiprocessing.process import BaseProcess
+
+start = BaseProcess.start
+
+def start_and_print(process):
+    print("started a", type(process).__name__)
+    start(process)
+
+if __name__ == "__main__":
+    if sys.argv[1] == "spawn":
+        threading.Thread(target=threading.Event().wait, daemon=True).start()
+    BaseProcess.start = start_and_print
+    from torchslam.cli.main import main
+    sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.usefixtures("without_pictures")
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
+def test_forks_and_new_interpreters_give_the_same_bytes(tmp_path: Path) -> None:
+    folder = write_tum_folder(tmp_path / "room", frames=16)
+    expected = {1: [], 2: ["Process"], 3: 2 * ["Process"]}
+    for method, processes in (("none", 1), ("fork", 2), ("fork", 3), ("spawn", 3)):
+        output = tmp_path / f"{method}{processes}"
+        arguments = ["run", str(folder), "-o", str(output), *SET, "--processes", str(processes)]
+        command = [sys.executable, "-c", RUN, method, *arguments, "--mapping", "online"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE)
+        started = [line.split()[-1] for line in done.stdout.splitlines() if line.startswith("started a")]
+        # `torchslam run` has a single thread when its workers start, so that they are forks.
+        assert started == [f"{method.capitalize()}{kind}" for kind in expected[processes]]
+        for name in ("trajectory.txt", "online.txt", "keyframes.txt", "map.safetensors", "map.ply"):
+            assert (output / name).read_bytes() == (tmp_path / "none1" / name).read_bytes(), (output, name)
 
 
 def test_videos_and_archives_can_be_sent_to_workers(tmp_path: Path, sequence: Sequence) -> None:
