@@ -36,6 +36,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from torchslam.utils.forks import close_decoders
+
 RESPONSE_TIMEOUT_S = 60.0
 """A worker that was stopped is given up after this time; a frame or a local adjustment takes less than a second."""
 
@@ -145,6 +147,8 @@ class WorkerPool:
         self._workers: deque[_Worker] = deque()
 
     def __enter__(self) -> Self:
+        if self.count > 0:
+            close_decoders()
         atexit.register(self._end)  # before multiprocessing waits for processes that wait for calls
         try:
             with _without_interrupts():
