@@ -242,13 +242,15 @@ def test_videos_and_archives_can_be_sent_to_workers(tmp_path: Path, sequence: Se
 # --- processes that are ended ---------------------------------------------------------------------------------
 
 ORPHAN = """
-import os, signal
+import os, signal, sys
 from tests.parallel.test_pool import wait_until_ready
 from tests.parallel.test_prefetch import ahead
 from torchslam.data import open_sequence
+from torchslam.parallel import pool
 
 if __name__ == "__main__":
-    with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
+    pool.can_fork = lambda: sys.argv[1] == "fork"
+    with ahead(open_sequence("synthetic:room?frames=50&blank=1"), processes=2) as frames:
         wait_until_ready(frames)
         frames[0], frames[1]
         os.kill(os.getpid(), signal.SIGKILL)
@@ -279,30 +281,33 @@ def wait_for_end(group: int) -> None:
 
 
 @needs_proc
-def test_a_worker_ends_with_its_parent() -> None:
-    asking = subprocess.Popen([sys.executable, "-c", ORPHAN], start_new_session=True)
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_workers_end_with_their_parent(method: str) -> None:
+    asking = subprocess.Popen([sys.executable, "-c", ORPHAN, method], start_new_session=True)
     assert asking.wait(PATIENCE) == -signal.SIGKILL
     wait_for_end(asking.pid)
 
 
 @needs_proc
 @pytest.mark.parametrize(
-    ("number", "status", "when"),
+    ("method", "number", "status", "when"),
     [
-        (signal.SIGINT, 130, "initializing"),
-        (signal.SIGTERM, 143, "? frames/s"),  # before the other process has started
-        pytest.param(signal.SIGINT, 130, "? frames/s", marks=pytest.mark.slow),
-        pytest.param(signal.SIGTERM, 143, "initializing", marks=pytest.mark.slow),
+        ("fork", signal.SIGINT, 130, "initializing"),
+        ("fork", signal.SIGTERM, 143, "? frames/s"),
+        ("spawn", signal.SIGTERM, 143, "? frames/s"),  # before the new interpreter has started
+        pytest.param("spawn", signal.SIGINT, 130, "? frames/s", marks=pytest.mark.slow),
+        pytest.param("spawn", signal.SIGTERM, 143, "initializing", marks=pytest.mark.slow),
     ],
 )
 def test_a_signal_to_the_process_group_ends_the_run_with_results(
-    tmp_path: Path, number: int, status: int, when: str
+    tmp_path: Path, method: str, number: int, status: int, when: str
 ) -> None:
     line = ["run", "synthetic:room?frames=50000&blank=1", "-o", str(tmp_path / "out"), *SET]
     command = [
         sys.executable,
-        "-m",
-        "torchslam.cli.main",
+        "-c",
+        RUN,
+        method,
         *line,
         "--processes",
         "2",
