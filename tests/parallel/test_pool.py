@@ -222,6 +222,26 @@ def test_a_worker_stopped_while_it_sends_a_result_is_given_up(monkeypatch: pytes
             pool.result(call)
 
 
+def test_a_worker_is_not_used_after_an_interrupt_within_a_message(
+    pool: WorkerPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(timeout: float) -> bool:
+        worker.connection._recv(2)  # type: ignore[attr-defined]
+        raise KeyboardInterrupt
+
+    wait_until_ready(pool)
+    (worker,) = pool._workers
+    calls = [pool.submit(torch.eye(2)) for _ in range(2)]
+    monkeypatch.setattr(worker, "receive", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pool.result(calls[0])
+    for call in calls:
+        with pytest.raises(WorkerLostError):
+            pool.result(call)
+    assert pool.submit(torch.eye(2)) is None
+    assert multiprocessing.active_children() == []
+
+
 @needs_stop
 def test_a_stopped_worker_can_be_ended(pool: WorkerPool) -> None:
     wait_until_ready(pool)

@@ -176,16 +176,16 @@ class WorkerPool:
 
     def submit(self, *question: object) -> Call | None:
         """Begin a call, of the workers in turn; None if calls are not accepted."""
-        packed = _pack(question) if self.is_ready else b""
+        if not self.is_ready:
+            return None
+        packed = _pack(question)
         for _ in range(len(self._workers)):
             worker = self._workers[0]
             self._workers.rotate(-1)
             if worker.task is not None:
                 continue
-            try:
+            with self._lost_on_error(worker):
                 return worker.send(packed)
-            except OSError as error:
-                self._lose(worker, error)
         return None
 
     def result(self, call: Call) -> Any:
@@ -198,11 +198,9 @@ class WorkerPool:
         while call.answer is None:
             if call.worker not in self._workers:
                 raise WorkerLostError
-            try:
+            with self._lost_on_error(call.worker):
                 if not call.worker.receive(RESPONSE_TIMEOUT_S):
                     raise BlockingIOError
-            except (OSError, EOFError) as error:
-                self._lose(call.worker, error)
         found, trace = pickle.loads(call.answer)
         if trace:
             raise found from RemoteError(trace)
@@ -215,29 +213,34 @@ class WorkerPool:
         asked = [each for each in self._workers if each.waiting]
         answering = wait([each.connection for each in asked], timeout)
         for worker in asked:
-            try:
-                if worker.connection in answering:
+            if worker.connection in answering:
+                with self._lost_on_error(worker):
                     worker.receive(0)
-            except (OSError, EOFError) as error:
-                self._lose(worker, error)
         return self._have_ended(calls)
 
     def _have_ended(self, calls: Sequence[Call]) -> list[Call]:
         return [call for call in calls if call.answer is not None or call.worker not in self._workers]
 
     def _is_ready(self, worker: _Worker) -> bool:
-        try:
+        with self._lost_on_error(worker):
             return worker.is_ready()
-        except (OSError, EOFError) as error:
-            self._lose(worker, error)
-            return False
+        return False
 
-    def _lose(self, worker: _Worker, error: Exception) -> None:
-        """Go on without a worker, and warn."""
-        self._workers.remove(worker)
-        worker.end()
-        reason = "does not answer" if isinstance(error, BlockingIOError) else "has ended"
-        warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=3)
+    @contextmanager
+    def _lost_on_error(self, worker: _Worker) -> Iterator[None]:
+        """Warn and go on without a worker that has ended or does not answer.
+
+        After Ctrl-C the worker is not used either: the next message would begin in the middle of this one.
+        """
+        try:
+            yield
+        except BaseException as error:
+            self._workers.remove(worker)
+            worker.end()
+            if not isinstance(error, OSError | EOFError):
+                raise
+            reason = "does not answer" if isinstance(error, BlockingIOError) else "has ended"
+            warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=4)
 
 
 class SharedTasks(WorkerPool):
