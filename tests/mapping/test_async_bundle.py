@@ -203,6 +203,7 @@ def test_the_run_continues_without_a_killed_worker() -> None:
 
 
 def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
     with BundleWorker() as solver:
         monkeypatch.setattr(solver, "result", None)
         adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()

@@ -7,6 +7,9 @@ import multiprocessing
 import os
 import signal
 import struct
+import subprocess
+import sys
+import textwrap
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -24,9 +27,10 @@ PATIENCE = 120.0  # seconds: torch is imported within two, on a machine with not
 
 def wait_until_ready(pool: WorkerPool) -> None:
     """Wait for all workers, which a run does not."""
-    for worker in pool._workers:
-        worker.started.result(PATIENCE)
-    assert pool.is_ready
+    until = time.monotonic() + PATIENCE
+    while not pool.is_ready or any(worker.task is not None for worker in pool._workers):
+        assert time.monotonic() < until
+        time.sleep(0.01)
 
 
 def multiplier(factor: Tensor) -> Callable[..., object]:
@@ -45,7 +49,7 @@ def fail(error: Exception) -> None:
 
 
 @pytest.fixture
-def pool() -> Iterator[WorkerPool]:
+def pool(start_method: str) -> Iterator[WorkerPool]:
     with WorkerPool(1, multiplier, torch.tensor([2.0, 3.0]), niceness=3) as found:
         yield found
 
@@ -67,7 +71,8 @@ def test_calls_are_answered_by_a_process_with_the_settings_of_this_one(pool: Wor
     assert pool.submit(torch.eye(2)) is None
 
 
-def test_no_call_is_accepted_before_a_worker_has_started() -> None:
+def test_no_call_is_accepted_before_a_new_interpreter_has_started(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
     begun = time.monotonic()
     with WorkerPool(2, multiplier, torch.ones(1)) as pool:
         assert not pool.is_ready
@@ -78,6 +83,34 @@ def test_no_call_is_accepted_before_a_worker_has_started() -> None:
         assert pool.submit(torch.eye(2)) is None
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
+def test_a_fork_accepts_calls_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: True)
+    with WorkerPool(2, multiplier, torch.ones(1)) as pool:
+        calls = [pool.submit(torch.full((2,), float(number))) for number in range(4)]
+        assert len({call.worker.process.pid for call in calls if call is not None}) == 2
+        for number, call in enumerate(calls):
+            assert call is not None
+            assert pool.result(call)[0].tolist() == [number, number]
+
+
+@pytest.mark.parametrize("is_alone", [True, False])
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
+def test_a_process_with_another_thread_is_not_forked(is_alone: bool) -> None:
+    script = f"""
+        import threading
+        from torchslam.parallel.pool import can_fork
+        if not {is_alone}:
+            threading.Thread(target=threading.Event().wait, daemon=True).start()
+        print(can_fork())
+        """
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    alone = os.environ | {"OPENBLAS_NUM_THREADS": "1"}  # it begins its threads when NumPy is imported
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=alone)
+    assert done.stdout.split() == [str(is_alone)]
+
+
+@pytest.mark.usefixtures("start_method")
 @pytest.mark.parametrize("error", [ZeroDivisionError("what is this?"), FrameError("frame 3 is damaged")])
 def test_an_error_is_raised_by_the_caller_with_its_traceback(error: Exception) -> None:
     with WorkerPool(1, partial, fail, error) as pool:
@@ -100,14 +133,22 @@ def test_a_killed_worker_is_reported_once(pool: WorkerPool) -> None:
         assert pool.submit(torch.eye(2)) is None
 
 
-def test_a_worker_that_cannot_start_is_reported() -> None:
+@pytest.mark.usefixtures("start_method")
+def test_a_worker_that_cannot_make_its_function_is_reported() -> None:
     with WorkerPool(1, fail, FrameError("it has no task")) as pool:
-        until = time.monotonic() + PATIENCE
-        while not pool.is_ready:
-            assert time.monotonic() < until
-            time.sleep(0.01)
+        wait_until_ready(pool)
+        pool._workers[0].process.join(PATIENCE)
         with pytest.warns(UserWarning, match="has ended: going on without it"):
             assert pool.submit() is None
+
+
+def test_a_new_interpreter_killed_while_it_starts_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
+    with WorkerPool(1, multiplier, torch.ones(1)) as pool:
+        pool._workers[0].process.kill()
+        pool._workers[0].process.join()
+        with pytest.warns(UserWarning, match="has ended: going on without it"):
+            assert pool.submit(torch.eye(2)) is None
 
 
 needs_stop = pytest.mark.skipif(not hasattr(signal, "SIGSTOP"), reason="processes cannot be stopped here")
@@ -130,18 +171,19 @@ def test_a_stopped_worker_is_given_up(pool: WorkerPool, monkeypatch: pytest.Monk
 
 
 def die(is_asked: bool) -> int:
-    """End as if killed while the result is sent: the executor here has read its beginning by then."""
+    """End as if killed while the result is sent."""
     if not is_asked:
         return os.getpid()
     frame = inspect.currentframe()
-    while frame is not None and "result_queue" not in frame.f_locals:
+    while frame is not None and "connection" not in frame.f_locals:
         frame = frame.f_back
     assert frame is not None
-    os.write(frame.f_locals["result_queue"]._writer.fileno(), struct.pack("!i", 100) + b"half a result")
+    os.write(frame.f_locals["connection"].fileno(), struct.pack("!i", 100) + b"half a result")
     os.kill(os.getpid(), signal.SIGKILL)
     return 0
 
 
+@pytest.mark.usefixtures("start_method")
 def test_a_worker_killed_while_it_sends_a_result_is_not_waited_for() -> None:
     with WorkerPool(2, partial, die) as pool:
         wait_until_ready(pool)
@@ -155,11 +197,81 @@ def test_a_worker_killed_while_it_sends_a_result_is_not_waited_for() -> None:
 
 
 @needs_stop
-def test_a_stopped_worker_with_calls_larger_than_a_pipe_can_be_ended(pool: WorkerPool) -> None:
+@pytest.mark.usefixtures("start_method")
+def test_a_stopped_worker_takes_no_calls_larger_than_its_pipe(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.RESPONSE_TIMEOUT_S", 0.5)
+    with WorkerPool(1, multiplier, torch.ones(1)) as pool:
+        wait_until_ready(pool)
+        os.kill(pool._workers[0].process.pid or 0, signal.SIGSTOP)
+        with pytest.warns(UserWarning, match="does not answer: going on without it"):
+            assert pool.submit(torch.zeros(10_000_000)) is None
+        assert multiprocessing.active_children() == []
+
+
+@needs_stop
+@pytest.mark.usefixtures("start_method")
+def test_a_worker_stopped_while_it_sends_a_result_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.RESPONSE_TIMEOUT_S", 0.5)
+    with WorkerPool(1, multiplier, torch.ones(1)) as pool:
+        wait_until_ready(pool)
+        call = pool.submit(torch.zeros(10_000_000))
+        assert call is not None
+        assert pool._workers[0].connection.poll(PATIENCE)  # it has begun
+        os.kill(pool._workers[0].process.pid or 0, signal.SIGSTOP)
+        with pytest.warns(UserWarning, match="does not answer"), pytest.raises(WorkerLostError):
+            pool.result(call)
+
+
+def test_a_worker_is_not_used_after_an_interrupt_within_a_message(
+    pool: WorkerPool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(timeout: float) -> bool:
+        worker.connection._recv(2)  # type: ignore[attr-defined]
+        raise KeyboardInterrupt
+
     wait_until_ready(pool)
-    (process,) = multiprocessing.active_children()
-    os.kill(process.pid or 0, signal.SIGSTOP)
+    (worker,) = pool._workers
+    calls = [pool.submit(torch.eye(2)) for _ in range(2)]
+    monkeypatch.setattr(worker, "receive", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        pool.result(calls[0])
+    for call in calls:
+        with pytest.raises(WorkerLostError):
+            pool.result(call)
+    assert pool.submit(torch.eye(2)) is None
+    assert multiprocessing.active_children() == []
+
+
+@needs_stop
+def test_a_stopped_worker_can_be_ended(pool: WorkerPool) -> None:
+    wait_until_ready(pool)
+    os.kill(pool._workers[0].process.pid or 0, signal.SIGSTOP)
     for _ in range(4):
-        assert pool.submit(torch.zeros(10_000_000)) is not None
+        assert pool.submit(torch.zeros(10)) is not None
     pool.__exit__(None, None, None)
     assert multiprocessing.active_children() == []
+
+
+def test_large_calls_and_results_do_not_wait_for_each_other(pool: WorkerPool) -> None:
+    wait_until_ready(pool)
+    calls = [pool.submit(torch.full((500_000, 2), float(number))) for number in range(5)]
+    for number, call in enumerate(calls):
+        assert call is not None
+        assert torch.equal(pool.result(call)[0][-1], number * torch.tensor([2.0, 3.0]))
+
+
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
+def test_a_program_that_does_not_end_its_workers_ends(method: str) -> None:
+    script = f"""
+        import os
+        from functools import partial
+        from torchslam.parallel import pool
+        if __name__ == "__main__":
+            pool.can_fork = lambda: {method == "fork"}
+            workers = pool.WorkerPool(2, partial, os.getpid).__enter__()
+            print("begun")
+        """
+    command = [sys.executable, "-c", textwrap.dedent(script)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, check=True)
+    assert done.stdout.split() == ["begun"]  # once: forks write nothing of their parent's

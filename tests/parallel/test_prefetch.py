@@ -129,7 +129,10 @@ def test_few_frames_are_requested_ahead() -> None:
         assert sorted(frames._requested) == [*range(12, 20)]
 
 
-def test_a_worker_that_has_not_started_is_not_waited_for(sequence: Sequence) -> None:
+def test_a_worker_that_has_not_started_is_not_waited_for(
+    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
     with ahead(sequence) as frames:
         start = time.monotonic()
         assert not check_same(frames, sequence, 0)
@@ -184,6 +187,42 @@ def test_one_or_two_processes_give_the_same_bytes(tmp_path: Path, capsys: pytest
     assert multiprocessing.active_children() == []
 
 
+RUN = """
+import sys, threading
+from multiprocessing.process import BaseProcess
+
+start = BaseProcess.start
+
+def start_and_print(process):
+    print("started a", type(process).__name__)
+    start(process)
+
+if __name__ == "__main__":
+    if sys.argv[1] == "spawn":
+        threading.Thread(target=threading.Event().wait, daemon=True).start()
+    BaseProcess.start = start_and_print
+    from torchslam.cli.main import main
+    sys.exit(main(sys.argv[2:]))
+"""
+
+
+@pytest.mark.usefixtures("without_pictures")
+@pytest.mark.skipif(sys.platform != "linux", reason="workers are forks on Linux alone")
+def test_forks_and_new_interpreters_give_the_same_bytes(tmp_path: Path) -> None:
+    folder = write_tum_folder(tmp_path / "room", frames=16)
+    expected = {1: [], 2: ["Process"], 3: 2 * ["Process"]}
+    for method, processes in (("none", 1), ("fork", 2), ("fork", 3), ("spawn", 3)):
+        output = tmp_path / f"{method}{processes}"
+        arguments = ["run", str(folder), "-o", str(output), *SET, "--processes", str(processes)]
+        command = [sys.executable, "-c", RUN, method, *arguments, "--mapping", "online"]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=PATIENCE)
+        started = [line.split()[-1] for line in done.stdout.splitlines() if line.startswith("started a")]
+        # `torchslam run` has a single thread when its workers start, so that they are forks.
+        assert started == [f"{method.capitalize()}{kind}" for kind in expected[processes]]
+        for name in ("trajectory.txt", "online.txt", "keyframes.txt", "map.safetensors", "map.ply"):
+            assert (output / name).read_bytes() == (tmp_path / "none1" / name).read_bytes(), (output, name)
+
+
 def test_videos_and_archives_can_be_sent_to_workers(tmp_path: Path, sequence: Sequence) -> None:
     images = [cv2.cvtColor(picture(index), cv2.COLOR_GRAY2BGR) for index in range(5)]
     write_mp4(tmp_path / "video.mp4", images)
@@ -203,13 +242,15 @@ def test_videos_and_archives_can_be_sent_to_workers(tmp_path: Path, sequence: Se
 # --- processes that are ended ---------------------------------------------------------------------------------
 
 ORPHAN = """
-import os, signal
+import os, signal, sys
 from tests.parallel.test_pool import wait_until_ready
 from tests.parallel.test_prefetch import ahead
 from torchslam.data import open_sequence
+from torchslam.parallel import pool
 
 if __name__ == "__main__":
-    with ahead(open_sequence("synthetic:room?frames=50&blank=1")) as frames:
+    pool.can_fork = lambda: sys.argv[1] == "fork"
+    with ahead(open_sequence("synthetic:room?frames=50&blank=1"), processes=2) as frames:
         wait_until_ready(frames)
         frames[0], frames[1]
         os.kill(os.getpid(), signal.SIGKILL)
@@ -240,30 +281,33 @@ def wait_for_end(group: int) -> None:
 
 
 @needs_proc
-def test_a_worker_ends_with_its_parent() -> None:
-    asking = subprocess.Popen([sys.executable, "-c", ORPHAN], start_new_session=True)
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_workers_end_with_their_parent(method: str) -> None:
+    asking = subprocess.Popen([sys.executable, "-c", ORPHAN, method], start_new_session=True)
     assert asking.wait(PATIENCE) == -signal.SIGKILL
     wait_for_end(asking.pid)
 
 
 @needs_proc
 @pytest.mark.parametrize(
-    ("number", "status", "when"),
+    ("method", "number", "status", "when"),
     [
-        (signal.SIGINT, 130, "initializing"),
-        (signal.SIGTERM, 143, "? frames/s"),  # before the other process has started
-        pytest.param(signal.SIGINT, 130, "? frames/s", marks=pytest.mark.slow),
-        pytest.param(signal.SIGTERM, 143, "initializing", marks=pytest.mark.slow),
+        ("fork", signal.SIGINT, 130, "initializing"),
+        ("fork", signal.SIGTERM, 143, "? frames/s"),
+        ("spawn", signal.SIGTERM, 143, "? frames/s"),  # before the new interpreter has started
+        pytest.param("spawn", signal.SIGINT, 130, "? frames/s", marks=pytest.mark.slow),
+        pytest.param("spawn", signal.SIGTERM, 143, "initializing", marks=pytest.mark.slow),
     ],
 )
 def test_a_signal_to_the_process_group_ends_the_run_with_results(
-    tmp_path: Path, number: int, status: int, when: str
+    tmp_path: Path, method: str, number: int, status: int, when: str
 ) -> None:
     line = ["run", "synthetic:room?frames=50000&blank=1", "-o", str(tmp_path / "out"), *SET]
     command = [
         sys.executable,
-        "-m",
-        "torchslam.cli.main",
+        "-c",
+        RUN,
+        method,
         *line,
         "--processes",
         "2",

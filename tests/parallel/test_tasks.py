@@ -36,6 +36,7 @@ def fail_elsewhere(folder: Path, main: int, number: int) -> None:
     note(folder, number)
 
 
+@pytest.mark.usefixtures("start_method")
 @pytest.mark.parametrize("processes", [1, 2, 3])
 def test_each_task_is_done_once_by_all_processes(tmp_path: Path, processes: int) -> None:
     with SharedTasks(note, (tmp_path,), processes) as shared:
@@ -49,6 +50,7 @@ def test_each_task_is_done_once_by_all_processes(tmp_path: Path, processes: int)
     assert str(os.getpid()) in by.values()
 
 
+@pytest.mark.usefixtures("start_method")
 def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
     with SharedTasks(die_elsewhere, (tmp_path, os.getpid()), 3) as shared:
         wait_until_ready(shared)
@@ -58,6 +60,7 @@ def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == len(TASKS)
 
 
+@pytest.mark.usefixtures("start_method")
 def test_an_error_of_a_worker_is_raised_here(tmp_path: Path) -> None:
     with SharedTasks(fail_elsewhere, (tmp_path, os.getpid()), 2) as shared:
         wait_until_ready(shared)

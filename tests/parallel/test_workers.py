@@ -15,6 +15,7 @@ from torchslam.mapping.local_bundle import solve_here
 from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
 from torchslam.parallel.workers import (
     WORTH,
+    WORTH_FORKED,
     BundleWorker,
     best_number,
     busy_elsewhere,
@@ -91,8 +92,11 @@ def test_accelerators_use_no_workers(capsys: pytest.CaptureFixture[str]) -> None
     assert "one process is used, since the camera is on meta" in capsys.readouterr().err
 
 
-def test_the_default_number_of_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    long, short = room(WORTH), room(WORTH - 1)
+@pytest.mark.parametrize("is_forked", [True, False])
+def test_the_default_number_of_processes(monkeypatch: pytest.MonkeyPatch, is_forked: bool) -> None:
+    monkeypatch.setattr("torchslam.parallel.workers.can_fork", lambda: is_forked)
+    worth = WORTH_FORKED if is_forked else WORTH
+    long, short = room(worth), room(worth - 1)
     monkeypatch.setattr("torchslam.parallel.workers.busy_elsewhere", lambda: 0)
     for count, several in ((1, 1), (2, 3), (8, 3)):
         monkeypatch.setattr("torchslam.parallel.workers.processors", lambda known=count: known)

@@ -82,6 +82,29 @@ def test_a_fork_that_drops_a_video_and_ends_does_not_wait_for_its_decoder(clip: 
     assert printed.split() == ["0", "7"]
 
 
+@pytest.mark.skipif(sys.platform != "linux", reason="counts threads in /proc")
+def test_decoders_are_closed_for_a_fork_and_opened_again(clip: Path) -> None:
+    printed = run(
+        """
+        import os, sys, cv2
+        from torchslam.data import open_sequence
+        from torchslam.utils.forks import close_decoders
+
+        def threads():
+            return len(os.listdir("/proc/self/task"))
+
+        cv2.setNumThreads(1)
+        sequence = open_sequence(sys.argv[1], "60,60,160,120")
+        before = [float(sequence.image(index).sum()) for index in range(40)]
+        decoding = threads()
+        close_decoders()
+        print(decoding > threads(), [float(sequence.image(index).sum()) for index in range(7, 40)] == before[7:])
+        """,
+        clip,
+    )
+    assert printed.split() == ["True", "True"]
+
+
 @pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
 def test_parent_and_fork_read_a_recording_each_at_its_own_place(tmp_path: Path, kind: str) -> None:
     pytest.importorskip("rosbags")

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -88,6 +89,8 @@ class StopSignals:
 
 # The monitor thread of tqdm would still run while the interpreter exits.
 tqdm.monitor_interval = 0
+# The default lock is shared with forks: one that is killed while it prints a warning would keep it.
+tqdm.set_lock(threading.RLock())
 
 
 class _Bar:

@@ -1,32 +1,42 @@
 """A pool of worker processes: calls are submitted now, and their results are used later.
 
-A worker is a new interpreter, which takes seconds to import everything. Calls are answered in this process until a
-worker is ready, and after one was killed or stopped.
+On Linux, a process with a single thread forks its workers, which are ready at once. Elsewhere a worker is a new
+interpreter, which takes seconds to import everything. Calls are answered in this process until a worker is ready, and
+after one was killed or stopped.
 """
 
 from __future__ import annotations
 
+import atexit
+import gc
 import io
 import multiprocessing
 import os
 import pickle
+import queue
 import signal
+import socket
+import struct
+import sys
 import threading
+import traceback
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
-from multiprocessing import connection, resource_tracker
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from pathlib import Path
 from types import TracebackType
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 import torch
 from torch import Tensor
+
+from torchslam.utils.forks import close_decoders
 
 RESPONSE_TIMEOUT_S = 60.0
 """A worker that was stopped is given up after this time; a frame or a local adjustment takes less than a second."""
@@ -34,45 +44,89 @@ RESPONSE_TIMEOUT_S = 60.0
 AHEAD = 2
 """Tasks that each worker is sent at a time, so that it need not wait while this process does one of its own."""
 
-_answer: Callable[..., object]
-"""Answers the calls, in a worker."""
+READY = b""
+"""First message of a worker that is a new interpreter, once its imports are done."""
+
+THREADS = Path("/proc/self/task")
+"""Folder with one entry for each thread of this process, on Linux."""
 
 
 class WorkerLostError(Exception):
     """A worker was killed or does not answer: whoever needs its result computes it."""
 
 
+class RemoteError(Exception):
+    """Traceback of an exception in a worker, as the cause of the one that is raised here."""
+
+
+@dataclass(eq=False)
+class Call:
+    """A call that a worker answers."""
+
+    worker: _Worker
+    answer: bytes | None = None
+
+
 @dataclass(eq=False)
 class _Worker:
-    """A worker process with an executor of its own: where one is lost, the others go on."""
+    """A worker process, which answers calls in their order, and the connection to it.
 
-    executor: ProcessPoolExecutor
+    Attributes:
+        task: For the worker to begin with, until it was sent.
+        waiting: Calls without an answer.
+    """
+
     process: BaseProcess
-    started: Future[int]
+    connection: Connection
+    task: bytes | None
+    waiting: deque[Call] = field(default_factory=deque)
 
     @classmethod
-    def spawn(cls, task: bytes) -> _Worker:
-        """Begin to start a worker."""
-        context, before = multiprocessing.get_context("spawn"), multiprocessing.active_children()
-        executor = ProcessPoolExecutor(1, context, _begin, (task,))
-        started = executor.submit(os.getpid)
-        (process,) = (each for each in multiprocessing.active_children() if each not in before)
-        # As long as this process could write to the pipe of the results, too, the executor would wait for ever for the
-        # rest of a result whose sender was killed.
-        executor._result_queue._writer.close()  # type: ignore[attr-defined]
-        return cls(executor, process, started)
+    def start(cls, task: bytes) -> _Worker:
+        """Fork a worker, or begin to start a new interpreter."""
+        ours, theirs = multiprocessing.Pipe()
+        process: BaseProcess
+        if is_forked := can_fork():
+            fork = multiprocessing.get_context("fork")
+            process = fork.Process(target=_serve_in_fork, args=(theirs, ours, task), daemon=True)
+        else:
+            spawn = multiprocessing.get_context("spawn")
+            process = spawn.Process(target=_serve_when_imported, args=(theirs,), daemon=True)
+        process.start()
+        theirs.close()  # the end of the process is to be the end of the connection; later forks would have it open, too
+        _limit_waiting(ours)
+        return cls(process, ours, None if is_forked else task)
+
+    def is_ready(self) -> bool:
+        """Return whether calls are accepted. Raises OSError or EOFError if the process has ended."""
+        if self.task is not None and self.connection.poll():
+            self.connection.recv_bytes()  # READY
+            self.connection.send_bytes(self.task)
+            self.task = None
+        return self.task is None
+
+    def send(self, question: bytes) -> Call:
+        """Send a call. Raises OSError if the process has ended, BlockingIOError if it takes nothing."""
+        self.connection.send_bytes(question)
+        self.waiting.append(call := Call(self))
+        return call
+
+    def receive(self, timeout: float) -> bool:
+        """Receive the answer of the first call that has none; return False if it does not come in time.
+
+        Raises:
+            OSError, EOFError: The process has ended; BlockingIOError if it stopped within an answer.
+        """
+        if not self.connection.poll(timeout):
+            return False
+        self.waiting.popleft().answer = self.connection.recv_bytes()
+        return True
 
     def end(self) -> None:
         """End the process at once, also one that is still starting or was stopped."""
         self.process.kill()
-        self.executor.shutdown()
-
-
-class Call(NamedTuple):
-    """A call that a worker answers."""
-
-    worker: _Worker
-    answer: Future[bytes]
+        self.process.join()
+        self.connection.close()
 
 
 class WorkerPool:
@@ -93,33 +147,45 @@ class WorkerPool:
         self._workers: deque[_Worker] = deque()
 
     def __enter__(self) -> Self:
-        with _without_interrupts():
-            for _ in range(self.count):
-                self._workers.append(_Worker.spawn(self._task))
+        if self.count > 0:
+            close_decoders()
+        atexit.register(self._end)  # before multiprocessing waits for processes that wait for calls
+        try:
+            with _without_interrupts():
+                for _ in range(self.count):
+                    self._workers.append(_Worker.start(self._task))
+        except BaseException:
+            self._end()
+            raise
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._end()
+
+    def _end(self) -> None:
         while self._workers:
             self._workers.pop().end()
+        atexit.unregister(self._end)
 
     @property
     def is_ready(self) -> bool:
         """Whether calls are accepted: a worker has started."""
-        return any(each.started.done() for each in self._workers)
+        return len([each for each in list(self._workers) if self._is_ready(each)]) > 0
 
     def submit(self, *question: object) -> Call | None:
         """Begin a call, of the workers in turn; None if calls are not accepted."""
+        if not self.is_ready:
+            return None
+        packed = _pack(question)
         for _ in range(len(self._workers)):
             worker = self._workers[0]
             self._workers.rotate(-1)
-            if not worker.started.done():
+            if worker.task is not None:
                 continue
-            try:
-                return Call(worker, worker.executor.submit(_call, _pack(question)))
-            except BrokenProcessPool:
-                self._lose(worker, "has ended")
+            with self._lost_on_error(worker):
+                return worker.send(packed)
         return None
 
     def result(self, call: Call) -> Any:
@@ -129,21 +195,52 @@ class WorkerPool:
             WorkerLostError: If there will be none.
             Exception: What the call raised, with its traceback as the cause.
         """
-        if not wait([call.answer], RESPONSE_TIMEOUT_S).done:
-            self._lose(call.worker, "does not answer")
-            raise WorkerLostError
-        try:
-            return pickle.loads(call.answer.result())
-        except BrokenProcessPool:
-            self._lose(call.worker, "has ended")
-            raise WorkerLostError from None
+        while call.answer is None:
+            if call.worker not in self._workers:
+                raise WorkerLostError
+            with self._lost_on_error(call.worker):
+                if not call.worker.receive(RESPONSE_TIMEOUT_S):
+                    raise BlockingIOError
+        found, trace = pickle.loads(call.answer)
+        if trace:
+            raise found from RemoteError(trace)
+        return found
 
-    def _lose(self, worker: _Worker, reason: str) -> None:
-        """Go on without a worker, and warn once."""
-        if worker in self._workers:
+    def answered(self, calls: Sequence[Call], timeout: float | None) -> list[Call]:
+        """Wait until `result` returns or raises at once for some of the calls; returns these."""
+        if self._have_ended(calls):
+            timeout = 0
+        asked = [each for each in self._workers if each.waiting]
+        answering = wait([each.connection for each in asked], timeout)
+        for worker in asked:
+            if worker.connection in answering:
+                with self._lost_on_error(worker):
+                    worker.receive(0)
+        return self._have_ended(calls)
+
+    def _have_ended(self, calls: Sequence[Call]) -> list[Call]:
+        return [call for call in calls if call.answer is not None or call.worker not in self._workers]
+
+    def _is_ready(self, worker: _Worker) -> bool:
+        with self._lost_on_error(worker):
+            return worker.is_ready()
+        return False
+
+    @contextmanager
+    def _lost_on_error(self, worker: _Worker) -> Iterator[None]:
+        """Warn and go on without a worker that has ended or does not answer.
+
+        After Ctrl-C the worker is not used either: the next message would begin in the middle of this one.
+        """
+        try:
+            yield
+        except BaseException as error:
             self._workers.remove(worker)
             worker.end()
-            warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=3)
+            if not isinstance(error, OSError | EOFError):
+                raise
+            reason = "does not answer" if isinstance(error, BlockingIOError) else "has ended"
+            warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=4)
 
 
 class SharedTasks(WorkerPool):
@@ -174,12 +271,11 @@ class SharedTasks(WorkerPool):
                 if call is None:
                     break
                 calls[call] = waiting.popleft()
-            if waiting:
+            is_busy = bool(waiting)
+            if is_busy:
                 self._do(*waiting.popleft())
                 yield
-            else:
-                wait([each.answer for each in calls], return_when=FIRST_COMPLETED)
-            for call in [each for each in calls if each.answer.done()]:
+            for call in self.answered(list(calls), 0 if is_busy else None):
                 task = calls.pop(call)
                 try:
                     self.result(call)
@@ -189,22 +285,44 @@ class SharedTasks(WorkerPool):
                     yield
 
 
+def can_fork() -> bool:
+    """Return whether this process may be forked: a lock that another thread holds would stay locked in the fork.
+
+    The use of a GPU does not survive a fork either. Elsewhere than on Linux the system's libraries may have threads.
+    """
+    return sys.platform == "linux" and len(list(THREADS.iterdir())) == 1 and not torch.cuda.is_initialized()
+
+
 @contextmanager
 def _without_interrupts() -> Iterator[None]:
     """Start processes that ignore Ctrl-C and SIGTERM, which this process handles: it ends them.
 
-    A process that SIGTERM ends while it starts would leave this one waiting: it writes what the process is to do into a
-    pipe, whose other end it has open as well.
+    A new interpreter that SIGTERM ends while it starts would leave this process waiting: it writes what to import into
+    a pipe, whose other end it has open as well.
     """
     if not hasattr(signal, "pthread_sigmask"):  # not on Windows
         yield
         return
-    resource_tracker.ensure_running()  # its start would let signals through again
+    if not can_fork():
+        resource_tracker.ensure_running()  # its start would let signals through again
     before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT, signal.SIGTERM])
     try:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def _limit_waiting(connection: Connection) -> None:
+    """Let reading and writing within a message fail with BlockingIOError after RESPONSE_TIMEOUT_S without progress.
+
+    Only where the connection is a socket: on Windows processes cannot be stopped.
+    """
+    if sys.platform == "win32":
+        return
+    limit = struct.pack("@ll", *divmod(round(1e6 * RESPONSE_TIMEOUT_S), 1_000_000))  # timeval: socket(7)
+    with socket.socket(fileno=os.dup(connection.fileno())) as shared:
+        shared.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
+        shared.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
 
 
 class _Pickler(pickle.Pickler):
@@ -225,25 +343,58 @@ def _pack(value: object) -> bytes:
 # --- in a worker -----------------------------------------------------------------------------------------------
 
 
-def _begin(task: bytes) -> None:
-    """Make the function that answers calls."""
-    global _answer
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+def _serve_in_fork(theirs: Connection, ours: Connection, task: bytes) -> None:
+    """Answer calls in a fork of the process that asks."""
+    ours.close()  # so that the end of the parent is the end of the connection
+    gc.freeze()  # nothing of the parent is finalized here, and its memory stays shared
+    _serve(theirs, task)
+
+
+def _serve_when_imported(connection: Connection) -> None:
+    """Answer calls in a new interpreter, which has imported everything to find this function."""
+    connection.send_bytes(READY)
+    _serve(connection, connection.recv_bytes())
+
+
+def _serve(connection: Connection, task: bytes) -> None:
+    """Answer calls.
+
+    Threads receive and send, so that neither this process nor the one that asks waits for the other one to receive.
+    """
+    received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_receive, args=(connection, received), daemon=True).start()
+    threading.Thread(target=_send, args=(connection, answers), daemon=True).start()
     threads, niceness, make, parts = pickle.loads(task)
     torch.set_num_threads(threads)
     if hasattr(os, "nice"):  # not on Windows
         os.nice(niceness)
-    _answer = make(*parts)
+    answer = make(*parts)
+    while True:
+        answers.put(_call(answer, received.get()))
 
 
-def _end_with_parent() -> None:
-    """End when the parent was killed: it left calls that nobody waits for, and workers would wait for more."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    connection.wait([parent.sentinel])
-    os._exit(1)
+def _receive(connection: Connection, received: queue.SimpleQueue[bytes]) -> None:
+    """Receive calls; end with the parent, which may have been killed: nobody waits for the answers."""
+    try:
+        while True:
+            received.put(connection.recv_bytes())
+    except (OSError, EOFError):
+        os._exit(1)
 
 
-def _call(question: bytes) -> bytes:
-    with torch.inference_mode():
-        return _pack(_answer(*pickle.loads(question)))
+def _send(connection: Connection, answers: queue.SimpleQueue[bytes]) -> None:
+    try:
+        while True:
+            connection.send_bytes(answers.get())
+    except OSError:
+        os._exit(1)
+
+
+def _call(answer: Callable[..., object], question: bytes) -> bytes:
+    """The packed result of a call and no traceback, or its exception and the traceback."""
+    try:
+        with torch.inference_mode():
+            return _pack((answer(*pickle.loads(question)), ""))
+    except Exception as error:
+        return _pack((error, traceback.format_exc()))

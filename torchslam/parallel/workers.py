@@ -23,12 +23,16 @@ from torchslam.geometry import Camera
 from torchslam.mapping.local_bundle import PendingSolution, Solution, solve_local
 from torchslam.mapping.mapper import Mapper
 from torchslam.optim import BundleProblem
-from torchslam.parallel.pool import WorkerLostError, WorkerPool
+from torchslam.parallel.pool import WorkerLostError, WorkerPool, can_fork
 from torchslam.parallel.prefetch import Extractor, FeaturePrefetcher, LivePrefetcher
+from torchslam.utils.forks import close_decoders
 from torchslam.utils.timing import Stopwatch
 
-WORTH = 100
-"""Frames of a run for which other processes are worth their start: its imports cost as much as some 40 frames."""
+WORTH, WORTH_FORKED = 100, 20
+"""Frames of a run for which other processes are worth their start, as new interpreters and as forks. The imports of two
+new interpreters cost 5 s of processor time, as much as 40 frames of kitti07; two forks cost 0.02 s. With forks, runs of
+20, 50 and 160 frames took no more processor time than with one process; shorter ones were not tried.
+"""
 LEAST_FREE = 2
 """Processors that must be free for three processes, which wait for each other: where one waits for its turn, all do."""
 LOAD = Path("/proc/loadavg")  # on Linux
@@ -80,7 +84,9 @@ def best_number(sequence: Sequence, start: int) -> int:
     """Best number of processes for a sequence from frame `start` on, beside what else the machine does now."""
     length = sequence.known_length
     frames = WORTH if length is None else length - start
-    return 3 if frames >= WORTH and processors() - busy_elsewhere() >= LEAST_FREE else 1
+    if frames < (WORTH_FORKED if can_fork() else WORTH):
+        return 1
+    return 3 if processors() - busy_elsewhere() >= LEAST_FREE else 1
 
 
 @contextmanager
@@ -94,6 +100,8 @@ def with_workers(
             prefetch worker, or a bundle worker if frames cannot be prefetched; with more there is one bundle
             worker, and the others prefetch
     """
+    if processes != 1:
+        close_decoders()  # so that workers may be forks
     wanted = best_number(sequence, start) if processes is None else processes
     slam.warm_up()
     if slam.camera.params.device.type != "cpu":

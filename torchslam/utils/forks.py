@@ -18,6 +18,9 @@ class Holder(Protocol):
     def forget_handle(self) -> None:
         """Called in a fork: open another one before the next use; `never_release` this one."""
 
+    def close_decoder(self) -> None:
+        """Close the handle, if it has threads and can be opened again at the next use."""
+
 
 _HOLDERS: weakref.WeakSet[Any] = weakref.WeakSet()
 
@@ -25,6 +28,12 @@ _HOLDERS: weakref.WeakSet[Any] = weakref.WeakSet()
 def forget_in_forks(holder: Holder) -> None:
     """Have `forget_handle` called in every fork of this process from now on."""
     _HOLDERS.add(holder)
+
+
+def close_decoders() -> None:
+    """Close decoders, whose threads would prevent a fork of this process; they are opened again for the next frame."""
+    for holder in list(_HOLDERS):
+        holder.close_decoder()
 
 
 def never_release(handle: object) -> None:

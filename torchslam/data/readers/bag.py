@@ -143,6 +143,9 @@ class BagSequence(Sequence):
         never_release(self._reader)
         self._is_inherited, self._position = True, sys.maxsize  # so that the next image opens the file anew
 
+    def close_decoder(self) -> None:
+        """Do nothing: a file has no threads."""
+
     def _rewind(self) -> None:
         if self._is_inherited:
             self._reader, self._is_inherited = _open_reader(self._path), False

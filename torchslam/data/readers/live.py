@@ -176,6 +176,9 @@ class LiveSequence(Sequence):
         self._is_inherited = self._ended = True
         self._fresh = threading.Condition()  # a thread that is not here may have the lock
 
+    def close_decoder(self) -> None:
+        """Do nothing: a live source cannot be opened again."""
+
     def close(self) -> None:
         """Stop watching and let the source go."""
         self._closing = True

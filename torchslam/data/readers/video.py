@@ -129,6 +129,10 @@ class VideoSequence(Sequence):
         never_release(self._capture)
         self._position = sys.maxsize  # so that the next frame opens the file anew
 
+    def close_decoder(self) -> None:
+        self._capture.release()
+        self._position = sys.maxsize
+
     def _rewind(self) -> None:
         forget_in_forks(self)
         # As an absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
