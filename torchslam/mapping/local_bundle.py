@@ -11,6 +11,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from enum import Enum
+from functools import partial
+from typing import Any
 
 import torch
 from jaxtyping import Float, Int
@@ -20,6 +22,7 @@ from torchslam.config import BundleAdjustmentConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, SharedCamera, passes_gate, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.robust import middle_variance
+from torchslam.geometry.similarity import in_place_of
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, Progress, solve_bundle
@@ -55,10 +58,8 @@ class BundleWindow:
 
 Solution = tuple[Float[Tensor, "K 4 4"], Float[Tensor, "N 3"]]
 """Poses and points of a solved window."""
-PendingSolution = Callable[[], Solution]
-"""Waits for the solution of a started adjustment."""
-Solver = Callable[[BundleProblem, int], PendingSolution]
-"""Starts a local bundle adjustment, given its problem and the number of iterations."""
+Solver = Callable[..., Callable[[], Any]]
+"""Starts a pure function of a module, given with its arguments; the result waits for what it returns."""
 
 
 def select_window(
@@ -86,9 +87,20 @@ def solve_local(problem: BundleProblem, iterations: int) -> Solution:
     return T_cw, points_w
 
 
-def solve_here(problem: BundleProblem, iterations: int) -> PendingSolution:
-    """Solve in this process, when the solution is requested."""
-    return lambda: solve_local(problem, iterations)
+def solve_whole(problem: BundleProblem, iterations: int) -> Solution:
+    """Solve the adjustment of a whole map, in place and unit of the map as it was. A pure function as `solve_local`.
+
+    With it go the frames in between, and the poses that follow.
+    """
+    found = solve_bundle(
+        problem, check=False, options=MAP_OPTIONS.replace(iterations=iterations, tolerance=LOCAL_TOLERANCE)
+    )
+    return in_place_of(problem.T_cw, found.T_cw, found.points_w)
+
+
+def solve_here(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+    """Call in this process, when the result is requested."""
+    return partial(function, *arguments)
 
 
 def adjust_all(
@@ -233,18 +245,22 @@ class _Adjustment:
     Attributes:
         due: the frame after which it is applied; None: before the next frame.
         slam_map: the map.
-        keyframe: row of the keyframe around which to adjust.
+        keyframe: row of the keyframe around which to adjust; None: the whole map.
+        camera: of the adjusted keyframes.
         version: `Map.version` at the time of the request.
+        on_applied: called once the map is adjusted.
         window: what is adjusted, once it was started; None as well if there is nothing to adjust.
         solution: of the window.
     """
 
     due: int | None
     slam_map: Map
-    keyframe: int
+    keyframe: int | None
+    camera: Camera
     version: int
+    on_applied: Callable[[], None] = lambda: None
     window: BundleWindow | None = None
-    solution: PendingSolution | None = None
+    solution: Callable[[], Solution] | None = None
 
 
 class AsyncBundleAdjustment:
@@ -278,6 +294,11 @@ class AsyncBundleAdjustment:
         return self._pending is not None
 
     @property
+    def is_whole(self) -> bool:
+        """Whether an adjustment of the whole map is pending."""
+        return self._pending is not None and self._pending.keyframe is None
+
+    @property
     def is_due_before_next_frame(self) -> bool:
         """Whether the result must be applied before the next frame is tracked."""
         return self._pending is not None and self._pending.due is None
@@ -299,17 +320,30 @@ class AsyncBundleAdjustment:
     def request(self, slam_map: Map, keyframe: int, due: int | None) -> None:
         """Request an adjustment around a keyframe, applied after frame `due` or, if None, before the next frame."""
         assert self._pending is None, "an adjustment is pending"
-        self._pending = _Adjustment(due, slam_map, keyframe, slam_map.version)
+        self._pending = _Adjustment(due, slam_map, keyframe, self.camera.current, slam_map.version)
+
+    def request_whole(self, slam_map: Map, camera: Camera, due: int, on_applied: Callable[[], None]) -> None:
+        """Request an adjustment of the whole map by another camera, applied after frame `due`, and start it."""
+        assert self._pending is None, "an adjustment is pending"
+        self._pending = _Adjustment(due, slam_map, None, camera, slam_map.version, on_applied)
+        self.start()
 
     def start(self) -> None:
         """Start the requested adjustment if it is not running."""
         pending = self._pending
         if pending is None or pending.window is not None:
             return
-        window = select_window(pending.slam_map, pending.keyframe, self.camera.current, self.settings)
+        slam_map, camera = pending.slam_map, pending.camera
+        if pending.keyframe is not None:
+            window = select_window(slam_map, pending.keyframe, camera, self.settings)
+            solve, iterations = solve_local, self.settings.local_iterations
+        else:
+            everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
+            window = build_window(slam_map, everyone[1:], everyone[:1], camera)
+            solve, iterations = solve_whole, self.settings.global_iterations
         if window is not None:
             pending.window = window
-            pending.solution = self.solver(window.problem, self.settings.local_iterations)
+            pending.solution = self.solver(solve, window.problem, iterations)
 
     def apply(self, slam_map: Map) -> None:
         """Wait for a requested adjustment and apply it to the map."""
@@ -318,7 +352,8 @@ class AsyncBundleAdjustment:
         if pending is None or pending.window is None or pending.solution is None:
             return
         assert slam_map.version == pending.version, "rows were renumbered since the request"
-        apply_solution(slam_map, pending.window, *pending.solution(), self.camera.current)
+        apply_solution(slam_map, pending.window, *pending.solution(), pending.camera)
+        pending.on_applied()
 
     def drop(self) -> None:
         """Discard a pending adjustment, since its map is gone."""

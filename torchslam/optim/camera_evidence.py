@@ -39,6 +39,8 @@ WORTH = 2.0
 """By how many variances of an observation a free parameter may raise the cost of stretches left out: half of one is by
 chance, and a parameter that is held keeps its whole given error. With 1 three of 24 right cameras were held; with 2
 one of them is, and a recording of four keyframes whose halves contradict each other."""
+CALIBRATED_STD = 0.03
+"""Relative standard deviation of a focal length up to which it counts as given; those by image pairs have 0.05."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +102,12 @@ class CameraEvidence:
     scores: Float[Tensor, "G n"]
     information: Float[Tensor, "G n n"]
     variance: float
+
+    def is_better_than(self, current: Camera) -> bool:
+        """Whether the camera of `estimate` is to replace the one in use."""
+        params = with_radial_terms(current).params
+        is_given = self.given.focal_std <= CALIBRATED_STD and torch.equal(params, self.given.camera.params)
+        return self.gain(current).is_worth(is_given)
 
     def gain(self, current: Camera) -> Gain:
         """How much better stretches are predicted by the camera that all others find than by the one in use.

@@ -16,10 +16,11 @@ from torch import Tensor
 
 STRETCHES = 10
 """Stretches of a recording whose gains are compared. Tried from 6 to 20: the decisions of the trials are the same."""
-LEAST_GAIN = 25.0
-"""Logarithm of the likelihood ratio from which on a change of a model with few parameters is believed. Exact cameras
-and global shutters gain up to 10 on rendered sequences, cameras that are off by 3 % from 25 on; experiments/decisions
-has the error rates. Observations count as independent in it, which they are not: with independent ones 5 would do."""
+LEAST_GAIN, LEAST_UPDATE = 40.0, 5.0
+"""Logarithm of the likelihood ratio from which on a change of a model with few parameters is believed: of a given
+model, and of a guess or an estimate from fewer observations. Exact cameras gain up to 29 on parts of recordings and up
+to 16 on rendered sequences, global shutters up to 20; experiments/decisions has the error rates. Observations count as
+independent, which they are not: with independent ones 5 would do for either."""
 SURE = 3.0
 """Standard deviations, of a normal distribution with the same probability, from which on a gain counts where two maps
 are compared, which differ in many parameters."""
@@ -56,10 +57,12 @@ class Gain:
         """Whether the first explanation is better by its scatter, where it has many more parameters."""
         return self.sigmas > SURE
 
-    @property
-    def is_worth(self) -> bool:
-        """Whether the first explanation, with a few more parameters, is the better one."""
-        return self.total > LEAST_GAIN
+    def is_worth(self, is_given: bool = True) -> bool:
+        """Whether the first explanation, with a few more parameters, is the better one.
+
+        is_given: whether the second one is a given one, neither a guess nor an estimate
+        """
+        return self.total > (LEAST_GAIN if is_given else LEAST_UPDATE)
 
     @classmethod
     def of_stretches(cls, sums: Float[Tensor, " G"]) -> Gain:

@@ -82,7 +82,7 @@ class RollingShutter:
     @property
     def is_read_out(self) -> bool:
         """Whether the motion of the camera shows a rolling shutter."""
-        is_certain = self.gain.is_worth and self.shift > MIN_SHIFT
+        is_certain = self.gain.is_worth() and self.shift > MIN_SHIFT
         return is_certain and abs(self.readout) < MAX_RATIO * self.interval
 
     @property
@@ -298,6 +298,9 @@ def _regress(
         for each in (left + start * shift, shift)
     )
     others = (products.sum() - products) / (squares.sum() - squares).clamp_min(MIN_INFORMATION)
-    variance = (left - readout * shift).square().mean()
+    # By the scatter where that is larger than the variance of the residuals: errors of neighbors are alike.
+    variance = torch.maximum(
+        (left - readout * shift).square().mean(), torch.stack(stds).max().square() * information
+    )
     gain = Gain.of_stretches((others * products - 0.5 * others.square() * squares) / variance)
     return float(readout), float(torch.stack(stds).max()), gain

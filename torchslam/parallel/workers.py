@@ -12,19 +12,18 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from torchslam.config import Config
 from torchslam.data.sequence import Frames, Sequence
 from torchslam.geometry import Camera
-from torchslam.mapping.local_bundle import PendingSolution, Solution, solve_local
+from torchslam.mapping.local_bundle import Solver
 from torchslam.mapping.mapper import Mapper
-from torchslam.optim import BundleProblem
 from torchslam.parallel.pool import WorkerLostError, WorkerPool, can_fork
-from torchslam.parallel.prefetch import Extractor, FeaturePrefetcher, LivePrefetcher
+from torchslam.parallel.prefetch import NICENESS, Extractor, FeaturePrefetcher, LivePrefetcher
 from torchslam.utils.forks import close_decoders
 from torchslam.utils.timing import Stopwatch
 
@@ -40,6 +39,13 @@ SAMPLES, SAMPLING_S = 5, 0.01
 """Looks at the load, and seconds between them: a median does not count what wakes up for a moment."""
 
 
+class _Estimator(Protocol):
+    """The part of `torchslam.system.online_camera.OnlineCamera` that workers need."""
+
+    def solved_by(self, solver: Solver) -> AbstractContextManager[None]:
+        """Estimate elsewhere while the context is entered."""
+
+
 class _System(Protocol):
     """The part of `torchslam.system.slam.SLAM` that workers need."""
 
@@ -47,6 +53,7 @@ class _System(Protocol):
     config: Config
     clock: Stopwatch
     mapper: Mapper
+    online_camera: _Estimator
     has_custom_components: bool
     make_extractor: Callable[[], Extractor]
 
@@ -98,7 +105,7 @@ def with_workers(
     Args:
         processes: number of processes, this one included; None: chosen automatically. With 2 there is a
             prefetch worker, or a bundle worker if frames cannot be prefetched; with more there is one bundle
-            worker, and the others prefetch
+            worker, the others prefetch, and one more process, which is mostly idle, estimates the sensor
     """
     if processes != 1:
         close_decoders()  # so that workers may be forks
@@ -118,8 +125,12 @@ def with_workers(
             others.enter_context(ahead)
             frames = ahead
         if slam.mapping and wanted > (1 if ahead is None else 2):
-            worker = others.enter_context(BundleWorker())
-            others.enter_context(slam.mapper.adjustment.solved_by(worker))
+            # One for each: a local adjustment, which is due in two frames, would wait for an estimate of the sensor.
+            adjusting, estimating = SolverWorker(), SolverWorker(NICENESS)
+            others.enter_context(adjusting)
+            others.enter_context(estimating)
+            others.enter_context(slam.mapper.adjustment.solved_by(adjusting))
+            others.enter_context(slam.online_camera.solved_by(estimating))
         slam.precompute_undistortion()  # while the workers start
         yield frames
 
@@ -149,23 +160,27 @@ def prefetch_obstacle(sequence: Sequence, slam: _System) -> str:
     return ""
 
 
-class BundleWorker(WorkerPool):
+class SolverWorker(WorkerPool):
     """A `mapping.local_bundle.Solver` that uses a worker, which runs while this is entered.
 
-    Problems are solved in this process until the worker has started, and after it was killed.
+    Functions are called in this process until the worker has started, and after it was killed.
     """
 
-    def __init__(self) -> None:
-        super().__init__(1, partial, solve_local)
+    def __init__(self, niceness: int = 0) -> None:
+        super().__init__(1, partial, apply, niceness=niceness)
 
-    def __call__(self, problem: BundleProblem, iterations: int) -> PendingSolution:
-        call = self.submit(problem, iterations)
+    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        call = self.submit(function, *arguments)
 
-        def answer() -> Solution:
+        def answer() -> Any:
             if call is not None:
                 with suppress(WorkerLostError):
-                    found: Solution = self.result(call)
-                    return found
-            return solve_local(problem, iterations)
+                    return self.result(call)
+            return function(*arguments)
 
         return answer
+
+
+def apply(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function, in a worker."""
+    return function(*arguments)

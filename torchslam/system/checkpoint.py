@@ -73,7 +73,6 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
             for change in slam.online_camera.changes
         ],
         "next_camera_check": slam.online_camera.next_check,
-        "next_readout_check": slam.online_camera.next_readout_check,
         "readout": _plain_readout(slam.shared_camera.model.readout),
         "loop_closures": [astuple(closure) for closure in slam.loop_closer.loop_closures],
     }
@@ -165,8 +164,7 @@ def _restore(
         None if precheck is None else (int(precheck[0]), bool(precheck[1])),
     )
     changes = [_camera_change(saved.camera, *change) for change in run["camera_changes"]]
-    next_checks = int(run["next_camera_check"]), int(run["next_readout_check"])
-    slam.online_camera.restore(changes, next_checks, _readout(run["readout"]))
+    slam.online_camera.restore(changes, int(run["next_camera_check"]), _readout(run["readout"]))
     slam.scene_filter.static_overlay.restore(tensors["run.evidence"])
     if run["adjustment"]:  # around the newest keyframe, where the map is as it was at the request
         due = None if run["due"] is None else int(run["due"])

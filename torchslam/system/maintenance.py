@@ -71,10 +71,13 @@ class Maintenance:
                 self._close(found)
 
     def _apply(self) -> None:
+        before = self.context.camera.model
         self.context.mapper.apply_adjustment(self.active_map.current.map)
+        if self.context.camera.model is not before:
+            self.context.scene_filter.forget_last()  # its pose was one of the map before
 
     def _close_and_cull(self) -> None:
-        """Close a loop at the newest keyframe, cull keyframes, compact the map, and check the camera."""
+        """Close a loop at the newest keyframe, cull keyframes, compact the map, and estimate the sensor."""
         self.close_loops()
         submap = self.active_map.current
         keys = submap.map.keys
@@ -82,10 +85,8 @@ class Maintenance:
         if remap is not None:
             self.context.loop_closer.remove(keys[remap.keyframes < 0])
         if self.context.mode is Mode.TRACKING and not self.adjustment.is_pending:
-            with self.context.clock("bundle"):
-                has_changed = self.context.online_camera.check(submap)
-            if has_changed:
-                self.context.scene_filter.forget_last()  # its pose was one of the map before
+            with self.context.clock("sensor"):
+                self.context.online_camera.step(submap)
 
     def _precheck_loop(self) -> None:
         """Look for a loop at the newest keyframe while its adjustment is pending.

@@ -121,6 +121,7 @@ class MapStart:
         context = self.context
         context.log.release(savepoint.frames)
         context.mapper.adjustment.drop()
+        context.online_camera.forget()
         context.loop_closer.remove(savepoint.submap.map.keys)
         context.session.atlas.remove(savepoint.submap)
         context.active_map.provisional = None

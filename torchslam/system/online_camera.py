@@ -1,61 +1,39 @@
-"""Correct the camera while a run goes on: where the map says that it is another one, the map is adjusted with it.
+"""Correct the sensor model while a run goes on: where the map predicts better with another one, it is adjusted by it.
 
 The given camera is a measurement with an error. Each time the keyframes of the active map have become a third more,
-its bundle adjustment frees the camera, with the given one as its prior. Where what it finds contradicts the camera in
-use by more than the errors that stretches of the recording show, the map takes it over, and the next frames are tracked
-with it. The prior stays the given camera, so that no evidence counts twice.
-
-A rolling shutter bends images as another lens would. So the residuals are tested for a readout as well, and always
-before the camera is moved. Where they show one, or where one is given, the camera is judged, the map adjusted and
-frames tracked by keypoints that are corrected to the middle row.
+its graph is handed to the process that estimates sensors (`optim.sensor_estimate`). No frame waits for it: the result
+is taken `ESTIMATE_FRAMES` later, however long it took, so that the bytes of a run do not depend on the machine. Where
+it is another model, the whole map is adjusted by it as a local bundle adjustment is, and frames are tracked with it
+once that is applied. The prior stays the given camera, so that no evidence counts twice.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import NamedTuple
-
-import torch
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
 
 from torchslam.config import CameraConfig, Config
 from torchslam.geometry import Camera, SensorModel, SharedCamera
-from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
+from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
-from torchslam.geometry.similarity import in_place_of
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.mapping.local_bundle import (
-    MAP_OPTIONS,
-    BundleWindow,
-    adjust_all,
-    apply_solution,
-    build_window,
-    solve_window,
-)
-from torchslam.optim import BundleProblem, camera_evidence
-from torchslam.optim.camera_evidence import CameraEstimate
-from torchslam.optim.rolling_shutter import ONLINE_FRAMES, find_rolling_shutter, readout_by
+from torchslam.mapping.local_bundle import MAP_OPTIONS, AsyncBundleAdjustment, Solver, adjust_all, solve_here
+from torchslam.optim.rolling_shutter import ONLINE_FRAMES
+from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor
 
 FIRST_KEYFRAMES, MAX_KEYFRAMES, GROWTH = 6, 100, 1.3
-"""Keyframes of the map at the first check and the last one, and their ratio from check to check. Tried from 6 to 8 and
-from 1.2 to 1.5: with later checks, more frames of kitti07 have the error of the given camera, and nothing else changes.
-The adjustment of a check takes .15 CPU s at 45 keyframes of redkitchen's final map, disturbed by .002, .27 s at 100;
-a frame waits for it, and in a run it may be twice as long."""
-MIN_DEPARTURE = 5.0
-"""Standard errors by which the camera in use must be off. Tried from 4 to 6: the same recordings take a camera over.
-Three parameters exceed 2.8 in one check of twenty by chance, and there are ten checks. A change is not free: the poses
-before it remain those of the former camera."""
-FIRST_READOUT_KEYFRAMES, READOUT_GROWTH = 8, 2.0
-"""Keyframes of the map at the first test for a readout, and their ratio from test to test until one is found. Tried at
-these values only: a test takes as long as a check of the camera, and where the shutter is global it is for nothing."""
-CHECK_TOLERANCE = 1e-4
-"""Predicted relative reduction of the cost that ends the adjustment of a check. Tried from 1e-8 to 1e-3 on 45, 77 and
-100 keyframes of redkitchen: the camera is the same to .01 px, its departure to .01 standard errors, and 1e-4 takes half
-to three quarters of the time of 1e-8."""
-READOUT_SIGMAS = 8.0
-"""Standard errors by which a readout must differ from zero before it is used. Few stretches of a young map tell their
-scatter badly: tests on 15 to 60 frames of global shutters gave up to 6.2 (kitti07), and those of rolling shutters 12 to
-40. Tried at 5, which finds one in kitti07, and at this value."""
+"""Keyframes of the map at the first estimate and the last one, and their ratio from one to the next. Tried from 6 to 8
+and from 1.2 to 1.5: with later ones, more frames of kitti07 have the error of the given camera."""
+ESTIMATE_FRAMES, ADJUST_FRAMES = 8, 6
+"""Frames after which an estimate is taken, and after which the map that is adjusted by it is: they take .15 to .5 s and
+.05 to .3 s of another process. Tried at these values only."""
+TOLERANCE = 1e-4
+"""Predicted relative reduction of the cost that ends the adjustment of an estimate. Tried from 1e-8 to 1e-3 on 45, 77
+and 100 keyframes of redkitchen: the camera is the same to .01 px, and 1e-4 takes half to three quarters of the time of
+1e-8."""
 
 
 @dataclass(frozen=True)
@@ -75,108 +53,111 @@ class CameraChange:
     readout: Readout | None = None
 
 
-class _Judged(NamedTuple):
-    """What the active map says of its camera: a window of all its keyframes, solved, and the camera by it."""
+@dataclass(frozen=True)
+class _Estimate:
+    """An estimate that was begun.
 
-    window: BundleWindow
-    solved: BundleProblem
-    estimate: CameraEstimate
-    departure: float
+    Attributes:
+        submap: of its graph.
+        due: the frame from which on it is taken.
+        result: waits for it.
+    """
+
+    submap: Submap
+    due: int
+    result: Callable[[], SensorEstimate]
 
 
 class OnlineCamera:
-    """Checks the camera in use by the active map, and replaces it.
+    """Estimates the sensor model by the active map, and replaces it.
 
     Attributes:
         changes: all replacements so far.
-        next_check: number of keyframes of the active map from which on it is checked again.
-        next_readout_check: the same for a readout, until one is found.
+        next_check: number of keyframes of the active map from which on it is estimated again.
+        solver: where the estimate is computed.
     """
 
-    def __init__(self, camera: SharedCamera, config: Config, atlas: Atlas) -> None:
-        self.camera, self.settings, self.atlas = camera, config.bundle_adjustment, atlas
-        self.given = CameraMeasurement.of(camera.current, config.camera.std) if config.camera.std else None
-        self.given_readout = given_readout(config.camera)
-        camera.use(SensorModel(camera.current, self.given_readout if self.given_readout.is_given else None))
-        self.changes: list[CameraChange] = []
-        self.next_check, self.next_readout_check = FIRST_KEYFRAMES, FIRST_READOUT_KEYFRAMES
-
-    def restore(
-        self, changes: list[CameraChange], next_checks: tuple[int, int], readout: Readout | None
+    def __init__(
+        self, camera: SharedCamera, config: Config, atlas: Atlas, adjustment: AsyncBundleAdjustment
     ) -> None:
-        """Go on where a checkpoint was written; the checks are the next ones of the camera and of a readout."""
-        self.changes = changes
-        self.next_check, self.next_readout_check = next_checks
+        self.camera, self.atlas, self.adjustment = camera, atlas, adjustment
+        self.settings = config.bundle_adjustment
+        self.given = CameraMeasurement.of(camera.current, config.camera.std) if config.camera.std else None
+        self.prior = SensorPrior(self.given, given_readout(config.camera))
+        camera.use(SensorModel(camera.current, self.prior.readout if self.prior.readout.is_given else None))
+        self.changes: list[CameraChange] = []
+        self.next_check = FIRST_KEYFRAMES
+        self.solver: Solver = solve_here
+        self._pending: _Estimate | None = None
+
+    @contextmanager
+    def solved_by(self, solver: Solver) -> Iterator[None]:
+        """Estimate elsewhere while the context is entered."""
+        before, self.solver = self.solver, solver
+        try:
+            yield
+        finally:
+            self.solver = before
+
+    @property
+    def is_pending(self) -> bool:
+        """Whether an estimate is being computed, or the map adjusted by one."""
+        return self._pending is not None or self.adjustment.is_whole
+
+    def restore(self, changes: list[CameraChange], next_check: int, readout: Readout | None) -> None:
+        """Go on where a checkpoint was written."""
+        self.changes, self.next_check = changes, next_check
         self.camera.use(SensorModel(changes[-1].camera if changes else self.camera.current, readout))
 
-    def check(self, submap: Submap) -> bool:
-        """Check the camera if the map has grown enough, and take over a better one.
+    def step(self, submap: Submap) -> None:
+        """Begin an estimate if the map has grown enough; take one that is due, and have the map adjusted by it.
 
         Args:
             submap: the active submap, of which no adjustment is pending.
-
-        Returns:
-            Whether the camera and the maps were changed.
         """
+        frame = _newest_frame(submap)
+        if self._pending is not None:
+            if self._pending.submap is not submap:
+                self._pending = None
+            elif frame >= self._pending.due:
+                found, self._pending = self._pending.result(), None
+                self._take(submap, found, frame)
+            return
         keyframes = submap.map.num_keyframes
-        if self.given is None or not self.settings.local or not self.next_check <= keyframes <= MAX_KEYFRAMES:
-            return False
+        is_wanted = self.given is not None or self.prior.readout.is_sought
+        if not is_wanted or not self.settings.local or not self.next_check <= keyframes <= MAX_KEYFRAMES:
+            return
         self.next_check = math.ceil(keyframes * GROWTH)
-        before, is_tested = self.camera.model.readout, False
-        if before is not None or keyframes >= self.next_readout_check:
-            self.next_readout_check, is_tested = math.ceil(keyframes * READOUT_GROWTH), True
-            self._find_readout(submap)
-        judged = self._judged(submap)
-        if judged is not None and judged.departure >= MIN_DEPARTURE and not is_tested:
-            self._find_readout(submap)
-            judged = judged if self.camera.model.readout is None else self._judged(submap)
-        is_off = judged is not None and judged.departure >= MIN_DEPARTURE
-        if judged is None or not (is_off or (before is None and self.camera.model.readout is not None)):
-            return False
-        window, at, estimate, departure = judged
-        if is_off:
-            found = solve_window(at, self.settings, calibration=estimate.prior)
-        else:
-            found = solve_window(replace(at, camera=with_radial_terms(self.camera.current)), self.settings)
-        # In place and unit of the map as it was: with them go the frames in between, and the poses that follow.
-        T_cw, points_w = in_place_of(submap.map.T_cw[window.keyframes], found.T_cw, found.points_w)
-        apply_solution(submap.map, window, T_cw, points_w, found.camera)
-        self.camera.replace(found.camera)
-        change = CameraChange(_newest_frame(submap), found.camera, departure, self.camera.model.readout)
-        self.changes.append(change)
+        model = self.camera.model
+        graph = submap.posed_frames.graph(submap.map, model.camera, readout=model.readout)
+        options = MAP_OPTIONS.replace(iterations=self.settings.global_iterations, tolerance=TOLERANCE)
+        result = self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES)
+        self._pending = _Estimate(submap, frame + ESTIMATE_FRAMES, result)
+
+    def _take(self, submap: Submap, found: SensorEstimate, frame: int) -> None:
+        """Have the map adjusted by another model."""
+        if found.has_other_readout:
+            self.camera.use(SensorModel(self.camera.current, found.sensor.readout))
+            submap.correct_keyframes(self.camera.model)
+        if found.is_change:
+            self.adjustment.request_whole(
+                submap.map, found.sensor.camera, frame + ADJUST_FRAMES, partial(self._use, submap, found)
+            )
+
+    def _use(self, submap: Submap, found: SensorEstimate) -> None:
+        """Use a model by which a submap was just adjusted."""
+        self.camera.use(found.sensor)
+        self.changes.append(
+            CameraChange(_newest_frame(submap), found.sensor.camera, found.departure, found.sensor.readout)
+        )
         for other in self.atlas:
             if other is not submap:
-                other.correct_keyframes(self.camera.model)
-                adjust_all(other.map, found.camera, self.settings)
-        return True
+                other.correct_keyframes(found.sensor)
+                adjust_all(other.map, found.sensor.camera, self.settings)
 
-    def _find_readout(self, submap: Submap) -> None:
-        """Test the residuals for a readout, unless one is given, and use what they show from here on."""
-        if not self.given_readout.is_sought:
-            return
-        graph = submap.posed_frames.graph(submap.map, self.camera.current, readout=self.camera.model.readout)
-        found = find_rolling_shutter(graph, ONLINE_FRAMES, for_shaking=False)
-        is_sure = found is not None and abs(found.readout) > READOUT_SIGMAS * found.readout_std
-        if is_sure or self.camera.model.readout is not None:
-            readout = readout_by(found, self.given_readout) or self.camera.model.readout
-            self.camera.use(replace(self.camera.model, readout=readout))
-            submap.correct_keyframes(self.camera.model)
-
-    def _judged(self, submap: Submap) -> _Judged | None:
-        """Adjust all keyframes with a free camera; None where they do not determine it."""
-        assert self.given is not None
-        everyone = torch.arange(submap.map.num_keyframes, device=submap.map.T_cw.device)
-        camera = with_radial_terms(self.camera.current)
-        window = build_window(submap.map, everyone[1:], everyone[:1], camera)
-        if window is None:
-            return None
-        found = solve_window(window.problem, self.settings, calibration=self.given, tolerance=CHECK_TOLERANCE)
-        at = replace(window.problem, T_cw=found.T_cw, points_w=found.points_w, camera=found.camera)
-        evidence = camera_evidence(at, self.given, MAP_OPTIONS, submap.map.keys[window.keyframes])
-        if evidence is None:
-            return None
-        estimate = evidence.estimate()
-        return _Judged(window, at, estimate, estimate.departure_from(self.camera.current))
+    def forget(self) -> None:
+        """Forget an estimate of a map that is no longer the active one."""
+        self._pending = None
 
 
 def given_readout(settings: CameraConfig) -> Readout:

@@ -424,7 +424,13 @@ class FinalAdjustment:
             evidence = graph_evidence(self._graph(submap, camera), given)
         if evidence is not None:
             found = evidence.estimate()
-            camera, given, measured = found.prior.nearest(camera), found.prior, found.measured
+            measured, is_better = found.measured, evidence.is_better_than(given.camera)
+            # Else the given camera predicts as well, and is held.
+            camera, given = (
+                (found.prior.nearest(camera), found.prior)
+                if is_better
+                else (given.camera, replace(given, directions=given.directions[:, :0]))
+            )
         solution = self._solve(submap, camera, given, progress, SETTLED if settled else FINAL)
         self.camera = solution.camera
         submap.correct_keyframes(SensorModel(self.camera, self.readout))

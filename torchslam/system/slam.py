@@ -139,7 +139,7 @@ class SLAM:
         self.mapper.adjustment.drop()
         self.loop_closer = LoopCloser(self.shared_camera, self.scaled_config, self.atlas, self.matcher)
         self.scene_filter = SceneFilter(self.shared_camera, self.scaled_config)
-        self.online_camera = OnlineCamera(self.shared_camera, self.config, self.atlas)
+        self.online_camera = OnlineCamera(self.shared_camera, self.config, self.atlas, self.mapper.adjustment)
         self._context = SystemContext(
             camera=self.shared_camera,
             config=self.scaled_config,
@@ -173,8 +173,8 @@ class SLAM:
 
     @property
     def can_checkpoint(self) -> bool:
-        """Whether the active submap is confirmed, and no frame is held back."""
-        return self.mode is Mode.TRACKING
+        """Whether the active submap is confirmed, no frame is held back, and no estimate of the sensor is pending."""
+        return self.mode is Mode.TRACKING and not self.online_camera.is_pending
 
     # --- pipeline --------------------------------------------------------------------------------------------
 

@@ -1,0 +1,114 @@
+"""Estimate the sensor model from the graph of a map: the readout of the shutter and the camera, one after the other.
+
+A rolling shutter bends images as another lens would. So the readout is estimated first, where it is not given, and
+keypoints are corrected by it before the camera is. Either is believed only where stretches of the recording predict
+each other better with it than with the model in use (`torchslam.optim.model_choice`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import torch
+
+from torchslam.geometry import Camera, SensorModel
+from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
+from torchslam.geometry.rolling_shutter import Readout
+from torchslam.optim._core.options import SolverOptions
+from torchslam.optim.bundle._api import BundleProblem, solve_bundle
+from torchslam.optim.camera_evidence import CameraEvidence, camera_evidence
+from torchslam.optim.rolling_shutter import find_rolling_shutter, readout_by
+from torchslam.optim.run_graph import RunGraph, camera_prior, keyframe_problem
+
+READOUT_STEPS = 2
+"""Steps of the readout, each with the keypoints corrected by the one before: the second changes it by a thirtieth."""
+
+
+@dataclass(frozen=True)
+class SensorPrior:
+    """What is known of a sensor before its recording.
+
+    Attributes:
+        camera: the given camera with its error; None: it is exact.
+        readout: given, sought (zero with an error) or excluded (zero, exact).
+    """
+
+    camera: CameraMeasurement | None
+    readout: Readout
+
+
+@dataclass(frozen=True)
+class SensorEstimate:
+    """The sensor by a graph and a prior.
+
+    Attributes:
+        sensor: the model to use: what was in use where nothing else predicts better.
+        has_other_camera: whether its camera is another one.
+        has_other_readout: whether its readout is another one.
+        departure: standard errors by which the camera in use was off; 0 where the graph does not determine it.
+    """
+
+    sensor: SensorModel
+    has_other_camera: bool
+    has_other_readout: bool
+    departure: float
+
+    @property
+    def is_change(self) -> bool:
+        """Whether the map is to be adjusted by the new model."""
+        return self.has_other_camera or self.has_other_readout
+
+
+def estimate_sensor(
+    graph: RunGraph, prior: SensorPrior, options: SolverOptions, readout_frames: int
+) -> SensorEstimate:
+    """Estimate the readout and the camera of a graph of one submap. Detached.
+
+    Args:
+        graph: with the camera and the readout in use.
+        prior: what is known without it.
+        options: of the adjustment of its keyframes.
+        readout_frames: most frames from which the readout is estimated.
+    """
+    readout = graph.readout
+    if prior.readout.is_sought or prior.readout.is_given:
+        for _ in range(READOUT_STEPS):
+            found = find_rolling_shutter(replace(graph, readout=readout), readout_frames, for_shaking=False)
+            readout = readout_by(found, prior.readout) or readout
+            if readout is None:
+                break
+    sensor = SensorModel(graph.camera, readout)
+    has_other_readout = readout is not graph.readout
+    if prior.camera is None:
+        return SensorEstimate(sensor, False, has_other_readout, 0.0)
+    evidence = keyframe_evidence(replace(graph, readout=readout), prior.camera, options)
+    if evidence is None:
+        return SensorEstimate(sensor, False, has_other_readout, 0.0)
+    estimate = evidence.estimate()
+    departure = estimate.departure_from(graph.camera)
+    if not evidence.is_better_than(graph.camera):
+        return SensorEstimate(sensor, False, has_other_readout, departure)
+    return SensorEstimate(replace(sensor, camera=estimate.camera), True, has_other_readout, departure)
+
+
+def keyframe_evidence(
+    graph: RunGraph, given: CameraMeasurement, options: SolverOptions
+) -> CameraEvidence | None:
+    """Adjust the keyframes of a graph of one submap with a free camera; None where they do not determine it."""
+    graph = graph.global_shutter()
+    keyframes, *_, problem = keyframe_problem(graph, int(graph.submap[0]))
+    problem = replace(problem, camera=with_radial_terms(problem.camera))
+    found = adjusted(problem, options, given)
+    return camera_evidence(found, given, options, graph.timestamps[keyframes])
+
+
+def adjusted(
+    problem: BundleProblem, options: SolverOptions, given: CameraMeasurement | None = None
+) -> BundleProblem:
+    """The problem at its minimum; given: the camera with its error, where it is free."""
+    free: bool | torch.Tensor = False
+    if given is not None:
+        problem, free = replace(problem, camera_prior=camera_prior(given)), given.directions
+    found = solve_bundle(problem, free_camera=free, check=False, options=options)
+    camera: Camera = found.camera if given is not None else problem.camera
+    return replace(problem, T_cw=found.T_cw, points_w=found.points_w, camera=camera, camera_prior=None)
