@@ -53,9 +53,12 @@ class _System(Protocol):
     config: Config
     clock: Stopwatch
     mapper: Mapper
-    online_camera: _Estimator
     has_custom_components: bool
     make_extractor: Callable[[], Extractor]
+
+    @property
+    def online_camera(self) -> _Estimator:
+        """What estimates the sensor model."""
 
     @property
     def mapping(self) -> bool:

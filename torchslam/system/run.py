@@ -422,7 +422,7 @@ class FinalAdjustment:
         measured, evidence = given, None
         if given is not None:
             evidence = graph_evidence(self._graph(submap, camera), given)
-        if evidence is not None:
+        if evidence is not None and given is not None:
             found = evidence.estimate()
             measured, is_better = found.measured, evidence.is_better_than(given.camera)
             # Else the given camera predicts as well, and is held.
