@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, SharedCamera, transform
+from torchslam.geometry import SensorModel, SharedCamera, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.tracking.data_association import match_keyframe
@@ -25,14 +25,14 @@ NUM_NEAREST = 3  # keyframes in time for the relocalization of a lost frame
 class FramePoser:
     """Poses the views of a sequence in a map whose keyframes are some of them."""
 
-    def __init__(self, camera: Camera, config: Config) -> None:
+    def __init__(self, sensor: SensorModel, config: Config) -> None:
         """Create a tracker.
 
         Args:
-            camera: Of all views.
+            sensor: Of all views.
             config: For the size of the images.
         """
-        self.tracker = Tracker(SharedCamera(camera), config)
+        self.tracker = Tracker(SharedCamera(sensor.camera, sensor.readout), config)
         self.config = config
 
     @torch.no_grad()
@@ -86,6 +86,7 @@ class FramePoser:
 
     def _track(self, submap: Submap, view: FrameFeatures) -> StepResult:
         """Track a frame from the last keyframe, or relocalize it by the keyframes nearest in time."""
+        view = self.tracker.at_middle_row(submap, view)
         estimate = self.tracker.track(submap, view)
         self.tracker.commit(submap, view, estimate)
         if estimate is None:

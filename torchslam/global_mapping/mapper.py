@@ -15,8 +15,9 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError
-from torchslam.geometry import Camera, so3_log
+from torchslam.geometry import Camera, SensorModel, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.chained_positions import chained_positions
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.frames_between import FramePoser
@@ -213,16 +214,24 @@ class GlobalMapper:
         self.progress = progress
         self.saved = saved or SavedStages(None, self.sequence, config)
         self.skipped: list[str] = []
+        self.readout: Readout | None = None  # by which the keypoints of images are corrected
 
     @torch.no_grad()
-    def run(self, results: Rows[StepResult] = ()) -> GlobalMap:
-        """Map the recording; `results`: of an online run over it, whose doubtful frames are mapped as well."""
+    def run(self, results: Rows[StepResult] = (), before: Run | None = None) -> GlobalMap:
+        """Map the recording.
+
+        Args:
+            results: of an online run over it, whose doubtful frames are mapped as well.
+            before: that run, whose readout and velocities correct keypoints for a rolling shutter.
+        """
         if learned_config(self.config) is not None and self.extract is None:
             raise ConfigError(
                 "global_mapping.learned_links requires images; the recording brings its features"
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
         views = self._saved_views(images)
+        if before is not None:
+            views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
         matcher = self.saved.matcher(PairMatcher(views, self.camera, self.matcher, self.scaled))
@@ -385,7 +394,7 @@ class GlobalMapper:
         fill_submap(submap, views, rows, observed, found)
         slam_map = submap.map
         slam_map.set_noise(squared_errors(slam_map, slam_map.observations(), found.camera))
-        poser = FramePoser(found.camera, self.scaled)
+        poser = FramePoser(SensorModel(found.camera, self.readout), self.scaled)
         mapped = {view.index: view for view in views}
         frames = range(len(self.sequence)) if frames is None else frames
         results = poser.pose(submap, self._all_views(frames, mapped), given_cw)

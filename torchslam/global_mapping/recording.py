@@ -107,7 +107,7 @@ def map_recording(
     mapper = GlobalMapper(
         sequence, camera, config, given, device, progress=progress, saved=saved, kept=features
     )
-    made = mapper.run(online.results)
+    made = mapper.run(online.results, online)
     reduction = mapper.scaled.features.reduction(camera.size)
 
     def checked(run: Run) -> MapCheck:
