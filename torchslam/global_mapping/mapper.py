@@ -249,9 +249,9 @@ class GlobalMapper:
             left_out = held_back | {len(pairs) + row for row in left_out}
             tied = self.reconstruct(views, used, LearnedPairs(learned.views, kept))
             if not isinstance(tied, str):
-                before, after = (self._check(made, learned.views, every, left_out) for made in (found, tied))
+                first, after = (self._check(made, learned.views, every, left_out) for made in (found, tied))
                 times = middle_times(learned.views, every, left_out)
-                if predictive_gain(after.evidence, before.evidence, times).is_sure:
+                if predictive_gain(after.evidence, first.evidence, times).is_sure:
                     added = set(tied[0].tolist()) - set(found[0].tolist())
                     doubtful = frozenset() if after.is_right else frozenset(views[row].index for row in added)
                     found, views, pairs, held_back = tied, learned.views, every, left_out
