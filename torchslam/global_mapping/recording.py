@@ -31,8 +31,8 @@ FEW_POSED = 0.98
 CHECKED_DISTANCES = 1, 2, 4
 """Distances, in keyframes, of the pairs that check an online run."""
 LOOP_MATCHES = 40
-"""Verified matches of a pair of similar places that counts. On kitti07, which visits no place twice, three pairs have 22
-to 30; where places are visited again, most have more than 40 (machine_hall, office_loop)."""
+"""Verified matches of a pair of similar places that counts. On kitti07, which visits no place twice, three have 22 to
+30; where places are visited again, most have more than 40 (machine_hall, office_loop)."""
 
 KeyframePairs = tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]]
 """Poses and features of keyframes, and their verified pairs."""
