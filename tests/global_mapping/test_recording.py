@@ -179,7 +179,7 @@ def test_a_run_that_the_check_contradicts_is_mapped_as_a_whole(world: World) -> 
     kept = world.map(a_run())
     assert kept.kept is Mapping.GLOBAL
     assert kept.check is world.checks[True]
-    assert kept.why == f"the check says: {world.online_check.sentence()}"
+    assert kept.why == f"the check of the online map failed: {world.online_check.sentence()}"
 
 
 def test_a_user_may_choose(world: World) -> None:
@@ -188,7 +188,7 @@ def test_a_user_may_choose(world: World) -> None:
     assert (kept.kept, kept.why, world.mapped) == (Mapping.ONLINE, "", [])
     assert kept.check is world.online_check
     kept = world.map(a_run(), Mapping.GLOBAL)
-    assert (kept.kept, kept.why, len(world.mapped)) == (Mapping.GLOBAL, "as asked", 1)
+    assert (kept.kept, kept.why, len(world.mapped)) == (Mapping.GLOBAL, "it was asked for", 1)
 
 
 @pytest.mark.parametrize(

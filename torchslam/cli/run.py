@@ -359,7 +359,7 @@ def _map_recording(
         online = online if attempt.end is None else attempt.end(False)
         return replace(attempt, finished=replace(online, interrupted=True))
     if mapped.why:
-        say(f"mapped as a whole, since {mapped.why}; kept: {mapped.kept}")
+        say(f"ran global mapping because {mapped.why}; kept the {mapped.kept} map")
     return replace(attempt, finished=mapped.run, mapped=mapped)
 
 

@@ -46,7 +46,7 @@ class Mapping(StrEnum):
     ONLINE = "online"
     """Frame by frame, in the order of time."""
     GLOBAL = "global"
-    """As a whole as well, whatever the check says."""
+    """As a whole as well, whatever the result of the check."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def map_recording(
         progress("check", 0, 1)
         check = check_run(online)
         if check is not None and not check.is_right:
-            why = f"the check says: {check.sentence()}"
+            why = f"the check of the online map failed: {check.sentence()}"
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
         return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, "")
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
@@ -140,7 +140,7 @@ def map_recording(
     if abs(gain.sigmas) > SURE:
         is_better = gain.total > 0
     run, check, kept = (made.run, whole, Mapping.GLOBAL) if is_better else (online, before, Mapping.ONLINE)
-    return MappedRecording(with_doubts(run, check), online, check, kept, why or "as asked")
+    return MappedRecording(with_doubts(run, check), online, check, kept, why or "it was asked for")
 
 
 def _loss(run: Run) -> str:
