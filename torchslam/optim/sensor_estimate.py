@@ -77,11 +77,12 @@ def estimate_sensor(
             readout = readout_by(found, prior.readout) or readout
             if readout is None:
                 break
-    sensor = SensorModel(graph.camera, readout)
-    has_other_readout = readout is not graph.readout
-    if prior.camera is None:
+    has_other_readout = _differs(readout, graph.readout)
+    sensor = SensorModel(graph.camera, readout if has_other_readout else graph.readout)
+    # A camera is estimated once the map is adjusted by the readout: before, its poses are those of a bent image.
+    if prior.camera is None or (has_other_readout and graph.readout is None):
         return SensorEstimate(sensor, False, has_other_readout, 0.0)
-    evidence = keyframe_evidence(replace(graph, readout=readout), prior.camera, options)
+    evidence = keyframe_evidence(replace(graph, readout=sensor.readout), prior.camera, options)
     if evidence is None:
         return SensorEstimate(sensor, False, has_other_readout, 0.0)
     estimate = evidence.estimate()
@@ -89,6 +90,13 @@ def estimate_sensor(
     if not evidence.is_better_than(graph.camera):
         return SensorEstimate(sensor, False, has_other_readout, departure)
     return SensorEstimate(replace(sensor, camera=estimate.camera), True, has_other_readout, departure)
+
+
+def _differs(readout: Readout | None, before: Readout | None) -> bool:
+    """Whether a readout is another one than before, by more than its error."""
+    if readout is None or before is None:
+        return readout is not before
+    return abs(float(readout.seconds) - float(before.seconds)) > readout.std
 
 
 def keyframe_evidence(
