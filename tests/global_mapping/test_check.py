@@ -16,14 +16,17 @@ from tests.global_mapping.synthetic import (
     Recording,
     arc,
     ball,
+    disturbed,
     line,
     rand,
     randn,
     wall,
 )
 from torchslam.geometry import se3_exp, se3_inverse, so3_exp
-from torchslam.global_mapping.check import Break, BreakKind, MapCheck, check_map
+from torchslam.global_mapping.check import MAX_LINK_STD, Break, BreakKind, MapCheck, check_map
 from torchslam.global_mapping.view_graph import ViewPair
+from torchslam.optim.model_choice import predictive_gain
+from torchslam.optim.scale_links import ScaleLinks
 
 WALK = Recording.of(line(24), wall(300, 6.0), noise_px=0.5, first=0)
 TURN = Recording.of(arc(24, 120.0), ball(100), noise_px=0.5, first=0)
@@ -37,6 +40,7 @@ def check(
     unposed: Collection[int] = (),
     held_back: Collection[int] | None = None,
     reduction: float = 1.0,
+    links: ScaleLinks | None = None,
 ) -> MapCheck:
     """Check the true poses or others by all pairs at distances up to three or by others."""
     return check_map(
@@ -47,7 +51,14 @@ def check(
         CAMERA,
         held_back,
         reduction,
+        links,
     )
+
+
+def loose(recording: Recording, *moments: int, std: float = math.inf) -> ScaleLinks:
+    """Scale links as the map of a recording has them that ties all its images but after some of them."""
+    frames = tuple(view.index for view in recording.views)
+    return ScaleLinks(frames, tuple(std if frame in moments else 1e-3 for frame in frames[:-1]))
 
 
 def bent(T_cw: Tensor, at: int, factor: float) -> Tensor:
@@ -55,6 +66,13 @@ def bent(T_cw: Tensor, at: int, factor: float) -> Tensor:
     T_wc = se3_inverse(T_cw)
     T_wc[at + 1 :, :3, 3] = T_wc[at, :3, 3] + factor * (T_wc[at + 1 :, :3, 3] - T_wc[at, :3, 3])
     return se3_inverse(T_wc)
+
+
+def bent_pose(T_cw: Tensor, row: int) -> Tensor:
+    """The poses with one image moved sideways."""
+    T_cw = T_cw.clone()
+    T_cw[row, 1, 3] += 0.3
+    return T_cw
 
 
 def contradicting(recording: Recording, first: int, second: int) -> ViewPair:
@@ -163,9 +181,7 @@ def test_a_scale_that_differs_little_is_right(factor: float, agrees: bool) -> No
 
 def test_a_camera_that_is_moved_sideways_contradicts_the_image_pairs() -> None:
     """Where most pairs that go across a moment are of that image: before it and after it."""
-    T_cw = WALK.T_cw.clone()
-    T_cw[10, 1, 3] += 0.3
-    found = check(WALK, T_cw, WALK.pairs(1, 2))
+    found = check(WALK, bent_pose(WALK.T_cw, 10), WALK.pairs(1, 2))
     assert [(each.before, each.after, each.kind) for each in found.breaks] == [
         (9, 10, BreakKind.POSE),
         (10, 11, BreakKind.POSE),
@@ -187,7 +203,7 @@ def test_most_pairs_across_a_moment_must_agree() -> None:
         (wrong, right, []),
         (wrong[:2], right[:2], []),
         (wrong, [], [BreakKind.POSE]),
-        (wrong[:2], [], [BreakKind.UNKNOWN]),
+        (wrong[:2], [], []),
     ):
         found = check(WALK, pairs=[*others, *bad, *good])
         assert [each.kind for each in found.breaks] == kinds
@@ -223,15 +239,16 @@ def tied_by_loops(*apart: tuple[int, int]) -> tuple[Recording, list[ViewPair], l
 def test_loops_tie_what_a_moment_does_not() -> None:
     """The two ends of a walk that returns; where the camera turns around, nothing ties them."""
     recording, near, loops = tied_by_loops((11, 12))
-    found = check(recording, pairs=near)
+    links = loose(recording, 11)
+    found = check(recording, pairs=near, links=links)
     assert found.breaks == (Break(11, 12, BreakKind.UNKNOWN),)
     assert len(found.uncertain) == 12
-    found = check(recording, pairs=[*near, *loops])
+    found = check(recording, pairs=[*near, *loops], links=links)
     assert found.is_right
     assert (found.breaks, found.certain, found.uncertain) == ((), tuple(range(24)), ())
     # Both ends tied, and the middle by nothing: only that hangs on weak links.
     recording, near, loops = tied_by_loops((7, 8), (15, 16))
-    found = check(recording, pairs=[*near, *loops])
+    found = check(recording, pairs=[*near, *loops], links=loose(recording, 7, 15))
     assert found.breaks == (Break(7, 8, BreakKind.UNKNOWN), Break(15, 16, BreakKind.UNKNOWN))
     assert (found.certain, found.uncertain) == ((*range(8), *range(16, 24)), tuple(range(8, 16)))
     assert found.score == pytest.approx(16 / 24)
@@ -244,7 +261,7 @@ def test_loops_that_contradict_the_scale_tie_nothing(factor: float) -> None:
     T_wc = se3_inverse(recording.T_cw)
     center = T_wc[23, :3, 3].clone()
     T_wc[12:, :3, 3] = center + factor * (T_wc[12:, :3, 3] - center)
-    found = check(recording, se3_inverse(T_wc), [*near, *loops])
+    found = check(recording, se3_inverse(T_wc), [*near, *loops], links=loose(recording, 11))
     assert Break(11, 12, BreakKind.UNKNOWN) in found.breaks
     assert len(found.uncertain) == 12
 
@@ -257,7 +274,7 @@ def test_nine_in_ten_matches_must_agree(wrong: int, matches: int, uncertain: int
         of_points(contradicting(recording, row, 23 - row), recording, 0, matches)
         for row in range(4, 4 + wrong)
     ]
-    found = check(recording, pairs=[*near, *loops, *bad])
+    found = check(recording, pairs=[*near, *loops, *bad], links=loose(recording, 11))
     assert len(found.uncertain) == uncertain
 
 
@@ -286,36 +303,47 @@ def test_contradicting_loops_are_found() -> None:
     assert check(recording, pairs=[*pairs[:-3], *last]).breaks == (Break(2, 21, BreakKind.LOOP),)
 
 
-def test_parts_that_nothing_ties_together_are_unknown() -> None:
-    """Without a pair across, or with pairs that share too few points with others to compare scales."""
+@pytest.mark.parametrize("std", [math.inf, 1.01 * MAX_LINK_STD])
+def test_parts_that_the_map_does_not_tie_are_unknown(std: float) -> None:
+    """A weak link is named, by the frames on both sides of it."""
     apart = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 10]
-    found = check(WALK, pairs=apart)
+    found = check(WALK, pairs=apart, links=loose(WALK, 9, std=std))
     assert found.breaks == (Break(9, 10, BreakKind.UNKNOWN),)
+    assert found.weak_links == 1
+    assert str(found.breaks[0]) in found.sentence()
     assert (found.certain, found.uncertain) == (tuple(range(10, 24)), tuple(range(10)))
     assert found.used_agreeing == 1
     assert not found.is_right
     assert found.score == pytest.approx(14 / 24)
 
 
-@pytest.mark.parametrize(("matches", "kinds"), [(99, [BreakKind.UNKNOWN]), (100, [])])
-def test_many_matches_tie_parts_together_without_a_ratio_of_scales(
-    matches: int, kinds: list[BreakKind]
-) -> None:
-    """A hundred of the pair with the most, of points that no other pair of these images has."""
-    tie = WALK.pair(9, 10)
-    point = WALK.shows[9][tie.keypoints_1]
-    order = torch.argsort(point)
-    split = int(point[order[matches - 1]]) + 1
-    tie = of_points(tie, WALK, 0, split)
-    assert len(tie) == matches
-    weak = of_points(WALK.pair(8, 10), WALK, 0, 20)
-    others = [
-        of_points(pair, WALK, split, 300) if {9, 10} & {pair.first, pair.second} else pair
-        for pair in WALK.pairs(*NEAR)
-        if pair.second <= 9 or pair.first >= 10
-    ]
-    found = check(WALK, pairs=[*others, weak, tie])
-    assert [each.kind for each in found.breaks] == kinds
+def test_a_map_that_ties_its_parts_needs_no_pairs_across() -> None:
+    """As one in which the camera stands still: no pair has parallax there."""
+    apart = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 10]
+    for links in (None, loose(WALK), loose(WALK, 9, std=0.99 * MAX_LINK_STD)):
+        found = check(WALK, pairs=apart, links=links)
+        assert found.breaks == ()
+        assert found.certain == tuple(range(24))
+
+
+def test_a_weak_link_is_sought_at_the_moments_of_the_map() -> None:
+    """Its keyframes are other frames than the images, and an image without a pose is passed over."""
+    apart = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 11]
+    dense = ScaleLinks(tuple(range(-5, 30)), tuple(1.0 if frame in (-3, 10) else 0.0 for frame in range(-5, 29)))
+    sparse = ScaleLinks((0, 8, 12, 23), (0.0, 1.0, 0.0))
+    found = check(WALK, pairs=apart, unposed=[10], links=dense)
+    assert found.breaks == (Break(9, 11, BreakKind.UNKNOWN),)
+    # Where keyframes are further apart than images, pairs that agree join what is on one side.
+    found = check(WALK, pairs=apart, unposed=[10], links=sparse)
+    assert found.breaks == (Break(9, 11, BreakKind.UNKNOWN),)
+
+
+def test_pairs_that_contradict_the_poses_say_more_than_a_weak_link() -> None:
+    found = check(WALK, bent_pose(WALK.T_cw, 10), WALK.pairs(1, 2), links=loose(WALK, 9))
+    assert [each.kind for each in found.breaks] == [BreakKind.POSE, BreakKind.POSE]
+    # A ratio of scales that is off means nothing where the map has none.
+    found = check(WALK, bent(WALK.T_cw, 14, 1.5), links=loose(WALK, 14))
+    assert Break(14, 15, BreakKind.UNKNOWN) in found.breaks
 
 
 def test_two_triplets_tell_nothing_and_three_do() -> None:
@@ -333,11 +361,7 @@ def test_two_triplets_tell_nothing_and_three_do() -> None:
     first = [WALK.pair(0, 1), WALK.pair(1, 2), WALK.pair(0, 2)]
     found = check(WALK, pairs=first, unposed=range(3, 24))
     assert found.consistent == 1
-    assert found.breaks == ()  # of more than a hundred matches
-    few = [of_points(pair, WALK, 0, 90) for pair in first]
-    assert [each.kind for each in check(WALK, pairs=few, unposed=range(3, 24)).breaks] == [
-        BreakKind.UNKNOWN
-    ] * 2
+    assert found.breaks == ()
 
 
 # --- what agrees -----------------------------------------------------------------------------------------------
@@ -464,6 +488,57 @@ def test_the_ratio_of_a_break_is_the_median_of_the_triplets() -> None:
     assert here.scale_ratio == pytest.approx(1.2, rel=0.03)
 
 
+# --- evidence --------------------------------------------------------------------------------------------------
+
+
+def times(recording: Recording, pairs: Sequence[ViewPair]) -> Tensor:
+    return torch.tensor([float(pair.first + pair.second) for pair in pairs])
+
+
+@pytest.mark.parametrize("recording", [WALK, TURN])
+def test_a_right_map_predicts_pairs_better_than_a_bent_one(recording: Recording) -> None:
+    """One that has another scale from a moment on, one that is off a little everywhere, and one that turns too far."""
+    pairs = recording.pairs(*NEAR)
+    right = check(recording, pairs=pairs).evidence
+    assert len(right) == len(pairs)
+    assert float(right.min()) > 0
+    worse = {
+        "bent": bent(recording.T_cw, 12, 1.5),
+        "disturbed": disturbed(recording.T_cw, 0.05, 0.3),
+        "turned": se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.02]).double() * torch.arange(24)[:, None]) @ recording.T_cw,
+    }
+    for name, T_cw in worse.items():
+        evidence = check(recording, T_cw, pairs).evidence
+        gain = predictive_gain(right, evidence, times(recording, pairs))
+        assert gain.total > 5, name
+        assert gain.is_sure or name == "bent"  # only the pairs across a bend tell of it
+        assert not predictive_gain(evidence, right, times(recording, pairs)).is_sure
+
+
+def test_pairs_that_a_map_does_not_predict_have_no_evidence() -> None:
+    """None below chance, however far they are off, and none of images without a pose."""
+    pairs = WALK.pairs(1)
+    pairs[4] = contradicting(WALK, 4, 5)
+    found = check(WALK, pairs=pairs, unposed=[10]).evidence
+    known = torch.tensor([row not in (4, 9, 10) for row in range(len(pairs))])
+    assert bool((found[known] > 1).all())
+    assert float(found[~known].max()) < 0.01
+    assert float(found.min()) >= 0
+
+
+def test_evidence_is_of_the_pairs_that_mapping_did_not_use() -> None:
+    """At the size at which features are found, and with the ratios of scales that the others give."""
+    pairs = WALK.pairs(*NEAR)
+    every = check(WALK, pairs=pairs).evidence
+    torch.testing.assert_close(check(WALK, pairs=pairs, held_back={20, 3, 7}).evidence, every[[3, 7, 20]])
+    alone = check(WALK, pairs=pairs[:1]).evidence
+    assert float(every[0]) > float(alone[0]) + 1
+    moved = moved_keypoints(WALK, 5, 0.0, 4.0)
+    own = [row for row, pair in enumerate(pairs) if 5 in (pair.first, pair.second)]
+    small, large = (check(moved, pairs=pairs, reduction=reduction).evidence[own] for reduction in (1.0, 4.0))
+    assert float(large.min()) > float(small.max())
+
+
 # --- what is counted -------------------------------------------------------------------------------------------
 
 
@@ -500,7 +575,8 @@ def test_only_pairs_that_mapping_did_not_use_are_counted() -> None:
 def test_nothing_to_check_is_not_right() -> None:
     found = check(WALK, pairs=[])
     assert (found.pairs, found.used_agreeing, found.score, found.is_right) == (0, 0, 0, False)
-    assert {each.kind for each in found.breaks} == {BreakKind.UNKNOWN}
+    assert found.breaks == ()
+    assert len(found.evidence) == 0
     assert found.distance_px == 0
     empty = replace(a_check(), images=0, certain=())
     assert (empty.score, empty.is_right) == (0, False)
@@ -522,6 +598,7 @@ def a_check(
         consistent=consistent,
         used_agreeing=agreeing / 10,
         distance_px=0.5,
+        evidence=torch.zeros(10, dtype=torch.float64),
         breaks=tuple(Break(row, row + 1, BreakKind.SCALE, 1.25 - 0.5 * (row % 2)) for row in range(breaks)),
         certain=tuple(range(certain)),
         uncertain=(),
@@ -553,24 +630,22 @@ def test_a_check_in_words() -> None:
     assert (
         str(Break(3, 5, BreakKind.LOOP)) == "between frames 3 and 5 images of one place contradict the poses"
     )
-    unknown = "between frames 3 and 5 nothing tells whether the scale is the same"
+    unknown = "between frames 3 and 5 weak link: the map does not determine the scale"
     assert str(Break(3, 5, BreakKind.UNKNOWN)) == unknown
 
 
 def test_pairs_that_contradict_the_map_tie_nothing_together() -> None:
-    """Two of them are too few to call the poses wrong, but they are no tie either, however many matches they have."""
+    """Two of them are too few to call the poses wrong, but they join no parts either, however many matches they have."""
     inside = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 10]
     wrong = [contradicting(WALK, *ends) for ends in ((9, 10), (8, 10))]
     assert min(len(pair) for pair in wrong) >= 100
-    found = check(WALK, pairs=[*inside, *wrong])
+    found = check(WALK, pairs=[*inside, *wrong], links=loose(WALK, 9))
     assert [each.kind for each in found.breaks] == [BreakKind.UNKNOWN]
 
 
 def test_a_single_camera_that_is_off_is_no_difference_of_scales() -> None:
     """Half of the pairs that go across before and after it are of other images, and agree."""
-    T_cw = WALK.T_cw.clone()
-    T_cw[10, 1, 3] += 0.3
-    found = check(WALK, T_cw)
+    found = check(WALK, bent_pose(WALK.T_cw, 10))
     assert BreakKind.SCALE not in {each.kind for each in found.breaks}
 
 
@@ -583,7 +658,7 @@ def test_breaks_are_in_the_order_of_time() -> None:
 
 
 def test_frames_can_be_doubted() -> None:
-    check = MapCheck(5, 4, 4, 3, 3, 1.0, 0.2, (), (0, 2, 4, 6), (8,))
+    check = MapCheck(5, 4, 4, 3, 3, 1.0, 0.2, torch.zeros(4), (), (0, 2, 4, 6), (8,))
     doubted = check.doubting({4, 8, 10})
     assert (doubted.certain, doubted.uncertain) == ((0, 2, 6), (4, 8))
     assert doubted.score == pytest.approx(3 / 4 * check.score)

@@ -40,8 +40,14 @@ def a_run(posed: int = 100, frames: int = 100, lost: int = 0, failure: str = "")
     return FakeRun((), CAMERA, Config(), results, [], False, failure, posed=posed)
 
 
-def a_check(score: float = 1.0, is_broken: bool = False, uncertain: tuple[int, ...] = ()) -> MapCheck:
-    """A check with a score."""
+PAIRS = 40
+"""Pairs that were held back."""
+
+
+def a_check(
+    score: float = 1.0, is_broken: bool = False, uncertain: tuple[int, ...] = (), predicted: int = PAIRS
+) -> MapCheck:
+    """A check with a score, of a map that predicts the first so many of the pairs that were held back."""
     breaks = (Break(3, 4, BreakKind.SCALE, 1.5),) * is_broken
     return MapCheck(
         images=100,
@@ -51,6 +57,7 @@ def a_check(score: float = 1.0, is_broken: bool = False, uncertain: tuple[int, .
         consistent=0,
         used_agreeing=score,
         distance_px=0.5,
+        evidence=10.0 * (torch.arange(PAIRS) < predicted).double(),
         breaks=breaks,
         certain=tuple(range(100)),
         uncertain=uncertain,
@@ -88,6 +95,7 @@ class World:
                     views=[],
                     pairs=["pair"],
                     held_back=frozenset({0}),
+                    held_back_times=torch.arange(PAIRS, dtype=torch.float64),
                     doubtful=world.doubtful,
                 )
 
@@ -99,6 +107,9 @@ class World:
         monkeypatch.setattr(recording, "check_run", check_online)
         monkeypatch.setattr(recording, "poses_of", lambda run, views: (run, "known"))
         monkeypatch.setattr(recording, "check_map", lambda run, *more: world.checks[run is world.whole])
+        monkeypatch.setattr(recording, "scale_links", lambda graph, session: None)
+        monkeypatch.setattr(FakeRun, "graph", None)
+        monkeypatch.setattr(FakeRun, "at_middle_row", lambda run, views: views)
 
     def map(
         self,
@@ -154,28 +165,19 @@ def test_a_recording_with_lost_frames_is_mapped_as_a_whole(world: World, online:
     assert world.checked_online == (not why)
 
 
-def timed(run: FakeRun) -> FakeRun:
-    """The run with other times for each frame."""
-    return replace(run, results=[replace(each, stage_ms={"total": 1.0 + each.index}) for each in run.results])
-
-
-def test_the_times_of_a_whole_map_are_those_of_the_online_run(world: World) -> None:
-    """By frame; frames that were not processed online have none."""
-    begun, ended = timed(a_run(posed=9, frames=10, lost=1)), timed(a_run(posed=60))
-    world.whole = replace(a_run(posed=97), results=a_run().results[3:])  # three could not be read
+def test_the_online_run_comes_with_the_whole_map(world: World) -> None:
+    """As far as it went: its times are those that are reported."""
+    begun, ended = a_run(posed=9, frames=10, lost=1), a_run(posed=60)
     kept = world.map(begun, go_on=lambda: ended)
-    assert kept.kept is Mapping.GLOBAL
-    expected = [{"total": 1.0 + index} if index < 10 else {} for index in range(3, 100)]
-    assert [result.stage_ms for result in kept.run.results] == expected
-    world.whole = a_run(posed=99)  # one frame has no pose: the run goes on, and its times are those of all
+    assert (kept.run, kept.online) == (world.whole, begun)
+    world.whole = a_run(posed=99)  # one frame has no pose: the run goes on
     kept = world.map(begun, go_on=lambda: ended)
-    assert kept.kept is Mapping.GLOBAL
-    assert [result.stage_ms for result in kept.run.results] == [each.stage_ms for each in ended.results]
+    assert (kept.run, kept.online) == (world.whole, ended)
 
 
 def test_a_run_that_the_check_contradicts_is_mapped_as_a_whole(world: World) -> None:
     world.online_check = a_check(is_broken=True)
-    world.checks[False] = a_check(0.9)
+    world.checks[False] = a_check(0.9, predicted=0)
     kept = world.map(a_run())
     assert kept.kept is Mapping.GLOBAL
     assert kept.check is world.checks[True]
@@ -194,22 +196,23 @@ def test_a_user_may_choose(world: World) -> None:
 @pytest.mark.parametrize(
     ("whole", "before", "posed", "kept"),
     [
-        (0.95, 0.5, 10, Mapping.GLOBAL),
-        (0.5, 0.95, 10, Mapping.ONLINE),
-        (0.9, 0.92, 10, Mapping.ONLINE),
-        (0.92, 0.9, 200, Mapping.GLOBAL),
-        (0.9, 0.905, 90, Mapping.GLOBAL),  # as good: the one with more poses
-        (0.9, 0.905, 89, Mapping.GLOBAL),
-        (0.9, 0.905, 91, Mapping.ONLINE),
-        (0.905, 0.9, 91, Mapping.ONLINE),
+        (PAIRS, 0, 200, Mapping.GLOBAL),  # every pair is predicted better, in all stretches
+        (0, PAIRS, 10, Mapping.ONLINE),
+        (PAIRS // 10, 0, 91, Mapping.ONLINE),  # those of a tenth of the recording are: the one with more poses
+        (PAIRS // 10, 0, 90, Mapping.GLOBAL),
+        (0, PAIRS // 10, 89, Mapping.GLOBAL),
+        (0, PAIRS // 10, 91, Mapping.ONLINE),
+        (PAIRS, PAIRS, 90, Mapping.GLOBAL),
+        (PAIRS, PAIRS, 89, Mapping.GLOBAL),
+        (PAIRS, PAIRS, 91, Mapping.ONLINE),
     ],
 )
-def test_the_map_with_the_better_score_is_kept(
-    world: World, whole: float, before: float, posed: int, kept: Mapping
+def test_the_map_that_predicts_the_held_out_pairs_better_is_kept(
+    world: World, whole: int, before: int, posed: int, kept: Mapping
 ) -> None:
-    """Of the pairs that the whole map did not use; where they say the same, the map with more poses."""
+    """Of the pairs that the whole map did not use; where stretches of them disagree, the map with more poses."""
     world.whole = a_run(posed=90)
-    world.checks = {True: a_check(whole), False: a_check(before)}
+    world.checks = {True: a_check(predicted=whole), False: a_check(predicted=before)}
     online = a_run(posed=posed, frames=300)
     made = world.map(online, Mapping.GLOBAL)
     assert made.kept is kept
@@ -260,7 +263,7 @@ def test_a_run_that_was_lost_goes_on_only_where_the_whole_map_is_not_right(world
     assert (kept.run, kept.why) == (world.whole, "60 of 100 frames are posed in one map")
     assert asked == [ended]
     world.whole = a_run()
-    world.checks = {True: a_check(0.7), False: a_check(0.9)}
+    world.checks = {True: a_check(0.7, predicted=0), False: a_check(0.9)}
     kept = world.map(begun, go_on=go_on)
     assert (kept.run, kept.check, kept.kept) == (ended, world.checks[False], Mapping.ONLINE)
     world.whole = a_run(posed=0, failure="no map: 2 images are too few")
@@ -278,7 +281,7 @@ def test_the_camera_is_given_with_its_error(world: World) -> None:
 
 
 def test_frames_that_the_mapper_doubts_are_uncertain(world: World) -> None:
-    world.doubtful, world.checks[False] = frozenset({7, 8}), a_check(0.5)
+    world.doubtful, world.checks[False] = frozenset({7, 8}), a_check(0.5, predicted=0)
     made = world.map(a_run(lost=3))
     assert made.kept is Mapping.GLOBAL
     states = [result.state for result in made.run.results]

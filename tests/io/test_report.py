@@ -21,6 +21,7 @@ from torchslam.io.report import (
     summary,
 )
 from torchslam.map.atlas import Submap
+from torchslam.optim.model_choice import Gain
 from torchslam.optim.rolling_shutter import RollingShutter
 from torchslam.system.run import Run
 from torchslam.types import PoseEstimate, State, Trajectory
@@ -89,7 +90,9 @@ def test_every_image_of_a_global_map_may_be_a_keyframe(run: Run) -> None:
 
 
 def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
-    check = MapCheck(9, 4, 3, 10, 9, 0.8, 0.5, (Break(3, 4, BreakKind.SCALE, 1.2),), (0, 1, 2), (4, 5))
+    check = MapCheck(
+        9, 4, 3, 10, 9, 0.8, 0.5, torch.zeros(4), (Break(3, 4, BreakKind.SCALE, 1.2),), (0, 1, 2), (4, 5)
+    )
     mapped = MappedRecording(run, run, check, Mapping.GLOBAL, "tracking was lost in 3 frames")
     found = check_metrics(mapped)
     assert found["mapping"] == "global"
@@ -120,7 +123,7 @@ def test_a_readout_is_a_row_of_the_summary(run: Run) -> None:
 
 
 def test_a_shaking_camera_is_a_warning(run: Run) -> None:
-    still = RollingShutter(0.0, 0.01, 0.03, 0.0, 0.03, 0.02)
+    still = RollingShutter(0.0, 0.01, 0.03, 0.0, Gain(0.0, 1.0, 10), 0.03, 0.02)
     assert shake_remark(replace(run, shutter=still)) == ""
     said = shake_remark(replace(run, shutter=replace(still, by_row=0.31)))
     assert "the row explains 31% of the squared errors, the column 2%" in said

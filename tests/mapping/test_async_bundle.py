@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pytest
 import torch
@@ -13,11 +14,10 @@ from torch import Tensor
 from tests.parallel.test_pool import wait_until_ready
 from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
 from torchslam.config import load_config
-from torchslam.geometry import SharedCamera, se3_exp
+from torchslam.geometry import Camera, SharedCamera, se3_exp, se3_inverse, umeyama
 from torchslam.map.map import Map
-from torchslam.mapping.local_bundle import AsyncBundleAdjustment, PendingSolution, solve_here
-from torchslam.optim import BundleProblem
-from torchslam.parallel.workers import BundleWorker
+from torchslam.mapping.local_bundle import AsyncBundleAdjustment, adjust_all, solve_here, solve_local, solve_whole, squared_errors
+from torchslam.parallel.workers import SolverWorker
 
 SCENE = Scene.of(150)
 ROWS = rows_of(SCENE)
@@ -54,6 +54,11 @@ def adjusted(seed: int = 0) -> Map:
     return slam_map
 
 
+def mean_error(slam_map: Map, camera: Camera) -> float:
+    """Mean squared reprojection error, whitened."""
+    return float(squared_errors(slam_map, slam_map.observations(), camera).mean())
+
+
 def test_the_map_does_not_change_before_the_result_is_applied() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
     assert not adjusting.is_pending
@@ -73,11 +78,11 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
 
 def test_a_request_is_started_once() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
-    started: list[BundleProblem] = []
+    started: list[Any] = []
 
-    def solver(problem: BundleProblem, iterations: int) -> PendingSolution:
-        started.append(problem)
-        return solve_here(problem, iterations)
+    def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        started.append(function)
+        return solve_here(function, *arguments)
 
     adjusting.solver = solver
     adjusting.start()  # nothing was requested
@@ -85,7 +90,7 @@ def test_a_request_is_started_once() -> None:
     assert not started
     adjusting.start()
     adjusting.start()
-    assert len(started) == 1
+    assert started == [solve_local]
     assert_same(slam_map, perturbed_map())
     adjusting.apply(slam_map)
     assert_same(slam_map, adjusted())
@@ -142,18 +147,67 @@ def test_an_empty_request_is_due_as_well() -> None:
     assert not adjusting.is_pending
 
 
+def test_a_whole_map_is_adjusted_by_another_camera_later() -> None:
+    """All keyframes but the first, in place and unit of the map; the camera is replaced once it is applied."""
+    shared = SharedCamera(CAMERA)
+    other = CAMERA.with_params(CAMERA.params * CAMERA.params.new_tensor([1.02, 1.02, 1, 1]))
+    adjusting, slam_map, used = AsyncBundleAdjustment(shared, SETTINGS), perturbed_map(), list[Any]()
+    started: list[Any] = []
+
+    def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        started.append(function)
+        return solve_here(function, *arguments)
+
+    adjusting.solver = solver
+    adjusting.request_whole(slam_map, other, due=12, on_applied=lambda: used.append(slam_map.T_cw.clone()))
+    assert started == [solve_whole]  # at once, since the camera was estimated for this map
+    assert adjusting.is_whole
+    assert [adjusting.is_due(frame) for frame in (11, 12)] == [False, True]
+    assert not adjusting.is_due_before_next_frame
+    assert_same(slam_map, perturbed_map())
+    before, off = slam_map.T_cw.clone(), mean_error(slam_map, other)
+    adjusting.apply(slam_map)
+    assert not adjusting.is_pending
+    assert not adjusting.is_whole
+    assert len(used) == 1
+    assert torch.equal(used[0], slam_map.T_cw)  # called after the map has changed
+    expected = perturbed_map()
+    adjust_all(expected, other, SETTINGS)
+    assert off > 5 * mean_error(expected, other)
+    assert mean_error(slam_map, other) < 1.2 * mean_error(expected, other)
+    centers, centers_before = (se3_inverse(T_cw)[:, :3, 3] for T_cw in (slam_map.T_cw, before))
+    assert float(umeyama(centers_before, centers)[0]) == pytest.approx(1.0, abs=1e-3)
+    torch.testing.assert_close(centers.mean(0), centers_before.mean(0), rtol=0.0, atol=1e-3)
+    adjusting.request(slam_map, 4, due=20)
+    assert not adjusting.is_whole
+    adjusting.drop()
+    adjusting.request_whole(slam_map, CAMERA, due=30, on_applied=lambda: pytest.fail("it was dropped"))
+    adjusting.drop()
+    adjusting.apply(slam_map)
+    assert not adjusting.is_whole
+
+
+def test_a_solver_is_used_within_its_context() -> None:
+    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
+
+    def elsewhere(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        return solve_here(function, *arguments)
+
+    with pytest.raises(KeyboardInterrupt), adjusting.solved_by(elsewhere):
+        assert adjusting.solver is elsewhere
+        raise KeyboardInterrupt
+    assert adjusting.solver is solve_here
+
+
 @pytest.fixture(scope="module")
-def worker() -> Iterator[BundleWorker]:
+def worker() -> Iterator[SolverWorker]:
     """A process that has started."""
-    with BundleWorker() as solver:
+    with SolverWorker() as solver:
         wait_until_ready(solver)
         yield solver
 
 
-def test_another_process_computes_the_same_result(
-    worker: BundleWorker, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchslam.parallel.workers.solve_local", None)  # here nothing is solved
+def test_another_process_computes_the_same_result(worker: SolverWorker) -> None:
     adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
     adjusting.solver = worker
     for seed in (0, 1):
@@ -170,13 +224,13 @@ def test_another_process_computes_the_same_result(
     assert_same(slam_map, adjusted(3))
 
 
-def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
+def test_errors_of_the_worker_are_raised_here(worker: SolverWorker) -> None:
     slam_map = perturbed_map()
     adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
 
-    def wrong(problem: BundleProblem, iterations: int):  # type: ignore[no-untyped-def]
+    def wrong(function: Callable[..., Any], problem: BundleProblem, iterations: int) -> Callable[[], Any]:
         problem.frame_index[0] = 99
-        return worker(problem, iterations)
+        return worker(function, problem, iterations)
 
     adjusting.solver = wrong
     adjusting.request(slam_map, 4, due=12)
@@ -187,7 +241,7 @@ def test_errors_of_the_worker_are_raised_here(worker: BundleWorker) -> None:
 
 def test_the_run_continues_without_a_killed_worker() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
-    with BundleWorker() as solver:
+    with SolverWorker() as solver:
         wait_until_ready(solver)
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
@@ -204,7 +258,7 @@ def test_the_run_continues_without_a_killed_worker() -> None:
 
 def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
-    with BundleWorker() as solver:
+    with SolverWorker() as solver:
         monkeypatch.setattr(solver, "result", None)
         adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
         adjusting.solver = solver

@@ -16,7 +16,7 @@ from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
 from torchslam.parallel.workers import (
     WORTH,
     WORTH_FORKED,
-    BundleWorker,
+    SolverWorker,
     best_number,
     busy_elsewhere,
     prefetch_obstacle,
@@ -35,16 +35,19 @@ def room(frames: int) -> Sequence:
 @pytest.fixture
 def no_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing is started: only who would be is looked at."""
-    for kind in (FeaturePrefetcher, LivePrefetcher, BundleWorker):
+    for kind in (FeaturePrefetcher, LivePrefetcher, SolverWorker):
         monkeypatch.setattr(kind, "__enter__", lambda self: self)
         monkeypatch.setattr(kind, "__exit__", lambda self, *error: None)
 
 
 def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -> tuple[str, bool]:
-    """The source of the frames, and whether a worker does bundle adjustment."""
+    """The source of the frames, and whether one worker does bundle adjustment and another one estimates the sensor."""
     with with_workers(sequence, slam, processes, start) as frames:
-        is_beside = isinstance(slam.mapper.adjustment.solver, BundleWorker)
-    assert slam.mapper.adjustment.solver is solve_here
+        adjusting, estimating = slam.mapper.adjustment.solver, slam.online_camera.solver
+        is_beside = isinstance(adjusting, SolverWorker)
+        assert isinstance(estimating, SolverWorker) == is_beside
+        assert not is_beside or adjusting is not estimating  # an adjustment would wait for an estimate
+    assert slam.mapper.adjustment.solver is slam.online_camera.solver is solve_here
     return type(frames).__name__, is_beside
 
 

@@ -52,9 +52,8 @@ class ScaleLinks:
 
 
 def scale_links(graph: RunGraph, session: int = 0) -> ScaleLinks:
-    """The scale links of the submap with most keyframes of a session, over these keyframes."""
-    is_own = graph.is_keyframe & (graph.sessions == session)
-    submap = int(torch.bincount(graph.submap[is_own]).argmax())
+    """The scale links of the submap with most frames of a session, over its keyframes of that session."""
+    submap = int(torch.bincount(graph.submap[graph.sessions == session]).argmax())
     keyframes, *_, problem = keyframe_problem(graph.global_shutter(), submap)
     order = torch.argsort(graph.frame_ids[keyframes] + (graph.sessions[keyframes] << 32))
     std = scale_stds(problem, torch.argsort(order))
