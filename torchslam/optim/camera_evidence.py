@@ -29,7 +29,7 @@ from torchslam.optim.run_graph import ObservationGraph, keyframe_problem
 MAX_STRETCHES, STRETCH_FRAMES = 10, 3
 """Stretches of a recording, and the least frames of one. By 4 to 20 stretches of seven recordings the errors of the
 focal length are the same within a third."""
-USUAL_FACTOR, USUAL_STRETCHES = 4.0, 3.0
+USUAL_FACTOR, USUAL_STRETCHES = 4.0, 1.5
 """By which the scatter of stretches exceeds the formal error before any is seen, and as how many stretches that counts:
 a few stretches may agree by chance. With a factor of 2, cameras of windows of 6 to 30 keyframes were off by up to four
 stated errors (20 rendered sequences, 25 parts of recordings), with 4 by up to 2.2."""
