@@ -93,12 +93,15 @@ def scale_stds(
     order, ends = torch.argsort(when, stable=True), torch.bincount(when, minlength=frames).cumsum(0).tolist()
     centers_w = -(T_cw[:, :3, :3].mT @ T_cw[:, :3, 3:])[torch.argsort(rank), :, 0]
     found = points_w.new_zeros(frames - 1)
+    is_known = (
+        total.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
+    )  # else the kernel leaves its observations no weight
     begin = 0
     for moment in range(frames - 1):
         rows, begin = order[begin : ends[moment]], ends[moment]
         before.index_add_(0, point[rows], information[rows])
         if 0 < moment < frames - 2:
-            across = ((first <= moment) & (last > moment)).nonzero()[:, 0]
+            across = ((first <= moment) & (last > moment) & is_known).nonzero()[:, 0]
             found[moment] = _scale_std(before[across], total[across], points_w[across] - centers_w[moment])
     return found
 
