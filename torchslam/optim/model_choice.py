@@ -16,12 +16,12 @@ from torch import Tensor
 
 STRETCHES = 10
 """Stretches of a recording whose gains are compared. Tried from 6 to 20: the decisions of the trials are the same."""
-LEAST_GAIN, LEAST_UPDATE = 20.0, 5.0
+LEAST_GAIN, LEAST_UPDATE = 30.0, 5.0
 """Logarithm of the likelihood ratio from which on a change of a model with few parameters is believed: of a given
 model, and of a guess or an estimate from fewer observations. In the tuning half of experiments/decisions, global
-shutters gain up to 9 and rolling ones of 10 ms and more at least 24; exact cameras of rendered sequences gain up to 9 but
-for one, those off by 3 % and more at least 43 but for one, which stands still. Observations count as independent, which
-they are not: with independent ones 5 would do for either."""
+shutters gain up to 9 (up to 22 in whole runs of kitti07), rolling ones of 12 ms and more mostly over 40; exact cameras
+of rendered sequences gain up to 9 but for one, those off by 3 % and more at least 43 but for one. Observations count
+as independent, which they are not: with independent ones 5 would do for either."""
 SURE = 3.0
 """Standard deviations, of a normal distribution with the same probability, from which on a gain counts where two maps
 are compared, which differ in many parameters."""
