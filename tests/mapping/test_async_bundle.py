@@ -16,7 +16,14 @@ from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_o
 from torchslam.config import load_config
 from torchslam.geometry import Camera, SharedCamera, se3_exp, se3_inverse, umeyama
 from torchslam.map.map import Map
-from torchslam.mapping.local_bundle import AsyncBundleAdjustment, adjust_all, solve_here, solve_local, solve_whole, squared_errors
+from torchslam.mapping.local_bundle import (
+    AsyncBundleAdjustment,
+    adjust_all,
+    solve_here,
+    solve_local,
+    solve_whole,
+    squared_errors,
+)
 from torchslam.parallel.workers import SolverWorker
 
 SCENE = Scene.of(150)
