@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Camera, SensorModel, SharedCamera, se3_exp, transform
+from torchslam.geometry import Camera, SensorModel, SharedCamera, transform
 from torchslam.geometry.rolling_shutter import Readout, global_shutter_pixels, row_fractions, row_poses
 
 CAMERA = Camera.radial_tangential(400.0, 405.0, 319.5, 239.5, -0.1, 0.02, 1e-3, 0.0, size=(640, 480))

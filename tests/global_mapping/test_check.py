@@ -638,7 +638,7 @@ def test_a_check_in_words() -> None:
 
 
 def test_pairs_that_contradict_the_map_tie_nothing_together() -> None:
-    """Two of them are too few to call the poses wrong, but they join no parts either, however many matches they have."""
+    """Two of them are too few to call the poses wrong, but they join no parts, however many matches they have."""
     inside = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 10]
     wrong = [contradicting(WALK, *ends) for ends in ((9, 10), (8, 10))]
     assert min(len(pair) for pair in wrong) >= 100

@@ -200,9 +200,13 @@ def test_a_solver_is_used_within_its_context() -> None:
     def elsewhere(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         return solve_here(function, *arguments)
 
-    with pytest.raises(KeyboardInterrupt), adjusting.solved_by(elsewhere):
-        assert adjusting.solver is elsewhere
-        raise KeyboardInterrupt
+    def fail() -> None:
+        with adjusting.solved_by(elsewhere):
+            assert adjusting.solver is elsewhere
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
     assert adjusting.solver is solve_here
 
 

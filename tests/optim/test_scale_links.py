@@ -1,4 +1,4 @@
-"""How well a map ties the scale on both sides of a moment: against the covariance of an explicit problem, and by hand."""
+"""How well a map ties the scale on both sides of a moment: known cases, and an explicit problem."""
 
 from __future__ import annotations
 

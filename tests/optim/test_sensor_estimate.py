@@ -1,4 +1,4 @@
-"""The sensor by a graph: an exact one is kept, a wrong camera and a readout are found, and neither is taken for another."""
+"""The sensor by a graph: an exact one is kept, a wrong camera and a readout are found."""
 
 from __future__ import annotations
 
