@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Camera, SensorModel, SharedCamera, se3_exp, transform
+from torchslam.geometry import Camera, SensorModel, SharedCamera, transform
 from torchslam.geometry.rolling_shutter import Readout, global_shutter_pixels, row_fractions, row_poses
 
 CAMERA = Camera.radial_tangential(400.0, 405.0, 319.5, 239.5, -0.1, 0.02, 1e-3, 0.0, size=(640, 480))
@@ -28,9 +28,7 @@ def seen(generator: torch.Generator, frames: int = 3, count: int = 20) -> tuple[
     assert readout is not None
     pixels = CAMERA.project(points_c)[0]
     for _ in range(12):  # the row decides about the pose, and the pose about the row
-        poses = row_poses(
-            EYE, velocities[:, None], row_fractions(pixels, CAMERA.height), readout.seconds
-        )
+        poses = row_poses(EYE, velocities[:, None], row_fractions(pixels, CAMERA.height), readout.seconds)
         points_row = transform(poses, points_c[..., None, :])[..., 0, :]
         pixels = CAMERA.project(points_row)[0]
     return points_c, velocities, torch.cat((pixels, points_row[..., 2:]), dim=-1)
@@ -50,7 +48,9 @@ def test_depths_in_the_middle_of_the_exposure_are_nearly_exact(generator: torch.
     points_c, velocities, rows = seen(generator)
     expected = CAMERA.project(points_c)[0]
     found = ROLLING.at_middle_row(rows[..., :2], velocities, points_c[..., 2])
-    assert float((found - expected).norm(dim=-1).max()) < 0.05 * float((rows[..., :2] - expected).norm(dim=-1).max())
+    assert float((found - expected).norm(dim=-1).max()) < 0.05 * float(
+        (rows[..., :2] - expected).norm(dim=-1).max()
+    )
 
 
 def test_keypoints_are_corrected_as_those_of_a_graph(generator: torch.Generator) -> None:
@@ -60,7 +60,12 @@ def test_keypoints_are_corrected_as_those_of_a_graph(generator: torch.Generator)
     assert readout is not None
     count = points_c.shape[1]
     of_graph = global_shutter_pixels(
-        rows[0, :, :2], EYE.expand(count, 4, 4), velocities.expand(count, 6), points_c[0], CAMERA, readout.seconds
+        rows[0, :, :2],
+        EYE.expand(count, 4, 4),
+        velocities.expand(count, 6),
+        points_c[0],
+        CAMERA,
+        readout.seconds,
     )
     found = ROLLING.at_middle_row(rows[..., :2], velocities, rows[..., 2])[0]
     torch.testing.assert_close(found, of_graph, rtol=0.0, atol=1e-6)
@@ -81,7 +86,10 @@ def test_a_global_shutter_changes_nothing(generator: torch.Generator) -> None:
     _, velocities, rows = seen(generator)
     detected = rows[..., :2]
     assert SensorModel(CAMERA).at_middle_row(detected, velocities, rows[..., 2]) is detected
-    for sensor, speeds in ((SensorModel(CAMERA, Readout.known(0.0, 1e-3)), velocities), (ROLLING, 0 * velocities)):
+    for sensor, speeds in (
+        (SensorModel(CAMERA, Readout.known(0.0, 1e-3)), velocities),
+        (ROLLING, 0 * velocities),
+    ):
         found = sensor.at_middle_row(detected, speeds, rows[..., 2])
         torch.testing.assert_close(found, detected, rtol=0.0, atol=1e-6)
 
@@ -111,14 +119,20 @@ def test_a_batch_equals_a_loop(generator: torch.Generator) -> None:
         for own, velocity in zip(rows, velocities, strict=True)
     ]
     torch.testing.assert_close(together, torch.cat(alone), rtol=0.0, atol=1e-10)
-    assert ROLLING.at_middle_row(rows[:0, :, :2], velocities[:0], rows[:0, :, 2]).shape == (0, rows.shape[1], 2)
+    assert ROLLING.at_middle_row(rows[:0, :, :2], velocities[:0], rows[:0, :, 2]).shape == (
+        0,
+        rows.shape[1],
+        2,
+    )
 
 
 def test_gradients(generator: torch.Generator) -> None:
     _, velocities, rows = seen(generator, frames=1, count=4)
 
     def corrected(detected: Tensor, velocities: Tensor, depths: Tensor, params: Tensor) -> Tensor:
-        return SensorModel(CAMERA.with_params(params), ROLLING.readout).at_middle_row(detected, velocities, depths)
+        return SensorModel(CAMERA.with_params(params), ROLLING.readout).at_middle_row(
+            detected, velocities, depths
+        )
 
     inputs = (rows[..., :2], velocities, rows[..., 2], CAMERA.params)
     assert torch.autograd.gradcheck(corrected, [each.clone().requires_grad_() for each in inputs])

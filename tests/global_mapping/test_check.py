@@ -329,7 +329,9 @@ def test_a_map_that_ties_its_parts_needs_no_pairs_across() -> None:
 def test_a_weak_link_is_sought_at_the_moments_of_the_map() -> None:
     """Its keyframes are other frames than the images, and an image without a pose is passed over."""
     apart = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 11]
-    dense = ScaleLinks(tuple(range(-5, 30)), tuple(1.0 if frame in (-3, 10) else 0.0 for frame in range(-5, 29)))
+    dense = ScaleLinks(
+        tuple(range(-5, 30)), tuple(1.0 if frame in (-3, 10) else 0.0 for frame in range(-5, 29))
+    )
     sparse = ScaleLinks((0, 8, 12, 23), (0.0, 1.0, 0.0))
     found = check(WALK, pairs=apart, unposed=[10], links=dense)
     assert found.breaks == (Break(9, 11, BreakKind.UNKNOWN),)
@@ -505,7 +507,8 @@ def test_a_right_map_predicts_pairs_better_than_a_bent_one(recording: Recording)
     worse = {
         "bent": bent(recording.T_cw, 12, 1.5),
         "disturbed": disturbed(recording.T_cw, 0.05, 0.3),
-        "turned": se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.02]).double() * torch.arange(24)[:, None]) @ recording.T_cw,
+        "turned": se3_exp(torch.tensor([0, 0, 0, 0, 0, 0.02]).double() * torch.arange(24)[:, None])
+        @ recording.T_cw,
     }
     for name, T_cw in worse.items():
         evidence = check(recording, T_cw, pairs).evidence
@@ -635,7 +638,7 @@ def test_a_check_in_words() -> None:
 
 
 def test_pairs_that_contradict_the_map_tie_nothing_together() -> None:
-    """Two of them are too few to call the poses wrong, but they join no parts either, however many matches they have."""
+    """Two of them are too few to call the poses wrong, but they join no parts, however many matches they have."""
     inside = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 10]
     wrong = [contradicting(WALK, *ends) for ends in ((9, 10), (8, 10))]
     assert min(len(pair) for pair in wrong) >= 100

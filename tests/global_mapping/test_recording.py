@@ -198,7 +198,12 @@ def test_a_user_may_choose(world: World) -> None:
     [
         (PAIRS, 0, 200, Mapping.GLOBAL),  # every pair is predicted better, in all stretches
         (0, PAIRS, 10, Mapping.ONLINE),
-        (PAIRS // 10, 0, 91, Mapping.ONLINE),  # those of a tenth of the recording are: the one with more poses
+        (
+            PAIRS // 10,
+            0,
+            91,
+            Mapping.ONLINE,
+        ),  # those of a tenth of the recording are: the one with more poses
         (PAIRS // 10, 0, 90, Mapping.GLOBAL),
         (0, PAIRS // 10, 89, Mapping.GLOBAL),
         (0, PAIRS // 10, 91, Mapping.ONLINE),

@@ -16,7 +16,14 @@ from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_o
 from torchslam.config import load_config
 from torchslam.geometry import Camera, SharedCamera, se3_exp, se3_inverse, umeyama
 from torchslam.map.map import Map
-from torchslam.mapping.local_bundle import AsyncBundleAdjustment, adjust_all, solve_here, solve_local, solve_whole, squared_errors
+from torchslam.mapping.local_bundle import (
+    AsyncBundleAdjustment,
+    adjust_all,
+    solve_here,
+    solve_local,
+    solve_whole,
+    squared_errors,
+)
 from torchslam.parallel.workers import SolverWorker
 
 SCENE = Scene.of(150)
@@ -193,9 +200,13 @@ def test_a_solver_is_used_within_its_context() -> None:
     def elsewhere(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         return solve_here(function, *arguments)
 
-    with pytest.raises(KeyboardInterrupt), adjusting.solved_by(elsewhere):
-        assert adjusting.solver is elsewhere
-        raise KeyboardInterrupt
+    def fail() -> None:
+        with adjusting.solved_by(elsewhere):
+            assert adjusting.solver is elsewhere
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fail()
     assert adjusting.solver is solve_here
 
 

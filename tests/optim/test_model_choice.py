@@ -60,14 +60,14 @@ def test_two_stretches_that_agree_within_a_third_are_not_sure() -> None:
 
 
 def test_a_given_model_is_harder_to_replace_than_an_estimate() -> None:
-    for total, given, update in (
+    for total, of_given, of_estimate in (
         (LEAST_GAIN + 1, True, True),
         (LEAST_GAIN - 1, False, True),
         (LEAST_UPDATE - 1, False, False),
         (-LEAST_GAIN - 1, False, False),
     ):
         found = Gain(total, 1e-3, 10)
-        assert (found.is_worth(), found.is_worth(is_given=False)) == (given, update)
+        assert (found.is_worth(), found.is_worth(is_given=False)) == (of_given, of_estimate)
 
 
 numbers = st.lists(st.floats(-1e3, 1e3), min_size=2, max_size=60)

@@ -1,4 +1,4 @@
-"""How well a map ties the scale on both sides of a moment: against the covariance of an explicit problem, and by hand."""
+"""How well a map ties the scale on both sides of a moment: known cases, and an explicit problem."""
 
 from __future__ import annotations
 
@@ -69,7 +69,9 @@ def explicit_std(problem: BundleProblem, moment: int) -> float:
     def pixels(similarity: Tensor, points_w: Tensor) -> Tensor:
         T_cw = problem.T_cw[problem.frame_index]
         own = points_w[problem.point_index]
-        moved = torch.exp(similarity[6]) * (so3_exp(similarity[3:6]) @ own[..., None])[..., 0] + similarity[:3]
+        moved = (
+            torch.exp(similarity[6]) * (so3_exp(similarity[3:6]) @ own[..., None])[..., 0] + similarity[:3]
+        )
         own = torch.where(after[:, None], moved, own)
         return CAMERA.project(transform(T_cw, own[:, None])[:, 0])[0]
 
@@ -239,6 +241,4 @@ def test_links_are_those_of_one_session_in_its_main_submap() -> None:
     parts = graph(order, 0 * order, every, submap)
     main = scale_links(parts)
     assert main.frames == tuple(range(40, 140, 10))
-    assert main.std == pytest.approx(
-        stds(keyframe_problem(parts, 1)[3], plain=False), rel=1e-6
-    )
+    assert main.std == pytest.approx(stds(keyframe_problem(parts, 1)[3], plain=False), rel=1e-6)

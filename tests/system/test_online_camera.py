@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -13,9 +16,18 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, so3_exp
 from torchslam.map.file import read_tensors, write_tensors
+from torchslam.mapping.local_bundle import solve_here
+from torchslam.optim.run_graph import RunGraph
+from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import Simulated, true_poses
-from torchslam.system.online_camera import MIN_DEPARTURE
+from torchslam.system.online_camera import (
+    ADJUST_FRAMES,
+    ESTIMATE_FRAMES,
+    FIRST_KEYFRAMES,
+    GROWTH,
+    MAX_KEYFRAMES,
+)
 from torchslam.system.run import RunProgress, run_sequence
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
@@ -72,7 +84,7 @@ def corrected() -> Run:
 def test_a_wrong_camera_is_corrected_while_the_run_goes_on(corrected: Run) -> None:
     assert corrected.camera_changes
     for change in corrected.camera_changes:
-        assert change.departure >= MIN_DEPARTURE
+        assert change.departure > 0
         assert 0 < change.frame < len(WALK) - 1
     assert focal_error(corrected.camera_changes[-1].camera) < 0.02
     assert focal_error(corrected.camera) < 0.01
@@ -141,13 +153,122 @@ def test_a_new_start_has_the_given_camera_again() -> None:
     assert slam.online_camera.changes == []
 
 
-def test_a_map_is_checked_once_it_has_grown() -> None:
+class Calls:
+    """A solver that computes here, and records when estimates are begun and taken, by the frame before."""
+
+    def __init__(self, slam: SLAM) -> None:
+        self.slam, self.begun, self.taken = slam, list[int](), list[int]()
+        self.found: list[SensorEstimate] = []
+
+    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        assert function is estimate_sensor
+        self.begun.append(self.frame)
+        found = function(*arguments)
+
+        def result() -> Any:
+            self.taken.append(self.frame)
+            self.found.append(found)
+            return found
+
+        return result
+
+    @property
+    def frame(self) -> int:
+        """The frame that is processed now."""
+        assert self.slam.last_frame is not None
+        return self.slam.last_frame[0]
+
+
+def test_no_frame_waits_for_an_estimate() -> None:
+    """It is taken some frames after it was begun, and the map that is adjusted by it some frames later."""
+    slam = SLAM(given(1.04), config())
+    calls, keyframes = Calls(slam), list[int]()
+    begin = slam.online_camera.solver
+
+    def solver(*arguments: Any) -> Callable[[], Any]:
+        assert slam.submap is not None
+        keyframes.append(slam.submap.map.num_keyframes)
+        return calls(*arguments)
+
+    with slam.online_camera.solved_by(solver):
+        run_sequence(slam, seen())
+    assert slam.online_camera.solver is begin
+    assert len(calls.begun) > 2
+    assert keyframes[0] >= FIRST_KEYFRAMES
+    assert all(later >= GROWTH * earlier for earlier, later in pairwise(keyframes))
+    assert keyframes[-1] <= MAX_KEYFRAMES
+    waits = [taken - begun for begun, taken in zip(calls.begun, calls.taken, strict=False)]
+    assert all(wait >= ESTIMATE_FRAMES for wait in waits[:-1])
+    assert calls.begun[1:] > calls.taken[: len(calls.begun) - 1]  # one at a time
+    changes = slam.online_camera.changes
+    moments = [taken for taken, found in zip(calls.taken, calls.found, strict=True) if found.is_change]
+    assert changes
+    for moment, change in zip(moments, changes, strict=False):
+        assert moment < change.frame <= moment + ADJUST_FRAMES
+
+
+def test_the_estimate_is_by_the_given_camera_and_the_one_in_use() -> None:
+    slam = SLAM(given(1.04), config())
+    cameras, priors = list[Camera](), set[int]()
+
+    def solver(function: Callable[..., Any], graph: RunGraph, prior: SensorPrior, *more: Any) -> Any:
+        cameras.append(graph.camera)
+        priors.add(id(prior))
+        assert graph.camera is slam.shared_camera.current
+        assert prior.camera is slam.online_camera.given
+        return solve_here(function, graph, prior, *more)
+
+    with slam.online_camera.solved_by(solver):
+        run_sequence(slam, seen())
+    assert len(priors) == 1
+    assert torch.equal(cameras[0].params[:4], slam.camera.params[:4])
+    assert cameras[-1] is slam.online_camera.changes[-1].camera
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [("camera.std=0", "camera.readout_std=0"), ("bundle_adjustment.local=false",)],
+    ids=["exact", "no adjustment"],
+)
+def test_nothing_is_estimated_where_nothing_may_change(settings: tuple[str, ...]) -> None:
+    slam = SLAM(given(1.0), config(*settings))
+    with slam.online_camera.solved_by(lambda *arguments: pytest.fail("an estimate was begun")):
+        run_sequence(slam, seen())
+    assert slam.online_camera.changes == []
+
+
+def test_no_checkpoint_while_an_estimate_is_pending() -> None:
+    """It is of a map that is not saved; until it is taken, the run goes on from the checkpoint before."""
+    slam = SLAM(given(1.04), config())
+    pending = 0
+
+    def look(result: StepResult) -> None:
+        nonlocal pending
+        if slam.online_camera.is_pending:
+            pending += 1
+            assert not slam.can_checkpoint
+
+    run_sequence(slam, seen(), look)
+    assert pending >= ESTIMATE_FRAMES + ADJUST_FRAMES - 2
+
+
+def test_an_estimate_of_a_map_that_is_gone_is_forgotten() -> None:
+    """Of a discarded one at once, and of another one than the active map when it would be taken."""
     slam, _ = half()
-    (submap,) = slam.atlas
-    count = submap.map.num_keyframes
-    assert slam.online_camera.next_check > count
-    assert not slam.online_camera.check(submap)
-    assert slam.online_camera.next_check > count
+    online, (submap,) = slam.online_camera, slam.atlas
+    online.solver = lambda *arguments: lambda: pytest.fail("the estimate was taken")
+    online.next_check = 0
+    online.step(submap)
+    assert online.is_pending
+    online.forget()
+    assert not online.is_pending
+    online.next_check = 0
+    online.step(submap)
+    assert online.is_pending
+    online.step(submap.fork())
+    assert not online.is_pending
+    changes = list(online.changes)
+    assert slam.online_camera.changes == changes
 
 
 def test_the_stated_error_of_the_camera_is_a_prior(corrected: Run) -> None:

@@ -111,7 +111,7 @@ def test_a_resumed_run_goes_on_with_the_readout(tmp_path: Path) -> None:
     resumed, loaded = read_checkpoint(path, ROOM, settings)
     assert resumed.shared_camera.model.readout == slam.shared_camera.model.readout
     assert resumed.online_camera.changes[-1].readout == slam.online_camera.changes[-1].readout
-    assert resumed.online_camera.next_readout_check == slam.online_camera.next_readout_check
+    assert resumed.online_camera.next_check == slam.online_camera.next_check
     following = ROOM[loaded.next]
     assert torch.equal(resumed.step(following).T_cw, slam.step(following).T_cw)
     tensors, about = read_tensors(path)
