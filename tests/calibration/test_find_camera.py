@@ -164,15 +164,16 @@ def test_a_guess_without_a_search_counts_as_one() -> None:
 @pytest.mark.parametrize(
     ("focal", "said"),
     [
-        (204.0, "better with a focal length of 204 ± 2 px than with 200"),
+        (204.0, "better with a focal length of 204 ± 2 than with 200 px"),
         # so far off, the run's own choices hide how much further it is
-        (210.0, "better with a focal length of 210 px or more than with 200; poses and map may be badly"),
-        (160.0, "better with a focal length of 160 px or less than with 200; poses and map may be badly"),
+        (210.0, "better with a focal length of 210 px or more than with 200 px; poses and map may be badly"),
+        (160.0, "better with a focal length of 160 px or less than with 200 px; poses and map may be badly"),
     ],
 )
 def test_a_contradicted_calibration_is_reported(focal: float, said: str) -> None:
     camera = CAMERA.with_params(CAMERA.params * torch.tensor([focal / 200] * 2 + [1.0] * 2))
-    assert said in contradiction(CAMERA, CameraMeasurement.of(camera, 0.01))
+    assert said in contradiction(CAMERA, CameraMeasurement.of(camera, 0.01), CAMERA)
+    assert contradiction(CAMERA, CameraMeasurement.of(camera, 0.01), camera).endswith("than with 200 px")
 
 
 def straight(camera: Camera, factor: float = 1.0) -> Camera:

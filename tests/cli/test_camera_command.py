@@ -68,7 +68,7 @@ def test_a_wrong_calibration_is_reported(
         said = json.loads((tmp_path / "metrics.json").read_text())["camera"]
         assert said in capsys.readouterr().out
         better = re.search(
-            r"the images agree better with a focal length of (\d+) px or more than with 400; ", said
+            r"the images agree better with a focal length of (\d+) px or more than with 400 px; ", said
         )
         assert better is not None
         assert 430 < int(better[1]) < 520

@@ -125,11 +125,11 @@ def camera_remark(finished: Run, found: str) -> str:
         better = better_camera(finished.graph, given.camera)
         if better is None or given.departure(better.camera) < MIN_SIGMAS:
             return described
-        return f"{described}; {contradiction(given.camera, better)}; {REMEDY}"
+        return f"{described}; {contradiction(given.camera, better, finished.camera)}; {REMEDY}"
     better = None
     if not (finished.failure or finished.interrupted or finished.session):
         better = better_camera(finished.graph, finished.camera)
-    against = "" if better is None else contradiction(finished.camera, better)
+    against = "" if better is None else contradiction(finished.camera, better, finished.camera)
     if found:
         return "; but over all frames ".join(filter(None, (found, against)))
     return f"{against}; {REMEDY}" if against else ""
@@ -163,7 +163,7 @@ LEAST_DEPARTURE = 0.5 * MIN_SIGMAS
 """Stated standard deviations that the images alone must seem off before `better_camera` adjusts all keyframes. Tried at
 this value only."""
 REMEDY = "--refine-camera estimates a better one"
-CONSEQUENCE = "poses and map may be badly wrong with it"
+CONSEQUENCE = "poses and map may be badly wrong"
 DEGENERATE = "pure rotation, straight motion and planes do not determine it"
 
 
@@ -189,18 +189,21 @@ def better_camera(graph: ObservationGraph, given: Camera) -> CameraMeasurement |
     return estimate.measured if is_other else None
 
 
-def contradiction(given: Camera, better: CameraMeasurement) -> str:
+def contradiction(given: Camera, better: CameraMeasurement, used: Camera) -> str:
     """Describe that the images contradict a given focal length.
 
     Args:
         given: The given camera.
         better: The result of `better_camera`.
+        used: The camera of the map.
     """
     was, focal, off = float(given.focal), float(better.camera.focal), _focal_ratio(given, better.camera)
-    words = "the images agree better with a focal length of"
-    if abs(off) <= LARGE_RATIO:
-        return f"{words} {_with_error(focal, focal * better.focal_std)} px than with {was:.0f}"
-    return f"{words} {focal:.0f} px or {'more' if off > 0 else 'less'} than with {was:.0f}; {CONSEQUENCE}"
+    number = _with_error(focal, focal * better.focal_std)
+    if abs(off) > LARGE_RATIO:
+        number = f"{focal:.0f} px or {'more' if off > 0 else 'less'}"
+    words = f"the images agree better with a focal length of {number} than with {was:.0f} px"
+    is_far = abs(_focal_ratio(used, better.camera)) > LARGE_RATIO
+    return f"{words}; {CONSEQUENCE}" if is_far else words
 
 
 def _focal_ratio(given: Camera, found: Camera) -> float:
