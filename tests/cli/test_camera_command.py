@@ -17,7 +17,7 @@ from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 
-FRAMES = 14
+FRAMES = 20
 
 
 @pytest.fixture(scope="module")
@@ -60,13 +60,20 @@ def test_images_without_a_calibration_are_calibrated(
 def test_a_wrong_calibration_is_reported(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The summary says that the images contradict 400 px, of so short a way without a better value, and what helps."""
+    """The summary has a better focal length than 400 px, and the option that helps; none for the true one."""
     camera = "400,400,319.5,239.5"
-    assert main(["run", str(folder), "-o", str(tmp_path / "results"), "--camera", camera, *FAST]) == 0
-    said = json.loads((tmp_path / "results" / "metrics.json").read_text())["camera"]
-    assert said in capsys.readouterr().out
-    assert "; the images contradict a focal length of 400 px and do not determine the right one;" in said
-    assert said.endswith("--refine-camera looks for a better one")
+    arguments = ["run", str(folder), "-o", str(tmp_path), "--overwrite", "--camera"]
+    for exact in ([], ["--camera-std", "0"]):
+        assert main([*arguments, camera, *exact, *FAST]) == 0
+        said = json.loads((tmp_path / "metrics.json").read_text())["camera"]
+        assert said in capsys.readouterr().out
+        better = re.search(
+            r"the images agree better with a focal length of (\d+) px or more than with 400 px; ", said
+        )
+        assert better is not None
+        assert 430 < int(better[1]) < 520
+        assert said.startswith("focal length 4") != bool(exact)
+        assert said.endswith("--refine-camera estimates a better one")
 
 
 def test_a_calibration_file_of_the_user_is_not_overwritten(

@@ -11,7 +11,6 @@ from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import (
     CameraMeasurement,
     may_be_same,
-    simplify_model,
     with_radial_terms,
 )
 
@@ -78,8 +77,3 @@ def test_a_found_camera_may_be_the_given_one(factor: float, shift: float, std: f
 def test_a_fisheye_is_not_a_pinhole() -> None:
     fisheye = Camera.fisheye(500.0, 510.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0.0, size=(640, 480))
     assert not may_be_same(fisheye, PINHOLE, 0.02)
-
-
-def test_a_pinhole_without_distortion_stays_one() -> None:
-    assert simplify_model(with_radial_terms(PINHOLE)).model == "pinhole"
-    assert with_radial_terms(PINHOLE).params[:4].tolist() == PINHOLE.params.tolist()

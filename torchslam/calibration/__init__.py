@@ -1,6 +1,6 @@
 """The camera from images: its focal length from pairs of them, its intrinsics from the graph of a run."""
 
 from torchslam.calibration.from_pairs import search_focal
-from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
+from torchslam.optim.sensor_estimate import keyframe_evidence
 
-__all__ = ["IntrinsicsEstimate", "estimate_intrinsics", "search_focal"]
+__all__ = ["keyframe_evidence", "search_focal"]

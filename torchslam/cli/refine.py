@@ -17,7 +17,6 @@ from typing import Any
 
 import torch
 
-from torchslam.calibration.find_camera import contradiction
 from torchslam.cli import arguments
 from torchslam.data import Sequence
 from torchslam.data.calibration import check_replaceable, is_found, write_calibration
@@ -26,6 +25,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.data.synthetic.sequence import is_synthetic
 from torchslam.errors import ConfigError, SequenceError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
+from torchslam.geometry.camera_measurement import with_radial_terms
 from torchslam.io.report import run_metrics, summary
 from torchslam.io.results import CALIBRATION, prepare, source_of
 from torchslam.io.write_run import write_run
@@ -126,7 +126,7 @@ def _write(refined: RefinementResult, sequence: Sequence, options: argparse.Name
     after, ate_before = _errors(finished.trajectory, sequence), _errors(before, sequence)
     metrics = run_metrics(finished, after, None if ate_before is None else ate_before.ate_m)
     metrics |= {
-        "camera": _describe_camera(refined, sequence),
+        "camera": _describe_camera(refined, sequence, options.fix_camera),
         "focal_px": [float(sequence.camera.focal), float(finished.camera.focal)],
         "without_pose": refined.without_pose,
         "without_image": refined.without_image,
@@ -153,18 +153,15 @@ def _errors(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
         return None
 
 
-def _describe_camera(refined: RefinementResult, sequence: Sequence) -> str:
+def _describe_camera(refined: RefinementResult, sequence: Sequence, is_fixed: bool) -> str:
     """Return how the camera was determined."""
-    found, focal = refined.intrinsics, float(refined.run.camera.focal)
-    if found is None:
-        return f"focal length {focal:.1f} px, as given"
-    if torch.equal(refined.run.camera.params.cpu(), sequence.camera.params):
-        against = contradiction(sequence.camera, found) or "the images do not contradict it"
-        return f"focal length {focal:.1f} px, as given; {against}"
-    std = found.focal_std * focal
-    return (
-        f"focal length {focal:.1f} ± {std:.1f} px from the images, given {float(sequence.camera.focal):.1f}"
-    )
+    found, focal = refined.run.calibration, float(refined.run.camera.focal)
+    params = with_radial_terms(refined.run.camera).params.cpu()
+    if torch.equal(params, with_radial_terms(sequence.camera).params):
+        words = f"focal length {focal:.1f} px, as given"
+        return words if is_fixed or refined.run.failure else f"{words}; the images do not contradict it"
+    std = "" if found is None else f" ± {focal * found.focal_std:.1f}"
+    return f"focal length {focal:.1f}{std} px from the images, given {float(sequence.camera.focal):.1f}"
 
 
 def _describe_poses(refined: RefinementResult, sequence: Sequence) -> dict[str, str]:

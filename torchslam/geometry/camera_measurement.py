@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 
-# Parameters of a camera that may be free: the logarithm of the focal length, k1, k2, and the principal point in widths.
-FOCAL, K1, K2, CX, CY = range(5)
+# Parameters of a camera that may be free: the logarithm of the focal length, k1 and k2.
+FOCAL, K1, K2 = range(3)
 
 OBSERVATION_VARIANCE = 9.0
 """`CameraMeasurement.observation_variance` before a recording has said anything: a point's errors in neighboring frames
@@ -110,10 +110,9 @@ def may_be_same(found: Camera, given: Camera, std: float) -> bool:
 
 
 def intrinsics_directions(camera: Camera, which: list[int]) -> Float[Tensor, "P D"]:
-    """Derivatives of the camera's parameters: log focal length, k1, k2, principal point in image widths."""
-    columns = camera.params.new_zeros(len(camera.params), 5)
+    """Derivatives of the camera's parameters: log focal length, k1, k2."""
+    columns = camera.params.new_zeros(len(camera.params), 3)
     columns[:2, FOCAL] = camera.params[:2]
-    columns[[2, 3], [CX, CY]] = float(camera.width)
     if camera.model != "pinhole":
         columns[[4, 5], [K1, K2]] = 1.0
     return columns[:, which]
@@ -124,10 +123,3 @@ def with_radial_terms(camera: Camera) -> Camera:
     if camera.model != "pinhole":
         return camera
     return Camera("radial_tangential", torch.cat([camera.params, camera.params.new_zeros(5)]), camera.size)
-
-
-def simplify_model(camera: Camera) -> Camera:
-    """The same camera, as a pinhole if it has no distortion."""
-    if camera.model != "radial_tangential" or bool(camera.params[4:].any()):
-        return camera
-    return Camera("pinhole", camera.params[:4], camera.size)

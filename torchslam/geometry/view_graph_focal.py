@@ -41,7 +41,7 @@ _LEVEL_ROUNDS = 4  # of the noise level and the best of the grid, which hardly c
 _BEND_ROUNDS = 10  # of reweighting, for the grid only: Newton's method does the rest
 _NEWTON_STEPS, _HALVINGS = 20, 20  # about five steps are needed
 _ROUNDING = 1e-12  # of the cost and of its minimum: what Newton's method cannot tell
-_MAX_STD = 0.1  # relative; as in `calibration.intrinsics`, beyond it a focal length counts as unknown
+_MAX_STD = 0.1  # relative; beyond it a focal length counts as unknown
 _RISE = 9.0  # of the cost, three deviations, that any focal length further away than three times `_MAX_STD` must have
 _MIN_MATCHES = 20  # of a pair: the noise of fewer cannot be told
 # Of the matches, that one homography explains: pairs beyond it have no information, however certain their matrix seems.

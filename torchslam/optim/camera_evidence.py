@@ -252,6 +252,5 @@ def graph_evidence(
         given: the given camera with its error.
         options: kernel and scale of that minimum.
     """
-    keyframes = torch.bincount(graph.submap[graph.is_keyframe])
-    frames, *_, problem = keyframe_problem(graph, int(keyframes.argmax()))
+    frames, *_, problem = keyframe_problem(graph, graph.main_submap)
     return camera_evidence(problem, given, options, graph.timestamps[frames])

@@ -121,6 +121,11 @@ class ObservationGraph:
             int(submap) for submap in torch.unique(self.submap)
         ]  # `tolist` fails in transforms of torch 2.5
 
+    @property
+    def main_submap(self) -> int:
+        """The number of the submap with most keyframes."""
+        return int(torch.bincount(self.submap[self.is_keyframe]).argmax())
+
     def part(self, submap: int) -> tuple[Int[Tensor, " n"], Int[Tensor, " m"], Int[Tensor, " p"]]:
         """Rows of the frames, the observations and the points of one submap; points without observations have none."""
         frames = (self.submap == submap).nonzero().squeeze(-1)

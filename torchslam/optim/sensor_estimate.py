@@ -18,7 +18,7 @@ from torchslam.optim._core.options import SolverOptions
 from torchslam.optim.bundle._api import BundleProblem, solve_bundle
 from torchslam.optim.camera_evidence import CameraEvidence, camera_evidence
 from torchslam.optim.rolling_shutter import find_rolling_shutter, readout_by
-from torchslam.optim.run_graph import RunGraph, camera_prior, keyframe_problem
+from torchslam.optim.run_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem
 
 READOUT_STEPS = 2
 """Steps of the readout, each with the keypoints corrected by the one before: the second changes it by a thirtieth."""
@@ -100,11 +100,20 @@ def _differs(readout: Readout | None, before: Readout | None) -> bool:
 
 
 def keyframe_evidence(
-    graph: RunGraph, given: CameraMeasurement, options: SolverOptions
+    graph: ObservationGraph, given: CameraMeasurement, options: SolverOptions
 ) -> CameraEvidence | None:
-    """Adjust the keyframes of a graph of one submap with a free camera; None where they do not determine it."""
+    """Adjust keyframes with a free camera and compute what they determine of it.
+
+    Args:
+        graph: Of a run; the submap with most keyframes is used.
+        given: The given camera with its error, the prior of the adjustment.
+        options: Of the adjustment.
+
+    Returns:
+        The evidence; None where the keyframes do not determine the camera.
+    """
     graph = graph.global_shutter()
-    keyframes, *_, problem = keyframe_problem(graph, int(graph.submap[0]))
+    keyframes, *_, problem = keyframe_problem(graph, graph.main_submap)
     problem = replace(problem, camera=with_radial_terms(problem.camera))
     found = adjusted(problem, options, given)
     return camera_evidence(found, given, options, graph.timestamps[keyframes])

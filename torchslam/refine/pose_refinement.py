@@ -17,8 +17,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.calibration.find_camera import contradiction
-from torchslam.calibration.intrinsics import IntrinsicsEstimate, estimate_intrinsics
+from torchslam.calibration.find_camera import better_camera
 from torchslam.config import Config
 from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
@@ -88,7 +87,6 @@ class RefinementResult:
             poses are the given ones.
         given: The given poses.
         pose_rows: Row of the given pose of each frame of the sequence, -1 for none.
-        intrinsics: Estimate of the camera; None if it was fixed or no map was built.
         rounds: Number of cameras with which a map was built.
         kept: Whether the given poses were kept, since the images do not improve on them.
     """
@@ -96,7 +94,6 @@ class RefinementResult:
     run: Run
     given: GivenPoses
     pose_rows: Int[Tensor, " F"]
-    intrinsics: IntrinsicsEstimate | None
     rounds: int
     kept: bool = False
 
@@ -159,18 +156,17 @@ def refine_poses(
         failure = refinement.map()
     if failure:
         run = Run((), camera, config, refinement.lost(failure), mapper.skipped, False, failure)
-        return RefinementResult(run, given, rows, None, 0)
-    rounds, estimate = 1, None
-    if choice is not CameraChoice.FIXED:
-        estimate = estimate_intrinsics(refinement.run.graph, camera, radial)
-    may_change = choice is CameraChoice.IF_CONTRADICTED and estimate is not None and estimate.is_determined
-    if may_change and estimate is not None and contradiction(camera, estimate):
-        mapper.given = _measurement(estimate.camera, radial)
-        refinement.map()
-        rounds, estimate = 2, estimate_intrinsics(refinement.run.graph, camera, radial)
+        return RefinementResult(run, given, rows, 0)
+    rounds = 1
+    if choice is CameraChoice.IF_CONTRADICTED:
+        better = better_camera(refinement.run.graph, camera)
+        if better is not None:
+            mapper.given = _measurement(better.camera, radial)
+            refinement.map()
+            rounds = 2
     kept = refinement.keep_given_unless_improved(is_free=mapper.given is not None)
     log(f"refined: {refinement.after.sentence()}" + ("; the given poses are kept" if kept else ""))
-    return RefinementResult(refinement.run, given, rows, estimate, rounds, kept)
+    return RefinementResult(refinement.run, given, rows, rounds, kept)
 
 
 def _measurement(camera: Camera, radial: int) -> CameraMeasurement:
