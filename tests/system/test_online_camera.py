@@ -31,7 +31,9 @@ from torchslam.system.online_camera import (
 from torchslam.system.run import RunProgress, run_sequence
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
-SETTINGS += ["simulated.noise_px=0.5", "initialization.provisional_frames=8"]
+SETTINGS += ["simulated.noise_px=0.2", "initialization.provisional_frames=8"]
+OFF = 1.06
+"""Ratio of the given focal length to the true one: two given standard deviations, and known of after a dozen frames."""
 
 
 def bend(frames: int, angle: float) -> torch.Tensor:
@@ -78,7 +80,7 @@ def error_after(found: Run, frame: int) -> float:
 
 @pytest.fixture(scope="module")
 def corrected() -> Run:
-    return run(1.04)
+    return run(OFF)
 
 
 def test_a_wrong_camera_is_corrected_while_the_run_goes_on(corrected: Run) -> None:
@@ -88,7 +90,7 @@ def test_a_wrong_camera_is_corrected_while_the_run_goes_on(corrected: Run) -> No
         assert 0 < change.frame < len(WALK) - 1
     assert focal_error(corrected.camera_changes[-1].camera) < 0.02
     assert focal_error(corrected.camera) < 0.01
-    fixed = run(1.04, "camera.std=0")
+    fixed = run(OFF, "camera.std=0")
     assert not fixed.camera_changes
     change = corrected.camera_changes[0].frame
     assert error_after(corrected, change) < 0.7 * error_after(fixed, change)
@@ -109,7 +111,7 @@ def test_a_right_camera_stays() -> None:
 
 def half() -> tuple[SLAM, RunProgress]:
     """A system after its camera was changed."""
-    slam, so_far = SLAM(given(1.04), config()), RunProgress()
+    slam, so_far = SLAM(given(OFF), config()), RunProgress()
 
     class Enough(BaseException):
         pass
@@ -181,7 +183,7 @@ class Calls:
 
 def test_no_frame_waits_for_an_estimate() -> None:
     """It is taken some frames after it was begun, and the map that is adjusted by it some frames later."""
-    slam = SLAM(given(1.04), config())
+    slam = SLAM(given(OFF), config())
     calls, keyframes = Calls(slam), list[int]()
     begin = slam.online_camera.solver
 
@@ -198,8 +200,10 @@ def test_no_frame_waits_for_an_estimate() -> None:
     assert all(later >= GROWTH * earlier for earlier, later in pairwise(keyframes))
     assert keyframes[-1] <= MAX_KEYFRAMES
     waits = [taken - begun for begun, taken in zip(calls.begun, calls.taken, strict=False)]
-    assert all(wait >= ESTIMATE_FRAMES for wait in waits[:-1])
-    assert calls.begun[1:] > calls.taken[: len(calls.begun) - 1]  # one at a time
+    assert all(wait >= ESTIMATE_FRAMES for wait in waits)
+    assert all(
+        begun >= taken for begun, taken in zip(calls.begun[1:], calls.taken, strict=False)
+    )  # one at a time
     changes = slam.online_camera.changes
     moments = [taken for taken, found in zip(calls.taken, calls.found, strict=True) if found.is_change]
     assert changes
@@ -208,7 +212,7 @@ def test_no_frame_waits_for_an_estimate() -> None:
 
 
 def test_the_estimate_is_by_the_given_camera_and_the_one_in_use() -> None:
-    slam = SLAM(given(1.04), config())
+    slam = SLAM(given(OFF), config())
     cameras, priors = list[Camera](), set[int]()
 
     def solver(function: Callable[..., Any], graph: RunGraph, prior: SensorPrior, *more: Any) -> Any:
@@ -239,7 +243,7 @@ def test_nothing_is_estimated_where_nothing_may_change(settings: tuple[str, ...]
 
 def test_no_checkpoint_while_an_estimate_is_pending() -> None:
     """It is of a map that is not saved; until it is taken, the run goes on from the checkpoint before."""
-    slam = SLAM(given(1.04), config())
+    slam = SLAM(given(OFF), config())
     pending = 0
 
     def look(result: StepResult) -> None:
@@ -267,12 +271,10 @@ def test_an_estimate_of_a_map_that_is_gone_is_forgotten() -> None:
     assert online.is_pending
     online.step(submap.fork())
     assert not online.is_pending
-    changes = list(online.changes)
-    assert slam.online_camera.changes == changes
 
 
 def test_the_stated_error_of_the_camera_is_a_prior(corrected: Run) -> None:
     """The surer the given camera, the less the images move it."""
-    sure = run(1.04, "camera.std=0.002")
-    last = sure.camera_changes[-1].camera if sure.camera_changes else given(1.04)
+    sure = run(OFF, "camera.std=0.002")
+    last = sure.camera_changes[-1].camera if sure.camera_changes else given(OFF)
     assert focal_error(last) > 2 * focal_error(corrected.camera_changes[-1].camera)

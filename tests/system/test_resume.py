@@ -78,7 +78,7 @@ def checkpoint(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_checkpoint_restores_the_state(checkpoint: Path) -> None:
     slam, so_far = half()
     resumed, loaded = read_checkpoint(checkpoint, WALK, CONFIG)
-    assert loaded.next == so_far.next == STOP + 1
+    assert loaded.next == so_far.next > STOP  # once no estimate of the sensor is pending
     assert loaded.skipped == so_far.skipped
     for before, after in zip(so_far.results, loaded.results, strict=True):
         for name in ("T_cw", "covariance"):
