@@ -10,7 +10,7 @@ comes from, as long as it differs between stretches (the cluster-robust covarian
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -41,6 +41,9 @@ chance, and a parameter that is held keeps its whole given error. With 1 three o
 one of them is, and a recording of four keyframes whose halves contradict each other."""
 CALIBRATED_STD = 0.03
 """Relative standard deviation of a focal length up to which it counts as given; those by image pairs have 0.05."""
+CONTRADICTED = 2.5
+"""Factor on the error of a given camera that the images contradict: a calibration is either exact, and kept, or off by
+more than stated. Errors of published ones go up to 5 %, 2.5 times the default of 2 %."""
 
 
 @dataclass(frozen=True)
@@ -96,17 +99,19 @@ class CameraEvidence:
         scores: of each stretch, at the given camera.
         information: of each stretch.
         variance: variance of an observation by the residuals, in units of the stated one.
+        is_calibration: whether `given` is a calibration, with `CONTRADICTED` times its error, not a guess.
     """
 
     given: CameraMeasurement
     scores: Float[Tensor, "G n"]
     information: Float[Tensor, "G n n"]
     variance: float
+    is_calibration: bool = False
 
     def is_better_than(self, current: Camera) -> bool:
         """Whether the camera of `estimate` is to replace the one in use."""
         params = with_radial_terms(current).params
-        is_given = self.given.focal_std <= CALIBRATED_STD and torch.equal(params, self.given.camera.params)
+        is_given = self.is_calibration and torch.equal(params, self.given.camera.params)
         return self.gain(current).is_worth(is_given)
 
     def gain(self, current: Camera) -> Gain:
@@ -223,6 +228,9 @@ def camera_evidence(
     parameters = problem.camera.params.shape[-1]
     if len(given.directions) != parameters:
         raise ValueError(f"given.directions must have {parameters} rows, not {len(given.directions)}")
+    is_calibration = given.focal_std <= CALIBRATED_STD
+    if is_calibration:
+        given = replace(given, directions=CONTRADICTED * given.directions)
     found = camera_scores(problem, given.directions, options)
     if found is None or len(problem.T_cw) < 2:
         return None
@@ -239,7 +247,7 @@ def camera_evidence(
     off = problem.camera.params.detach() - given.camera.params
     step = torch.linalg.pinv(given.directions) @ off
     at_given = scores + (information @ step[..., None])[..., 0]
-    return CameraEvidence(given, at_given, information, float(found.variance))
+    return CameraEvidence(given, at_given, information, float(found.variance), is_calibration)
 
 
 def graph_evidence(
