@@ -256,6 +256,23 @@ def test_no_checkpoint_while_an_estimate_is_pending() -> None:
     assert pending >= ESTIMATE_FRAMES + ADJUST_FRAMES - 2
 
 
+def test_an_estimate_can_be_postponed_for_a_checkpoint() -> None:
+    """As before the run ends: it begins anew, also in the run that is resumed."""
+    slam, _ = half()
+    online, (submap,) = slam.online_camera, slam.atlas
+    waiting = online.next_check
+    online.postpone()
+    assert online.next_check == waiting  # none is pending
+    online.next_check = 0
+    online.step(submap)
+    assert not slam.can_checkpoint
+    online.postpone()
+    assert slam.can_checkpoint
+    assert online.next_check == submap.map.num_keyframes
+    online.step(submap)
+    assert online.is_pending
+
+
 def test_an_estimate_of_a_map_that_is_gone_is_forgotten() -> None:
     """Of a discarded one at once, and of another one than the active map when it would be taken."""
     slam, _ = half()

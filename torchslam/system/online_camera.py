@@ -156,6 +156,14 @@ class OnlineCamera:
                 other.correct_keyframes(found.sensor)
                 adjust_all(other.map, found.sensor.camera, self.settings)
 
+    def postpone(self) -> None:
+        """Begin a pending estimate anew with the next keyframe: a checkpoint does not have its graph."""
+        if self._pending is not None:
+            self.next_check = min(
+                self.next_check, max(self._pending.submap.map.num_keyframes, FIRST_KEYFRAMES)
+            )
+            self._pending = None
+
     def forget(self) -> None:
         """Forget an estimate of a map that is no longer the active one."""
         self._pending = None
