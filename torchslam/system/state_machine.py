@@ -105,6 +105,7 @@ class StateMachine:
     def finalize(self) -> None:
         """End the session: frames that are held back keep their poses, uncertain as they are."""
         if self.active_map.submap is not None:
+            self.context.online_camera.forget()  # the final adjustment estimates the sensor
             num_new = self._keep_held()
             self.maintenance.after_frame(None)
             self.maintenance.close_loops(num_new)
