@@ -148,7 +148,7 @@ class FrameFeatures:
     )
     image: Float[Tensor, "1 1 H W"] | None = None
     backlog: int = 0
-    detected: Float[Tensor, "N 2"] = field(
+    detected: Float[Tensor, "_ 2"] = field(
         default_factory=lambda: torch.zeros(0, 2, dtype=torch.float32, device="cpu")
     )
 
