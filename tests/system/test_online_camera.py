@@ -241,36 +241,43 @@ def test_nothing_is_estimated_where_nothing_may_change(settings: tuple[str, ...]
     assert slam.online_camera.changes == []
 
 
-def test_no_checkpoint_while_an_estimate_is_pending() -> None:
-    """It is of a map that is not saved; until it is taken, the run goes on from the checkpoint before."""
-    slam = SLAM(given(OFF), config())
-    pending = 0
+def test_a_checkpoint_has_the_estimate_that_is_pending(tmp_path: Path) -> None:
+    """The graph of the estimate is gone when the run goes on, so that its result is kept."""
+    slam, so_far, path = SLAM(given(OFF), config()), RunProgress(), tmp_path / "checkpoint.safetensors"
 
-    def look(result: StepResult) -> None:
-        nonlocal pending
-        if slam.online_camera.is_pending:
-            pending += 1
+    class Enough(BaseException):
+        pass
+
+    def stop(_: StepResult) -> None:
+        if slam.online_camera.is_pending and slam.can_checkpoint:
+            raise Enough
+
+    with pytest.raises(Enough):
+        run_sequence(slam, seen(), stop, so_far)
+    write_checkpoint(path, slam, so_far, seen())
+    resumed, _ = read_checkpoint(path, seen(), config())
+    one, other = slam.online_camera.pending, resumed.online_camera.pending
+    assert one is not None
+    assert other is not None
+    assert one[0] == other[0]
+    assert one[1].is_change == other[1].is_change
+    assert one[1].departure == other[1].departure
+    if one[1].has_other_camera:
+        assert torch.equal(one[1].sensor.camera.params, other[1].sensor.camera.params)
+
+
+def test_no_checkpoint_while_the_whole_map_is_adjusted() -> None:
+    slam = SLAM(given(OFF), config())
+    adjusted = 0
+
+    def look(_: StepResult) -> None:
+        nonlocal adjusted
+        if slam.mapper.adjustment.is_whole:
+            adjusted += 1
             assert not slam.can_checkpoint
 
     run_sequence(slam, seen(), look)
-    assert pending >= ESTIMATE_FRAMES + ADJUST_FRAMES - 2
-
-
-def test_an_estimate_can_be_postponed_for_a_checkpoint() -> None:
-    """As before the run ends: it begins anew, also in the run that is resumed."""
-    slam, _ = half()
-    online, (submap,) = slam.online_camera, slam.atlas
-    waiting = online.next_check
-    online.postpone()
-    assert online.next_check == waiting  # none is pending
-    online.next_check = 0
-    online.step(submap)
-    assert not slam.can_checkpoint
-    online.postpone()
-    assert slam.can_checkpoint
-    assert online.next_check == submap.map.num_keyframes
-    online.step(submap)
-    assert online.is_pending
+    assert adjusted > 0
 
 
 def test_an_estimate_of_a_map_that_is_gone_is_forgotten() -> None:

@@ -152,8 +152,7 @@ def describe_calibration(found: CameraMeasurement) -> str:
     return described + "".join(f", {name} {k:.3f} ± {std:.3f}" for k, std, name in terms)
 
 
-MIN_SIGMAS, MIN_RATIO = 3.0, 0.01
-LARGE_SIGMAS, LARGE_RATIO = 1.0, 0.03
+(MIN_SIGMAS, MIN_RATIO), (LARGE_SIGMAS, LARGE_RATIO) = (3.0, 0.01), (1.0, 0.03)
 """Standard errors and ratio by which the focal length of an estimate must be off, either line, where its camera
 predicts better; else only its distortion does. Exact focal lengths of shelf_bin and kitti07 are off by at most 1.1
 standard errors and 0.9 %; of eight that are 20 % off, on 20 to 30 rendered frames, seven are off by more than one.

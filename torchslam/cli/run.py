@@ -91,11 +91,7 @@ class Checkpoints:
     def offer(self, at_once: bool = False) -> None:
         """Write a checkpoint after a frame if one is due, or `at_once` before the run ends."""
         slam, so_far, sequence = self._run
-        if not self._every or not slam.mapping:
-            return
-        if at_once:
-            slam.online_camera.postpone()
-        if not slam.can_checkpoint:
+        if not self._every or not slam.mapping or not slam.can_checkpoint:
             return
         keyframes = self._keyframes()
         if at_once or keyframes - self._last >= max(self._every, GROWTH * keyframes):

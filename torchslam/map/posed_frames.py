@@ -20,7 +20,7 @@ from torchslam.geometry import (
 )
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
-from torchslam.map.map import Map, key_of
+from torchslam.map.map import SESSION_BITS, Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
 from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
@@ -291,7 +291,7 @@ class PosedFrames:
         row_of = {key: row for row, key in enumerate(self.keys.tolist())}
         corrected = []
         for view in views:
-            row = row_of.get(int(key_of(torch.tensor(view.session), torch.tensor(view.index))))
+            row = row_of.get((view.session << SESSION_BITS) + view.index)
             own = depths[:0] if row is None else depths[seen_by == row]
             if row is not None and len(own):
                 depth = own.median().expand(1, len(view.detected))

@@ -20,12 +20,13 @@ from torch import Tensor
 from torchslam.config import Config, to_toml
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ResultsError
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import with_radial_terms
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import TrackingState
 from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_submaps, write_tensors
+from torchslam.optim.sensor_estimate import SensorEstimate
 from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.online_camera import CameraChange
 from torchslam.system.run import RunProgress
@@ -73,6 +74,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
             for change in slam.online_camera.changes
         ],
         "next_camera_check": slam.online_camera.next_check,
+        "pending_estimate": _plain_estimate(slam.online_camera.pending),
         "readout": _plain_readout(slam.shared_camera.model.readout),
         "loop_closures": [astuple(closure) for closure in slam.loop_closer.loop_closures],
     }
@@ -164,7 +166,13 @@ def _restore(
         None if precheck is None else (int(precheck[0]), bool(precheck[1])),
     )
     changes = [_camera_change(saved.camera, *change) for change in run["camera_changes"]]
-    slam.online_camera.restore(changes, int(run["next_camera_check"]), _readout(run["readout"]))
+    slam.online_camera.restore(
+        changes,
+        int(run["next_camera_check"]),
+        _readout(run["readout"]),
+        submap,
+        _estimate(saved.camera, run["pending_estimate"]),
+    )
     slam.scene_filter.static_overlay.restore(tensors["run.evidence"])
     if run["adjustment"]:  # around the newest keyframe, where the map is as it was at the request
         due = None if run["due"] is None else int(run["due"])
@@ -183,15 +191,42 @@ def _readout(plain: list[float] | None) -> Readout | None:
     return Readout.from_numbers(torch.tensor(plain, dtype=torch.float64, device="cpu"))
 
 
+def _plain_estimate(pending: tuple[int, SensorEstimate] | None) -> list[Any] | None:
+    """A pending estimate as JSON has it: when it is due, its camera and readout, what of them is new, the departure."""
+    if pending is None:
+        return None
+    due, found = pending
+    sensor = found.sensor
+    flags = [found.has_other_camera, found.has_other_readout]
+    return [due, sensor.camera.params.tolist(), _plain_readout(sensor.readout), *flags, found.departure]
+
+
+def _estimate(given: Camera, plain: list[Any] | None) -> tuple[int, SensorEstimate] | None:
+    """Invert `_plain_estimate`; raise ValueError or TypeError for anything else."""
+    if plain is None:
+        return None
+    due, params, readout, has_other_camera, has_other_readout, departure = plain
+    if not all(isinstance(flag, bool) for flag in (has_other_camera, has_other_readout)):
+        raise ValueError("what is new in the estimate of the sensor is unknown")
+    camera = _camera(given, params)
+    sensor = SensorModel(camera, _readout(readout))
+    return int(due), SensorEstimate(sensor, has_other_camera, has_other_readout, float(departure))
+
+
 def _camera_change(
     given: Camera, frame: int, params: list[float], departure: float, readout: list[float] | None
 ) -> CameraChange:
     """Raises ValueError where the parameters are no camera's."""
-    camera = with_radial_terms(given)
+    return CameraChange(int(frame), _camera(given, params), float(departure), _readout(readout))
+
+
+def _camera(given: Camera, params: list[float]) -> Camera:
+    """The camera with these parameters, in the given model or with radial terms. Raises ValueError for no camera."""
+    camera = given if len(params) == len(given.params) else with_radial_terms(given)
     found = camera.params.new_tensor(params)
     if found.shape != camera.params.shape or not bool(found.isfinite().all() and (found[:2] > 0).all()):
         raise ValueError(f"the parameters of the camera are {params}")
-    return CameraChange(int(frame), camera.with_params(found), float(departure), _readout(readout))
+    return camera.with_params(found)
 
 
 def _check_tracking(tracking: TrackingState) -> None:

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 
 from torchslam.config import CameraConfig, Config
@@ -102,13 +102,30 @@ class OnlineCamera:
 
     @property
     def is_pending(self) -> bool:
-        """Whether an estimate is being computed, or the map adjusted by one."""
-        return self._pending is not None or self.adjustment.is_whole
+        """Whether an estimate was begun that is not taken yet."""
+        return self._pending is not None
 
-    def restore(self, changes: list[CameraChange], next_check: int, readout: Readout | None) -> None:
-        """Go on where a checkpoint was written."""
+    @property
+    def pending(self) -> tuple[int, SensorEstimate] | None:
+        """The estimate that is to be taken, and the frame from which on; waits for it. None: there is none."""
+        return None if self._pending is None else (self._pending.due, self._pending.result())
+
+    def restore(
+        self,
+        changes: list[CameraChange],
+        next_check: int,
+        readout: Readout | None,
+        submap: Submap,
+        pending: tuple[int, SensorEstimate] | None,
+    ) -> None:
+        """Go on where a checkpoint was written, with this active submap."""
         self.changes, self.next_check = changes, next_check
         self.camera.use(SensorModel(changes[-1].camera if changes else self.camera.current, readout))
+        if pending is not None:
+            due, found = pending
+            if not found.has_other_camera:
+                found = replace(found, sensor=SensorModel(self.camera.current, found.sensor.readout))
+            self._pending = _Estimate(submap, due, lambda: found)
 
     def step(self, submap: Submap) -> None:
         """Begin an estimate if the map has grown enough; take one that is due, and have the map adjusted by it.
@@ -155,14 +172,6 @@ class OnlineCamera:
             if other is not submap:
                 other.correct_keyframes(found.sensor)
                 adjust_all(other.map, found.sensor.camera, self.settings)
-
-    def postpone(self) -> None:
-        """Begin a pending estimate anew with the next keyframe: a checkpoint does not have its graph."""
-        if self._pending is not None:
-            self.next_check = min(
-                self.next_check, max(self._pending.submap.map.num_keyframes, FIRST_KEYFRAMES)
-            )
-            self._pending = None
 
     def forget(self) -> None:
         """Forget an estimate of a map that is no longer the active one."""

@@ -173,8 +173,8 @@ class SLAM:
 
     @property
     def can_checkpoint(self) -> bool:
-        """Whether the active submap is confirmed, no frame is held back, and no estimate of the sensor is pending."""
-        return self.mode is Mode.TRACKING and not self.online_camera.is_pending
+        """Whether the active submap is confirmed, no frame is held back, and the whole map is not being adjusted."""
+        return self.mode is Mode.TRACKING and not self.mapper.adjustment.is_whole
 
     # --- pipeline --------------------------------------------------------------------------------------------
 
