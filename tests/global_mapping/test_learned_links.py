@@ -172,11 +172,11 @@ def test_learned_links_without_weights_or_sift_are_an_error(
 @pytest.mark.parametrize(
     ("gains", "is_right", "views", "doubtful"),
     [
-        ([10.0, 11.0, 12.0], True, TIED.views, set()),
-        ([10.0, 11.0, 12.0], False, TIED.views, {5, 6, 7, 8, 9}),
-        ([-10.0, -11.0, -12.0], True, VIEWS, set()),
-        ([40.0, 0.0, 0.0], True, VIEWS, set()),
-        ([0.0, 0.0, 0.0], True, VIEWS, set()),
+        ([10.0, 11.0, 12.0, 11.0], True, TIED.views, set()),
+        ([10.0, 11.0, 12.0, 11.0], False, TIED.views, {5, 6, 7, 8, 9}),
+        ([-10.0, -11.0, -12.0, -11.0], True, VIEWS, set()),
+        ([40.0, 0.0, 0.0, 0.0], True, VIEWS, set()),
+        ([0.0, 0.0, 0.0, 0.0], True, VIEWS, set()),
     ],
 )
 def test_learned_links_are_kept_where_pairs_prefer_the_map(
@@ -186,18 +186,23 @@ def test_learned_links_are_kept_where_pairs_prefer_the_map(
     doubtful: set[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """For sure: by all of them, not by one alone. Images that only they hold are doubted where pairs contradict that map.
+    """By all of them, not by one alone. Images that only links hold are doubted where pairs contradict that map.
 
-    gains: log likelihood that each pair that was held back gains by learned links
+    gains: by how much the log likelihood of each pair that was held back is higher with learned links.
     """
     mapper = GlobalMapper(open_sequence("synthetic:room?frames=10"), CAMERA, Config(), None)
     none = torch.zeros(0, dtype=torch.int64)
     maps = iter([(torch.arange(BREAK), none, none), (torch.arange(COUNT), none, none)])
     gained = torch.tensor(gains, dtype=torch.float64)
+    without = torch.full_like(gained, -5.0)
     checks = iter(
-        SimpleNamespace(evidence=evidence, is_right=is_right) for evidence in (-5.0 - gained, torch.full((3,), -5.0))
+        SimpleNamespace(evidence=evidence, is_right=is_right) for evidence in (without, without + gained)
     )
     monkeypatch.setattr("torchslam.global_mapping.mapper.build_view_graph", lambda *_: PAIRS)
+    # Two of the pairs of the images' own features, and two of the learned ones.
+    monkeypatch.setattr(
+        "torchslam.global_mapping.mapper.choose_held_back", lambda pairs: frozenset({0, len(pairs) - 1})
+    )
     monkeypatch.setattr("torchslam.global_mapping.mapper.open_links", lambda *_: [([4], [5])])
     monkeypatch.setattr(mapper, "_saved_views", lambda _: VIEWS)
     monkeypatch.setattr(mapper, "_learned", lambda *_: TIED)
