@@ -170,27 +170,39 @@ def test_learned_links_without_weights_or_sift_are_an_error(
 
 
 @pytest.mark.parametrize(
-    ("scores", "is_right", "views", "doubtful"),
+    ("gains", "is_right", "views", "doubtful"),
     [
-        ((0.5, 0.9), True, TIED.views, set()),
-        ((0.5, 0.9), False, TIED.views, {5, 6, 7, 8, 9}),
-        ((0.9, 0.5), True, VIEWS, set()),
-        ((0.9, 0.9), True, VIEWS, set()),
+        ([10.0, 11.0, 12.0, 11.0], True, TIED.views, set()),
+        ([10.0, 11.0, 12.0, 11.0], False, TIED.views, {5, 6, 7, 8, 9}),
+        ([-10.0, -11.0, -12.0, -11.0], True, VIEWS, set()),
+        ([40.0, 0.0, 0.0, 0.0], True, VIEWS, set()),
+        ([0.0, 0.0, 0.0, 0.0], True, VIEWS, set()),
     ],
 )
 def test_learned_links_are_kept_where_pairs_prefer_the_map(
-    scores: tuple[float, float],
+    gains: list[float],
     is_right: bool,
     views: list[FrameFeatures],
     doubtful: set[int],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Images that only they hold are doubted where pairs contradict that map."""
+    """By all of them, not by one alone. Images that only links hold are doubted where pairs contradict that map.
+
+    gains: by how much the log likelihood of each pair that was held back is higher with learned links.
+    """
     mapper = GlobalMapper(open_sequence("synthetic:room?frames=10"), CAMERA, Config(), None)
     none = torch.zeros(0, dtype=torch.int64)
     maps = iter([(torch.arange(BREAK), none, none), (torch.arange(COUNT), none, none)])
-    checks = iter(SimpleNamespace(score=score, is_right=is_right) for score in scores)
+    gained = torch.tensor(gains, dtype=torch.float64)
+    without = torch.full_like(gained, -5.0)
+    checks = iter(
+        SimpleNamespace(evidence=evidence, is_right=is_right) for evidence in (without, without + gained)
+    )
     monkeypatch.setattr("torchslam.global_mapping.mapper.build_view_graph", lambda *_: PAIRS)
+    # Two of the pairs of the images' own features, and two of the learned ones.
+    monkeypatch.setattr(
+        "torchslam.global_mapping.mapper.choose_held_back", lambda pairs: frozenset({0, len(pairs) - 1})
+    )
     monkeypatch.setattr("torchslam.global_mapping.mapper.open_links", lambda *_: [([4], [5])])
     monkeypatch.setattr(mapper, "_saved_views", lambda _: VIEWS)
     monkeypatch.setattr(mapper, "_learned", lambda *_: TIED)

@@ -44,6 +44,7 @@ from torchslam.global_mapping.mapper import (
 )
 from torchslam.global_mapping.rounds import COARSE
 from torchslam.global_mapping.view_graph import Relation, ViewPair
+from torchslam.optim.camera_evidence import CONTRADICTED
 from torchslam.system.front_end import Simulated
 from torchslam.types import State, StepResult
 
@@ -237,30 +238,45 @@ def test_progress_names_the_stages() -> None:
     assert sum("agree" in stage for stage, _, _ in calls) > len(COARSE)
 
 
-def map_with_error(std: float) -> tuple[CameraMeasurement, GlobalMap]:
-    """A walk around something, by a camera whose focal length is three percent too long, known with an error."""
+def map_with_error(std: float, off: float = 0.03) -> tuple[CameraMeasurement, GlobalMap]:
+    """A walk around something, by a camera whose focal length is too long, by `off`, known with an error."""
     around = Walk(se3_inverse(arc(12, 120.0, 2.5)))
     settings = config("simulated.depth_near=0.9", "simulated.depth_far=1.3")
     sequence = Simulated(settings, around.camera, true_T_cw(around)).of(around)
     params = around.camera.params.double()
     measured = CameraMeasurement.of(
-        around.camera.with_params(torch.cat([1.03 * params[:2], params[2:]])), std
+        around.camera.with_params(torch.cat([(1 + off) * params[:2], params[2:]])), std
     )
     return measured, GlobalMapper(sequence, measured.camera, settings, measured).run()
 
 
 @pytest.mark.usefixtures("without_shape_checks")
 def test_a_camera_that_is_known_with_an_error_is_measured() -> None:
-    """It is found, and the run says what was given with which error."""
-    measured, made = map_with_error(0.03)
+    """It is found where it is off by three percent, and the run says what was given, and by which error it counts."""
+    measured, made = map_with_error(0.03, off=0.03)
     run = made.run
     assert float(run.camera.focal) == pytest.approx(400, rel=0.01)
     assert run.given is not None
     assert run.given.camera is measured.camera
-    assert torch.equal(run.given.directions[:, 0], measured.directions[:, 0])  # the focal length is free
+    # The focal length is free, by the error of a calibration that the images contradict.
+    assert torch.equal(run.given.directions[:, 0], CONTRADICTED * measured.directions[:, 0])
     assert run.calibration is not None
     assert torch.equal(run.calibration.camera.params, run.camera.params)
     assert run.calibration.focal_std < 0.005
+
+
+@pytest.mark.usefixtures("without_shape_checks")
+def test_a_camera_that_is_known_with_an_error_is_held_where_it_predicts_as_well() -> None:
+    """Off by a thousandth, as far as its error by the images: they do not predict each other better by another one."""
+    measured, made = map_with_error(0.03, off=0.001)
+    run = made.run
+    assert torch.equal(run.camera.params, measured.camera.params)
+    assert run.given is not None
+    assert run.given.camera is measured.camera
+    assert run.given.directions.shape[1] == 0  # nothing is free
+    assert run.calibration is not None
+    assert torch.equal(run.calibration.camera.params, run.camera.params)
+    assert 0 < run.calibration.focal_std < 0.005
 
 
 @pytest.mark.usefixtures("without_shape_checks")

@@ -88,7 +88,8 @@ class World:
                 world.given = given
                 self.scaled = config
 
-            def run(self, results: Any) -> SimpleNamespace:
+            def run(self, results: Any, before: Run) -> SimpleNamespace:
+                assert before.results is results  # keypoints are corrected by the run they come from
                 world.mapped.append(results)
                 return SimpleNamespace(
                     run=world.whole,

@@ -80,7 +80,8 @@ def test_the_order_is_the_given_one_and_pairs_do_not_change_each_other() -> None
         (alone,) = matcher.verify([each])
         assert torch.equal(pair.keypoints_1, alone.keypoints_1)
         assert torch.equal(pair.keypoints_2, alone.keypoints_2)
-        torch.testing.assert_close(pair.T_21, alone.T_21, atol=1e-9, rtol=0)
+        # A padded batch adds up in another order, and the refinement ends at a step, not at the last digit.
+        torch.testing.assert_close(pair.T_21, alone.T_21, atol=1e-8, rtol=0)
         assert pair.relation is alone.relation
 
 

@@ -119,7 +119,8 @@ def test_matches_are_near_their_epipolar_line(limit_px: float, near: bool) -> No
             name: getattr(view, name)[rows]
             for name in ("scales", "angles", "descriptors", "mask", "information")
         }
-        return replace(view, keypoints=torch.tensor(pixels, dtype=torch.float64), **columns)
+        keypoints = torch.tensor(pixels, dtype=torch.float64)
+        return replace(view, keypoints=keypoints, detected=keypoints, **columns)
 
     allowed = near_epipolar_line(
         at((320, 240), (330, 250)), at((320, 228), (260, 228), (600, 250)), T_21, CAMERA, limit_px
