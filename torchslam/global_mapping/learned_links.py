@@ -146,6 +146,7 @@ def _in_rows(view: FrameFeatures, count: int) -> FrameFeatures:
     return replace(
         view,
         keypoints=pad(view.keypoints, (0, 0, 0, new)),
+        detected=pad(view.detected, (0, 0, 0, new)),
         scales=pad(view.scales, (0, new), value=1.0),
         angles=pad(view.angles, (0, new)),
         descriptors=pad(view.descriptors, (0, 0, 0, new)),
@@ -160,7 +161,7 @@ def _filled(view: FrameFeatures, learned: FrameFeatures, chosen: Tensor, begin: 
     width = view.descriptors.shape[1] - learned.descriptors.shape[1]
     columns = {
         name: getattr(view, name).clone()
-        for name in ("keypoints", "scales", "angles", "descriptors", "mask", "information")
+        for name in ("keypoints", "detected", "scales", "angles", "descriptors", "mask", "information")
     }
     for name, column in columns.items():
         new = getattr(learned, name)[chosen]
