@@ -81,7 +81,7 @@ def exact_depth(renderer: Renderer, T_wc: Float[Tensor, "4 4"]) -> np.ndarray:
     y, x = np.mgrid[0:height, 0:width].astype(np.float64)
     best = np.zeros((height, width))
     for form, (along_u, along_v) in zip(
-        renderer._linear_forms(se3_inverse(T_wc).numpy()), renderer._sizes, strict=True
+        renderer._linear_forms(se3_inverse(T_wc)[None].numpy())[0], renderer._sizes, strict=True
     ):
         u, v, q = (a * x + b * y + c for a, b, c in form)
         is_hit = (q > best) & (u >= 0) & (v >= 0) & (u <= along_u * q) & (v <= along_v * q)

@@ -144,7 +144,9 @@ def rendered_depth(
         pose = sequence.pose(index)
         assert pose is not None
         best = np.zeros(size[::-1])
-        for form, (width, height) in zip(renderer._linear_forms(pose.numpy()), renderer._sizes, strict=True):
+        for form, (width, height) in zip(
+            renderer._linear_forms(pose[None].numpy())[0], renderer._sizes, strict=True
+        ):
             u, v, q = (a * x + b * y + c for a, b, c in form)
             hit = (q > best) & (u >= 0) & (v >= 0) & (u <= width * q) & (v <= height * q)
             best = np.where(hit, q, best)

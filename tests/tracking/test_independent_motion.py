@@ -33,7 +33,7 @@ def thing_at(index: int, speed: float) -> Tensor:
 
 def joined(one: FrameFeatures, other: FrameFeatures) -> FrameFeatures:
     """The keypoints of both."""
-    columns = ("keypoints", "scales", "angles", "descriptors", "mask", "information")
+    columns = ("keypoints", "detected", "scales", "angles", "descriptors", "mask", "information")
     return replace(one, **{name: torch.cat([getattr(one, name), getattr(other, name)]) for name in columns})
 
 

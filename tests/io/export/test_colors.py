@@ -53,7 +53,7 @@ def test_other_sessions_and_missing_images_keep_colors(slam_map: Map) -> None:
 
 
 def test_keypoints_beyond_the_last_pixel_take_its_color(slam_map: Map) -> None:
-    slam_map.keyframes["keypoints"][:] = torch.tensor((SIZE[0] - 0.4, SIZE[1] - 0.4), dtype=torch.float64)
+    slam_map.keyframes["detected"][:] = torch.tensor((SIZE[0] - 0.4, SIZE[1] - 0.4), dtype=torch.float64)
     colorize_points([slam_map], Painted(arc(30)), session=0)
     alive = slam_map.valid_points()
     expected = torch.tensor((SIZE[0] - 1, SIZE[1] - 1), dtype=torch.uint8).expand(len(alive), 2)
