@@ -120,10 +120,11 @@ def camera_remark(finished: Run, found: str) -> str:
         if found:
             return f"{found}; over all frames {described}"
         described += f" (given {float(given.camera.focal):.1f} px)"
-        if not _may_contradict(given, finished.calibration):
+        stated = finished.config.camera.std
+        if not _may_contradict(given, finished.calibration, stated):
             return described
         better = better_camera(finished.graph, given.camera)
-        if better is None or given.departure(better.camera) < MIN_SIGMAS:
+        if better is None or abs(_focal_ratio(given.camera, better.camera)) < MIN_SIGMAS * stated:
             return described
         return f"{described}; {contradiction(given.camera, better, finished.camera)}; {REMEDY}"
     better = None
@@ -135,13 +136,13 @@ def camera_remark(finished: Run, found: str) -> str:
     return f"{against}; {REMEDY}" if against else ""
 
 
-def _may_contradict(given: CameraMeasurement, found: CameraMeasurement) -> bool:
-    """Whether the focal length by the images alone may be `MIN_SIGMAS` from the given one.
+def _may_contradict(given: CameraMeasurement, found: CameraMeasurement, stated: float) -> bool:
+    """Whether the focal length by the images alone may be `MIN_SIGMAS` of its stated error from the given one.
 
     The found one is the mean of the two, weighted by their information.
     """
     share = 1 - (found.focal_std / given.focal_std) ** 2 if given.focal_std > 0 else 0.0
-    return given.departure(found.camera) > LEAST_DEPARTURE * share
+    return abs(_focal_ratio(given.camera, found.camera)) > LEAST_DEPARTURE * stated * share
 
 
 def describe_calibration(found: CameraMeasurement) -> str:
