@@ -32,8 +32,13 @@ BREAK = 5  # nothing but learned features goes from the images before this one t
 
 
 def explicit(recording: Recording, weight: float) -> list[FrameFeatures]:
+    """Views with the weight of each keypoint, and keypoints that a rolling shutter has shifted by a pixel."""
     return [
-        replace(view, information=torch.full((len(view.mask), 1), weight, dtype=torch.float64))
+        replace(
+            view,
+            information=torch.full((len(view.mask), 1), weight, dtype=torch.float64),
+            detected=view.keypoints + 1.0,
+        )
         for view in recording.views
     ]
 
@@ -61,6 +66,7 @@ def test_keypoints_are_appended_and_pairs_point_to_them() -> None:
         ):
             view, own = TIED.views[row], LEARNED[row]
             torch.testing.assert_close(view.keypoints[new], own.keypoints[old], rtol=0, atol=0)
+            torch.testing.assert_close(view.detected[new], own.detected[old], rtol=0, atol=0)
             assert bool(view.mask[new].all())
             assert bool((view.information[new] == 1.0).all())
             assert not bool(VIEWS[row].mask[new[new < len(VIEWS[row].mask)]].any())
@@ -71,7 +77,7 @@ def test_keypoints_of_an_image_stay() -> None:
     assert len(lengths) == 1
     for row, (before, after) in enumerate(zip(VIEWS, TIED.views, strict=True)):
         was = before.mask
-        for name in ("keypoints", "scales", "angles", "descriptors", "information"):
+        for name in ("keypoints", "detected", "scales", "angles", "descriptors", "information"):
             old, new = getattr(before, name), getattr(after, name)
             assert torch.equal(new[: len(was)][was], old[was]), name
         added = int(after.mask.sum() - was.sum())
