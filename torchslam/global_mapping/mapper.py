@@ -242,7 +242,7 @@ class GlobalMapper:
         if isinstance(found, str):
             return self._failed(found, views, pairs)
         doubtful: frozenset[int] = frozenset()
-        learned = self._learned(views, open_links(*found[1:]))
+        learned = self._learned(views, open_links(*found[1:]), before)
         if learned is not None:
             every, left_out = pairs + learned.pairs, choose_held_back(learned.pairs)
             kept = [pair for row, pair in enumerate(learned.pairs) if row not in left_out]
@@ -272,9 +272,12 @@ class GlobalMapper:
         return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction)
 
     def _learned(
-        self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]]
+        self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]], before: Run | None
     ) -> LearnedPairs | None:
-        """Views and pairs with learned features around links; None if not asked for, or if nothing holds."""
+        """Views and pairs with learned features around links; None if not asked for, or if nothing holds.
+
+        Their keypoints are corrected for a rolling shutter by the run `before`, as those of the views are.
+        """
         config = learned_config(self.config)
         if config is None or not links:
             return None
@@ -285,7 +288,7 @@ class GlobalMapper:
             self.progress("learned features", len(found), len(views))
             view = next(own.views([views[row].index]))
             if view is not None:
-                found[row] = view
+                found[row] = view if before is None else before.at_middle_row([view])[0]
         matcher = PairMatcher(
             [found.get(row, view) for row, view in enumerate(views)], self.camera, own.matcher, own.scaled
         )
