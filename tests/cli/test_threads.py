@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -16,8 +17,9 @@ def test_a_run_has_one_thread_when_it_ends(tmp_path: Path) -> None:
         "print(len(os.listdir('/proc/self/task'))); sys.exit(status)"
     )
     arguments = ["run", "synthetic:room?frames=12", "--features", "opencv-orb", "-o", str(tmp_path)]
-    for processes in ("1", "3"):
+    unset = {name: value for name, value in os.environ.items() if name != "OMP_NUM_THREADS"}
+    for processes, env in (("1", unset), ("3", unset), ("1", unset | {"OMP_NUM_THREADS": "1"})):
         command = [sys.executable, "-c", code, *arguments, "--overwrite", "--processes", processes]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
         assert done.returncode == 0, done.stderr
         assert done.stdout.split()[-1] == "1"

@@ -134,16 +134,17 @@ class Version(argparse.Action):
 
 
 def _compute_in_one_thread() -> None:
-    """Use one thread unless OMP_NUM_THREADS is set: the tensors of a frame are too small for more.
+    """Use one thread: the tensors of a frame are too small for more. OMP_NUM_THREADS may ask PyTorch for more.
 
-    A thread of OpenCV would also still run while the process exits.
+    OpenCV does not read it; a thread of OpenCV would keep workers from being forks, and still run while the process
+    exits.
     """
     import cv2  # both after the arguments were checked
     import torch
 
     if "OMP_NUM_THREADS" not in os.environ:
         torch.set_num_threads(1)
-        cv2.setNumThreads(1)
+    cv2.setNumThreads(1)
 
 
 def load_command(name: str) -> tuple[str, Callable[..., None], Callable[..., int]]:

@@ -274,7 +274,10 @@ class GlobalMapper:
     def _learned(
         self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]], before: Run | None
     ) -> LearnedPairs | None:
-        """Views and pairs with learned features around links; None if not asked for, or if nothing holds."""
+        """Views and pairs with learned features around links; None if not asked for, or if nothing holds.
+
+        Their keypoints are corrected for a rolling shutter by the run `before`, as those of the views are.
+        """
         config = learned_config(self.config)
         if config is None or not links:
             return None
@@ -285,7 +288,7 @@ class GlobalMapper:
             self.progress("learned features", len(found), len(views))
             view = next(own.views([views[row].index]))
             if view is not None:
-                (found[row],) = [view] if before is None else before.at_middle_row([view])
+                found[row] = view if before is None else before.at_middle_row([view])[0]
         matcher = PairMatcher(
             [found.get(row, view) for row, view in enumerate(views)], self.camera, own.matcher, own.scaled
         )
