@@ -28,9 +28,9 @@ FIRST_KEYFRAMES, MAX_KEYFRAMES, GROWTH = 6, 100, 1.3
 """Keyframes of the map at the first estimate and the last one, and their ratio from one to the next. Tried from 6 to 8
 and from 1.2 to 1.5: with later ones, more frames of kitti07 have the error of the given camera."""
 ESTIMATE_FRAMES, ADJUST_FRAMES = 15, 8
-"""Frames after which an estimate is taken, or as many as the map has keyframes, and after which the map that is adjusted
-by it is: they take .15 to 1.5 s and .05 to .3 s of another process, and frames at full speed 15 to 25 ms. Tried from 3 and 2 on: the errors of kitti07 and
-tsukuba change by up to a third, without order."""
+"""Frames after which an estimate is taken, at least as many as the map has keyframes, and after which the map that is
+adjusted by it is: they take .15 to 1.5 s and .05 to .3 s of another process, frames at full speed 15 to 25 ms. Tried
+from 3 and 2 on: the errors of kitti07 and tsukuba change by up to a third, without order."""
 TOLERANCE = 1e-4
 """Predicted relative reduction of the cost that ends the adjustment of an estimate. Tried from 1e-8 to 1e-3 on 45, 77
 and 100 keyframes of redkitchen: the camera is the same to .01 px, and 1e-4 takes half to three quarters of the time of
