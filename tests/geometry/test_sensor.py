@@ -139,15 +139,14 @@ def test_gradients(generator: torch.Generator) -> None:
 
 
 def test_components_share_the_model_that_is_used_last() -> None:
-    """Another camera keeps the shutter, and undistortion follows."""
+    """The undistortion follows the camera."""
     shared = SharedCamera(CAMERA)
     assert shared.model == SensorModel(CAMERA)
     shared.use(ROLLING)
     assert shared.model is ROLLING
     other = CAMERA.with_params(1.1 * CAMERA.params)
     undistortion = shared.undistortion
-    shared.replace(other)
-    assert shared.model.readout is ROLLING.readout
+    shared.use(SensorModel(other, ROLLING.readout))
     assert shared.current is shared.model.camera is other
     assert shared.undistortion is not undistortion
     assert shared.undistortion.camera is other

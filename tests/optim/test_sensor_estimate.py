@@ -12,11 +12,10 @@ from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim import GRAPH_OPTIONS
-from torchslam.optim.run_graph import RunGraph, keyframe_problem, solve_graph
+from torchslam.optim.run_graph import RunGraph, solve_graph
 from torchslam.optim.sensor_estimate import (
     SensorEstimate,
     SensorPrior,
-    adjusted,
     estimate_sensor,
     keyframe_evidence,
 )
@@ -161,14 +160,3 @@ def test_evidence_is_of_the_keyframes_at_their_own_minimum() -> None:
     torch.testing.assert_close(
         other.estimate().camera.params[:2], evidence.estimate().camera.params[:2], rtol=1e-3, atol=0.0
     )
-
-
-def test_an_adjusted_problem_is_at_its_minimum() -> None:
-    problem = keyframe_problem(graph(factor=1.04), 0)[3]
-    fixed = adjusted(problem, OPTIONS)
-    assert fixed.camera is problem.camera
-    free = adjusted(problem, OPTIONS, prior(1.04).camera)
-    assert focal_error(free.camera) < focal_error(fixed.camera) / 2
-    assert free.camera_prior is None
-    again = adjusted(fixed, OPTIONS)
-    torch.testing.assert_close(again.T_cw, fixed.T_cw, rtol=0.0, atol=1e-5)

@@ -1,12 +1,12 @@
 """The sensor model: what turns a point of the scene into a keypoint.
 
-Camera, readout of the shutter and noise of the keypoints are one value, replaced as a whole. A frame asks it once what
-its keypoints mean (`SensorModel.at_middle_row`); from then on every stage works with the keypoints of a global shutter.
+Camera and readout of the shutter are one value, replaced as a whole. The keypoints of a frame are corrected by it once
+(`SensorModel.at_middle_row`); from then on every stage works with the keypoints of a global shutter.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
@@ -20,7 +20,7 @@ from torchslam.geometry.undistorted import Undistortion
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Camera, shutter and noise of the images of a recording.
+    """Camera and shutter of the images of a recording.
 
     Attributes:
         camera: of all frames.
@@ -72,7 +72,3 @@ class SharedCamera:
     def use(self, model: SensorModel) -> None:
         """Use another sensor model from now on."""
         self.model, self.undistortion = model, Undistortion(model.camera)
-
-    def replace(self, camera: Camera) -> None:
-        """Use another camera with the same shutter from now on."""
-        self.use(replace(self.model, camera=camera))

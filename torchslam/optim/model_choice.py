@@ -2,7 +2,7 @@
 
 Both are estimated without a held-out share of the observations. For each held-out one, the logarithms of its likelihood
 under either explanation are compared. Errors of neighbors are alike, so the sum counts with the scatter of stretches of
-the recording, not of single observations; few stretches tell their scatter badly, which Student's t accounts for.
+the recording, not of single observations; the scatter of few stretches is uncertain, which Student's t accounts for.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from jaxtyping import Float, Shaped
 from torch import Tensor
 
 STRETCHES = 10
-"""Stretches of a recording whose gains are compared. Tried from 6 to 20: the decisions of the trials are the same."""
+"""Stretches of a recording whose gains are compared. Tried at this value only."""
 LEAST_GAIN, LEAST_UPDATE = 30.0, 5.0
 """Logarithm of the likelihood ratio from which on a change of a model with few parameters is believed: of a given
 model, and of a guess or an estimate from fewer observations. In the tuning half of experiments/decisions, global

@@ -9,13 +9,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import torch
-
-from torchslam.geometry import Camera, SensorModel
+from torchslam.geometry import SensorModel
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim._core.options import SolverOptions
-from torchslam.optim.bundle._api import BundleProblem, solve_bundle
+from torchslam.optim.bundle._api import solve_bundle
 from torchslam.optim.camera_evidence import CameraEvidence, camera_evidence
 from torchslam.optim.rolling_shutter import find_rolling_shutter, readout_by
 from torchslam.optim.run_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem
@@ -114,18 +112,7 @@ def keyframe_evidence(
     """
     graph = graph.global_shutter()
     keyframes, *_, problem = keyframe_problem(graph, graph.main_submap)
-    problem = replace(problem, camera=with_radial_terms(problem.camera))
-    found = adjusted(problem, options, given)
-    return camera_evidence(found, given, options, graph.timestamps[keyframes])
-
-
-def adjusted(
-    problem: BundleProblem, options: SolverOptions, given: CameraMeasurement | None = None
-) -> BundleProblem:
-    """The problem at its minimum; given: the camera with its error, where it is free."""
-    free: bool | torch.Tensor = False
-    if given is not None:
-        problem, free = replace(problem, camera_prior=camera_prior(given)), given.directions
-    found = solve_bundle(problem, free_camera=free, check=False, options=options)
-    camera: Camera = found.camera if given is not None else problem.camera
-    return replace(problem, T_cw=found.T_cw, points_w=found.points_w, camera=camera, camera_prior=None)
+    problem = replace(problem, camera=with_radial_terms(problem.camera), camera_prior=camera_prior(given))
+    found = solve_bundle(problem, free_camera=given.directions, check=False, options=options)
+    at = replace(problem, T_cw=found.T_cw, points_w=found.points_w, camera=found.camera, camera_prior=None)
+    return camera_evidence(at, given, options, graph.timestamps[keyframes])
