@@ -7,6 +7,7 @@ localized, 4 some sequences of a batch failed, 130 and 143 ended by Ctrl-C and b
 from __future__ import annotations
 
 import argparse
+import gc
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -76,6 +77,7 @@ def console() -> NoReturn:
     A stream that has gone away may hold its thread in OpenCV for half a minute. Python's own way to exit would end that
     thread from within, which aborts the process, so then nothing but the buffers is left to be done.
     """
+    gc.disable()  # until `main` has imported what it needs
     status = main()
     live = sys.modules.get("torchslam.data.readers.live")  # imports torch
     if live is not None and not live.close_sources():
@@ -92,6 +94,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else arguments
     try:
         options = _parse(arguments)
+        if not gc.isenabled():
+            # Imports leave 200,000 objects that stay: each search for garbage among them takes a tenth of a second.
+            gc.freeze()
+            gc.enable()
         if options.command not in WITHOUT_THREADS:
             _compute_in_one_thread()
         return options.execute(options)

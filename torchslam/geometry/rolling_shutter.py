@@ -18,7 +18,14 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import se3_exp, se3_inverse, se3_log, so3_exp, transform
+from torchslam.geometry.lie import (
+    se3_exp,
+    se3_exp_transform,
+    se3_inverse,
+    se3_log,
+    so3_exp,
+    transform,
+)
 from torchslam.geometry.precision import full_precision, without_autocast
 
 MAX_GAP = 1.5
@@ -136,8 +143,8 @@ def global_shutter_pixels(
     """
     fractions = row_fractions(pixels, camera.height)
     points_c = transform(T_cw, points_w[..., None, :])[..., 0, :]
-    motions = se3_exp((fractions * readout)[..., None] * velocities)
-    at_row, is_valid = camera.project(transform(motions, points_c[..., None, :])[..., 0, :])
+    points_row = se3_exp_transform((fractions * readout)[..., None] * velocities, points_c)
+    at_row, is_valid = camera.project(points_row)
     at_middle, is_valid_too = camera.project(points_c)
     return pixels + torch.where((is_valid & is_valid_too)[..., None], at_middle - at_row, 0.0)
 
@@ -161,6 +168,7 @@ def frame_velocities(
     T_cw: Float[Tensor, "K 4 4"],
     timestamps: Float[Tensor, " K"],
     recordings: Int[Tensor, " K"] | None = None,
+    frames: Int[Tensor, " R"] | None = None,
 ) -> tuple[Float[Tensor, "K 6"], Bool[Tensor, " K"]]:
     """The velocity of each frame from the poses of the frames before and after, a left perturbation per second.
 
@@ -171,6 +179,7 @@ def frame_velocities(
         T_cw: poses, in any order.
         timestamps: seconds.
         recordings: frames with different numbers are no neighbors; one recording if omitted.
+        frames: rows whose velocities are computed, the others are zero; all if omitted.
 
     Returns:
         Velocities, zero without neighbors, and which frames have neighbors on both sides.
@@ -187,7 +196,10 @@ def frame_velocities(
     has_before, has_after = (torch.nn.functional.pad(follows, ends) for ends in ((1, 0), (0, 1)))
     velocities = torch.zeros_like(T_cw[:, 0, :1]).expand(len(T_cw), 6)
     is_central = torch.zeros_like(has_before).index_copy(0, order, has_before & has_after)
-    place = (has_before | has_after).nonzero()[:, 0]
+    is_wanted = has_before | has_after
+    if frames is not None:
+        is_wanted = is_wanted & torch.zeros_like(is_wanted).index_fill(0, frames, True)[order]
+    place = is_wanted.nonzero()[:, 0]
     before, after = order[place - has_before[place].long()], order[place + has_after[place].long()]
     elapsed = (timestamps[after] - timestamps[before]).to(T_cw.dtype)
     steps = se3_log(T_cw[after] @ se3_inverse(T_cw[before])) / elapsed[:, None]

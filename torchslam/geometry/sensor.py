@@ -13,7 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import se3_exp, transform
+from torchslam.geometry.lie import se3_exp_transform
 from torchslam.geometry.rolling_shutter import Readout, row_fractions
 from torchslam.geometry.undistorted import Undistortion
 
@@ -35,6 +35,7 @@ class SensorModel:
         detected: Float[Tensor, "K N 2"],
         velocities: Float[Tensor, "K 6"],
         depths: Float[Tensor, "K N"],
+        rays: Float[Tensor, "K N 2"] | None = None,
     ) -> Float[Tensor, "K N 2"]:
         """Where a global shutter would have seen the keypoints of K frames, while their middle rows were exposed.
 
@@ -42,14 +43,15 @@ class SensorModel:
             detected: pixels at which keypoints were found.
             velocities: left perturbations of the poses of the frames per second, translation first.
             depths: of the points that the keypoints see, along the optical axis.
+            rays: x/z and y/z of the keypoints; computed if None.
         """
         if self.readout is None:
             return detected
-        rays = self.camera.normalize(detected)
+        rays = self.camera.normalize(detected) if rays is None else rays
         points_row = depths[..., None] * torch.cat((rays, torch.ones_like(rays[..., :1])), dim=-1)
         elapsed = row_fractions(detected, self.camera.height) * self.readout.seconds.to(rays)
-        motions = se3_exp(-elapsed[..., None] * velocities[:, None])
-        pixels, is_valid = self.camera.project(transform(motions, points_row[..., None, :])[..., 0, :])
+        points_c = se3_exp_transform(-elapsed[..., None] * velocities[:, None], points_row)
+        pixels, is_valid = self.camera.project(points_c)
         return torch.where(is_valid[..., None], pixels, detected)
 
 
@@ -69,6 +71,14 @@ class SharedCamera:
         """The camera of the model."""
         return self.model.camera
 
-    def use(self, model: SensorModel) -> None:
-        """Use another sensor model from now on."""
-        self.model, self.undistortion = model, Undistortion(model.camera)
+    def use(self, model: SensorModel, undistortion: Undistortion | None = None) -> None:
+        """Use another sensor model from now on; `undistortion`: of its camera, where it was computed elsewhere."""
+        self.model, self.undistortion = model, undistortion or Undistortion(model.camera)
+
+    def at_middle_row(
+        self, detected: Float[Tensor, "N 2"], velocity: Float[Tensor, " 6"], depth: Float[Tensor, ""]
+    ) -> Float[Tensor, "N 2"]:
+        """As `SensorModel.at_middle_row`, of one frame and at one depth."""
+        rays = self.undistortion.normalize(detected)[None]
+        depths = depth.expand(1, len(detected))
+        return self.model.at_middle_row(detected[None], velocity[None], depths, rays)[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Self
 
 import torch
 from jaxtyping import Float, Int
@@ -82,10 +83,11 @@ class Undistortion:
         off = torch.addcmul(pixels.mT, at, self._step, value=-1)
         return UndistortedKeypoints(xy + (inverse.view(2, 2, -1) * off[:, None]).sum(0), slope.view(2, 2, -1))
 
-    def prepare(self) -> None:
+    def prepare(self) -> Self:
         """Make the table now rather than on first use."""
         if self.camera.model != "pinhole":
             _ = self._table
+        return self
 
     def normalize(self, pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"]:
         """As `Camera.normalize`, from the table."""

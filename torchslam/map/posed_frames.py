@@ -256,11 +256,11 @@ class PosedFrames:
         if sensor.readout is None:
             table["keypoints"][rows] = detected
             return
-        velocities, _ = frame_velocities(
-            self.T_cw(slam_map), self.frames["timestamp"], self.frames["session"]
-        )
         keys, order = self.keys.sort()
         frame = order[torch.searchsorted(keys, slam_map.keys[rows]).clamp_max(len(keys) - 1)]
+        velocities, _ = frame_velocities(
+            self.T_cw(slam_map), self.frames["timestamp"], self.frames["session"], frame
+        )
         is_posed = self.keys[frame] == slam_map.keys[rows]
         velocities = torch.where(is_posed[:, None], velocities[frame], 0.0)
         depths = transform(slam_map.T_cw[rows], slam_map.positions_w[ids.clamp_min(0)])[..., 2]

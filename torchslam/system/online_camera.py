@@ -19,6 +19,7 @@ from torchslam.config import CameraConfig, Config
 from torchslam.geometry import Camera, SensorModel, SharedCamera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
+from torchslam.geometry.undistorted import Undistortion
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import MAP_OPTIONS, AsyncBundleAdjustment, Solver, adjust_all, solve_here
 from torchslam.optim.rolling_shutter import ONLINE_FRAMES
@@ -150,21 +151,27 @@ class OnlineCamera:
         graph = submap.posed_frames.graph(submap.map, model.camera, readout=model.readout)
         options = MAP_OPTIONS.replace(iterations=self.settings.global_iterations, tolerance=TOLERANCE)
         result = self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES)
-        self._pending = _Estimate(submap, frame + max(ESTIMATE_FRAMES, keyframes), result)
+        self._pending = _Estimate(submap, frame + max(ESTIMATE_FRAMES, 3 * keyframes // 2), result)
 
     def _take(self, submap: Submap, found: SensorEstimate, frame: int) -> None:
         """Have the map adjusted by another model."""
         if found.has_other_readout:
-            self.camera.use(SensorModel(self.camera.current, found.sensor.readout))
+            self.camera.use(SensorModel(self.camera.current, found.sensor.readout), self.camera.undistortion)
             submap.correct_keyframes(self.camera.model)
         if found.is_change:
-            self.adjustment.request_whole(
-                submap.map, found.sensor.camera, frame + ADJUST_FRAMES, partial(self._use, submap, found)
+            undistortion = self.camera.undistortion
+            prepared = (
+                self.solver(Undistortion(found.sensor.camera).prepare)
+                if found.has_other_camera
+                else lambda: undistortion
             )
+            due = frame + max(ADJUST_FRAMES, submap.map.num_keyframes // 4)
+            use = partial(self._use, submap, found, prepared)
+            self.adjustment.request_whole(submap.map, found.sensor.camera, due, use)
 
-    def _use(self, submap: Submap, found: SensorEstimate) -> None:
+    def _use(self, submap: Submap, found: SensorEstimate, prepared: Callable[[], Undistortion]) -> None:
         """Use a model by which a submap was just adjusted."""
-        self.camera.use(found.sensor)
+        self.camera.use(found.sensor, prepared())
         self.changes.append(
             CameraChange(_newest_frame(submap), found.sensor.camera, found.departure, found.sensor.readout)
         )

@@ -88,12 +88,9 @@ class StateMachine:
 
         Static overlays are found in the image as it is.
         """
-        correct = self.context.tracker.at_middle_row
-        return replace(
-            filtered,
-            view=correct(submap, filtered.view),
-            without_overlays=correct(submap, filtered.without_overlays),
-        )
+        view = self.context.tracker.at_middle_row(submap, filtered.view)
+        without_overlays = replace(filtered.without_overlays, keypoints=view.keypoints)
+        return replace(filtered, view=view, without_overlays=without_overlays)
 
     def confirm_map(self) -> None:
         """Confirm a provisional map as it is, with the frames that are held back."""

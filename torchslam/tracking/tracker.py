@@ -132,11 +132,8 @@ class Tracker:
         depths = depths[depths > 0]
         if len(depths) == 0:
             return view
-        velocity = se3_log(tracking.velocity)[None] / tracking.interval
-        depth = depths.median().expand(1, len(view.detected))
-        return replace(
-            view, keypoints=self.camera.model.at_middle_row(view.detected[None], velocity, depth)[0]
-        )
+        velocity = se3_log(tracking.velocity) / tracking.interval
+        return replace(view, keypoints=self.camera.at_middle_row(view.detected, velocity, depths.median()))
 
     def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
         """Sets of matches by ever wider search: near the predicted pixels, in a wider window, in the whole image."""
