@@ -33,6 +33,9 @@ from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indic
 
 LOCAL_TOLERANCE = 1e-4
 """Predicted relative reduction of the cost that ends a local adjustment; the next keyframe moves the map by more."""
+WHOLE_TOLERANCE = 1e-2
+"""The same for the whole map by another camera, which the local adjustments refine. Of six such maps of redkitchen, 14
+to 79 keyframes, the poses are then at 73 to 100 % of their way to those by 1e-4, in 40 to 70 % of the time."""
 HUBER = CHI_SQUARE_95**0.5
 """Whitened residual at which the kernel leaves its quadratic part: the 95 % quantile for two dimensions, 2.45."""
 MAP_OPTIONS = BUNDLE_OPTIONS.replace(kernel="huber", scale=HUBER, backward="detached")
@@ -93,7 +96,7 @@ def solve_whole(problem: BundleProblem, iterations: int) -> Solution:
     With it go the frames in between, and the poses that follow.
     """
     found = solve_bundle(
-        problem, check=False, options=MAP_OPTIONS.replace(iterations=iterations, tolerance=LOCAL_TOLERANCE)
+        problem, check=False, options=MAP_OPTIONS.replace(iterations=iterations, tolerance=WHOLE_TOLERANCE)
     )
     return in_place_of(problem.T_cw, found.T_cw, found.points_w)
 

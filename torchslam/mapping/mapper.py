@@ -27,7 +27,8 @@ RECENT_KEYFRAMES = 3
 MIN_POSE_SUPPORT = 0.5
 """Ratio of a frame's matches that must be inliers for the frame to support a new map: a majority."""
 LIVE_MIN_OVERLAP = 0.4
-"""Overlap above which keyframes wait for as many frames as a live camera is ahead, since late frames are dropped.
+"""Overlap above which keyframes wait for as many frames as a live camera is ahead, since late frames are dropped, and
+for an adjustment of the whole map.
 
 Half of the default `min_overlap`, so that tracking stays safe."""
 
@@ -198,6 +199,11 @@ class MapInitializer:
         return estimate.inliers > MIN_POSE_SUPPORT * estimate.matches
 
 
+def overlap_with_reference(estimate: PoseEstimate, submap: Submap) -> float:
+    """Observed points of a tracked frame as a ratio of those of its reference keyframe."""
+    return estimate.inliers / max(submap.tracking.reference_size, 1)
+
+
 def keyframe_reason(
     view: FrameFeatures, estimate: PoseEstimate, submap: Submap, settings: KeyframesConfig
 ) -> Explanation | None:
@@ -209,7 +215,7 @@ def keyframe_reason(
     slam_map, tracking = submap.map, submap.tracking
     newest = slam_map.num_keyframes - 1
     age = abs(view.index - int(slam_map.keyframes["frame_index"][newest]))
-    overlap = estimate.inliers / max(tracking.reference_size, 1)
+    overlap = overlap_with_reference(estimate, submap)
     if age < max(1, settings.min_interval) or (age < view.backlog and overlap > LIVE_MIN_OVERLAP):
         return None
     around = torch.cat([tracking.local_keyframes, tracking.local_keyframes.new_tensor([newest])])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from torchslam.map.atlas import Submap
 from torchslam.mapping.local_bundle import ApplyAt
-from torchslam.mapping.mapper import keyframe_reason
+from torchslam.mapping.mapper import LIVE_MIN_OVERLAP, keyframe_reason, overlap_with_reference
 from torchslam.system.frame_log import HeldFrame
 from torchslam.system.savepoint import Savepoint
 from torchslam.system.session import SystemContext
@@ -30,13 +30,15 @@ class LocalMapping:
     ) -> Explanation | None:
         """Add a frame with a certain pose; return why it became a keyframe, or None.
 
-        While an adjustment is pending there is no other keyframe: it is applied after this frame instead.
+        While an adjustment is pending there is no other keyframe: it is applied after this frame instead. That of the
+        whole map takes longer: it is waited for as long as enough of the map is seen.
         """
         context = self.context
         context.tracker.count_visible(submap.map, estimate)
         reason = self._keyframe_reason(submap, view, estimate)
         if reason and self.adjustment.is_pending:
-            self.adjustment.set_deadline(view.index)
+            if not self.adjustment.is_whole or overlap_with_reference(estimate, submap) <= LIVE_MIN_OVERLAP:
+                self.adjustment.set_deadline(view.index)
             reason = None
         if reason:
             keyframe = context.mapper.insert(submap.map, view, estimate, apply_at)
