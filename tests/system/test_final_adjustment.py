@@ -25,7 +25,7 @@ def unadjusted() -> Run:
 
 def adjusted(run: Run, settled: bool) -> Atlas:
     atlas = Atlas(run.camera.params, deepcopy(run.submaps))
-    FinalAdjustment(run.camera, load_config(None, SETTINGS), None).adjust(atlas, 0, settled=settled)
+    FinalAdjustment(run.sensor, load_config(None, SETTINGS), None).adjust(atlas, 0, settled=settled)
     return atlas
 
 

@@ -401,8 +401,7 @@ class GlobalMapper:
         mapped = {view.index: view for view in views}
         frames = range(len(self.sequence)) if frames is None else frames
         results = poser.pose(submap, self._all_views(frames, mapped), given_cw)
-        final = FinalAdjustment(self.camera, self.config, self.given)
-        final.camera = found.camera
+        final = FinalAdjustment(SensorModel(found.camera, self.readout), self.config, self.given)
         if not keep:
             final.adjust(
                 atlas, 0, lambda done, most: self.progress("final adjustment", done, most), settled=True

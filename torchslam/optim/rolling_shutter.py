@@ -177,9 +177,8 @@ def find_rolling_shutter(
         return None
     frames = frames[torch.argsort(graph.timestamps[frames], stable=True)]
     interval = float(graph.timestamps[largest].sort().values.diff().median())
-    velocities, raw = interval * velocities, graph.pixels
+    velocities = interval * velocities
     start = 0.0 if graph.readout is None else float(graph.readout.seconds)
-    graph = graph.global_shutter()
     count = min(len(frames), max_frames)
     frames = frames[torch.arange(count, device=frames.device) * len(frames) // count]
     rank = torch.full_like(graph.submap, -1)
@@ -194,12 +193,13 @@ def find_rolling_shutter(
     pixels, valid, J_points, J_camera = graph.camera.project_with_jacobians(points_c)
     if 2 * int(valid.sum()) <= 6 * count + 3 * len(points) + J_camera.shape[-1]:
         return None
-    W = _robust_whitening(graph, rows, pixels, valid)
-    residuals = W @ (graph.pixels[rows] - pixels)[..., None]
+    errors = graph.global_shutter_pixels(rows) - pixels
+    W = _robust_whitening(graph.weights[rows], errors, valid)
+    residuals = W @ errors[..., None]
     J_points = W @ J_points
     J_poses = torch.cat((J_points, -J_points @ skew(points_c)), dim=-1)
     size = pixels.new_tensor(graph.camera.size)
-    column, row = ((raw[rows] + 0.5) / size - 0.5)[..., None, None].unbind(1)  # (O, 1, 1)
+    column, row = ((graph.pixels[rows] + 0.5) / size - 0.5)[..., None, None].unbind(1)  # (O, 1, 1)
     flow = J_poses @ velocities[frames][frame][..., None]
     common = torch.cat((W @ J_camera, column * flow), dim=-1)
     others = [
@@ -240,14 +240,13 @@ def _shared_rows(graph: ObservationGraph, rank: Int[Tensor, " K"]) -> Int[Tensor
 
 
 def _robust_whitening(
-    graph: ObservationGraph, rows: Int[Tensor, " R"], pixels: Float[Tensor, "R 2"], valid: Bool[Tensor, " R"]
+    weights: Float[Tensor, "R *information"], errors: Float[Tensor, "R 2"], valid: Bool[Tensor, " R"]
 ) -> Float[Tensor, "R 2 2"]:
     """The square roots of the weights, smaller for large residuals as in the adjustment, zero where not `valid`."""
-    weights = graph.weights[rows]
     if weights.ndim == 1:
         weights = weights[:, None, None] * torch.eye(2, dtype=weights.dtype, device=weights.device)
     W = whitening(weights)
-    squared = (W @ (graph.pixels[rows] - pixels)[..., None]).square().sum((1, 2))
+    squared = (W @ errors[..., None]).square().sum((1, 2))
     scale = squared.new_tensor(GRAPH_OPTIONS.scale)
     factors = robustify(squared, GRAPH_OPTIONS.kernel, scale).weight.sqrt()
     return W * torch.where(valid, factors, 0.0)[:, None, None]

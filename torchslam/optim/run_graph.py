@@ -141,16 +141,23 @@ class ObservationGraph:
         """The graph of a global shutter, keypoints corrected by the poses, points and camera; itself if it is one."""
         if self.readout is None:
             return self
+        rows = torch.arange(len(self.pixels), device=self.pixels.device)
+        return replace(self, pixels=self.global_shutter_pixels(rows), readout=None)
+
+    def global_shutter_pixels(self, rows: Int[Tensor, " R"]) -> Float[Tensor, "R 2"]:
+        """The keypoints of some observations, corrected as in `global_shutter`."""
+        if self.readout is None:
+            return self.pixels[rows]
+        frame = self.frame_index[rows]
         velocities, _ = frame_velocities(self.T_cw, self.timestamps, self.recordings)
-        pixels = global_shutter_pixels(
-            self.pixels,
-            self.T_cw[self.frame_index],
-            velocities[self.frame_index],
-            self.points_w[self.point_index],
+        return global_shutter_pixels(
+            self.pixels[rows],
+            self.T_cw[frame],
+            velocities[frame],
+            self.points_w[self.point_index[rows]],
             self.camera,
             self.readout.seconds.to(self.pixels),
         )
-        return replace(self, pixels=pixels, readout=None)
 
     def save(self, path: str | Path) -> None:
         """Write to a safetensors file."""

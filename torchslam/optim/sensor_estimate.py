@@ -15,11 +15,12 @@ from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim._core.options import SolverOptions
 from torchslam.optim.bundle._api import solve_bundle
 from torchslam.optim.camera_evidence import CameraEvidence, camera_evidence
-from torchslam.optim.rolling_shutter import find_rolling_shutter, readout_by
+from torchslam.optim.rolling_shutter import MAX_FRAMES, RollingShutter, find_rolling_shutter, readout_by
 from torchslam.optim.run_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem
 
 READOUT_STEPS = 2
-"""Steps of the readout, each with the keypoints corrected by the one before: the second changes it by a thirtieth."""
+"""Gauss-Newton steps of the readout, each with the keypoints corrected by the one before: the second changes it by a
+thirtieth."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +45,14 @@ class SensorEstimate:
         has_other_camera: whether its camera is another one.
         has_other_readout: whether its readout is another one.
         departure: standard errors by which the camera in use was off; 0 where the graph does not determine it.
+        shutter: the residuals as functions of the readout; None where that was not tested, or could not be.
     """
 
     sensor: SensorModel
     has_other_camera: bool
     has_other_readout: bool
     departure: float
+    shutter: RollingShutter | None = None
 
     @property
     def is_change(self) -> bool:
@@ -58,7 +61,11 @@ class SensorEstimate:
 
 
 def estimate_sensor(
-    graph: RunGraph, prior: SensorPrior, options: SolverOptions, readout_frames: int
+    graph: RunGraph,
+    prior: SensorPrior,
+    options: SolverOptions,
+    readout_frames: int = MAX_FRAMES,
+    for_shaking: bool = False,
 ) -> SensorEstimate:
     """Estimate the readout and the camera of a graph of one submap. Detached.
 
@@ -67,27 +74,29 @@ def estimate_sensor(
         prior: what is known without it.
         options: of the adjustment of its keyframes.
         readout_frames: most frames from which the readout is estimated.
+        for_shaking: as in `find_rolling_shutter`.
     """
-    readout = graph.readout
+    readout, shutter = graph.readout, None
     if prior.readout.is_sought or prior.readout.is_given:
         for _ in range(READOUT_STEPS):
-            found = find_rolling_shutter(replace(graph, readout=readout), readout_frames, for_shaking=False)
-            readout = readout_by(found, prior.readout) or readout
+            shutter = find_rolling_shutter(replace(graph, readout=readout), readout_frames, for_shaking)
+            readout = readout_by(shutter, prior.readout)
             if readout is None:
                 break
-    has_other_readout = _differs(readout, graph.readout)
-    sensor = SensorModel(graph.camera, readout if has_other_readout else graph.readout)
+    held = SensorEstimate(
+        SensorModel(graph.camera, readout), False, _differs(readout, graph.readout), 0.0, shutter
+    )
     # A camera is estimated once the map is adjusted by the readout: before, its poses are those of a bent image.
-    if prior.camera is None or (has_other_readout and graph.readout is None):
-        return SensorEstimate(sensor, False, has_other_readout, 0.0)
-    evidence = keyframe_evidence(replace(graph, readout=sensor.readout), prior.camera, options)
+    if prior.camera is None or (readout is not None and graph.readout is None):
+        return held
+    evidence = keyframe_evidence(replace(graph, readout=readout), prior.camera, options)
     if evidence is None:
-        return SensorEstimate(sensor, False, has_other_readout, 0.0)
+        return held
     estimate = evidence.estimate()
-    departure = estimate.departure_from(graph.camera)
+    held = replace(held, departure=estimate.departure_from(graph.camera))
     if not evidence.is_better_than(graph.camera):
-        return SensorEstimate(sensor, False, has_other_readout, departure)
-    return SensorEstimate(replace(sensor, camera=estimate.camera), True, has_other_readout, departure)
+        return held
+    return replace(held, sensor=replace(held.sensor, camera=estimate.camera), has_other_camera=True)
 
 
 def _differs(readout: Readout | None, before: Readout | None) -> bool:

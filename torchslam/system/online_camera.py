@@ -155,16 +155,13 @@ class OnlineCamera:
 
     def _take(self, submap: Submap, found: SensorEstimate, frame: int) -> None:
         """Have the map adjusted by another model."""
-        if found.has_other_readout:
+        if found.is_change:
             self.camera.use(SensorModel(self.camera.current, found.sensor.readout), self.camera.undistortion)
             submap.correct_keyframes(self.camera.model)
-        if found.is_change:
             undistortion = self.camera.undistortion
-            prepared = (
-                self.solver(Undistortion(found.sensor.camera).prepare)
-                if found.has_other_camera
-                else lambda: undistortion
-            )
+            if found.has_other_camera:
+                undistortion = Undistortion(found.sensor.camera)
+            prepared = self.adjustment.solver(undistortion.prepare)
             due = frame + max(ADJUST_FRAMES, submap.map.num_keyframes // 4)
             use = partial(self._use, submap, found, prepared)
             self.adjustment.request_whole(submap.map, found.sensor.camera, due, use)

@@ -26,7 +26,7 @@ from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
 from torchslam.optim.camera_evidence import graph_evidence
-from torchslam.optim.rolling_shutter import RollingShutter, find_rolling_shutter, readout_by
+from torchslam.optim.rolling_shutter import RollingShutter
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
     GraphSolution,
@@ -35,6 +35,7 @@ from torchslam.optim.run_graph import (
     keyframe_problem,
     solve_graph,
 )
+from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor
 from torchslam.system.front_end import source
 from torchslam.system.online_camera import CameraChange, OnlineCamera, given_readout
 from torchslam.system.session import Session
@@ -299,7 +300,7 @@ def finish(
     """Adjust all maps if so configured, and gather what the run leaves behind; `adjusting` as in `run_sequence`."""
     with torch.inference_mode():
         slam.finalize()
-    final = FinalAdjustment(slam.shared_camera.current, slam.config, slam.online_camera.given)
+    final = FinalAdjustment(slam.shared_camera.model, slam.config, slam.online_camera.given)
     try:
         if slam.session.mapping:
             final.adjust(slam.session.atlas, slam.session.number, adjusting)
@@ -340,8 +341,6 @@ lower the cost from 1e-8 to 1e-10 of it, by a hundredth of what tells two poses 
 MOST_JOINT_FRAMES = 600
 """Keyframes of which the joint covariance is computed for their own ones: its four matrices take .4 GB then, and grow
 with the square. Maps of more keep the covariances of the normal matrix. Tried with 4 to 152 keyframes."""
-READOUT_ROUNDS = 2
-"""Steps of the readout: the second one changes it by a thirtieth, a third one by less than a hundredth."""
 LEAST_RATIO = 0.3
 """Least share of the observations of a frame that are near; else its pose may be wrong, and it keeps them all."""
 
@@ -358,14 +357,19 @@ class FinalAdjustment:
         shutter: what the residuals say of it; None where that was not tested.
     """
 
-    def __init__(self, camera: Camera, config: Config, measured: CameraMeasurement | None) -> None:
-        """Create the adjustment; `measured`: the given camera with its error, None if it is exact."""
-        self.camera, self.settings = camera, config.bundle_adjustment
+    def __init__(self, sensor: SensorModel, config: Config, measured: CameraMeasurement | None) -> None:
+        """Create the adjustment.
+
+        Args:
+            sensor: of the maps as they are.
+            config: the configuration.
+            measured: the given camera with its error; None if it is exact.
+        """
+        self.camera, self.readout, self.settings = sensor.camera, sensor.readout, config.bundle_adjustment
         self._measured = measured
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
         self._known = given_readout(config.camera)
-        self.readout: Readout | None = None
         self.shutter: RollingShutter | None = None
 
     def adjust(
@@ -400,12 +404,14 @@ class FinalAdjustment:
             camera = camera if given is None else with_radial_terms(camera)
             camera = adjust_all(submap.map, camera, self.settings, progress, given, ROUGH.tolerance)
         self.camera, self.given = camera, given or self.given
-        submap.posed_frames.remove_outliers(submap.map, camera)
+        submap.posed_frames.remove_outliers(submap.map, camera, readout=self.readout)
         if not settled:
             self.camera = camera = self._solve(submap, camera, given, progress, ROUGH).camera
         if is_main:
             # Before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
-            self.camera = camera = self._find_readout(submap, camera, given, progress)
+            graph = submap.posed_frames.graph(submap.map, camera, readout=self.readout)
+            found = estimate_sensor(graph, SensorPrior(None, self._known), FINAL, for_shaking=True)
+            self.readout, self.shutter = found.sensor.readout, found.shutter
         submap.correct_keyframes(SensorModel(camera, self.readout))
         if not settled:
             # Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map
@@ -423,11 +429,11 @@ class FinalAdjustment:
         if given is not None:
             evidence = graph_evidence(self._graph(submap, camera), given)
         if evidence is not None and given is not None:
-            found = evidence.estimate()
-            measured, is_better = found.measured, evidence.is_better_than(given.camera)
+            estimate = evidence.estimate()
+            measured, is_better = estimate.measured, evidence.is_better_than(given.camera)
             # Else the given camera predicts as well, and is held.
             camera, given = (
-                (found.prior.nearest(camera), found.prior)
+                (estimate.prior.nearest(camera), estimate.prior)
                 if is_better
                 else (given.camera, replace(given, directions=given.directions[:, :0]))
             )
@@ -450,28 +456,6 @@ class FinalAdjustment:
             found = found._replace(frames=joint.diagonal(dim1=0, dim2=2).movedim(-1, 0))
         submap.map.set_covariances(keyframes, graph.point_ids, found)
 
-    def _find_readout(
-        self,
-        submap: Submap,
-        camera: Camera,
-        given: CameraMeasurement | None,
-        progress: Progress | None,
-    ) -> Camera:
-        """Find the readout of a rolling shutter, where there is one, and solve with it; return the camera.
-
-        Each round is a Gauss-Newton step of the readout, with everything else eliminated, and one of the solution.
-        """
-        if not (self._known.is_given or self._known.is_sought):
-            return camera
-        for _ in range(READOUT_ROUNDS):
-            graph = submap.posed_frames.graph(submap.map, camera, readout=self.readout)
-            self.shutter = find_rolling_shutter(graph)
-            self.readout = readout_by(self.shutter, self._known)
-            if self.readout is None and graph.readout is None:
-                break
-            camera = self._solve(submap, camera, given, progress, ROUGH, once=True).camera
-        return camera
-
     def _graph(self, submap: Submap, camera: Camera) -> RunGraph:
         """The graph of a submap, with the keypoints of a global shutter as its poses are now."""
         return submap.posed_frames.graph(submap.map, camera, readout=self.readout).global_shutter()
@@ -483,11 +467,13 @@ class FinalAdjustment:
         given: CameraMeasurement | None,
         progress: Progress | None,
         options: SolverOptions = FINAL,
-        once: bool = False,
     ) -> GraphSolution:
-        """Solve the graph of a submap. once: with the keypoints as its poses correct them now."""
+        """Solve the graph of a submap, and move the submap to the solution.
+
+        A rough solution is that of the keypoints as the poses before correct them.
+        """
         graph = submap.posed_frames.graph(submap.map, camera, calibration=given, readout=self.readout)
-        graph = graph.global_shutter() if once else graph
+        graph = graph.global_shutter() if options is ROUGH else graph
         solution = solve_graph(graph, progress=progress, options=options)
         submap.posed_frames.apply_solution(solution, graph, submap.map)
         return solution
