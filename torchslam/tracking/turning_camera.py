@@ -49,6 +49,7 @@ class TurningCamera:
         self.threshold_px = config.initialization.threshold_px
         self.min_matches = config.initialization.min_matches
         self.std = relative_focal_std(config.camera)
+        self.seeks_readout = config.camera.readout_std > 0
         self._first: list[FrameFeatures] = []
         self._last: list[FrameFeatures] = []
         self._first_rates: list[Tensor] = []  # once they are known
@@ -68,11 +69,15 @@ class TurningCamera:
     ) -> tuple[RotatingCamera, Float[Tensor, "2 3"]]:
         """The rotation that explains matches of the reference and the last view best, and the turns during a readout.
 
-        The focal length may be as wrong as the configuration says of the camera, the readout as long as the interval
-        between two frames. The turns, rotation vectors from the first row to the last one of both views, are zero where
-        no readout time is measured.
+        The focal length may be as wrong as the configuration says of the camera. The readout is that of the sensor
+        model or, where it has none, at most the interval between two frames. The turns, rotation vectors from the first
+        row to the last one of both views, are zero where no readout time is known.
         """
-        turns = self._turns()
+        turns, known = self._turns(), self.camera.model.readout
+        if known is not None:
+            turns = float(known.seconds) / self._interval * turns
+            pixels_1, pixels_2 = self.at_middle_rows((pixels_1, pixels_2), turns)
+        is_sought = known is None and self.seeks_readout
         found = fit_rotating_camera(
             pixels_1[None],
             pixels_2[None],
@@ -80,8 +85,10 @@ class TurningCamera:
             self.std,
             self.threshold_px,
             mask[None],
-            turns[None],
+            turns[None] if is_sought else None,
         )
+        if not is_sought:
+            return found, turns if known is not None else torch.zeros_like(turns)
         readout = float(found.readout)
         if readout <= READOUT_SIGMAS * float(found.readout_std):
             return found, torch.zeros_like(turns)
@@ -110,8 +117,15 @@ class TurningCamera:
         if len(self._last) < RATE_VIEWS:
             return self.camera.current.params.new_zeros(2, 3)
         first = self._first_rates = self._first_rates or self._rates(self._first)
-        last, interval = self._rates(self._last), self._last[-1].timestamp - self._last[-2].timestamp
-        return interval * torch.stack((1.5 * first[0] - 0.5 * first[1], 1.5 * last[1] - 0.5 * last[0]))
+        last = self._rates(self._last)
+        return self._interval * torch.stack((1.5 * first[0] - 0.5 * first[1], 1.5 * last[1] - 0.5 * last[0]))
+
+    @property
+    def _interval(self) -> float:
+        """Seconds between the last two frames; infinite with fewer."""
+        if len(self._last) < 2:
+            return math.inf
+        return self._last[-1].timestamp - self._last[-2].timestamp
 
     def _rates(self, views: list[FrameFeatures]) -> list[Float[Tensor, "3"]]:
         return [self._rate(*pair) for pair in pairwise(views)]
