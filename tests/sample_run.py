@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.config import Config
-from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
+from torchslam.geometry import Camera, SensorModel, rigid, se3_inverse, so3_exp
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
 from torchslam.system.run import Run
@@ -72,7 +72,7 @@ def run(submap: Submap, camera: Camera, results: list[StepResult]) -> Run:
     """A run with one submap."""
     return Run(
         submaps=(submap,),
-        camera=camera,
+        sensor=SensorModel(camera),
         config=Config(),
         results=results,
         skipped=["image 31 is not an image"],

@@ -157,7 +157,9 @@ class FrameFeatures:
         if len(self.detected) == 0:
             object.__setattr__(self, "detected", self.keypoints)
         if len(self.detected) != len(self.keypoints):
-            raise ValueError(f"detected has {len(self.detected)} rows, but keypoints has {len(self.keypoints)}")
+            raise ValueError(
+                f"detected has {len(self.detected)} rows, but keypoints has {len(self.keypoints)}"
+            )
 
     @classmethod
     def of(cls, frame: Frame, features: Features, like: Tensor) -> FrameFeatures:

@@ -58,7 +58,7 @@ def main() -> None:
                 if run.main is None:
                     rows.append([name, kind, "no map", "", ""])
                     continue
-                graph = run.main.posed_frames.graph(run.map, run.camera)
+                graph = run.main.posed_frames.graph(run.map, run.sensor)
                 seen = graph.frame_index.clamp(max=run.map.num_keyframes - 1)
                 scales = run.map.keyframes["scales"][seen, graph.keypoint_index]
                 px, in_scales = noise_px(graph, scales)

@@ -39,7 +39,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.dense import DepthMaps
 from torchslam.errors import CalibrationError, ConfigError, FrameError, InitializationError, ResultsError
 from torchslam.features.learned import ALIKED, XFeat
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, SensorModel
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_map_cloud
@@ -297,7 +297,7 @@ def _map(root: Path) -> None:
     saved = read_atlas(root / "map.safetensors")
     for submap in saved.atlas:
         assert bool(submap.trajectory().T_wc.isfinite().all())
-        submap.posed_frames.graph(submap.map, saved.camera)
+        submap.posed_frames.graph(submap.map, SensorModel(saved.camera))
         with contextlib.suppress(ResultsError):  # of a submap without frames
             _export(submap, saved.camera, root / "export")
     session = Session.load(root / "map.safetensors")

@@ -44,7 +44,7 @@ def test_counts(run: Run) -> None:
 
 
 def test_quality(run: Run) -> None:
-    graph = run.posed_frames.graph(run.map, run.camera)
+    graph = run.posed_frames.graph(run.map, run.sensor)
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])[:, 0]
     pixels, valid = run.camera.project(points_c)
     assert valid.any()
@@ -114,7 +114,7 @@ def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
 
 
 def test_a_readout_is_a_row_of_the_summary(run: Run) -> None:
-    known = replace(run, readout=Readout.known(0.0, 0.1).updated(0.028, 0.001))
+    known = replace(run, sensor=replace(run.sensor, readout=Readout.known(0.0, 0.1).updated(0.028, 0.001)))
     found = {"readout": readout_metrics(known)}
     assert summary(run_metrics(run) | found)["readout"].startswith(
         "28.0 ± 1.0 ms from the first row to the last (found)"

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tests.map.simulated import CAMERA, path, reprojection_errors, simulated_submap, view_of
 from tests.map.test_observation_index import check
+from torchslam.geometry import SensorModel
 from torchslam.map import compaction
 from torchslam.map.atlas import Submap
 from torchslam.map.compaction import compact, remove_invalid_rows, remove_keyframes
@@ -96,7 +97,7 @@ def test_the_graph_keeps_observations_of_removed_keyframes(submap: Submap) -> No
     submap.map.add_observations(keyframe, free, others[~torch.isin(others, first)][:1])
     before = copy.deepcopy(submap)
     remove_keyframes(submap, GONE)
-    old, new = before.posed_frames.graph(before.map, CAMERA), submap.posed_frames.graph(submap.map, CAMERA)
+    old, new = (each.posed_frames.graph(each.map, SensorModel(CAMERA)) for each in (before, submap))
     assert int(new.is_keyframe.sum()) == int(old.is_keyframe.sum()) - 2
     assert sorted(new.frame_ids.tolist()) == sorted(old.frame_ids.tolist())
     torch.testing.assert_close(by_frame(new), by_frame(old))
@@ -167,7 +168,7 @@ def test_compaction_only_renumbers_points(submap: Submap) -> None:
     for name, column in submap.map.points.columns().items():
         assert torch.equal(column, before.map.points[name][alive]), name
     assert torch.equal(reprojection_errors(submap), reprojection_errors(before))
-    old, new = before.posed_frames.graph(before.map, CAMERA), submap.posed_frames.graph(submap.map, CAMERA)
+    old, new = (each.posed_frames.graph(each.map, SensorModel(CAMERA)) for each in (before, submap))
     for name in ("T_cw", "points_w", "frame_index", "point_index", "pixels", "weights", "keypoint_index"):
         assert torch.equal(getattr(new, name), getattr(old, name)), name
     assert torch.equal(new.point_ids, rows[old.point_ids])

@@ -9,7 +9,7 @@ import torch
 
 from tests.map.simulated import estimate_at, simulated_submap
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
-from torchslam.geometry import se3_inverse
+from torchslam.geometry import SensorModel, se3_inverse
 from torchslam.map.atlas import Submap
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.optim import GRAPH_OPTIONS
@@ -55,7 +55,7 @@ def test_a_trajectory_is_in_order_of_time() -> None:
 
 def test_the_run_graph_holds_all_observations() -> None:
     submap = submap_with_frames()
-    graph = submap.posed_frames.graph(submap.map, CAMERA)
+    graph = submap.posed_frames.graph(submap.map, SensorModel(CAMERA))
     assert graph.frame_ids.tolist() == [0, 1, 10, 11, 12]
     assert graph.is_keyframe.tolist() == [True, True, False, False, False]
     torch.testing.assert_close(graph.T_cw, torch.cat([sideways(2, step=0.5), sideways(3, start=0.6)]))
@@ -75,7 +75,7 @@ def test_the_run_graph_holds_all_observations() -> None:
 
 def test_map_and_frames_apply_the_solution_of_their_graph() -> None:
     submap = submap_with_frames(noise=0.5)
-    graph = submap.posed_frames.graph(submap.map, CAMERA)
+    graph = submap.posed_frames.graph(submap.map, SensorModel(CAMERA))
     solution = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached"))
     submap.posed_frames.apply_solution(solution, graph, submap.map)
     torch.testing.assert_close(submap.map.T_cw, solution.T_cw[:2])
@@ -92,7 +92,7 @@ def test_frames_apply_a_solution_in_any_order() -> None:
         submap.posed_frames.observations["frame_row"]
     ]
     for one in (submap, shuffled):
-        graph = one.posed_frames.graph(one.map, CAMERA)
+        graph = one.posed_frames.graph(one.map, SensorModel(CAMERA))
         one.posed_frames.apply_solution(
             solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached")), graph, one.map
         )
@@ -147,7 +147,7 @@ def test_outliers_of_frames_are_removed() -> None:
     before, ids = of_frames(submap), submap.posed_frames.observations["point_ids"].clone()
     at = torch.nonzero(submap.posed_frames.observations["frame_row"] == 3)[:, 0]
     stray(submap, 3, 5)
-    submap.posed_frames.remove_outliers(submap.map, CAMERA)
+    submap.posed_frames.remove_outliers(submap.map, SensorModel(CAMERA))
     assert [was - now for was, now in zip(before, of_frames(submap), strict=True)] == [0, 0, 0, 5, 0]
     seen = submap.posed_frames.observations
     assert torch.equal(seen["point_ids"][seen["frame_row"] == 3], ids[at[5:]])
@@ -159,7 +159,7 @@ def test_the_outlier_threshold_is_twice_the_inlier_threshold(off: float, forgott
     submap = submap_with_frames()
     count = len(submap.posed_frames.observations)
     stray(submap, 3, 5, off)
-    submap.posed_frames.remove_outliers(submap.map, CAMERA)
+    submap.posed_frames.remove_outliers(submap.map, SensorModel(CAMERA))
     assert count - len(submap.posed_frames.observations) == forgotten
 
 
@@ -167,7 +167,7 @@ def test_a_frame_with_few_inliers_keeps_all_observations() -> None:
     submap = submap_with_frames()
     before = of_frames(submap)
     stray(submap, 3, before[3] // 4 + 1)
-    submap.posed_frames.remove_outliers(submap.map, CAMERA)
+    submap.posed_frames.remove_outliers(submap.map, SensorModel(CAMERA))
     assert of_frames(submap) == before
 
 
@@ -177,11 +177,11 @@ def test_an_outlier_does_not_move_its_frame() -> None:
     stray(submap, 3, 3)
 
     def off() -> float:
-        graph = submap.posed_frames.graph(submap.map, CAMERA)
+        graph = submap.posed_frames.graph(submap.map, SensorModel(CAMERA))
         row = int(torch.nonzero(graph.frame_ids == 11)[0])
         T_cw = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached")).T_cw[row]
         return float((T_cw @ se3_inverse(truth))[:3, 3].norm())
 
     assert off() > 1e-4
-    submap.posed_frames.remove_outliers(submap.map, CAMERA)
+    submap.posed_frames.remove_outliers(submap.map, SensorModel(CAMERA))
     assert off() < 1e-9

@@ -11,7 +11,15 @@ import torch
 from tests.map.simulated import CAMERA, reprojection_errors, simulated_submap
 from torchslam.config import Config
 from torchslam.errors import MeasurementError
-from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, sim3_inverse, sim3_scale, transform
+from torchslam.geometry import (
+    SensorModel,
+    se3_exp,
+    se3_inverse,
+    sim3_exp,
+    sim3_inverse,
+    sim3_scale,
+    transform,
+)
 from torchslam.geometry.transforms import level_rotation
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.unit import MetricUnit
@@ -180,7 +188,7 @@ def test_what_was_returned_frame_by_frame_follows() -> None:
         StepResult(1, 0.1, State.TRACKING, T_cw, submap=9),
         StepResult(2, 0.2, State.LOST, None),
     ]
-    run = Run((submap,), CAMERA, Config(), results, [], False, "")
+    run = Run((submap,), SensorModel(CAMERA), Config(), results, [], False, "")
     up_w = torch.tensor([0.0, -1.0, 0.0], dtype=torch.float64)
     found = run_in_meters(run, None, [scale_of(2.0, up_w=up_w, up_std=0.1)])
     moved = found.results[0]
@@ -203,7 +211,7 @@ def test_a_wrong_measurement_loses_nothing_of_a_run() -> None:
 
     submap = simulated_submap()
     before = submap.trajectory().T_wc
-    found = run_in_meters(Run((submap,), CAMERA, Config(), [], [], False, ""), None, [Wrong()])
+    found = run_in_meters(Run((submap,), SensorModel(CAMERA), Config(), [], [], False, ""), None, [Wrong()])
     assert found.unmeasured == ("the clock runs backwards",)
     assert found.metric is None
     assert torch.equal(found.trajectory.T_wc, before)

@@ -82,7 +82,7 @@ def test_a_run_uses_the_given_information(informed: tuple[SLAM, Run, Say]) -> No
     graph, kept = run.graph, run.map.keyframes
     of_keyframes = graph.frame_index < run.map.num_keyframes
     scales = kept["scales"][graph.frame_index[of_keyframes], graph.keypoint_index[of_keyframes]]
-    wanted = scales**-2 / run.map.final_variance
+    wanted = scales**-2 / run.sensor.noise_variance
     if say is by_matrix:
         wanted = wanted[:, None, None] * torch.eye(2, dtype=torch.float64)
     torch.testing.assert_close(graph.weights[of_keyframes], wanted)

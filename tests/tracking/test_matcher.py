@@ -129,7 +129,7 @@ class Doubting(Wrapped):
 def test_weights_multiply_the_information_of_what_is_seen() -> None:
     _, run = run_with(Doubting())
     assert len(run.trajectory) == len(WALK)
-    weights, pixels = run.graph.weights * run.map.final_variance, run.graph.pixels
+    weights, pixels = run.graph.weights * run.sensor.noise_variance, run.graph.pixels
     right, left = weights[pixels[:, 0] >= 160], weights[pixels[:, 0] < 160]
     assert (
         float(right.isclose(right.new_tensor(4.0)).double().mean()) > 0.8

@@ -323,7 +323,13 @@ def _attempt(
     finished = frames_to(end=is_watched or not may_go_on or not _all_are_mapped(sequence, config))
     if finished is None:
         begun = Run(
-            tuple(slam.atlas), slam.camera, slam.config, so_far.results, so_far.skipped, False, failure=""
+            tuple(slam.atlas),
+            slam.shared_camera.model,
+            slam.config,
+            so_far.results,
+            so_far.skipped,
+            False,
+            failure="",
         )
         return Attempt(begun, sequence, found, latencies, watching, kept=kept, end=ended)
     return Attempt(finished, sequence, found, latencies, watching, kept=kept)

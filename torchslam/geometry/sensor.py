@@ -1,7 +1,7 @@
 """The sensor model: what turns a point of the scene into a keypoint.
 
-Camera and readout of the shutter are one value, replaced as a whole. The keypoints of a frame are corrected by it once
-(`SensorModel.at_middle_row`); from then on every stage works with the keypoints of a global shutter.
+Camera, readout of the shutter and noise are one value, replaced as a whole. The keypoints of a frame are corrected by
+it once (`SensorModel.at_middle_row`); from then on every stage works with the keypoints of a global shutter.
 """
 
 from __future__ import annotations
@@ -20,15 +20,18 @@ from torchslam.geometry.undistorted import Undistortion
 
 @dataclass(frozen=True)
 class SensorModel:
-    """Camera and shutter of the images of a recording.
+    """Camera, shutter and noise of the images of a recording.
 
     Attributes:
         camera: of all frames.
         readout: of a rolling shutter; None: a global shutter.
+        noise_variance: of keypoints, in units of what the feature extractor states, as the final adjustment estimates
+            it: the weights of a graph are divided by it.
     """
 
     camera: Camera
     readout: Readout | None = None
+    noise_variance: float = 1.0
 
     def at_middle_row(
         self,

@@ -408,7 +408,7 @@ class GlobalMapper:
             )
         return Run(
             tuple(atlas),
-            final.camera,
+            final.sensor,
             self.config,
             results,
             self.skipped,
@@ -416,7 +416,6 @@ class GlobalMapper:
             "",
             given=final.given,
             calibration=final.calibration,
-            readout=final.readout,
             shutter=final.shutter,
         )
 
@@ -475,7 +474,7 @@ class GlobalMapper:
         results = [
             StepResult(view.index, view.timestamp, State.LOST, None, reasons=reasons) for view in views
         ]
-        run = Run((), self.camera, self.config, results, self.skipped, False, reason)
+        run = Run((), SensorModel(self.camera), self.config, results, self.skipped, False, reason)
         return GlobalMap(run, views, pairs, frozenset())
 
 

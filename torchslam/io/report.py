@@ -187,7 +187,7 @@ def quality(run: Run) -> dict[str, float | None]:
     found: dict[str, float | None] = {"reprojection_px": None, "far_ratio": None, "track_length": None}
     if run.main is None or run.map.num_points == 0:
         return found
-    graph = run.posed_frames.graph(run.map, run.camera, readout=run.readout).global_shutter()
+    graph = run.posed_frames.graph(run.map, run.sensor).global_shutter()
     rows = torch.nonzero(graph.sessions[graph.frame_index] == run.session)[:, 0]
     T_cw, points_w = graph.T_cw[graph.frame_index[rows]], graph.points_w[graph.point_index[rows]]
     pixels, valid = run.camera.project(transform(T_cw, points_w[:, None])[:, 0])

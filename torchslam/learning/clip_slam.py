@@ -20,7 +20,7 @@ from torchslam.errors import ClipError
 from torchslam.evaluation import MIN_POSES, ate
 from torchslam.features.contract import FixedKeypoints, check_features, check_gray
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
-from torchslam.geometry import Camera, KeypointNoise
+from torchslam.geometry import Camera, KeypointNoise, SensorModel
 from torchslam.geometry.gating import times
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graphs
@@ -395,8 +395,8 @@ class ClipSLAM(nn.Module):
         if run.main is None:
             return None, run.failure
         # With the stated noise: training moves the keypoints away from those of which a noise was found.
-        graph = run.main.posed_frames.graph(run.map, run.camera)
-        return replace(graph, weights=graph.weights * run.map.final_variance), run.failure
+        graph = run.main.posed_frames.graph(run.map, SensorModel(run.camera))
+        return graph, run.failure
 
 
 def _per_clip(features: Features | Sequence[Features]) -> Sequence[Features]:

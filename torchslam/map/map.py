@@ -43,8 +43,6 @@ class Map:
         images: Of the keyframes, by key, if the matcher needs them; not saved.
         version: Changes when rows are renumbered.
         noise_variance: Of keypoints, at least 1, in units of what the feature extractor states; poses are judged by it.
-        final_variance: Of keypoints as the final adjustment found it, in the same units, of any size: the weights of a
-            run's graph are by it. Not saved.
     """
 
     def __init__(self) -> None:
@@ -53,7 +51,7 @@ class Map:
         self.keyframes = Table(KEYFRAMES)
         self.images: dict[int, Shaped[Tensor, "1 1 H W"]] = {}
         self.version = 0
-        self.noise_variance = self.final_variance = 1.0
+        self.noise_variance = 1.0
         self._index: ObservationIndex | None = None  # None: not built yet
 
     @property

@@ -11,7 +11,6 @@ from torch import Tensor
 
 from torchslam.geometry import (
     CHI_SQUARE_95,
-    Camera,
     KeypointNoise,
     SensorModel,
     passes_gate,
@@ -19,7 +18,7 @@ from torchslam.geometry import (
     transform,
 )
 from torchslam.geometry.camera_measurement import CameraMeasurement
-from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
+from torchslam.geometry.rolling_shutter import frame_velocities, global_shutter_pixels
 from torchslam.map.map import SESSION_BITS, Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
@@ -186,28 +185,26 @@ class PosedFrames:
     def remove_outliers(
         self,
         slam_map: Map,
-        camera: Camera,
+        sensor: SensorModel,
         chi_square: float = _OUTLIER_CHI_SQUARE,
         least_ratio: float = _MIN_INLIER_RATIO,
-        readout: Readout | None = None,
     ) -> None:
         """Remove observations far from the current reprojection, since their point was merged or has moved.
 
         Args:
             slam_map: the map.
-            camera: of all frames.
+            sensor: of all frames.
             chi_square: squared error, in units of the stated noise, from which on an observation is far.
             least_ratio: of its observations that must be near; else a frame keeps all, since its pose may be wrong.
-            readout: of a rolling shutter, by which keypoints are corrected; None: a global shutter.
         """
         T_cw, seen_by = self.T_cw(slam_map), self.observations["frame_row"]
         velocities = None
-        if readout is not None:
+        if sensor.readout is not None:
             velocities, _ = frame_velocities(T_cw, self.frames["timestamp"], self.frames["session"])
         every = torch.arange(len(seen_by), device=T_cw.device)
         agrees = torch.cat(
             [
-                self._agree(rows, T_cw, slam_map, camera, chi_square, readout, velocities)
+                self._agree(rows, T_cw, slam_map, sensor, chi_square, velocities)
                 for rows in every.split(_CHUNK)
             ]
         )
@@ -222,9 +219,8 @@ class PosedFrames:
         rows: Int[Tensor, " O"],
         T_cw: Float[Tensor, "F 4 4"],
         slam_map: Map,
-        camera: Camera,
+        sensor: SensorModel,
         chi_square: float,
-        readout: Readout | None,
         velocities: Float[Tensor, "F 6"] | None,
     ) -> Bool[Tensor, " O"]:
         """Test which observations are near their reprojection by the frames, which with a readout have velocities."""
@@ -232,8 +228,9 @@ class PosedFrames:
         points_w = slam_map.positions_w[slam_map.follow_merges(seen["point_ids"])]
         frame, pixels = seen["frame_row"], seen["pixels"]
         points_c = transform(T_cw[frame], points_w[:, None])[:, 0]
-        if readout is not None and velocities is not None:
-            seconds = readout.seconds.to(pixels)
+        camera = sensor.camera
+        if sensor.readout is not None and velocities is not None:
+            seconds = sensor.readout.seconds.to(pixels)
             pixels = global_shutter_pixels(pixels, T_cw[frame], velocities[frame], points_w, camera, seconds)
         noise = KeypointNoise(seen["scales"], seen["information"])
         return passes_gate(noise.squared_reprojection(points_c, pixels, camera), chi_square)
@@ -303,10 +300,9 @@ class PosedFrames:
     def graph(
         self,
         slam_map: Map,
-        camera: Camera,
+        sensor: SensorModel,
         submap: int = 0,
         calibration: CameraMeasurement | None = None,
-        readout: Readout | None = None,
     ) -> RunGraph:
         """Build the observation graph: keyframes first, then the frames between them.
 
@@ -315,10 +311,9 @@ class PosedFrames:
 
         Args:
             slam_map: the map.
-            camera: of all frames.
+            sensor: of all frames.
             submap: number of the submap.
-            calibration: the given camera with its error; None: `camera` is exact.
-            readout: of a rolling shutter; None: a global one.
+            calibration: the given camera with its error; None: that of `sensor` is exact.
         """
         seen = slam_map.observations(as_detected=True)
         point_ids = torch.unique(seen.point_index)
@@ -346,10 +341,10 @@ class PosedFrames:
             weights=KeypointNoise(
                 with_own(seen.scales, "scales"), with_own(seen.information, "information")
             ).weights
-            / slam_map.final_variance,
-            camera=camera,
+            / sensor.noise_variance,
+            camera=sensor.camera,
             calibration=calibration,
-            readout=readout,
+            readout=sensor.readout,
             is_keyframe=torch.arange(slam_map.num_keyframes + len(between), device=point_ids.device)
             < slam_map.num_keyframes,
             frame_ids=torch.cat([keyframes["frame_index"], self.frames["frame_index"][between]]),

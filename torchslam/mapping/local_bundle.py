@@ -219,12 +219,13 @@ def squared_errors(slam_map: Map, seen: Observations, camera: Camera) -> Float[T
     return seen.noise.squared_reprojection(points_c[:, 0], seen.pixels, camera)
 
 
-def find_final_variance(slam_map: Map, seen: Observations, camera: Camera) -> None:
-    """Estimate the variance of the keypoints of an adjusted map by all its observations, and store it in the map."""
+def noise_variance(slam_map: Map, camera: Camera) -> float:
+    """Estimate the variance of the keypoints of an adjusted map, in units of the stated one, by all observations."""
+    seen = slam_map.observations()
     squared = squared_errors(slam_map, seen, camera) * seen.noise.gate_factor**2
     unknowns = 6 * slam_map.num_keyframes + 3 * len(distinct(seen.point_index))
     redundancy = 1 - unknowns / max(2 * len(seen), 1)
-    slam_map.final_variance = middle_variance(squared, redundancy)
+    return middle_variance(squared, redundancy)
 
 
 def select(seen: Observations, rows: Int[Tensor, " R"]) -> Observations:

@@ -22,7 +22,7 @@ from torchslam.config import Config
 from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.errors import TrajectoryError
-from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry import Camera, SensorModel, se3_inverse
 from torchslam.geometry.camera_measurement import (
     FOCAL,
     K1,
@@ -155,7 +155,7 @@ def refine_poses(
         )
         failure = refinement.map()
     if failure:
-        run = Run((), camera, config, refinement.lost(failure), mapper.skipped, False, failure)
+        run = Run((), SensorModel(camera), config, refinement.lost(failure), mapper.skipped, False, failure)
         return RefinementResult(run, given, rows, 0)
     rounds = 1
     if choice is CameraChoice.IF_CONTRADICTED:

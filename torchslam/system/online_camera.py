@@ -147,8 +147,7 @@ class OnlineCamera:
         if not is_wanted or not self.settings.local or not self.next_check <= keyframes <= MAX_KEYFRAMES:
             return
         self.next_check = math.ceil(keyframes * GROWTH)
-        model = self.camera.model
-        graph = submap.posed_frames.graph(submap.map, model.camera, readout=model.readout)
+        graph = submap.posed_frames.graph(submap.map, self.camera.model)
         options = MAP_OPTIONS.replace(iterations=self.settings.global_iterations, tolerance=TOLERANCE)
         result = self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES)
         self._pending = _Estimate(submap, frame + max(ESTIMATE_FRAMES, 3 * keyframes // 2), result)

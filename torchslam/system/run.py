@@ -23,7 +23,7 @@ from torchslam.map.atlas import Atlas, Submap, main_submap
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.map.unit import MetricUnit
-from torchslam.mapping.local_bundle import adjust_all, find_final_variance, squared_errors
+from torchslam.mapping.local_bundle import adjust_all, noise_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
 from torchslam.optim.camera_evidence import graph_evidence
 from torchslam.optim.rolling_shutter import RollingShutter
@@ -69,7 +69,8 @@ class Run:
 
     Attributes:
         submaps: submaps in the order of their creation; usually one.
-        camera: the camera that the final adjustment found; the given one without it, or where that is exact.
+        sensor: camera, shutter and noise as the final adjustment found them; the given camera where there is none, or
+            where that is exact. With a readout, the final poses are corrected for a rolling shutter.
         config: the configuration.
         results: one result per processed frame.
         skipped: messages about the frames that could not be read.
@@ -81,14 +82,12 @@ class Run:
         given: the given camera with its error, if the final adjustment changed it.
         calibration: `camera` with its error after the final adjustment.
         camera_changes: cameras that the map took over while the run went on.
-        readout: of a rolling shutter, given or found by the final adjustment; None: the final poses are those of a
-            global one.
         shutter: what the residuals say of it; None where that was not tested.
         unmeasured: one line for each source of meters that said nothing of the main submap.
     """
 
     submaps: tuple[Submap, ...]
-    camera: Camera
+    sensor: SensorModel
     config: Config
     results: list[StepResult]
     skipped: list[str]
@@ -100,7 +99,6 @@ class Run:
     given: CameraMeasurement | None = None
     calibration: CameraMeasurement | None = None
     camera_changes: tuple[CameraChange, ...] = ()
-    readout: Readout | None = None
     shutter: RollingShutter | None = None
     unmeasured: tuple[str, ...] = ()
 
@@ -154,9 +152,14 @@ class Run:
         return [part for number in numbers if len(part := self._given_in(number))]
 
     @property
-    def sensor(self) -> SensorModel:
-        """Camera and shutter of all frames."""
-        return SensorModel(self.camera, self.readout)
+    def camera(self) -> Camera:
+        """The camera of all frames."""
+        return self.sensor.camera
+
+    @property
+    def readout(self) -> Readout | None:
+        """The readout of a rolling shutter, given or found; None: a global shutter."""
+        return self.sensor.readout
 
     def at_middle_row(self, views: list[FrameFeatures]) -> list[FrameFeatures]:
         """Views of frames of the main submap with the keypoints of a global shutter; others as they are."""
@@ -187,7 +190,7 @@ class Run:
         return concatenate_graphs([self._graph_of(submap) for submap in self.submaps])
 
     def _graph_of(self, submap: Submap) -> RunGraph:
-        return submap.posed_frames.graph(submap.map, self.camera, submap.number, self.given, self.readout)
+        return submap.posed_frames.graph(submap.map, self.sensor, submap.number, self.given)
 
 
 @dataclass
@@ -306,10 +309,10 @@ def finish(
             final.adjust(slam.session.atlas, slam.session.number, adjusting)
     except KeyboardInterrupt:
         interrupted = True
-    slam.adopt_camera(final.camera)
+    slam.adopt_camera(final.sensor.camera)
     return Run(
         tuple(slam.session.atlas),
-        final.camera,
+        final.sensor,
         slam.config,
         results,
         skipped,
@@ -321,7 +324,6 @@ def finish(
         final.given,
         final.calibration,
         tuple(slam.online_camera.changes),
-        final.readout,
         final.shutter,
     )
 
@@ -349,12 +351,11 @@ class FinalAdjustment:
     """The adjustment of all maps at the end of a run, over keyframes, points, frames in between and the camera.
 
     Attributes:
-        camera: the camera of the adjusted maps.
+        sensor: of the adjusted maps.
         given: the given camera with its error, along the directions that the images agree on, as the final adjustment
             has it as its prior; None until then, and where the camera is exact.
-        calibration: `camera` with its error; None as `given`.
-        readout: of a rolling shutter, by which the keypoints are corrected; None: a global shutter.
-        shutter: what the residuals say of it; None where that was not tested.
+        calibration: the camera of `sensor` with its error; None as `given`.
+        shutter: the residuals as functions of the readout; None where that was not tested.
     """
 
     def __init__(self, sensor: SensorModel, config: Config, measured: CameraMeasurement | None) -> None:
@@ -365,11 +366,10 @@ class FinalAdjustment:
             config: the configuration.
             measured: the given camera with its error; None if it is exact.
         """
-        self.camera, self.readout, self.settings = sensor.camera, sensor.readout, config.bundle_adjustment
-        self._measured = measured
+        self.sensor, self.settings = sensor, config.bundle_adjustment
+        self.prior = SensorPrior(measured, given_readout(config.camera))
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
-        self._known = given_readout(config.camera)
         self.shutter: RollingShutter | None = None
 
     def adjust(
@@ -386,7 +386,7 @@ class FinalAdjustment:
         main = atlas.main(session)
         if main is None or not (self.settings.local and self.settings.global_at_end):
             return
-        self._adjust(main, self._measured, progress, settled, is_main=True)
+        self._adjust(main, self.prior.camera, progress, settled, is_main=True)
         for submap in atlas:
             if submap is not main:
                 self._adjust(submap, None, progress, settled)
@@ -399,54 +399,55 @@ class FinalAdjustment:
         settled: bool,
         is_main: bool = False,
     ) -> None:
-        camera = self.camera
         if not settled:
-            camera = camera if given is None else with_radial_terms(camera)
-            camera = adjust_all(submap.map, camera, self.settings, progress, given, ROUGH.tolerance)
-        self.camera, self.given = camera, given or self.given
-        submap.posed_frames.remove_outliers(submap.map, camera, readout=self.readout)
+            camera = self.sensor.camera if given is None else with_radial_terms(self.sensor.camera)
+            self._use(adjust_all(submap.map, camera, self.settings, progress, given, ROUGH.tolerance))
+        self.given = given or self.given
+        submap.posed_frames.remove_outliers(submap.map, self.sensor)
         if not settled:
-            self.camera = camera = self._solve(submap, camera, given, progress, ROUGH).camera
+            self._solve(submap, given, progress, ROUGH)
         if is_main:
             # Before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
-            graph = submap.posed_frames.graph(submap.map, camera, readout=self.readout)
-            found = estimate_sensor(graph, SensorPrior(None, self._known), FINAL, for_shaking=True)
-            self.readout, self.shutter = found.sensor.readout, found.shutter
-        submap.correct_keyframes(SensorModel(camera, self.readout))
+            graph = submap.posed_frames.graph(submap.map, self.sensor)
+            found = estimate_sensor(graph, replace(self.prior, camera=None), FINAL, for_shaking=True)
+            self.sensor, self.shutter = found.sensor, found.shutter
+        submap.correct_keyframes(self.sensor)
         if not settled:
             # Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map
             # have removed that already, and what holds a weak link is often less exact than the rest.
             seen = submap.map.observations()
-            wrong = ~passes_gate(squared_errors(submap.map, seen, camera), FINAL_CHI_SQUARE)
+            wrong = ~passes_gate(squared_errors(submap.map, seen, self.sensor.camera), FINAL_CHI_SQUARE)
             submap.map.remove_masked_observations(seen, wrong)
-            submap.posed_frames.remove_outliers(
-                submap.map, camera, FINAL_CHI_SQUARE, LEAST_RATIO, self.readout
-            )
-        find_final_variance(submap.map, submap.map.observations(), camera)
+            submap.posed_frames.remove_outliers(submap.map, self.sensor, FINAL_CHI_SQUARE, LEAST_RATIO)
+        if is_main:
+            variance = noise_variance(submap.map, self.sensor.camera)
+            self.sensor = replace(self.sensor, noise_variance=variance)
         if not settled:
-            self.camera = camera = self._solve(submap, camera, given, progress, ROUGH).camera
+            self._solve(submap, given, progress, ROUGH)
         measured, evidence = given, None
         if given is not None:
-            evidence = graph_evidence(self._graph(submap, camera), given)
+            evidence = graph_evidence(self._graph(submap), given)
         if evidence is not None and given is not None:
             estimate = evidence.estimate()
-            measured, is_better = estimate.measured, evidence.is_better_than(given.camera)
-            # Else the given camera predicts as well, and is held.
-            camera, given = (
-                (estimate.prior.nearest(camera), estimate.prior)
-                if is_better
-                else (given.camera, replace(given, directions=given.directions[:, :0]))
-            )
-        solution = self._solve(submap, camera, given, progress, SETTLED if settled else FINAL)
-        self.camera = solution.camera
-        submap.correct_keyframes(SensorModel(self.camera, self.readout))
+            measured = estimate.measured
+            if evidence.is_better_than(given.camera):
+                given = estimate.prior
+                self._use(given.nearest(self.sensor.camera))
+            else:  # it predicts as well, and is held
+                self._use(given.camera)
+                given = replace(given, directions=given.directions[:, :0])
+        solution = self._solve(submap, given, progress, SETTLED if settled else FINAL)
+        submap.correct_keyframes(self.sensor)
         if measured is not None:
-            self.given, self.calibration = given, replace(measured, camera=self.camera)
+            self.given, self.calibration = given, replace(measured, camera=self.sensor.camera)
         self._store_covariances(submap, solution)
+
+    def _use(self, camera: Camera) -> None:
+        self.sensor = replace(self.sensor, camera=camera)
 
     def _store_covariances(self, submap: Submap, solution: GraphSolution) -> None:
         """Store how exact keyframes and points are; the error of the camera is one of the keyframes."""
-        graph = self._graph(submap, self.camera)
+        graph = self._graph(submap)
         errors = None if self.calibration is None else self.calibration.directions
         keyframes, *_, problem = keyframe_problem(graph, 0)
         (bundle,) = solution.keyframes
@@ -456,26 +457,26 @@ class FinalAdjustment:
             found = found._replace(frames=joint.diagonal(dim1=0, dim2=2).movedim(-1, 0))
         submap.map.set_covariances(keyframes, graph.point_ids, found)
 
-    def _graph(self, submap: Submap, camera: Camera) -> RunGraph:
+    def _graph(self, submap: Submap) -> RunGraph:
         """The graph of a submap, with the keypoints of a global shutter as its poses are now."""
-        return submap.posed_frames.graph(submap.map, camera, readout=self.readout).global_shutter()
+        return submap.posed_frames.graph(submap.map, self.sensor).global_shutter()
 
     def _solve(
         self,
         submap: Submap,
-        camera: Camera,
         given: CameraMeasurement | None,
         progress: Progress | None,
-        options: SolverOptions = FINAL,
+        options: SolverOptions,
     ) -> GraphSolution:
-        """Solve the graph of a submap, and move the submap to the solution.
+        """Solve the graph of a submap, and use the camera and the poses of the solution.
 
         A rough solution is that of the keypoints as the poses before correct them.
         """
-        graph = submap.posed_frames.graph(submap.map, camera, calibration=given, readout=self.readout)
+        graph = submap.posed_frames.graph(submap.map, self.sensor, calibration=given)
         graph = graph.global_shutter() if options is ROUGH else graph
         solution = solve_graph(graph, progress=progress, options=options)
         submap.posed_frames.apply_solution(solution, graph, submap.map)
+        self._use(solution.camera)
         return solution
 
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.map.simulated import CAMERA, simulated_submap
-from torchslam.geometry import Camera, transform
+from torchslam.geometry import Camera, SensorModel, transform
 from torchslam.metric.markers.corners import PlacedTarget
 from torchslam.metric.markers.detection import Detection
 from torchslam.metric.markers.source import Markers, log_sizes
@@ -85,7 +85,7 @@ def test_markers_give_the_unit_and_its_error() -> None:
     assert found.rejected == ()
     assert error_of(found) < 3 * found.relative_std < 0.1
     # The adjustment, whose poses are kept, stays one of the images.
-    graph = view.submap.posed_frames.graph(view.submap.map, view.camera)
+    graph = view.submap.posed_frames.graph(view.submap.map, SensorModel(view.camera))
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])[:, 0]
     assert float((view.camera.project(points_c)[0] - graph.pixels).norm(dim=-1).median()) < 1.0
 

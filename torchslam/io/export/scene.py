@@ -23,7 +23,7 @@ from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Sequence
 from torchslam.data.transforms import resize
 from torchslam.errors import FrameError, ResultsError, SequenceError
-from torchslam.geometry import Camera, se3_inverse, squared_reprojection_errors, transform
+from torchslam.geometry import Camera, SensorModel, se3_inverse, squared_reprojection_errors, transform
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.map.atlas import Submap
 
@@ -119,7 +119,8 @@ def scene_of(
     """
     if submap.map.num_keyframes == 0:
         raise ResultsError(f"submap {submap.number} is empty")
-    graph = submap.posed_frames.graph(submap.map, camera, submap.number, readout=readout).global_shutter()
+    sensor = SensorModel(camera, readout)
+    graph = submap.posed_frames.graph(submap.map, sensor, submap.number).global_shutter()
     wanted = (graph.sessions == session) & (graph.is_keyframe | (not keyframes_alone))
     rows = torch.nonzero(wanted)[:, 0]
     if len(rows) == 0:

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.errors import FrameError, MeasurementError
-from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry import Camera, SensorModel, se3_inverse, transform
 from torchslam.metric.markers.corners import GraphWithCorners, PlacedTarget, Sighting, add_corners
 from torchslam.metric.markers.detection import Detector, detector_of
 from torchslam.metric.markers.targets import Target, TargetKind, parse_target
@@ -72,7 +72,7 @@ class Markers:
         if view.sequence is None or view.sequence.brings_features:
             return Unmeasured(ScaleSource.MARKER, "there are no images to find markers in")
         submap = view.submap
-        graph = submap.posed_frames.graph(submap.map, view.camera, readout=view.readout)
+        graph = submap.posed_frames.graph(submap.map, SensorModel(view.camera, view.readout))
         detectors = [self._make_detector(target, view.camera) for target in self._targets]
         sightings = find_targets(graph, view.session, view.sequence, detectors)
         if not sightings:
