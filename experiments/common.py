@@ -15,7 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
-import torch
+from jaxtyping import Float
 from torch import Tensor
 
 import experiments.storey  # noqa: F401  it adds a scene
@@ -26,7 +26,7 @@ from torchslam.batch.results_table import read_times
 from torchslam.batch.rows import short_name
 from torchslam.data import Sequence as Frames
 from torchslam.data import open_sequence
-from torchslam.geometry import Camera
+from torchslam.geometry import se3_inverse
 from torchslam.io.results import read_metrics
 from torchslam.types import Trajectory
 
@@ -36,11 +36,6 @@ DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "sh
 
 DRONE_CAMERA, DRONE_TRUTH = "553,553,319.5,179.5", "drone_colmap.txt"
 """Of drone.mp4, which comes without: as COLMAP found them."""
-WEIGHTS_DIR = DATA_DIR.parent / "weights"
-LEARNED_FEATURES = {"xfeat": "xfeat.safetensors", "aliked": "aliked-t16.safetensors"}
-"""Files of the learned feature extractors in the folder of `add_weights`."""
-CONTROL = "synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3"
-"""A rendered room that nothing is trained on: with other textures, noise and exposure, and exact poses."""
 
 
 def place_of(name: str) -> str:
@@ -64,28 +59,36 @@ def available(names: Iterable[str]) -> list[str]:
     return found
 
 
-def part_of(sequence: Frames, share: tuple[float, float]) -> range:
-    """The frames of a sequence from one share of its length to another."""
-    return range(*(round(end * len(sequence)) for end in share))
-
-
 def row_of(name: str, *labels: str, overrides: Iterable[str] = (), **more: Any) -> Row:
     """A row of a batch; `labels` distinguish it from other runs over the same sequence."""
     label = "_".join(short_name(word) for word in (name.removeprefix("synthetic:"), *labels))
     return Row(label, place_of(name), overrides=tuple(overrides), **more)
 
 
-class PosedSequence(Frames):
-    """A camera on a path (F, 4, 4) T_wc with blank images, for simulated features."""
+class Backward(Frames):
+    """The frames of a sequence in reverse."""
 
-    def __init__(self, name: str, camera: Camera, T_wc: Tensor, timestamps: Tensor) -> None:
-        super().__init__(name, "poses", camera, timestamps, Trajectory(timestamps, T_wc))
+    def __init__(self, forward: Frames) -> None:
+        times = (forward.timestamps[-1] - forward.timestamps).flip(0)
+        truth = forward.groundtruth
+        if truth is not None:
+            truth = Trajectory((forward.timestamps[-1] - truth.timestamps).flip(0), truth.T_wc.flip(0))
+        super().__init__(forward.name, forward.kind, forward.camera, times, truth)
+        self._forward = forward
 
     def image(self, index: int) -> Tensor:
-        return torch.zeros(1, 1, self.camera.height, self.camera.width)
+        return self._forward.image(len(self) - 1 - index)
 
     def image_name(self, index: int) -> str:
-        return f"pose {index}"
+        return self._forward.image_name(len(self) - 1 - index)
+
+
+def scaled(T_cw: Float[Tensor, "K 4 4"], factor: float, about: int | None = None) -> Float[Tensor, "K 4 4"]:
+    """Scale the second half of the poses around a camera; None: around its first one."""
+    T_wc, half = se3_inverse(T_cw), len(T_cw) // 2
+    center = T_wc[half if about is None else about, :3, 3].clone()
+    T_wc[half:, :3, 3] = center + factor * (T_wc[half:, :3, 3] - center)
+    return se3_inverse(T_wc)
 
 
 def parser_of(
@@ -112,20 +115,6 @@ def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
     parser.add_argument("--workers", type=int, metavar="N", help="of --engine ray")
 
 
-def add_weights(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the folder of the weights of learned feature extractors."""
-    parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR, help="folder of the weights")
-
-
-def weights_of(name: str, folder: Path) -> Path | None:
-    """The weights of a learned feature extractor; None, with a message, if they are not in the folder."""
-    weights = (folder / LEARNED_FEATURES[name]).absolute()
-    if not weights.is_file():
-        print(f"{name}: no {weights}, left out")
-        return None
-    return weights
-
-
 def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: bool = False) -> list[Columns]:
     """Run the rows with the options of `add_engine`; return the metrics of each, times included.
 
@@ -136,21 +125,6 @@ def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: boo
     check(run_batch(tasks, Engine(options.engine, options.workers), on_progress=_log))
     folders = [output / RUNS / row.name for row in rows]
     return [read_metrics(folder) | read_times(folder) for folder in folders]
-
-
-def tabulate_runs(
-    rows: Sequence[Row],
-    options: argparse.Namespace,
-    header: str,
-    cells: Callable[[int, Columns], list[str]],
-    module: str,
-) -> None:
-    """Run the rows, print the table of their metrics, and write it into the README unless --no-readme is given.
-
-    cells: maps the number of a row and its metrics to its line of the table; module: file next to the README
-    """
-    found = enumerate(metrics_of_runs(rows, options))
-    publish(table(header, [cells(number, metrics) for number, metrics in found]), options, module)
 
 
 def publish(text: str, options: argparse.Namespace, module: str) -> None:
@@ -259,12 +233,6 @@ def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
             result, spent = timed(task)
             record.append(result if isinstance(result, float) else spent)
     return [statistics.median(record[2:]) for record in times]
-
-
-def interval_of(draws: Tensor) -> tuple[float, float]:
-    """95 % interval of a mean by its bootstrap draws."""
-    low, high = draws.quantile(draws.new_tensor([0.025, 0.975])).tolist()
-    return low, high
 
 
 def table(header: str | Sequence[str], rows: Iterable[Sequence[str]]) -> str:
