@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeVar
 
+import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -127,11 +128,20 @@ def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: boo
     return [read_metrics(folder) | read_times(folder) for folder in folders]
 
 
-def publish(text: str, options: argparse.Namespace, module: str) -> None:
-    """Print the result of an experiment, and write it into the README next to its module without --no-readme."""
+def publish(text: str, options: argparse.Namespace, module: str, *marks: str) -> None:
+    """Print the result of an experiment, and write it into the README next to its module without --no-readme.
+
+    marks: start and end of the text in the README, if they are not those of `write_between`
+    """
     print(text)
     if not options.no_readme:
-        write_between(Path(module).parent / "README.md", text)
+        write_between(Path(module).parent / "README.md", text, *marks)
+
+
+def publish_page(title: str, text: str, options: argparse.Namespace) -> None:
+    """Print the result of a benchmark, and write it as a page into the file --output."""
+    print(text)
+    options.output.write_text(f"# {title}\n\n{text}", encoding="utf-8")
 
 
 def cached_run(
@@ -233,6 +243,33 @@ def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
             result, spent = timed(task)
             record.append(result if isinstance(result, float) else spent)
     return [statistics.median(record[2:]) for record in times]
+
+
+def gradient_error(
+    solve: Callable[..., Tensor],
+    inputs: Mapping[str, Tensor],
+    steps: Mapping[str, float],
+    reference: Callable[..., Tensor] | None = None,
+) -> float:
+    """Largest relative error of gradients against central differences, along one random direction for each input.
+
+    solve: from the inputs to a number; steps: of the differences, for each input with a gradient
+    reference: what is differenced, where it is not `solve`
+    """
+    reference = reference or solve
+    generator = torch.Generator().manual_seed(0)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+    gradients = torch.autograd.grad(solve(**leaves), [leaves[name] for name in steps])
+    worst = 0.0
+    for (name, step), gradient in zip(steps.items(), gradients, strict=True):
+        direction = torch.randn(inputs[name].shape, generator=generator, dtype=torch.float64)
+        with torch.no_grad():
+            ahead, behind = (
+                reference(**{**inputs, name: inputs[name] + sign * step * direction}) for sign in (1, -1)
+            )
+        expected = (ahead - behind) / (2 * step)
+        worst = max(worst, float(((gradient * direction).sum() / expected - 1).abs()))
+    return worst
 
 
 def table(header: str | Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from experiments.benchmarks.problems import PEERS, load_problems
-from experiments.common import milliseconds, parser_of, table, timed
+from experiments.common import milliseconds, parser_of, publish_page, table, timed
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose
 
 HERE = Path(__file__).parent
@@ -222,8 +222,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     text = report(load_problems(arguments.peers), arguments.problems)
-    print(text)
-    arguments.output.write_text(f"# Pose estimation compared with poselib\n\n{text}")
+    publish_page("Pose estimation compared with poselib", text, arguments)
 
 
 if __name__ == "__main__":
