@@ -29,6 +29,7 @@ from torchslam.data import Sequence as Frames
 from torchslam.data import open_sequence
 from torchslam.geometry import se3_inverse
 from torchslam.io.results import read_metrics
+from torchslam.system.run import Run
 from torchslam.types import Trajectory
 
 T = TypeVar("T")
@@ -90,6 +91,14 @@ def scaled(T_cw: Float[Tensor, "K 4 4"], factor: float, about: int | None = None
     center = T_wc[half if about is None else about, :3, 3].clone()
     T_wc[half:, :3, 3] = center + factor * (T_wc[half:, :3, 3] - center)
     return se3_inverse(T_wc)
+
+
+def focal_of(run: Run) -> str:
+    """The focal length that the final adjustment found, with its standard error; without one the given one."""
+    found = run.calibration
+    if found is None:
+        return f"{float(run.camera.focal):.1f}"
+    return f"{float(found.camera.focal):.1f} ± {float(found.camera.focal) * found.focal_std:.1f}"
 
 
 def parser_of(
