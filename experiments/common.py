@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import IO, Any, TypeVar
 
 import torch
+from jaxtyping import Float
 from torch import Tensor
 
 import experiments.storey  # noqa: F401  it adds a scene
@@ -26,8 +27,9 @@ from torchslam.batch.results_table import read_times
 from torchslam.batch.rows import short_name
 from torchslam.data import Sequence as Frames
 from torchslam.data import open_sequence
-from torchslam.geometry import Camera
+from torchslam.geometry import se3_inverse
 from torchslam.io.results import read_metrics
+from torchslam.system.run import Run
 from torchslam.types import Trajectory
 
 T = TypeVar("T")
@@ -36,11 +38,6 @@ DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "sh
 
 DRONE_CAMERA, DRONE_TRUTH = "553,553,319.5,179.5", "drone_colmap.txt"
 """Of drone.mp4, which comes without: as COLMAP found them."""
-WEIGHTS_DIR = DATA_DIR.parent / "weights"
-LEARNED_FEATURES = {"xfeat": "xfeat.safetensors", "aliked": "aliked-t16.safetensors"}
-"""Files of the learned feature extractors in the folder of `add_weights`."""
-CONTROL = "synthetic:room?frames=120&seed=2&noise=8&blur=0.8&exposure=0.3"
-"""A rendered room that nothing is trained on: with other textures, noise and exposure, and exact poses."""
 
 
 def place_of(name: str) -> str:
@@ -64,28 +61,44 @@ def available(names: Iterable[str]) -> list[str]:
     return found
 
 
-def part_of(sequence: Frames, share: tuple[float, float]) -> range:
-    """The frames of a sequence from one share of its length to another."""
-    return range(*(round(end * len(sequence)) for end in share))
-
-
 def row_of(name: str, *labels: str, overrides: Iterable[str] = (), **more: Any) -> Row:
     """A row of a batch; `labels` distinguish it from other runs over the same sequence."""
     label = "_".join(short_name(word) for word in (name.removeprefix("synthetic:"), *labels))
     return Row(label, place_of(name), overrides=tuple(overrides), **more)
 
 
-class PosedSequence(Frames):
-    """A camera on a path (F, 4, 4) T_wc with blank images, for simulated features."""
+class Backward(Frames):
+    """The frames of a sequence in reverse."""
 
-    def __init__(self, name: str, camera: Camera, T_wc: Tensor, timestamps: Tensor) -> None:
-        super().__init__(name, "poses", camera, timestamps, Trajectory(timestamps, T_wc))
+    def __init__(self, forward: Frames) -> None:
+        times = (forward.timestamps[-1] - forward.timestamps).flip(0)
+        truth = forward.groundtruth
+        if truth is not None:
+            truth = Trajectory((forward.timestamps[-1] - truth.timestamps).flip(0), truth.T_wc.flip(0))
+        super().__init__(forward.name, forward.kind, forward.camera, times, truth)
+        self._forward = forward
 
     def image(self, index: int) -> Tensor:
-        return torch.zeros(1, 1, self.camera.height, self.camera.width)
+        return self._forward.image(len(self) - 1 - index)
 
     def image_name(self, index: int) -> str:
-        return f"pose {index}"
+        return self._forward.image_name(len(self) - 1 - index)
+
+
+def scaled(T_cw: Float[Tensor, "K 4 4"], factor: float, about: int | None = None) -> Float[Tensor, "K 4 4"]:
+    """Scale the second half of the poses around a camera; None: around its first one."""
+    T_wc, half = se3_inverse(T_cw), len(T_cw) // 2
+    center = T_wc[half if about is None else about, :3, 3].clone()
+    T_wc[half:, :3, 3] = center + factor * (T_wc[half:, :3, 3] - center)
+    return se3_inverse(T_wc)
+
+
+def focal_of(run: Run) -> str:
+    """The focal length that the final adjustment found, with its standard error; without one the given one."""
+    found = run.calibration
+    if found is None:
+        return f"{float(run.camera.focal):.1f}"
+    return f"{float(found.camera.focal):.1f} ± {float(found.camera.focal) * found.focal_std:.1f}"
 
 
 def parser_of(
@@ -112,20 +125,6 @@ def add_engine(parser: argparse.ArgumentParser, experiment: str) -> None:
     parser.add_argument("--workers", type=int, metavar="N", help="of --engine ray")
 
 
-def add_weights(parser: argparse.ArgumentParser) -> None:
-    """Add the option for the folder of the weights of learned feature extractors."""
-    parser.add_argument("--weights", type=Path, default=WEIGHTS_DIR, help="folder of the weights")
-
-
-def weights_of(name: str, folder: Path) -> Path | None:
-    """The weights of a learned feature extractor; None, with a message, if they are not in the folder."""
-    weights = (folder / LEARNED_FEATURES[name]).absolute()
-    if not weights.is_file():
-        print(f"{name}: no {weights}, left out")
-        return None
-    return weights
-
-
 def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: bool = False) -> list[Columns]:
     """Run the rows with the options of `add_engine`; return the metrics of each, times included.
 
@@ -138,26 +137,20 @@ def metrics_of_runs(rows: Sequence[Row], options: argparse.Namespace, plots: boo
     return [read_metrics(folder) | read_times(folder) for folder in folders]
 
 
-def tabulate_runs(
-    rows: Sequence[Row],
-    options: argparse.Namespace,
-    header: str,
-    cells: Callable[[int, Columns], list[str]],
-    module: str,
-) -> None:
-    """Run the rows, print the table of their metrics, and write it into the README unless --no-readme is given.
+def publish(text: str, options: argparse.Namespace, module: str, *marks: str) -> None:
+    """Print the result of an experiment, and write it into the README next to its module without --no-readme.
 
-    cells: maps the number of a row and its metrics to its line of the table; module: file next to the README
+    marks: start and end of the text in the README, if they are not those of `write_between`
     """
-    found = enumerate(metrics_of_runs(rows, options))
-    publish(table(header, [cells(number, metrics) for number, metrics in found]), options, module)
-
-
-def publish(text: str, options: argparse.Namespace, module: str) -> None:
-    """Print the result of an experiment, and write it into the README next to its module without --no-readme."""
     print(text)
     if not options.no_readme:
-        write_between(Path(module).parent / "README.md", text)
+        write_between(Path(module).parent / "README.md", text, *marks)
+
+
+def publish_page(title: str, text: str, options: argparse.Namespace) -> None:
+    """Print the result of a benchmark, and write it as a page into the file --output."""
+    print(text)
+    options.output.write_text(f"# {title}\n\n{text}", encoding="utf-8")
 
 
 def cached_run(
@@ -261,10 +254,31 @@ def milliseconds(*tasks: Callable[[], Any], repeats: int = 15) -> list[float]:
     return [statistics.median(record[2:]) for record in times]
 
 
-def interval_of(draws: Tensor) -> tuple[float, float]:
-    """95 % interval of a mean by its bootstrap draws."""
-    low, high = draws.quantile(draws.new_tensor([0.025, 0.975])).tolist()
-    return low, high
+def gradient_error(
+    solve: Callable[..., Tensor],
+    inputs: Mapping[str, Tensor],
+    steps: Mapping[str, float],
+    reference: Callable[..., Tensor] | None = None,
+) -> float:
+    """Largest relative error of gradients against central differences, along one random direction for each input.
+
+    solve: from the inputs to a number; steps: of the differences, for each input with a gradient
+    reference: what is differenced, where it is not `solve`
+    """
+    reference = reference or solve
+    generator = torch.Generator().manual_seed(0)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
+    gradients = torch.autograd.grad(solve(**leaves), [leaves[name] for name in steps])
+    worst = 0.0
+    for (name, step), gradient in zip(steps.items(), gradients, strict=True):
+        direction = torch.randn(inputs[name].shape, generator=generator, dtype=torch.float64)
+        with torch.no_grad():
+            ahead, behind = (
+                reference(**{**inputs, name: inputs[name] + sign * step * direction}) for sign in (1, -1)
+            )
+        expected = (ahead - behind) / (2 * step)
+        worst = max(worst, float(((gradient * direction).sum() / expected - 1).abs()))
+    return worst
 
 
 def table(header: str | Sequence[str], rows: Iterable[Sequence[str]]) -> str:

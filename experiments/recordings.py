@@ -1,10 +1,14 @@
-"""Whole runs over all real recordings, a change compared with the default: ratios of errors with intervals."""
+"""Settings compared with the default, in whole runs over real recordings: ratios of the ATE with intervals.
+
+python -m experiments.recordings --arm "fewer keyframes" keyframes.max_translation=0.14 keyframes.min_overlap=0.7
+python -m experiments.recordings shelf_bin --arm aliked features.kind=aliked 'features.weights="aliked.safetensors"'
+"""
 
 from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,19 +19,15 @@ from experiments.common import (
     DRONE_TRUTH,
     add_engine,
     available,
-    interval_of,
     metrics_of_runs,
+    parser_of,
     row_of,
     table,
 )
 from torchslam.batch import Columns, Row
-from torchslam.batch.result_store import RUNS
-from torchslam.io.results import read_metrics
 
 SEEDS = (0, 1, 2)
 DEFAULT = "default"
-KEPT_ORB = ("features.kind=experiments.cached_features:ORB",)
-"""The default's features, cached: the same bytes."""
 ENOUGH = 0.9
 """Fraction of the frames posed by the default; with fewer, the path is another one and errors are not compared."""
 _DRAWS = 2000
@@ -93,32 +93,15 @@ Outcomes = dict[tuple[str, str, int], Outcome]
 """By recording, arm and seed."""
 
 
-Overrides = Callable[[str, str, int], Sequence[str]]
-"""Maps recording, arm and seed to the settings of a run, without the seed."""
+def outcomes_of(options: argparse.Namespace, arms: Mapping[str, Sequence[str]]) -> Outcomes:
+    """Run the recordings and seeds that the options select with the settings of each arm, or reuse the results.
 
-
-def add_choices(parser: argparse.ArgumentParser, arms: Sequence[str]) -> None:
-    """Add the choice of recordings, arms and seeds; all experiments share a folder, so the default is run once."""
-    parser.add_argument("labels", nargs="*", choices=[[], *RECORDINGS], help="recordings; all by default")
-    parser.add_argument("--arms", nargs="*", choices=arms, default=list(arms))
-    parser.add_argument("--seeds", nargs="*", type=int, default=list(SEEDS))
-    parser.add_argument("--cached", action="store_true", help="only a table of the existing runs")
-    parser.add_argument("--no-readme", action="store_true", help="print only")
-    add_engine(parser, "recordings")
-
-
-def outcomes_of(options: argparse.Namespace, overrides: Overrides) -> Outcomes:
-    """Run what the options of `add_choices` select, or reuse it. Raises SystemExit for an error."""
+    Raises SystemExit for an error.
+    """
     cases = [
-        (label, arm, seed)
-        for seed in options.seeds
-        for arm in options.arms
-        for label in recordings(options.labels)
+        (label, arm, seed) for seed in options.seeds for arm in arms for label in recordings(options.labels)
     ]
-    if options.cached:
-        folders = {case: options.output / RUNS / RECORDINGS[case[0]].row(*case, ()).name for case in cases}
-        return {case: Outcome.of(read_metrics(path)) for case, path in folders.items() if path.is_dir()}
-    rows = [RECORDINGS[case[0]].row(*case, overrides(*case)) for case in cases]
+    rows = [RECORDINGS[label].row(label, arm, seed, arms[arm]) for label, arm, seed in cases]
     figures = metrics_of_runs(rows, options)
     return {case: Outcome.of(found) for case, found in zip(cases, figures, strict=True)}
 
@@ -164,7 +147,8 @@ def interval(
         some = [values for number in drawn(len(families)) for values in families[number]]
         each = [sum(values[k] for k in drawn(len(values))) / len(values) for values in some]
         means.append(math.exp(sum(each) / len(each)))
-    return interval_of(torch.tensor(means))
+    low, high = torch.tensor(means).quantile(torch.tensor([0.025, 0.975])).tolist()
+    return low, high
 
 
 HEADER = ["recording", "arm", "posed, %", "ATE"]
@@ -199,3 +183,21 @@ def _row(outcomes: Outcomes, label: str, arm: str, reference: str) -> list[str]:
 
 def _ate(run: Outcome) -> str:
     return "none" if run.ate is None else f"{run.ate:.4f}"
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    parser.add_argument("labels", nargs="*", choices=[[], *RECORDINGS], help="recordings; all by default")
+    parser.add_argument(
+        "--arm", nargs="+", action="append", default=[], metavar=("NAME", "section.key=value"),
+        help="name and settings of what is compared with the default; repeatable",
+    )  # fmt: skip
+    parser.add_argument("--seeds", nargs="*", type=int, default=list(SEEDS), choices=SEEDS)
+    add_engine(parser, "recordings")
+    options = parser.parse_args()
+    arms = {DEFAULT: []} | {name: settings for name, *settings in options.arm}
+    print(report(outcomes_of(options, arms), list(arms)))
+
+
+if __name__ == "__main__":
+    main()

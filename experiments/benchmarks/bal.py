@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from experiments.benchmarks.ceres import solve_by_ceres
-from experiments.common import parser_of, table
+from experiments.common import parser_of, publish_page, table
 from torchslam import SLAM
 from torchslam.config import load_config
 from torchslam.data import open_sequence
@@ -214,8 +214,6 @@ def main() -> None:
         f"{len(problem.T_cw)} cameras, {len(problem.points_w)} points, {len(problem.pixels)} observations"
     )
     lines = [
-        "# Bundle adjustment on a problem in BAL's format",
-        "",
         f"{counts}; {source}. The cost at the start is {start:.1f} px^2; {beside}.",
         "",
         "## Poses and points are free",
@@ -230,9 +228,7 @@ def main() -> None:
         "earlier, once. Written by `python -m experiments.benchmarks.bal`, or with the path of a problem from the "
         "collection.",
     ]
-    text = "\n".join(lines) + "\n"
-    print(text)
-    arguments.output.write_text(text, encoding="utf-8")
+    publish_page("Bundle adjustment on a problem in BAL's format", "\n".join(lines) + "\n", arguments)
 
 
 if __name__ == "__main__":

@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.benchmarks.solvers import camera, colmap_solve, gradient_error, rmse
-from experiments.common import milliseconds, parser_of, table
+from experiments.benchmarks.solvers import camera, colmap_solve, rmse
+from experiments.common import gradient_error, milliseconds, parser_of, publish_page, table
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, transform
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, solve_bundle
 
@@ -129,14 +129,14 @@ def large() -> list[str]:
     reached = rmse(replace(problem, T_cw=solution.T_cw, points_w=solution.points_w))
     iterations = int(solution.convergence.iterations)
     error = gradient_error(
-        lambda pixels, **options: loss_of(
+        lambda pixels: points_loss(
             solve_bundle(
-                replace(problem, pixels=pixels), options=BUNDLE_OPTIONS.replace(kernel="none", **options)
-            )
+                replace(problem, pixels=pixels),
+                options=BUNDLE_OPTIONS.replace(kernel="none", iterations=40, tolerance=1e-28),
+            ).points_w
         ),
         {"pixels": problem.pixels},
         {"pixels": 1e-4},
-        {"iterations": 40, "tolerance": 1e-28},
     )
     memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     header = ["", "RMSE, px", "solve, ms", "iterations", "an iteration, ms", "gradient to all pixels, ms"]
@@ -207,8 +207,6 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     lines = [
-        "# Bundle adjustment, large and in batches",
-        "",
         "One thread, float64, median CPU time of the process, interleaved.",
         "",
         "    python -m experiments.benchmarks.bundle",
@@ -222,9 +220,7 @@ def main() -> None:
         "",
         *windows(),
     ]
-    text = "\n".join(lines)
-    print(text)
-    arguments.output.write_text(text, encoding="utf-8")
+    publish_page("Bundle adjustment, large and in batches", "\n".join(lines), arguments)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from experiments.common import parser_of, sequences, table, timed
+from experiments.common import parser_of, publish_page, sequences, table, timed
 from torchslam import ORB, ClipGraph, ClipSLAM, Features, clip_loss
 from torchslam.learning.dataset import Clip, Clips
 from torchslam.learning.losses import relative_ate
@@ -154,7 +154,7 @@ def main() -> None:
         " | gradients differ by"
     )
     text = (
-        "# Training through clips\n\nClips of 8 frames, 1000 ORB keypoints each, moved by half a pixel before every "
+        "Clips of 8 frames, 1000 ORB keypoints each, moved by half a pixel before every "
         "step; gradients of the ATE to keypoints, weights and camera. Medians of the CPU time of one thread, in "
         "milliseconds per clip; a step is pose and backward, without the feature extractor and `build_graph`. The "
         "columns after them pose all clips of a row in one call, each with its own camera, alternating with one call "
@@ -162,8 +162,7 @@ def main() -> None:
         "maximum.\n\n"
         f"    python -m experiments.benchmarks.clips\n\n{table(header, rows)}"
     )
-    print(text)
-    arguments.output.write_text(text, encoding="utf-8")
+    publish_page("Training through clips", text, arguments)
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from experiments.benchmarks.problems import match_pixels
-from experiments.common import DATA_DIR, milliseconds, parser_of, table
+from experiments.common import DATA_DIR, milliseconds, parser_of, publish_page, table
 from torchslam.features import ORB, OpenCVORB, match, match_by_projection
 from torchslam.types import Features
 
@@ -217,8 +217,7 @@ def main() -> None:
             *quality_tables(arguments.data, arguments.pairs),
         ]
     text = "\n".join(parts)
-    print(text)
-    arguments.output.write_text(f"# Features and matching compared with OpenCV\n\n{text}")
+    publish_page("Features and matching compared with OpenCV", text, arguments)
 
 
 if __name__ == "__main__":

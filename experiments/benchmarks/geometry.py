@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import statistics
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from types import ModuleType
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from experiments.benchmarks.problems import PEERS, load_problems
-from experiments.common import milliseconds, parser_of, table, timed
+from experiments.common import milliseconds, parser_of, publish_page, table, timed
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose
 
 HERE = Path(__file__).parent
@@ -31,6 +31,8 @@ CAMERA = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))
 POSELIB_CAMERA = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
 RELATIVE_THRESHOLD, ABSOLUTE_THRESHOLD = 1.0, 2.0
 BATCH = 64
+relative_of = partial(estimate_relative_pose, camera_1=CAMERA, camera_2=CAMERA, threshold=RELATIVE_THRESHOLD)
+absolute_of = partial(estimate_absolute_pose, camera=CAMERA, threshold=ABSOLUTE_THRESHOLD)
 
 
 class Errors(NamedTuple):
@@ -45,54 +47,37 @@ def batch_of_one(*arrays: NDArray) -> list[Tensor]:
     return [torch.from_numpy(array)[None] for array in arrays]
 
 
-def relative(problems: ModuleType, outliers: float, count: int) -> tuple[list[Errors], list[Errors]]:
+def relative(problems: ModuleType, seed: int, outliers: float) -> tuple[Errors, Errors]:
     """Ours and poselib's, on 500 matches with noise of one pixel."""
-    ours, theirs = [], []
-    for seed in range(count):
-        x_1, x_2, R, t, _ = problems.two_view(seed, 500, outliers)
-        options = {"max_epipolar_error": RELATIVE_THRESHOLD}
-        (pose, _), ms = timed(
-            partial(poselib.estimate_relative_pose, x_1, x_2, POSELIB_CAMERA, POSELIB_CAMERA, options, {})
-        )
-        theirs.append(
-            Errors(ms, problems.rot_err_deg(R, pose.R), problems.dir_err_deg(t, pose.t, signed=True))
-        )
-        one, two = batch_of_one(x_1, x_2)
-        found, ms = timed(
-            partial(
-                estimate_relative_pose,
-                one,
-                two,
-                camera_1=CAMERA,
-                camera_2=CAMERA,
-                threshold=RELATIVE_THRESHOLD,
-            )
-        )
-        T_21 = found.T_21[0].numpy()
-        rotation, direction = T_21[:3, :3], T_21[:3, 3]
-        ours.append(
-            Errors(ms, problems.rot_err_deg(R, rotation), problems.dir_err_deg(t, direction, signed=True))
-        )
-    return ours, theirs
+    x_1, x_2, R, t, _ = problems.two_view(seed, 500, outliers)
+
+    def errors(ms: float, R_21: NDArray, t_21: NDArray) -> Errors:
+        return Errors(ms, problems.rot_err_deg(R, R_21), problems.dir_err_deg(t, t_21, signed=True))
+
+    options = {"max_epipolar_error": RELATIVE_THRESHOLD}
+    cameras = POSELIB_CAMERA, POSELIB_CAMERA
+    (pose, _), ms = timed(partial(poselib.estimate_relative_pose, x_1, x_2, *cameras, options, {}))
+    theirs = errors(ms, pose.R, pose.t)
+    found, ms = timed(partial(relative_of, *batch_of_one(x_1, x_2)))
+    T_21 = found.T_21[0].numpy()
+    return errors(ms, T_21[:3, :3], T_21[:3, 3]), theirs
 
 
-def absolute(problems: ModuleType, outliers: float, count: int) -> tuple[list[Errors], list[Errors]]:
+def absolute(problems: ModuleType, seed: int, outliers: float) -> tuple[Errors, Errors]:
     """Ours and poselib's, on 300 pairs with noise of one pixel."""
-    ours, theirs = [], []
-    for seed in range(count):
-        points, pixels, R, t, _ = problems.pnp(seed, 300, outliers)
-        options = {"max_reproj_error": ABSOLUTE_THRESHOLD}
-        (pose, _), ms = timed(
-            partial(poselib.estimate_absolute_pose, pixels, points, POSELIB_CAMERA, options, {})
-        )
-        theirs.append(Errors(ms, problems.rot_err_deg(R, pose.R), float(np.linalg.norm(t - pose.t))))
-        one, two = batch_of_one(points, pixels)
-        found, ms = timed(
-            partial(estimate_absolute_pose, one, two, camera=CAMERA, threshold=ABSOLUTE_THRESHOLD)
-        )
-        T_cw = found.T_cw[0].numpy()
-        ours.append(Errors(ms, problems.rot_err_deg(R, T_cw[:3, :3]), float(np.linalg.norm(t - T_cw[:3, 3]))))
-    return ours, theirs
+    points, pixels, R, t, _ = problems.pnp(seed, 300, outliers)
+
+    def errors(ms: float, R_cw: NDArray, t_cw: NDArray) -> Errors:
+        return Errors(ms, problems.rot_err_deg(R, R_cw), float(np.linalg.norm(t - t_cw)))
+
+    options = {"max_reproj_error": ABSOLUTE_THRESHOLD}
+    (pose, _), ms = timed(
+        partial(poselib.estimate_absolute_pose, pixels, points, POSELIB_CAMERA, options, {})
+    )
+    theirs = errors(ms, pose.R, pose.t)
+    found, ms = timed(partial(absolute_of, *batch_of_one(points, pixels)))
+    T_cw = found.T_cw[0].numpy()
+    return errors(ms, T_cw[:3, :3], T_cw[:3, 3]), theirs
 
 
 def plane(problems: ModuleType, seed: int, baseline: float, count: int = 300, outliers: float = 0.3) -> Any:
@@ -127,10 +112,7 @@ def models(problems: ModuleType, baseline: float, expected: str, count: int = 50
     seen, ambiguous, errors = Counter[str](), 0, []
     for seed in range(count):
         x_1, x_2, _, t = plane(problems, seed, baseline)
-        one, two = batch_of_one(x_1, x_2)
-        found = estimate_relative_pose(
-            one, two, camera_1=CAMERA, camera_2=CAMERA, threshold=RELATIVE_THRESHOLD
-        )
+        found = relative_of(*batch_of_one(x_1, x_2))
         seen[found.model[0]] += 1
         ambiguous += int(found.ambiguous.item())
         if found.success.item():
@@ -159,14 +141,6 @@ def speedup(what: str, estimate: Callable[..., Any], cases: list[tuple[NDArray, 
 
 
 def throughput(problems: ModuleType) -> list[list[str]]:
-    def absolute_of(points: Tensor, pixels: Tensor) -> Any:
-        return estimate_absolute_pose(points, pixels, camera=CAMERA, threshold=ABSOLUTE_THRESHOLD)
-
-    def relative_of(pixels_1: Tensor, pixels_2: Tensor) -> Any:
-        return estimate_relative_pose(
-            pixels_1, pixels_2, camera_1=CAMERA, camera_2=CAMERA, threshold=RELATIVE_THRESHOLD
-        )
-
     seeds = range(BATCH)
     return [
         speedup("absolute pose, 30 % outliers", absolute_of, [problems.pnp(s, 300, 0.3)[:2] for s in seeds]),
@@ -177,7 +151,7 @@ def throughput(problems: ModuleType) -> list[list[str]]:
     ]
 
 
-def compared(what: str, ours: list[Errors], theirs: list[Errors]) -> list[str]:
+def compared(what: str, ours: Sequence[Errors], theirs: Sequence[Errors]) -> list[str]:
     """One row: medians and means of ours and the peer's, and their ratios."""
     cells = [what, f"{len(ours)}"]
     for field, digits in (("rotation", 3), ("translation", 4)):
@@ -197,7 +171,10 @@ def report(problems: ModuleType, count: int) -> str:
         ("absolute", absolute, (0.1, 0.3, 0.6)),
     ):
         rows += [
-            compared(f"{what} pose, {outliers:.0%} outliers", *estimate(problems, outliers, count))
+            compared(
+                f"{what} pose, {outliers:.0%} outliers",
+                *zip(*(estimate(problems, seed, outliers) for seed in range(count)), strict=True),
+            )
             for outliers in fractions
         ]
     scenes = [
@@ -222,8 +199,7 @@ def main() -> None:
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     text = report(load_problems(arguments.peers), arguments.problems)
-    print(text)
-    arguments.output.write_text(f"# Pose estimation compared with poselib\n\n{text}")
+    publish_page("Pose estimation compared with poselib", text, arguments)
 
 
 if __name__ == "__main__":

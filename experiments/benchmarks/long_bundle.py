@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from experiments.benchmarks.solvers import camera
-from experiments.common import parser_of, table
+from experiments.common import parser_of, publish_page, table
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, transform
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.optim.bundle import _schur as schur
@@ -151,8 +151,6 @@ def main() -> None:
                 rows.append([*sizes, *of_steps, *covariances, difference])
                 print(rows[-1], flush=True)
     lines = [
-        "# The adjustment of a long recording",
-        "",
         f"A simulated walk, three times round a block; {POINTS} points begin in each image. One thread, float64, CPU",
         "time with that of the check that all is determined, which is one more factorization; the memory is that of",
         "the process, some 250 MB of it before the adjustment.",
@@ -161,9 +159,7 @@ def main() -> None:
         "",
         table(header, rows),
     ]
-    text = "\n".join(lines)
-    print(text)
-    arguments.output.write_text(text, encoding="utf-8")
+    publish_page("The adjustment of a long recording", "\n".join(lines), arguments)
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from experiments.common import parser_of, table
+from experiments.common import parser_of, publish_page, table
 from torchslam.config import Config
 from torchslam.geometry import Camera, SharedCamera, transform
 from torchslam.loop_closing.loop_closer import LoopCloser
@@ -147,13 +147,12 @@ def main() -> None:
         rows.append([stage, *(f"{each:.1f}" for each in ms), f"{ms[-1] / ms[0]:.2f}"])
     header = ["ms of one keyframe", *(f"{size} keyframes" for size in SIZES), f"{SIZES[-1]} / {SIZES[0]}"]
     text = (
-        "# A keyframe in a small map and in a large one\n\nSimulated: a camera goes along a wall. One thread, "
+        "Simulated: a camera goes along a wall. One thread, "
         f"medians of {NEXT} keyframes, CPU time of the process, the three maps interleaved.\n\n"
         "    python -m experiments.benchmarks.mapping\n\n"
         f"{table(header, rows)}"
     )
-    print(text)
-    arguments.output.write_text(text, encoding="utf-8")
+    publish_page("A keyframe in a small map and in a large one", text, arguments)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ from torch import Tensor
 from torch.nn.utils.rnn import pad_sequence
 
 from experiments.benchmarks.problems import match_pixels
-from experiments.common import DATA_DIR, parser_of, table
+from experiments.common import DATA_DIR, parser_of, publish_page, table
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.features import ORB
@@ -271,8 +271,7 @@ def main() -> None:
         for name, least_baseline in SEQUENCES.items():
             pairs += pairs_of(open_sequence(arguments.data / name), least_baseline, arguments.pairs)
         text = report(pairs, arguments.seeds)
-    print(text)
-    arguments.output.write_text(f"# Relative pose of real pairs\n\n{text}")
+    publish_page("Relative pose of real pairs", text, arguments)
 
 
 if __name__ == "__main__":

@@ -8,8 +8,8 @@ FOLDER holds `problems.py`, which makes the fixed problems. Prints a table and w
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -19,12 +19,14 @@ from torch import Tensor
 
 from experiments.benchmarks.ceres import solve_by_ceres
 from experiments.benchmarks.problems import PEERS, load_problems
-from experiments.common import milliseconds, parser_of, table
+from experiments.common import gradient_error, milliseconds, parser_of, publish_page, table
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.geometry.robust import Kernel
 from torchslam.optim import BUNDLE_OPTIONS, POSE_OPTIONS, BundleProblem, solve_bundle, solve_pose
 
 HERE = Path(__file__).parent
+POSE_STEPS = {"points_w": 1e-6, "pixels": 1e-4, "weights": 1e-5, "params": 1e-4, "scale": 1e-5}
+"""Of central differences, by input."""
 FOCAL, CENTER, SIZE = 525.0, (319.5, 239.5), (640, 480)
 
 
@@ -46,33 +48,6 @@ class Peer(NamedTuple):
 
 def camera() -> Camera:
     return Camera.pinhole(FOCAL, FOCAL, *CENTER, size=SIZE)
-
-
-def central_difference(
-    solve: Callable[[Tensor], Tensor], at: Tensor, direction: Tensor, step: float
-) -> Tensor:
-    with torch.no_grad():
-        return (solve(at + step * direction) - solve(at - step * direction)) / (2 * step)
-
-
-def gradient_error(
-    solve: Callable[..., Tensor], inputs: dict[str, Tensor], steps: dict[str, float], exactly: dict[str, Any]
-) -> float:
-    """Largest relative error of the gradient to any input, along one random direction each."""
-    generator = torch.Generator().manual_seed(0)
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in inputs.items()}
-    gradients = torch.autograd.grad(solve(**leaves, **exactly), [leaves[name] for name in steps])
-    worst = 0.0
-    for (name, step), gradient in zip(steps.items(), gradients, strict=True):
-        direction = torch.randn(inputs[name].shape, generator=generator, dtype=torch.float64)
-
-        def along(tensor: Tensor, name: str = name) -> Tensor:
-            return solve(**(inputs | {name: tensor}), **exactly)
-
-        expected = central_difference(along, inputs[name], direction, step)
-        found = (gradient * direction).sum()
-        worst = max(worst, float((found - expected).abs() / expected.abs()))
-    return worst
 
 
 # --- poses -----------------------------------------------------------------------------------------------------
@@ -141,12 +116,7 @@ def benchmark_pose(problems: ModuleType) -> list[Row]:
 
     forward_ms, backward_ms = milliseconds(forward, backward, repeats=101)
     together_ms, loop_ms = milliseconds(together, loop, repeats=5)
-    error = gradient_error(
-        lambda **tensors: pose_loss(start, **tensors),
-        inputs,
-        {"points_w": 1e-6, "pixels": 1e-4, "weights": 1e-5, "params": 1e-4, "scale": 1e-5},
-        {"iterations": 100, "tolerance": 0.0},
-    )
+    error = gradient_error(partial(pose_loss, start, iterations=100, tolerance=0.0), inputs, POSE_STEPS)
     iterations = solve_pose(
         inputs["points_w"], inputs["pixels"], T_cw=start, camera=camera(), weights=inputs["weights"]
     ).convergence.iterations.item()
@@ -235,14 +205,10 @@ def benchmark_bundle(problems: ModuleType) -> list[Row]:
     with torch.no_grad():
         solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none"))
     reached = rmse(replace(problem, T_cw=solution.T_cw, points_w=solution.points_w))
-    steps = {"pixels": 1e-4, "weights": 1e-5, "params": 1e-4}
+    exactly = partial(bundle_loss, problem, scale=2.0, iterations=60, tolerance=1e-28)
+    steps = {name: POSE_STEPS[name] for name in inputs}
     errors = {
-        kernel: gradient_error(
-            lambda kernel=kernel, **tensors: bundle_loss(problem, **tensors, kernel=kernel, scale=2.0),
-            inputs,
-            steps,
-            {"iterations": 60, "tolerance": 1e-28},
-        )
+        kernel: gradient_error(partial(exactly, kernel=kernel), inputs, steps)
         for kernel in ("none", "cauchy")
     }
     return [
@@ -275,11 +241,8 @@ def main() -> None:
     problems = load_problems(arguments.peers)
     rows = benchmark_pose(problems) + benchmark_bundle(problems)
     text = table("what | reached | required, or the peer", rows)
-    print(text)
-    arguments.output.write_text(
-        "# Solvers\n\nOne thread, float64, median CPU time of the process, interleaved with the peers: "
-        f"`python -m experiments.benchmarks.solvers`.\n\n{text}"
-    )
+    how = "One thread, float64, median CPU time of the process, interleaved with the peers: "
+    publish_page("Solvers", f"{how}`python -m experiments.benchmarks.solvers`.\n\n{text}", arguments)
 
 
 if __name__ == "__main__":

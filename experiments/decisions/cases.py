@@ -14,9 +14,8 @@ from typing import Protocol
 
 import numpy as np
 
-from experiments.common import DATA_DIR, DRONE_CAMERA, DRONE_TRUTH, parser_of
+from experiments.common import DATA_DIR, DRONE_CAMERA, DRONE_TRUTH, Backward, parser_of
 from experiments.decisions.rendered import MOTIONS, Path, RenderedSequence
-from experiments.global_mapping.check_trials import Backward
 from torchslam.batch import Columns
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.trajectories import read_trajectory

@@ -13,8 +13,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from experiments.common import scaled
 from experiments.decisions.cases import Case, half_of, name_of
-from experiments.global_mapping.check_trials import scaled
 from experiments.trials.judging import extent, wrong
 from torchslam.batch import Columns
 from torchslam.config import Config

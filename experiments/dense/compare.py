@@ -8,28 +8,53 @@ the one that the classical aggregation keeps; the learned one keeps as much by a
 
 from __future__ import annotations
 
-import argparse
-import time
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
+from jaxtyping import Float
 from safetensors.torch import load_file
 from torch import Tensor
 
-from experiments.dense.peers import Depth, fused
-from experiments.dense.run import LEVELS, opened, truth_of
+from experiments.common import parser_of, timed
+from experiments.dense.run import LEVELS, add_truth, estimator, opened, truth_of
 from torchslam.dense import DepthMaps
-from torchslam.dense.confidence import LEAST_KEPT, confidence_alone, kept
-from torchslam.dense.estimate import Estimate, estimate_depth
+from torchslam.dense.confidence import LEAST_KEPT, confidence_alone, confidence_together, kept
+from torchslam.dense.consistency import merge
+from torchslam.dense.estimate import Estimate
 from torchslam.dense.learned import RatingNet, learned_confidence
-from torchslam.densify.views import SWEPT
+from torchslam.densify.views import Views
 from torchslam.io.results import DEPTHS
 
 HALVINGS = 18  # of the interval in which a least confidence is sought
 CANDIDATES = torch.linspace(0.02, 0.998, 100)  # least confidences
 RIGHT = 0.05
+
+
+Alone = Callable[[int], tuple[Tensor, Tensor]]
+"""Inverse depth and confidence (H, W) of a view alone."""
+
+
+class Depth(NamedTuple):
+    """Inverse depth of views, 0 where unknown, and its confidence."""
+
+    inverse_depth: Float[Tensor, "K H W"]
+    confidence: Float[Tensor, "K H W"]
+
+
+def fused(views: Views, alone: Alone) -> Depth:
+    """Depth of all views after the comparison with their neighbors."""
+    depths, confidences = [], []
+    for view in range(len(views)):
+        others = [alone(other) for other in views.neighbors[view]]
+        depth, confidence = alone(view)
+        near, weights = (torch.stack([each[i] for each in others]) for i in (0, 1))
+        merged = merge(depth, confidence, near, weights, views.camera, views.T_sr(view))
+        depths.append(merged.inverse_depth)
+        confidences.append(confidence_together(merged, confidence))
+    return Depth(torch.stack(depths), torch.stack(confidences))
 
 
 def kept_with(depth: Depth, truth: Tensor, least: float) -> Tensor:
@@ -63,9 +88,8 @@ def most_at(depth: Depth, truth: Tensor, accuracy: float) -> float:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("results", type=Path)
-    parser.add_argument("--depth", type=Path, help="folder of the sensor's depth; else the scene is rendered")
+    parser = parser_of(__doc__)
+    add_truth(parser)
     parser.add_argument(
         "--weights", type=Path, nargs="*", default=[], help="of other networks, to be measured too"
     )
@@ -73,35 +97,33 @@ def main() -> None:
     maps = DepthMaps.load(options.results / DEPTHS)
     truth, (views, images) = truth_of(options.results, maps, options.depth), opened(options.results, maps)
     seconds: list[float] = []
+    swept = estimator(views, images)
 
     @cache
-    @torch.no_grad()
     def estimate(view: int) -> Estimate:
-        sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
-        gray, started = images.gray(view)[None], time.process_time()
-        limits, poses = (views.near[view, None], views.far[view, None]), views.T_sr(view)[None, :SWEPT]
-        found = estimate_depth(gray, sources[None], views.camera, poses, *limits)
-        seconds.append(time.process_time() - started)
+        for each in (view, *views.neighbors[view]):
+            images.gray(each)  # reading is not counted
+        found, spent = timed(lambda: swept(view))
+        seconds.append(spent / 1e3)
         return found
 
     def classical(view: int) -> tuple[Tensor, Tensor]:
         found = estimate(view)
         return found.inverse_depth[0], confidence_alone(found)[0]
 
-    def learned(net: RatingNet | None) -> Callable[[int], tuple[Tensor, Tensor]]:
+    def learned(net: RatingNet | None) -> Alone:
         @cache
         @torch.no_grad()
         def alone(view: int) -> tuple[Tensor, Tensor]:
-            found, gray, started = estimate(view), images.gray(view)[None], time.process_time()
+            found, gray = estimate(view), images.gray(view)[None]
             limits = views.near[view, None], views.far[view, None]
-            confidence = learned_confidence(found, gray, *limits, net)
-            added.append(time.process_time() - started)
+            confidence, spent = timed(lambda: learned_confidence(found, gray, *limits, net))
+            added.append(spent / 1e3)
             return found.inverse_depth[0], confidence[0]
 
         return alone
 
-    rows = list(range(len(views)))
-    base = fused(views, rows, classical)
+    base = fused(views, classical)
     is_kept = kept_with(base, truth, LEAST_KEPT)
     share, wrong = float(is_kept.sum() / (truth > 0).sum()), errors(base, truth, is_kept)
     accuracy = float((wrong < RIGHT).double().mean())
@@ -119,7 +141,7 @@ def main() -> None:
         if weights is not None:
             net = RatingNet().requires_grad_(False)
             net.load_state_dict(load_file(weights))
-        depth = fused(views, rows, learned(net))
+        depth = fused(views, learned(net))
         taken = (sum(seconds) + sum(added)) / len(seconds)
         name = "learned" if weights is None else weights.stem
         same = kept_with(depth, truth, least_for(depth, truth, share))

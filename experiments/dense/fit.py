@@ -14,12 +14,10 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from experiments.dense.run import opened, truth_of
+from experiments.dense.run import estimator, opened, truth_of
 from torchslam.dense import DepthMaps
 from torchslam.dense.confidence import alone_features, confidence_alone, together_features
 from torchslam.dense.consistency import merge
-from torchslam.dense.estimate import estimate_depth
-from torchslam.densify.views import SWEPT
 from torchslam.io.results import DEPTHS
 
 RIGHT = 0.05
@@ -32,12 +30,11 @@ def samples(folder: Path, depth: Path | None) -> tuple[Tensor, Tensor, Tensor, T
     maps = DepthMaps.load(folder / DEPTHS)
     truth, (views, images) = truth_of(folder, maps, depth), opened(folder, maps)
 
+    estimate = estimator(views, images)
+
     @cache
-    @torch.no_grad()
     def alone(view: int) -> tuple[Tensor, Tensor, Tensor]:
-        sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
-        poses, limits = views.T_sr(view)[None, :SWEPT], (views.near[view, None], views.far[view, None])
-        found = estimate_depth(images.gray(view)[None], sources[None], views.camera, poses, *limits)
+        found = estimate(view)
         return found.inverse_depth[0], confidence_alone(found)[0], alone_features(found)[0]
 
     rows: list[list[Tensor]] = [[], [], [], []]

@@ -6,18 +6,21 @@ python -m experiments.dense.run RESULTS [--depth FOLDER]
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
+from functools import cache
 from itertools import pairwise
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-import experiments.storey  # noqa: F401  it adds a scene
+from experiments.common import parser_of
 from experiments.dense.truth import Sensor, rendered_depth
 from torchslam.data import open_sequence
 from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.dense import DepthMaps
-from torchslam.densify.views import ViewImages, Views, views_of
+from torchslam.dense.estimate import Estimate, estimate_depth
+from torchslam.densify.views import SWEPT, ViewImages, Views, views_of
 from torchslam.geometry import se3_inverse
 from torchslam.io.export.scene import open_images, scene_of
 from torchslam.io.results import DEPTHS, MAP, read_image_source, read_metrics
@@ -64,12 +67,28 @@ def opened(folder: Path, maps: DepthMaps) -> tuple[Views, ViewImages]:
     return views, ViewImages(views, open_images(source, scene, views.camera))
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+def estimator(views: Views, images: ViewImages) -> Callable[[int], Estimate]:
+    """Depth of a view alone, as `torchslam densify` finds it, before its confidence; cached."""
+
+    @cache
+    @torch.no_grad()
+    def estimate(view: int) -> Estimate:
+        sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])
+        poses, limits = views.T_sr(view)[None, :SWEPT], (views.near[view, None], views.far[view, None])
+        return estimate_depth(images.gray(view)[None], sources[None], views.camera, poses, *limits)
+
+    return estimate
+
+
+def add_truth(parser: argparse.ArgumentParser) -> None:
+    """Add the folder of results and that of the sensor's depth."""
     parser.add_argument("results", type=Path)
-    parser.add_argument(
-        "--depth", type=Path, help="folder of the sensor's depth images; else the scene is rendered"
-    )
+    parser.add_argument("--depth", type=Path, help="folder of the sensor's depth; else the scene is rendered")
+
+
+def main() -> None:
+    parser = parser_of(__doc__)
+    add_truth(parser)
     options = parser.parse_args()
     maps = DepthMaps.load(options.results / DEPTHS)
     truth = truth_of(options.results, maps, options.depth)

@@ -17,6 +17,7 @@ from experiments.common import (
     available,
     cached_run,
     check,
+    focal_of,
     parser_of,
     place_of,
     publish,
@@ -163,14 +164,6 @@ def ate_of(run: Run, groundtruth: Trajectory | None) -> float | None:
         return evaluate(run.trajectory, groundtruth).ate_m
     except TrajectoryError:
         return None
-
-
-def focal_of(run: Run) -> str:
-    """The focal length that the final adjustment found, with its standard error; without one the given one."""
-    found = run.calibration
-    if found is None:
-        return f"{float(run.camera.focal):.1f}"
-    return f"{float(found.camera.focal):.1f} ± {float(found.camera.focal) * found.focal_std:.1f}"
 
 
 def cells(name: str, outcome: Columns, folder: Path, peer: Path | None) -> list[str]:

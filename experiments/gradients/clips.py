@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from experiments.benchmarks.clips import MOVE_PX, PreparedClip, prepare
-from experiments.common import parser_of, sequences, table
+from experiments.common import parser_of, publish_page, sequences, table
 from torchslam import ORB, ClipGraph, ClipPoses, ClipSLAM, Features
 from torchslam.learning import clip_slam as clip_module
 from torchslam.learning.dataset import Clips
@@ -213,7 +213,6 @@ def main() -> None:
         float(before.deviations[some].median()) for some in (before.there, ~before.there)
     )
     text = (
-        "# Gradients of clips\n\n"
         f"{count} clips of {', '.join(NAMES)}, {SEEDS} noises of half a pixel each: how far gradients of the relative "
         "ATE to keypoints or camera (the worse of the two) are off those of the reference, as a share of their length: "
         "least, median, most; and the most by which they differ between all clips of a sequence in one call and one "
@@ -230,8 +229,7 @@ def main() -> None:
         f"{rank_correlation(before.deviations[before.there], before.off[before.there]):.2f} among those at a "
         "minimum).\n"
     )
-    print(text)
-    arguments.output.write_text(text, encoding="utf-8")
+    publish_page("Gradients of clips", text, arguments)
 
 
 if __name__ == "__main__":

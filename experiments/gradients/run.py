@@ -1,6 +1,6 @@
 """How accurate, fast and large are the gradients of a pose refinement, by mode?
 
-    python experiments/gradients/run.py [--quick]
+    python -m experiments.gradients.run [--quick]
 
 Writes results.md and gradients.png next to this file. Float64, one thread, robust kernel (cauchy) throughout.
 """
@@ -11,19 +11,20 @@ import statistics
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import matplotlib
 import torch
 from torch import Tensor
 
-from experiments.common import parser_of, table
+from experiments.benchmarks.solvers import POSE_STEPS
+from experiments.common import gradient_error, parser_of, table
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
 from torchslam.optim import POSE_OPTIONS, Backward, RefinedPose, solve_pose
 
 HERE = Path(__file__).parent
 MODES: tuple[tuple[Backward, int], ...] = (("implicit", 20), ("unroll", 20), ("unroll", 5), ("truncated", 20))
-STEPS = {"points_w": 1e-6, "pixels": 1e-4, "weights": 1e-5, "params": 1e-4, "scale": 1e-5}
 
 
 @dataclass(frozen=True)
@@ -80,41 +81,14 @@ def simulate(points: int, noise: float, outliers: float, seed: int) -> Problem:
     return Problem(se3_exp(0.05 * normal(1, 6)) @ T_cw, inputs)
 
 
-def directions(problem: Problem) -> dict[str, Tensor]:
-    generator = torch.Generator().manual_seed(99)
-    return {n: torch.randn(problem.inputs[n].shape, generator=generator, dtype=torch.float64) for n in STEPS}
+def error(problem: Problem, mode: Backward, iterations: int) -> float:
+    """Largest relative error over the inputs; converged solves are differenced."""
 
+    def loss(mode: Backward, iterations: int, tolerance: float, **inputs: Tensor) -> Tensor:
+        return problem.loss(inputs, mode, iterations, tolerance)
 
-def central_differences(problem: Problem) -> Tensor:
-    """The derivative of the loss along one direction per input, by converged solves at either side."""
-    slopes = []
-    with torch.no_grad():
-        for name, direction in directions(problem).items():
-            ahead, behind = (
-                problem.loss(
-                    problem.inputs | {name: problem.inputs[name] + sign * STEPS[name] * direction},
-                    "detached",
-                    100,
-                    0.0,
-                )
-                for sign in (1, -1)
-            )
-            slopes.append((ahead - behind) / (2 * STEPS[name]))
-    return torch.stack(slopes)
-
-
-def gradients(problem: Problem, mode: Backward, iterations: int) -> Tensor:
-    """The same derivatives by autograd."""
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in problem.inputs.items()}
-    along = directions(problem)
-    loss = problem.loss(leaves, mode, iterations, 1e-10)
-    found = torch.autograd.grad(loss, [leaves[name] for name in along])
-    return torch.stack([(g * d).sum() for g, d in zip(found, along.values(), strict=True)])
-
-
-def error(problem: Problem, mode: Backward, iterations: int, truth: Tensor) -> float:
-    """Largest relative error over the inputs."""
-    return float(((gradients(problem, mode, iterations) - truth) / truth).abs().max())
+    solve, converged = partial(loss, mode, iterations, 1e-10), partial(loss, "detached", 100, 0.0)
+    return gradient_error(solve, problem.inputs, POSE_STEPS, converged)
 
 
 def median_error(points: int, noise: float, outliers: float, seeds: int) -> list[float]:
@@ -122,9 +96,8 @@ def median_error(points: int, noise: float, outliers: float, seeds: int) -> list
     errors: list[list[float]] = [[] for _ in MODES]
     for seed in range(seeds):
         problem = simulate(points, noise, outliers, seed)
-        truth = central_differences(problem)
         for record, (mode, iterations) in zip(errors, MODES, strict=True):
-            record.append(error(problem, mode, iterations, truth))
+            record.append(error(problem, mode, iterations))
     return [statistics.median(record) for record in errors]
 
 

@@ -1,73 +1,137 @@
-"""Does the cost of a frame grow with the length of the run? See README.md."""
+"""Does the cost of a frame, or the map of one room, grow with the length of the run? See README.md.
+
+python -m experiments.long_loop.run rounds
+python -m experiments.long_loop.run to_and_fro
+"""
 
 from __future__ import annotations
 
 import math
+import resource
 import time
+from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from experiments.common import parser_of, table, write_between
-from torchslam.config import load_config
+from experiments.common import parser_of, place_of, publish, table
+from torchslam.config import Config, load_config
+from torchslam.data import open_sequence
+from torchslam.data.sequence import Sequence
+from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.system.front_end import Simulated
+from torchslam.system.run import finish
 from torchslam.system.slam import SLAM
-from torchslam.types import Frame
+from torchslam.types import Frame, StepResult, Trajectory
+
+FRAMES = {"rounds": 3000, "to_and_fro": 5000}
+WINDOWS = 10
+"""Rows of the table."""
+HEADER = "frames | median (ms) | mean (ms) | 95 % (ms) | keyframes | points | rows of points | peak (MB)"
+FRAMES_PER_LAP = 500
 
 
-def loop_poses(frames: int, frames_per_lap: int = 500) -> Tensor:
+def rounds(frames: int) -> Tensor:
     """(F, 4, 4) T_cw of a camera that walks an ellipse, looks ahead and outwards, and never quite repeats itself."""
-    s = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames_per_lap)
+    s = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / FRAMES_PER_LAP)
     drift = 0.5 * torch.sin(s / 7.3)
     centers = torch.stack([10 * torch.cos(s), drift, 6 * torch.sin(s)], -1)
-    heading = -(s + 0.4)
     zero = torch.zeros_like(s)
-    about_y = torch.stack([zero, heading, zero], -1)
+    about_y = torch.stack([zero, -(s + 0.4), zero], -1)
     return se3_inverse(rigid(so3_exp(about_y), centers))
 
 
-def main() -> None:
-    parser = parser_of(__doc__)
-    parser.add_argument("--frames", type=int, default=3000)
-    frames = parser.parse_args().frames
-    torch.set_num_threads(1)
-    poses = loop_poses(frames)
+class ToAndFro(Sequence):
+    """The frames of a sequence forwards, backwards, forwards, with timestamps that go on."""
+
+    def __init__(self, whole: Sequence, frames: int) -> None:
+        period = 2 * (len(whole) - 1)
+        self._whole = whole
+        self._order = [min(i % period, period - i % period) for i in range(frames)]
+        timestamps = torch.arange(frames, dtype=torch.float64) / whole.frame_rate
+        posed = [(i, pose) for i, j in enumerate(self._order) if (pose := whole.pose(j)) is not None]
+        truth = Trajectory(
+            timestamps[[i for i, _ in posed]], se3_inverse(torch.stack([pose for _, pose in posed]))
+        )
+        super().__init__(whole.name, whole.kind, whole.camera, timestamps, truth)
+
+    def image(self, index: int) -> Tensor:
+        return self._whole.image(self._order[index])
+
+    def image_name(self, index: int) -> str:
+        return self._whole.image_name(self._order[index])
+
+
+def simulated(frames: int) -> tuple[SLAM, Iterable[Frame]]:
+    """Rounds of an ellipse with simulated features, 0.5 px of noise."""
     camera = Camera.pinhole(500.0, 500.0, 319.5, 239.5, size=(640, 480))
     config = load_config(None, ["features.kind=simulated", "simulated.noise_px=0.5"])
-    slam, eyes = SLAM(camera, config), Simulated(config, camera, poses)
-    blank = torch.zeros(1, 1, 480, 640)
-    ms, states = [], []
-    for i, T_cw in enumerate(poses):
+    poses, blank = rounds(frames), torch.zeros(1, 1, 480, 640)
+    eyes = Simulated(config, camera, poses)
+
+    def seen() -> Iterable[Frame]:
+        for i, T_cw in enumerate(poses):
+            frame = Frame(i, i / 30, blank, f"frame {i}", T_cw)
+            yield replace(frame, features=eyes(frame))
+
+    return SLAM(camera, config), seen()
+
+
+def peak_mb() -> int:
+    """Peak memory of the process (Linux)."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 2**10
+
+
+def processed(slam: SLAM, frames: Iterable[Frame], window: int) -> tuple[list[list[str]], list[StepResult]]:
+    """The rows of the table, one for so many frames, and all results."""
+    rows, results, ms = list[list[str]](), list[StepResult](), list[float]()
+    for frame in frames:
         before = time.process_time()
-        frame = Frame(i, i / 30, blank, f"frame {i}", T_cw)
-        result = slam.step(replace(frame, features=eyes(frame)))
+        results.append(slam.step(frame))
         ms.append(1e3 * (time.process_time() - before))
-        states.append(result.state.value)
-        if i % 300 == 299:
-            print(
-                i + 1,
-                f"{torch.tensor(ms[-300:]).median():.1f} ms",
-                slam.map.num_keyframes,
-                slam.map.num_points,
-                flush=True,
-            )
-    cost = torch.tensor(ms, dtype=torch.float64)
-    rows = []
-    for start in range(0, frames - 299, 300):
-        part = cost[start : start + 300]
-        rows.append([f"{start} to {start + 300}", f"{part.median():.1f}", f"{part.quantile(0.95):.1f}"])
-    ratio = cost[-300:].median() / cost[300:600].median()
-    summary = (
-        f"\nMedian of the last 300 frames over that of frames 300 to 600: {ratio:.2f}. "
-        f"{slam.map.num_keyframes} keyframes, {slam.map.num_points} points, {states.count('lost')} frames lost.\n"
-    )
-    write_between(
-        Path(__file__).parent / "README.md", table(["frames", "median (ms)", "95 % (ms)"], rows) + summary
-    )
-    print(summary)
+        if len(ms) == window:
+            cost, end = torch.tensor(ms, dtype=torch.float64), len(results)
+            times = cost.median(), cost.mean(), cost.quantile(0.95)
+            sizes = slam.map.num_keyframes, slam.map.num_points, len(slam.map.points), peak_mb()
+            row = [f"{end - window} to {end}", *(f"{each:.1f}" for each in times), *map(str, sizes)]
+            print(*row, sep=" | ", flush=True)
+            rows.append(row)
+            ms.clear()
+    return rows, results
+
+
+def main() -> None:
+    parser = parser_of(__doc__, readme=True)
+    parser.add_argument("path", choices=FRAMES)
+    parser.add_argument("--frames", type=int)
+    parser.add_argument("--sequence", default="redkitchen", help="of to_and_fro")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    count = options.frames or FRAMES[options.path]
+    if options.path == "rounds":
+        slam, frames = simulated(count)
+        truth = None
+    else:
+        frames = ToAndFro(open_sequence(place_of(options.sequence)), count)
+        slam, truth = SLAM(frames.camera, Config()), frames.groundtruth
+    rows, results = processed(slam, frames, count // WINDOWS)
+    ratio = float(rows[-1][1]) / float(rows[1][1])
+    summary = f"\nMedian of the last row over that of the second: {ratio:.2f}. "
+    if truth is None:
+        lost = sum(result.state.value == "lost" for result in results)
+        summary += f"{slam.map.num_keyframes} keyframes, {slam.map.num_points} points, {lost} frames lost.\n"
+    else:
+        before = time.process_time()
+        run = finish(slam, results, [], interrupted=False)
+        summary += (
+            f"Final adjustment: {time.process_time() - before:.1f} s, at most {peak_mb()} MB. "
+            f"{run.map.num_keyframes} keyframes, {len(run.trajectory)} of {count} frames posed, "
+            f"ATE {evaluate(run.trajectory, truth).ate_m:.4f} m.\n"
+        )
+    marks = f"<!-- {options.path} -->\n", f"<!-- end {options.path} -->"
+    publish(table(HEADER, rows) + summary, options, __file__, *marks)
 
 
 if __name__ == "__main__":

@@ -6,11 +6,10 @@ from pathlib import Path
 
 import torch
 
-from experiments.common import available, parser_of, place_of, table, write_between
+from experiments.common import available, focal_of, parser_of, place_of, table, write_between
 from torchslam.config import CameraConfig, Config
 from torchslam.data import open_sequence
 from torchslam.evaluation import evaluate
-from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 
 HERE = Path(__file__).parent
@@ -40,19 +39,9 @@ def row_of(name: str) -> list[str]:
         str(len(found.trajectory)),
         "none" if found.readout is None else found.readout.description().removesuffix(" ms"),
         *errors,
-        _focal(found),
-        _focal(told),
+        focal_of(found),
+        focal_of(told),
     ]
-
-
-def _focal(run: Run) -> str:
-    """The focal length with its standard error."""
-    focal = float(run.camera.focal)
-    return (
-        f"{focal:.1f}"
-        if run.calibration is None
-        else f"{focal:.1f} ± {focal * run.calibration.focal_std:.1f}"
-    )
 
 
 def main() -> None:

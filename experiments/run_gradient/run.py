@@ -10,6 +10,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -26,6 +27,7 @@ from torchslam.system.slam import SLAM
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
+EXACT = GRAPH_OPTIONS.replace(tolerance=0.0, iterations=12)
 MEASURES = ("adjust from a disturbed start", "adjust", "adjust and differentiate")
 
 
@@ -60,10 +62,49 @@ def disturbed(graph: ObservationGraph) -> ObservationGraph:
     )  # fmt: skip
 
 
-def with_leaves(graph: ObservationGraph) -> tuple[ObservationGraph, Tensor, Tensor]:
-    """The graph, its pixels and its camera parameters as leaves."""
-    pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
-    return replace(graph, pixels=pixels, camera=graph.camera.with_params(params)), pixels, params
+class Inputs(NamedTuple):
+    """What the gradient of a run reaches: a value of each, a derivative by each, or a direction of change.
+
+    Attributes:
+        pixels: (O, 2).
+        weights: (O,) or (O, 2, 2).
+        params: of the given camera.
+        readout: of the rolling shutter, seconds; not used without one.
+    """
+
+    pixels: Tensor
+    weights: Tensor
+    params: Tensor
+    readout: Tensor
+
+    @classmethod
+    def of(cls, graph: ObservationGraph) -> Inputs:
+        given = graph.camera if graph.calibration is None else graph.calibration.camera
+        readout = graph.pixels.new_zeros(()) if graph.readout is None else graph.readout.seconds
+        return cls(graph.pixels, graph.weights, given.params, readout)
+
+    def zeros(self) -> Inputs:
+        return Inputs(*map(torch.zeros_like, self))
+
+    def leaves(self) -> Inputs:
+        return Inputs(*(each.clone().requires_grad_() for each in self))
+
+    def moved(self, along: Inputs, step: float) -> Inputs:
+        return Inputs(*(each + step * change for each, change in zip(self, along, strict=True)))
+
+    def put_into(self, graph: ObservationGraph) -> ObservationGraph:
+        """The graph with these inputs."""
+        camera, calibration, readout = graph.camera, graph.calibration, graph.readout
+        if calibration is None or not calibration.directions.numel():  # else the camera is found
+            camera = camera.with_params(self.params)
+        if calibration is not None:
+            calibration = replace(calibration, camera=calibration.camera.with_params(self.params))
+        if readout is not None:
+            readout = replace(readout, seconds=self.readout)
+        return replace(
+            graph,
+            pixels=self.pixels, weights=self.weights, camera=camera, calibration=calibration, readout=readout,
+        )  # fmt: skip
 
 
 def measure(name: str, sequence: Sequence) -> dict[str, float]:
@@ -83,8 +124,7 @@ def measure(name: str, sequence: Sequence) -> dict[str, float]:
         )
         seconds = {"adjust": time.process_time() - start}
     else:
-        leaves, _, _ = with_leaves(graph)
-        solution = solve_graph(leaves)
+        solution = solve_graph(Inputs.of(graph).leaves().put_into(graph))
         loss = ate(T_cw=solution.T_cw[known], T_cw_groundtruth=T_cw[known])
         middle = time.process_time()
         loss.backward()
@@ -116,70 +156,66 @@ def measured(name: str, sequence: str, repetitions: int) -> dict[str, float]:
     return {key: statistics.median(result[key] for result in results) for key in results[0]}
 
 
-Direction = tuple[str, Tensor, Tensor, float]
-"""A name, the directions of pixels (O, 2) and camera parameters, and the step of the differences in px."""
+class Direction(NamedTuple):
+    """A change of the inputs, and the step of the differences along it."""
+
+    name: str
+    along: Inputs
+    step: float
 
 
 def differentiate(
     graph: ObservationGraph, T_cw: Tensor, known: Tensor
-) -> tuple[GraphSolution, Tensor, Tensor, Tensor]:
-    """Solve the graph; return the solution, its ATE, and the gradients of that to pixels and camera parameters."""
-    leaves, pixels, params = with_leaves(graph)
-    solution = solve_graph(leaves)
+) -> tuple[GraphSolution, Tensor, Inputs]:
+    """Solve the graph; return the solution, its ATE in meters, and the gradient of that to each input."""
+    leaves = Inputs.of(graph).leaves()
+    solution = solve_graph(leaves.put_into(graph), options=EXACT)
     loss = ate(T_cw=solution.T_cw[known], T_cw_groundtruth=T_cw[known])
-    loss.backward()
-    assert pixels.grad is not None
-    assert params.grad is not None
-    return solution, loss, pixels.grad, params.grad
+    return solution, loss, Inputs(*torch.autograd.grad(loss, leaves, materialize_grads=True))
 
 
 def check(
-    graph: ObservationGraph,
-    T_cw: Tensor,
-    known: Tensor,
-    pixels: Tensor,
-    params: Tensor,
-    along: list[Direction],
+    graph: ObservationGraph, T_cw: Tensor, known: Tensor, gradient: Inputs, directions: list[Direction]
 ) -> str:
-    """A table of derivatives along directions: by the gradients of pixels and parameters, by central differences."""
+    """A table of derivatives along directions: by the gradient, by central differences."""
+    inputs = Inputs.of(graph)
 
-    def error_m(step_pixels: Tensor, step_params: Tensor) -> float:
-        moved = replace(
-            graph,
-            pixels=graph.pixels + step_pixels,
-            camera=graph.camera.with_params(graph.camera.params + step_params),
-        )
-        solution = solve_graph(
-            moved, options=GRAPH_OPTIONS.replace(iterations=12, tolerance=0.0, backward="detached")
-        )
+    @torch.no_grad()
+    def error_m(moved: Inputs) -> float:
+        solution = solve_graph(moved.put_into(graph), options=EXACT)
         return float(ate(T_cw=solution.T_cw[known], T_cw_groundtruth=T_cw[known]))
 
     rows = []
-    for name, along_pixels, along_params, step in along:
-        analytic = float((pixels * along_pixels).sum() + (params * along_params).sum())
-        ahead, behind = (error_m(sign * step * along_pixels, sign * step * along_params) for sign in (1, -1))
+    for name, along, step in directions:
+        analytic = sum(float((g * d).sum()) for g, d in zip(gradient, along, strict=True))
+        ahead, behind = (error_m(inputs.moved(along, sign * step)) for sign in (1, -1))
         numeric = (ahead - behind) / (2 * step)
-        rows.append(
-            [name, f"{1e3 * analytic:.6f}", f"{1e3 * numeric:.6f}", f"{abs(analytic / numeric - 1):.1e}"]
-        )
+        cells = f"{1e3 * analytic:.6g}", f"{1e3 * numeric:.6g}", f"{abs(analytic / numeric - 1):.1e}"
+        rows.append([name, *cells])
         print(*rows[-1], sep="\t", flush=True)
-    return table("direction | gradient (mm/px) | central differences (mm/px) | relative error", rows)
+    return table("direction | gradient (mm) | central differences (mm) | relative error", rows)
 
 
 def directions(graph: ObservationGraph) -> list[Direction]:
+    """Changes of the camera, of the keypoints, of the weights, and of the readout where there is one."""
     generator = torch.Generator().manual_seed(1)
+    still = Inputs.of(graph).zeros()
     noise = torch.randn(graph.pixels.shape, generator=generator, dtype=graph.pixels.dtype)
     one_frame = noise * (graph.frame_index == len(graph.T_cw) // 2)[:, None]
-    fixed = torch.zeros_like(graph.camera.params)
-    focal, center = fixed.clone(), fixed.clone()
+    focal, center = still.params.clone(), still.params.clone()
     focal[:2], center[2] = 1.0, 1.0
-    still = torch.zeros_like(noise)
-    return [
-        ("fx and fy, by 1 px", still, focal, 1e-2),
-        ("cx, by 1 px", still, center, 1e-2),
-        ("all keypoints, at random by 1 px", noise, fixed, 1e-4),
-        ("the keypoints of one frame, at random by 1 px", one_frame, fixed, 1e-2),
+    factors = 0.1 * noise[:, 0].reshape(-1, *[1] * (graph.weights.ndim - 1))
+    found = [
+        Direction("given fx and fy, by 1 px", still._replace(params=focal), 1e-2),
+        Direction("given cx, by 1 px", still._replace(params=center), 1e-2),
+        Direction("all keypoints, at random by 1 px", still._replace(pixels=noise), 1e-4),
+        Direction("the keypoints of one frame, at random by 1 px", still._replace(pixels=one_frame), 1e-2),
+        Direction("all weights, at random by 10 %", still._replace(weights=factors * graph.weights), 1e-3),
     ]
+    if graph.readout is not None:
+        shutter = torch.full_like(still.readout, 1e-3)
+        found.append(Direction("readout, by 1 ms", still._replace(readout=shutter), 1e-1))
+    return found
 
 
 def draw(graph: ObservationGraph, solution: GraphSolution, pixels: Tensor, file: Path) -> None:
@@ -246,7 +282,7 @@ def cost_rows(name: str, repetitions: int) -> list[list[str]]:
 
 
 def main() -> None:
-    parser = parser_of(__doc__)
+    parser = parser_of(__doc__, readme=True)
     parser.add_argument("name", nargs="?", default="redkitchen")
     parser.add_argument("--repetitions", type=int, default=3)
     parser.add_argument("--measure", choices=MEASURES, help=argparse.SUPPRESS)
@@ -258,8 +294,7 @@ def main() -> None:
             return
         graph = graph_of(sequence)
         T_cw, known = truth_of(graph, sequence)
-        solution, loss, pixels, params = differentiate(graph, T_cw, known)
-        draw(graph, solution, pixels, HERE / "pictures" / f"{arguments.name}.png")
+        solution, loss, gradient = differentiate(graph, T_cw, known)
         counts = (
             f"{len(graph.T_cw)} frames, {int(graph.is_keyframe.sum())} of them keyframes, "
             f"{len(graph.points_w)} points, {len(graph.pixels)} observations; ATE {loss.item():.4f} m.\n\n"
@@ -267,8 +302,10 @@ def main() -> None:
         rows = cost_rows(arguments.name, arguments.repetitions)
         cost = table(" | iterations | seconds | relative | memory (MiB) | relative", rows)
         print(counts + cost, flush=True)
-        checks = check(graph, T_cw, known, pixels, params, directions(graph))
-        write_between(HERE / "README.md", counts + cost + "\n" + checks)
+        checks = check(graph, T_cw, known, gradient, directions(graph))
+        if not arguments.no_readme:
+            draw(graph, solution, gradient.pixels, HERE / "pictures" / f"{arguments.name}.png")
+            write_between(HERE / "README.md", counts + cost + "\n" + checks)
 
 
 if __name__ == "__main__":

@@ -6,14 +6,16 @@ import math
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
-from experiments.common import PosedSequence, write_between
-from experiments.run_gradient.run import Direction, check, differentiate
+from experiments.common import write_between
+from experiments.run_gradient.run import Direction, Inputs, check, differentiate
 from experiments.trials.edited import Edited, shots
 from torchslam.data.sequence import Sequence
 from torchslam.geometry import Camera, rigid, so3_exp
 from torchslam.optim.run_graph import ObservationGraph
 from torchslam.system.run import Run
+from torchslam.types import Trajectory
 
 SETTINGS = (
     "features.kind=simulated",
@@ -27,7 +29,7 @@ PIXELS = 3  # observations that are moved one by one
 STEP_PX = 1e-3
 
 
-class Round(PosedSequence):
+class Round(Sequence):
     """A camera that walks a circle, looks outwards and returns to its start."""
 
     def __init__(self, frames: int = ROUND + BEYOND) -> None:
@@ -37,7 +39,15 @@ class Round(PosedSequence):
         zero = torch.zeros_like(phase)
         R_wc = so3_exp(torch.stack((zero, math.pi / 2 - phase, zero), -1))
         camera = Camera.pinhole(400.0, 400.0, 319.5, 239.5, size=(640, 480))
-        super().__init__("round", camera, rigid(R_wc, centers_w), phase * ROUND / (2 * math.pi) / 30)
+        timestamps = phase * ROUND / (2 * math.pi) / 30
+        super().__init__("round", "poses", camera, timestamps, Trajectory(timestamps, rigid(R_wc, centers_w)))
+
+    def image(self, index: int) -> Tensor:
+        """A blank image: the features are simulated."""
+        return torch.zeros(1, 1, self.camera.height, self.camera.width)
+
+    def image_name(self, index: int) -> str:
+        return f"pose {index}"
 
     @classmethod
     def shots(cls) -> Edited:
@@ -52,8 +62,8 @@ def gradient_table(run: Run, sequence: Sequence) -> str:
     T_true = torch.stack([pose for i in graph.frame_ids.tolist() if (pose := sequence.pose(i)) is not None])
     assert len(graph.submaps) == 1
     known = torch.ones(len(T_true), dtype=torch.bool)
-    _, _, pixels, params = differentiate(graph, T_true, known)
-    return check(graph, T_true, known, pixels, params, _directions(graph))
+    _, _, gradient = differentiate(graph, T_true, known)
+    return check(graph, T_true, known, gradient, _directions(graph))
 
 
 def report(run: Run, sequence: Sequence, file: Path, loop_closures: list[tuple[int, int]]) -> None:
@@ -71,17 +81,18 @@ def report(run: Run, sequence: Sequence, file: Path, loop_closures: list[tuple[i
 
 def _directions(graph: ObservationGraph) -> list[Direction]:
     """Every parameter, some single keypoints, and all keypoints at random."""
-    still, fixed = torch.zeros_like(graph.pixels), torch.zeros_like(graph.camera.params)
-    found: list[Direction] = []
+    still = Inputs.of(graph).zeros()
+    found = []
     for row, name in enumerate(("fx", "fy", "cx", "cy")):
-        along = fixed.clone()
+        along = still.params.clone()
         along[row] = 1.0
-        found.append((name, still, along, STEP_PX))
+        found.append(Direction(f"{name}, by 1 px", still._replace(params=along), STEP_PX))
     generator = torch.Generator().manual_seed(0)
     seen = torch.nonzero(graph.is_keyframe[graph.frame_index])[:, 0]
     for row in seen[torch.randperm(len(seen), generator=generator)[:PIXELS]].tolist():
-        along = still.clone()
+        along = still.pixels.clone()
         along[row, 0] = 1.0
-        found.append((f"x of observation {row}, in a keyframe", along, fixed, STEP_PX))
-    noise = torch.randn(still.shape, generator=generator, dtype=still.dtype)
-    return [*found, ("all keypoints, at random", noise, fixed, STEP_PX)]
+        name = f"x of observation {row}, in a keyframe, by 1 px"
+        found.append(Direction(name, still._replace(pixels=along), STEP_PX))
+    noise = torch.randn(still.pixels.shape, generator=generator, dtype=still.pixels.dtype)
+    return [*found, Direction("all keypoints, at random by 1 px", still._replace(pixels=noise), STEP_PX)]

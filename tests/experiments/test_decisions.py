@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from experiments.common import scaled
 from experiments.decisions import table
 from experiments.decisions.cases import (
     HALVES,
@@ -26,7 +27,6 @@ from experiments.decisions.measure import bent, deformation_of
 from experiments.decisions.rendered import MOTIONS, Event, Path, RenderedSequence, smooth_step
 from experiments.decisions.run import groups, records, run_group
 from experiments.decisions.table import ROWS, Counted, columns_of
-from experiments.global_mapping.check_trials import scaled
 from tests.walks import arc
 from torchslam.data import open_sequence
 from torchslam.geometry import Camera, se3_inverse, so3_log

@@ -1,7 +1,7 @@
 """Learned features behind the same interface as `ORB`, with weights from a local file: see `features.weights`.
 
 The networks are kornia's. Descriptors are floats of unit length, angles are 0. All keypoints have the scale 2 pixels,
-and their information is that of the noise measured on real sequences (`experiments/front_ends/noise.py`).
+and their information is that of the noise measured on real sequences (docs/studies.md).
 Keypoints, scores and descriptors carry gradients to the weights.
 """
 

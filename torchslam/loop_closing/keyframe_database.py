@@ -2,7 +2,7 @@
 
 The score of two images sums, over the visual words they share, the rarity of the word times the similarity of their
 codes. It is 1 for an image with itself and 0 for images without a common word. Recall and cost compared with
-alternatives: experiments/places.
+alternatives: docs/studies.md.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _CODE_NOISE = 9.0
 Tried at this value only."""
 _CODE_LIMIT = 19
 """Bits by which codes differ that count as different: the similarity is 0.01 there."""
-# by experiments/places/train.py, from rendered images
+# by experiments/vocabulary.py, from rendered images
 _WORDS_FILE = Path(__file__).parent / "words.safetensors"
 _SEED = 0  # of the choice of bits and of the projections of floats; part of what a saved state means
 

@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import torch
 
 from examples.learn_camera import FRAMES, MIN_PARALLAX, LearnedCamera, Straightened, describe, learn
-from experiments.common import parser_of, place_of, table, write_between
+from experiments.common import parser_of, place_of, publish, table
 from experiments.learning.camera.bent_lens import FOCAL, SIZE, Bent, bent_lens, ray_errors
 from torchslam import SLAM, Camera, evaluate, load_config, open_sequence
 from torchslam.data import Sequence as Frames
@@ -135,10 +134,8 @@ def main() -> None:
         text = table(DRIVE_HEADER, drive_rows())
     else:
         text = table(ROOMS_HEADER, [row for seed in SEEDS for row in room_rows(seed)])
-    print(text)
-    if not arguments.no_readme:
-        readme, name = Path(__file__).parent / "README.md", arguments.recordings
-        write_between(readme, text, f"<!-- {name} -->\n", f"<!-- end {name} -->")
+    marks = f"<!-- {arguments.recordings} -->\n", f"<!-- end {arguments.recordings} -->"
+    publish(text, arguments, __file__, *marks)
 
 
 if __name__ == "__main__":

@@ -2,15 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import torch
 
 from experiments.common import parser_of, publish, sequences, table
-from torchslam import SLAM, Config, evaluate
+from experiments.meters.scale import scale_by, scale_error, view_of_run
 from torchslam.metric.camera_height import CameraHeight
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView
 
 HEIGHT = 1.65
 """Of KITTI's cameras, meters: https://www.cvlibs.net/datasets/kitti/setup.php"""
@@ -26,12 +22,9 @@ def main() -> None:
     rows = []
     for stop in options.parts:
         part = sequence.part(0, stop)
-        run = SLAM(part.camera, Config()).run(part)
-        assert run.main is not None
-        assert part.groundtruth is not None
-        found = CameraHeight(HEIGHT).measure(SubmapView(run.main, run.camera, 0, part, run.readout))
-        assert isinstance(found, ScaleMeasurement), found
-        off = math.log(found.meters_per_unit / evaluate(run.trajectory, part.groundtruth).scale)
+        run, view = view_of_run(part)
+        found = scale_by(CameraHeight(HEIGHT), view)
+        off = scale_error(found, run.trajectory, part.groundtruth)
         rows.append(
             [
                 f"1 to {stop}",

@@ -5,21 +5,16 @@ python -m experiments.meters.depth.run RESULTS --depth FOLDER
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from experiments.common import parser_of, publish, table
-from torchslam.data import open_sequence
+from experiments.meters.scale import scale_by, scale_error, view_of_results
 from torchslam.data.formats.depth_images import find_depth_images
 from torchslam.evaluation import evaluate
-from torchslam.io.results import MAP, read_metrics
-from torchslam.map.file import read_atlas
-from torchslam.metric.scale import ScaleMeasurement
 from torchslam.metric.sensor_depth import SensorDepth
-from torchslam.metric.source import SubmapView
 from torchslam.types import Trajectory
 
 OWN_CAMERA = "585,585,320,240"
@@ -35,33 +30,28 @@ def main() -> None:
     parser.add_argument("--depth", type=Path, required=True, help="folder of the sensor's depth images")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    metrics, saved = read_metrics(options.results), read_atlas(options.results / MAP)
-    submap, sequence = saved.atlas.main(), open_sequence(metrics["source"])
-    assert submap is not None
-    assert sequence.groundtruth is not None
-    view = SubmapView(submap, saved.camera, int(metrics["session"]), sequence)
-    trajectory = submap.trajectory(view.session)
-    scale = evaluate(trajectory, sequence.groundtruth).scale
+    sequence, view = view_of_results(options.results)
+    trajectory, truth = view.submap.trajectory(view.session), sequence.groundtruth
+    assert truth is not None
     images, rows = find_depth_images(options.depth), []
     for name, camera in (("its own, f = 585 px", OWN_CAMERA), ("taken for that of the color images", "")):
-        found = SensorDepth(images, camera).measure(view)
-        assert isinstance(found, ScaleMeasurement), found
+        found = scale_by(SensorDepth(images, camera), view)
         rows.append(
             [
                 name,
                 f"{found.meters_per_unit:.3f}",
-                f"{math.log(found.meters_per_unit / scale):+.1%}",
+                f"{scale_error(found, trajectory, truth):+.1%}",
                 f"{found.relative_std:.1%}",
                 f"{found.apart:.1%}",
                 str(found.count),
             ]
         )
     parts = [
-        evaluate(Trajectory(trajectory.timestamps[part], trajectory.T_wc[part]), sequence.groundtruth).scale
+        evaluate(Trajectory(trajectory.timestamps[part], trajectory.T_wc[part]), truth).scale
         for part in np.array_split(np.arange(len(trajectory)), PARTS)
     ]
-    truth = ", ".join(f"{each:.3f}" for each in parts)
-    print(f"meters per unit by the ground truth: {scale:.3f}; of {PARTS} parts {truth}")
+    scale, of_parts = evaluate(trajectory, truth).scale, ", ".join(f"{each:.3f}" for each in parts)
+    print(f"meters per unit by the ground truth: {scale:.3f}; of {PARTS} parts {of_parts}")
     publish(table(HEADER, rows), options, __file__)
 
 

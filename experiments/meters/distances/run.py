@@ -17,10 +17,8 @@ from torch import Tensor
 
 from experiments.common import parser_of, publish, table
 from experiments.dense.truth import EVERY, Sensor
-from torchslam.data import open_sequence
+from experiments.meters.scale import view_of_results
 from torchslam.geometry import se3_inverse, transform
-from torchslam.io.results import MAP, read_metrics
-from torchslam.map.file import read_atlas
 from torchslam.metric.distances import Click, Distance, measure_distance
 from torchslam.metric.scale import ScaleMeasurement
 from torchslam.metric.source import SubmapView
@@ -100,11 +98,7 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=50, help="frames from one with clicks to the next")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    metrics, saved = read_metrics(options.results), read_atlas(options.results / MAP)
-    submap = saved.atlas.main()
-    assert submap is not None
-    sequence = open_sequence(metrics["source"])
-    view = SubmapView(submap, saved.camera, int(metrics["session"]), sequence)
+    _, view = view_of_results(options.results)
     sensor = Sensor(options.depth, view.frame_index, view.T_cw)
     T_cs, meters = registered(view, sensor)
     kinds: dict[str, list[tuple[float, float] | None]] = {

@@ -10,7 +10,8 @@ import torch
 from torch import Tensor
 
 from experiments.common import parser_of, publish, sequences, table
-from torchslam import SLAM, Config, evaluate
+from experiments.meters.scale import view_of_run
+from torchslam import evaluate
 from torchslam.data.formats.fixes import Fixes
 from torchslam.data.formats.speed_file import Speeds
 from torchslam.data.trajectories import interpolate_poses
@@ -18,7 +19,7 @@ from torchslam.geometry import geodetic_from_enu, rigid, se3_exp, se3_inverse, s
 from torchslam.metric.odometry import OdometrySource
 from torchslam.metric.positions import PositionSource
 from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import MetricSource, SubmapView
+from torchslam.metric.source import MetricSource
 from torchslam.metric.speeds import SpeedSource
 from torchslam.types import Trajectory
 
@@ -105,9 +106,7 @@ def main() -> None:
     (sequence,) = sequences(["kitti07"])
     truth = sequence.groundtruth
     assert truth is not None
-    run = SLAM(sequence.camera, Config()).run(sequence)
-    assert run.main is not None
-    view = SubmapView(run.main, run.camera)
+    run, view = view_of_run(sequence)
     with_scale = evaluate(run.trajectory, truth)
     rows = []
     for name, instrument in INSTRUMENTS.items():

@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import copy
-import math
 
 import torch
 
 import experiments.meters.markers.scene  # noqa: F401  it adds scenes
 from experiments.common import parser_of, publish, table
-from torchslam import SLAM, Config, evaluate, open_sequence
+from experiments.meters.scale import scale_by, scale_error, view_of_run
+from torchslam import open_sequence
 from torchslam.metric.markers.source import Markers
 from torchslam.metric.markers.targets import parse_target
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView
 
 CASES = (
     ("tags", "4 tags, a fifth of another size that is stated", "apriltag-36h11:0.16,9=0.2"),
@@ -35,15 +33,10 @@ def main() -> None:
     for scene, name, text in CASES:
         sequence = open_sequence(f"synthetic:{scene}?frames={FRAMES}&seed={options.seed}&blur=0.8")
         if scene not in runs:
-            runs[scene] = SLAM(sequence.camera, Config()).run(sequence)
-        run = runs[scene]
-        submap = copy.deepcopy(run.main)
-        assert submap is not None
-        assert sequence.groundtruth is not None
-        view = SubmapView(submap, run.camera, 0, sequence, run.readout)
-        found = Markers([parse_target(text)]).measure(view)
-        assert isinstance(found, ScaleMeasurement), found
-        off = math.log(found.meters_per_unit / evaluate(submap.trajectory(0), sequence.groundtruth).scale)
+            runs[scene] = view_of_run(sequence)[1]
+        view = copy.deepcopy(runs[scene])
+        found = scale_by(Markers([parse_target(text)]), view)
+        off = scale_error(found, view.submap.trajectory(0), sequence.groundtruth)
         rows.append([name, f"{off:+.2%}", f"{found.relative_std:.2%}", "0.3 %", "; ".join(found.rejected)])
         print(*rows[-1], sep=" | ", flush=True)
     publish(table(HEADER, rows), options, __file__)

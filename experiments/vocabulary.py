@@ -1,4 +1,4 @@
-"""Make the words that torchslam.loop_closing brings along: centers of ORB descriptors. See README.md."""
+"""Build the vocabulary that torchslam.loop_closing ships: centers of ORB descriptors of rendered images."""
 
 from __future__ import annotations
 
