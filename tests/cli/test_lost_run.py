@@ -14,9 +14,9 @@ import torch
 from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, StepResult, load_config
 from torchslam.cli import arguments
-from torchslam.cli import run as command
 from torchslam.cli.main import main
 from torchslam.data import read_trajectory
+from torchslam.global_mapping import recording
 from torchslam.global_mapping.check import MapCheck
 from torchslam.system.run import RunProgress, finish, run_frames, run_sequence
 
@@ -117,7 +117,7 @@ def test_ctrl_c_keeps_the_frames_so_far(
     def stop(*given: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(command, "map_recording", stop)
+    monkeypatch.setattr(recording, "map_recording", stop)
     found = run("auto")
     assert steps == list(range(LOST + 1))
     assert found["interrupted"]

@@ -35,12 +35,13 @@ from torchslam.data.transforms import WithGroundTruth
 from torchslam.errors import SequenceError
 from torchslam.global_mapping.learned_links import learned_config
 from torchslam.global_mapping.mapper import mapping_config
-from torchslam.global_mapping.recording import map_recording
+from torchslam.global_mapping.recording import run_recording
 from torchslam.io.report import compute_metrics
 from torchslam.io.results import source_of
 from torchslam.io.write_run import write_run
 from torchslam.metric.options import given_files, given_options, sources_of
-from torchslam.system.metric_run import run_in_meters
+from torchslam.system.front_end import source
+from torchslam.system.online_run import OnlineRun
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 from torchslam.utils.text import without_credentials
@@ -195,11 +196,11 @@ def _run(task: Task, folder: Path) -> Columns:
     config = with_stated_std(config, sequence)
     # What measures does so once, in the map that is kept.
     unmeasured = replace(config, metric=MetricConfig(own=False))
-    finished = SLAM(sequence.camera.to(device), unmeasured).run(sequence)
+    slam = SLAM(sequence.camera.to(device), unmeasured)
+    online = OnlineRun(slam, source(sequence, unmeasured, slam.camera), processes=1)
+    finished, mapped = run_recording(online, sequence, sources=sources, device=device)
     if finished.interrupted:
         raise KeyboardInterrupt
-    mapped = map_recording(sequence, finished, config, sequence.camera, device=device)
-    finished = run_in_meters(mapped.run, sequence, sources)
     finished = replace(finished, config=replace(finished.config, metric=config.metric))
     seconds = time.process_time() - start
     metrics = compute_metrics(finished, sequence, camera, mapped=mapped)
@@ -211,7 +212,7 @@ def _run(task: Task, folder: Path) -> Columns:
         sequence,
         metrics,
         folder,
-        online=mapped.online,
+        online=None if mapped is None else mapped.online,
         plots=task.plots,
         viewer=task.plots,
     )

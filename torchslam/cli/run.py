@@ -16,10 +16,9 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -38,7 +37,7 @@ from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
 from torchslam.global_mapping.learned_links import learned_config
 from torchslam.global_mapping.mapper import features_to_keep, mapping_config
-from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
+from torchslam.global_mapping.recording import Mapping, run_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
@@ -55,14 +54,12 @@ from torchslam.io.results import (
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
-from torchslam.metric.source import MetricSource
-from torchslam.parallel.workers import with_workers
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import KeptFeatures, source
-from torchslam.system.metric_run import run_in_meters
-from torchslam.system.run import Run, RunProgress, finish, run_frames
+from torchslam.system.online_run import Observer, OnlineRun
+from torchslam.system.run import RunProgress
 from torchslam.system.slam import SLAM
-from torchslam.types import State, StepResult
+from torchslam.types import StepResult
 from torchslam.utils.console import say, table, warn
 from torchslam.utils.usage import cpu_seconds, peak_memory_mb
 
@@ -202,29 +199,57 @@ def _sequence(options: argparse.Namespace) -> Sequence:
     return found.with_guess()
 
 
-@dataclass(frozen=True)
-class Attempt:
-    """A finished run, and what it was made with.
+class _Screen(Observer):
+    """Shows the progress of a run on the terminal and in the viewers, and writes its checkpoints.
 
-    Attributes:
-        finished: the run.
-        sequence: with the camera of the run.
-        found: description of the camera, if it was estimated from the images.
-        latencies: milliseconds from capture to pose, of a live source.
-        watching: the viewers, open until the results are written.
-        mapped: the check, and whether the recording was mapped as a whole; None where it is no recording.
-        kept: features of frames that the search for the camera has used.
-        end: where the run stopped since tracking was lost: processes the other frames, or none of them, and ends it.
+    Args:
+        slam: the system.
+        sequence: the frames.
+        stop_signals: a signal ends the run after the frame or the step.
+        checkpoints: of the run.
+        watching: the viewers.
     """
 
-    finished: Run
-    sequence: Sequence
-    found: str
-    latencies: list[float]
-    watching: FrameViewers
-    mapped: MappedRecording | None = None
-    kept: KeptFeatures | None = None
-    end: Callable[[bool], Run] | None = None
+    def __init__(
+        self,
+        slam: SLAM,
+        sequence: Sequence,
+        stop_signals: StopSignals,
+        checkpoints: Checkpoints,
+        watching: FrameViewers,
+    ) -> None:
+        self.slam, self.sequence, self.stop_signals = slam, sequence, stop_signals
+        self.checkpoints, self.watching = checkpoints, watching
+        self.latencies: list[float] = []  # milliseconds from capture to pose, of a live source
+
+    @contextmanager
+    def online(self, first: int) -> Iterator[None]:
+        """Show a bar of the frames."""
+        length = self.sequence.known_length
+        with ProgressBar(length, lambda: self.slam.map.num_points, self.stop_signals, first) as self._frames:
+            yield
+
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """Show a bar of the stages."""
+        with StageBar(self.stop_signals) as self._stages:
+            yield
+
+    def frame(self, result: StepResult, is_last: bool) -> None:
+        """Show a frame, and write a checkpoint if one is due."""
+        if self.sequence.is_live:
+            self.latencies.append(1e3 * (time.time() - result.timestamp))
+        self.checkpoints.offer(at_once=self.stop_signals.is_wanted or is_last)
+        self.watching.show(result)
+        self._frames.update(result)
+
+    def adjusting(self, iteration: int, most: int) -> None:
+        """Show an iteration of the final adjustment."""
+        self._frames.adjusting(iteration, most)
+
+    def stage(self, stage: str, done: int, most: int) -> None:
+        """Show a step of a stage."""
+        self._stages.update(stage, done, most)
 
 
 def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
@@ -236,19 +261,37 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
             "measurements of the unit cannot be combined with --localize: a map that is not changed keeps its unit"
         )
     mode = _mode(sequence, options)
-    if mode not in (None, Mapping.ONLINE):
+    may_map = mode not in (None, Mapping.ONLINE)
+    if may_map:
         learned_config(mapping_config(config))  # raises now rather than after the online run
     prepare(options.output, options.overwrite, options.resume)
     check_replaceable(options.output / CALIBRATION)
     with StopSignals() as stop_signals, ExitStack() as viewers:
-        attempt = _attempt(sequence, config, options, stop_signals, viewers)
-        if mode is not None and not attempt.finished.interrupted:
-            attempt = _map_recording(attempt, mode, options, stop_signals)
-        attempt = _in_meters(attempt, sources)
+        kept = features_to_keep(config, sequence.size, NUM_KEYPOINTS, options.device) if may_map else None
+        sequence, camera = _with_camera(sequence, config, options, kept)
+        if options.camera_std is None:
+            config = with_stated_std(config, sequence)
+        slam, so_far = _begin(sequence, config, options)
+        sequence = source(sequence, config, slam.camera)
+        watching = viewers.enter_context(_watching(slam, sequence, options))
+        checkpoints = Checkpoints(options.output, options.checkpoint, slam, so_far, sequence)
+        screen = _Screen(slam, sequence, stop_signals, checkpoints, watching)
+        is_watched = options.view or options.video  # then this process needs the images
+        online = OnlineRun(slam, watching.sequence, so_far, 1 if is_watched else options.processes, screen)
+        stages = options.output / STAGES if options.checkpoint else None
+        finished, mapped = run_recording(
+            online, sequence, mode, sources, options.device, stages, kept, all_frames=is_watched
+        )
+        if mapped is not None and mapped.why:
+            say(f"ran global mapping because {mapped.why}; kept the {mapped.kept} map")
         stop_signals.begin("when the results are written")
-        metrics = _write(attempt, options, before_s)
-        attempt.watching.end(attempt.finished)
-    finished = attempt.finished
+        metrics = compute_metrics(finished, sequence, camera, warn, mapped)
+        metrics |= _latency(screen.latencies) | _usage(before_s)
+        metrics |= source_of(options.path, options.fps, sequence)
+        write_run(
+            finished, sequence, metrics, options.output, online=None if mapped is None else mapped.online
+        )
+        watching.end(finished)
     written = {"results": options.output, "view": options.output / VIEW}
     written |= {"video": options.output / VIDEO} if options.video else {}
     words = summary(metrics) | {label: str(path) for label, path in written.items()}
@@ -263,122 +306,6 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         say(finished.failure)
         return NO_MAP
     return DONE
-
-
-def _attempt(
-    sequence: Sequence,
-    config: Config,
-    options: argparse.Namespace,
-    stop_signals: StopSignals,
-    viewers: ExitStack,
-) -> Attempt:
-    """Find the camera, if it is not given, and run."""
-    may_go_on = _mode(sequence, options) not in (None, Mapping.ONLINE)
-    kept = features_to_keep(config, sequence.size, NUM_KEYPOINTS, options.device) if may_go_on else None
-    sequence, found = _with_camera(sequence, config, options, kept)
-    if options.camera_std is None:
-        config = with_stated_std(config, sequence)
-    slam, so_far = _begin(sequence, config, options)
-    sequence = source(sequence, config, slam.camera)
-    checkpoints = Checkpoints(options.output, options.checkpoint, slam, so_far, sequence)
-    processes = (
-        1 if options.view or options.video else options.processes
-    )  # the viewers need the images in this process
-    watching = viewers.enter_context(_watching(slam, sequence, options))
-    latencies: list[float] = []
-
-    def frames_to(end: bool) -> Run | None:
-        """The run, finished; None if it stopped, which it may before the end, where tracking was lost."""
-        bar = ProgressBar(sequence.known_length, lambda: slam.map.num_points, stop_signals, so_far.next)
-        with bar as progress:
-
-            def after_frame(result: StepResult) -> None:
-                if sequence.is_live:
-                    latencies.append(1e3 * (time.time() - result.timestamp))
-                is_last = result.index + 1 == sequence.known_length or (
-                    result.state is State.LOST and not end
-                )
-                checkpoints.offer(at_once=stop_signals.is_wanted or (may_go_on and is_last))
-                watching.show(result)
-                progress.update(result)
-
-            interrupted = False
-            with with_workers(watching.sequence, slam, processes, so_far.next) as frames:
-                try:
-                    if not run_frames(slam, watching.sequence, so_far, after_frame, frames, not end):
-                        return None
-                except KeyboardInterrupt:
-                    interrupted = True
-                return finish(slam, so_far.results, so_far.skipped, interrupted, progress.adjusting)
-
-    whole: list[Run] = []  # once it has ended
-
-    def ended(go_on: bool) -> Run:
-        if not whole:
-            found = frames_to(end=True) if go_on else None
-            whole.append(found or finish(slam, so_far.results, so_far.skipped, interrupted=True))
-        return whole[0]
-
-    is_watched = options.view or options.video
-    finished = frames_to(end=is_watched or not may_go_on or not _all_are_mapped(sequence, config))
-    if finished is None:
-        begun = Run(
-            tuple(slam.atlas),
-            slam.shared_camera.model,
-            slam.config,
-            so_far.results,
-            so_far.skipped,
-            False,
-            failure="",
-        )
-        return Attempt(begun, sequence, found, latencies, watching, kept=kept, end=ended)
-    return Attempt(finished, sequence, found, latencies, watching, kept=kept)
-
-
-def _all_are_mapped(sequence: Sequence, config: Config) -> bool:
-    """Whether global mapping takes all frames of a recording, whatever becomes of them online."""
-    length = sequence.known_length
-    return length is not None and length <= config.global_mapping.max_images
-
-
-def _map_recording(
-    attempt: Attempt, mapping: Mapping, options: argparse.Namespace, stop_signals: StopSignals
-) -> Attempt:
-    """Check the run, and map the recording as a whole where that is wanted or needed; Ctrl-C keeps the run."""
-    online, config = attempt.finished, attempt.finished.config
-    stages = options.output / STAGES if options.checkpoint else None
-    try:
-        with StageBar(stop_signals) as bar:
-            mapped = map_recording(
-                attempt.sequence,
-                online,
-                config,
-                attempt.sequence.camera,
-                mapping,
-                options.device,
-                bar.update,
-                stages,
-                None if attempt.end is None else partial(attempt.end, True),
-                attempt.kept,
-            )
-    except KeyboardInterrupt:
-        online = online if attempt.end is None else attempt.end(False)
-        return replace(attempt, finished=replace(online, interrupted=True))
-    if mapped.why:
-        say(f"ran global mapping because {mapped.why}; kept the {mapped.kept} map")
-    return replace(attempt, finished=mapped.run, mapped=mapped)
-
-
-def _in_meters(attempt: Attempt, sources: list[MetricSource]) -> Attempt:
-    """Bring the run into meters; Ctrl-C leaves it in an arbitrary unit, and says so."""
-    finished = attempt.finished
-    try:
-        if finished.interrupted and sources:
-            raise KeyboardInterrupt
-        return replace(attempt, finished=run_in_meters(finished, attempt.sequence, sources))
-    except KeyboardInterrupt:
-        why = "interrupted; `torchslam align` measures later"
-        return replace(attempt, finished=replace(finished, interrupted=True, unmeasured=(why,)))
 
 
 def _with_camera(
@@ -440,33 +367,12 @@ def _describe(camera: Camera) -> str:
     return f"{camera.model} {numbers} of {camera.width} x {camera.height} pixels"
 
 
-def _write(attempt: Attempt, options: argparse.Namespace, before_s: float | None) -> dict[str, object]:
-    """Evaluate and write the run; returns the metrics.
-
-    Args:
-        attempt: the finished run.
-        options: of the command line.
-        before_s: `cpu_seconds` when the run began.
-    """
-    finished, sequence, latencies = attempt.finished, attempt.sequence, attempt.latencies
-    metrics = compute_metrics(
-        finished,
-        sequence,
-        attempt.found,
-        warn,
-        attempt.mapped,
-    )
-    if latencies:
-        median, p95 = (
-            torch.tensor(latencies, dtype=torch.float32, device="cpu")
-            .quantile(torch.tensor([0.5, 0.95], dtype=torch.float32, device="cpu"))
-            .tolist()
-        )
-        metrics["latency_ms"] = {"median": median, "p95": p95}
-    metrics |= _usage(before_s) | source_of(options.path, options.fps, sequence)
-    online = None if attempt.mapped is None else attempt.mapped.online
-    write_run(finished, sequence, metrics, options.output, online=online)
-    return metrics
+def _latency(milliseconds: list[float]) -> dict[str, dict[str, float]]:
+    """The latency of a live source, for metrics.json; empty of a recording."""
+    if not milliseconds:
+        return {}
+    found = torch.tensor(milliseconds, dtype=torch.float64, device="cpu")
+    return {"latency_ms": {"median": float(found.median()), "p95": float(found.quantile(0.95))}}
 
 
 def _usage(before_s: float | None) -> dict[str, float]:

@@ -1,8 +1,8 @@
-"""A recording is mapped twice, in time and as a whole; the check from outside decides which of both to believe."""
+"""From a recording to a result: frame by frame, the check, the recording as a whole where it fails, meters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -19,9 +19,12 @@ from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, Progress, poses_of
 from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.view_graph import FAR, PairMatcher, ViewPair, similar_places
+from torchslam.metric.source import MetricSource
 from torchslam.optim.model_choice import SURE, predictive_gain
 from torchslam.optim.scale_links import scale_links
 from torchslam.system.front_end import KeptFeatures
+from torchslam.system.metric_run import run_in_meters
+from torchslam.system.online_run import OnlineRun
 from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
@@ -34,6 +37,8 @@ LOOP_MATCHES = 40
 """Verified matches of a pair of similar places that counts. On kitti07, which visits no place twice, three have 22 to
 30; where places are visited again, most have more than 40 (machine_hall, office_loop)."""
 
+UNMEASURED = "interrupted; `torchslam align` measures later"
+"""Why an interrupted run has an arbitrary unit."""
 KeyframePairs = tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]]
 """Poses and features of keyframes, and their verified pairs."""
 
@@ -67,6 +72,57 @@ class MappedRecording:
     check: MapCheck | None
     kept: Mapping
     why: str
+
+
+def run_recording(
+    online: OnlineRun,
+    sequence: Sequence,
+    mapping: Mapping | None = Mapping.AUTO,
+    sources: Iterable[MetricSource] = (),
+    device: torch.device | str = "cpu",
+    stages: Path | None = None,
+    features: KeptFeatures | None = None,
+    all_frames: bool = False,
+) -> tuple[Run, MappedRecording | None]:
+    """Process the frames of a recording, check the map, map the recording as a whole where needed, measure its unit.
+
+    An interrupt keeps what there is: the run of the frames so far, or the online map, or a map in an arbitrary unit.
+
+    Args:
+        online: the run of its frames, which may have begun; its observer sees all stages.
+        sequence: the recording, with its camera.
+        mapping: when to map as a whole; None: never, without a check, as of a live source or a known map.
+        sources: of meters.
+        device: of torch.
+        stages: as in `map_recording`.
+        features: as in `map_recording`.
+        all_frames: whether all frames are processed online, even after tracking was lost.
+
+    Returns:
+        The run that was kept, and how it was chosen; None for an interrupted run, and without a check.
+    """
+    config, observer, sources = online.slam.config, online.observer, list(sources)
+    length, mapped = sequence.known_length, None
+    are_all_mapped = length is not None and length <= config.global_mapping.max_images
+    may_map = mapping in (Mapping.AUTO, Mapping.GLOBAL)
+    run = online.run(until_lost=may_map and are_all_mapped and not all_frames)
+    if mapping is not None and not run.interrupted:
+        go_on = None if online.is_finished else online.run
+        try:
+            with observer.whole():
+                camera = sequence.camera
+                mapped = map_recording(
+                    sequence, run, config, camera, mapping, device, observer.stage, stages, go_on, features
+                )
+            run = mapped.run
+        except KeyboardInterrupt:
+            run = replace(run if go_on is None else online.end(), interrupted=True)
+    if run.interrupted and sources:
+        return replace(run, unmeasured=(UNMEASURED,)), mapped
+    try:
+        return run_in_meters(run, sequence, sources), mapped
+    except KeyboardInterrupt:
+        return replace(run, interrupted=True, unmeasured=(UNMEASURED,)), mapped
 
 
 def map_recording(
