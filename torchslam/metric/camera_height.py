@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.geometry.robust import NORMAL_MEDIAN
+from torchslam.geometry.robust import median_with_error
 from torchslam.metric.options import Given
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import SubmapView, Unmeasured
@@ -94,16 +94,12 @@ class CameraHeight:
                 f"the ground is seen below the camera in {len(heights)} of {FRAMES} frames: it must move along it, and "
                 "look at it",
             )
-        logs = np.log(heights)
-        middle = float(np.median(logs))
-        spread = float(np.median(np.abs(logs - middle))) / NORMAL_MEDIAN
-        # The variance of a median is pi / 2 times that of a mean.
-        error = math.sqrt(math.pi / 2 / len(logs)) * spread
+        middle, spread, error = median_with_error(np.log(heights))
         return ScaleMeasurement(
             ScaleSource.CAMERA_HEIGHT,
             self._meters / math.exp(middle),
             math.hypot(error, MODEL_STD),
-            len(logs),
+            len(heights),
             "frames above the ground",
             apart=spread,
         )

@@ -22,6 +22,7 @@ from torchslam.data.formats.depth_images import DepthImages, find_depth_images, 
 from torchslam.data.transforms import scale_camera
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, transform
+from torchslam.geometry.robust import weighted_median
 from torchslam.metric.options import Given
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import SlowMean, slow_mean
@@ -212,7 +213,7 @@ def frame_ratio(view: SubmapView, row: int, depth: Float[np.ndarray, "H W"], cam
         return None
     z, middle = z[inside][is_one], middle[is_one]
     weights = 1 / (POINT_STD**2 + (NOISE * middle).square())
-    return _weighted_median((middle / z).log(), weights)
+    return weighted_median((middle / z).log(), weights)
 
 
 def _observed(view: SubmapView, row: int) -> tuple[Float[Tensor, "R 2"], Float[Tensor, " R"]]:
@@ -226,13 +227,6 @@ def _observed(view: SubmapView, row: int) -> tuple[Float[Tensor, "R 2"], Float[T
 
 def _mean(depth: Float[np.ndarray, "H W"], patch: np.ndarray) -> np.ndarray:
     return cv2.blur(depth, patch.shape)
-
-
-def _weighted_median(values: Float[Tensor, " N"], weights: Float[Tensor, " N"]) -> float:
-    """The value with half of the weight on either side."""
-    order = values.argsort()
-    passed = weights[order].cumsum(0)
-    return float(values[order][int(torch.searchsorted(passed, passed[-1] / 2))])
 
 
 def _rejected(frames: Int[Tensor, " N"], logs: Float[Tensor, " N"], mean: SlowMean) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.geometry.robust import NORMAL_MEDIAN
+from torchslam.geometry.robust import fit_inliers, median_scale
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviations of the slow noise, in those of the white noise; beyond the last one the white noise does not
@@ -114,17 +114,18 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
         values: three or more.
         stds: relative to each other.
     """
-    mean = _densest(values)
-    inliers = torch.ones_like(values, dtype=torch.bool)
-    for _ in range(ROUNDS):
-        before = inliers
+
+    def inliers_of(mean: Tensor) -> Tensor:
         whitened = (values - mean).abs() / stds
-        scale = (whitened.median() / NORMAL_MEDIAN).clamp_min(1e-9)  # rounding is no scatter
-        inliers = whitened <= GATE * scale
+        return whitened <= GATE * median_scale(whitened).clamp_min(1e-9)  # rounding is no scatter
+
+    def mean_of(_: Tensor, inliers: Tensor) -> Tensor:
         weights = inliers / stds.square()
-        mean = (weights * values).sum() / weights.sum()
-        if bool((inliers == before).all()):
-            break
+        return (weights * values).sum() / weights.sum()
+
+    found = fit_inliers(_densest(values), inliers_of, mean_of, ROUNDS)
+    assert found is not None  # a mean is always determined
+    inliers = found[1]
     group, size = group_rows(int(inliers.sum()))
     kept, own = values[inliers], stds[inliers].square()
     white = group_means(own, group, size) / size
