@@ -15,11 +15,11 @@ from typing import Any
 import torch
 
 from torchslam.batch.result_store import (
+    DIGITS,
     DONE,
     NO_MAP,
     Columns,
     hash_files,
-    hash_json,
     program_hash,
     run_or_reuse,
 )
@@ -43,6 +43,7 @@ from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.metric_run import run_in_meters
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
+from torchslam.utils.files import fingerprint
 from torchslam.utils.text import without_credentials
 
 TIMES = "times.json"
@@ -120,15 +121,8 @@ def configuration(task: Task) -> str:
         ConfigError: The settings of the row are not valid.
     """
     row = asdict(replace(task.row, config=None, overrides=(), folder=""))
-    return hash_json(
-        {
-            "row": row,
-            "settings": to_toml(settings_of(task.row)),
-            "device": torch.device(task.device).type,
-            "plots": task.plots,
-            "program": program_hash(),
-        }
-    )
+    settings, device = to_toml(settings_of(task.row)), torch.device(task.device).type
+    return fingerprint([row, settings, device, task.plots, program_hash()], DIGITS)
 
 
 def _input(task: Task) -> str:
