@@ -51,16 +51,56 @@ def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[flo
     """Parse finite numbers separated by spaces or commas. Raises `error` at `where` otherwise."""
     if len(text) > MAX_LINE:
         raise error(f"{where}: {len(text)} characters, more than the {MAX_LINE} of a line of numbers")
-    numbers = []
-    for word in text.replace(",", " ").split():
-        try:
-            number = float(word)
-        except ValueError:
-            raise error(f"{where}: `{word}` is not a number") from None
-        if not math.isfinite(number):
-            raise error(f"{where}: `{word}` is not a finite number")
-        numbers.append(number)
-    return numbers
+    return [parse_number(word, where, error) for word in text.replace(",", " ").split()]
+
+
+def parse_number(text: str, where: str, error: type[TorchslamError]) -> float:
+    """Parse a finite number, which must be the whole text. Raises `error` at `where` otherwise."""
+    try:
+        number = float(text)
+    except ValueError:
+        raise error(f"{where}: `{text[:100]}` is not a number") from None
+    if not math.isfinite(number):
+        raise error(f"{where}: `{text[:100]}` is not a finite number")
+    return number
+
+
+def number_rows(
+    path: str | Path, columns: str, error: type[TorchslamError]
+) -> Iterator[tuple[str, list[float]]]:
+    """Yield the place and the numbers of each line of a file, such as of `columns` "tx ty tz".
+
+    Raises `error` for a line without that many numbers, and for a file without a line.
+    """
+    count, row = len(columns.split()), None
+    for number, line in numbered_lines(path, error):
+        where = f"{path}:{number}"
+        row = parse_floats(line, where, error)
+        if len(row) != count:
+            raise error(f"{where}: expected `{columns}`, got {len(row)} numbers")
+        yield where, row
+    if row is None:
+        raise error(f"{path}: is empty; expected lines `{columns}`")
+
+
+def listed_files(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[str, float, Path]]:
+    """Yield the place, the time in seconds and the file of each line `timestamp file` of a list.
+
+    Raises `error` for anything else, and for a list without a line.
+    """
+    where = ""
+    for number, line in numbered_lines(path, error):
+        where = f"{path}:{number}"
+        time, _, file = line.partition(" ")
+        if not file.strip():
+            raise error(f"{where}: expected `timestamp file`, got `{line}`")
+        yield (
+            where,
+            in_seconds(parse_number(time, where, error), where, error),
+            Path(path).parent / file.strip(),
+        )
+    if not where:
+        raise error(f"{path}: no files are listed")
 
 
 def parse_count(text: str) -> int | None:

@@ -12,12 +12,12 @@ from xml.etree import ElementTree
 
 from PIL import Image
 
-from torchslam.data.formats.csv_tables import parse_moment, read_csv
+from torchslam.data.formats.csv_tables import TIMES, Column, parse_moment, read_table
 from torchslam.data.formats.fixes import Fix, Fixes, checked_fixes
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.image_file import MAX_BYTES, SUFFIXES
 from torchslam.data.formats.oxts import is_oxts, read_oxts
-from torchslam.data.text_file import MAX_LINE, read_text
+from torchslam.data.text_file import MAX_LINE, parse_number, read_text
 from torchslam.errors import MeasurementError
 from torchslam.utils.files import read_bytes
 
@@ -29,15 +29,18 @@ HORIZONTAL_ERROR = 31
 """Tag of the horizontal error, meters."""
 XML_BYTES = 1 << 26
 """Size limit of GPX files; half a million points, of which the parser makes objects of ten times the size."""
-POSITION_COLUMNS = {
-    "name": ("name", "image", "filename", "file"),
-    "latitude": ("latitude", "lat"),
-    "longitude": ("longitude", "lon", "lng"),
-    "altitude": ("altitude", "alt", "elevation", "ele"),
-    "std_horizontal": ("std_horizontal",),
-    "std_vertical": ("std_vertical",),
+DEGREES, METERS = {"deg": 1.0, "degrees": 1.0, "°": 1.0}, {"m": 1.0, "meters": 1.0}
+"""Units that headings may state."""
+COLUMNS = {
+    **TIMES,
+    "name": Column(("name", "image", "filename", "file")),
+    "latitude": Column(("latitude", "lat"), DEGREES),
+    "longitude": Column(("longitude", "lon", "lng"), DEGREES),
+    "altitude": Column(("altitude", "alt", "elevation", "ele"), METERS),
+    "std_horizontal": Column(("stdhorizontal",), METERS),
+    "std_vertical": Column(("stdvertical",), METERS),
 }
-"""Kinds of columns and what they are called."""
+"""Kinds of columns."""
 OXTS_ACCURACY = 23  # the place of `pos_accuracy` in a packet (dataformat.txt)
 
 
@@ -65,8 +68,8 @@ def read_fixes(path: str | Path) -> Fixes:
 
 
 def _csv_rows(path: Path) -> Iterator[Fix]:
-    for row in read_csv(path, POSITION_COLUMNS, MeasurementError):
-        if not row.time_column and "name" not in row.cells:
+    for row in read_table(path, COLUMNS, MeasurementError):
+        if not row.has_time and "name" not in row.cells:
             raise MeasurementError(f"{row.where}: neither a `time` nor the `name` of an image")
         if "latitude" not in row.cells and "longitude" not in row.cells and "altitude" in row.cells:
             raise MeasurementError(f"{row.where}: no `latitude` and `longitude`, in degrees")
@@ -75,7 +78,7 @@ def _csv_rows(path: Path) -> Iterator[Fix]:
             row.number("latitude"),
             row.number("longitude"),
             row.number("altitude"),
-            row.time() if row.time_column else None,
+            row.time() if row.has_time else None,
             row.cells.get("name", ""),
             (row.number("std_horizontal"), row.number("std_vertical")),
         )
@@ -181,7 +184,7 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
                 f"{where}: no time; a route that was planned says nothing about the images"
             )
         latitude, longitude, altitude = (
-            _number(text, where)
+            math.nan if text == "nan" else parse_number(text, where, MeasurementError)
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
         )
         yield Fix(where, latitude, longitude, altitude, time=time)
@@ -190,13 +193,6 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
 def _tag(element: ElementTree.Element) -> str:
     """The name of an element without its namespace."""
     return element.tag.rpartition("}")[2]
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise MeasurementError(f"{where}: `{text}` is not a number") from None
 
 
 # --- NMEA ----------------------------------------------------------------------------------------------------
@@ -251,7 +247,7 @@ def _nmea_rows(rows: list[tuple[str, list[str]]]) -> Iterator[Fix]:
             where,
             _degrees(fields[at], fields[at + 1], "NS", where) if has_fix else math.nan,
             _degrees(fields[at + 2], fields[at + 3], "EW", where) if has_fix else math.nan,
-            _number(fields[9] or "nan", where) if is_gga else math.nan,
+            parse_number(fields[9], where, MeasurementError) if is_gga and fields[9] else math.nan,
             time=last,
         )
 

@@ -17,9 +17,8 @@ from torchslam.data.formats.calibration_files import read_calibration, read_matr
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
 from torchslam.data.text_file import check_later, numbered_lines, parse_count, parse_floats
-from torchslam.data.trajectories import checked_poses
+from torchslam.data.trajectories import poses_from_rows
 from torchslam.errors import SequenceError, TrajectoryError
-from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.types import Trajectory
 
 NANOSECONDS = 1_000_000_000
@@ -81,6 +80,7 @@ def _read_extrinsics(path: Path) -> Float[Tensor, "4 4"]:
 def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
     """Camera poses from the body's: nanoseconds, position, quaternion wxyz, then velocity and biases."""
     times: list[float] = []
+    places: list[str] = []
     rows: list[list[float]] = []
     for number, line in numbered_lines(path, TrajectoryError):
         where = f"{path}:{number}"
@@ -92,13 +92,12 @@ def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
         times.append(nanoseconds / NANOSECONDS)
         if rows:
             check_later(times[-1], times[-2], where, TrajectoryError)
-        rows.append(row[:7])
+        places.append(where)
+        rows.append([*row[:3], *row[4:7], row[3]])
     if not rows:
         raise TrajectoryError(f"{path}: no poses")
-    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
-    T_wb = rigid(matrix_from_quaternion(table[:, [4, 5, 6, 3]]), table[:, :3])
-    T_wc = checked_poses(T_wb @ T_bc, path)
-    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
+    T_wb = poses_from_rows(torch.tensor(rows, dtype=torch.float64, device="cpu"), places)
+    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wb @ T_bc)
 
 
 EUROC = Reader("mav0/cam0/data.csv (EuRoC)", _is_euroc, _open_euroc)
