@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
+from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, median_scale, weighted_median
 from torchslam.metric.markers.corners import GraphWithCorners, PlacedTarget, Sighting, add_corners
 from torchslam.metric.markers.detection import Detector, detector_of
 from torchslam.metric.markers.targets import Target, TargetKind, parse_target
@@ -212,7 +213,7 @@ def _agreeing(
     used = torch.ones(len(targets), dtype=torch.bool, device=logs.device)
     lines = []
     while int(used.sum()) > 1:
-        middle = _weighted_median(logs[used], sizes.information[used])
+        middle = weighted_median(logs[used], sizes.information[used])
         off = torch.where(used, (logs - middle).abs(), 0.0)
         row = int(off.argmax())
         others = used.clone()
@@ -234,13 +235,6 @@ def _agreeing(
     return used, lines
 
 
-def _weighted_median(values: Float[Tensor, " N"], weights: Float[Tensor, " N"]) -> Float[Tensor, ""]:
-    """The value below which half of the weight lies."""
-    order = torch.argsort(values)
-    total = weights[order].cumsum(0)
-    return values[order][int(torch.searchsorted(total, total[-1] / 2))]
-
-
 def pixel_variances(with_corners: GraphWithCorners, solution: GraphSolution) -> Float[Tensor, " O"]:
     """Variances of all pixels, px^2: by the stated weights, calibrated by the residuals of keypoints and of corners."""
     graph = with_corners.graph
@@ -258,8 +252,7 @@ def pixel_variances(with_corners: GraphWithCorners, solution: GraphSolution) -> 
     variances = torch.empty_like(squared)
     for rows, unknowns in ((slice(0, first), 0), (slice(first, None), 3 * corners)):
         count = 2 * len(squared[rows])
-        # Half of the squares of two normal numbers are below 1.386; wrong observations do not count so.
-        factor = squared[rows].median() / (2 * math.log(2)) * count / max(count - unknowns, 1)
+        factor = median_scale(squared[rows], NORMAL_SQUARED_MEDIAN_2D) * count / max(count - unknowns, 1)
         variances[rows] = factor / weights[rows].clamp(min=1e-12)
     return variances
 
