@@ -17,8 +17,9 @@ from typing import Any
 
 import torchslam
 from torchslam.data.synthetic import is_synthetic
+from torchslam.data.text_file import read_object
 from torchslam.errors import ResultsError, SequenceError, TorchslamError
-from torchslam.utils.files import JSON_BYTES, fingerprint, parse_json, read_text, whole_folder, write_whole
+from torchslam.utils.files import fingerprint, whole_folder, write_whole
 from torchslam.utils.text import printable, without_credentials
 
 RUNS = "runs"
@@ -108,29 +109,10 @@ def read_record(path: Path) -> Columns | None:
     Raises:
         ResultsError: The file is not a record, or not readable.
     """
-    record = read_object(path)
+    record = read_object(path, ResultsError)
     if record is not None and not isinstance(record.get("status"), str):
         raise ResultsError(f"{path}: not the record of a row")
     return record
-
-
-def read_object(path: Path) -> Columns | None:
-    """Read a JSON object; None if there is no file.
-
-    Raises:
-        ResultsError: The file is something else, or not readable.
-    """
-    try:
-        found = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ResultsError(f"{path}: not valid JSON: {error}") from None
-    if not isinstance(found, dict):
-        raise ResultsError(f"{path}: not a JSON object")
-    return found
 
 
 def _write(path: Path, columns: Columns) -> None:

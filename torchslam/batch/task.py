@@ -41,7 +41,6 @@ from torchslam.io.results import source_of
 from torchslam.io.write_run import write_run
 from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.metric_run import run_in_meters
-from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 from torchslam.utils.files import fingerprint
 from torchslam.utils.text import without_credentials
@@ -201,7 +200,7 @@ def _run(task: Task, folder: Path) -> Columns:
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
     metrics |= source_of(row.resolve(row.sequence), row.fps, sequence)
     write_run(
-        _without_times(finished),
+        replace(finished, results=[replace(result, stage_ms={}) for result in finished.results]),
         sequence,
         metrics,
         folder,
@@ -215,10 +214,6 @@ def _run(task: Task, folder: Path) -> Columns:
         "error": finished.failure,
         **_columns(metrics),
     }
-
-
-def _without_times(finished: Run) -> Run:
-    return replace(finished, results=[replace(result, stage_ms={}) for result in finished.results])
 
 
 def _columns(metrics: Mapping[str, Any]) -> Columns:

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from torchslam.errors import TorchslamError
 from torchslam.utils import files
@@ -34,6 +35,21 @@ def read_text(path: str | Path, error: type[TorchslamError], limit: int | None =
         raise error(f"{path}: cannot be read: {cause.strerror}") from cause
     except ValueError as cause:
         raise error(f"{path}: cannot be read: {cause}") from cause
+
+
+def read_object(path: str | Path, error: type[TorchslamError]) -> dict[str, Any] | None:
+    """Read a JSON object; None if there is no file. Raises `error` for anything else."""
+    try:
+        found = files.parse_json(files.read_text(path, files.JSON_BYTES, "a JSON file"))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror}") from None
+    except ValueError as cause:
+        raise error(f"{path}: not valid JSON: {cause}") from None
+    if not isinstance(found, dict):
+        raise error(f"{path}: not a JSON object")
+    return found
 
 
 def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[int, str]]:

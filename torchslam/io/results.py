@@ -20,6 +20,7 @@ from torchslam.data.formats.csv_tables import read_cells
 from torchslam.data.formats.image_file import read_gray, write_image
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
+from torchslam.data.text_file import read_object
 from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError
@@ -34,7 +35,7 @@ from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
 from torchslam.system.run import Run
 from torchslam.types import Explanation, State, StepResult, Trajectory
-from torchslam.utils.files import JSON_BYTES, parse_json, read_text, write_whole
+from torchslam.utils.files import write_whole
 from torchslam.utils.text import is_unicode
 
 TRAJECTORY = "trajectory.txt"
@@ -215,13 +216,10 @@ def read_results(directory: Path) -> Results:
 def read_metrics(directory: Path) -> dict[str, Any]:
     """Read metrics.json. Raises ResultsError if it is missing or invalid."""
     path = directory / METRICS
-    try:
-        metrics = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ResultsError(f"{path}: not valid JSON: {error}") from None
-    missing = [name for name in NEEDED if not isinstance(metrics, dict) or name not in metrics]
+    metrics = read_object(path, ResultsError)
+    if metrics is None:
+        raise ResultsError(f"{path}: cannot be read: No such file or directory")
+    missing = [name for name in NEEDED if name not in metrics]
     if missing:
         raise ResultsError(f"{path}: not the metrics of a run: {', '.join(missing)} missing")
     wrong = [

@@ -6,7 +6,6 @@ drift of the map. The fit is made for several covariances and averaged (`slow_no
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -218,7 +217,8 @@ def _grouped(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> _Groups:
         return group_means(values, group, size)
 
     white = (mean(stds.square()) / size[:, None]).sqrt()
-    level = (mean((~pairs.has_height).double()) > 0) * level_std(pairs)
+    extent = (pairs.positions_e.amax(0) - pairs.positions_e.amin(0))[:2].norm()
+    level = (mean((~pairs.has_height).double()) > 0) * LEVEL * extent
     white[:, 2] = (white[:, 2].square() + level.square()).sqrt()
     return _Groups(
         mean(pairs.times),
@@ -232,12 +232,6 @@ def _grouped(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> _Groups:
 
 LEVEL = 0.05
 """Where heights were not measured the path is taken for level, with this part of its extent as standard deviation."""
-
-
-def level_std(pairs: PositionPairs) -> float:
-    """Standard deviation of heights that were not measured, meters."""
-    extent = (pairs.positions_e.amax(0) - pairs.positions_e.amin(0))[:2].norm()
-    return LEVEL * float(extent)
 
 
 @dataclass(frozen=True)
@@ -373,8 +367,3 @@ def _rescaled(
     scaled[:3, :3] = factor * S_ew[:3, :3]
     scaled[:3, 3] = center_e - scaled[:3, :3] @ center_w
     return scaled
-
-
-def is_line(up_std: float) -> bool:
-    """Whether positions leave the turn about them open, so that their up is the cameras' own."""
-    return up_std > math.radians(15.0)

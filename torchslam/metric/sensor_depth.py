@@ -146,7 +146,8 @@ class SensorDepth:
         if near is not None and bool((near >= 0).any()):
             return [(row, images.paths[place]) for row, place in enumerate(near.tolist()) if place >= 0]
         by_name = {_numbers(path.name): path for path in images.paths}
-        names = [] if view.sequence is None else [_numbers(name) for name in _file_names(view)]
+        file_name = None if view.sequence is None else view.sequence.file_name
+        names = [_numbers(file_name(index)) for index in view.frame_index.tolist()] if file_name else []
         named = [(row, by_name[key]) for row, key in enumerate(names) if key and key in by_name]
         if named:
             return named
@@ -168,11 +169,6 @@ def nearest_times(times: Float[Tensor, " N"], others: Float[Tensor, " M"]) -> In
     intervals = [each.diff().median() for each in (times, others) if len(each) > 1]
     limit = min(map(float, intervals), default=0.0) / 2
     return torch.where(distances <= limit, rows, -1)
-
-
-def _file_names(view: SubmapView) -> list[str]:
-    assert view.sequence is not None  # the caller's condition
-    return [Path(view.sequence.file_name(index)).name for index in view.frame_index.tolist()]
 
 
 def _numbers(name: str) -> tuple[int, ...]:

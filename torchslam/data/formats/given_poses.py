@@ -191,7 +191,8 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
         if line.startswith("#"):
             continue
         words = line.split(maxsplit=9)
-        if not words or (is_points and _are_points(line.split())):
+        numbers = line.split()  # observations in threes; ten words are an image whose name is a number
+        if not words or (is_points and len(numbers) != 10 and _are_numbers(numbers)):
             is_points = False
             continue
         if len(words) != 10:
@@ -199,12 +200,6 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
         images.append((words[9].strip(), parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)))
         is_points = True
     return images
-
-
-def _are_points(words: list[str]) -> bool:
-    """Whether a line is of observations: numbers alone, in threes, of which the last may be cut; a line of ten words is
-    that of an image whose name is a number."""
-    return len(words) != 10 and _are_numbers(words)
 
 
 def _are_numbers(words: list[str]) -> bool:

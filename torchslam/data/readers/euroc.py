@@ -28,11 +28,6 @@ IMU = "imu0"
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 
-def _is_euroc(path: str) -> bool:
-    """Return True if the folder, or its `mav0`, has a camera in this layout."""
-    return (_root(Path(path)) / "cam0" / "data.csv").is_file()
-
-
 def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """The left camera of a EuRoC recording; `camera` overrides `sensor.yaml`.
 
@@ -47,7 +42,9 @@ def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> Im
         notes = [f"no {sensor}: the camera is unknown unless --camera is given{unused}"]
     else:
         camera = camera if camera is not None else read_calibration(sensor)
-        groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor)) if has_truth else None
+        if has_truth:
+            T_bc = torch.tensor(read_matrix(sensor, "T_BS", 16), dtype=torch.float64, device="cpu").view(4, 4)
+            groundtruth = _read_body_poses(root / TRUTH, T_bc)
     name = folder.resolve().parent.name if folder.name == "mav0" else folder.name
     sequence = ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth, notes)
     if sensor.exists() and (root / IMU / "data.csv").is_file():
@@ -70,11 +67,6 @@ def _read_images(folder: Path) -> list[ImageEntry]:
             raise SequenceError(f"{where}: expected `nanoseconds,file`, got `{line}`")
         entries.append(ImageEntry(nanoseconds / NANOSECONDS, folder / "data" / words[1], where))
     return entries
-
-
-def _read_extrinsics(path: Path) -> Float[Tensor, "4 4"]:
-    """T_bc: camera to body."""
-    return torch.tensor(read_matrix(path, "T_BS", 16), dtype=torch.float64, device="cpu").view(4, 4)
 
 
 def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
@@ -100,4 +92,8 @@ def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
     return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wb @ T_bc)
 
 
-EUROC = Reader("mav0/cam0/data.csv (EuRoC)", _is_euroc, _open_euroc)
+EUROC = Reader(
+    "mav0/cam0/data.csv (EuRoC)",
+    lambda path: (_root(Path(path)) / "cam0" / "data.csv").is_file(),
+    _open_euroc,
+)

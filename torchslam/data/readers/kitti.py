@@ -113,11 +113,6 @@ def _read_odometry_poses(path: Path, times: Float[Tensor, " N"], offset_x: float
     return Trajectory(times, checked_poses(T_w0 @ T_0c, found))
 
 
-def _is_kitti_raw(path: str) -> bool:
-    """Return True for a drive (`2011_09_26_drive_0001_sync`)."""
-    return _raw_camera(Path(path)) is not None
-
-
 def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """The left camera of a drive, gray before color; times are seconds since the day began, UTC.
 
@@ -230,4 +225,8 @@ def _poses_of(packets: list[Packet]) -> Float[Tensor, "N 4 4"]:
 
 
 KITTI = Reader("image_0/ or image_2/ with times.txt (KITTI odometry)", _is_kitti, _open_kitti)
-KITTI_RAW = Reader("image_00/data/ with timestamps.txt (KITTI raw)", _is_kitti_raw, _open_kitti_raw)
+KITTI_RAW = Reader(
+    "image_00/data/ with timestamps.txt (KITTI raw)",
+    lambda path: _raw_camera(Path(path)) is not None,
+    _open_kitti_raw,
+)

@@ -50,11 +50,6 @@ TARTANAIR_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """The axes of our cameras, right, down, forward, as columns in the dataset's: forward, right, down."""
 
 
-def _is_tum(path: str) -> bool:
-    """Return True if the folder has a list of images."""
-    return (Path(path) / "rgb.txt").is_file()
-
-
 def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """A folder of ETH3D-SLAM or TUM RGB-D; `camera` overrides the folder's calibration.
 
@@ -62,7 +57,9 @@ def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> Imag
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     folder = Path(path)
-    entries = read_image_list(folder / "rgb.txt")
+    entries = [
+        ImageEntry(time, file, where) for where, time, file in listed_files(folder / "rgb.txt", SequenceError)
+    ]
     camera = camera if camera is not None else find_calibration(folder)
     robot = FREIBURG.search(folder.resolve().name)
     if camera is None and robot is not None:
@@ -80,16 +77,6 @@ def _with_depth(sequence: ImageSequence, path: Path, camera: str = "") -> ImageS
             {"depth_camera": camera} if camera else {}
         )
     return sequence
-
-
-def read_image_list(path: Path) -> list[ImageEntry]:
-    """The lines `timestamp file` of a list. Raises SequenceError naming file and line."""
-    return [ImageEntry(time, file, where) for where, time, file in listed_files(path, SequenceError)]
-
-
-def _is_icl_nuim(path: str) -> bool:
-    """Return True if the folder has images and a trajectory of this dataset."""
-    return (Path(path) / "rgb").is_dir() and next(Path(path).glob(ICL_TRUTH), None) is not None
 
 
 def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -110,11 +97,6 @@ def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) ->
     camera = PRESETS["icl"] if camera is None else camera
     sequence = ImageSequence(folder.name, "ICL-NUIM folder", entries, camera, groundtruth, found.notes)
     return _with_depth(sequence, folder / "depth")
-
-
-def _is_seven_scenes(path: str) -> bool:
-    """Return True if the folder has color frames with the names of this dataset."""
-    return Path(path).is_dir() and next(Path(path).glob(SEVEN_SCENES_COLOR), None) is not None
 
 
 def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -159,11 +141,6 @@ def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:
     return checked_poses(rigid(nearest_rotation(R), T_wc[:3, 3])[None], path)[0]
 
 
-def _is_tartanair(path: str) -> bool:
-    """Return True for a trajectory (`P000`) of the dataset."""
-    return _tartanair_camera(Path(path)) is not None
-
-
 def _open_tartanair(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """The left camera of a trajectory; the dataset has no times, so that `rate` or 30 frames per second are taken.
 
@@ -196,7 +173,19 @@ def _read_tartanair_poses(path: Path, times: list[float]) -> Trajectory:
     return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
 
 
-TUM = Reader("rgb.txt (ETH3D, TUM)", _is_tum, _open_tum)
-ICL_NUIM = Reader("rgb/ with *.gt.freiburg (ICL-NUIM)", _is_icl_nuim, _open_icl_nuim)
-SEVEN_SCENES = Reader("frame-*.color.png (7-Scenes)", _is_seven_scenes, _open_seven_scenes)
-TARTANAIR = Reader("image_left/ with pose_left.txt (TartanAir)", _is_tartanair, _open_tartanair)
+TUM = Reader("rgb.txt (ETH3D, TUM)", lambda path: Path(path, "rgb.txt").is_file(), _open_tum)
+ICL_NUIM = Reader(
+    "rgb/ with *.gt.freiburg (ICL-NUIM)",
+    lambda path: Path(path, "rgb").is_dir() and any(Path(path).glob(ICL_TRUTH)),
+    _open_icl_nuim,
+)
+SEVEN_SCENES = Reader(
+    "frame-*.color.png (7-Scenes)",
+    lambda path: Path(path).is_dir() and any(Path(path).glob(SEVEN_SCENES_COLOR)),
+    _open_seven_scenes,
+)
+TARTANAIR = Reader(
+    "image_left/ with pose_left.txt (TartanAir)",
+    lambda path: _tartanair_camera(Path(path)) is not None,
+    _open_tartanair,
+)

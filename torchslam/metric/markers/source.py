@@ -88,7 +88,8 @@ class Markers:
             if not bool(solution.keyframes[0].success):
                 return Unmeasured(ScaleSource.MARKER, "the adjustment with the corners of the markers failed")
             measured = scale_of_targets(with_corners, solution, pixels)
-        submap.posed_frames.apply_solution(_detached(solution), graph, submap.map)
+        detached = replace(solution, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())
+        submap.posed_frames.apply_solution(detached, graph, submap.map)
         return measured
 
 
@@ -261,8 +262,3 @@ def _edges_apart(target: PlacedTarget, points_w: Float[Tensor, "N 3"]) -> float:
     """Relative standard deviation of the distances between all corners of one target."""
     true, found = (torch.pdist(corners) for corners in (target.corners, points_w[target.points]))
     return float((found / true).log().std())
-
-
-def _detached(solution: GraphSolution) -> GraphSolution:
-    """A solution without its gradient."""
-    return replace(solution, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())
