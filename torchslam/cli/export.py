@@ -187,7 +187,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="which of the posed frames to export (default: see above)",
     )
     parser.add_argument(
-        "--submap", type=arguments.not_negative, metavar="N", help="submap to export (default: the main one)"
+        "--submap", type=arguments.at_least(0), metavar="N", help="submap to export (default: the main one)"
     )
     parser.add_argument(
         "--undistort", action="store_true", help="undistort images and keypoints (always done for rerun)"

@@ -13,7 +13,7 @@ from torch import Tensor
 from torchslam.geometry import so3_log
 from torchslam.metric.camera_path import CameraPath, found_shift
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.scale_series import scale_of_series
+from torchslam.metric.slow_noise import scale_of_series
 from torchslam.metric.source import Unmeasured
 
 STRETCH = 1.0

@@ -25,7 +25,7 @@ from torchslam.geometry import Camera, transform
 from torchslam.geometry.robust import weighted_median
 from torchslam.metric.options import Given
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.scale_series import scale_of_series
+from torchslam.metric.slow_noise import scale_of_series
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
 
 IMAGES = 60

@@ -12,8 +12,7 @@ import torch
 from PIL import Image
 
 from torchslam.data.formats.csv_tables import utc_from_gps
-from torchslam.data.formats.fix_files import read_fixes
-from torchslam.data.formats.fixes import Fixes
+from torchslam.data.formats.fix_files import Fixes, read_fixes
 from torchslam.errors import MeasurementError, TorchslamError
 
 MAVIC_3 = """1
