@@ -22,7 +22,7 @@ from torch import Tensor
 import experiments.storey  # noqa: F401  it adds a scene
 from torchslam.batch import ERROR, Columns, Engine, Row, Task, run_batch
 from torchslam.batch.engines import ENGINES
-from torchslam.batch.result_store import RUNS, hash_files, hash_json, program_hash, run_or_reuse
+from torchslam.batch.result_store import RUNS, hash_files, program_hash, run_or_reuse
 from torchslam.batch.results_table import read_times
 from torchslam.batch.rows import short_name
 from torchslam.data import Sequence as Frames
@@ -31,6 +31,7 @@ from torchslam.geometry import se3_inverse
 from torchslam.io.results import read_metrics
 from torchslam.system.run import Run
 from torchslam.types import Trajectory
+from torchslam.utils.files import fingerprint
 
 T = TypeVar("T")
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
@@ -163,7 +164,7 @@ def cached_run(
     """
 
     def fingerprints_of() -> Columns:
-        config = hash_json({"label": label, "settings": list(settings), "program": program_hash()})
+        config = fingerprint([label, list(settings), program_hash()])
         return {"configuration": config, "input": hash_files([f"{code}/*.py", str(DATA_DIR)])}
 
     return run_or_reuse(Path(output), name, fingerprints_of, work, overwrite=True)

@@ -130,13 +130,11 @@ def evaluate(
             f"all {compared} compared positions of the {name} are the same, the others are not: nothing fixes the scale"
         )
     s, R, t = umeyama(matched[:, :3, 3], reference[:, :3, 3])
-    aligned = Trajectory(times, _aligned(T_we, s, R, t))
+    aligned = Trajectory(times, rigid(R @ T_we[:, :3, :3], s * T_we[:, :3, 3] @ R.mT + t))
     errors = (aligned.positions_w[valid] - reference[:, :3, 3]).norm(dim=-1)
     T_ew, T_gw = se3_inverse(matched), se3_inverse(reference)
     delta = min(delta, compared - 1)
     rpe_translation, rpe_rotation = rpe(T_cw=T_ew, T_cw_groundtruth=T_gw, delta=delta)
-    S = torch.eye(4, dtype=torch.float64, device=device)
-    S[:3, :3], S[:3, 3] = s * R, t
     return Evaluation(
         ate_m=float(_rms(errors.square())),
         ate_se3_m=float(ate(T_cw=T_ew, T_cw_groundtruth=T_gw, with_scale=False)),
@@ -147,7 +145,7 @@ def evaluate(
         path_length_m=float(reference[:, :3, 3].diff(dim=0).norm(dim=-1).sum()),
         posed=len(times),
         compared=compared,
-        S_groundtruth_estimate=S,
+        S_groundtruth_estimate=rigid(s * R, t),
         aligned=aligned,
         matched=Trajectory(times[valid], aligned.T_wc[valid]),
         groundtruth=Trajectory(times[valid], reference),
@@ -299,13 +297,6 @@ def _ranges(times: Tensor, truth_times: Tensor) -> str:
         return ""
     spans = [f"from {float(span[0]):.3f} to {float(span[-1]):.3f} s" for span in (times, truth_times)]
     return f"; the estimate goes {spans[0]}, the ground truth {spans[1]}"
-
-
-def _aligned(
-    T_wc: Float[Tensor, "N 4 4"], s: Float[Tensor, ""], R: Float[Tensor, "3 3"], t: Float[Tensor, " 3"]
-) -> Float[Tensor, "N 4 4"]:
-    """Camera poses after a similarity of the world."""
-    return rigid(R @ T_wc[:, :3, :3], s * T_wc[:, :3, 3] @ R.mT + t)
 
 
 def _counted(

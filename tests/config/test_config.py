@@ -22,7 +22,7 @@ from torchslam.config import (
     load_config,
     to_toml,
 )
-from torchslam.config.schema import MAX_BYTES, Allowed, Settings, setting, to_commented_toml
+from torchslam.config.schema import MAX_BYTES, Allowed, Settings, setting
 from torchslam.errors import ConfigError
 
 SECTIONS = {
@@ -141,7 +141,7 @@ def test_every_section_is_written_out() -> None:
 
 def test_the_commented_toml_reads_back(tmp_path: Path) -> None:
     config = load_config(None, ["seed=7", "features.max_image_pixels=0", "matching.max_ratio=0.7"])
-    text = to_commented_toml(config)
+    text = to_toml(config, commented=True)
     (tmp_path / "c.toml").write_text(text)
     assert load_config(tmp_path / "c.toml") == config
     assert len((tmp_path / "c.toml").read_bytes()) < MAX_BYTES / 2

@@ -467,7 +467,6 @@ def test_angle_of_a_blender_scene(tmp_path: Path) -> None:
     [
         ("a.yaml", "nothing: 1\n", "no camera in it; looked for"),
         ("a.yaml", "camera_matrix: [1, 2, 3]\n", "a camera matrix has 9 numbers, not 3"),
-        ("a.yaml", "camera_matrix: [1, 2, 3\n", "a camera matrix has 9 numbers, not 3"),
         ("a.yaml", KALIBR.replace("radtan", "fov"), "distortion model `fov` is not known"),
         ("a.yaml", KALIBR.replace("pinhole", "omni"), "camera model `omni` is not known"),
         ("a.yaml", KALIBR.replace("500.0, 501.0", "500.0, -1"), "focal lengths must be positive"),

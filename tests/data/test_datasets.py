@@ -46,7 +46,7 @@ def test_seven_scenes_without_some_poses(seven_scenes: Path) -> None:
     (seven_scenes / "frame-000001.pose.txt").write_text("0 0 0 0\n" * 3 + "0 0 0 1\n")
     assert open_sequence(seven_scenes).groundtruth.timestamps.tolist() == [2 / 30]
     (seven_scenes / "frame-000002.pose.txt").write_text("1 2 3\n")
-    with pytest.raises(TrajectoryError, match=r"frame-000002\.pose\.txt: expected four lines"):
+    with pytest.raises(TrajectoryError, match=r"frame-000002\.pose\.txt:1: expected .* got 3 numbers"):
         open_sequence(seven_scenes)
 
 

@@ -21,7 +21,7 @@ from tests.fuzz.inputs import clear, numbers, outcome
 from tests.fuzz.readers import Reader, readers
 from torchslam.data import parse_camera, read_calibration, read_trajectory
 from torchslam.data.formats.image_file import read_gray
-from torchslam.data.readers.rgbd import read_image_list
+from torchslam.data.text_file import listed_files
 from torchslam.errors import CalibrationError, FrameError, SequenceError, TrajectoryError
 
 WORDS = st.one_of(
@@ -52,7 +52,7 @@ def test_trajectories(tmp_path: Path, text: str) -> None:
 def test_image_lists(tmp_path: Path, text: str) -> None:
     (tmp_path / "rgb.txt").write_text(text)
     with contextlib.suppress(SequenceError):
-        assert read_image_list(tmp_path / "rgb.txt")
+        assert list(listed_files(tmp_path / "rgb.txt", SequenceError))
 
 
 @given(LINES)

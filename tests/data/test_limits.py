@@ -106,7 +106,7 @@ def test_long_lines_are_refused(tmp_path: Path) -> None:
     start = time.process_time()
     with pytest.raises(CalibrationError, match="here: 200000 characters, more than the 65536 of a line"):
         parse_numbers("1 " * 100_000, "here")
-    (tmp_path / "c.yaml").write_text("camera_matrix:\n" + "\n" * 200_000)
+    (tmp_path / "c.yaml").write_text("camera_matrix:\n" + "\n" * 100_000)
     with pytest.raises(CalibrationError, match="matrix has 9 numbers, not 0"):
         read_calibration(tmp_path / "c.yaml")
     (tmp_path / "c.yaml").write_text("\n" * 300_000)

@@ -60,7 +60,7 @@ def test_bad_line(tmp_path: Path, line: str, message: str) -> None:
 
 def test_empty_and_missing(tmp_path: Path) -> None:
     (tmp_path / "empty.txt").write_text("# nothing\n")
-    with pytest.raises(TrajectoryError, match=r"empty\.txt: no poses"):
+    with pytest.raises(TrajectoryError, match=r"empty\.txt: is empty; expected"):
         read_trajectory(tmp_path / "empty.txt")
     with pytest.raises(TrajectoryError, match=r"missing\.txt: cannot be read"):
         read_trajectory(tmp_path / "missing.txt")

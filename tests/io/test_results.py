@@ -180,7 +180,7 @@ def test_ellipses_are_drawn_at_the_keyframes(
 
 def test_unknown_metrics_are_refused(tmp_path: Path, run: Run) -> None:
     write(run, tmp_path)
-    for content in ("[]", '{"frames": 3}'):
+    for content in ("{}", '{"frames": 3}'):
         (tmp_path / "metrics.json").write_text(content)
         with pytest.raises(ResultsError, match=r"metrics\.json: not the metrics of a run: .*submap"):
             read_results(tmp_path)

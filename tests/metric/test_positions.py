@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from tests.metric.drives import METERS_PER_UNIT, ORIGIN, drive, receiver, true_S_ew, view_of
-from torchslam.data.formats.fixes import Fixes
+from torchslam.data.formats.fix_files import Fixes
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, geodetic_from_enu, sim3_exp, transform
 from torchslam.metric.camera_path import Clock, clocks_of, parse_clock

@@ -79,6 +79,10 @@ def _map_with_ray(
     work: Work, rows: list[Columns], workers: int | None, address: str | None, gpus: int = 0
 ) -> Iterator[tuple[int, Columns | None]]:
     """Run `Engine.map_unordered` as Ray tasks of one row and one processor each."""
+
+    def on_item(item: Columns) -> Columns:
+        return {"number": item["number"], "row": json.dumps(work(json.loads(item["row"])))}
+
     ray, data = _import_ray()
     _start(ray, workers, address)
     try:
@@ -90,7 +94,7 @@ def _map_with_ray(
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # max_retries is deprecated in Ray 2.64, without a replacement
             done = data.from_items(items, override_num_blocks=len(items)).map(
-                _through_text(work),
+                on_item,
                 num_cpus=1,
                 num_gpus=gpus or None,
                 max_retries=RETRIES,
@@ -103,13 +107,6 @@ def _map_with_ray(
             yield number, None
     finally:
         ray.shutdown()
-
-
-def _through_text(work: Work) -> Callable[[Columns], Columns]:
-    def on_item(item: Columns) -> Columns:
-        return {"number": item["number"], "row": json.dumps(work(json.loads(item["row"])))}
-
-    return on_item
 
 
 def _import_ray() -> tuple[Any, Any]:

@@ -7,19 +7,19 @@ A fingerprint hashes the settings, the program, and the files that were read.
 from __future__ import annotations
 
 import glob
-import hashlib
 import json
 import os
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import torchslam
 from torchslam.data.synthetic import is_synthetic
+from torchslam.data.text_file import read_object
 from torchslam.errors import ResultsError, SequenceError, TorchslamError
-from torchslam.utils.files import JSON_BYTES, parse_json, read_text, whole_folder, write_whole
+from torchslam.utils.files import fingerprint, whole_folder, write_whole
 from torchslam.utils.text import printable, without_credentials
 
 RUNS = "runs"
@@ -109,29 +109,10 @@ def read_record(path: Path) -> Columns | None:
     Raises:
         ResultsError: The file is not a record, or not readable.
     """
-    record = read_object(path)
+    record = read_object(path, ResultsError)
     if record is not None and not isinstance(record.get("status"), str):
         raise ResultsError(f"{path}: not the record of a row")
     return record
-
-
-def read_object(path: Path) -> Columns | None:
-    """Read a JSON object; None if there is no file.
-
-    Raises:
-        ResultsError: The file is something else, or not readable.
-    """
-    try:
-        found = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
-    except (FileNotFoundError, NotADirectoryError):
-        return None
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ResultsError(f"{path}: not valid JSON: {error}") from None
-    if not isinstance(found, dict):
-        raise ResultsError(f"{path}: not a JSON object")
-    return found
 
 
 def _write(path: Path, columns: Columns) -> None:
@@ -152,24 +133,18 @@ def _describe(error: Exception) -> str:
 MAX_FILES = 1_000_000
 """Below the path of a sequence; a folder with more is not a sequence."""
 DIGITS = 16
-"""Hexadecimal digits of a hash: among a billion, two are equal by chance with probability 3 %."""
-
-
-def hash_json(values: Mapping[str, Any]) -> str:
-    """Hash JSON values."""
-    text = json.dumps(values, sort_keys=True, ensure_ascii=True)
-    return hashlib.sha256(text.encode()).hexdigest()[:DIGITS]
+"""Hexadecimal digits of a hash."""
 
 
 @cache
 def program_hash() -> str:
     """Hash the version and files of this package; another version may give other results."""
     root = Path(torchslam.__file__).parent
-    found = hashlib.sha256(torchslam.__version__.encode())
-    for path in sorted(root.rglob("*")):
-        if path.suffix in (".py", ".safetensors", ".js", ".css", ".html"):
-            found.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
-    return f"{torchslam.__version__}+{found.hexdigest()[:DIGITS]}"
+    paths = (
+        p for p in sorted(root.rglob("*")) if p.suffix in (".py", ".safetensors", ".js", ".css", ".html")
+    )
+    parts = (part for path in paths for part in (path.relative_to(root).as_posix(), path.read_bytes()))
+    return f"{torchslam.__version__}+{fingerprint(parts, DIGITS)}"
 
 
 def hash_files(paths: list[str]) -> str:
@@ -181,16 +156,17 @@ def hash_files(paths: list[str]) -> str:
         SequenceError: There are more than `MAX_FILES` files.
         OSError: A file cannot be looked at.
     """
-    found = hashlib.sha256()
-    for path in paths:
-        if is_synthetic(path):
-            found.update(path.encode() + b"\0")
-            continue
-        for file in _files(path):
-            name, status = os.path.relpath(file, Path(path).parent), file.stat()
-            found.update(f"{name}\0{status.st_size} {status.st_mtime_ns}\0".encode(errors="surrogateescape"))
-        found.update(b"\1")
-    return found.hexdigest()[:DIGITS]
+    return fingerprint((part for path in paths for part in _parts(path)), DIGITS)
+
+
+def _parts(path: str) -> Iterator[Any]:
+    """What is hashed of a path: a synthetic sequence by its name, files by theirs."""
+    yield path if is_synthetic(path) else None
+    if is_synthetic(path):
+        return
+    for file in _files(path):
+        status = file.stat()
+        yield os.path.relpath(file, Path(path).parent), status.st_size, status.st_mtime_ns
 
 
 def _files(path: str) -> Iterator[Path]:

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 from uuid import uuid4
 
-from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, read_object, read_stored
+from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, read_stored
 from torchslam.batch.task import TIMES, Task, configuration
+from torchslam.data.text_file import read_object
 from torchslam.errors import ResultsError, TorchslamError
 from torchslam.utils.files import write_whole
 from torchslam.utils.text import without_credentials
@@ -111,7 +112,7 @@ def _times(rows: Sequence[Columns], output: Path) -> list[Columns]:
 
 def read_times(folder: Path) -> Columns:
     """Read times.json; empty if there is none. Raises ResultsError if it is not readable."""
-    return read_object(folder / TIMES) or {}
+    return read_object(folder / TIMES, ResultsError) or {}
 
 
 def _csv(rows: Sequence[Columns], columns: Mapping[str, type]) -> str:

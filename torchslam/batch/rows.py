@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import difflib
-import io
-import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
@@ -15,8 +12,9 @@ from typing import Any
 
 from torchslam.config import Config
 from torchslam.config.schema import check_override_in_file
+from torchslam.data.formats.csv_tables import read_cells
 from torchslam.data.synthetic import is_synthetic
-from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, read_text
+from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, parse_number
 from torchslam.errors import ConfigError, SequenceError
 from torchslam.utils.text import without_credentials
 
@@ -83,12 +81,12 @@ def read_list(path: str | Path) -> list[Row]:
     path = Path(path)
     table = _cells if path.suffix.lower() == ".csv" else _lines
     rows: list[Row] = []
-    seen: dict[Row, int] = {}
-    for number, cells in table(path):
-        row = _row(cells, f"{path}:{number}", str(path.parent.absolute()))
+    seen: dict[Row, str] = {}
+    for where, cells in table(path):
+        row = _row(cells, where, str(path.parent.absolute()))
         if row in seen:
-            raise SequenceError(f"{path}:{number}: the same as line {seen[row]}; give each its own name")
-        seen[row] = number
+            raise SequenceError(f"{where}: the same as {seen[row]}; give each its own name")
+        seen[row] = where
         rows.append(row)
     if not rows:
         raise SequenceError(f"{path}: no sequences in the list")
@@ -131,28 +129,18 @@ def _free(name: str, taken: set[str]) -> str:
     return found
 
 
-def _lines(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
+def _lines(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     for number, line in numbered_lines(path, SequenceError):
-        yield number, {"sequence": line}
+        yield f"{path}:{number}", {"sequence": line}
 
 
-def _cells(path: Path) -> Iterator[tuple[int, dict[str, str]]]:
-    """The cells of each row by column, with the number of its last line."""
-    reader = csv.reader(io.StringIO(read_text(path, SequenceError, MAX_BYTES), newline=""), strict=True)
-    try:
-        header = [name.strip() for name in next(reader, [])]
-        _check_header(header, path)
-        for cells in reader:
-            if not any(cell.strip() for cell in cells):
-                continue
-            if len(cells) != len(header):
-                raise SequenceError(
-                    f"{path}:{reader.line_num}: {len(cells)} cells under {len(header)} columns"
-                )
-            stripped = {name: cell.strip() for name, cell in zip(header, cells, strict=True)}
-            yield reader.line_num, {name: cell for name, cell in stripped.items() if cell}
-    except csv.Error as error:
-        raise SequenceError(f"{path}:{reader.line_num}: not CSV: {error}") from None
+def _cells(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
+    """The place of each row, and its cells by column."""
+    rows = read_cells(path, SequenceError, MAX_BYTES, ",")
+    header = [name.strip() for name in next(rows, ("", []))[1]]
+    _check_header(header, path)
+    for where, cells in rows:
+        yield where, {name: cell.strip() for name, cell in zip(header, cells, strict=True) if cell.strip()}
 
 
 def _check_header(header: list[str], path: Path) -> None:
@@ -185,7 +173,9 @@ def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
                 raise SequenceError(f"{where}: {key} must be a positive integer, not `{values[key]}`")
             values[key] = count
     if "fps" in values:
-        values["fps"] = _rate(values["fps"], where)
+        values["fps"] = parse_number(values["fps"], f"{where}: fps", SequenceError)
+        if values["fps"] <= 0:
+            raise SequenceError(f"{where}: fps must be a positive number, not `{cells['fps']}`")
     settings = (setting.strip() for setting in values.get("overrides", "").split(SEPARATOR))
     values["overrides"] = tuple(setting for setting in settings if setting)
     try:
@@ -194,13 +184,3 @@ def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
     except ConfigError as error:
         raise SequenceError(str(error)) from None
     return Row(**values, folder=folder)
-
-
-def _rate(text: str, where: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = math.nan
-    if not 0 < rate < math.inf:
-        raise SequenceError(f"{where}: fps must be a positive number, not `{text}`")
-    return rate

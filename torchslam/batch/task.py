@@ -15,11 +15,11 @@ from typing import Any
 import torch
 
 from torchslam.batch.result_store import (
+    DIGITS,
     DONE,
     NO_MAP,
     Columns,
     hash_files,
-    hash_json,
     program_hash,
     run_or_reuse,
 )
@@ -42,8 +42,8 @@ from torchslam.io.write_run import write_run
 from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.front_end import source
 from torchslam.system.online_run import OnlineRun
-from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
+from torchslam.utils.files import fingerprint
 from torchslam.utils.text import without_credentials
 
 TIMES = "times.json"
@@ -121,15 +121,8 @@ def configuration(task: Task) -> str:
         ConfigError: The settings of the row are not valid.
     """
     row = asdict(replace(task.row, config=None, overrides=(), folder=""))
-    return hash_json(
-        {
-            "row": row,
-            "settings": to_toml(settings_of(task.row)),
-            "device": torch.device(task.device).type,
-            "plots": task.plots,
-            "program": program_hash(),
-        }
-    )
+    settings, device = to_toml(settings_of(task.row)), torch.device(task.device).type
+    return fingerprint([row, settings, device, task.plots, program_hash()], DIGITS)
 
 
 def _input(task: Task) -> str:
@@ -208,7 +201,7 @@ def _run(task: Task, folder: Path) -> Columns:
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
     metrics |= source_of(row.resolve(row.sequence), row.fps, sequence)
     write_run(
-        _without_times(finished),
+        replace(finished, results=[replace(result, stage_ms={}) for result in finished.results]),
         sequence,
         metrics,
         folder,
@@ -222,10 +215,6 @@ def _run(task: Task, folder: Path) -> Columns:
         "error": finished.failure,
         **_columns(metrics),
     }
-
-
-def _without_times(finished: Run) -> Run:
-    return replace(finished, results=[replace(result, stage_ms={}) for result in finished.results])
 
 
 def _columns(metrics: Mapping[str, Any]) -> Columns:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -56,14 +57,16 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     reading = parser.add_argument_group("frame selection")
     reading.add_argument("--start", default=0, metavar="N|TIME", help="first frame: 120, 12.5s or 1:30")
     reading.add_argument("--stop", metavar="N|TIME", help="end before this frame: 240, 20s or 2:00")
-    reading.add_argument("--stride", type=positive, default=1, metavar="N", help="use every N-th frame")
+    reading.add_argument("--stride", type=at_least(1), default=1, metavar="N", help="use every N-th frame")
     reading.add_argument(
         "--fps",
         type=float,
         metavar="RATE",
         help="use at most RATE frames per second; also the frame rate of images without timestamps (default: 30)",
     )
-    reading.add_argument("--limit", type=positive, metavar="N", help="use only the first N of these frames")
+    reading.add_argument(
+        "--limit", type=at_least(1), metavar="N", help="use only the first N of these frames"
+    )
     reading.add_argument(
         "--resize",
         metavar="WxH|W|FACTOR",
@@ -257,7 +260,7 @@ def add_processes(parser: argparse.ArgumentParser) -> None:
     """Add the argument for the number of processes."""
     parser.add_argument(
         "--processes",
-        type=positive,
+        type=at_least(1),
         metavar="N",
         help="number of processes: 2 adds a feature prefetcher, 3 also a bundle-adjustment worker; results are "
         "identical (default: 3 if two processors are free and there are enough frames, else 1)",
@@ -287,17 +290,13 @@ def _readout(text: str) -> float | str:
         raise argparse.ArgumentTypeError(f"{text!r} is neither a number nor one of {known}") from None
 
 
-def not_negative(text: str) -> int:
-    """Parse a non-negative integer argument."""
-    number = int(text)
-    if number < 0:
-        raise argparse.ArgumentTypeError(f"must be at least 0, not {number}")
-    return number
+def at_least(lowest: int) -> Callable[[str], int]:
+    """Return a parser of an integer argument that is not below the lowest one."""
 
+    def integer(text: str) -> int:
+        number = int(text)
+        if number < lowest:
+            raise argparse.ArgumentTypeError(f"must be at least {lowest}, not {number}")
+        return number
 
-def positive(text: str) -> int:
-    """Parse a positive integer argument."""
-    number = int(text)
-    if number < 1:
-        raise argparse.ArgumentTypeError(f"must be at least 1, not {number}")
-    return number
+    return integer

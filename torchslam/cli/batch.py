@@ -71,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     spread.add_argument(
         "--workers",
-        type=arguments.positive,
+        type=arguments.at_least(1),
         metavar="N",
         help="number of concurrent Ray workers (default: one per processor)",
     )

@@ -107,9 +107,9 @@ def execute_config(options: argparse.Namespace) -> int:
 
     With --config and --set, the values that a run would use are printed.
     """
-    from torchslam.config.schema import to_commented_toml
+    from torchslam.config.schema import to_toml
 
-    print(to_commented_toml(arguments.config(options)), end="")
+    print(to_toml(arguments.config(options), commented=True), end="")
     return 0
 
 

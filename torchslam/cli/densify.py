@@ -64,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--processes",
-        type=arguments.positive,
+        type=arguments.at_least(1),
         metavar="N",
         help="number of processes on the CPU; results are identical (default: one per processor, at most "
         f"{MAX_PROCESSES})",
@@ -88,7 +88,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--every",
-        type=arguments.positive,
+        type=arguments.at_least(1),
         metavar="N",
         help="depth for every N-th posed frame (default: for the keyframes)",
     )

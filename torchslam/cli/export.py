@@ -26,6 +26,7 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -186,7 +187,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="which of the posed frames to export (default: see above)",
     )
     parser.add_argument(
-        "--submap", type=arguments.not_negative, metavar="N", help="submap to export (default: the main one)"
+        "--submap", type=arguments.at_least(0), metavar="N", help="submap to export (default: the main one)"
     )
     parser.add_argument(
         "--undistort", action="store_true", help="undistort images and keypoints (always done for rerun)"
@@ -333,15 +334,9 @@ def _ply(job: Job) -> dict[str, str]:
     return {"points": f"{job.submap.map.num_points}, and {keyframes} keyframes"}
 
 
-def _tum(job: Job) -> dict[str, str]:
+def _trajectory(write: Callable[[Path, Trajectory], None], job: Job) -> dict[str, str]:
     trajectory = job.trajectory()
-    write_trajectory(job.output, trajectory)
-    return {"poses": str(len(trajectory))}
-
-
-def _kitti(job: Job) -> dict[str, str]:
-    trajectory = job.trajectory()
-    write_kitti(job.output, trajectory)
+    write(job.output, trajectory)
     return {"poses": str(len(trajectory))}
 
 
@@ -350,7 +345,9 @@ TARGETS = {
     "nerfstudio": Target(_nerfstudio, "nerfstudio", is_of_images=True, keyframes=True),
     "ply": Target(_ply, "map.ply", is_of_images=False, keyframes=True),
     "rerun": Target(_rerun, "recording.rrd", is_of_images=True, keyframes=False),
-    "tum": Target(_tum, "trajectory.txt", is_of_images=False, keyframes=False),
-    "kitti": Target(_kitti, "kitti", is_of_images=False, keyframes=False),
+    "tum": Target(
+        partial(_trajectory, write_trajectory), "trajectory.txt", is_of_images=False, keyframes=False
+    ),
+    "kitti": Target(partial(_trajectory, write_kitti), "kitti", is_of_images=False, keyframes=False),
     "mesh": Target(_mesh, "mesh.ply", is_of_images=True, keyframes=True),
 }

@@ -119,7 +119,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--checkpoint",
-        type=arguments.not_negative,
+        type=arguments.at_least(0),
         default=CHECKPOINT_EVERY,
         metavar="N",
         help="save the state at most every N keyframes, and what global mapping finds, for --resume; 0: never "

@@ -84,7 +84,7 @@ def setting(
     """Declare a field of a Settings class with its allowed values, see `Allowed`; non-negative without `low`.
 
     Args:
-        about: description, for `to_commented_toml` and the documentation.
+        about: description, for `to_toml` and the documentation.
         grows: whether the value is an image length that `scale_pixel_settings` scales.
     """
     allowed = Allowed(low, high, above, choices, also, group)
@@ -187,35 +187,23 @@ def scale_pixel_settings(config: Section, factor: float) -> Section:
     return replace(config, **changes)
 
 
-def to_toml(config: Settings) -> str:
-    """Return the configuration as TOML with all values."""
-    values = {name: getattr(config, name) for name in _declared(type(config))}
-    sections = {name: value for name, value in values.items() if isinstance(value, Settings)}
-    lines = [f"{name} = {_toml_value(value)}" for name, value in values.items() if name not in sections]
-    for name, section in sections.items():
-        lines += ["", f"[{name}]", to_toml(section).rstrip("\n")]
-    return "\n".join(lines) + "\n"
-
-
-def to_commented_toml(config: Settings) -> str:
-    """Return the configuration as TOML with the description, range and default of every setting as comments."""
-    lines, inner = [], []
+def to_toml(config: Settings, commented: bool = False) -> str:
+    """Return the configuration as TOML with all values; `commented`: with description, range and default of each."""
+    lines, inner = list[str](), list[str]()
     for declared in fields(config):
-        value, about = getattr(config, declared.name), declared.metadata.get("about", "")
+        value = getattr(config, declared.name)
         if isinstance(value, Settings):
-            words = (type(value).__doc__ or "").strip().splitlines()
+            words = (type(value).__doc__ or "").strip().splitlines()[:1] if commented else []
             # A dataclass without a docstring has its signature in place of one.
-            inner += [
-                "",
-                *(f"# {line.strip()}" for line in words[:1] if "(" not in line),
-                f"[{declared.name}]",
-            ]
-            inner.append(to_commented_toml(value).rstrip("\n"))
+            about = [f"# {line.strip()}" for line in words if "(" not in line]
+            inner += ["", *about, f"[{declared.name}]", to_toml(value, commented).rstrip("\n")]
             continue
-        allowed = _declared(type(config))[declared.name][1]
-        is_free = isinstance(value, bool) or (isinstance(value, str) and not allowed.choices)
-        limits = "" if is_free else f"{allowed}; "
-        lines += [f"# {about}", f"#   {limits}default {_toml_value(declared.default)}"]
+        if commented:
+            allowed = declared.metadata.get("allowed", Allowed())
+            is_free = isinstance(value, bool) or (isinstance(value, str) and not allowed.choices)
+            limits = "" if is_free else f"{allowed}; "
+            lines.append(f"# {declared.metadata.get('about', '')}")
+            lines.append(f"#   {limits}default {_toml_value(declared.default)}")
         lines.append(f"{declared.name} = {_toml_value(value)}")
     return "\n".join(lines + inner) + "\n"
 

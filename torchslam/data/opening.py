@@ -191,7 +191,9 @@ def _not_found_message(path: str) -> str:
     if foreign and (target.exists() or is_pattern(path)):
         return f"{path}: {foreign}"
     if not target.exists():
-        near = difflib.get_close_matches(target.name, _names(target.parent), n=1, cutoff=0.6)
+        near = difflib.get_close_matches(
+            target.name, [each.name for each in _entries(target.parent)], n=1, cutoff=0.6
+        )
         return f"{path}: does not exist" + _meant([target.parent / name for name in near])
     suffixes = ", ".join(sorted(video.SUFFIXES | bag.SUFFIXES | {".zip"}))
     return f"{path}: a file that is neither a video nor a recording ({suffixes})" + _meant(_around(target))
@@ -254,7 +256,3 @@ def _entries(folder: Path) -> list[Path]:
         return sorted(itertools.islice(folder.iterdir(), MAX_ENTRIES))
     except OSError:  # an unreadable folder gives no suggestions
         return []
-
-
-def _names(folder: Path) -> list[str]:
-    return [entry.name for entry in _entries(folder)]

@@ -6,6 +6,7 @@ import math
 import re
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 from torchslam.errors import TorchslamError
 from torchslam.utils import files
@@ -36,6 +37,21 @@ def read_text(path: str | Path, error: type[TorchslamError], limit: int | None =
         raise error(f"{path}: cannot be read: {cause}") from cause
 
 
+def read_object(path: str | Path, error: type[TorchslamError]) -> dict[str, Any] | None:
+    """Read a JSON object; None if there is no file. Raises `error` for anything else."""
+    try:
+        found = files.parse_json(files.read_text(path, files.JSON_BYTES, "a JSON file"))
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as cause:
+        raise error(f"{path}: cannot be read: {cause.strerror}") from None
+    except ValueError as cause:
+        raise error(f"{path}: not valid JSON: {cause}") from None
+    if not isinstance(found, dict):
+        raise error(f"{path}: not a JSON object")
+    return found
+
+
 def numbered_lines(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[int, str]]:
     """Yield the non-empty lines of a file with their numbers from 1; `#` after a space starts a comment.
 
@@ -51,16 +67,56 @@ def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[flo
     """Parse finite numbers separated by spaces or commas. Raises `error` at `where` otherwise."""
     if len(text) > MAX_LINE:
         raise error(f"{where}: {len(text)} characters, more than the {MAX_LINE} of a line of numbers")
-    numbers = []
-    for word in text.replace(",", " ").split():
-        try:
-            number = float(word)
-        except ValueError:
-            raise error(f"{where}: `{word}` is not a number") from None
-        if not math.isfinite(number):
-            raise error(f"{where}: `{word}` is not a finite number")
-        numbers.append(number)
-    return numbers
+    return [parse_number(word, where, error) for word in text.replace(",", " ").split()]
+
+
+def parse_number(text: str, where: str, error: type[TorchslamError]) -> float:
+    """Parse a finite number, which must be the whole text. Raises `error` at `where` otherwise."""
+    try:
+        number = float(text)
+    except ValueError:
+        raise error(f"{where}: `{text[:100]}` is not a number") from None
+    if not math.isfinite(number):
+        raise error(f"{where}: `{text[:100]}` is not a finite number")
+    return number
+
+
+def number_rows(
+    path: str | Path, columns: str, error: type[TorchslamError]
+) -> Iterator[tuple[str, list[float]]]:
+    """Yield the place and the numbers of each line of a file, such as of `columns` "tx ty tz".
+
+    Raises `error` for a line without that many numbers, and for a file without a line.
+    """
+    count, row = len(columns.split()), None
+    for number, line in numbered_lines(path, error):
+        where = f"{path}:{number}"
+        row = parse_floats(line, where, error)
+        if len(row) != count:
+            raise error(f"{where}: expected `{columns}`, got {len(row)} numbers")
+        yield where, row
+    if row is None:
+        raise error(f"{path}: is empty; expected lines `{columns}`")
+
+
+def listed_files(path: str | Path, error: type[TorchslamError]) -> Iterator[tuple[str, float, Path]]:
+    """Yield the place, the time in seconds and the file of each line `timestamp file` of a list.
+
+    Raises `error` for anything else, and for a list without a line.
+    """
+    where = ""
+    for number, line in numbered_lines(path, error):
+        where = f"{path}:{number}"
+        time, _, file = line.partition(" ")
+        if not file.strip():
+            raise error(f"{where}: expected `timestamp file`, got `{line}`")
+        yield (
+            where,
+            in_seconds(parse_number(time, where, error), where, error),
+            Path(path).parent / file.strip(),
+        )
+    if not where:
+        raise error(f"{path}: no files are listed")
 
 
 def parse_count(text: str) -> int | None:

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.data.text_file import check_later, in_seconds, numbered_lines, parse_floats
+from torchslam.data.text_file import check_later, in_seconds, number_rows
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid, se3_interpolate
 from torchslam.types import Trajectory
 
 ORTHOGONAL = 0.05
 """Tolerated deviation of R R^T from the identity; some files have few digits."""
+UNIT_LENGTH = 0.05
+"""Tolerated deviation of the length of a quaternion from one."""
 FARTHEST = 1e12
 """Maximum coordinate of a position, in meters."""
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
@@ -26,36 +29,44 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Raises TrajectoryError naming file and line: a missing or empty file, not eight finite numbers, a
     quaternion far from unit length, timestamps out of order or doubled.
     """
+    places: list[str] = []
     rows: list[list[float]] = []
-    for number, line in numbered_lines(path, TrajectoryError):
-        where = f"{path}:{number}"
-        row = parse_floats(line, where, TrajectoryError)
-        if len(row) != 8:
-            raise TrajectoryError(
-                f"{where}: expected `timestamp tx ty tz qx qy qz qw`, got {len(row)} numbers"
-            )
-        if abs(sum(value * value for value in row[4:]) - 1.0) > 0.1:
-            raise TrajectoryError(f"{where}: the quaternion {row[4:]} does not have unit length")
+    for where, row in number_rows(path, COLUMNS, TrajectoryError):
         row[0] = in_seconds(row[0], where, TrajectoryError)
         if rows:
             check_later(row[0], rows[-1][0], where, TrajectoryError)
+        places.append(where)
         rows.append(row)
-    if not rows:
-        raise TrajectoryError(f"{path}: no poses")
     table = torch.tensor(rows, dtype=torch.float64, device="cpu")
-    quaternions = table[:, 4:] / table[:, 4:].norm(dim=-1, keepdim=True)
-    T_wc = checked_poses(rigid(matrix_from_quaternion(quaternions), table[:, 1:4]), path)
-    return Trajectory(table[:, 0].contiguous(), T_wc)
+    return Trajectory(table[:, 0].contiguous(), poses_from_rows(table[:, 1:], places))
 
 
-def checked_poses(T_wc: Float[Tensor, "*batch 4 4"], path: Path | str) -> Float[Tensor, "*batch 4 4"]:
-    """Return poses unchanged. Raises TrajectoryError for an invalid rotation or position."""
-    R, positions_w = T_wc[..., :3, :3], T_wc[..., :3, 3]
-    error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs()
-    if not bool((error < ORTHOGONAL).all()):  # not so NaN either
-        raise TrajectoryError(f"{path}: a pose is not a rigid transformation")
-    if not bool((positions_w.abs() < FARTHEST).all()):
-        raise TrajectoryError(f"{path}: a position is farther away than {FARTHEST:g}")
+def poses_from_rows(rows: Float[Tensor, "N 7"], places: Sequence[str]) -> Float[Tensor, "N 4 4"]:
+    """Convert rows `tx ty tz qx qy qz qw` to poses.
+
+    Raises TrajectoryError, at the place of the row, for a quaternion far from unit length or a position beyond
+    `FARTHEST`.
+    """
+    lengths = rows[:, 3:].norm(dim=-1, keepdim=True)
+    wrong = torch.nonzero(~((lengths[:, 0] - 1).abs() <= UNIT_LENGTH))[:, 0].tolist()
+    if wrong:
+        raise TrajectoryError(
+            f"{places[wrong[0]]}: the quaternion {rows[wrong[0], 3:].tolist()} does not have unit length"
+        )
+    return checked_poses(rigid(matrix_from_quaternion(rows[:, 3:] / lengths), rows[:, :3]), places)
+
+
+def checked_poses(T_wc: Float[Tensor, "N 4 4"], places: Path | Sequence[str]) -> Float[Tensor, "N 4 4"]:
+    """Return poses unchanged. Raises TrajectoryError for an invalid rotation or position, at its place or its file."""
+    R, positions_w = T_wc[:, :3, :3], T_wc[:, :3, 3]
+    error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs().flatten(1).amax(1)
+    for is_right, what in (
+        (error < ORTHOGONAL, "a pose is not a rigid transformation"),
+        (positions_w.abs().amax(1) < FARTHEST, f"a position is farther away than {FARTHEST:g}"),
+    ):
+        wrong = torch.nonzero(~is_right)[:, 0].tolist()  # NaN is neither
+        if wrong:
+            raise TrajectoryError(f"{places if isinstance(places, Path) else places[wrong[0]]}: {what}")
     return T_wc
 
 

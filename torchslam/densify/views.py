@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import lru_cache
@@ -17,6 +16,7 @@ from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.scene import ExportedScene, Images, undistorted
+from torchslam.utils.files import fingerprint
 
 NEIGHBORS = 12
 """Views that a depth map is compared with."""
@@ -58,10 +58,9 @@ class Views:
 
     def fingerprint(self) -> str:
         """A digest of everything but the images."""
-        digest = hashlib.sha256(repr((self.camera.size, self.neighbors)).encode())
-        for rows in (self.frame_index, self.T_cw, self.camera.params, self.near, self.far):
-            digest.update(rows.contiguous().numpy().tobytes())
-        return digest.hexdigest()
+        tensors = (self.frame_index, self.T_cw, self.camera.params, self.near, self.far)
+        numbers = [rows.contiguous().numpy().tobytes() for rows in tensors]
+        return fingerprint([self.camera.size, self.neighbors, *numbers])
 
     def T_sr(self, view: int) -> Float[Tensor, "V 4 4"]:
         """Poses from the camera of a view to those of its neighbors."""

@@ -62,18 +62,7 @@ class XFeat(nn.Module):
     def forward(
         self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
     ) -> Features:
-        """Detect and describe keypoints.
-
-        Args:
-            images: gray, in [0, 1].
-            mask: where keypoints may lie; None: everywhere.
-
-        Returns:
-            Features with N = num_keypoints rows, in order of falling score, masked ones last.
-
-        Raises:
-            ValueError: The images or the mask have another shape or type.
-        """
+        """Detect and describe keypoints; arguments, result and errors as for `ORB.forward`."""
         from kornia.geometry.subpix import nms2d
 
         check_images(images, mask)
@@ -175,18 +164,9 @@ class ALIKED(nn.Module):
     def forward(
         self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
     ) -> Features:
-        """Detect and describe keypoints.
+        """Detect and describe keypoints; arguments, result and errors as for `ORB.forward`.
 
-        Args:
-            images: gray, in [0, 1].
-            mask: where keypoints may lie; None: everywhere. The detector of the network has no mask, so keypoints
-                elsewhere are dropped, not replaced.
-
-        Returns:
-            Features with N = num_keypoints rows, in order of falling score, masked ones last.
-
-        Raises:
-            ValueError: The images or the mask have another shape or type.
+        The detector of the network has no mask, so keypoints elsewhere are dropped, not replaced.
         """
         check_images(images, mask)
         with images.device:  # kornia makes tensors on the default device

@@ -16,7 +16,7 @@ from torchslam.geometry.essential import sampson_errors
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
-from torchslam.geometry.robust import NORMAL_MEDIAN, robustify
+from torchslam.geometry.robust import median_scale, robustify
 from torchslam.geometry.two_view import TwoViews, fit_homography, propose_homography, transfer_squared
 
 _ITERATIONS = 15
@@ -213,7 +213,7 @@ def _uncertainty(
     robust = robustify((distance / threshold).square(), "cauchy", distance.new_tensor(1.0))
     weight = torch.where(mask, robust.weight, 0.0)
     count = mask.sum(-1).to(F.dtype)
-    middle = distance.abs().masked_fill(~mask, torch.nan).nanmedian(dim=-1).values / NORMAL_MEDIAN
+    middle = median_scale(distance.abs(), mask=mask)
     # The fit follows the noise of as many matches as it has parameters.
     noise = middle * (count / (count - _FREEDOMS).clamp_min(1.0)).sqrt()
     noise = noise.nan_to_num(threshold).clamp_min(_LEAST_NOISE * threshold)

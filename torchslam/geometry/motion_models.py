@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchslam.geometry.homography import decompose_homography
 from torchslam.geometry.ransac import SUPPORT_WIDTH, best_of, is_significant, is_unlikely
-from torchslam.geometry.robust import NORMAL_MEDIAN
+from torchslam.geometry.robust import NORMAL_MEDIAN, NORMAL_SQUARED_MEDIAN_2D
 from torchslam.geometry.two_view import (
     TRANSFER_WIDTH,
     TwoViews,
@@ -51,7 +51,8 @@ _MIN_LEAN_SIGMAS, _MIN_LEAN = 4.0, 1 / 3
 # Squared deviations by which the five parameters of an essential matrix, fitted, beat the true one in one case of a
 # hundred (chi-square).
 _GAIN_OF_A_FIT = 15.09
-_PLANE_MEDIAN = NORMAL_MEDIAN**2 / 1.3863  # the median square of one Gaussian, over that of the length of two
+# The median square of one Gaussian, over that of the length of two.
+_PLANE_MEDIAN = NORMAL_MEDIAN**2 / NORMAL_SQUARED_MEDIAN_2D
 # Ratio of the support of the second motion before a plane to that of the first, above which either may be the right
 # one; and entries of two rotations that differ by less are those of one motion, to 0.06 degrees. Tried at these values
 # only.

@@ -11,14 +11,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, TypeVar, get_args
 
+import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.utils.torch_internals import in_transform
 
+Model = TypeVar("Model")
 Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
 """Robust kernels, by the cost of a residual beyond the scale.
 
@@ -121,6 +123,8 @@ def robustify(
 
 NORMAL_MEDIAN, NORMAL_MEDIAN_3D = 0.6745, 1.54
 """Medians of the absolute value of a standard normal number, and of the length of three of them."""
+NORMAL_SQUARED_MEDIAN_2D = 2 * math.log(2)
+"""Median of the squared length of a standard normal 2-vector."""
 TAIL_SCALE = 4.0
 """Scale of Cauchy's kernel for observations of a run, in standard deviations of the middle of their errors.
 
@@ -143,5 +147,72 @@ def middle_variance(squared: Float[Tensor, " O"], redundancy: float) -> float:
     """
     if len(squared) == 0 or not redundancy > 0:
         return 1.0
-    variance = float(squared.median()) / (2 * math.log(2)) / redundancy
+    variance = float(median_scale(squared, NORMAL_SQUARED_MEDIAN_2D)) / redundancy
     return min(max(variance, _MIN_VARIANCE), _MAX_VARIANCE)
+
+
+def median_scale(
+    magnitudes: Float[Tensor, "*batch N"],
+    expected: float = NORMAL_MEDIAN,
+    mask: Bool[Tensor, "*batch N"] | None = None,
+) -> Float[Tensor, "*batch"]:
+    """The scale of normal errors by the median of their magnitudes, which up to half of them may exceed by anything.
+
+    Args:
+        magnitudes: absolute values, lengths or squares of errors; NaN does not count.
+        expected: median of these magnitudes for a standard deviation of one.
+        mask: errors that count.
+
+    Returns:
+        The standard deviation, or the variance of squares; NaN where nothing counts.
+    """
+    if mask is not None:
+        magnitudes = magnitudes.masked_fill(~mask, torch.nan)
+    return magnitudes.nanmedian(dim=-1).values / expected
+
+
+def median_with_error(values: Float[np.ndarray, " N"]) -> tuple[float, float, float]:
+    """The median of numbers, their standard deviation about it without outliers, and its standard error."""
+    middle = float(np.median(values))
+    std = float(np.median(np.abs(values - middle))) / NORMAL_MEDIAN
+    # The variance of a median is pi / 2 times that of a mean.
+    return middle, std, math.sqrt(math.pi / 2 / len(values)) * std
+
+
+def weighted_median(values: Float[Tensor, " N"], weights: Float[Tensor, " N"]) -> float:
+    """The lowest value with at least half of the weight at or below it; NaN if nothing has a weight."""
+    order = values.argsort()
+    passed = weights[order].cumsum(0)
+    if len(values) == 0 or float(passed[-1]) == 0:
+        return math.nan
+    return float(values[order][(passed >= 0.5 * passed[-1]).nonzero()[0, 0]])
+
+
+def fit_inliers(
+    model: Model,
+    find_inliers: Callable[[Model], Bool[Tensor, " N"]],
+    fit: Callable[[Model, Bool[Tensor, " N"]], Model | None],
+    rounds: int,
+) -> tuple[Model, Bool[Tensor, " N"]] | None:
+    """Fit a model to the data that agree with the previous one, until these stay the same.
+
+    Args:
+        model: to start with.
+        find_inliers: data that agree with a model.
+        fit: fits a model to these, starting from the previous one; None where they do not determine it.
+        rounds: maximum number of fits.
+
+    Returns:
+        The model and the data that it was fitted to; None where they do not determine it.
+    """
+    before: Tensor | None = None
+    for _ in range(rounds):
+        inliers = find_inliers(model)
+        found = fit(model, inliers)
+        if found is None:
+            return None
+        model = found
+        if bool(inliers.all()) if before is None else torch.equal(inliers, before):
+            break
+        before = inliers
+    return model, inliers

@@ -84,22 +84,29 @@ def umeyama(
     )
 
 
-def align_poses(T_ac: Float[Tensor, "N 4 4"], T_bc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "4 4"]:
-    """The similarity S_ba from poses of cameras in one world to the same cameras' poses in another.
+def align_poses(
+    T_ac: Float[Tensor, "N 4 4"], T_bc: Float[Tensor, "N 4 4"], use_centers: bool = False
+) -> Float[Tensor, "4 4"]:
+    """Compute the similarity S_ba from poses of cameras in one world to the same cameras' poses in another.
 
-    Its rotation is the mean of those of the cameras, so that centers on a line, or close to each other, do not leave it
-    open; its scale is the ratio of the spreads of the centers, one where all are at one place.
+    Its rotation is the mean of those of the cameras, so that centers on a line, or close to each other, determine it
+    too. Its scale is the ratio of the spreads of the centers, one where all are at one place.
+
+    Args:
+        T_ac: poses, camera to world a.
+        T_bc: poses of the same cameras, camera to world b.
+        use_centers: let centers and orientations count equally in the rotation.
     """
-    R = nearest_rotation((T_bc[:, :3, :3] @ T_ac[:, :3, :3].mT).sum(0))
+    M = (T_bc[:, :3, :3] @ T_ac[:, :3, :3].mT).sum(0)
     a, b = T_ac[:, :3, 3], T_bc[:, :3, 3]
     mean_a, mean_b = a.mean(0), b.mean(0)
     spread_a, spread_b = ((x - m).square().sum().sqrt() for x, m in ((a, mean_a), (b, mean_b)))
     least = torch.finfo(a.dtype).tiny
+    if use_centers:
+        M = M / len(T_ac) + (b - mean_b).mT @ (a - mean_a) / (spread_a * spread_b).clamp_min(least)
+    R = nearest_rotation(M)
     scale = torch.where((spread_a > least) & (spread_b > least), spread_b / spread_a.clamp_min(least), 1.0)
-    S_ba = torch.eye(4, dtype=a.dtype, device=a.device)
-    S_ba[:3, :3] = scale * R
-    S_ba[:3, 3] = mean_b - scale * R @ mean_a
-    return S_ba
+    return rigid(scale * R, mean_b - scale * R @ mean_a)
 
 
 def in_place_of(

@@ -35,7 +35,7 @@ from torchslam.geometry.ransac import (
     sample_minimal,
     truncated_score,
 )
-from torchslam.geometry.robust import NORMAL_MEDIAN, Kernel, robustify
+from torchslam.geometry.robust import NORMAL_MEDIAN, Kernel, median_scale, robustify
 
 # Thresholds: a two-dimensional error so large is as probable as a one-dimensional one of one.
 TRANSFER_WIDTH = 1.5
@@ -251,7 +251,7 @@ def _fit_essential_part(
 def noise_variance(squared: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:
     """Variance of the noise, in squared thresholds, by the squared Sampson errors of a pose."""
     near = (squared < NOISE_WIDTH**2) & mask
-    return squared.masked_fill(~near, torch.nan).nanmedian(dim=-1).values.nan_to_num(1.0) / NORMAL_MEDIAN**2
+    return median_scale(squared, NORMAL_MEDIAN**2, near).nan_to_num(NORMAL_MEDIAN**-2)
 
 
 def score_essential(views: TwoViews, E: Float[Tensor, "B K 3 3"], soft: bool = False) -> Float[Tensor, "B K"]:

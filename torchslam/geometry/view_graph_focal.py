@@ -23,7 +23,7 @@ from torch import Tensor
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.fundamental import homography_share, refine_fundamental
 from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import robustify
+from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, robustify, weighted_median
 from torchslam.geometry.two_view import tangent_basis
 
 # Of the focal length, in longer sides of the image: 118 to 14 degrees of view along that side.
@@ -35,7 +35,7 @@ _GRID = 300  # focal lengths in that range: steps of 0.9 %, below the width that
 # lost in it, such as of a drone that circles its object; with 1e-4 as well, these give focal lengths off by 15 %.
 _MODEL_NOISE = 1e-3
 _KERNEL_SCALE = 1.5  # deviations of the noise at which a pair begins to count less; 1 to 3 were tried
-_MEDIAN = 2 * math.log(2)  # of the squared length of a standard normal 2-vector
+
 _LARGEST = 3.03  # deviations: 99 % of the lengths of such a vector are shorter
 _LEVEL_ROUNDS = 4  # of the noise level and the best of the grid, which hardly change after the second
 _BEND_ROUNDS = 10  # of reweighting, for the grid only: Newton's method does the rest
@@ -292,7 +292,7 @@ def _search(graph: _Graph, k1_std: float) -> _Profile:
         costs = _costs(at, graph.weights, level)
         prior = _prior(k1, k1_std)
         best = int((costs.sum(-1) + prior).argmin())
-        before, level = level, max(1.0, _weighted_median(at[best], graph.weights) / _MEDIAN)
+        before, level = level, max(1.0, weighted_median(at[best], graph.weights) / NORMAL_SQUARED_MEDIAN_2D)
         if level == before:
             break
     return _Profile(log_focal, costs, k1, prior, best, before)
@@ -300,15 +300,6 @@ def _search(graph: _Graph, k1_std: float) -> _Profile:
 
 def _prior(k1: Tensor, k1_std: float) -> Tensor:
     return (k1 / k1_std).square() if k1_std > 0 else torch.zeros_like(k1)
-
-
-def _weighted_median(values: Float[Tensor, " M"], weights: Float[Tensor, " M"]) -> float:
-    """The lower median; zero if nothing has a weight."""
-    order = values.argsort()
-    cumulated = weights[order].cumsum(0)
-    if len(values) == 0 or float(cumulated[-1]) == 0:
-        return 0.0
-    return float(values[order][(cumulated >= 0.5 * cumulated[-1]).nonzero()[0, 0]])
 
 
 def _solve(graph: _Graph, k1_std: float, scale: float, dtype: torch.dtype) -> ViewGraphFocal:

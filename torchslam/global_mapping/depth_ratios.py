@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry.robust import median_with_error
 from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.types import FrameFeatures
 
@@ -110,7 +110,5 @@ def depth_ratio(one: PairDepths, at_one: int, other: PairDepths, at_other: int) 
     good = (a > MIN_PARALLAX_SIGMAS * sigma_a) & (b > MIN_PARALLAX_SIGMAS * sigma_b)
     if np.count_nonzero(good) < MIN_POINTS:
         return None
-    ratios = np.log(b[good] / a[good])
-    center = float(np.median(ratios))
-    spread = 1.4826 * float(np.median(np.abs(ratios - center)))
-    return DepthRatio(center, 1.2533 * spread / math.sqrt(len(ratios)))  # of a median
+    center, _, error = median_with_error(np.log(b[good] / a[good]))
+    return DepthRatio(center, error)

@@ -6,8 +6,6 @@ content depends on, so what belongs to another run, or to other images, is never
 
 from __future__ import annotations
 
-import hashlib
-import json
 import warnings
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -22,9 +20,9 @@ from torchslam.data.sequence import Sequence as Recording
 from torchslam.errors import ResultsError
 from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair
 from torchslam.map.file import FORMAT, read_tensors, write_tensors
-from torchslam.system.checkpoint import fingerprint
+from torchslam.system.checkpoint import input_hash
 from torchslam.types import FrameFeatures
-from torchslam.utils.files import PART
+from torchslam.utils.files import PART, fingerprint
 
 VIEWS, PAIRS = "views", "pairs"
 """What files begin with."""
@@ -51,7 +49,7 @@ class SavedStages:
         self, folder: Path | None, sequence: Recording, config: Config, device: torch.device | str = "cpu"
     ) -> None:
         self.folder, self.device = folder, device
-        self._run = [torchslam.__version__, fingerprint(sequence), fingerprint(config)] if folder else []
+        self._run = [torchslam.__version__, input_hash(sequence), input_hash(config)] if folder else []
 
     def views(
         self, images: Sequence[int], find: Callable[[], list[FrameFeatures | None]]
@@ -93,8 +91,7 @@ class SavedStages:
     ) -> list[_Found]:
         if self.folder is None:
             return find()
-        key = hashlib.sha256(json.dumps([self._run, name, of]).encode()).hexdigest()
-        path = self.folder / f"{name}_{key[:32]}.safetensors"
+        path = self.folder / f"{name}_{fingerprint([self._run, name, of], digits=32)}.safetensors"
         if path.exists():
             try:
                 saved, _ = read_tensors(path)

@@ -16,6 +16,7 @@ from torch import Tensor
 from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.map.map import Map
 from torchslam.types import FrameFeatures
+from torchslam.utils.indexing import connected_parts
 
 MIN_PARALLAX = math.radians(0.5)
 """Least angle between rays to a point. Points of 0.25 to 1 degree give the same poses; without any limit, far points
@@ -73,25 +74,13 @@ def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
     none = torch.zeros(0, dtype=torch.int64, device=pairs[0].keypoints_1.device if pairs else "cpu")
     one = torch.cat([none, *(pair.first * keypoints + pair.keypoints_1 for pair in pairs)])
     other = torch.cat([none, *(pair.second * keypoints + pair.keypoints_2 for pair in pairs)])
-    label = lowest_connected(one, other, views * keypoints)
+    label = connected_parts(torch.stack([one, other], dim=1), views * keypoints)
     nodes = torch.unique(torch.cat([one, other]))
     nodes = nodes[torch.argsort(label[nodes], stable=True)]  # within a track by image
     _, track = torch.unique(label[nodes], return_inverse=True)
     view = nodes // keypoints
     _, which, counts = torch.unique(track * views + view, return_inverse=True, return_counts=True)
     return Tracks(track, view, nodes % keypoints).select(counts[which] == 1)[0]
-
-
-def lowest_connected(one: Int[Tensor, " M"], other: Int[Tensor, " M"], count: int) -> Int[Tensor, " R"]:
-    """The lowest node of the connected component of each of `count` nodes with the given edges."""
-    label = torch.arange(count, device=one.device)
-    while True:
-        lower = torch.minimum(label[one], label[other])
-        new = label.scatter_reduce(0, torch.cat([one, other]), torch.cat([lower, lower]), "amin")
-        new = torch.minimum(new, new[new])
-        if torch.equal(new, label):
-            return label
-        label = new
 
 
 def largest_part(
@@ -109,7 +98,7 @@ def largest_part(
     follows = track[1:] == track[:-1]
     links, counts = torch.unique((view[:-1] * views + view[1:])[follows], return_counts=True)
     links = links[counts >= least_shared]
-    label = lowest_connected(links // views, links % views, views)
+    label = connected_parts(torch.stack([links // views, links % views], dim=1), views)
     return label == torch.bincount(label, minlength=views).argmax()
 
 

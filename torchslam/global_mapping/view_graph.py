@@ -18,6 +18,7 @@ from torchslam.geometry import Camera, estimate_relative_pose
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.tracking.matcher import run_matcher
 from torchslam.types import FrameFeatures, Matcher
+from torchslam.utils.indexing import connected_parts
 
 NEAR = 1, 2, 3, 5, 8
 """Distances in images at which all neighbors in time are matched: a blurred image breaks no chain. On garden all of 1
@@ -189,15 +190,6 @@ def similar_places(views: list[FrameFeatures]) -> list[tuple[int, int]]:
 
 def connected_views(pairs: list[ViewPair], count: int) -> Int[Tensor, " K"]:
     """The rows of the largest set of `count` views that pairs connect, ascending; of equal ones the lowest."""
-    label = torch.arange(count, device="cpu")
-    if not pairs:
-        return label[:1]
-    ends = torch.tensor([(pair.first, pair.second) for pair in pairs], device="cpu")
-    while True:
-        lower = label[ends].amin(1)
-        new = label.scatter_reduce(0, ends.flatten(), lower.repeat_interleave(2), "amin")
-        new = torch.minimum(new, new[new])
-        if torch.equal(new, label):
-            break
-        label = new
-    return (label == torch.bincount(label, minlength=count).argmax()).nonzero()[:, 0]
+    ends = torch.tensor([(pair.first, pair.second) for pair in pairs], dtype=torch.int64, device="cpu")
+    label = connected_parts(ends.view(-1, 2), count)
+    return (label == torch.bincount(label).argmax()).nonzero()[:, 0] if count else label

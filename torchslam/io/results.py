@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import math
 from collections.abc import Callable, Iterable
@@ -17,9 +16,11 @@ from torch import Tensor
 
 from torchslam.config import to_toml
 from torchslam.data.calibration import CALIBRATION, write_calibration
+from torchslam.data.formats.csv_tables import read_cells
 from torchslam.data.formats.image_file import read_gray, write_image
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
+from torchslam.data.text_file import read_object
 from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError
@@ -34,7 +35,7 @@ from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
 from torchslam.system.run import Run
 from torchslam.types import Explanation, State, StepResult, Trajectory
-from torchslam.utils.files import JSON_BYTES, parse_json, read_text, write_whole
+from torchslam.utils.files import write_whole
 from torchslam.utils.text import is_unicode
 
 TRAJECTORY = "trajectory.txt"
@@ -215,13 +216,10 @@ def read_results(directory: Path) -> Results:
 def read_metrics(directory: Path) -> dict[str, Any]:
     """Read metrics.json. Raises ResultsError if it is missing or invalid."""
     path = directory / METRICS
-    try:
-        metrics = parse_json(read_text(path, JSON_BYTES, "a JSON file"))
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
-    except ValueError as error:
-        raise ResultsError(f"{path}: not valid JSON: {error}") from None
-    missing = [name for name in NEEDED if not isinstance(metrics, dict) or name not in metrics]
+    metrics = read_object(path, ResultsError)
+    if metrics is None:
+        raise ResultsError(f"{path}: cannot be read: No such file or directory")
+    missing = [name for name in NEEDED if name not in metrics]
     if missing:
         raise ResultsError(f"{path}: not the metrics of a run: {', '.join(missing)} missing")
     wrong = [
@@ -375,16 +373,11 @@ def read_image_source(
 
 def _read_rows(path: str | Path) -> list[tuple[StepResult, str]]:
     """The frames and their files, empty if frames are no files."""
-    try:
-        reader = csv.DictReader(
-            io.StringIO(read_text(path, MAX_FRAMES_BYTES, "a list of frames"), newline="")
-        )
-        # Folders that earlier versions wrote have no files.
-        return [(_frame_result(row, f"{path}:{reader.line_num}"), row.get("image") or "") for row in reader]
-    except OSError as error:
-        raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
-    except (csv.Error, UnicodeDecodeError) as error:
-        raise ResultsError(f"{path}: not a list of frames: {error}") from None
+    rows = read_cells(path, ResultsError, MAX_FRAMES_BYTES, ",")
+    header = next(rows, ("", []))[1]
+    cells = ((where, dict(zip(header, each, strict=True))) for where, each in rows)
+    # Folders that earlier versions wrote have no files.
+    return [(_frame_result(row, where), row.get("image") or "") for where, row in cells]
 
 
 def _frame_result(row: dict[str, str], where: str) -> StepResult:
@@ -415,8 +408,6 @@ def _check_counts(row: dict[str, str]) -> None:
     for name in ("index", "submap", "keyframe", "matches", "inliers"):
         if row[name] and not 0 <= int(row[name]) < 1 << 31:
             raise ValueError(f"{name} is {int(row[name])}")
-    if row["reason"] is None:
-        raise ValueError("it is too short")
 
 
 def _finite(text: str) -> float:

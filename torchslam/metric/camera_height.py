@@ -11,18 +11,18 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.errors import FrameError, MeasurementError
+from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
-from torchslam.geometry.robust import NORMAL_MEDIAN
+from torchslam.geometry.robust import median_with_error
 from torchslam.metric.options import Given
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.windows import read_gray, sample_windows
 
 FRAMES = 16
 """Frames, evenly spread over a submap, in which a plane is sought: the error of one is 3 to 4 %."""
@@ -56,8 +56,6 @@ MAX_ROLL = 0.08
 """Largest roll of a plane that is believed, radians: another surface has others."""
 ALIKE, LEAST_SHARE = 0.7, 0.15
 """Correlation of a window that lies on the plane, and the least share of these windows."""
-CONTRAST = 2.0 / 255
-"""Least standard deviation of the gray levels of a window."""
 MODEL_STD = 0.015
 """Relative error that all frames share: the road is curved, the height is known to a centimeter or two, and the
 focal length to 1 %."""
@@ -94,16 +92,12 @@ class CameraHeight:
                 f"the ground is seen below the camera in {len(heights)} of {FRAMES} frames: it must move along it, and "
                 "look at it",
             )
-        logs = np.log(heights)
-        middle = float(np.median(logs))
-        spread = float(np.median(np.abs(logs - middle))) / NORMAL_MEDIAN
-        # The variance of a median is pi / 2 times that of a mean.
-        error = math.sqrt(math.pi / 2 / len(logs)) * spread
+        middle, spread, error = median_with_error(np.log(heights))
         return ScaleMeasurement(
             ScaleSource.CAMERA_HEIGHT,
             self._meters / math.exp(middle),
             math.hypot(error, MODEL_STD),
-            len(logs),
+            len(heights),
             "frames above the ground",
             apart=spread,
         )
@@ -129,14 +123,14 @@ def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
         if around is None:
             continue
         direction_c = T_cw[row, :3, :3] @ around.direction_w
-        images = [_gray(view, int(view.frame_index[each])) for each in (row, *around.others)]
+        images = [read_gray(view, int(view.frame_index[each])) for each in (row, *around.others)]
         reference, *others = images
         kept = [each for each, image in zip(around.others, others, strict=True) if image is not None]
         if reference is None or not kept:
             continue
         fit = _PlaneFit(
             windows,
-            windows.sampled(reference, windows.pixels),
+            sample_windows(reference, windows.pixels),
             [image for image in others if image is not None],
             T_cw[kept] @ se3_inverse(T_cw[row]),
             direction_c,
@@ -221,19 +215,6 @@ class _Windows:
         rays = camera.unproject(pixels)
         return cls(camera, pixels, rays / rays[..., 2:])
 
-    def sampled(
-        self, image: Float[np.ndarray, "H W"], pixels: Float[Tensor, "W P 2"]
-    ) -> Float[np.ndarray, "W P"]:
-        """Windows of an image, of mean zero and unit length; flat ones are nearly zero."""
-        x, y = pixels.numpy().astype(np.float32).transpose(2, 0, 1)
-        window = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
-        window -= window.mean(axis=-1, keepdims=True)
-        least = CONTRAST * math.sqrt(window.shape[-1])
-        normalized: Float[np.ndarray, "W P"] = window / np.maximum(
-            np.linalg.norm(window, axis=-1, keepdims=True), least
-        )
-        return normalized
-
 
 @dataclass(frozen=True)
 class _PlaneFit:
@@ -282,16 +263,7 @@ class _PlaneFit:
         for image, T_oc in zip(self.others, self.T_oc, strict=True):
             pixels, seen = self.windows.camera.project(transform(T_oc, points_c))
             inside = (seen & self.windows.camera.in_image(pixels, 1.0)).all(dim=-1).numpy()
-            other = self.windows.sampled(image, torch.where(seen[..., None], pixels, 0.0))
+            other = sample_windows(image, pixels, seen)
             total += np.where(inside, (self.own * other).sum(axis=-1), 0.0)
             count += inside
         return total / np.maximum(count, 1)
-
-
-def _gray(view: SubmapView, frame_index: int) -> Float[np.ndarray, "H W"] | None:
-    """A gray image; None where it cannot be read."""
-    assert view.sequence is not None  # the caller's condition
-    try:
-        return view.sequence.image(frame_index)[0, 0].cpu().numpy()
-    except FrameError:
-        return None

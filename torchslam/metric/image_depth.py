@@ -9,15 +9,14 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.errors import FrameError
 from torchslam.geometry import se3_inverse, transform
 from torchslam.metric.source import SubmapView
+from torchslam.metric.windows import read_gray, sample_windows
 
 NEAREST = 30
 """Observed points nearest to the pixel, whose depths bound the search."""
@@ -55,8 +54,6 @@ MATCH_STD_PX = 0.3
 """Standard deviation of where a window matches in one image, pixels; noise and the slant of surfaces."""
 CLICK_STD_PX = 1.0
 """Standard deviation of a click, pixels."""
-CONTRAST = 2.0 / 255
-"""Least standard deviation of the gray levels of a window."""
 
 
 @dataclass(frozen=True)
@@ -214,8 +211,8 @@ class _Sweep:
         """Read the images of the frame and of others with parallax; None where there are too few."""
         point_w = _point(view, T_cw[center], pixel, 1 / depth)
         rows = _chosen(view, T_cw, center, point_w)
-        reference = _gray(view, int(view.frame_index[center]))
-        images = [_gray(view, int(view.frame_index[row])) for row in rows.tolist()]
+        reference = read_gray(view, int(view.frame_index[center]))
+        images = [read_gray(view, int(view.frame_index[row])) for row in rows.tolist()]
         kept = [number for number, image in enumerate(images) if image is not None]
         if reference is None or len(kept) < LEAST_FRAMES:
             return None
@@ -228,7 +225,7 @@ class _Sweep:
         """Correlation, in each frame, of the window at the pixel and an offset; -1 where it is out of the image."""
         steps = self.spacing * np.arange(-self.radius, self.radius + 1)
         window = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + np.array(self.pixel) + offset
-        own = _normalized(_sample(self.reference, window)[None])
+        own = sample_windows(self.reference, torch.from_numpy(window)[None])
         camera = self.view.camera.to("cpu")
         rays = camera.unproject(torch.from_numpy(window))
         rays = rays / rays[:, 2:]
@@ -238,7 +235,7 @@ class _Sweep:
             points_o = transform(T_ow @ se3_inverse(self.T_cw), points_c)
             pixels, seen = camera.project(points_o)
             inside = (seen & camera.in_image(pixels)).all(dim=-1)
-            other = _normalized(_sample(image, torch.where(seen[..., None], pixels, 0.0).numpy()))
+            other = sample_windows(image, pixels, seen)
             alike = torch.from_numpy((own * other).sum(axis=-1))
             scores.append(torch.where(inside, alike, -1.0))
         return torch.stack(scores)
@@ -288,28 +285,3 @@ def _chosen(
     if len(fits) <= FRAMES:
         return fits
     return fits[torch.linspace(0, len(fits) - 1, FRAMES, dtype=torch.float64, device="cpu").round().long()]
-
-
-def _gray(view: SubmapView, frame_index: int) -> Float[np.ndarray, "H W"] | None:
-    """A gray image; None where it cannot be read."""
-    assert view.sequence is not None  # the caller's condition
-    try:
-        return view.sequence.image(frame_index)[0, 0].cpu().numpy()
-    except FrameError:
-        return None
-
-
-def _sample(
-    image: Float[np.ndarray, "H W"], pixels: Float[np.ndarray, "*shape 2"]
-) -> Float[np.ndarray, "*shape"]:
-    """Gray levels between pixels, beyond the image those of its border."""
-    x, y = (pixels[..., axis].astype(np.float32).reshape(-1, pixels.shape[-2]) for axis in (0, 1))
-    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-    return sampled.reshape(pixels.shape[:-1])
-
-
-def _normalized(windows: Float[np.ndarray, "D P"]) -> Float[np.ndarray, "D P"]:
-    """Windows of mean zero and unit length; flat ones are nearly zero."""
-    centered = windows - windows.mean(axis=-1, keepdims=True)
-    least = CONTRAST * math.sqrt(windows.shape[-1])
-    return centered / np.maximum(np.linalg.norm(centered, axis=-1, keepdims=True), least)

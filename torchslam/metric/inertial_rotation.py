@@ -16,7 +16,7 @@ from torchslam.errors import MeasurementError
 from torchslam.geometry import skew, so3_exp, so3_log, umeyama
 from torchslam.geometry.lie import so3_left_jacobian_inverse
 from torchslam.geometry.preintegration import Increments, inertial_steps, preintegrate
-from torchslam.geometry.robust import NORMAL_MEDIAN, robustify
+from torchslam.geometry.robust import median_scale, robustify
 from torchslam.utils.indexing import between_rows
 
 TURN_INTERVAL = 0.1
@@ -204,7 +204,7 @@ def _refined(
     J = torch.cat(
         (inverse @ turned, -from_right @ increments.jacobian[:, 6:, :3], -from_right @ shift), dim=-1
     )
-    std = (error.detach().abs().median() / NORMAL_MEDIAN).clamp_min(SMALLEST_TURN_STD)
+    std = median_scale(error.detach().abs().flatten()).clamp_min(SMALLEST_TURN_STD)
     std = std if turn_std is None else torch.full_like(std, turn_std)
     kernel = robustify((error / std).square().sum(-1), "cauchy", std.new_tensor(ROBUST_SCALE))
     weighted = (kernel.weight[:, None] * error / std**2)[..., None]

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from torchslam.data.trajectories import read_trajectory
 from torchslam.geometry import se3_inverse, so3_log, umeyama
-from torchslam.geometry.robust import NORMAL_MEDIAN, NORMAL_MEDIAN_3D
+from torchslam.geometry.robust import NORMAL_MEDIAN_3D, median_scale
 from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, on_clock_of_images
 from torchslam.metric.options import Given
 from torchslam.metric.path_lengths import (
@@ -127,7 +127,7 @@ def hand_eye(
     """
     turns, camera_turns = so3_log(motions[:, :3, :3]), so3_log(camera_motions[:, :3, :3])
     turned = (turns.norm(dim=-1) - camera_turns.norm(dim=-1)).abs()
-    noise = (turned[known].median() / NORMAL_MEDIAN).clamp_min(MIN_TURN_NOISE)
+    noise = median_scale(turned[known]).clamp_min(MIN_TURN_NOISE)
     alike = turned <= GATE * noise
     used = known & alike
     lever = torch.zeros(3, dtype=torch.float64, device="cpu")
@@ -151,7 +151,7 @@ def hand_eye(
         scale = (weights[:, None] * rotated * target).sum() / (weights[:, None] * rotated.square()).sum()
         moved = scale * rotated
         residual = (moved - target).norm(dim=-1)
-        spread = (residual[used].median() / NORMAL_MEDIAN_3D).clamp_min(1e-9)
+        spread = median_scale(residual[used], NORMAL_MEDIAN_3D).clamp_min(1e-9)
         weights = used / (1 + (residual / (2.5 * spread)).square()).square()  # Geman and McClure
         # t_sensor + (R - I) lever = translation of the camera, with a prior for what no turn determines.
         root = weights.sqrt()[:, None, None] / spread

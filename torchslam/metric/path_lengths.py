@@ -13,7 +13,7 @@ from torch import Tensor
 from torchslam.geometry import so3_log
 from torchslam.metric.camera_path import CameraPath, found_shift
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.slow_noise import SlowMean, slow_mean
+from torchslam.metric.slow_noise import scale_of_series
 from torchslam.metric.source import Unmeasured
 
 STRETCH = 1.0
@@ -26,8 +26,6 @@ MIN_STRETCHES = 4
 """Fewer say nothing of how far they are apart."""
 STANDING = 0.15
 """Part of the typical length of a stretch below which it says nothing: the vehicle stands, or nearly."""
-MAX_RELATIVE_STD = 0.25
-"""Relative standard error from which on a scale is no measurement."""
 SEARCH_STEP = 0.1
 """Seconds between the clocks that are tried."""
 SEARCH_GAIN = 18.0
@@ -109,29 +107,14 @@ def measured(
         return Unmeasured(source, "the camera hardly moves, or not when the vehicle does")
     times, logs = found.times[moving], (found.lengths[moving] / found.lengths_w[moving]).log()
     relative = found.lengths[moving].mean() / found.lengths[moving]  # short ones are less sure
-    mean = slow_mean(times, logs, relative.clamp_min(1e-3))
-    if mean.std > MAX_RELATIVE_STD or float(mean.inliers.double().mean()) < 0.5:
-        return Unmeasured(
-            source, f"{what} and the camera's path differ by {mean.scatter:.0%} from stretch to stretch"
-        )
-    return ScaleMeasurement(
+    return scale_of_series(
         source,
-        math.exp(mean.mean),
-        max(mean.std, 1e-6),
-        int(mean.inliers.sum()),
+        times,
+        logs,
+        relative.clamp_min(1e-3),
         "stretches",
-        tuple(_rejected(times, logs, mean)),
-        apart=mean.scatter,
+        lambda row: f"at {float(times[row]):.1f} s",
+        disagreement=f"{what} and the camera's path differ by {{}} from stretch to stretch",
+        cause=", as with wheels that slip",
         notes=notes,
     )
-
-
-def _rejected(times: Float[Tensor, " S"], logs: Float[Tensor, " S"], mean: SlowMean) -> list[str]:
-    wrong = ~mean.inliers
-    if not bool(wrong.any()):
-        return []
-    off = (logs[wrong] - mean.mean).exp() - 1
-    return [
-        f"{int(wrong.sum())} of {len(logs)} stretches, the first one at {float(times[wrong][0]):.1f} s, are "
-        f"{float(off.min()):+.0%} to {float(off.max()):+.0%} off, as with wheels that slip"
-    ]

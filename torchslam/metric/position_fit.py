@@ -6,15 +6,15 @@ drift of the map. The fit is made for several covariances and averaged (`slow_no
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry import sim3_scale, skew, transform, umeyama
-from torchslam.geometry.robust import NORMAL_MEDIAN_3D
+from torchslam.geometry import rigid, sim3_scale, skew, transform, umeyama
+from torchslam.geometry.robust import NORMAL_MEDIAN_3D, fit_inliers
 from torchslam.metric.slow_noise import averaged, group_means, group_rows, slow_correlations
 from torchslam.optim import LEAST_SQUARES_OPTIONS, solve_least_squares
 
@@ -108,22 +108,26 @@ def fit_positions(
         camera_up_w: mean direction in the map that is up in the images, a unit vector.
         clock_std: standard deviation of the difference of the clocks, seconds.
     """
-    S_ew, stds = _robust_start(pairs)
-    inliers = torch.ones_like(pairs.has_height)
-    for _ in range(ROUNDS):
-        before = inliers
-        residuals = pairs.positions_e - transform(S_ew, pairs.positions_w)
-        inliers = _within(residuals, stds, pairs)
+
+    def residuals_of(S_ew: Tensor) -> Float[Tensor, "N 3"]:
+        return pairs.positions_e - transform(S_ew, pairs.positions_w)
+
+    def inliers_of(model: _Model) -> Bool[Tensor, " N"]:
+        return ((residuals_of(model.S_ew).abs() <= GATE * model.stds) | ~_known(pairs)).all(-1)
+
+    def fitted(model: _Model, inliers: Bool[Tensor, " N"]) -> _Model | None:
         if int(inliers.sum()) < MIN_POSITIONS:
             return None
-        stds = _scatter(residuals, inliers, pairs)
+        stds = _scatter(residuals_of(model.S_ew), inliers, pairs)
         kept = _grouped(pairs.select(inliers), stds[inliers])
-        fit = _average(kept, S_ew, camera_up_w, clock_std, slow=False)
-        if fit is None:
-            return None
-        S_ew = fit.S_ew
-        if bool((inliers == before).all()):
-            break
+        fit = _average(kept, model.S_ew, camera_up_w, clock_std, slow=False)
+        return None if fit is None else _Model(fit.S_ew, stds)
+
+    found = fit_inliers(_robust_start(pairs), inliers_of, fitted, ROUNDS)
+    if found is None:
+        return None
+    (S_ew, stds), inliers = found
+    kept = _grouped(pairs.select(inliers), stds[inliers])
     fit = _average(kept, S_ew, camera_up_w, clock_std, slow=True)
     if fit is None:
         return None
@@ -141,7 +145,7 @@ def fit_positions(
 
 def start_distance(pairs: PositionPairs) -> float:
     """Standard deviation of the positions about the similarity that fits half of them best, meters."""
-    return float(_robust_start(pairs)[1][0, 0])
+    return float(_robust_start(pairs).stds[0, 0])
 
 
 def _known(pairs: PositionPairs) -> Bool[Tensor, "N 3"]:
@@ -151,7 +155,14 @@ def _known(pairs: PositionPairs) -> Bool[Tensor, "N 3"]:
     return known
 
 
-def _robust_start(pairs: PositionPairs) -> tuple[Float[Tensor, "4 4"], Float[Tensor, "N 3"]]:
+class _Model(NamedTuple):
+    """A similarity, and standard deviations of the positions about it along the axes."""
+
+    S_ew: Float[Tensor, "4 4"]
+    stds: Float[Tensor, "N 3"]
+
+
+def _robust_start(pairs: PositionPairs) -> _Model:
     """The similarity of three positions with the least median of distances, and standard deviations.
 
     Source: Rousseeuw, "Least median of squares regression", 1984.
@@ -164,18 +175,9 @@ def _robust_start(pairs: PositionPairs) -> tuple[Float[Tensor, "4 4"], Float[Ten
     distances = torch.where(_known(pairs), pairs.positions_e - moved, 0.0).norm(dim=-1)
     half = distances.kthvalue((len(pairs) + 4) // 2, dim=1).values.nan_to_num(torch.inf)
     best = int(half.argmin())
-    S = torch.eye(4, dtype=torch.float64, device="cpu")
-    S[:3, :3], S[:3, 3] = s[best] * R[best], t[best]
     # Few positions are overfitted.
     std = half[best] / NORMAL_MEDIAN_3D * (1 + 5 / max(len(pairs) - 3, 1))
-    return S, std.clamp_min(1e-3).expand(len(pairs), 3)
-
-
-def _within(
-    residuals: Float[Tensor, "N 3"], stds: Float[Tensor, "N 3"], pairs: PositionPairs
-) -> Bool[Tensor, " N"]:
-    """Positions within the gate along each axis."""
-    return ((residuals.abs() <= GATE * stds) | ~_known(pairs)).all(-1)
+    return _Model(rigid(s[best] * R[best], t[best]), std.clamp_min(1e-3).expand(len(pairs), 3))
 
 
 def _scatter(
@@ -215,7 +217,8 @@ def _grouped(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> _Groups:
         return group_means(values, group, size)
 
     white = (mean(stds.square()) / size[:, None]).sqrt()
-    level = (mean((~pairs.has_height).double()) > 0) * level_std(pairs)
+    extent = (pairs.positions_e.amax(0) - pairs.positions_e.amin(0))[:2].norm()
+    level = (mean((~pairs.has_height).double()) > 0) * LEVEL * extent
     white[:, 2] = (white[:, 2].square() + level.square()).sqrt()
     return _Groups(
         mean(pairs.times),
@@ -229,12 +232,6 @@ def _grouped(pairs: PositionPairs, stds: Float[Tensor, "N 3"]) -> _Groups:
 
 LEVEL = 0.05
 """Where heights were not measured the path is taken for level, with this part of its extent as standard deviation."""
-
-
-def level_std(pairs: PositionPairs) -> float:
-    """Standard deviation of heights that were not measured, meters."""
-    extent = (pairs.positions_e.amax(0) - pairs.positions_e.amin(0))[:2].norm()
-    return LEVEL * float(extent)
 
 
 @dataclass(frozen=True)
@@ -370,8 +367,3 @@ def _rescaled(
     scaled[:3, :3] = factor * S_ew[:3, :3]
     scaled[:3, 3] = center_e - scaled[:3, :3] @ center_w
     return scaled
-
-
-def is_line(up_std: float) -> bool:
-    """Whether positions leave the turn about them open, so that their up is the cameras' own."""
-    return up_std > math.radians(15.0)

@@ -9,8 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.data.formats.fix_files import read_fixes
-from torchslam.data.formats.fixes import Fixes
+from torchslam.data.formats.fix_files import Fixes, read_fixes
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, sim3_scale
@@ -29,7 +28,6 @@ from torchslam.metric.position_fit import (
     PositionFit,
     PositionPairs,
     fit_positions,
-    is_line,
     start_distance,
 )
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
@@ -41,6 +39,8 @@ MAX_RELATIVE_STD = 0.25
 """Relative standard error from which on a scale is no measurement: positions then hardly differ beyond their noise."""
 SWAPPED = 3.0
 """How much nearer a path must be to positions with latitude and longitude exchanged before it is said that they are."""
+LINE_UP_STD = math.radians(15.0)
+"""Standard error of up from which on positions do not constrain the rotation about their line."""
 UPSIDE_DOWN = -0.5
 """Cosine between up and the cameras' up below which it is enough that they are nearer at all: a mirrored path that is
 level fits if it is turned over."""
@@ -212,7 +212,7 @@ class PositionSource:
             )
 
     def _result(self, pairs: PositionPairs, fit: PositionFit, shift: float) -> ScaleMeasurement:
-        line = is_line(fit.up_std)
+        line = fit.up_std > LINE_UP_STD
         return ScaleMeasurement(
             ScaleSource.POSITION,
             float(sim3_scale(fit.S_ew)),

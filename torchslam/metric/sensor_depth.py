@@ -6,7 +6,6 @@ the place of the camera, with its axes; what it is aside, some centimeters, is p
 
 from __future__ import annotations
 
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,12 +18,14 @@ from torch import Tensor
 
 from torchslam.data.camera_argument import parse_calibration
 from torchslam.data.formats.depth_images import DepthImages, find_depth_images, parse_depth_folder, read_depth
+from torchslam.data.trajectories import nearest
 from torchslam.data.transforms import scale_camera
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, transform
+from torchslam.geometry.robust import weighted_median
 from torchslam.metric.options import Given
 from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.slow_noise import SlowMean, slow_mean
+from torchslam.metric.slow_noise import scale_of_series
 from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
 
 IMAGES = 60
@@ -48,8 +49,6 @@ POINT_STD = 0.02
 SENSOR_STD = 0.015
 """Relative error that all images share: of the sensor's own calibration (TUM corrected its three Kinects by 3.5, 3.1
 and 0 %), of its place and of its axis."""
-MAX_RELATIVE_STD = 0.25
-"""Relative standard error from which on a scale is no measurement."""
 
 
 def from_options(given: Given) -> list[MetricSource]:
@@ -110,17 +109,15 @@ class SensorDepth:
             return Unmeasured(ScaleSource.DEPTH, "; ".join([why, *notes]))
         times = view.timestamps[rows].cpu().double()
         values = torch.tensor(logs, dtype=torch.float64, device="cpu")
-        mean = slow_mean(times, values, torch.ones_like(values))
-        if mean.std > MAX_RELATIVE_STD or float(mean.inliers.double().mean()) < 0.5:
-            return Unmeasured(ScaleSource.DEPTH, f"depth images differ by {mean.scatter:.0%} from each other")
-        return ScaleMeasurement(
+        return scale_of_series(
             ScaleSource.DEPTH,
-            math.exp(mean.mean),
-            math.hypot(mean.std, SENSOR_STD),
-            int(mean.inliers.sum()),
+            times,
+            values,
+            torch.ones_like(values),
             "depth images",
-            _rejected(view.frame_index[rows], values, mean),
-            apart=mean.scatter,
+            lambda row: f"that of frame {int(view.frame_index[rows[row]])}",
+            disagreement="depth images differ by {} from each other",
+            shared_std=SENSOR_STD,
             notes=notes,
         )
 
@@ -149,7 +146,8 @@ class SensorDepth:
         if near is not None and bool((near >= 0).any()):
             return [(row, images.paths[place]) for row, place in enumerate(near.tolist()) if place >= 0]
         by_name = {_numbers(path.name): path for path in images.paths}
-        names = [] if view.sequence is None else [_numbers(name) for name in _file_names(view)]
+        file_name = None if view.sequence is None else view.sequence.file_name
+        names = [_numbers(file_name(index)) for index in view.frame_index.tolist()] if file_name else []
         named = [(row, by_name[key]) for row, key in enumerate(names) if key and key in by_name]
         if named:
             return named
@@ -167,17 +165,10 @@ def nearest_times(times: Float[Tensor, " N"], others: Float[Tensor, " M"]) -> In
 
     The shorter one of both median intervals counts: in between, another image would have been nearer.
     """
-    after = torch.searchsorted(others, times).clamp_max(len(others) - 1)
-    before = (after - 1).clamp_min(0)
-    nearest = torch.where((times - others[before]).abs() < (others[after] - times).abs(), before, after)
+    rows, distances = nearest(times, others)
     intervals = [each.diff().median() for each in (times, others) if len(each) > 1]
     limit = min(map(float, intervals), default=0.0) / 2
-    return torch.where((others[nearest] - times).abs() <= limit, nearest, -1)
-
-
-def _file_names(view: SubmapView) -> list[str]:
-    assert view.sequence is not None  # the caller's condition
-    return [Path(view.sequence.file_name(index)).name for index in view.frame_index.tolist()]
+    return torch.where(distances <= limit, rows, -1)
 
 
 def _numbers(name: str) -> tuple[int, ...]:
@@ -212,7 +203,7 @@ def frame_ratio(view: SubmapView, row: int, depth: Float[np.ndarray, "H W"], cam
         return None
     z, middle = z[inside][is_one], middle[is_one]
     weights = 1 / (POINT_STD**2 + (NOISE * middle).square())
-    return _weighted_median((middle / z).log(), weights)
+    return weighted_median((middle / z).log(), weights)
 
 
 def _observed(view: SubmapView, row: int) -> tuple[Float[Tensor, "R 2"], Float[Tensor, " R"]]:
@@ -226,23 +217,3 @@ def _observed(view: SubmapView, row: int) -> tuple[Float[Tensor, "R 2"], Float[T
 
 def _mean(depth: Float[np.ndarray, "H W"], patch: np.ndarray) -> np.ndarray:
     return cv2.blur(depth, patch.shape)
-
-
-def _weighted_median(values: Float[Tensor, " N"], weights: Float[Tensor, " N"]) -> float:
-    """The value with half of the weight on either side."""
-    order = values.argsort()
-    passed = weights[order].cumsum(0)
-    return float(values[order][int(torch.searchsorted(passed, passed[-1] / 2))])
-
-
-def _rejected(frames: Int[Tensor, " N"], logs: Float[Tensor, " N"], mean: SlowMean) -> tuple[str, ...]:
-    wrong = ~mean.inliers & (
-        (logs - mean.mean).abs() > SENSOR_STD
-    )  # where all others agree, .1 % are many errors
-    if not bool(wrong.any()):
-        return ()
-    off = (logs[wrong] - mean.mean).exp() - 1
-    return (
-        f"{int(wrong.sum())} of {len(logs)} depth images, the first one that of frame {int(frames.cpu()[wrong][0])}, "
-        f"are {float(off.min()):+.0%} to {float(off.max()):+.0%} off",
-    )

@@ -7,13 +7,17 @@ approaches to variance component estimation and to related problems", 1977).
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.geometry.robust import NORMAL_MEDIAN
+from torchslam.geometry.robust import fit_inliers, median_scale
+from torchslam.metric.scale import ScaleMeasurement, ScaleSource
+from torchslam.metric.source import Unmeasured
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviations of the slow noise, in those of the white noise; beyond the last one the white noise does not
@@ -28,6 +32,10 @@ GATE = 4.0
 """Standard deviations beyond which a value is wrong: 6e-5 of right ones are. Tried at 4 only."""
 ROUNDS = 20
 """Rejections until nothing changes; two to four are usual."""
+MAX_RELATIVE_STD = 0.25
+"""Relative standard error from which on a scale is no measurement."""
+LEAST_STD = 1e-6
+"""Of exact data."""
 
 
 def slow_correlations(
@@ -114,17 +122,18 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
         values: three or more.
         stds: relative to each other.
     """
-    mean = _densest(values)
-    inliers = torch.ones_like(values, dtype=torch.bool)
-    for _ in range(ROUNDS):
-        before = inliers
+
+    def inliers_of(mean: Tensor) -> Tensor:
         whitened = (values - mean).abs() / stds
-        scale = (whitened.median() / NORMAL_MEDIAN).clamp_min(1e-9)  # rounding is no scatter
-        inliers = whitened <= GATE * scale
+        return whitened <= GATE * median_scale(whitened).clamp_min(1e-9)  # rounding is no scatter
+
+    def mean_of(_: Tensor, inliers: Tensor) -> Tensor:
         weights = inliers / stds.square()
-        mean = (weights * values).sum() / weights.sum()
-        if bool((inliers == before).all()):
-            break
+        return (weights * values).sum() / weights.sum()
+
+    found = fit_inliers(_densest(values), inliers_of, mean_of, ROUNDS)
+    assert found is not None  # a mean is always determined
+    inliers = found[1]
     group, size = group_rows(int(inliers.sum()))
     kept, own = values[inliers], stds[inliers].square()
     white = group_means(own, group, size) / size
@@ -154,3 +163,54 @@ def _densest(values: Float[Tensor, " N"]) -> Float[Tensor, ""]:
     half = len(values) // 2
     start = (ordered[half:] - ordered[: len(values) - half]).argmin()
     return (ordered[start] + ordered[start + half]) / 2
+
+
+def scale_of_series(
+    source: ScaleSource,
+    times: Float[Tensor, " N"],
+    logs: Float[Tensor, " N"],
+    stds: Float[Tensor, " N"],
+    unit: str,
+    name_of: Callable[[int], str],
+    *,
+    disagreement: str,
+    cause: str = "",
+    shared_std: float = 0.0,
+    notes: tuple[str, ...] = (),
+) -> ScaleMeasurement | Unmeasured:
+    """Average a series of logarithms of meters per unit, up to half of them wrong; see `slow_mean`.
+
+    Args:
+        source: where they come from.
+        times: seconds, ascending.
+        logs: the logarithms.
+        stds: their standard deviations, relative to each other.
+        unit: what is counted, in the plural.
+        name_of: the name of a row, such as "at 3.2 s".
+        disagreement: message where they determine no scale, with `{}` for their relative standard deviation.
+        cause: end of the message about rejected ones.
+        shared_std: relative standard deviation of an error that all have in common.
+        notes: remarks.
+    """
+    mean = slow_mean(times, logs, stds)
+    if mean.std > MAX_RELATIVE_STD or float(mean.inliers.double().mean()) < 0.5:
+        return Unmeasured(source, disagreement.format(f"{mean.scatter:.0%}"))
+    # Where all others agree, deviations below the shared error are many standard deviations.
+    wrong = torch.nonzero(~mean.inliers & ((logs - mean.mean).abs() > shared_std))[:, 0]
+    rejected = []
+    if len(wrong):
+        off = (logs[wrong] - mean.mean).exp() - 1
+        rejected.append(
+            f"{len(wrong)} of {len(logs)} {unit}, the first one {name_of(int(wrong[0]))}, are "
+            f"{float(off.min()):+.0%} to {float(off.max()):+.0%} off{cause}"
+        )
+    return ScaleMeasurement(
+        source,
+        math.exp(mean.mean),
+        max(math.hypot(mean.std, shared_std), LEAST_STD),
+        int(mean.inliers.sum()),
+        unit,
+        tuple(rejected),
+        apart=mean.scatter,
+        notes=notes,
+    )

@@ -16,7 +16,7 @@ from torchslam.optim._core.levenberg_marquardt import Convergence, SolverReason,
 from torchslam.optim._core.options import ROTATION_OPTIONS, UNWEIGHTED_ROTATION_OPTIONS, SolverOptions
 from torchslam.optim._rotation_start import RotationEdges, robust_start, spanning_forest
 from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, is_similarity, solve_pose_graph
-from torchslam.optim.pose_graph._problem import connected_parts
+from torchslam.utils.indexing import connected_parts
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,7 @@ def solve_rotations(
         angles = R_ji.new_full((len(edges),), torch.inf).index_copy(0, rows, error.norm(dim=-1))
         kept = robustify(measured.weights * error.square().sum(-1), kernel, scale).weight > 0
         # All views that an edge joins are still joined by those which kept some weight.
-        split = _components(measured.select(kept), num_views) != component
+        split = connected_parts(measured.select(kept).pairs, num_views) != component
         lost = torch.zeros_like(split).index_fill(0, component[split], True)
         success = determined & ~lost[component]
     if options.strict:
@@ -141,7 +141,7 @@ class _Start(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         rows = _canonical_rows(edges, known)
         counted, num_views = edges.select(rows), len(known)
-        component = _components(counted, num_views)
+        component = connected_parts(counted.pairs, num_views)
         R_cw = spanning_forest(counted, num_views, scale) if on_forest else given.clone()
         if len(rows):
             R_cw = robust_start(R_cw, counted, component, kernel, scale)
@@ -176,12 +176,6 @@ def _canonical_rows(edges: RotationEdges, known: Bool[Tensor, " K"]) -> Int[Tens
     keys = (*R_ji.flatten(1).unbind(-1), weights, j, i)
     order = np.lexsort([key[rows].detach().cpu().numpy() for key in keys])
     return rows[torch.from_numpy(order).to(rows.device)]
-
-
-def _components(edges: RotationEdges, num_views: int) -> Int[Tensor, " K"]:
-    """The lowest view that edges join, over others or not, with each view."""
-    counted = torch.ones(1, len(edges.i), dtype=torch.bool, device=edges.i.device)
-    return connected_parts(edges.pairs, counted, counted.new_zeros(1, num_views))[0]
 
 
 def _minimum(

@@ -14,7 +14,7 @@ from enum import Enum
 from pathlib import Path
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.calibration.find_camera import better_camera
@@ -22,7 +22,7 @@ from torchslam.config import Config
 from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.errors import TrajectoryError
-from torchslam.geometry import Camera, SensorModel, se3_inverse
+from torchslam.geometry import Camera, SensorModel, se3_inverse, transform
 from torchslam.geometry.camera_measurement import (
     FOCAL,
     K1,
@@ -31,7 +31,8 @@ from torchslam.geometry.camera_measurement import (
     intrinsics_directions,
     with_radial_terms,
 )
-from torchslam.geometry.similarity import nearest_rotation
+from torchslam.geometry.robust import fit_inliers
+from torchslam.geometry.similarity import align_poses
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, choose_held_back, choose_images
 from torchslam.global_mapping.rounds import (
@@ -304,24 +305,15 @@ def align_to_input(T_cw: Float[Tensor, "F 4 4"], given_cw: Float[Tensor, "F 4 4"
     of the centers the scale is one.
     """
     T_wc, given = se3_inverse(T_cw), se3_inverse(given_cw)
-    is_inlier = torch.ones(len(T_wc), dtype=torch.bool, device=T_wc.device)
-    for _ in range(3):
-        S = _similarity(T_wc[is_inlier], given[is_inlier])
-        moved = T_wc[:, :3, 3] @ S[:3, :3].mT + S[:3, 3]
-        off = torch.linalg.vector_norm(moved - given[:, :3, 3], dim=-1)
-        is_inlier = off <= MAX_OUTLIER_RATIO * off.median().clamp(min=1e-12)
-    return S
 
+    def similarity(_: Tensor, counted: Bool[Tensor, " F"]) -> Float[Tensor, "4 4"]:
+        return align_poses(T_wc[counted], given[counted], use_centers=True)
 
-def _similarity(T_wc: Float[Tensor, "F 4 4"], given: Float[Tensor, "F 4 4"]) -> Float[Tensor, "4 4"]:
-    """The similarity that aligns centers and orientations in the least-squares sense."""
-    source, target = T_wc[:, :3, 3], given[:, :3, 3]
-    x, y = source - source.mean(0), target - target.mean(0)
-    extent = (x.square().sum() * y.square().sum()).sqrt()
-    M = (given[:, :3, :3] @ T_wc[:, :3, :3].mT).mean(0) + (y.mT @ x) / extent.clamp(min=1e-300)
-    R = nearest_rotation(M)
-    scale = (y * (x @ R.mT)).sum() / x.square().sum() if float(extent) > 0 else x.new_ones(())
-    S = torch.eye(4, dtype=x.dtype, device=x.device)
-    S[:3, :3] = scale * R
-    S[:3, 3] = target.mean(0) - scale * (R @ source.mean(0))
-    return S
+    def are_near(S: Float[Tensor, "4 4"]) -> Bool[Tensor, " F"]:
+        off = torch.linalg.vector_norm(transform(S, T_wc[:, :3, 3]) - given[:, :3, 3], dim=-1)
+        return off <= MAX_OUTLIER_RATIO * off.median().clamp(min=1e-12)
+
+    everything = torch.ones(len(T_wc), dtype=torch.bool, device=T_wc.device)
+    found = fit_inliers(similarity(T_wc, everything), are_near, similarity, rounds=2)
+    assert found is not None  # poses always determine a similarity
+    return found[0]

@@ -7,8 +7,6 @@ is no provisional map and no held-back frame, since no checkpoint is written the
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 from dataclasses import astuple, fields
 from pathlib import Path
@@ -33,6 +31,7 @@ from torchslam.system.run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
 from torchslam.types import Explanation, Reason, State, StepResult
+from torchslam.utils.files import fingerprint
 
 STATES = tuple(State)
 """The order of states in a file."""
@@ -56,8 +55,8 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
     tracking = {TRACKING + name: value for name, value in whole.items() if isinstance(value, Tensor)}
     results, reasons, stages = _packed(so_far.results)
     about["run"] = {
-        "sequence": fingerprint(sequence),
-        "config": fingerprint(slam.config),
+        "sequence": input_hash(sequence),
+        "config": input_hash(slam.config),
         "next": so_far.next,
         "skipped": so_far.skipped,
         "reasons": reasons,
@@ -103,7 +102,7 @@ def read_checkpoint(
     if not isinstance(run, dict):
         raise ResultsError(f"{path}: a map, but not a checkpoint")
     for what, mine in (("sequence", sequence), ("config", config)):
-        if run.get(what) != fingerprint(mine):
+        if run.get(what) != input_hash(mine):
             word = "configuration" if what == "config" else what
             raise ResultsError(f"{path}: a checkpoint of a run with another {word}")
     own = {name: tensors.pop(name) for name in list(tensors) if name.startswith("run.")}
@@ -125,14 +124,14 @@ def read_checkpoint(
     return slam, so_far
 
 
-def fingerprint(of: Sequence | Config) -> str:
+def input_hash(of: Sequence | Config) -> str:
     """Hash of a sequence or a configuration."""
     if isinstance(of, Config):
-        return hashlib.sha256(to_toml(of).encode()).hexdigest()
+        return fingerprint([to_toml(of)])
     files = [of.file_name(index) for index in range(len(of.timestamps))]
     camera = of.camera
-    about = json.dumps([of.name, camera.model, camera.size, camera.params.tolist(), of.known_length, files])
-    return hashlib.sha256(about.encode() + of.timestamps.cpu().numpy().tobytes()).hexdigest()
+    about = [of.name, camera.model, camera.size, camera.params.tolist(), of.known_length, files]
+    return fingerprint([about, of.timestamps.cpu().numpy().tobytes()])
 
 
 def _restore(

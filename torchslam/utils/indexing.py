@@ -1,4 +1,4 @@
-"""Set operations on dense row numbers, by a flag per number between the lowest and the highest; places in a table.
+"""Set operations on dense row numbers, by a flag per number between the lowest and the highest; components of graphs.
 
 For dense numbers flags are several times faster than the sorting of `torch.unique` and `torch.isin`.
 """
@@ -62,6 +62,35 @@ def is_among(ids: Int[Tensor, " N"], others: Int[Tensor, " M"]) -> Bool[Tensor, 
     at = ids - low
     is_within = (at >= 0) & (at < len(flags))
     return flags.index_select(0, at.clamp_(0, len(flags) - 1)) & is_within
+
+
+def connected_parts(
+    edges: Int[Tensor, "E 2"], count: int, counted: Bool[Tensor, "*batch E"] | None = None
+) -> Int[Tensor, "*batch {count}"]:
+    """Return the lowest node of the connected component of each of `count` nodes.
+
+    Every node points to one of its component with a number not above its own; edges hook these onto one another, and
+    pointers are shortened, until nothing changes: about log(count) rounds.
+
+    Args:
+        edges: nodes that are joined.
+        count: number of nodes.
+        counted: edges in use; None: all.
+    """
+    if counted is None:
+        counted = edges.new_ones(len(edges), dtype=torch.bool)
+    label = torch.arange(count, device=edges.device).expand(*counted.shape[:-1], count)
+    ends = edges.T.flatten()
+    while True:
+        at_ends = label[..., ends]
+        low = torch.minimum(*at_ends.chunk(2, dim=-1))
+        low = torch.cat([torch.where(counted, low, count)] * 2, dim=-1)
+        hooked = label.scatter_reduce(-1, at_ends, low, "amin")
+        hooked = hooked.scatter_reduce(-1, ends.expand_as(low), low, "amin")
+        shortened = hooked.gather(-1, hooked)
+        if torch.equal(shortened, label):
+            return label
+        label = shortened
 
 
 def row_mask(name: str, rows: Tensor | Sequence[int] | None, like: Tensor) -> Tensor:

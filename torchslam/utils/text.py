@@ -22,11 +22,7 @@ def without_credentials(text: str) -> str:
 
 def printable(text: str) -> str:
     """Return the text with control characters, line ends and lone surrogates escaped."""
-    return text if text.isprintable() else "".join(map(_escaped, text))
-
-
-def _escaped(character: str) -> str:
-    return character if character.isprintable() else character.encode("unicode_escape").decode()
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
 
 
 def is_unicode(text: str) -> bool:

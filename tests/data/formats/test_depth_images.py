@@ -93,9 +93,9 @@ def test_a_scale_after_a_colon(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", "no depth images are listed"),
+        ("", "no files are listed"),
         ("1.0\n", "expected `timestamp file`"),
-        ("x depth/0.png\n", "expected `timestamp file`"),
+        ("x depth/0.png\n", "`x` is not a number"),
         ("1 a.png\n1 b.png\n", ":2: "),
     ],
 )

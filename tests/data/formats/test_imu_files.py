@@ -83,11 +83,11 @@ def test_a_folder_is_that_of_its_data(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("header", "rows", "message"),
     [
-        ("", [], "no samples"),
-        (PLAIN, [], "no samples"),
+        ("", [], "the first line must name the columns `time`"),
+        (PLAIN, [], "0 samples; at least two"),
         (PLAIN, rows_of(["0"]), "1 samples; at least two"),
         ("time,gyro_x,gyro_y,gyro_z,acc_x,acc_y", rows_of(["0", "0.01"]), "no column acc_z in the header"),
-        ("1,2,3,4,5,6,7", rows_of(["0", "0.01"]), "no column time in the header"),
+        ("1,2,3,4,5,6,7", rows_of(["0", "0.01"]), "the first line must name the columns `time`"),
         (
             PLAIN.replace("gyro_x", "gyro_x [turns/s]"),
             rows_of(["0", "0.01"]),
@@ -102,10 +102,14 @@ def test_a_folder_is_that_of_its_data(tmp_path: Path) -> None:
         ),
         (PLAIN, rows_of(["0", "0.01"], rate=300.0), "a rate of 300 rad/s is too fast"),
         (PLAIN, rows_of(["0", "1e30"]), "in no unit that a sensor has"),
-        (PLAIN, [*rows_of(["0", "0.01"]), "0.02,1,2,x,4,5,6"], r"imu.csv:4: `x` is not a number"),
-        (PLAIN, [*rows_of(["0", "0.01"]), "0.02,1,2"], r"imu.csv:4: no number in column 4"),
-        (PLAIN, [*rows_of(["0", "0.01"]), "0.02,1,nan,3,4,5,6"], r"imu.csv:4: `nan` is not a finite number"),
-        (PLAIN, [*rows_of(["0", "0.01"]), "0.02,1,,3,4,5,6"], r"imu.csv:4: no number in column 3"),
+        (
+            PLAIN,
+            [*rows_of(["0", "0.01"]), "0.02,1,2,x,4,5,6"],
+            r"imu.csv:4: column gyro_z: `x` is not a number",
+        ),
+        (PLAIN, [*rows_of(["0", "0.01"]), "0.02,1,2"], r"imu.csv:4: 3 cells, the header has 7 columns"),
+        (PLAIN, [*rows_of(["0", "0.01"]), "0.02,1,nan,3,4,5,6"], r"imu.csv:4: no number in column gyro_y"),
+        (PLAIN, [*rows_of(["0", "0.01"]), "0.02,1,,3,4,5,6"], r"imu.csv:4: no number in column gyro_y"),
     ],
 )
 def test_wrong_samples_are_one_clear_error(

@@ -10,7 +10,7 @@ import hypothesis.strategies as st
 import pytest
 from hypothesis import given
 
-from torchslam.data.formats.key_files import parse_yaml, read_tree
+from torchslam.data.formats.key_files import MAX_YAML, parse_yaml, read_tree
 
 NAMES = st.sampled_from(["a", "b_c", "D", "Camera.fx", "k1", "data"])
 SCALARS = st.one_of(st.integers(-1000, 1000), st.floats(-1e3, 1e3), st.sampled_from(["abc", "x y"]))
@@ -53,16 +53,30 @@ def test_what_pyyaml_writes(tree: dict[str, Any], flow: bool | None, width: int)
         ("a:\n  - b: 1\n    c: 2\n  -\n    - 3\n", {"a": [{"b": "1", "c": "2"}, ["3"]]}),
         ("a: {b: [1, 2], c: {d: 3}}\n", {"a": {"b": ["1", "2"], "c": {"d": "3"}}}),
         ("a: [fx: 1, fy: 2]\n", {"a": [{"fx": "1"}, {"fy": "2"}]}),
-        ("a: [1, 2\n", {"a": ["1", "2"]}),
         ("a: &x !!opencv-matrix\n  rows: 1\nb: !!python/tuple [1]\n", {"a": {"rows": "1"}, "b": ["1"]}),
         ("a: some words\n  that go on\nb: 1\n", {"a": "some words that go on", "b": "1"}),
         ("%YAML:1.0\n---\nCamera.fx:500\n", {"Camera.fx": "500"}),
-        ("a: 1\na: 2\n", {"a": "1"}),
+        ("a: &x [1]\nb: *x\n", {"a": ["1"], "b": ["1"]}),
         ("", {}),
     ],
 )
 def test_yaml(text: str, tree: dict[str, Any]) -> None:
     assert parse_yaml(text) == tree
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("a: 1\nb: [1, 2\n", "line 2: expected"),
+        ("%YAML:1.0\na: 1\nb: 2: 3\n", "line 3: mapping values are not allowed here"),
+        ("a" * (MAX_YAML + 1), "characters, more than"),
+        ("a: &a [1]\n" + "b: *a\n" * 21, "more than 20 aliases"),
+        ("[" * 30, "nested deeper than 20"),
+    ],
+)
+def test_wrong_yaml(text: str, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        parse_yaml(text)
 
 
 def test_xml_and_json() -> None:
@@ -83,5 +97,5 @@ def test_xml_and_json() -> None:
 def test_every_text_ends_soon(text: str) -> None:
     start = time.process_time()
     with contextlib.suppress(ValueError):
-        parse_yaml(text)
+        parse_yaml(text[:MAX_YAML])
     assert time.process_time() - start < 5

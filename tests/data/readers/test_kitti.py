@@ -88,7 +88,7 @@ def test_relative_paths_find_the_poses(folder: Path, monkeypatch: pytest.MonkeyP
         ),
         ("calib.txt", P0.replace("70", "nan"), CalibrationError, r"calib\.txt:1: `nan`"),
         ("poses.txt", "1 0 0 7 0 1 0 0 0 0 1 0\n", TrajectoryError, r"poses\.txt: 1 poses for 3 times"),
-        ("poses.txt", "1 0 0\n", TrajectoryError, r"poses\.txt:1: expected 12 numbers, got 3"),
+        ("poses.txt", "1 0 0\n", TrajectoryError, r"poses\.txt:1: expected .* got 3 numbers"),
     ],
 )
 def test_bad_files(folder: Path, file: str, text: str, error: type[Exception], message: str) -> None:

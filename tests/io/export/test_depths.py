@@ -14,7 +14,7 @@ from torchslam.dense import DepthMaps
 from torchslam.dense.depth_maps import read_frames
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, rigid, so3_exp, transform
-from torchslam.io.export.depths import UNIT, colmap_map, depth_images, depth_png, enlarged, write_workspace
+from torchslam.io.export.depths import UNIT, colmap_map, depth_png, enlarged, write_workspace
 from torchslam.io.export.ply import read_cloud
 from torchslam.io.export.scene import ExportedScene, Undistorter, undistorted
 
@@ -63,7 +63,7 @@ class Painted:
 
 
 def test_maps_are_read_one_by_one(room: tuple[ExportedScene, Path]) -> None:
-    maps, found = DepthMaps.load(room[1]), list(depth_images(room[1]))
+    maps, found = DepthMaps.load(room[1]), list(DepthMaps.blocks(room[1], 1))
     assert torch.equal(torch.cat([each.depth for each in found]), maps.depth)
     assert torch.equal(torch.cat([each.T_cw for each in found]), maps.T_cw)
     frames, camera = read_frames(room[1])

@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchslam.data.formats.frame_names import MAX_FILES, in_order, times_in_names
 from torchslam.data.formats.image_file import read_pixels
-from torchslam.data.text_file import check_later, in_seconds, numbered_lines
+from torchslam.data.text_file import check_later, listed_files
 from torchslam.errors import MeasurementError, SequenceError
 
 DEPTH_LIST = "depth.txt"
@@ -136,24 +136,13 @@ def _read_list(path: Path, units_per_meter: float | None) -> DepthImages:
     """The lines `timestamp file` of TUM's list."""
     times: list[float] = []
     files: list[Path] = []
-    for number, line in numbered_lines(path, MeasurementError):
-        where = f"{path}:{number}"
-        words = line.split(maxsplit=1)
-        try:
-            time = float(words[0])
-        except ValueError:
-            time = math.nan
-        if len(words) != 2 or not math.isfinite(time):
-            raise MeasurementError(f"{where}: expected `timestamp file`, got `{line[:200]}`")
-        time = in_seconds(time, where, MeasurementError)
+    for where, time, file in listed_files(path, MeasurementError):
         if times:
             check_later(time, times[-1], where, MeasurementError)
         times.append(time)
-        files.append(path.parent / words[1])
+        files.append(file)
         if len(files) > MAX_FILES:
             raise MeasurementError(f"{path}: more than {MAX_FILES} depth images")
-    if not files:
-        raise MeasurementError(f"{path}: no depth images are listed")
     table = torch.tensor(times, dtype=torch.float64, device="cpu")
     return DepthImages(path, tuple(files), table, units_per_meter or FIVE_THOUSANDTHS)
 

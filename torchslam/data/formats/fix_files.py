@@ -6,18 +6,22 @@ import io
 import math
 import os
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree import ElementTree
 
+import torch
+from jaxtyping import Float
 from PIL import Image
+from torch import Tensor
 
-from torchslam.data.formats.csv_tables import parse_moment, read_csv
-from torchslam.data.formats.fixes import Fix, Fixes, checked_fixes
+from torchslam.data.formats.csv_tables import TIMES, Column, parse_moment, read_table
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.image_file import MAX_BYTES, SUFFIXES
 from torchslam.data.formats.oxts import is_oxts, read_oxts
-from torchslam.data.text_file import MAX_LINE, read_text
+from torchslam.data.text_file import MAX_LINE, parse_number, read_text
 from torchslam.errors import MeasurementError
 from torchslam.utils.files import read_bytes
 
@@ -29,16 +33,130 @@ HORIZONTAL_ERROR = 31
 """Tag of the horizontal error, meters."""
 XML_BYTES = 1 << 26
 """Size limit of GPX files; half a million points, of which the parser makes objects of ten times the size."""
-POSITION_COLUMNS = {
-    "name": ("name", "image", "filename", "file"),
-    "latitude": ("latitude", "lat"),
-    "longitude": ("longitude", "lon", "lng"),
-    "altitude": ("altitude", "alt", "elevation", "ele"),
-    "std_horizontal": ("std_horizontal",),
-    "std_vertical": ("std_vertical",),
+DEGREES, METERS = {"deg": 1.0, "degrees": 1.0, "°": 1.0}, {"m": 1.0, "meters": 1.0}
+"""Units that headings may state."""
+COLUMNS = {
+    **TIMES,
+    "name": Column(("name", "image", "filename", "file")),
+    "latitude": Column(("latitude", "lat"), DEGREES),
+    "longitude": Column(("longitude", "lon", "lng"), DEGREES),
+    "altitude": Column(("altitude", "alt", "elevation", "ele"), METERS),
+    "std_horizontal": Column(("stdhorizontal",), METERS),
+    "std_vertical": Column(("stdvertical",), METERS),
 }
-"""Kinds of columns and what they are called."""
+"""Kinds of columns."""
+MAX_FIXES = 1_000_000
+"""Maximum number of positions of a file: more than a day at 10 Hz."""
+MAX_ALTITUDE = 1e5
+"""Meters: the farthest from the ground that a position may be; balloons and rockets of amateurs stay below."""
 OXTS_ACCURACY = 23  # the place of `pos_accuracy` in a packet (dataformat.txt)
+
+
+class Fix(NamedTuple):
+    """One position as a file has it.
+
+    Attributes:
+        where: file and line, for messages.
+        latitude: degrees; NaN where the receiver had no position.
+        longitude: degrees.
+        altitude: meters, above the sea or the ellipsoid or the start; NaN if unknown.
+        time: seconds; None where `name` says whose position it is.
+        name: of an image.
+        std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
+    """
+
+    where: str
+    latitude: float
+    longitude: float
+    altitude: float = math.nan
+    time: float | None = None
+    name: str = ""
+    std: tuple[float, float] = (math.nan, math.nan)
+
+
+@dataclass(frozen=True)
+class Fixes:
+    """N positions, each at a time or of an image.
+
+    Attributes:
+        path: where they come from.
+        geodetic: latitude and longitude, degrees, and altitude, meters; the altitude is NaN if it is unknown.
+        std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
+        timestamps: seconds, increasing, on the clock of the file; None where they are known by names.
+        names: N names of image files, or empty.
+        notes: remarks for the user, one line each.
+    """
+
+    path: Path
+    geodetic: Float[Tensor, "N 3"]
+    std: Float[Tensor, "N 2"]
+    timestamps: Float[Tensor, " N"] | None = None
+    names: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.geodetic)
+
+
+def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = ()) -> Fixes:
+    """The positions of a file in the order of time, without those that the receiver did not have.
+
+    Rows without a position (empty, NaN or the zeros that receivers write) and second ones of one time are left out,
+    with a note. Raises MeasurementError for coordinates or errors that cannot be, times out of order, and where nothing
+    is left.
+    """
+    kept: list[Fix] = []
+    empty = doubled = 0
+    for count, row in enumerate(rows):
+        if count >= MAX_FIXES:
+            raise MeasurementError(f"{path}: more than the {MAX_FIXES} positions that are read")
+        if math.isnan(row.latitude) or math.isnan(row.longitude) or row.latitude == row.longitude == 0:
+            empty += 1
+            continue
+        _check(row)
+        if row.time is not None and kept and kept[-1].time is not None and row.time <= kept[-1].time:
+            if row.time < kept[-1].time:
+                raise MeasurementError(
+                    f"{row.where}: the time {row.time!r} is earlier than the one before, {kept[-1].time!r}: "
+                    "sort the file by its times"
+                )
+            doubled += 1
+            continue
+        kept.append(row)
+    if not kept:
+        raise MeasurementError(f"{path}: no position in it" + (f"; {empty} rows are empty" if empty else ""))
+    said = [*notes]
+    if empty:
+        said.append(f"{path}: left out {empty} rows without a position")
+    if doubled:
+        said.append(f"{path}: left out {doubled} positions of a time that another one has")
+    times = [row.time for row in kept if row.time is not None]
+    return Fixes(
+        Path(path),
+        torch.tensor([row[1:4] for row in kept], dtype=torch.float64, device="cpu"),
+        torch.tensor([row.std for row in kept], dtype=torch.float64, device="cpu"),
+        torch.tensor(times, dtype=torch.float64, device="cpu") if times else None,
+        () if times else tuple(row.name for row in kept),
+        tuple(said),
+    )
+
+
+def _check(row: Fix) -> None:
+    """Raise MeasurementError for a position that is none of the Earth's, or an error that is none."""
+    if not abs(row.latitude) <= 90:
+        hint = ": are latitude and longitude swapped?" if abs(row.longitude) <= 90 else ""
+        raise MeasurementError(
+            f"{row.where}: a latitude of {row.latitude:g} degrees is beyond the poles{hint}"
+        )
+    if not abs(row.longitude) <= 360:
+        raise MeasurementError(f"{row.where}: a longitude of {row.longitude:g} degrees is beyond 180")
+    if not (math.isnan(row.altitude) or abs(row.altitude) <= MAX_ALTITUDE):
+        raise MeasurementError(
+            f"{row.where}: an altitude of {row.altitude:g} is no altitude in meters above the ground of the Earth"
+        )
+    for std in row.std:
+        if not (math.isnan(std) or 0 < std < math.inf):
+            raise MeasurementError(f"{row.where}: a standard deviation of {std:g} m is not above zero")
 
 
 def read_fixes(path: str | Path) -> Fixes:
@@ -65,8 +183,8 @@ def read_fixes(path: str | Path) -> Fixes:
 
 
 def _csv_rows(path: Path) -> Iterator[Fix]:
-    for row in read_csv(path, POSITION_COLUMNS, MeasurementError):
-        if not row.time_column and "name" not in row.cells:
+    for row in read_table(path, COLUMNS, MeasurementError):
+        if not row.has_time and "name" not in row.cells:
             raise MeasurementError(f"{row.where}: neither a `time` nor the `name` of an image")
         if "latitude" not in row.cells and "longitude" not in row.cells and "altitude" in row.cells:
             raise MeasurementError(f"{row.where}: no `latitude` and `longitude`, in degrees")
@@ -75,7 +193,7 @@ def _csv_rows(path: Path) -> Iterator[Fix]:
             row.number("latitude"),
             row.number("longitude"),
             row.number("altitude"),
-            row.time() if row.time_column else None,
+            row.time() if row.has_time else None,
             row.cells.get("name", ""),
             (row.number("std_horizontal"), row.number("std_vertical")),
         )
@@ -181,7 +299,7 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
                 f"{where}: no time; a route that was planned says nothing about the images"
             )
         latitude, longitude, altitude = (
-            _number(text, where)
+            math.nan if text == "nan" else parse_number(text, where, MeasurementError)
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
         )
         yield Fix(where, latitude, longitude, altitude, time=time)
@@ -190,13 +308,6 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
 def _tag(element: ElementTree.Element) -> str:
     """The name of an element without its namespace."""
     return element.tag.rpartition("}")[2]
-
-
-def _number(text: str, where: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise MeasurementError(f"{where}: `{text}` is not a number") from None
 
 
 # --- NMEA ----------------------------------------------------------------------------------------------------
@@ -251,7 +362,7 @@ def _nmea_rows(rows: list[tuple[str, list[str]]]) -> Iterator[Fix]:
             where,
             _degrees(fields[at], fields[at + 1], "NS", where) if has_fix else math.nan,
             _degrees(fields[at + 2], fields[at + 3], "EW", where) if has_fix else math.nan,
-            _number(fields[9] or "nan", where) if is_gga else math.nan,
+            parse_number(fields[9], where, MeasurementError) if is_gga and fields[9] else math.nan,
             time=last,
         )
 

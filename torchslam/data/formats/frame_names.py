@@ -170,7 +170,8 @@ def sort_out(files: Iterable[Path], where: Path) -> Found:
         else:
             left_out[kind] += 1
     series = _series(frames)
-    rivals = [name for name, numbers in series.items() if numbers & set().union(*_others(series, name))]
+    shared = Counter(number for numbers in series.values() for number in numbers)
+    rivals = [name for name, numbers in series.items() if any(shared[number] > 1 for number in numbers)]
     if len(rivals) > 1:
         globs = " or ".join(f"'{where / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
         raise SequenceError(f"{where}: several series of images that count alike; which one? Give {globs}")
@@ -220,10 +221,6 @@ def _series(files: list[Path]) -> dict[str, set[str]]:
         if "#" in name:
             series.setdefault(name, set()).add("-".join(str(int(n)) for n in re.findall(r"\d+", file.stem)))
     return series
-
-
-def _others(series: dict[str, set[str]], name: str) -> list[set[str]]:
-    return [numbers for other, numbers in series.items() if other != name]
 
 
 def is_pattern(path: str) -> bool:

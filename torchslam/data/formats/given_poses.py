@@ -20,9 +20,9 @@ from torchslam.data.calibration import Calibration
 from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.text_file import parse_floats, read_text
-from torchslam.data.trajectories import nearest, read_trajectory
+from torchslam.data.trajectories import nearest, poses_from_rows, read_trajectory
 from torchslam.errors import CalibrationError, FrameError, TrajectoryError
-from torchslam.geometry.lie import matrix_from_quaternion, rigid, se3_inverse
+from torchslam.geometry.lie import rigid, se3_inverse
 from torchslam.geometry.transforms import opengl
 from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
@@ -177,13 +177,11 @@ def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
     if not images:
         raise TrajectoryError(f"{folder}: no images in the model")
     table = torch.tensor([numbers for _, numbers in images], dtype=torch.float64, device="cpu")
-    if not bool(table.isfinite().all()) or bool((table[:, :4].norm(dim=-1) - 1).abs().gt(0.05).any()):
-        raise TrajectoryError(f"{folder}: a quaternion that does not have unit length, or no number")
-    quaternions = table[:, :4].roll(-1, dims=-1) / table[:, :4].norm(dim=-1, keepdim=True)
-    T_cw = rigid(matrix_from_quaternion(quaternions), table[:, 4:])
+    names = tuple(name for name, _ in images)
+    T_cw = poses_from_rows(table[:, [4, 5, 6, 1, 2, 3, 0]], [f"{folder}: {name}" for name in names])
     text = folder / "cameras.txt"
     calibration = _binary_camera(folder / "cameras.bin") if binary else read_calibration(text)
-    return GivenPoses(COLMAP, folder, T_cw, None, tuple(name for name, _ in images), calibration)
+    return GivenPoses(COLMAP, folder, T_cw, None, names, calibration)
 
 
 def _text_images(path: Path) -> list[tuple[str, list[float]]]:
@@ -193,7 +191,8 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
         if line.startswith("#"):
             continue
         words = line.split(maxsplit=9)
-        if not words or (is_points and _are_points(line.split())):
+        numbers = line.split()  # observations in threes; ten words are an image whose name is a number
+        if not words or (is_points and len(numbers) != 10 and _are_numbers(numbers)):
             is_points = False
             continue
         if len(words) != 10:
@@ -201,12 +200,6 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
         images.append((words[9].strip(), parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)))
         is_points = True
     return images
-
-
-def _are_points(words: list[str]) -> bool:
-    """Whether a line is of observations: numbers alone, in threes, of which the last may be cut; a line of ten words is
-    that of an image whose name is a number."""
-    return len(words) != 10 and _are_numbers(words)
 
 
 def _are_numbers(words: list[str]) -> bool:

@@ -8,7 +8,7 @@ Mountings are Kalibr's camchain-imucam, EuRoC's sensor.yaml of the camera, ORB-S
 
 from __future__ import annotations
 
-import re
+import math
 from pathlib import Path
 
 import numpy as np
@@ -17,22 +17,17 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.formats.calibration_files import Keys, read_keys
-from torchslam.data.formats.csv_tables import UNITS
+from torchslam.data.formats.csv_tables import TIME_UNITS, Column, read_table
 from torchslam.data.inertial import InertialCalibration, InertialSamples
-from torchslam.data.text_file import parse_floats, read_text
 from torchslam.data.trajectories import ORTHOGONAL
 from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.geometry.lie import rigid, se3_inverse
 
-DELIMITERS = (",", ";", "\t")
-"""Between columns, in the order in which they are looked for; spaces otherwise."""
 TIMES = ("timestamp", "time", "t", "secondselapsed", "elapsed", "seconds")
 AXES = ("x", "y", "z")
 GYROSCOPES = ("wrss", "gyro", "gyroscope", "gyr", "g", "w", "omega", "angularvelocity", "rotationrate")
 ACCELEROMETERS = ("arss", "acc", "accel", "accelerometer", "acceleration", "a", "linearacceleration")
 """Names of columns without their axis, in lower case, letters alone."""
-TIME_UNITS = {**UNITS, "sec": 1.0, "µs": 1e-6}
-"""Units of times by their letters, in seconds."""
 RATE_UNITS = {
     **dict.fromkeys(("rads", "radsec", "rads1", "rad"), 1.0),
     **dict.fromkeys(("degs", "degsec", "degs1", "deg", "dps", "°s"), np.pi / 180),
@@ -46,6 +41,12 @@ FORCE_UNITS = {
     "mg": 1e-3 * STANDARD_GRAVITY,
 }
 """Units by their letters and digits, in m/s^2."""
+COLUMNS = {
+    "time": Column(TIMES, TIME_UNITS),
+    **{f"gyro_{axis}": Column(tuple(word + axis for word in GYROSCOPES), RATE_UNITS) for axis in AXES},
+    **{f"acc_{axis}": Column(tuple(word + axis for word in ACCELEROMETERS), FORCE_UNITS) for axis in AXES},
+}
+"""Kinds of columns."""
 SHORTEST_PERIOD = 2e-4
 """Seconds; with a thousand times of it, 0.2 s, one unit of time alone is possible. Sensors have 1e-3 to 0.1 s."""
 FORCE_RANGE = (7.0, 13.0)
@@ -75,25 +76,28 @@ def read_imu(path: str | Path) -> InertialSamples:
             increase, no gravity in the forces.
     """
     path = Path(path) / "data.csv" if Path(path).is_dir() else Path(path)
-    lines = read_text(path, MeasurementError).splitlines()
-    header = next((number for number, line in enumerate(lines) if line.strip()), None)
-    if header is None:
-        raise MeasurementError(f"{path}: no samples")
-    first = lines[header].lstrip("\ufeff# ")
-    delimiter = next((mark for mark in DELIMITERS if mark in first), None)
-    columns, units = _columns([name.strip(" \"'") for name in first.split(delimiter)], path)
-    table = _numbers(path, lines, header, delimiter, columns)
-    if len(table) < 2:
-        raise MeasurementError(f"{path}: {len(table)} samples; at least two are needed")
+    units: dict[str, float] = {}
+    rows = []
+    for row in read_table(path, COLUMNS, MeasurementError, needed=COLUMNS, are_unique=False):
+        units = dict(row.units)
+        rows.append([row.number(column) for column in COLUMNS])
+        if any(map(math.isnan, rows[-1])):
+            empty = next(name for name, number in zip(COLUMNS, rows[-1], strict=True) if math.isnan(number))
+            raise MeasurementError(f"{row.where}: no number in column {empty}")
+    if len(rows) < 2:
+        raise MeasurementError(f"{path}: {len(rows)} samples; at least two are needed")
+    for kind in ("gyro", "acc"):
+        if len({str(units[f"{kind}_{axis}"]) for axis in AXES}) > 1:
+            raise MeasurementError(f"{path}: the axes of a sensor have different units")
+    table = np.array(rows)
     times = table[:, 0] - table[0, 0]
     late = np.nonzero(np.diff(times) <= 0)[0]
     if len(late):
         raise MeasurementError(
             f"{path}: sample {late[0] + 2} is not later than the one before, of {len(table)} samples"
         )
-    unit = units[0] if units[0] is not None else _unit_of_times(times, path)
-    gyroscope = table[:, 1:4] * (units[1] or 1.0)
-    accelerometer = table[:, 4:] * (units[2] or 1.0)
+    unit = _unit_of_times(times, path) if math.isnan(units["time"]) else 1.0
+    gyroscope, accelerometer = table[:, 1:4], table[:, 4:]
     if np.abs(gyroscope).max() > FASTEST:
         raise MeasurementError(
             f"{path}: a rate of {np.abs(gyroscope).max():.0f} rad/s is too fast; state the unit, as in gyro_x [deg/s]"
@@ -108,85 +112,6 @@ def read_imu(path: str | Path) -> InertialSamples:
         torch.from_numpy(np.ascontiguousarray(x)) for x in (table[:, 0] * unit, gyroscope, accelerometer)
     )
     return InertialSamples(seconds, rates, forces, str(path))
-
-
-def _columns(names: list[str], path: Path) -> tuple[list[int], tuple[float | None, ...]]:
-    """Where time, rates and forces are, and their units; None where they are not stated."""
-    found: dict[str, tuple[int, float | None]] = {}
-    kinds = (
-        ("time", TIMES, TIME_UNITS),
-        ("gyro", GYROSCOPES, RATE_UNITS),
-        ("acc", ACCELEROMETERS, FORCE_UNITS),
-    )
-    for column, name in enumerate(names):
-        for kind, words, known in kinds:
-            parsed = _parsed(
-                name, words, known, with_axis=kind != "time", where=f"{path}: column `{name[:80]}`"
-            )
-            if parsed is not None:
-                found.setdefault(f"{kind}{parsed[0]}", (column, parsed[1]))
-    wanted = ("time", *(f"{kind}_{axis}" for kind in ("gyro", "acc") for axis in AXES))
-    missing = [name for name in wanted if name not in found]
-    if missing:
-        raise MeasurementError(
-            f"{path}: no column {missing[0]} in the header `{', '.join(names)[:200]}`; needed are "
-            f"{', '.join(wanted)}, with units as in gyro_x [deg/s]"
-        )
-    units = [{found[name][1] for name in group} for group in (wanted[:1], wanted[1:4], wanted[4:])]
-    if any(len(each) > 1 for each in units):
-        raise MeasurementError(
-            f"{path}: the axes of a sensor have different units: `{', '.join(names)[:200]}`"
-        )
-    return [found[name][0] for name in wanted], tuple(each.pop() for each in units)
-
-
-def _parsed(
-    name: str, words: tuple[str, ...], units: dict[str, float], with_axis: bool, where: str
-) -> tuple[str, float | None] | None:
-    """The axis, such as `_x`, and the unit of a column; None if it is another kind of column."""
-    bare, *brackets = re.split(r"[\[(]", name.lower(), maxsplit=1)
-    bracket = "".join(brackets)
-    parts = [part for part in re.split(r"[^a-z0-9µ°]+", bare) if part]
-    unit = re.sub(r"[^a-z0-9µ°]", "", bracket.replace("²", "2"))
-    for length in range(len(parts), 0, -1):
-        head, tail = "".join(parts[:length]), "".join(parts[length:])
-        axis = ""
-        if with_axis:
-            if head[-1:] not in AXES:
-                continue
-            head, axis = head[:-1], f"_{head[-1]}"
-        if head not in words:
-            continue
-        unit = unit or tail
-        if unit and unit not in units:
-            raise MeasurementError(f"{where}: the unit `{unit}` is not known; known are {', '.join(units)}")
-        return axis, units[unit] if unit else None
-    return None
-
-
-def _numbers(
-    path: Path, lines: list[str], header: int, delimiter: str | None, columns: list[int]
-) -> Float[np.ndarray, "M 7"]:
-    """The numbers of some columns in all lines behind the header."""
-    rows = lines[header + 1 :]
-    if not any(row.strip() for row in rows):
-        raise MeasurementError(f"{path}: no samples")
-    try:
-        table = np.loadtxt(rows, dtype=np.float64, ndmin=2, delimiter=delimiter, usecols=columns)
-    except ValueError:
-        table = np.full((1, 1), np.nan)  # which line is wrong follows
-    if np.isfinite(table).all():
-        return table
-    for number, row in enumerate(rows, start=header + 2):
-        words = row.split("#")[0].split(delimiter)
-        if "".join(words).strip():
-            where = f"{path}:{number}"
-            cells = [words[column].strip() if column < len(words) else "" for column in columns]
-            if not all(cells):
-                raise MeasurementError(f"{where}: no number in column {columns[cells.index('')] + 1}")
-            for cell in cells:
-                parse_floats(cell, where, MeasurementError)
-    raise MeasurementError(f"{path}: the samples cannot be read")
 
 
 def _unit_of_times(times: np.ndarray, path: Path) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,19 +10,19 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.formats.csv_tables import read_csv
-from torchslam.data.text_file import check_later, in_seconds, numbered_lines, parse_floats
+from torchslam.data.formats.csv_tables import TIMES, Column, read_table
+from torchslam.data.text_file import check_later, in_seconds, number_rows, numbered_lines
 from torchslam.errors import MeasurementError
 
 MAX_SPEED = 1000.0
 """Meters per second that a speed may be at most: airplanes fly at 250."""
-COLUMNS = {
-    "speed": ("speed", "speed_m_s", "speed_mps", "velocity"),
-    "km_h": ("speed_km_h", "speed_kmh", "speed_kph"),
-}
-"""Kinds of columns and what they are called."""
 KM_H = 1 / 3.6
 """Meters per second of a kilometer per hour."""
+COLUMNS = {
+    **TIMES,
+    "speed": Column(("speed", "velocity"), {"ms": 1.0, "mps": 1.0, "kmh": KM_H, "kph": KM_H}),
+}
+"""Kinds of columns."""
 
 
 @dataclass(frozen=True)
@@ -59,24 +60,16 @@ def read_speeds(path: str | Path) -> Speeds:
     return Speeds(Path(path), table[0], table[1])
 
 
-def _rows(path: Path) -> list[tuple[str, float, float]]:
+def _rows(path: Path) -> Iterator[tuple[str, float, float]]:
     """Place, time in seconds and speed of each line."""
-    lines = list(numbered_lines(path, MeasurementError))
-    if lines and not any(character.isalpha() for character in lines[0][1].lower().replace("e", "")):
-        found = []
-        for number, line in lines:
-            where = f"{path}:{number}"
-            numbers = parse_floats(line, where, MeasurementError)
-            if len(numbers) != 2:
-                raise MeasurementError(f"{where}: expected a time and a speed, got {len(numbers)} numbers")
-            found.append((where, in_seconds(numbers[0], where, MeasurementError), numbers[1]))
-        return found
-    found = []
-    for row in read_csv(path, COLUMNS, MeasurementError):
-        if not row.time_column or not ("speed" in row.cells or "km_h" in row.cells):
+    line = next(numbered_lines(path, MeasurementError), (0, ""))[1]
+    if not any(character.isalpha() for character in line.lower().replace("e", "")):
+        for where, (time, speed) in number_rows(path, "time speed", MeasurementError):
+            yield where, in_seconds(time, where, MeasurementError), speed
+        return
+    for row in read_table(path, COLUMNS, MeasurementError):
+        if not row.has_time or "speed" not in row.cells:
             raise MeasurementError(
                 f"{row.where}: no `time` or no `speed`, in meters per second (or `speed_km_h`)"
             )
-        speed = row.number("speed") if "speed" in row.cells else KM_H * row.number("km_h")
-        found.append((row.where, row.time(), speed))
-    return found
+        yield row.where, row.time(), row.number("speed")

@@ -17,9 +17,8 @@ from torchslam.data.formats.calibration_files import read_calibration, read_matr
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
 from torchslam.data.text_file import check_later, numbered_lines, parse_count, parse_floats
-from torchslam.data.trajectories import checked_poses
+from torchslam.data.trajectories import poses_from_rows
 from torchslam.errors import SequenceError, TrajectoryError
-from torchslam.geometry.lie import matrix_from_quaternion, rigid
 from torchslam.types import Trajectory
 
 NANOSECONDS = 1_000_000_000
@@ -27,11 +26,6 @@ NANOSECONDS = 1_000_000_000
 IMU = "imu0"
 """Folder of the inertial sensor, whose frame is the body's."""
 TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
-
-
-def _is_euroc(path: str) -> bool:
-    """Return True if the folder, or its `mav0`, has a camera in this layout."""
-    return (_root(Path(path)) / "cam0" / "data.csv").is_file()
 
 
 def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -48,7 +42,9 @@ def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> Im
         notes = [f"no {sensor}: the camera is unknown unless --camera is given{unused}"]
     else:
         camera = camera if camera is not None else read_calibration(sensor)
-        groundtruth = _read_body_poses(root / TRUTH, _read_extrinsics(sensor)) if has_truth else None
+        if has_truth:
+            T_bc = torch.tensor(read_matrix(sensor, "T_BS", 16), dtype=torch.float64, device="cpu").view(4, 4)
+            groundtruth = _read_body_poses(root / TRUTH, T_bc)
     name = folder.resolve().parent.name if folder.name == "mav0" else folder.name
     sequence = ImageSequence(name, "EuRoC folder", _read_images(root / "cam0"), camera, groundtruth, notes)
     if sensor.exists() and (root / IMU / "data.csv").is_file():
@@ -73,14 +69,10 @@ def _read_images(folder: Path) -> list[ImageEntry]:
     return entries
 
 
-def _read_extrinsics(path: Path) -> Float[Tensor, "4 4"]:
-    """T_bc: camera to body."""
-    return torch.tensor(read_matrix(path, "T_BS", 16), dtype=torch.float64, device="cpu").view(4, 4)
-
-
 def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
     """Camera poses from the body's: nanoseconds, position, quaternion wxyz, then velocity and biases."""
     times: list[float] = []
+    places: list[str] = []
     rows: list[list[float]] = []
     for number, line in numbered_lines(path, TrajectoryError):
         where = f"{path}:{number}"
@@ -92,13 +84,16 @@ def _read_body_poses(path: Path, T_bc: Float[Tensor, "4 4"]) -> Trajectory:
         times.append(nanoseconds / NANOSECONDS)
         if rows:
             check_later(times[-1], times[-2], where, TrajectoryError)
-        rows.append(row[:7])
+        places.append(where)
+        rows.append([*row[:3], *row[4:7], row[3]])
     if not rows:
         raise TrajectoryError(f"{path}: no poses")
-    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
-    T_wb = rigid(matrix_from_quaternion(table[:, [4, 5, 6, 3]]), table[:, :3])
-    T_wc = checked_poses(T_wb @ T_bc, path)
-    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
+    T_wb = poses_from_rows(torch.tensor(rows, dtype=torch.float64, device="cpu"), places)
+    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wb @ T_bc)
 
 
-EUROC = Reader("mav0/cam0/data.csv (EuRoC)", _is_euroc, _open_euroc)
+EUROC = Reader(
+    "mav0/cam0/data.csv (EuRoC)",
+    lambda path: (_root(Path(path)) / "cam0" / "data.csv").is_file(),
+    _open_euroc,
+)

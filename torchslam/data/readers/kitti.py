@@ -19,9 +19,9 @@ from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.oxts import Packet, read_day_times, read_oxts
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
-from torchslam.data.text_file import in_seconds, numbered_lines, parse_floats, read_text
+from torchslam.data.text_file import in_seconds, number_rows, numbered_lines, parse_floats, read_text
 from torchslam.data.trajectories import checked_poses
-from torchslam.errors import CalibrationError, SequenceError, TorchslamError, TrajectoryError
+from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.types import Trajectory
 
@@ -29,6 +29,7 @@ CAMERAS = ("image_0", "image_2")
 RAW_CAMERAS = ("image_00", "image_02")
 """The left cameras, gray and color."""
 CALIBRATION = "calib_cam_to_cam.txt"
+POSE_COLUMNS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 EARTH_RADIUS = 6378137.0  # meters
 
 
@@ -58,10 +59,11 @@ def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> Im
             f"{path}: no times.txt, which comes with calib.txt in data_odometry_calib.zip; {folder} alone is read as "
             "images of --fps 10, with --camera"
         )
-    listed, rows = base / "times.txt", _read_table(base / "times.txt", 1, SequenceError)[:, 0].tolist()
-    times = torch.tensor(
-        [in_seconds(time, str(listed), SequenceError) for time in rows], dtype=torch.float64, device="cpu"
-    )
+    seconds = [
+        in_seconds(time, where, SequenceError)
+        for where, (time,) in number_rows(base / "times.txt", "time", SequenceError)
+    ]
+    times = torch.tensor(seconds, dtype=torch.float64, device="cpu")
     found = find_frames(folder)
     images = found.frames
     if len(images) != len(times):
@@ -101,32 +103,14 @@ def _read_odometry_poses(path: Path, times: Float[Tensor, " N"], offset_x: float
     found = next((candidate for candidate in candidates if candidate.is_file()), None)
     if found is None:
         return None
-    rows = _read_table(found, 12, TrajectoryError)
+    rows = [row for _, row in number_rows(found, POSE_COLUMNS, TrajectoryError)]
     if len(rows) != len(times):
         raise TrajectoryError(f"{found}: {len(rows)} poses for {len(times)} times")
     T_w0 = torch.eye(4, dtype=torch.float64, device="cpu").repeat(len(rows), 1, 1)
-    T_w0[:, :3] = rows.view(-1, 3, 4)
+    T_w0[:, :3] = torch.tensor(rows, dtype=torch.float64, device="cpu").view(-1, 3, 4)
     T_0c = torch.eye(4, dtype=torch.float64, device="cpu")
     T_0c[0, 3] = -offset_x
     return Trajectory(times, checked_poses(T_w0 @ T_0c, found))
-
-
-def _read_table(path: Path, columns: int, error: type[TorchslamError]) -> Float[Tensor, "N {columns}"]:
-    """Numbers, one row a line."""
-    rows = []
-    for number, line in numbered_lines(path, error):
-        row = parse_floats(line, f"{path}:{number}", error)
-        if len(row) != columns:
-            raise error(f"{path}:{number}: expected {columns} numbers, got {len(row)}")
-        rows.append(row)
-    if not rows:
-        raise error(f"{path}: is empty")
-    return torch.tensor(rows, dtype=torch.float64, device="cpu")
-
-
-def _is_kitti_raw(path: str) -> bool:
-    """Return True for a drive (`2011_09_26_drive_0001_sync`)."""
-    return _raw_camera(Path(path)) is not None
 
 
 def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -241,4 +225,8 @@ def _poses_of(packets: list[Packet]) -> Float[Tensor, "N 4 4"]:
 
 
 KITTI = Reader("image_0/ or image_2/ with times.txt (KITTI odometry)", _is_kitti, _open_kitti)
-KITTI_RAW = Reader("image_00/data/ with timestamps.txt (KITTI raw)", _is_kitti_raw, _open_kitti_raw)
+KITTI_RAW = Reader(
+    "image_00/data/ with timestamps.txt (KITTI raw)",
+    lambda path: _raw_camera(Path(path)) is not None,
+    _open_kitti_raw,
+)

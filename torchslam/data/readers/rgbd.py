@@ -11,7 +11,6 @@ TartanAir    `image_left/` and `pose_left.txt`, in version 2 with `lcam_front` i
 
 from __future__ import annotations
 
-import math
 import re
 import shlex
 from pathlib import Path
@@ -31,10 +30,11 @@ from torchslam.data.readers.image_sequence import (
     find_calibration,
 )
 from torchslam.data.sequence import Reader
-from torchslam.data.text_file import in_seconds, numbered_lines, parse_count, parse_floats
-from torchslam.data.trajectories import checked_poses, read_trajectory
+from torchslam.data.text_file import listed_files, number_rows, parse_count, read_text
+from torchslam.data.trajectories import ORTHOGONAL, checked_poses, poses_from_rows, read_trajectory
 from torchslam.errors import SequenceError, TrajectoryError
-from torchslam.geometry.lie import matrix_from_quaternion, rigid
+from torchslam.geometry.lie import rigid
+from torchslam.geometry.similarity import nearest_rotation
 from torchslam.types import Trajectory
 
 FREIBURG = re.compile(r"freiburg([123])(?!\d)")
@@ -45,16 +45,9 @@ points down, so that camera and world are mirrored."""
 SEVEN_SCENES_COLOR = "frame-*.color.png"
 SEVEN_SCENES_DEPTH_CAMERA = "585,585,320,240"
 """Of the depth images, which are not registered to the color images; the page of the dataset has it."""
-ORTHOGONAL = 0.05
-"""Tolerated deviation of R R^T from the identity; fused poses are printed with few digits."""
 TARTANAIR_CAMERAS = ("left", "lcam_front")
 TARTANAIR_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
 """The axes of our cameras, right, down, forward, as columns in the dataset's: forward, right, down."""
-
-
-def _is_tum(path: str) -> bool:
-    """Return True if the folder has a list of images."""
-    return (Path(path) / "rgb.txt").is_file()
 
 
 def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -64,7 +57,9 @@ def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> Imag
     Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     folder = Path(path)
-    entries = read_image_list(folder / "rgb.txt")
+    entries = [
+        ImageEntry(time, file, where) for where, time, file in listed_files(folder / "rgb.txt", SequenceError)
+    ]
     camera = camera if camera is not None else find_calibration(folder)
     robot = FREIBURG.search(folder.resolve().name)
     if camera is None and robot is not None:
@@ -82,30 +77,6 @@ def _with_depth(sequence: ImageSequence, path: Path, camera: str = "") -> ImageS
             {"depth_camera": camera} if camera else {}
         )
     return sequence
-
-
-def read_image_list(path: Path) -> list[ImageEntry]:
-    """The lines `timestamp file` of a list. Raises SequenceError naming file and line."""
-    entries = []
-    for number, line in numbered_lines(path, SequenceError):
-        where = f"{path}:{number}"
-        words = line.split(maxsplit=1)
-        try:
-            timestamp = float(words[0])
-        except ValueError:
-            timestamp = math.nan
-        if len(words) != 2 or not math.isfinite(timestamp):
-            raise SequenceError(f"{where}: expected `timestamp file`, got `{line}`")
-        timestamp = in_seconds(timestamp, where, SequenceError)
-        entries.append(ImageEntry(timestamp, path.parent / words[1], where))
-    if not entries:
-        raise SequenceError(f"{path}: no images are listed")
-    return entries
-
-
-def _is_icl_nuim(path: str) -> bool:
-    """Return True if the folder has images and a trajectory of this dataset."""
-    return (Path(path) / "rgb").is_dir() and next(Path(path).glob(ICL_TRUTH), None) is not None
 
 
 def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -126,11 +97,6 @@ def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) ->
     camera = PRESETS["icl"] if camera is None else camera
     sequence = ImageSequence(folder.name, "ICL-NUIM folder", entries, camera, groundtruth, found.notes)
     return _with_depth(sequence, folder / "depth")
-
-
-def _is_seven_scenes(path: str) -> bool:
-    """Return True if the folder has color frames with the names of this dataset."""
-    return Path(path).is_dir() and next(Path(path).glob(SEVEN_SCENES_COLOR), None) is not None
 
 
 def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -162,26 +128,17 @@ def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None
 
 def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:
     """T_wc; None where tracking had failed: the dataset then writes numbers that are no rotation."""
-    rows = []
-    for number, line in numbered_lines(path, TrajectoryError):
-        if "nan" in line.lower() or "inf" in line.lower():
-            return None
-        rows.append(parse_floats(line, f"{path}:{number}", TrajectoryError))
-    if [len(row) for row in rows] != [4, 4, 4, 4]:
+    text = read_text(path, TrajectoryError).lower()
+    if "nan" in text or "inf" in text:
+        return None
+    rows = [row for _, row in number_rows(path, "r1 r2 r3 t", TrajectoryError)]
+    if len(rows) != 4:
         raise TrajectoryError(f"{path}: expected four lines of four numbers")
     T_wc = torch.tensor(rows, dtype=torch.float64, device="cpu")
     R = T_wc[:3, :3]
     if (R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs().max() > ORTHOGONAL:
         return None
-    # The nearest rotation: poses are printed with few digits.
-    U, _, Vh = torch.linalg.svd(R)
-    T_wc[:3, :3] = U @ Vh
-    return checked_poses(T_wc, path)
-
-
-def _is_tartanair(path: str) -> bool:
-    """Return True for a trajectory (`P000`) of the dataset."""
-    return _tartanair_camera(Path(path)) is not None
+    return checked_poses(rigid(nearest_rotation(R), T_wc[:3, 3])[None], path)[0]
 
 
 def _open_tartanair(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -207,24 +164,28 @@ def _tartanair_camera(folder: Path) -> str | None:
 
 def _read_tartanair_poses(path: Path, times: list[float]) -> Trajectory:
     """One line `tx ty tz qx qy qz qw` per frame."""
-    rows = []
-    for number, line in numbered_lines(path, TrajectoryError):
-        row = parse_floats(line, f"{path}:{number}", TrajectoryError)
-        if len(row) != 7 or abs(sum(value * value for value in row[3:]) - 1.0) > 0.1:
-            raise TrajectoryError(
-                f"{path}:{number}: expected `tx ty tz qx qy qz qw` of unit length, got `{line}`"
-            )
-        rows.append(row)
+    places, rows = zip(*number_rows(path, "tx ty tz qx qy qz qw", TrajectoryError), strict=True)
     if len(rows) != len(times):
         raise TrajectoryError(f"{path}: {len(rows)} poses for {len(times)} images")
-    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
-    quaternions = table[:, 3:] / table[:, 3:].norm(dim=-1, keepdim=True)
-    R = matrix_from_quaternion(quaternions) @ torch.tensor(TARTANAIR_AXES, dtype=torch.float64, device="cpu")
-    T_wc = checked_poses(rigid(R, table[:, :3]), path)
+    T_wc = poses_from_rows(torch.tensor(rows, dtype=torch.float64, device="cpu"), places)
+    axes = torch.tensor(TARTANAIR_AXES, dtype=torch.float64, device="cpu")
+    T_wc = rigid(T_wc[:, :3, :3] @ axes, T_wc[:, :3, 3])
     return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
 
 
-TUM = Reader("rgb.txt (ETH3D, TUM)", _is_tum, _open_tum)
-ICL_NUIM = Reader("rgb/ with *.gt.freiburg (ICL-NUIM)", _is_icl_nuim, _open_icl_nuim)
-SEVEN_SCENES = Reader("frame-*.color.png (7-Scenes)", _is_seven_scenes, _open_seven_scenes)
-TARTANAIR = Reader("image_left/ with pose_left.txt (TartanAir)", _is_tartanair, _open_tartanair)
+TUM = Reader("rgb.txt (ETH3D, TUM)", lambda path: Path(path, "rgb.txt").is_file(), _open_tum)
+ICL_NUIM = Reader(
+    "rgb/ with *.gt.freiburg (ICL-NUIM)",
+    lambda path: Path(path, "rgb").is_dir() and any(Path(path).glob(ICL_TRUTH)),
+    _open_icl_nuim,
+)
+SEVEN_SCENES = Reader(
+    "frame-*.color.png (7-Scenes)",
+    lambda path: Path(path).is_dir() and any(Path(path).glob(SEVEN_SCENES_COLOR)),
+    _open_seven_scenes,
+)
+TARTANAIR = Reader(
+    "image_left/ with pose_left.txt (TartanAir)",
+    lambda path: _tartanair_camera(Path(path)) is not None,
+    _open_tartanair,
+)

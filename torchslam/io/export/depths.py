@@ -6,7 +6,6 @@ then float32 numbers, of which those along a row of the image are neighbors, and
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
@@ -15,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchslam.data.transforms import scale_camera
 from torchslam.dense.cloud import PointCloud
 from torchslam.dense.depth_maps import DepthMaps
 from torchslam.geometry import Camera
@@ -29,21 +29,6 @@ MAX_POINTS = 500_000
 NEIGHBORS = 20  # COLMAP's default: images that it compares a depth map with
 
 
-def depth_images(path: Path) -> Iterator[DepthMaps]:
-    """Read the depth maps of a file one by one. Raises ResultsError."""
-    for block in DepthMaps.blocks(path):
-        for row in range(len(block)):
-            rows = slice(row, row + 1)
-            yield DepthMaps(
-                block.frame_index[rows],
-                block.depth[rows],
-                block.normal[rows],
-                block.confidence[rows],
-                block.T_cw[rows],
-                block.camera,
-            )
-
-
 def depth_png(depth: Float[Tensor, "H W"]) -> bytes:
     """Encode depth as a 16-bit PNG image in UNIT; 0 where it is unknown."""
     units = (depth.double() / UNIT).round()
@@ -55,11 +40,7 @@ def enlarged(pinhole: Camera, camera: Camera) -> Camera:
     """The camera of a depth map, for images as large as those of the camera that it was made from."""
     factor = max(1.0, float(camera.params[0] / pinhole.params[0]))
     size = (round(factor * pinhole.width), round(factor * pinhole.height))
-    scale = torch.tensor(size, device="cpu").to(pinhole.params) / torch.tensor(pinhole.size, device="cpu").to(
-        pinhole.params
-    )
-    center = (pinhole.params[2:] + 0.5) * scale - 0.5
-    return Camera("pinhole", torch.cat((pinhole.params[:2] * scale, center)), size)
+    return scale_camera(pinhole, size)
 
 
 def write_workspace(
@@ -79,7 +60,7 @@ def write_workspace(
         (stereo / kind).mkdir(parents=True, exist_ok=True)
         for old in (stereo / kind).glob("[0-9]" * 6 + ".png.*"):
             old.unlink()
-    for maps in depth_images(path):
+    for maps in DepthMaps.blocks(path, 1):
         name = f"{names[int(maps.frame_index)]}.geometric.bin"
         (stereo / "depth_maps" / name).write_bytes(colmap_map(maps.depth))
         (stereo / "normal_maps" / name).write_bytes(colmap_map(maps.normal[0]))

@@ -21,7 +21,6 @@ from torch import Tensor
 from torchslam.dense.depth_maps import DepthMaps, read_frames
 from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, se3_inverse, transform
-from torchslam.io.export.depths import depth_images
 from torchslam.io.export.scene import Images
 
 MIN_CONFIDENCE = 0.5
@@ -88,7 +87,7 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
         block_count=FIRST_BLOCKS,
         device=o3d.core.Device("CPU:0"),
     )
-    for maps in depth_images(depths):
+    for maps in DepthMaps.blocks(depths, 1):
         depth = o3d.t.geometry.Image(o3d.core.Tensor(_sure_depth(maps, middle).numpy()))
         color = o3d.t.geometry.Image(o3d.core.Tensor(_color(maps, images)))
         K = o3d.core.Tensor(maps.camera.K.double().numpy())
@@ -134,7 +133,7 @@ def _sure_depth(maps: DepthMaps, middle: float = math.inf) -> Float[Tensor, "H W
 
 def _median_depth(depths: Path) -> float:
     """The median over the maps of their median depths. Raises ResultsError without any depth."""
-    seen = [depth[depth > 0] for depth in map(_sure_depth, depth_images(depths))]
+    seen = [depth[depth > 0] for depth in map(_sure_depth, DepthMaps.blocks(depths, 1))]
     medians = [each.median() for each in seen if len(each)]
     if not medians:
         raise ResultsError(f"{depths}: no depth of a confidence of {MIN_CONFIDENCE} or more")
@@ -144,7 +143,7 @@ def _median_depth(depths: Path) -> float:
 def _voxel(depths: Path, middle: float) -> float:
     """The width of a voxel: what the depth maps resolve, or what memory allows."""
     points = []
-    for maps in depth_images(depths):
+    for maps in DepthMaps.blocks(depths, 1):
         depth = _sure_depth(maps, middle)[::BLOCK_STRIDE, ::BLOCK_STRIDE].double()
         v, u = (BLOCK_STRIDE * index for index in torch.nonzero(depth).T)
         rays_c = maps.camera.to(torch.float64).unproject(torch.stack((u, v), dim=-1).double())

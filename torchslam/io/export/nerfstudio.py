@@ -19,10 +19,11 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.dense.cloud import PointCloud
+from torchslam.dense.depth_maps import DepthMaps
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, opengl
-from torchslam.io.export.depths import MAX_POINTS, depth_images, depth_png
+from torchslam.io.export.depths import MAX_POINTS, depth_png
 from torchslam.io.export.ply import write_cloud, write_ply
 from torchslam.io.export.scene import ExportedScene
 
@@ -96,5 +97,5 @@ def write_nerfstudio(
 def _write_depths(folder: Path, scene: ExportedScene, depths: Path) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     names = dict(zip(scene.frame_ids.tolist(), scene.image_names, strict=True))
-    for maps in depth_images(depths):
+    for maps in DepthMaps.blocks(depths, 1):
         (folder / names[int(maps.frame_index)]).write_bytes(depth_png(maps.depth[0]))

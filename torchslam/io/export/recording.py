@@ -13,11 +13,11 @@ from jaxtyping import Float, Num, UInt8
 from torch import Tensor
 
 from torchslam.dense.cloud import PointCloud
-from torchslam.dense.depth_maps import read_frames
+from torchslam.dense.depth_maps import DepthMaps, read_frames
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.transforms import corner_camera, corner_pixels
-from torchslam.io.export.depths import MAX_POINTS, UNIT, depth_images, depth_png
+from torchslam.io.export.depths import MAX_POINTS, UNIT, depth_png
 from torchslam.io.export.scene import ExportedScene, Images
 
 APPLICATION = "torchslam"
@@ -175,7 +175,7 @@ def _record_depths(
     turn = torch.eye(4, dtype=torch.float64, device="cpu")
     turn[:3, :3] = R_up
     recorder.camera(DEPTH, camera)
-    for maps, time in zip(depth_images(depths), seconds.tolist(), strict=True):
+    for maps, time in zip(DepthMaps.blocks(depths, 1), seconds.tolist(), strict=True):
         recorder.at(int(maps.frame_index), time)
         recorder.pose(DEPTH, turn @ se3_inverse(maps.T_cw[0].double()))
         recorder.depth(DEPTH, maps.depth[0])

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, SensorModel, se3_inverse, transform
+from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, median_scale, weighted_median
 from torchslam.metric.markers.corners import GraphWithCorners, PlacedTarget, Sighting, add_corners
 from torchslam.metric.markers.detection import Detector, detector_of
 from torchslam.metric.markers.targets import Target, TargetKind, parse_target
@@ -87,7 +88,8 @@ class Markers:
             if not bool(solution.keyframes[0].success):
                 return Unmeasured(ScaleSource.MARKER, "the adjustment with the corners of the markers failed")
             measured = scale_of_targets(with_corners, solution, pixels)
-        submap.posed_frames.apply_solution(_detached(solution), graph, submap.map)
+        detached = replace(solution, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())
+        submap.posed_frames.apply_solution(detached, graph, submap.map)
         return measured
 
 
@@ -212,7 +214,7 @@ def _agreeing(
     used = torch.ones(len(targets), dtype=torch.bool, device=logs.device)
     lines = []
     while int(used.sum()) > 1:
-        middle = _weighted_median(logs[used], sizes.information[used])
+        middle = weighted_median(logs[used], sizes.information[used])
         off = torch.where(used, (logs - middle).abs(), 0.0)
         row = int(off.argmax())
         others = used.clone()
@@ -234,13 +236,6 @@ def _agreeing(
     return used, lines
 
 
-def _weighted_median(values: Float[Tensor, " N"], weights: Float[Tensor, " N"]) -> Float[Tensor, ""]:
-    """The value below which half of the weight lies."""
-    order = torch.argsort(values)
-    total = weights[order].cumsum(0)
-    return values[order][int(torch.searchsorted(total, total[-1] / 2))]
-
-
 def pixel_variances(with_corners: GraphWithCorners, solution: GraphSolution) -> Float[Tensor, " O"]:
     """Variances of all pixels, px^2: by the stated weights, calibrated by the residuals of keypoints and of corners."""
     graph = with_corners.graph
@@ -258,8 +253,7 @@ def pixel_variances(with_corners: GraphWithCorners, solution: GraphSolution) -> 
     variances = torch.empty_like(squared)
     for rows, unknowns in ((slice(0, first), 0), (slice(first, None), 3 * corners)):
         count = 2 * len(squared[rows])
-        # Half of the squares of two normal numbers are below 1.386; wrong observations do not count so.
-        factor = squared[rows].median() / (2 * math.log(2)) * count / max(count - unknowns, 1)
+        factor = median_scale(squared[rows], NORMAL_SQUARED_MEDIAN_2D) * count / max(count - unknowns, 1)
         variances[rows] = factor / weights[rows].clamp(min=1e-12)
     return variances
 
@@ -268,8 +262,3 @@ def _edges_apart(target: PlacedTarget, points_w: Float[Tensor, "N 3"]) -> float:
     """Relative standard deviation of the distances between all corners of one target."""
     true, found = (torch.pdist(corners) for corners in (target.corners, points_w[target.points]))
     return float((found / true).log().std())
-
-
-def _detached(solution: GraphSolution) -> GraphSolution:
-    """A solution without its gradient."""
-    return replace(solution, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())

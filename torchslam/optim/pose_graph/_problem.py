@@ -27,6 +27,7 @@ from torchslam.optim.pose_graph._sparse_cholesky import (
     build_block_structure,
     factorize_sparse,
 )
+from torchslam.utils.indexing import connected_parts
 
 
 @dataclass(frozen=True)
@@ -78,7 +79,7 @@ def build_pose_graph_layout(
     """Find the moving nodes and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
     i, j = edges.unbind(-1)
     num_nodes = fixed.shape[1]
-    part = connected_parts(edges, counted, fixed)
+    part = connected_parts(edges, fixed.shape[1], counted)
     is_first = part == torch.arange(num_nodes, device=part.device)
     stays = torch.where(fixed.any(1, keepdim=True), fixed, is_first)
     reached = torch.zeros_like(part).scatter_reduce(1, part, stays.long(), "amax").gather(1, part) > 0
@@ -98,27 +99,6 @@ def build_pose_graph_layout(
         Groups.of(torch.cat((i, j)), num_nodes),
         build_block_structure(num_nodes, dims, pairs),
     )
-
-
-def connected_parts(edges: Tensor, counted: Tensor, fixed: Tensor) -> Tensor:
-    """The first of the nodes that counted edges join, over others or not, with each node (B, K).
-
-    Every node points to one of its component with a number not above its own; edges hook these onto one another, and
-    pointers are shortened, until nothing changes: about log K rounds.
-    """
-    num_nodes = fixed.shape[1]
-    label = torch.arange(num_nodes, device=fixed.device).expand_as(fixed)
-    ends = edges.T.flatten()
-    while True:
-        at_ends = label[:, ends]
-        low = torch.minimum(*at_ends.chunk(2, dim=1))
-        low = torch.where(counted, low, num_nodes).repeat(1, 2)
-        hooked = label.scatter_reduce(1, at_ends, low, "amin")
-        hooked = hooked.scatter_reduce(1, ends.expand_as(low), low, "amin")
-        shortened = hooked.gather(1, hooked)
-        if torch.equal(shortened, label):
-            return label
-        label = shortened
 
 
 # A long loop resists bending as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
