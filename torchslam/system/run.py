@@ -408,22 +408,17 @@ class FinalAdjustment:
             self._solve(submap, given, progress, ROUGH)
         if is_main:
             # Before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
-            graph = submap.posed_frames.graph(submap.map, self.sensor)
-            found = estimate_sensor(graph, replace(self.prior, camera=None), FINAL, for_shaking=True)
-            self.sensor, self.shutter = found.sensor, found.shutter
+            self._estimate_readout(submap)
         submap.correct_keyframes(self.sensor)
         if not settled:
-            # Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map
-            # have removed that already, and what holds a weak link is often less exact than the rest.
-            seen = submap.map.observations()
-            wrong = ~passes_gate(squared_errors(submap.map, seen, self.sensor.camera), FINAL_CHI_SQUARE)
-            submap.map.remove_masked_observations(seen, wrong)
-            submap.posed_frames.remove_outliers(submap.map, self.sensor, FINAL_CHI_SQUARE, LEAST_RATIO)
+            self._reject(submap)
         if is_main:
             variance = noise_variance(submap.map, self.sensor.camera)
             self.sensor = replace(self.sensor, noise_variance=variance)
         if not settled:
             self._solve(submap, given, progress, ROUGH)
+            if is_main and self.sensor.readout is not None:
+                self._estimate_readout(submap)
         measured, evidence = given, None
         if given is not None:
             evidence = graph_evidence(self._graph(submap), given)
@@ -441,6 +436,23 @@ class FinalAdjustment:
         if measured is not None:
             self.given, self.calibration = given, replace(measured, camera=self.sensor.camera)
         self._store_covariances(submap, solution)
+
+    def _estimate_readout(self, submap: Submap) -> None:
+        graph = submap.posed_frames.graph(submap.map, self.sensor)
+        found = estimate_sensor(graph, replace(self.prior, camera=None), FINAL, for_shaking=True)
+        self.sensor = replace(self.sensor, readout=found.sensor.readout)
+        self.shutter = found.shutter
+
+    def _reject(self, submap: Submap) -> None:
+        """Remove observations that are far from their points.
+
+        Poses are right now where they can be, so that what is still far is wrong. The rounds of a settled map have
+        removed that already, and what holds a weak link is often less exact than the rest.
+        """
+        seen = submap.map.observations()
+        wrong = ~passes_gate(squared_errors(submap.map, seen, self.sensor.camera), FINAL_CHI_SQUARE)
+        submap.map.remove_masked_observations(seen, wrong)
+        submap.posed_frames.remove_outliers(submap.map, self.sensor, FINAL_CHI_SQUARE, LEAST_RATIO)
 
     def _use(self, camera: Camera) -> None:
         self.sensor = replace(self.sensor, camera=camera)
