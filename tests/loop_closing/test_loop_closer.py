@@ -256,4 +256,6 @@ def test_the_loop_closer_fuses_earlier_visits_without_detection(S_21: Tensor) ->
         last = submap.map.num_keyframes - 1
         points = submap.map.num_points
         assert memory.detect(submap, last) is None
+        assert submap.map.num_points == points
+        memory.fuse_with_earlier_visits(submap, last)
         assert (submap.map.num_points < points) is enabled

@@ -86,17 +86,16 @@ class LoopCloser:
         self.loop_precheck = submap.map.key(keyframe), is_known
 
     def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
-        """Return the verified loop candidate of a keyframe, or None.
-
-        If there is none, or `precheck` found none, landmarks are fused with covisible keyframes of earlier visits.
-        """
-        if not self.config.loop_closing.enabled:
-            return None
+        """Return the verified loop candidate of a keyframe; None if there is none, or if `precheck` found none."""
         looks_new = self.loop_precheck == (submap.map.key(keyframe), False)
-        found = None if looks_new else self.loop_detector.detect(submap, keyframe)
-        if found is None:
+        if looks_new or not self.config.loop_closing.enabled:
+            return None
+        return self.loop_detector.detect(submap, keyframe)
+
+    def fuse_with_earlier_visits(self, submap: Submap, keyframe: int) -> None:
+        """Fuse the landmarks of a keyframe without a loop with those of covisible keyframes of earlier visits."""
+        if self.config.loop_closing.enabled:
             fuse_with_earlier_visits(submap, keyframe, self.camera.current, self.config)
-        return found
 
     def close(self, found: LoopCandidate) -> tuple[Submap, int]:
         """Close a loop or merge two submaps; return the submap and the row of the keyframe in it."""

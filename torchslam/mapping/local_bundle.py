@@ -267,30 +267,35 @@ class _Adjustment:
     solution: Callable[[], Solution] | None = None
 
 
-class AsyncBundleAdjustment:
-    """One local bundle adjustment at a time: requested, started, and applied later.
+class SolvedElsewhere:
+    """What starts computations now and uses their results later.
 
-    Until it is applied, only the frame counters of the map may change; hence the result does not depend on when or
-    where it is solved.
-
-    Args:
-        solver: solver of the problem; default: in this process
+    Attributes:
+        solver: where they are computed; default: in this process.
     """
 
-    def __init__(
-        self, camera: SharedCamera, settings: BundleAdjustmentConfig, solver: Solver = solve_here
-    ) -> None:
-        self.camera, self.settings, self.solver = camera, settings, solver
-        self._pending: _Adjustment | None = None
+    solver: Solver = staticmethod(solve_here)
 
     @contextmanager
     def solved_by(self, solver: Solver) -> Iterator[None]:
-        """Solve elsewhere while the context is entered."""
+        """Compute elsewhere while the context is entered."""
         before, self.solver = self.solver, solver
         try:
             yield
         finally:
             self.solver = before
+
+
+class AsyncBundleAdjustment(SolvedElsewhere):
+    """One local bundle adjustment at a time: requested, started, and applied later.
+
+    Until it is applied, only the frame counters of the map may change; hence the result does not depend on when or
+    where it is solved.
+    """
+
+    def __init__(self, camera: SharedCamera, settings: BundleAdjustmentConfig) -> None:
+        self.camera, self.settings = camera, settings
+        self._pending: _Adjustment | None = None
 
     @property
     def is_pending(self) -> bool:

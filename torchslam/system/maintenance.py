@@ -64,11 +64,12 @@ class Maintenance:
         """
         context, submap = self.context, self.active_map.current
         with context.clock("loops"):
-            keyframes = torch.argsort(submap.map.keys, descending=True)[:count:LOOP_STRIDE].tolist()
-            detected = (context.loop_closer.detect(submap, keyframe) for keyframe in keyframes)
-            found = next((candidate for candidate in detected if candidate is not None), None)
-            if found is not None:
-                self._close(found)
+            for keyframe in torch.argsort(submap.map.keys, descending=True)[:count:LOOP_STRIDE].tolist():
+                found = context.loop_closer.detect(submap, keyframe)
+                if found is not None:
+                    self._close(found)
+                    break
+                context.loop_closer.fuse_with_earlier_visits(submap, keyframe)
 
     def _apply(self) -> None:
         before = self.context.camera.model

@@ -10,8 +10,7 @@ once that is applied. The prior stays the given camera, so that no evidence coun
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -21,7 +20,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.geometry.undistorted import Undistortion
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.mapping.local_bundle import MAP_OPTIONS, AsyncBundleAdjustment, Solver, adjust_all, solve_here
+from torchslam.mapping.local_bundle import MAP_OPTIONS, AsyncBundleAdjustment, SolvedElsewhere, adjust_all
 from torchslam.optim.rolling_shutter import ONLINE_FRAMES
 from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor
 
@@ -70,13 +69,12 @@ class _Estimate:
     result: Callable[[], SensorEstimate]
 
 
-class OnlineCamera:
+class OnlineCamera(SolvedElsewhere):
     """Estimates the sensor model by the active map, and replaces it.
 
     Attributes:
         changes: all replacements so far.
         next_check: number of keyframes of the active map from which on it is estimated again.
-        solver: where the estimate is computed.
     """
 
     def __init__(
@@ -89,17 +87,7 @@ class OnlineCamera:
         camera.use(SensorModel(camera.current, self.prior.readout if self.prior.readout.is_given else None))
         self.changes: list[CameraChange] = []
         self.next_check = FIRST_KEYFRAMES
-        self.solver: Solver = solve_here
         self._pending: _Estimate | None = None
-
-    @contextmanager
-    def solved_by(self, solver: Solver) -> Iterator[None]:
-        """Estimate elsewhere while the context is entered."""
-        before, self.solver = self.solver, solver
-        try:
-            yield
-        finally:
-            self.solver = before
 
     @property
     def is_pending(self) -> bool:
