@@ -406,9 +406,9 @@ class FinalAdjustment:
         submap.posed_frames.remove_outliers(submap.map, self.sensor)
         if not settled:
             self._solve(submap, given, progress, ROUGH)
-        if is_main:
-            # Before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
-            self._estimate_readout(submap)
+        # Before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
+        if is_main and self._estimate_readout(submap) and not settled:
+            self._solve(submap, given, progress, ROUGH)
         submap.correct_keyframes(self.sensor)
         if not settled:
             self._reject(submap)
@@ -437,11 +437,13 @@ class FinalAdjustment:
             self.given, self.calibration = given, replace(measured, camera=self.sensor.camera)
         self._store_covariances(submap, solution)
 
-    def _estimate_readout(self, submap: Submap) -> None:
+    def _estimate_readout(self, submap: Submap) -> bool:
+        """Estimate the readout; return whether it is another one than before."""
         graph = submap.posed_frames.graph(submap.map, self.sensor)
         found = estimate_sensor(graph, replace(self.prior, camera=None), FINAL, for_shaking=True)
         self.sensor = replace(self.sensor, readout=found.sensor.readout)
         self.shutter = found.shutter
+        return found.has_other_readout
 
     def _reject(self, submap: Submap) -> None:
         """Remove observations that are far from their points.
