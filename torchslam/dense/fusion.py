@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import torch
 from jaxtyping import Float, Int, UInt8
-from kornia.geometry.depth import depth_to_3d_v2
 from torch import Tensor
 
 from torchslam.dense.cloud import PointCloud
@@ -52,6 +51,8 @@ class CloudFusion:
         )
 
     def _add(self, maps: DepthMaps, row: int, colors: Tensor) -> None:
+        from kornia.geometry.depth import depth_to_3d_v2  # 0.2 s of processor time, which few runs need
+
         depth, normal = maps.depth[row].double(), maps.normal[row].double()
         is_used = (depth > 0) & (normal != 0).any(0) & (maps.confidence[row] > 0)
         y, x = torch.nonzero(is_used, as_tuple=True)
