@@ -2,7 +2,7 @@
 
 The given camera is a measurement with an error. Each time the keyframes of the active map have become a third more,
 its graph is handed to the process that estimates sensors (`optim.sensor_estimate`). No frame waits for it: the result
-is taken `ESTIMATE_FRAMES` later, however long it took, so that the bytes of a run do not depend on the machine. Where
+is taken at a fixed frame, however long it took, so that the bytes of a run do not depend on the machine. Where
 it is another model, the whole map is adjusted by it as a local bundle adjustment is, and frames are tracked with it
 once that is applied. The prior stays the given camera, so that no evidence counts twice.
 """
@@ -28,9 +28,12 @@ FIRST_KEYFRAMES, MAX_KEYFRAMES, GROWTH = 6, 100, 1.3
 """Keyframes of the map at the first estimate and the last one, and their ratio from one to the next. Tried from 6 to 8
 and from 1.2 to 1.5: with later ones, more frames of kitti07 have the error of the given camera."""
 ESTIMATE_FRAMES, ADJUST_FRAMES = 15, 8
-"""Frames after which an estimate is taken, at least as many as the map has keyframes, and after which the map that is
-adjusted by it is: they take .15 to 1.5 s and .05 to .3 s of another process, frames at full speed 15 to 25 ms. Tried
-from 3 and 2 on: the errors of kitti07 and tsukuba change by up to a third, without order."""
+"""Frames after which an estimate is taken, and after which the map that is adjusted by it is, at least. Tried from 3 and
+2 on: the errors of kitti07 and tsukuba change by up to a third, without order."""
+ESTIMATE_RATIO, ADJUST_RATIO = 1.5, 0.25
+"""The same in frames per keyframe of the map, for larger ones: with 73 keyframes of redkitchen, an estimate takes 2.2 s
+of another process and the adjustment .2 s; frames at full speed take 15 to 25 ms. With 1 and 0 frames waited for up to
+.5 s."""
 TOLERANCE = 1e-4
 """Predicted relative reduction of the cost that ends the adjustment of an estimate. Tried from 1e-8 to 1e-3 on 45, 77
 and 100 keyframes of redkitchen: the camera is the same to .01 px, and 1e-4 takes half to three quarters of the time of
@@ -138,24 +141,27 @@ class OnlineCamera(SolvedElsewhere):
         graph = submap.posed_frames.graph(submap.map, self.camera.model)
         options = MAP_OPTIONS.replace(iterations=self.settings.global_iterations, tolerance=TOLERANCE)
         result = self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES)
-        self._pending = _Estimate(submap, frame + max(ESTIMATE_FRAMES, 3 * keyframes // 2), result)
+        self._pending = _Estimate(
+            submap, frame + max(ESTIMATE_FRAMES, int(ESTIMATE_RATIO * keyframes)), result
+        )
 
     def _take(self, submap: Submap, found: SensorEstimate, frame: int) -> None:
         """Have the map adjusted by another model."""
         if found.is_change:
             self.camera.use(SensorModel(self.camera.current, found.sensor.readout), self.camera.undistortion)
             submap.correct_keyframes(self.camera.model)
-            undistortion = self.camera.undistortion
+            prepared = None
             if found.has_other_camera:
-                undistortion = Undistortion(found.sensor.camera)
-            prepared = self.adjustment.solver(undistortion.prepare)
-            due = frame + max(ADJUST_FRAMES, submap.map.num_keyframes // 4)
+                prepared = self.adjustment.solver(Undistortion(found.sensor.camera).prepare)
+            due = frame + max(ADJUST_FRAMES, int(ADJUST_RATIO * submap.map.num_keyframes))
             use = partial(self._use, submap, found, prepared)
             self.adjustment.request_whole(submap.map, found.sensor.camera, due, use)
 
-    def _use(self, submap: Submap, found: SensorEstimate, prepared: Callable[[], Undistortion]) -> None:
-        """Use a model by which a submap was just adjusted."""
-        self.camera.use(found.sensor, prepared())
+    def _use(
+        self, submap: Submap, found: SensorEstimate, prepared: Callable[[], Undistortion] | None
+    ) -> None:
+        """Use a model by which a submap was just adjusted; `prepared`: the undistortion of another camera."""
+        self.camera.use(found.sensor, self.camera.undistortion if prepared is None else prepared())
         self.changes.append(
             CameraChange(_newest_frame(submap), found.sensor.camera, found.departure, found.sensor.readout)
         )
