@@ -123,7 +123,7 @@ def tried(sequence: Sequence) -> Columns:
     error = evaluate(run.trajectory, sequence.groundtruth).ate_m / extent
     T_cw, views, matched = pairs
     known = torch.ones(len(views), dtype=torch.bool)
-    reduction = run.config.for_size(run.camera.size).features.reduction(run.camera.size)
+    reduction = run.config.features.reduction(run.camera.size)
 
     def checked(T_cw: Tensor) -> MapCheck:
         return check_map(T_cw, known, views, matched, run.camera, None, reduction)

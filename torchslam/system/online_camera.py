@@ -20,7 +20,14 @@ from torchslam.geometry import Camera, SensorModel, SharedCamera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.mapping.local_bundle import MAP_OPTIONS, AsyncBundleAdjustment, Solver, adjust_all, solve_here
+from torchslam.mapping.local_bundle import (
+    GLOBAL_ITERATIONS,
+    MAP_OPTIONS,
+    AsyncBundleAdjustment,
+    Solver,
+    adjust_all,
+    solve_here,
+)
 from torchslam.optim.rolling_shutter import ONLINE_FRAMES
 from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor
 
@@ -82,7 +89,7 @@ class OnlineCamera:
         self, camera: SharedCamera, config: Config, atlas: Atlas, adjustment: AsyncBundleAdjustment
     ) -> None:
         self.camera, self.atlas, self.adjustment = camera, atlas, adjustment
-        self.settings = config.bundle_adjustment
+        self.is_refined = not config.paper.unrefined
         self.given = CameraMeasurement.of(camera.current, config.camera.std) if config.camera.std else None
         self.prior = SensorPrior(self.given, given_readout(config.camera))
         camera.use(SensorModel(camera.current, self.prior.readout if self.prior.readout.is_given else None))
@@ -143,12 +150,12 @@ class OnlineCamera:
             return
         keyframes = submap.map.num_keyframes
         is_wanted = self.given is not None or self.prior.readout.is_sought
-        if not is_wanted or not self.settings.local or not self.next_check <= keyframes <= MAX_KEYFRAMES:
+        if not is_wanted or not self.is_refined or not self.next_check <= keyframes <= MAX_KEYFRAMES:
             return
         self.next_check = math.ceil(keyframes * GROWTH)
         model = self.camera.model
         graph = submap.posed_frames.graph(submap.map, model.camera, readout=model.readout)
-        options = MAP_OPTIONS.replace(iterations=self.settings.global_iterations, tolerance=TOLERANCE)
+        options = MAP_OPTIONS.replace(iterations=GLOBAL_ITERATIONS, tolerance=TOLERANCE)
         result = self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES)
         self._pending = _Estimate(submap, frame + max(ESTIMATE_FRAMES, keyframes), result)
 
@@ -171,7 +178,7 @@ class OnlineCamera:
         for other in self.atlas:
             if other is not submap:
                 other.correct_keyframes(found.sensor)
-                adjust_all(other.map, found.sensor.camera, self.settings)
+                adjust_all(other.map, found.sensor.camera)
 
     def forget(self) -> None:
         """Forget an estimate of a map that is no longer the active one."""

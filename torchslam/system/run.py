@@ -360,7 +360,7 @@ class FinalAdjustment:
 
     def __init__(self, camera: Camera, config: Config, measured: CameraMeasurement | None) -> None:
         """Create the adjustment; `measured`: the given camera with its error, None if it is exact."""
-        self.camera, self.settings = camera, config.bundle_adjustment
+        self.camera, self.is_wanted = camera, not config.paper.unrefined
         self._measured = measured
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
@@ -371,7 +371,7 @@ class FinalAdjustment:
     def adjust(
         self, atlas: Atlas, session: int, progress: Progress | None = None, settled: bool = False
     ) -> None:
-        """Adjust all submaps, if so configured. The main one determines the camera; the others follow.
+        """Adjust all submaps, unless they stay unrefined. The main one determines the camera; the others follow.
 
         Args:
             atlas: the submaps.
@@ -380,7 +380,7 @@ class FinalAdjustment:
             settled: keyframes and points are at a minimum already, and what is far from it has been removed.
         """
         main = atlas.main(session)
-        if main is None or not (self.settings.local and self.settings.global_at_end):
+        if main is None or not self.is_wanted:
             return
         self._adjust(main, self._measured, progress, settled, is_main=True)
         for submap in atlas:
@@ -398,7 +398,7 @@ class FinalAdjustment:
         camera = self.camera
         if not settled:
             camera = camera if given is None else with_radial_terms(camera)
-            camera = adjust_all(submap.map, camera, self.settings, progress, given, ROUGH.tolerance)
+            camera = adjust_all(submap.map, camera, progress, given, ROUGH.tolerance)
         self.camera, self.given = camera, given or self.given
         submap.posed_frames.remove_outliers(submap.map, camera)
         if not settled:
