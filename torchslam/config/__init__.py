@@ -52,7 +52,12 @@ class Config(Settings):
     for a value that is not allowed.
     """
 
-    seed: int = setting(0, "Seed of the random number generators.", low=0, high=2**63 - 1)
+    seed: int = setting(
+        0,
+        "Seed of the random number generators; other seeds show how much results vary.",
+        low=0,
+        high=2**63 - 1,
+    )
     scale: str = setting(
         "unit",
         "Length unit of the map; unit: the median depth of the initial map is 1.",

@@ -66,7 +66,13 @@ class FeaturesConfig(Settings, section="features"):
         choices=("orb", "opencv-orb", "sift", "simulated", "xfeat", "aliked"),
         group=FEATURE_EXTRACTORS,
     )
-    num_keypoints: int = setting(1000, "Maximum number of keypoints per image.", low=1, high=MAX_KEYPOINTS)
+    num_keypoints: int = setting(
+        1000,
+        "Maximum number of keypoints per image. More for images of weak texture, or where tracking is lost; the time "
+        "of a frame grows with it.",
+        low=1,
+        high=MAX_KEYPOINTS,
+    )
     max_image_pixels: int = setting(
         640 * 480,
         "Number of pixels to which much larger images are reduced before extraction; 0 disables the reduction.",
@@ -90,7 +96,7 @@ class FeaturesConfig(Settings, section="features"):
 
 @dataclass(frozen=True)
 class SimulatedConfig(Settings, section="simulated"):
-    """Simulated features: scene points scattered along the true trajectory and projected into the frames."""
+    """Scene points that are projected into the frames in place of features, to test the geometry without images."""
 
     points_per_view: int = setting(
         400, "Number of points scattered in each sampled view.", low=1, high=100_000
@@ -120,7 +126,7 @@ class SimulatedConfig(Settings, section="simulated"):
 
 @dataclass(frozen=True)
 class MatchingConfig(Settings, section="matching"):
-    """Descriptor matching; the limits depend on the descriptor, so that another front end may need others."""
+    """Matching of descriptors. A feature extractor of your own may need other limits, since they depend on it."""
 
     max_hamming_distance: float = setting(
         64.0, "Maximum Hamming distance between binary descriptors, in bits.", above=0, high=4096

@@ -61,8 +61,7 @@ class SLAM:
 
     Args:
         camera: The camera of all frames.
-        config: The configuration; the default one if None. Settings in pixels are those of images as
-            `features.max_image_pixels` reduces them, and are scaled for larger ones.
+        config: The configuration; the default one if None.
         extractor: The extractor, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
             bring their own features, as those of `front_end.Simulated`, are not passed to it.
         matcher: The matcher of two views, see `types.Matcher`, or one of kornia; the configured one if None.
