@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tests.map.simulated import estimate_at
-from torchslam.config import BundleAdjustmentConfig, Config
+from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
     SharedCamera,
@@ -174,8 +174,8 @@ def assert_same_state(one: dict[str, object], two: dict[str, object]) -> None:
             assert value == two[name], name
 
 
-def adjust_local(slam_map: Map, keyframe: int, camera: Camera, settings: BundleAdjustmentConfig) -> None:
+def adjust_local(slam_map: Map, keyframe: int, camera: Camera) -> None:
     """Request a local bundle adjustment around a keyframe, and apply it at once."""
-    adjusting = AsyncBundleAdjustment(SharedCamera(camera), settings)
+    adjusting = AsyncBundleAdjustment(SharedCamera(camera))
     adjusting.request(slam_map, keyframe, due=None)
     adjusting.apply(slam_map)

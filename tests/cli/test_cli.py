@@ -355,6 +355,21 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
     assert f"usage: torchslam {command}" in capsys.readouterr().out
 
 
+def test_the_first_screen_of_run_has_ten_options(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit, match="0"):
+        main(["run", "--help"])
+    screen = capsys.readouterr().out.split("\nframe selection:")[0]
+    options = [line.split()[0].rstrip(",") for line in screen.splitlines() if line.startswith("  -")]
+    assert options == [
+        "-h", "--camera", "--output", "--overwrite", "--resume", "--mapping", "--dense", "--view", "--device",
+        "--config", "--set",
+    ]  # fmt: skip
+    assert len(screen.splitlines()) <= 40
+
+
 def test_the_command_list_shows_each_commands_summary() -> None:
     for name, (_, summary) in COMMANDS.items():
         first = load_command(name)[0].split("\n")[0].rstrip(".")

@@ -13,12 +13,11 @@ from hypothesis import strategies as st
 
 from torchslam.config import (
     CHOICES,
-    BundleAdjustmentConfig,
     Config,
     FeaturesConfig,
-    InitializationConfig,
+    KeyframesConfig,
+    LoopClosingConfig,
     MatchingConfig,
-    TrackingConfig,
     load_config,
     to_toml,
 )
@@ -55,7 +54,7 @@ def test_overrides_take_precedence_over_the_file(tmp_path: Path) -> None:
 
 
 def test_an_integer_is_accepted_as_a_float() -> None:
-    assert load_config(None, ["tracking.search_radius_px=20"]).tracking.search_radius_px == 20.0
+    assert load_config(None, ["keyframes.max_rotation_deg=20"]).keyframes.max_rotation_deg == 20.0
 
 
 @pytest.mark.parametrize(
@@ -70,25 +69,20 @@ def test_an_integer_is_accepted_as_a_float() -> None:
         ("matching.max_ratio=nan", "matching.max_ratio must be above 0 and at most 1, not nan"),
         ("matching.max_ratio=-0.5", "matching.max_ratio must be above 0 and at most 1, not -0.5"),
         (
-            "tracking.search_radius_px=inf",
-            "tracking.search_radius_px must be above 0 and at most 10000, not inf",
+            "simulated.noise_px=inf",
+            "simulated.noise_px must be at least 0 and at most 10000, not inf",
         ),
         (
-            "bundle_adjustment.local_window=0",
-            "--set bundle_adjustment.local_window=0: bundle_adjustment.local_window must be at least 2 "
-            "and at most 1000000, not 0",
+            "global_mapping.max_images=0",
+            "--set global_mapping.max_images=0: global_mapping.max_images must be at least 3 and at most 1000000, "
+            "not 0",
         ),
         ("features.num_keypoints=0", "features.num_keypoints must be at least 1 and at most 8192, not 0"),
         ("features.max_image_pixels=1", "features.max_image_pixels must be 0 or at least 1024 and at most"),
-        ("static_overlay.cell_px=1e-300", "static_overlay.cell_px must be at least 1.0 and at most 10000"),
+        ("simulated.depth_near=1e300", "simulated.depth_near must be above 0 and at most 1000000"),
         ("features.num_keypoints=100000", "features.num_keypoints must be at least 1 and at most 8192"),
-        ("bundle_adjustment.local_iterations=10000", "must be at least 1 and at most 1000, not 10000"),
         ("seed=18446744073709551616", "seed must be at least 0 and at most 9223372036854775807"),
-        ("tracking.threshold_px=0", "tracking.threshold_px must be above 0 and at most 10000, not 0"),
-        (
-            "tracking.search_radius_px=1e300",
-            "tracking.search_radius_px must be above 0 and at most 10000, not 1e\\+300",
-        ),
+        ("matching.max_ratio=0", "matching.max_ratio must be above 0 and at most 1, not 0"),
         pytest.param("a" + 20_000 * ".a" + "=1", "40003 characters, more than the 4096", id="too many dots"),
         pytest.param("seed=" + 3000 * "[" + 3000 * "]", "6005 characters", id="too deep"),
         pytest.param("seed=" + 1500 * "[" + 1500 * "]", "seed must be of type int", id="deep"),
@@ -104,9 +98,9 @@ def test_an_invalid_override_is_rejected_by_name(override: str, message: str) ->
 
 def test_an_unknown_key_in_a_file_names_the_file(tmp_path: Path) -> None:
     file = tmp_path / "mine.toml"
-    file.write_text("[tracking]\nsearch_radius = 3\n")
+    file.write_text("[keyframes]\nmax_rotation = 3\n")
     with pytest.raises(
-        ConfigError, match=r"mine\.toml: unknown key 'tracking\.search_radius'.*tracking\.search_radius_px"
+        ConfigError, match=r"mine\.toml: unknown key 'keyframes\.max_rotation'.*keyframes\.max_rotation_deg"
     ):
         load_config(file)
 
@@ -166,11 +160,6 @@ def test_every_setting_has_a_description_and_a_range(kind: type[Settings]) -> No
             assert declared.metadata["about"], declared.name
 
 
-def test_scaled_settings_stay_in_their_range() -> None:
-    config = load_config(None, ["tracking.threshold_px=9000"]).for_size((4000, 3000))
-    assert config.tracking.threshold_px == 10_000
-
-
 def test_a_slow_or_large_file_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "hostile.toml"
     for text, message in (
@@ -197,8 +186,6 @@ def test_the_choices_of_settings() -> None:
         "scale": ("unit", "groundtruth"),
         "dense.aggregation": ("classical", "learned"),
         "features.kind": ("orb", "opencv-orb", "sift", "simulated", "xfeat", "aliked"),
-        "initialization.criterion": ("uncertainty", "parallax"),
-        "mapping.triangulation_partners": ("covisible", "last"),
         "matching.matcher": ("descriptors", "lightglue"),
     }
 
@@ -208,19 +195,15 @@ def test_the_choices_of_settings() -> None:
     [
         (lambda: Config(scale="metric"), "^scale must be one of unit, groundtruth, not 'metric'"),
         (
-            lambda: InitializationConfig(criterion="xyz"),
-            "^initialization.criterion must be one of uncertainty, parallax, not 'xyz'",
-        ),
-        (
-            lambda: replace(Config().bundle_adjustment, local_window=1),
-            "^bundle_adjustment.local_window must be at least 2",
+            lambda: replace(Config().global_mapping, max_images=2),
+            "^global_mapping.max_images must be at least 3",
         ),
         (
             lambda: replace(Config(), seed=-1),
             "^seed must be at least 0 and at most 9223372036854775807, not -1",
         ),
-        (lambda: Config(tracking=BundleAdjustmentConfig()), "^tracking must be of type TrackingConfig"),
-        (lambda: Config(tracking=None), "^tracking must be of type TrackingConfig, not None"),
+        (lambda: Config(keyframes=LoopClosingConfig()), "^keyframes must be of type KeyframesConfig"),
+        (lambda: Config(keyframes=None), "^keyframes must be of type KeyframesConfig, not None"),
         (
             lambda: FeaturesConfig(num_keypoints=100.0),
             "^features.num_keypoints must be of type int, not 100.0",
@@ -255,22 +238,10 @@ def test_an_invalid_value_in_python_is_rejected_by_name(build: Any, message: str
         ("matching.max_ratio", 1e-9, 0),
         ("initialization.min_matches", 1, 0),
         ("initialization.min_planar_frames", 0, -1),
-        ("initialization.max_reference_age", 2, 1),
-        ("initialization.min_parallax_deg", 180, 180.1),
-        ("initialization.min_explained_ratio", 1, 1.001),
-        ("tracking.threshold_px", 1e-9, 0),
-        ("tracking.wide_radius_factor", 1, 0.999),
-        ("measurement.max_chi_square", 1e-9, 0),
-        ("tracking.max_view_angle_deg", 180, 180.1),
-        ("tracking.local_keyframes", 1, 0),
-        ("tracking.recent_frames", 0, -1),
         ("keyframes.max_translation", 0, -1e-9),
         ("keyframes.min_overlap", 1, 1.001),
-        ("mapping.num_partners", 1, 0),
-        ("mapping.min_found_ratio", 1, 1.001),
-        ("bundle_adjustment.local_window", 2, 1),
-        ("bundle_adjustment.max_fixed_keyframes", 1, 0),
-        ("bundle_adjustment.local_iterations", 1, 0),
+        ("keyframes.max_rotation_deg", 180, 180.1),
+        ("global_mapping.max_images", 3, 2),
     ],
 )
 def test_range_limits_are_inclusive_or_exclusive_as_documented(
@@ -282,7 +253,7 @@ def test_range_limits_are_inclusive_or_exclusive_as_documented(
 
 
 def test_an_integer_becomes_a_float_in_python_too() -> None:
-    assert repr(TrackingConfig(search_radius_px=20).search_radius_px) == "20.0"
+    assert repr(KeyframesConfig(max_rotation_deg=20).max_rotation_deg) == "20.0"
 
 
 def _valid(default: Any, allowed: Allowed) -> st.SearchStrategy[Any]:

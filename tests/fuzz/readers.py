@@ -383,12 +383,8 @@ def _settings(root: Path) -> None:
 
 
 def _whole(config: Config) -> None:
-    """A configuration can be written, read and scaled."""
+    """A configuration can be written and read."""
     assert bool(to_toml(config))
-    with contextlib.suppress(
-        ConfigError
-    ):  # of what grows, beyond its range: is said when the images are known
-        config.for_size((4000, 3000))
 
 
 def _list(root: Path, name: str) -> None:

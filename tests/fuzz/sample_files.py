@@ -26,7 +26,7 @@ from torchslam.system.run import RunProgress, run_sequence
 
 OVERRIDES = (
     *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
-    *("initialization.min_matches=40", "initialization.min_points=30", "initialization.provisional_frames=0"),
+    "initialization.min_matches=40",
 )
 CONFIG = load_config(None, OVERRIDES)
 WALK = Walk(arc(30)[:14])

@@ -332,7 +332,7 @@ FRAME_ARGUMENTS = [
 ]
 OVERRIDES = [
     "features.num_keypoints=2000",
-    "tracking.search_radius_px=12.5",
+    "keyframes.max_rotation_deg=12.5",
     "seed=7",
     'features.weights="a.safetensors"',
 ]

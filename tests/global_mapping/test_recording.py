@@ -86,7 +86,7 @@ class World:
                 self, sequence: Any, camera: Any, config: Config, given: Any, *more: Any, **rest: Any
             ):
                 world.given = given
-                self.scaled = config
+                self.config = config
 
             def run(self, results: Any, before: Run) -> SimpleNamespace:
                 assert before.results is results  # keypoints are corrected by the run they come from

@@ -30,7 +30,7 @@ WALK = Recording.of(line(10), wall(200, 2.5), noise_px=0.3, first=0)
 
 
 def matcher_of(recording: Recording) -> PairMatcher:
-    config = mapping_config(Config()).for_size(CAMERA.size)
+    config = mapping_config(Config())
     return PairMatcher(recording.views, CAMERA, make_matcher(config.matching), config)
 
 

@@ -10,14 +10,14 @@ from torch import Tensor, nn
 
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc, still
-from torchslam import ORB, Camera, ClipPoses, ClipSLAM, Features, clip_loss, load_config, open_sequence
+from torchslam import ORB, Camera, ClipPoses, ClipSLAM, Features, clip_loss, open_sequence
 from torchslam.errors import ClipError, FrameError
 from torchslam.evaluation import ate, rpe
 from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_exp
+from torchslam.system import map_start, state_machine
 
 FRAMES = 10
-CONFIG = load_config(None, ["bundle_adjustment.global_iterations=30"])
 
 
 class BentExtractor(nn.Module):
@@ -61,7 +61,7 @@ def test_the_gradient_to_a_feature_extractor_agrees_with_finite_differences() ->
     walk = Walk(arc(FRAMES, length=1.0))
     images, truth = clip_of(walk)
     extractor = BentExtractor(walk, bend=0.01)
-    clip_slam = ClipSLAM(extractor, config=CONFIG)
+    clip_slam = ClipSLAM(extractor)
 
     def loss(bend: float) -> Tensor:
         with torch.no_grad():
@@ -88,7 +88,7 @@ def test_the_gradient_to_weights_and_camera_agrees_with_finite_differences() -> 
             return torch.exp(-falloff * (away / 200).square().sum(-1))
 
         camera = Camera.pinhole(focal, focal, 159.5, 119.5, size=(320, 240))
-        poses = ClipSLAM(extractor, keypoint_weight, CONFIG)(images, camera)
+        poses = ClipSLAM(extractor, keypoint_weight)(images, camera)
         return ate(T_cw=poses.T_cw, T_cw_groundtruth=truth, mask=poses.posed)
 
     falloff = torch.tensor(1.0, dtype=torch.float64, requires_grad=True)
@@ -201,21 +201,15 @@ def test_images_have_the_dimensions_of_clips() -> None:
         ClipSLAM(BentExtractor(walk, bend=0.0))(clip_of(walk)[0][0], walk.camera)
 
 
-def test_a_split_clip_has_the_poses_of_its_main_submap() -> None:
+def test_a_split_clip_has_the_poses_of_its_main_submap(monkeypatch: pytest.MonkeyPatch) -> None:
     """It looks ahead in most frames, and back in the others: what cannot be compared is not posed."""
     poses = torch.cat([arc(22, length=1.0), arc(10, length=1.0)])
     poses[22:, :3, :3] *= torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)  # half a turn about y
     walk = Walk(poses)
     images, truth = clip_of(walk)
-    config = load_config(
-        None,
-        [
-            "relocalization.frames_before_new_submap=1",
-            "initialization.provisional_frames=2",
-            "bundle_adjustment.global_at_end=false",
-        ],
-    )
-    poses_found = ClipSLAM(BentExtractor(walk, bend=0.0), config=config)(images, walk.camera)
+    monkeypatch.setattr(state_machine, "FRAMES_BEFORE_NEW_SUBMAP", 1)
+    monkeypatch.setattr(map_start, "PROVISIONAL_FRAMES", 2)
+    poses_found = ClipSLAM(BentExtractor(walk, bend=0.0))(images, walk.camera)
     assert poses_found.posed.tolist() == [True] * 22 + [False] * 10
     assert float(ate(T_cw=poses_found.T_cw, T_cw_groundtruth=truth, mask=poses_found.posed).detach()) < 0.01
 
@@ -239,9 +233,7 @@ def test_the_gradient_is_the_same_under_detect_anomaly() -> None:
         extractor = BentExtractor(walk, bend=0.02)
         camera = walk.camera.with_params(walk.camera.params.clone().requires_grad_())
         with torch.autograd.set_detect_anomaly(is_detected):
-            ate(
-                T_cw=ClipSLAM(extractor, config=CONFIG)(images, camera).T_cw, T_cw_groundtruth=truth
-            ).backward()
+            ate(T_cw=ClipSLAM(extractor)(images, camera).T_cw, T_cw_groundtruth=truth).backward()
         gradients.append((extractor.bend.grad, camera.params.grad))
     torch.testing.assert_close(*gradients)
     assert float(gradients[1][0]) != 0
@@ -253,9 +245,7 @@ def test_weights_of_keypoints_of_another_shape_are_refused() -> None:
     walk = Walk(arc(FRAMES, length=1.0))
     for change in (lambda x: x[..., None], lambda x: x[0], lambda x: x.long()):
         extractor = BentExtractor(walk, bend=0.02)
-        clip_slam = ClipSLAM(
-            extractor, lambda features, change=change: change(features.scores), config=CONFIG
-        )
+        clip_slam = ClipSLAM(extractor, lambda features, change=change: change(features.scores))
         with pytest.raises(ValueError, match=r"keypoint_weight must give floats \(T, N\) = \(10, 300\), not"):
             clip_slam(clip_of(walk)[0], walk.camera)
 

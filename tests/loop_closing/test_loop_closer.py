@@ -90,15 +90,14 @@ def test_a_loop_without_drift_moves_nothing() -> None:
 
 
 def test_the_final_adjustment_can_be_left_out() -> None:
-    for override in ("loop_closing.global_bundle_adjustment=false", "bundle_adjustment.local=false"):
-        submap = ring_submap(scale=1.01, twist=0.002)
-        found = loop(submap)
-        T_cw = essential_graph_solution(found)
-        close_loop(found, CAMERA, load_config(None, [override]))
-        unit = torch.linalg.det(T_cw[:, :3, :3]) ** (1 / 3)
-        torch.testing.assert_close(submap.map.T_cw[:, :3, :3], T_cw[:, :3, :3] / unit[:, None, None])
-        torch.testing.assert_close(submap.map.T_cw[:, :3, 3], T_cw[:, :3, 3] / unit[:, None])
-        assert len(submap.map.observed_points(torch.tensor([0]))) > 0
+    submap = ring_submap(scale=1.01, twist=0.002)
+    found = loop(submap)
+    T_cw = essential_graph_solution(found)
+    close_loop(found, CAMERA, load_config(None, ["paper.unrefined=true"]))
+    unit = torch.linalg.det(T_cw[:, :3, :3]) ** (1 / 3)
+    torch.testing.assert_close(submap.map.T_cw[:, :3, :3], T_cw[:, :3, :3] / unit[:, None, None])
+    torch.testing.assert_close(submap.map.T_cw[:, :3, 3], T_cw[:, :3, 3] / unit[:, None])
+    assert len(submap.map.observed_points(torch.tensor([0]))) > 0
 
 
 @pytest.mark.parametrize("query", ["newer", "older"])
@@ -232,10 +231,7 @@ def test_only_points_of_the_other_side_are_searched(S_21: Tensor, monkeypatch: p
 def test_duplicates_found_after_the_adjustment_are_merged_too(S_21: Tensor) -> None:
     """The two sides lie 4 px apart: at first only coarse keypoints are near enough, adjusted all are."""
     counts = []
-    for override in (
-        "loop_closing.global_bundle_adjustment=false",
-        "loop_closing.global_bundle_adjustment=true",
-    ):
+    for override in ("paper.unrefined=true", "paper.unrefined=false"):
         submap = submap_of_scene(SCENE, sideways(4))
         submap.merge(submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100), pose(0.08) @ sim3_inverse(S_21))
         fuse_and_adjust(submap, 5, 1, CAMERA, load_config(None, [override]))

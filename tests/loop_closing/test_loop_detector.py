@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import pytest
 import torch
@@ -11,8 +10,9 @@ from torch import Tensor
 
 from tests.loop_closing.ring import END, KEYFRAMES, ring_submap
 from tests.scene import CAMERA, Scene, camera_center, pose, sideways, submap_of_scene
-from torchslam.config import Config, LoopClosingConfig, load_config
+from torchslam.config import Config
 from torchslam.geometry import SharedCamera, sim3_inverse
+from torchslam.loop_closing import loop_detector as detector
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.loop_closing.loop_detector import (
     LoopCandidate,
@@ -30,7 +30,7 @@ SIDE = sideways(4)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
 
 
-def loop_detector(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetector:
+def loop_detector(*held: Submap) -> LoopDetector:
     """A detector whose database holds all keyframes of these submaps."""
     atlas, database = Atlas(CAMERA.params), KeyframeDatabase()
     atlas._submaps = list(held)
@@ -38,7 +38,7 @@ def loop_detector(*held: Submap, overrides: tuple[str, ...] = ()) -> LoopDetecto
         for keyframe in range(submap.map.num_keyframes):
             view = submap.map.frame_features(keyframe)
             database.add(submap.map.key(keyframe), view.descriptors, view.mask)
-    return LoopDetector(SharedCamera(CAMERA), load_config(None, overrides), atlas, database)
+    return LoopDetector(SharedCamera(CAMERA), Config(), atlas, database)
 
 
 def two_submaps(S_21: Tensor) -> tuple[Submap, Submap]:
@@ -76,29 +76,29 @@ def test_a_place_that_was_never_left_is_no_loop() -> None:
     assert loop_detector(submap).detect(submap, 5) is None
 
 
-def test_a_similar_looking_place_elsewhere_is_no_loop() -> None:
+def test_a_similar_looking_place_elsewhere_is_no_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     """A hundred meters later everything looks the same; no drift is that large over a hundred meters."""
     submap = submap_of_scene(SCENE, sideways(4))
     submap.merge(submap_of_scene(SCENE, OTHER, first=50), pose(0, 0, 100.0))
     assert loop_detector(submap).detect(submap, 7) is None
-    found = loop_detector(submap, overrides=("loop_closing.max_drift=1.1",)).detect(submap, 7)
+    monkeypatch.setattr(detector, "_MAX_DRIFT", 1.1)
+    found = loop_detector(submap).detect(submap, 7)
     assert found is not None
     torch.testing.assert_close(found.relation.S_21, pose(0, 0, -100.0), atol=1e-5, rtol=0)
 
 
-def test_neighboring_keyframes_must_verify_a_loop(S_21: Tensor) -> None:
+def test_neighboring_keyframes_must_verify_a_loop(S_21: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     one, other = two_submaps(S_21)
     other.map.keyframes["keypoints"][:3] += 40.0  # these see nothing where it should be
     assert loop_detector(one, other).detect(other, 3) is None
-    alone = loop_detector(one, other, overrides=("loop_closing.min_confirming_keyframes=0",))
-    assert alone.detect(other, 3) is not None
+    monkeypatch.setattr(detector, "_MIN_VERIFYING", 0)
+    assert loop_detector(one, other).detect(other, 3) is not None
+    monkeypatch.undo()
     one, other = two_submaps(S_21)
     other.map.keyframes["keypoints"][:1] += 40.0
     assert loop_detector(one, other).detect(other, 3) is not None
-    assert (
-        loop_detector(one, other, overrides=("loop_closing.min_confirming_keyframes=3",)).detect(other, 3)
-        is None
-    )
+    monkeypatch.setattr(detector, "_MIN_VERIFYING", 3)
+    assert loop_detector(one, other).detect(other, 3) is None
 
 
 def test_covisibility_reaches_two_steps() -> None:
@@ -126,12 +126,9 @@ def drifts(
     submap: Submap | None = None,
     keyframe: int = 10,
     matched_keyframe: int = 0,
-    **settings: float,
 ) -> bool:
     relation = RelativeSim3(S_21, 0, 0, 0)
-    return is_plausible_drift(
-        submap or way(), keyframe, matched_keyframe, relation, replace(LoopClosingConfig(), **settings)
-    )
+    return is_plausible_drift(submap or way(), keyframe, matched_keyframe, relation)
 
 
 def test_the_allowed_position_drift_grows_with_path_length() -> None:
@@ -140,7 +137,6 @@ def test_the_allowed_position_drift_grows_with_path_length() -> None:
     assert drifts(pose(0, 0, 0.99), matched_keyframe=5)
     assert not drifts(pose(0, 0, 1.01), matched_keyframe=5)
     assert drifts(pose(0, 0, 0.99), keyframe=0, matched_keyframe=5)
-    assert drifts(pose(0, 3.99), max_drift=0.4)
 
 
 def test_path_length_follows_the_order_of_the_frames() -> None:
@@ -216,11 +212,11 @@ def test_candidates_in_different_submaps_are_not_compared() -> None:
     assert answers(pose(5.0), pose(), same=False)
 
 
-def test_two_contradicting_candidates_are_no_loop(S_21: Tensor) -> None:
+def test_two_contradicting_candidates_are_no_loop(S_21: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
     """Two corridors of one submap look the same, so a place in them is ambiguous."""
     twin = submap_of_scene(SCENE, sideways(4), first=0)
     twin.merge(submap_of_scene(SCENE, sideways(4), first=50), pose(100.0))
     one = submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
     assert loop_detector(twin, one).detect(one, 3) is None
-    assert loop_detector(twin, one, overrides=("loop_closing.max_candidates=1",)).detect(one, 3) is not None
-    assert Config().loop_closing.max_candidates == 3
+    monkeypatch.setattr(detector, "_MAX_CANDIDATES", 1)
+    assert loop_detector(twin, one).detect(one, 3) is not None

@@ -13,9 +13,9 @@ from torch import Tensor
 
 from tests.parallel.test_pool import wait_until_ready
 from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
-from torchslam.config import load_config
 from torchslam.geometry import Camera, SharedCamera, se3_exp, se3_inverse, umeyama
 from torchslam.map.map import Map
+from torchslam.mapping import local_bundle
 from torchslam.mapping.local_bundle import (
     AsyncBundleAdjustment,
     adjust_all,
@@ -28,7 +28,12 @@ from torchslam.parallel.workers import SolverWorker
 
 SCENE = Scene.of(150)
 ROWS = rows_of(SCENE)
-SETTINGS = load_config(None, ["bundle_adjustment.local_window=3"]).bundle_adjustment
+
+
+@pytest.fixture(autouse=True)
+def small_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Local adjustments free three of the five keyframes."""
+    monkeypatch.setattr(local_bundle, "LOCAL_WINDOW", 3)
 
 
 def perturbed_map(seed: int = 0) -> Map:
@@ -57,7 +62,7 @@ def assert_same(mine: Map, other: Map) -> None:
 def adjusted(seed: int = 0) -> Map:
     """The same map, adjusted at once."""
     slam_map = perturbed_map(seed)
-    adjust_local(slam_map, 4, CAMERA, SETTINGS)
+    adjust_local(slam_map, 4, CAMERA)
     return slam_map
 
 
@@ -67,7 +72,7 @@ def mean_error(slam_map: Map, camera: Camera) -> float:
 
 
 def test_the_map_does_not_change_before_the_result_is_applied() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     assert not adjusting.is_pending
     assert adjusting.due is None
     assert not adjusting.is_due(100)
@@ -84,7 +89,7 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
 
 
 def test_a_request_is_started_once() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     started: list[Any] = []
 
     def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
@@ -115,7 +120,7 @@ def test_a_request_is_started_once() -> None:
 
 
 def test_a_request_can_be_hurried_or_dropped() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     adjusting.set_deadline(3)
     assert not adjusting.is_pending
     adjusting.request(slam_map, 4, due=12)
@@ -127,7 +132,7 @@ def test_a_request_can_be_hurried_or_dropped() -> None:
 
 
 def test_a_request_may_be_due_before_the_next_frame() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     assert not adjusting.is_due_before_next_frame
     adjusting.request(slam_map, 4, due=12)
     assert not adjusting.is_due_before_next_frame
@@ -144,7 +149,7 @@ def test_a_request_may_be_due_before_the_next_frame() -> None:
 
 
 def test_an_empty_request_is_due_as_well() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     slam_map.keyframes["point_ids"][:] = -1
     adjusting.request(slam_map, 4, due=12)
     assert adjusting.is_due(12)
@@ -158,7 +163,7 @@ def test_a_whole_map_is_adjusted_by_another_camera_later() -> None:
     """All keyframes but the first, in place and unit of the map; the camera is replaced once it is applied."""
     shared = SharedCamera(CAMERA)
     other = CAMERA.with_params(CAMERA.params * CAMERA.params.new_tensor([1.02, 1.02, 1, 1]))
-    adjusting, slam_map, used = AsyncBundleAdjustment(shared, SETTINGS), perturbed_map(), list[Any]()
+    adjusting, slam_map, used = AsyncBundleAdjustment(shared), perturbed_map(), list[Any]()
     started: list[Any] = []
 
     def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
@@ -179,7 +184,7 @@ def test_a_whole_map_is_adjusted_by_another_camera_later() -> None:
     assert len(used) == 1
     assert torch.equal(used[0], slam_map.T_cw)  # called after the map has changed
     expected = perturbed_map()
-    adjust_all(expected, other, SETTINGS)
+    adjust_all(expected, other)
     assert off > 5 * mean_error(expected, other)
     assert mean_error(slam_map, other) < 1.2 * mean_error(expected, other)
     centers, centers_before = (se3_inverse(T_cw)[:, :3, 3] for T_cw in (slam_map.T_cw, before))
@@ -195,7 +200,7 @@ def test_a_whole_map_is_adjusted_by_another_camera_later() -> None:
 
 
 def test_a_solver_is_used_within_its_context() -> None:
-    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
+    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA))
 
     def elsewhere(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         return solve_here(function, *arguments)
@@ -219,7 +224,7 @@ def worker() -> Iterator[SolverWorker]:
 
 
 def test_another_process_computes_the_same_result(worker: SolverWorker) -> None:
-    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
+    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA))
     adjusting.solver = worker
     for seed in (0, 1):
         expected = adjusted(seed)
@@ -237,7 +242,7 @@ def test_another_process_computes_the_same_result(worker: SolverWorker) -> None:
 
 def test_errors_of_the_worker_are_raised_here(worker: SolverWorker) -> None:
     slam_map = perturbed_map()
-    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS)
+    adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA))
 
     def wrong(function: Callable[..., Any], problem: BundleProblem, iterations: int) -> Callable[[], Any]:
         problem.frame_index[0] = 99
@@ -251,7 +256,7 @@ def test_errors_of_the_worker_are_raised_here(worker: SolverWorker) -> None:
 
 
 def test_the_run_continues_without_a_killed_worker() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
+    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     with SolverWorker() as solver:
         wait_until_ready(solver)
         adjusting.solver = solver
@@ -271,7 +276,7 @@ def test_a_worker_that_has_not_started_is_not_waited_for(monkeypatch: pytest.Mon
     monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
     with SolverWorker() as solver:
         monkeypatch.setattr(solver, "result", None)
-        adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA), SETTINGS), perturbed_map()
+        adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
         adjusting.solver = solver
         adjusting.request(slam_map, 4, due=12)
         adjusting.apply(slam_map)

@@ -160,5 +160,5 @@ def test_a_moving_camera_keeps_its_keyframes() -> None:
 
 
 def test_culling_can_be_disabled() -> None:
-    keeping = load_config(None, ["mapping.cull=false"])
+    keeping = load_config(None, ["paper.last_keyframe=true"])
     assert Mapper(SharedCamera(CAMERA), keeping, Stopwatch()).cull_and_compact(world_of(standing(30))) is None

@@ -7,9 +7,9 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, adjust_local, rows_of, sideways, submap_of_scene
-from torchslam.config import BundleAdjustmentConfig, load_config
 from torchslam.geometry import se3_exp, transform
 from torchslam.map.map import NO_POINT, Map
+from torchslam.mapping import local_bundle
 from torchslam.mapping.local_bundle import (
     HUBER,
     adjust_all,
@@ -39,18 +39,14 @@ def which_moved(slam_map: Map, before: Tensor) -> list[int]:
     return torch.nonzero((slam_map.T_cw != before).flatten(1).any(1))[:, 0].tolist()
 
 
-def bundle(**changes: int) -> BundleAdjustmentConfig:
-    return load_config(
-        None, [f"bundle_adjustment.{name}={value}" for name, value in changes.items()]
-    ).bundle_adjustment
-
-
-def test_a_window_has_free_neighbors_and_fixed_keyframes() -> None:
+def test_a_window_has_free_neighbors_and_fixed_keyframes(monkeypatch: pytest.MonkeyPatch) -> None:
     slam_map = row(sideways(6))
     truth = slam_map.T_cw.clone()
     perturb(slam_map, [4, 5])
     before = slam_map.T_cw.clone()
-    adjust_local(slam_map, 5, CAMERA, bundle(local_window=2, local_iterations=20))
+    monkeypatch.setattr(local_bundle, "LOCAL_WINDOW", 2)
+    monkeypatch.setattr(local_bundle, "LOCAL_ITERATIONS", 20)
+    adjust_local(slam_map, 5, CAMERA)
     assert which_moved(slam_map, before) == [4, 5]  # the one that shares most with it
     torch.testing.assert_close(slam_map.T_cw, truth, atol=1e-5, rtol=0)
 
@@ -59,21 +55,22 @@ def test_the_first_keyframe_is_always_fixed() -> None:
     slam_map = row(sideways(3))
     perturb(slam_map, [1, 2])
     before = slam_map.T_cw.clone()
-    adjust_local(slam_map, 1, CAMERA, bundle(local_window=8))
+    adjust_local(slam_map, 1, CAMERA)
     assert which_moved(slam_map, before) == [1, 2]
-    adjust_all(slam_map, CAMERA, bundle())
+    adjust_all(slam_map, CAMERA)
     assert torch.equal(slam_map.T_cw[0], before[0])
 
 
-def test_the_number_of_fixed_keyframes_is_bounded() -> None:
+def test_the_number_of_fixed_keyframes_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """With one holding keyframe alone the scale is free; with two it is not."""
+    monkeypatch.setattr(local_bundle, "LOCAL_WINDOW", 2)
+    monkeypatch.setattr(local_bundle, "LOCAL_ITERATIONS", 30)
     for limit, holds in ((1, False), (2, True)):
+        monkeypatch.setattr(local_bundle, "MAX_FIXED_KEYFRAMES", limit)
         slam_map = row(sideways(4))
         truth = slam_map.T_cw.clone()
         slam_map.keyframes["T_cw"][2:, 0, 3] *= 1.02
-        adjust_local(
-            slam_map, 3, CAMERA, bundle(local_window=2, max_fixed_keyframes=limit, local_iterations=30)
-        )
+        adjust_local(slam_map, 3, CAMERA)
         off = float((slam_map.T_cw[2:] - truth[2:]).abs().max())
         assert (off < 1e-6) is holds
 
@@ -142,24 +139,25 @@ def test_an_adjusted_window_has_no_outliers() -> None:
     table = slam_map.keyframes["point_ids"]
     at = torch.nonzero(table[3] >= 0)[:5, 0]
     slam_map.keyframes["keypoints"][3, at] += 25.0
-    adjust_local(slam_map, 3, CAMERA, bundle(local_window=2))
+    adjust_local(slam_map, 3, CAMERA)
     assert (table[3, at] == NO_POINT).all()
 
 
 def test_adjusted_points_are_refreshed_from_their_observations() -> None:
     slam_map = row(sideways(4))
     slam_map.points["scale_distance"][:] = 0
-    adjust_local(slam_map, 3, CAMERA, bundle(local_window=2))
+    adjust_local(slam_map, 3, CAMERA)
     seen = slam_map.observed_points(torch.tensor([3]))
     size = SCENE.sizes[torch.argsort(ROWS)[seen]] * 200.0
     torch.testing.assert_close(slam_map.points["scale_distance"][seen], size)
 
 
-def test_global_adjustment_fixes_the_first_keyframe() -> None:
+def test_global_adjustment_fixes_the_first_keyframe(monkeypatch: pytest.MonkeyPatch) -> None:
     slam_map = row(sideways(5))
     truth = slam_map.T_cw.clone()
     perturb(slam_map, [1, 2, 3, 4])
-    adjust_all(slam_map, CAMERA, bundle(global_iterations=30))
+    monkeypatch.setattr(local_bundle, "GLOBAL_ITERATIONS", 30)
+    adjust_all(slam_map, CAMERA)
     torch.testing.assert_close(slam_map.T_cw[:, :3, :3], truth[:, :3, :3], atol=1e-6, rtol=0)
     scale = float(slam_map.T_cw[4, 0, 3] / truth[4, 0, 3])
     torch.testing.assert_close(slam_map.T_cw[:, :3, 3], scale * truth[:, :3, 3], atol=1e-6, rtol=0)
@@ -170,8 +168,8 @@ def test_an_empty_window_changes_nothing() -> None:
     slam_map = row(sideways(2))
     slam_map.remove_points(slam_map.valid_points())
     before = slam_map.T_cw.clone()
-    adjust_local(slam_map, 1, CAMERA, bundle())
-    assert adjust_all(slam_map, CAMERA, bundle()) is CAMERA
+    adjust_local(slam_map, 1, CAMERA)
+    assert adjust_all(slam_map, CAMERA) is CAMERA
     assert torch.equal(slam_map.T_cw, before)
 
 

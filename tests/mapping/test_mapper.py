@@ -101,7 +101,7 @@ def inserted(by: Mapper, submap: Submap, T_cw: Tensor) -> int:
 def test_a_keyframe_adds_observations_and_new_points() -> None:
     submap = submap_of_half_the_points()
     before = len(submap.map.points)
-    keyframe = inserted(mapper("bundle_adjustment.local=false"), submap, sideways(1, start=0.8)[0])
+    keyframe = inserted(mapper("paper.unrefined=true"), submap, sideways(1, start=0.8)[0])
     assert keyframe == 2
     assert submap.map.num_keyframes == 3
     new = torch.arange(before, len(submap.map.points))
@@ -122,29 +122,21 @@ def test_a_keyframe_adds_observations_and_new_points() -> None:
 
 def test_new_points_come_from_the_configured_neighbors() -> None:
     made = []
-    for count in (1, 5):
+    for override in ("paper.last_keyframe=true", "paper.last_keyframe=false"):
         submap = submap_of_half_the_points(3)
         before = len(submap.map.points)
         inserted(
-            mapper("bundle_adjustment.local=false", f"mapping.num_partners={count}"),
+            mapper("paper.unrefined=true", override),
             submap,
             sideways(1, start=1.2)[0],
         )
         made.append(len(submap.map.points) - before)
     assert 0 < made[0] < made[1]
-    last = submap_of_half_the_points(3)
-    before = len(last.map.points)
-    inserted(
-        mapper("bundle_adjustment.local=false", "mapping.triangulation_partners=last"),
-        last,
-        sideways(1, start=1.2)[0],
-    )
-    assert len(last.map.points) - before == made[1]
 
 
 def test_fusion_culling_and_adjustment_can_be_disabled() -> None:
     doubles: dict[str, int] = {}
-    for fuse in ("true", "false"):
+    for without in ("true", "false"):
         submap = submap_of_scene(SCENE, sideways(2, step=0.4))
         table = submap.map.keyframes["point_ids"]
         at = torch.nonzero(table[0] >= 0)[:10, 0]
@@ -160,24 +152,24 @@ def test_fusion_culling_and_adjustment_can_be_disabled() -> None:
         submap.map.update_appearance(torch.arange(2))
         Tracker(SharedCamera(CAMERA), Config()).reset_to_keyframe(submap, 1)
         inserted(
-            mapper("bundle_adjustment.local=false", "mapping.cull=false", f"mapping.fuse={fuse}"),
+            mapper("paper.unrefined=true", f"paper.last_keyframe={without}"),
             submap,
             sideways(1, start=0.2)[0],
         )
-        doubles[fuse] = int(submap.map.points["is_valid"][twins].sum())
-    assert doubles["false"] == 10
-    assert doubles["true"] < 5
+        doubles[without] = int(submap.map.points["is_valid"][twins].sum())
+    assert doubles["true"] == 10
+    assert doubles["false"] < 5
 
 
 def test_a_local_bundle_adjustment_follows_a_keyframe() -> None:
-    for enabled in ("true", "false"):
+    for unrefined in ("true", "false"):
         submap = submap_of_scene(SCENE, sideways(3, step=0.4), noise=0.5)
         before = submap.map.T_cw.clone()
-        by = mapper(f"bundle_adjustment.local={enabled}")
+        by = mapper(f"paper.unrefined={unrefined}")
         inserted(by, submap, sideways(1, start=1.0)[0])
         has_moved = bool((submap.map.T_cw[:3] != before).any())
-        assert has_moved is (enabled == "true")
-        assert ("bundle" in by.clock.take()) is (enabled == "true")
+        assert has_moved is (unrefined == "false")
+        assert ("bundle" in by.clock.take()) is (unrefined == "false")
 
 
 def is_kept(

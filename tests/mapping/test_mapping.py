@@ -15,11 +15,12 @@ from torchslam.config import Config, load_config
 from torchslam.errors import ConfigError
 from torchslam.geometry import KeypointNoise, SharedCamera, se3_exp, se3_inverse, transform
 from torchslam.map.map import NO_POINT, Map
-from torchslam.mapping.local_bundle import adjust_all
+from torchslam.mapping.local_bundle import GLOBAL_ITERATIONS, adjust_all
 from torchslam.mapping.mapper import Mapper, initial_scale, keyframe_reason
 from torchslam.mapping.new_points import fuse, has_consistent_scale
 from torchslam.system.front_end import Simulated
 from torchslam.system.slam import SLAM
+from torchslam.tracking import tracker as tracker_module
 from torchslam.tracking.data_association import match_points
 from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
@@ -85,7 +86,7 @@ def test_every_observation_reprojects(slam: SLAM) -> None:
 def test_points_project_where_they_are_seen(slam: SLAM) -> None:
     view = view_of(slam, 20)
     near = project_points(
-        slam.map, slam.map.valid_points(), walk_from_start(slam, 20), slam.camera, 60.0, (1.0, 1.0)
+        slam.map, slam.map.valid_points(), walk_from_start(slam, 20), slam.camera, (1.0, 1.0)
     )
     pairs = match_projected_points(slam.map, near, view, 1.0, DescriptorMatcher(CONFIG.matching))
     ids, keypoints = pairs.first, pairs.second
@@ -103,11 +104,10 @@ def test_tracking_finds_the_true_pose(slam: SLAM) -> None:
     assert torch.allclose(estimate.T_cw, walk_from_start(slam, 20), atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "override", ["tracking.motion_model=false", "tracking.guided_matching=false", "tracking.recent_frames=10"]
-)
-def test_tracking_works_without_optional_checks(slam: SLAM, override: str) -> None:
-    tracker = Tracker(SharedCamera(slam.camera), load_config(None, ["features.kind=simulated", override]))
+def test_tracking_works_by_brute_force(slam: SLAM, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracker_module, "RECENT_FRAMES", 10)
+    config = load_config(None, ["features.kind=simulated", "paper.brute_force=true"])
+    tracker = Tracker(SharedCamera(slam.camera), config)
     tracker.reset_to_keyframe(slam.submap, slam.map.num_keyframes - 1)
     estimate = tracker.track(slam.submap, view_of(slam, 20))
     assert estimate is not None
@@ -129,7 +129,7 @@ def test_bundle_adjustment_repairs_a_perturbed_map(slam: SLAM, generator: torch.
     count = slam.map.num_keyframes
     shake = 0.01 * torch.randn(count - 1, 6, generator=generator, dtype=torch.float64)
     slam.map.keyframes["T_cw"][1:] = se3_exp(shake) @ slam.map.T_cw[1:]
-    adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment)
+    adjust_all(slam.map, slam.camera)
     scale = (
         slam.map.T_cw[-1, :3, 3].norm()
         / walk_from_start(slam, int(slam.map.keyframes["frame_index"][-1]))[:3, 3].norm()
@@ -146,12 +146,12 @@ def test_an_interrupted_adjustment_leaves_the_map_unchanged(slam: SLAM, generato
     before = copy.deepcopy(slam.map)
 
     def interrupt(iteration: int, iterations: int) -> None:
-        assert iterations == CONFIG.bundle_adjustment.global_iterations
+        assert iterations == GLOBAL_ITERATIONS
         if iteration == 2:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment, interrupt)
+        adjust_all(slam.map, slam.camera, interrupt)
     for table, old in ((slam.map.points, before.points), (slam.map.keyframes, before.keyframes)):
         for name, column in table.columns().items():
             assert torch.equal(column, old[name]), name
@@ -161,14 +161,14 @@ def test_bundle_adjustment_removes_an_outlier(slam: SLAM) -> None:
     keyframe = slam.map.num_keyframes - 1
     keypoint = int(torch.nonzero(slam.map.keyframes["point_ids"][keyframe] >= 0)[0])
     slam.map.keyframes["keypoints"][keyframe, keypoint] += 40.0
-    adjust_local(slam.map, keyframe, slam.camera, CONFIG.bundle_adjustment)
+    adjust_local(slam.map, keyframe, slam.camera)
     assert slam.map.keyframes["point_ids"][keyframe, keypoint] == NO_POINT
 
 
 def test_the_first_keyframe_is_fixed(slam: SLAM) -> None:
     before = slam.map.T_cw[0].clone()
-    adjust_local(slam.map, 1, slam.camera, CONFIG.bundle_adjustment)
-    adjust_all(slam.map, slam.camera, CONFIG.bundle_adjustment)
+    adjust_local(slam.map, 1, slam.camera)
+    adjust_all(slam.map, slam.camera)
     assert torch.equal(slam.map.T_cw[0], before)
 
 
@@ -244,7 +244,7 @@ def test_two_views_initialize_with_the_true_motion() -> None:
 
 
 def test_the_parallax_criterion_initializes_later() -> None:
-    strict = load_config(None, [*OVERRIDES, "initialization.criterion=parallax"])
+    strict = load_config(None, [*OVERRIDES, "paper.parallax=true"])
     rejection = start_of((0, 1), WALK, strict)
     assert isinstance(rejection, Rejection)
     assert "parallax" in str(rejection)

@@ -10,9 +10,10 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
-from torchslam.config import MatchingConfig, load_config
+from torchslam.config import Config, MatchingConfig
 from torchslam.geometry import KeypointNoise, se3_inverse, so3_exp, transform, triangulation_covariance
 from torchslam.map.map import Map
+from torchslam.mapping import new_points
 from torchslam.mapping.new_points import has_baseline, has_consistent_scale, triangulate_against
 from torchslam.tracking.epipolar import FreeKeypoints, angle_around_axis, match_along_epipolar_lines
 from torchslam.tracking.matcher import max_distance
@@ -27,12 +28,10 @@ def map_of_half_the_points(T_cw: Tensor, noise: float = 0.0) -> Map:
     return submap_of_scene(SCENE, T_cw, noise=noise, seen=torch.arange(300) % 2 == 0).map
 
 
-def triangulated(
-    slam_map: Map, *overrides: str, keyframe: int = 1, neighbors: tuple[int, ...] = (0,)
-) -> Tensor:
+def triangulated(slam_map: Map, keyframe: int = 1, neighbors: tuple[int, ...] = (0,)) -> Tensor:
     """(n,) rows of the points that a keyframe and its neighbors make."""
-    before, config = len(slam_map.points), load_config(None, overrides)
-    triangulate_against(slam_map, keyframe, torch.tensor(neighbors), CAMERA, config)
+    before = len(slam_map.points)
+    triangulate_against(slam_map, keyframe, torch.tensor(neighbors), CAMERA, Config())
     return torch.arange(before, len(slam_map.points))
 
 
@@ -93,12 +92,15 @@ def test_new_points_have_covariances() -> None:
     torch.testing.assert_close(slam_map.points["covariances_w"][new], wanted)
 
 
-def test_points_with_little_parallax_are_rejected() -> None:
+def test_points_with_little_parallax_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     T_cw = sideways(2, step=0.1)
     slam_map = map_of_half_the_points(T_cw)
-    new = triangulated(slam_map, "mapping.min_parallax_deg=1.5", "mapping.min_baseline=0.001")
+    monkeypatch.setattr(new_points, "MIN_BASELINE", 0.001)
+    monkeypatch.setattr(new_points, "MIN_PARALLAX_DEG", 1.5)
+    new = triangulated(slam_map)
     every = map_of_half_the_points(T_cw)
-    all_of_them = triangulated(every, "mapping.min_parallax_deg=0", "mapping.min_baseline=0.001")
+    monkeypatch.setattr(new_points, "MIN_PARALLAX_DEG", 0)
+    all_of_them = triangulated(every)
 
     def angles(points_w: Tensor) -> Tensor:
         rays = [torch.nn.functional.normalize(points_w - se3_inverse(T)[:3, 3], dim=-1) for T in T_cw]
@@ -115,19 +117,16 @@ def spoiled(slam_map: Map, keyframe: int, pixels: float, axis: int) -> None:
 
 
 @pytest.mark.parametrize(("offset", "good"), [(4.6, True), (5.2, False)])
-def test_points_must_reproject_onto_their_keypoints(offset: float, good: bool) -> None:
+def test_points_must_reproject_onto_their_keypoints(
+    offset: float, good: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Across the epipolar line an error is shared by the two views: each may be off by 2.45 times its scale."""
     slam_map = map_of_half_the_points(sideways(2, step=0.4))
     spoiled(slam_map, 0, offset, 1)
-    new = triangulated(slam_map, "mapping.max_epipolar_px=100")
+    monkeypatch.setattr(new_points, "MAX_EPIPOLAR_PX", 100)
+    new = triangulated(slam_map)
     assert (len(new) > 40) is good
     assert (len(new) == 0) is not good or good
-
-
-def test_the_gate_is_the_configured_one() -> None:
-    slam_map = map_of_half_the_points(sideways(2, step=0.4))
-    spoiled(slam_map, 0, 5.2, 1)
-    assert len(triangulated(slam_map, "mapping.max_epipolar_px=100", "measurement.max_chi_square=9")) > 40
 
 
 def test_points_with_inconsistent_scales_are_rejected() -> None:
@@ -143,14 +142,16 @@ def test_points_with_inconsistent_scales_are_rejected() -> None:
     assert not fine[torch.nonzero(torch.isin(slam_map.keyframes["point_ids"][1], new))[:, 0]].any()
 
 
-def test_the_baseline_must_be_a_fraction_of_the_depth() -> None:
+def test_the_baseline_must_be_a_fraction_of_the_depth(monkeypatch: pytest.MonkeyPatch) -> None:
     slam_map = map_of_half_the_points(sideways(2, step=0.4))
     seen = slam_map.observed_points(torch.tensor([0]))
     share = 0.4 / float(slam_map.positions_w[seen, 2].median())
     assert has_baseline(slam_map, 1, torch.tensor([0, 1]), 0.99 * share).tolist() == [True, False]
     assert not has_baseline(slam_map, 1, torch.tensor([0]), 1.01 * share)
-    assert len(triangulated(slam_map, f"mapping.min_baseline={1.01 * share}")) == 0
-    assert len(triangulated(slam_map, f"mapping.min_baseline={0.99 * share}")) > 0
+    monkeypatch.setattr(new_points, "MIN_BASELINE", 1.01 * share)
+    assert len(triangulated(slam_map)) == 0
+    monkeypatch.setattr(new_points, "MIN_BASELINE", 0.99 * share)
+    assert len(triangulated(slam_map)) > 0
 
 
 def test_the_median_depth_is_that_of_the_neighbor() -> None:

@@ -313,7 +313,7 @@ def test_a_signal_to_the_process_group_ends_the_run_with_results(
         "--processes",
         "2",
         "--set",
-        "bundle_adjustment.global_at_end=false",
+        "paper.unrefined=true",
     ]
     with (tmp_path / "err").open("w+") as errors:
         child = subprocess.Popen(command, stderr=errors, stdout=errors, start_new_session=True)

@@ -10,8 +10,7 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
-from torchslam import SLAM, load_config
-from torchslam.config import PoseValidationConfig
+from torchslam import SLAM
 from torchslam.map.atlas import Submap
 from torchslam.system import savepoint as savepoints
 from torchslam.system.frame_log import FrameStatus, HeldFrame
@@ -34,10 +33,8 @@ class Frames:
         tried: Frames that were to become tentative keyframes.
     """
 
-    def __init__(
-        self, T_cw: Tensor, monkeypatch: pytest.MonkeyPatch, *overrides: str, noise: float = 0.0
-    ) -> None:
-        self.slam = SLAM(CAMERA, load_config(None, overrides))
+    def __init__(self, T_cw: Tensor, monkeypatch: pytest.MonkeyPatch, noise: float = 0.0) -> None:
+        self.slam = SLAM(CAMERA)
         self.context, self.backward = self.slam._context, self.slam._state_machine.backward
         self.submap = submap_of_scene(SCENE, sideways(4), first=FIRST)
         self.log = self.context.log
@@ -78,10 +75,8 @@ class Frames:
         return self.submap.map.keyframes["frame_index"].tolist()
 
 
-def tracked_backward(
-    T_cw: Tensor, monkeypatch: pytest.MonkeyPatch, *overrides: str, noise: float = 0.0
-) -> Frames:
-    return Frames(T_cw, monkeypatch, *overrides, noise=noise).tracked()
+def tracked_backward(T_cw: Tensor, monkeypatch: pytest.MonkeyPatch, noise: float = 0.0) -> Frames:
+    return Frames(T_cw, monkeypatch, noise=noise).tracked()
 
 
 def doubting(monkeypatch: pytest.MonkeyPatch, doubtful: Container[int]) -> None:
@@ -137,7 +132,8 @@ def test_many_blank_frames_end_backward_tracking(monkeypatch: pytest.MonkeyPatch
 def test_frames_with_invalid_poses_are_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     T_cw = sideways(3, -0.05, start=-0.05)
     assert tracked_backward(T_cw, monkeypatch, noise=0.5).posed == [99, 98, 97]
-    walk = tracked_backward(T_cw, monkeypatch, "pose_validation.max_rotation_std_deg=1e-6", noise=0.5)
+    monkeypatch.setattr(pose_validation, "MAX_ROTATION_STD_DEG", 1e-6)
+    walk = tracked_backward(T_cw, monkeypatch, noise=0.5)
     assert walk.posed == []
     assert walk.unposed == [99, 98, 97]
     assert walk.tried == []
@@ -147,7 +143,8 @@ def test_a_jump_from_the_predicted_motion_is_not_accepted(monkeypatch: pytest.Mo
     T_cw = sideways(4, -0.05, start=-0.05)
     # the first frame has no motion to be compared with; the motion from the second to the third is too large
     T_cw[2:] = sideways(2, -0.05, start=-0.5)
-    walk = tracked_backward(T_cw, monkeypatch, "pose_validation.max_jump=0.03")
+    monkeypatch.setattr(pose_validation, "MAX_JUMP", 0.03)
+    walk = tracked_backward(T_cw, monkeypatch)
     assert walk.posed == [99, 98]
     assert walk.tried == []
 
@@ -177,7 +174,7 @@ def test_doubtful_frames_are_unposed_again_when_tracking_ends_early(monkeypatch:
 
 
 def test_doubtful_frames_are_kept_after_enough_certain_ones(monkeypatch: pytest.MonkeyPatch) -> None:
-    confirming = PoseValidationConfig().num_confirming_frames
+    confirming = pose_validation.NUM_CONFIRMING_FRAMES
     T_cw = sideways(15, -0.02, start=-0.02)
     for certain, posed in ((confirming - 1, [99]), (confirming, list(range(99, 96 - confirming, -1)))):
         doubting(monkeypatch, {1, 2})

@@ -19,8 +19,10 @@ WALK = Walk(arc(60)[:30])
 
 @pytest.fixture(scope="module")
 def unadjusted() -> Run:
-    settings = [*SETTINGS, "simulated.noise_px=0.5", "bundle_adjustment.global_at_end=false"]
-    return SLAM(WALK.camera, load_config(None, settings)).run(WALK)
+    config = load_config(None, [*SETTINGS, "simulated.noise_px=0.5"])
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(FinalAdjustment, "adjust", lambda *_, **__: None)
+        return SLAM(WALK.camera, config).run(WALK)
 
 
 def adjusted(run: Run, settled: bool) -> Atlas:

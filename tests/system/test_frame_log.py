@@ -9,9 +9,10 @@ import torch
 
 from tests.map.simulated import estimate_at
 from tests.scene import Scene, pose
-from torchslam.config import InitializationConfig
 from torchslam.map.atlas import TrackingState
-from torchslam.system.frame_log import FrameLog, FrameStatus, HeldFrame
+from torchslam.system import frame_log
+from torchslam.system.frame_log import MAX_UNPOSED_FRAMES, FrameLog, FrameStatus, HeldFrame
+from torchslam.tracking.initialization import MAX_REFERENCE_AGE
 from torchslam.types import FrameFeatures
 
 SCENE = Scene.of(10)
@@ -29,10 +30,6 @@ def held_frame(index: int) -> HeldFrame:
     return HeldFrame.of(view_of(index), estimate, tracking)
 
 
-def log_of(limit: int = 100, reference_age: int = 2) -> FrameLog:
-    return FrameLog(InitializationConfig(max_unposed_frames=limit, max_reference_age=reference_age))
-
-
 def unposed(log: FrameLog, before: int | None = None) -> list[int]:
     return [view.index for view in log.unposed(before)]
 
@@ -45,7 +42,7 @@ SET = {
 
 
 def test_a_frame_that_was_never_logged_has_no_status() -> None:
-    log = log_of()
+    log = FrameLog()
     log.unpose(view_of(3))
     assert log.status(4) is None
     with pytest.raises(KeyError):
@@ -59,7 +56,7 @@ def test_a_frame_that_was_never_logged_has_no_status() -> None:
 def test_a_frame_changes_its_status_and_is_logged_once(
     before: FrameStatus | None, after: FrameStatus
 ) -> None:
-    log = log_of()
+    log = FrameLog()
     if before is not None:
         SET[before](log, 3)
         assert log.status(3) is before
@@ -71,7 +68,7 @@ def test_a_frame_changes_its_status_and_is_logged_once(
 
 @pytest.mark.parametrize("before", SET)
 def test_a_released_frame_is_unposed_again(before: FrameStatus) -> None:
-    log = log_of()
+    log = FrameLog()
     SET[before](log, 3)
     SET[before](log, 5)
     log.release([3])
@@ -82,7 +79,7 @@ def test_a_released_frame_is_unposed_again(before: FrameStatus) -> None:
 
 @pytest.mark.parametrize("status", SET)
 def test_a_forgotten_frame_is_gone(status: FrameStatus) -> None:
-    log = log_of()
+    log = FrameLog()
     for index in (3, 4):
         SET[status](log, index)
     log.forget([3, 9])  # the other one was never logged
@@ -91,7 +88,7 @@ def test_a_forgotten_frame_is_gone(status: FrameStatus) -> None:
 
 
 def test_held_frames_are_taken_with_their_poses_in_the_order_asked_for() -> None:
-    log = log_of()
+    log = FrameLog()
     frames = {index: held_frame(index) for index in (5, 3, 4, 6)}
     for frame in frames.values():
         log.hold(frame)
@@ -112,7 +109,7 @@ def test_a_held_frame_keeps_the_pose_of_when_it_was_held() -> None:
 
 
 def test_frames_are_listed_in_the_order_of_their_indices() -> None:
-    log = log_of()
+    log = FrameLog()
     log.unpose(*map(view_of, (7, 1, 8, 2)))
     log.hold(held_frame(3))
     log.pose(view_of(5))
@@ -123,8 +120,9 @@ def test_frames_are_listed_in_the_order_of_their_indices() -> None:
     assert [view.index for view in log.views([8, 3, 5])] == [3, 5, 8]
 
 
-def test_the_latest_unposed_frames_are_kept() -> None:
-    log = log_of(3)
+def test_the_latest_unposed_frames_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(frame_log, "MAX_UNPOSED_FRAMES", 3)
+    log = FrameLog()
     log.unpose(*map(view_of, (0, 1, 2, 3)))
     log.unpose(view_of(5))
     assert unposed(log) == [2, 3, 5]
@@ -135,15 +133,15 @@ def test_the_latest_unposed_frames_are_kept() -> None:
 
 
 def test_frames_with_which_a_map_may_begin_are_kept() -> None:
-    for reference_age in (2, 3):
-        log = log_of(limit=0, reference_age=reference_age)
-        log.unpose(*map(view_of, range(5)))
-        assert unposed(log) == list(range(5))[-reference_age:]
+    assert MAX_UNPOSED_FRAMES > MAX_REFERENCE_AGE
 
 
 @pytest.mark.parametrize("status", [HELD, POSED])
-def test_frames_with_a_pose_are_not_limited_and_limit_no_others(status: FrameStatus) -> None:
-    log = log_of(2)
+def test_frames_with_a_pose_are_not_limited_and_limit_no_others(
+    status: FrameStatus, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(frame_log, "MAX_UNPOSED_FRAMES", 2)
+    log = FrameLog()
     log.unpose(view_of(0))
     for index in range(1, 8):
         SET[status](log, index)
@@ -167,7 +165,7 @@ def test_frames_with_a_pose_are_not_limited_and_limit_no_others(status: FrameSta
     ],
 )
 def test_a_copy_restores_what_changed_since(change: Callable[[FrameLog], object]) -> None:
-    log = log_of()
+    log = FrameLog()
     log.unpose(view_of(1))
     log.hold(held_frame(2))
     log.pose(view_of(3))
@@ -183,4 +181,3 @@ def test_a_copy_restores_what_changed_since(change: Callable[[FrameLog], object]
     assert statuses(log) == [UNPOSED, HELD, POSED, None]
     change(log)
     assert statuses(copied) == [UNPOSED, HELD, POSED, None]
-    assert copied.settings is log.settings

@@ -1,4 +1,4 @@
-"""Images of any size: large ones are looked at reduced, and what is said in pixels grows with them."""
+"""Images of any size: large ones are looked at reduced, and thresholds in pixels grow with them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import torch
 
 from torchslam import SLAM
 from torchslam.config import Config, FeaturesConfig
-from torchslam.config.schema import scale_pixel_settings
 from torchslam.data import open_sequence
 from torchslam.data.transforms import resize
 from torchslam.features import match
@@ -19,12 +18,6 @@ from torchslam.system.run import Run
 from torchslam.types import Features, Frame
 
 WALK = "synthetic:room?frames=20"
-GROWING = {
-    "initialization": {"min_motion_px", "max_static_px", "threshold_px"},
-    "tracking": {"threshold_px"},
-    "static_overlay": {"min_motion_px", "radius_px", "cell_px"},
-    "independent_motion": {"threshold_px", "search_px"},
-}
 
 
 @pytest.mark.parametrize(
@@ -50,19 +43,6 @@ def test_reduction_does_not_alias() -> None:
     assert mask is not None
     assert mask.dtype == torch.bool
     assert bool(mask.all())
-
-
-def test_pixel_settings_grow_with_the_image() -> None:
-    config = Config()
-    assert config.for_size((1241, 376)) == config
-    large = config.for_size((1920, 1440))
-    assert large == scale_pixel_settings(config, 3.0)
-    for section in config.__dataclass_fields__:
-        before, after = getattr(config, section), getattr(large, section)
-        names = getattr(before, "__dataclass_fields__", {})
-        changed = {name for name in names if getattr(before, name) != getattr(after, name)}
-        assert changed == GROWING.get(section, set())
-        assert all(getattr(after, name) == 3 * getattr(before, name) for name in changed)
 
 
 @lru_cache
@@ -103,16 +83,20 @@ def test_a_mask_applies_to_the_large_image() -> None:
     assert int(found.mask.sum()) > 300  # the budget goes there
 
 
-def test_every_stage_gets_the_scaled_configuration() -> None:
-    slam = SLAM(resize(open_sequence(WALK), "1280x960").camera)
-    scaled = Config().for_size((1280, 960))
-    assert slam.config == Config()
-    initializer = slam._state_machine.map_start.initializer
-    assert all(
-        one.config == scaled for one in (slam.mapper, slam.loop_closer, slam.scene_filter, initializer)
-    )
-    assert slam.tracker.settings == scaled.tracking
-    assert slam.scene_filter.static_overlay.evidence.shape == (121, 161)
+def test_thresholds_grow_with_the_image() -> None:
+    small, large = (SLAM(resize(open_sequence(WALK), size).camera) for size in ("640x480", "1280x960"))
+    for before, after in zip(thresholds_px(small), thresholds_px(large), strict=True):
+        assert after == 2 * before
+    assert large.scene_filter.static_overlay.evidence.shape == (121, 161)
+
+
+def thresholds_px(slam: SLAM) -> tuple[float, ...]:
+    start, overlay = slam._state_machine.map_start.initializer, slam.scene_filter.static_overlay
+    return (
+        start.threshold_px, start.min_motion_px, start.max_static_px, start.turning.threshold_px,
+        slam.tracker.localizer.threshold_px, overlay.cell_px, overlay.reduction,
+        slam.scene_filter.independent_motion.reduction,
+    )  # fmt: skip
 
 
 def run(size: str) -> Run:

@@ -18,9 +18,11 @@ from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.evaluation import ate
 from torchslam.features import SimulatedFeatures
+from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import Simulated, WithFeatures
 from torchslam.system.run import RunProgress, run_sequence
+from torchslam.system.state_machine import StateMachine
 from torchslam.types import Frame
 
 CONFIG = load_config(
@@ -31,11 +33,16 @@ CONFIG = load_config(
         "simulated.points_per_view=150",
         "simulated.noise_px=0.3",
         "simulated.with_scales=true",
-        "bundle_adjustment.delay_frames=0",  # young or not, a submap grows alike
     ],
 )
 WALK = Walk(arc(30)[:16])
 Say = Callable[[Features], Tensor | None]
+
+
+@pytest.fixture(autouse=True)
+def adjusted_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Young or not, a submap grows alike."""
+    monkeypatch.setattr(StateMachine, "_apply_at", lambda _: ApplyAt.NOW)
 
 
 def by_number(features: Features) -> Tensor:
@@ -180,7 +187,7 @@ def test_gradients_reach_the_information(kind: str) -> None:
     walk = Walk(arc(6, length=1.0))
     images, truth = torch.cat([walk.image(index) for index in range(6)]), true_T_cw(walk)
     extractor = Doubtful(walk, kind)
-    clip_slam = ClipSLAM(extractor, config=load_config(None, ["bundle_adjustment.global_iterations=30"]))
+    clip_slam = ClipSLAM(extractor)
     graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(falloff: float) -> Tensor:

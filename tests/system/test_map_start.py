@@ -30,7 +30,8 @@ class Started:
     """
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, num_confirming: int = 12) -> None:
-        self.slam = SLAM(CAMERA, load_config(None, [f"initialization.provisional_frames={num_confirming}"]))
+        monkeypatch.setattr(map_starts, "PROVISIONAL_FRAMES", num_confirming)
+        self.slam = SLAM(CAMERA)
         self.context, self.submap = self.slam._context, submap_of_scene(SCENE, sideways(3))
         self.active, self.log = self.context.active_map, self.context.log
         self.slam.atlas._submaps, self.slam.atlas.num_created = [self.submap], 1

@@ -5,12 +5,14 @@ from __future__ import annotations
 import random
 from collections.abc import Callable, Iterator
 from itertools import pairwise, product
+from types import ModuleType
 
 import pytest
 
 from tests.system.judging import DOUBT, NO_POSE, WRONG, Drive, Judgment
 from tests.walks import Walk, arc
 from torchslam import State
+from torchslam.system import map_start, state_machine
 from torchslam.system.modes import TRANSITIONS, Mode
 from torchslam.system.session import SystemContext
 from torchslam.system.state_machine import FrameOutcome, StateMachine
@@ -19,9 +21,9 @@ from torchslam.types import Reason
 INITIALIZING, LOST = Mode.INITIALIZING, Mode.LOST
 PROVISIONAL, PROVISIONAL_DOUBTED = Mode.PROVISIONAL, Mode.PROVISIONAL_DOUBTED
 TRACKING, DOUBTED, RELOCALIZED = Mode.TRACKING, Mode.DOUBTED, Mode.RELOCALIZED
-SOON_KEPT = ("initialization.provisional_frames=8",)
-SOON_ANEW = ("relocalization.frames_before_new_submap=2",)
-LONG_PROVISIONAL = ("initialization.provisional_frames=60",)
+Constants = tuple[tuple[ModuleType, str, int], ...]
+SOON_KEPT: Constants = ((map_start, "PROVISIONAL_FRAMES", 8),)
+SOON_ANEW: Constants = ((state_machine, "FRAMES_BEFORE_NEW_SUBMAP", 2),)
 
 
 def until_lost(drive: Drive) -> None:
@@ -60,9 +62,7 @@ def relocalize(drive: Drive) -> None:
 def confirm_by_frames(drive: Drive) -> None:
     drive.until(TRACKING)
     certain = [result for result in drive.results if result.state is State.TRACKING]
-    assert (
-        len(certain) == drive.slam.config.initialization.provisional_frames + 1
-    )  # and the frame of its start
+    assert len(certain) == map_start.PROVISIONAL_FRAMES + 1  # and the frame of its start
     assert not drive.slam.loop_closer.loop_closures
 
 
@@ -194,7 +194,7 @@ def lose_doubted(drive: Drive) -> None:
 
 def confirm_relocalized(drive: Drive) -> None:
     relocalize(drive)
-    for _ in range(drive.slam.config.relocalization.num_confirming_frames):
+    for _ in range(state_machine.NUM_RELOCALIZED_FRAMES):
         assert drive.slam.mode is RELOCALIZED
         drive.step()
 
@@ -204,7 +204,7 @@ def lose_relocalized(drive: Drive) -> None:
     drive.step(NO_POSE)
 
 
-SCENARIOS: list[tuple[Mode, Mode, Callable[[Drive], None], tuple[str, ...]]] = [
+SCENARIOS: list[tuple[Mode, Mode, Callable[[Drive], None], Constants]] = [
     (INITIALIZING, PROVISIONAL, start, ()),
     (LOST, PROVISIONAL, start_another_map, SOON_ANEW),
     (LOST, RELOCALIZED, relocalize, ()),
@@ -232,11 +232,13 @@ SCENARIOS: list[tuple[Mode, Mode, Callable[[Drive], None], tuple[str, ...]]] = [
 
 @pytest.mark.parametrize("transition", TRANSITIONS, ids=lambda pair: f"{pair[0].name}-{pair[1].name}")
 def test_every_transition_happens(transition: tuple[Mode, Mode], monkeypatch: pytest.MonkeyPatch) -> None:
-    scenarios = [(drives, settings) for *pair, drives, settings in SCENARIOS if tuple(pair) == transition]
+    scenarios = [(drives, constants) for *pair, drives, constants in SCENARIOS if tuple(pair) == transition]
     assert scenarios
-    for drives, settings in scenarios:
+    for drives, constants in scenarios:
         with monkeypatch.context() as patched:
-            drive = Drive(patched, Walk(arc(120)), *settings)
+            for constant in constants:
+                patched.setattr(*constant)
+            drive = Drive(patched, Walk(arc(120)))
             drives(drive)
             assert tuple(drive.modes[-2:]) == transition
             drive.check()
@@ -275,7 +277,9 @@ def test_no_other_transition_happens_and_no_frame_is_forgotten_whatever_the_judg
     seed: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Frames are judged by chance, in runs; places are recognized by chance. The assertion is in the state machine."""
-    drive, draw = Drive(monkeypatch, Walk(arc(240)), *SOON_KEPT, *SOON_ANEW), random.Random(seed)
+    for constant in (*SOON_KEPT, *SOON_ANEW):
+        monkeypatch.setattr(*constant)
+    drive, draw = Drive(monkeypatch, Walk(arc(240))), random.Random(seed)
     drive.limit_held_frames(6)
     judgments: list[Judgment] = [None, None, None, None, DOUBT, DOUBT, WRONG, NO_POSE]
     while len(drive.results) < 160:

@@ -7,13 +7,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchslam import SLAM, Config, Run, StepResult, Trajectory, evaluate, load_config, open_sequence
+from torchslam import SLAM, Config, Run, StepResult, Trajectory, evaluate, open_sequence
 from torchslam.config import CameraConfig
 from torchslam.errors import ResultsError
 from torchslam.geometry import SensorModel
 from torchslam.map.file import read_tensors, write_tensors
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.run import RunProgress, run_sequence
+from torchslam.tracking.non_static import NO_MOVEMENT, SceneFilter
 
 ROOM = open_sequence("synthetic:room?readout=30&pace=2", limit=60)
 
@@ -94,9 +95,10 @@ def test_a_given_readout_holds_from_the_first_frame() -> None:
     assert SLAM(ROOM.camera).shared_camera.model.readout is None
 
 
-def test_a_resumed_run_goes_on_with_the_readout(tmp_path: Path) -> None:
-    settings = load_config(None, ["independent_motion.enabled=false"])  # what moves is not in a checkpoint
-    slam, so_far, path = SLAM(ROOM.camera, settings), RunProgress(), tmp_path / "checkpoint.safetensors"
+def test_a_resumed_run_goes_on_with_the_readout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # What moves is not in a checkpoint.
+    monkeypatch.setattr(SceneFilter, "detect_independent_motion", lambda *_: NO_MOVEMENT)
+    slam, so_far, path = SLAM(ROOM.camera), RunProgress(), tmp_path / "checkpoint.safetensors"
 
     class Enough(BaseException):
         pass
@@ -108,7 +110,7 @@ def test_a_resumed_run_goes_on_with_the_readout(tmp_path: Path) -> None:
     with pytest.raises(Enough):
         run_sequence(slam, ROOM, stop, so_far)
     write_checkpoint(path, slam, so_far, ROOM)
-    resumed, loaded = read_checkpoint(path, ROOM, settings)
+    resumed, loaded = read_checkpoint(path, ROOM, Config())
     assert resumed.shared_camera.model.readout == slam.shared_camera.model.readout
     assert resumed.online_camera.changes[-1].readout == slam.online_camera.changes[-1].readout
     assert resumed.online_camera.next_check == slam.online_camera.next_check
@@ -118,4 +120,4 @@ def test_a_resumed_run_goes_on_with_the_readout(tmp_path: Path) -> None:
     for wrong in ([0.03], [float("inf"), 0.001, 0.0, 0.2], [0.03, -1.0, 0.0, 0.2], "fast"):
         write_tensors(path, tensors, about | {"run": about["run"] | {"readout": wrong}})
         with pytest.raises(ResultsError, match="not a whole checkpoint"):
-            read_checkpoint(path, ROOM, settings)
+            read_checkpoint(path, ROOM, Config())

@@ -30,19 +30,28 @@ from torchslam.io.results import read_frames
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import TrackingState
 from torchslam.map.file import read_atlas, read_tensors, write_atlas, write_tensors
+from torchslam.mapping import local_bundle, mapper
+from torchslam.system import map_start, state_machine
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.run import RunProgress, run_sequence
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
-# A system is settled once its submap is no longer to be taken back. Without any noise, what a run says of its camera
-# would be looked for to the last bit, in hundreds of iterations.
-SETTINGS += ["initialization.provisional_frames=8", "simulated.noise_px=0.05"]
+# Without any noise, what a run says of its camera would be looked for to the last bit, in hundreds of iterations.
+SETTINGS += ["simulated.noise_px=0.05"]
 SET = [part for setting in SETTINGS for part in ("--set", setting)]
 CONFIG = load_config(None, SETTINGS)
 FRAMES = 26
 PATH = arc(45)[:FRAMES]
 WALK = Walk(PATH)
 STOP = 17  # frame after which a run ends early
+
+
+@pytest.fixture(scope="module", autouse=True)
+def soon_kept() -> Iterator[None]:
+    """A system is settled once its submap is no longer to be taken back."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(map_start, "PROVISIONAL_FRAMES", 8)
+        yield
 
 
 class PowerCut(BaseException):
@@ -119,12 +128,14 @@ def test_a_resumed_run_equals_an_uninterrupted_one(checkpoint: Path, tmp_path: P
 
 
 @pytest.mark.parametrize("window", [3, 1000])  # few keyframes are enough to wait, or none are
-def test_a_pending_adjustment_is_finished_after_resuming(tmp_path: Path, window: int) -> None:
-    config = load_config(
-        None, [*SETTINGS, "bundle_adjustment.delay_frames=3", f"bundle_adjustment.local_window={window}"]
-    )
-    whole = SLAM(WALK.camera, config).run(WALK)
-    slam, so_far = SLAM(WALK.camera, config), RunProgress()
+def test_a_pending_adjustment_is_finished_after_resuming(
+    tmp_path: Path, window: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mapper, "DELAY_FRAMES", 3)
+    for module in (local_bundle, state_machine):
+        monkeypatch.setattr(module, "LOCAL_WINDOW", window)
+    whole = SLAM(WALK.camera, CONFIG).run(WALK)
+    slam, so_far = SLAM(WALK.camera, CONFIG), RunProgress()
 
     def cut(result: StepResult) -> None:
         if slam.can_checkpoint and slam.mapper.adjustment.is_pending:
@@ -133,7 +144,7 @@ def test_a_pending_adjustment_is_finished_after_resuming(tmp_path: Path, window:
     with pytest.raises(PowerCut):
         run_sequence(slam, WALK, cut, so_far)
     write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
-    resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, config)
+    resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG)
     assert resumed.mapper.adjustment.is_pending
     assert resumed.mapper.adjustment.due == slam.mapper.adjustment.due
     assert resumed.mapper.adjustment.is_due_before_next_frame is (window == 1000)

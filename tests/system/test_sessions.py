@@ -15,6 +15,7 @@ from tests.walks import Walk, arc
 from torchslam import SLAM, Config, Frame, Run, State, TorchslamError, evaluate, load_config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError, ResultsError
+from torchslam.system import state_machine
 from torchslam.system.front_end import Simulated, WithFeatures
 from torchslam.types import Features
 
@@ -105,8 +106,11 @@ def test_localization_does_not_change_the_map(first: tuple[SLAM, Run, Path], tmp
     assert (tmp_path / "after").read_bytes() == first[2].read_bytes()
 
 
-def test_localization_elsewhere_finds_no_pose_and_starts_no_map(first: tuple[SLAM, Run, Path]) -> None:
-    slam = SLAM.load(first[2], config_of("relocalization.frames_before_new_submap=2"), mapping=False)
+def test_localization_elsewhere_finds_no_pose_and_starts_no_map(
+    first: tuple[SLAM, Run, Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(state_machine, "FRAMES_BEFORE_NEW_SUBMAP", 2)
+    slam = SLAM.load(first[2], config_of(), mapping=False)
     run = slam.run(simulated_features(seed=1).of(WALK).part(0, 10))  # another scene: a map of it could begin
     assert {result.state for result in run.results} == {State.LOST}
     assert len(run.submaps) == 1
@@ -186,7 +190,7 @@ class Stumbling(Sequence):
 
 
 def test_a_run_skips_invalid_frames() -> None:
-    slam = SLAM(WALK.camera, config_of("bundle_adjustment.global_at_end=false"))
+    slam = SLAM(WALK.camera, config_of("paper.unrefined=true"))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         run = slam.run(simulated_features().of(Stumbling()))
@@ -198,7 +202,7 @@ def test_a_run_skips_invalid_frames() -> None:
 
 @pytest.mark.parametrize("before", [lambda slam: slam.run(SEEN.part(0, 5)), lambda slam: slam.step(SEEN[0])])
 def test_a_second_run_is_refused_until_reset(before: Callable[[SLAM], object]) -> None:
-    slam = SLAM(WALK.camera, config_of("bundle_adjustment.global_at_end=false"))
+    slam = SLAM(WALK.camera, config_of("paper.unrefined=true"))
     before(slam)
     with pytest.raises(TorchslamError, match=r"reset\(\).*SLAM.load\(\)"):
         slam.run(SEEN.part(0, 5))

@@ -15,7 +15,6 @@ from tests.walks import Walk, arc, still, turn, walk_with_jump
 from torchslam import (
     SLAM,
     Camera,
-    Config,
     Frame,
     Run,
     State,
@@ -31,11 +30,15 @@ from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_inverse, se3_log, transform
 from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
-from torchslam.mapping.local_bundle import AsyncBundleAdjustment
+from torchslam.mapping import local_bundle, mapper
+from torchslam.mapping.local_bundle import ApplyAt, AsyncBundleAdjustment
 from torchslam.mapping.mapper import MapInitializer
 from torchslam.optim import GRAPH_OPTIONS
+from torchslam.system import map_start, state_machine
 from torchslam.system.front_end import Simulated
 from torchslam.system.modes import Mode
+from torchslam.system.state_machine import StateMachine
+from torchslam.tracking.localizer import LOCAL_KEYFRAMES
 from torchslam.types import FrameFeatures, Reason, Trajectory, TwoViewMap
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
@@ -57,7 +60,7 @@ def test_exact_features_give_the_exact_trajectory() -> None:
 @pytest.mark.parametrize("scales", ["false", "true"])
 def test_noise_and_outliers_are_tolerated(scales: str) -> None:
     walk = Walk(arc(60)[:30])
-    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1", "simulated.dropout_ratio=0.1")
+    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1")
     run = run_walk(walk, *noisy, f"simulated.with_scales={scales}")
     assert len(run.trajectory) == 30
     result = evaluate(run.trajectory, walk.groundtruth)
@@ -72,7 +75,7 @@ def test_the_scale_can_be_that_of_ground_truth() -> None:
 
 def test_unit_scale_sets_the_initial_median_depth_to_one() -> None:
     walk = Walk(arc(12))
-    run = run_walk(walk, "bundle_adjustment.local=false", "mapping.cull=false")
+    run = run_walk(walk, "paper.unrefined=true", "paper.last_keyframe=true")
     initial = run.map.points["first_keyframe"] == 1
     assert float(run.map.positions_w[initial, 2].median()) == pytest.approx(1.0, rel=0.2)
 
@@ -115,7 +118,7 @@ def test_loss_is_reported_and_tracking_recovers() -> None:
     states = [r.state for r in run.results]
     assert states[35:40] == [State.LOST] * 5
     assert all(r.T_cw is None for r in run.results[35:40])
-    confirmed = 40 + Config().relocalization.num_confirming_frames
+    confirmed = 40 + state_machine.NUM_RELOCALIZED_FRAMES
     assert states[40:confirmed] == [State.UNCERTAIN] * (confirmed - 40)
     assert run.results[40].reason == Reason.RELOCALIZED
     assert not any(r.is_keyframe for r in run.results[35 : confirmed + 1])
@@ -176,6 +179,7 @@ def test_an_initialization_must_explain_the_frames_since_its_reference(
     least: float, believed: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The reference frame is explained, the one that starts the map is not."""
+    monkeypatch.setattr(mapper, "MIN_EXPLAINED_RATIO", least)
     explains = MapInitializer._explains
     monkeypatch.setattr(
         MapInitializer,
@@ -187,7 +191,6 @@ def test_an_initialization_must_explain_the_frames_since_its_reference(
         walk,
         "simulated.depth_near=7",
         "simulated.depth_far=25",
-        f"initialization.min_explained_ratio={least}",
     )
     assert (len(run.submaps) == 1) is believed
     assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
@@ -198,7 +201,7 @@ def test_a_contradicting_initialization_replaces_a_provisional_map(
     explained: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """No support is enough here: whatever start the first and the last frame make is a rival."""
-    few = ("initialization.min_matches=30", "initialization.min_points=20")
+    few = ("initialization.min_matches=30",)
     walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
     monkeypatch.setattr("torchslam.tracking.initialization.MIN_SUPPORT_RATIO", 2.0)
     found, founded = MapInitializer.build, []
@@ -239,10 +242,18 @@ def test_frames_before_initialization_have_poses_in_the_end() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
 
 
-JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.noise_px=0.5", "simulated.with_scales=true",
-          "relocalization.frames_before_new_submap=3", "initialization.provisional_frames=8")  # fmt: skip
+JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.noise_px=0.5",
+          "simulated.with_scales=true")  # fmt: skip
 
 
+@pytest.fixture
+def submaps_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A lost camera soon starts another submap, which is soon kept."""
+    monkeypatch.setattr(state_machine, "FRAMES_BEFORE_NEW_SUBMAP", 3)
+    monkeypatch.setattr(map_start, "PROVISIONAL_FRAMES", 8)
+
+
+@pytest.mark.usefixtures("submaps_soon")
 def test_two_submaps_merge_when_the_second_reaches_the_first() -> None:
     walk = Walk(walk_with_jump())
     run = run_walk(walk, *JOINED)
@@ -256,6 +267,7 @@ def test_two_submaps_merge_when_the_second_reaches_the_first() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 0.01
 
 
+@pytest.mark.usefixtures("submaps_soon")
 def test_separate_submaps_are_kept() -> None:
     walk = Walk(walk_with_jump()[4:33])
     run = run_walk(walk, *JOINED)
@@ -318,7 +330,7 @@ def test_every_frame_uses_a_bounded_part_of_the_map() -> None:
     assert slam.map.num_keyframes > 10
     assert slam.submap is not None
     tracking = slam.submap.tracking
-    assert len(tracking.local_keyframes) <= Config().tracking.local_keyframes + 1
+    assert len(tracking.local_keyframes) <= LOCAL_KEYFRAMES + 1
     assert len(tracking.local_points) < 0.5 * slam.map.num_points
 
 
@@ -492,13 +504,9 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk = Walk(arc(80, 6.0)[:40])
-    at_once = adjustment_events(monkeypatch, walk, "bundle_adjustment.delay_frames=0")
-    assert len(at_once) >= 6
-    assert {(what, frame) for what, frame in at_once if what == "requested"} == {
-        ("requested", frame) for what, frame in at_once if what == "applied"
-    }
     for delay in (1, 3):
-        events = adjustment_events(monkeypatch, walk, f"bundle_adjustment.delay_frames={delay}")
+        monkeypatch.setattr(mapper, "DELAY_FRAMES", delay)
+        events = adjustment_events(monkeypatch, walk)
         kinds = [what for what, _ in events]
         assert kinds[: len(kinds) // 2 * 2] == ["requested", "applied"] * (
             len(kinds) // 2
@@ -509,9 +517,8 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
         ]
         assert len(waits) >= 3
         assert set(waits) <= set(range(1, delay + 1))
-    rare = adjustment_events(
-        monkeypatch, walk, "bundle_adjustment.delay_frames=2", "keyframes.max_translation=0.6"
-    )
+    monkeypatch.setattr(mapper, "DELAY_FRAMES", 2)
+    rare = adjustment_events(monkeypatch, walk, "keyframes.max_translation=0.6")
     waits = [applied - requested for (_, requested), (_, applied) in zip(rare[::2], rare[1::2], strict=False)]
     assert 2 in waits
 
@@ -529,19 +536,20 @@ def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
         start(self)
 
     monkeypatch.setattr(AsyncBundleAdjustment, "start", record_start)
-    for delay in (0, 2):
+    for module in (local_bundle, state_machine):
+        monkeypatch.setattr(module, "LOCAL_WINDOW", 1000)
+    for is_at_once in (True, False):
         begun.clear()
-        runs.append(
-            run_walk(walk, "bundle_adjustment.local_window=1000", f"bundle_adjustment.delay_frames={delay}")
-        )
+        with monkeypatch.context() as patched:
+            if is_at_once:
+                patched.setattr(StateMachine, "_apply_at", lambda _: ApplyAt.NOW)
+            runs.append(run_walk(walk))
         assert len(begun) > 6
         assert set(begun) == {None}  # no frame is tracked before
     at_once, between = runs
     assert torch.equal(at_once.trajectory.T_wc, between.trajectory.T_wc)
     assert torch.equal(at_once.map.positions_w, between.map.positions_w)
-    events = adjustment_events(
-        monkeypatch, walk, "bundle_adjustment.local_window=1000", "bundle_adjustment.delay_frames=2"
-    )
+    events = adjustment_events(monkeypatch, walk)
     assert [what for what, _ in events[:6]] == ["requested", "applied"] * 3
     assert all(
         applied == requested + 1
@@ -551,18 +559,19 @@ def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
 
 def test_a_lost_camera_leaves_no_pending_adjustment(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(walk_with_jump())
-    events = adjustment_events(
-        monkeypatch, walk, "bundle_adjustment.delay_frames=1000", "keyframes.min_overlap=0"
-    )
+    monkeypatch.setattr(mapper, "DELAY_FRAMES", 1000)
+    events = adjustment_events(monkeypatch, walk, "keyframes.min_overlap=0")
     assert [what for what, _ in events if what == "applied"]
 
 
-def test_a_delay_costs_no_accuracy() -> None:
+def test_a_delay_costs_no_accuracy(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(arc(80, 6.0)[:35])
-    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1", "simulated.dropout_ratio=0.1")
+    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1")
     errors = []
-    for delay in (0, 2):
-        run = run_walk(walk, *noisy, f"bundle_adjustment.delay_frames={delay}")
+    for is_at_once in (False, True):
+        if is_at_once:
+            monkeypatch.setattr(StateMachine, "_apply_at", lambda _: ApplyAt.NOW)
+        run = run_walk(walk, *noisy)
         assert len(run.trajectory) == 35
         result = evaluate(run.trajectory, walk.groundtruth)
         errors.append(result.ate_m / result.path_length_m)

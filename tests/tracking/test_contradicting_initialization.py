@@ -17,11 +17,11 @@ from torchslam.tracking.initialization import (
     contradicting_initialization,
     support,
 )
+from torchslam.tracking.turning_camera import THRESHOLD_PX
 from torchslam.types import FrameFeatures, TwoViewMap
 
 SCENE = Scene.of(400)
 SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
-THRESHOLD = Config().initialization.threshold_px
 
 
 def swung(degrees: float) -> Tensor:
@@ -54,7 +54,7 @@ def two_views() -> TwoViewMap:
 
 def supported(start: TwoViewMap, T_21: Tensor) -> float:
     pixels_1 = start.reference.keypoints[start.keypoints_1]
-    return support(pixels_1, start.view.keypoints[start.keypoints_2], T_21, CAMERA, THRESHOLD)
+    return support(pixels_1, start.view.keypoints[start.keypoints_2], T_21, CAMERA, THRESHOLD_PX)
 
 
 def test_a_consistent_map_has_no_contradicting_initialization(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -100,6 +100,6 @@ def test_support_falls_with_the_square_of_the_error_and_ends_at_the_threshold() 
     pixels_1 = start.reference.keypoints[start.keypoints_1]
     pixels_2 = start.view.keypoints[start.keypoints_2]
     errors = epipolar_offsets(T_21, pixels_1, pixels_2, CAMERA, CAMERA)[0].abs()
-    wanted = sum(1 - (e / THRESHOLD) ** 2 for e in errors.tolist() if e < THRESHOLD)
+    wanted = sum(1 - (e / THRESHOLD_PX) ** 2 for e in errors.tolist() if e < THRESHOLD_PX)
     assert 0 < wanted < len(start.points_w)
     assert supported(start, T_21) == pytest.approx(wanted)

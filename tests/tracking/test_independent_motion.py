@@ -10,14 +10,15 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose
-from torchslam.config import IndependentMotionConfig, MatchingConfig
+from torchslam.config import Config
 from torchslam.geometry import SharedCamera, se3_inverse
-from torchslam.tracking.non_static import IndependentMotion, Movement
+from torchslam.tracking import non_static
+from torchslam.tracking.non_static import FRAME_INTERVAL, IndependentMotion, Movement
 from torchslam.types import FrameFeatures, PoseEstimate, Reason
 
 SCENE = Scene.of(200)
 NEAR = Scene.of(60, seed=1, depth=2.0, width=0.8)  # a thing: a sixth of the image's width
-EVERY = IndependentMotionConfig().frame_interval
+EVERY = FRAME_INTERVAL
 DEPTH = 4.0
 
 
@@ -54,10 +55,8 @@ def estimate(view: FrameFeatures, T_cw: Tensor, keypoints: Tensor) -> PoseEstima
     return PoseEstimate(T_cw, keypoints, keypoints, len(keypoints), torch.eye(6).double(), DEPTH)
 
 
-def watcher(**settings: float) -> IndependentMotion:
-    return IndependentMotion(
-        SharedCamera(CAMERA), replace(IndependentMotionConfig(), **settings), MatchingConfig()
-    )
+def watcher() -> IndependentMotion:
+    return IndependentMotion(SharedCamera(CAMERA), Config())
 
 
 def watched(
@@ -105,20 +104,22 @@ def test_depth_differences_are_no_motion(depth: float) -> None:
         assert by.observe(view, estimate(view, camera_at(index), torch.arange(50))) == Movement()
 
 
-def test_the_least_error_decides() -> None:
+def test_the_least_error_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     """A thing that falls by 3 px from look to look is none for a threshold of 4 of its scales, and one of 1."""
     speed = 3.0 / EVERY / 100.0  # 100 px a unit at its depth
     for least, found in ((4.0, False), (0.5, True)):
-        by = watcher(min_error_px=least)
+        monkeypatch.setattr(non_static, "MIN_ERROR", least)
+        by = watcher()
         views = [frame(index, speed) for index in range(EVERY + 1)]
         *_, (_, _, said) = watched(by, views)
         assert bool(said.note) is found
 
 
-def test_too_few_matches_are_no_object() -> None:
+def test_too_few_matches_are_no_object(monkeypatch: pytest.MonkeyPatch) -> None:
     few = Scene.of(19, seed=1, depth=2.0, width=0.8)
     for least, found in ((20, False), (15, True)):
-        by = watcher(min_matches=least)
+        monkeypatch.setattr(non_static, "MIN_MATCHES", least)
+        by = watcher()
         *_, (_, _, said) = watched(by, [frame(index, thing=few) for index in range(EVERY + 1)])
         assert bool(said.note) is found
 
@@ -147,9 +148,10 @@ def test_an_object_is_tracked_while_the_camera_is_lost() -> None:
         assert (left_out & ~is_thing(view)).sum() < 0.2 * view.mask.sum()
 
 
-def test_an_object_is_dropped_when_it_has_not_moved_for_long() -> None:
+def test_an_object_is_dropped_when_it_has_not_moved_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
     for limit, kept in ((2, False), (100, True)):
-        by = watcher(max_unseen_frames=limit)
+        monkeypatch.setattr(non_static, "MAX_UNSEEN_FRAMES", limit)
+        by = watcher()
         *_, _ = watched(by, [frame(index) for index in range(EVERY + 1)])
         for index in range(EVERY + 1, EVERY + 4):
             cleared = by.mask_out(frame(index))
@@ -190,13 +192,14 @@ def test_a_map_that_attaches_to_a_moving_object_is_uncertain() -> None:
     assert any(doubts)
 
 
-def test_where_most_of_the_image_moves_the_pose_is_uncertain() -> None:
+def test_where_most_of_the_image_moves_the_pose_is_uncertain(monkeypatch: pytest.MonkeyPatch) -> None:
     by = watcher()
     *_, (view, _, said) = watched(by, [frame(index) for index in range(EVERY + 1)])
     assert not said.rejection
     cell = torch.nonzero(view.mask & ~is_thing(view))[:1, 0]  # one keypoint agrees with the map
     assert by.observe(view, estimate(view, camera_at(view.index), cell)).rejection
-    assert not watcher(max_area_ratio=100.0).observe(view, estimate(view, camera_at(0), cell)).rejection
+    monkeypatch.setattr(non_static, "MAX_AREA_RATIO", 100.0)
+    assert not watcher().observe(view, estimate(view, camera_at(0), cell)).rejection
 
 
 def test_poses_of_two_submaps_are_not_compared() -> None:

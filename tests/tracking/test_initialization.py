@@ -4,19 +4,20 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, camera_center, pose
-from torchslam.config import InitializationConfig, load_config
+from torchslam.config import Config, load_config
 from torchslam.geometry import KeypointNoise, SharedCamera, Triangulation, transform
+from torchslam.tracking import initialization
 from torchslam.tracking.initialization import Initializer, check_two_view_map, is_good, refine_pair
 from torchslam.types import FrameFeatures, TwoViewMap
 
 SCENE = Scene.of(400)
+DEFAULT, PARALLAX = Config(), load_config(None, ["paper.parallax=true"])
 SIDE = pose(-0.5, 0.0, 0.1, 0.01, -0.05, 0.02)
 
 
@@ -59,8 +60,9 @@ def test_an_initialization_has_motion_and_points_in_units_of_its_baseline() -> N
     assert len(shown) > 150
 
 
-def test_the_first_frame_is_the_reference_until_it_is_too_old() -> None:
-    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.max_reference_age=3"]))
+def test_the_first_frame_is_the_reference_until_it_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(initialization, "MAX_REFERENCE_AGE", 3)
+    initializer = Initializer(SharedCamera(CAMERA), DEFAULT)
     for index, reason in (
         (0, "took"),
         (1, "the camera stands"),
@@ -116,9 +118,7 @@ def static(
 def test_a_scene_behind_a_static_overlay_initializes_a_map() -> None:
     views = [SCENE.view(0, pose()), SCENE.view(1, SIDE)]
     half = static(views[1], 0.6, SCENE.shows(1), views[0], SCENE.shows(0))
-    start, reason = tried_views(
-        [views[0], half], "initialization.min_matches=60", "initialization.min_points=30"
-    )
+    start, reason = tried_views([views[0], half], "initialization.min_matches=60")
     assert start is not None, reason
     wanted = SIDE[:3, 3] / SIDE[:3, 3].norm()
     torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=1e-4, rtol=0)
@@ -199,7 +199,7 @@ def test_a_plane_is_accepted_after_several_frames() -> None:
         start, reason = tried(
             poses,
             f"initialization.min_planar_frames={patience}",
-            "initialization.min_points=30",
+            "initialization.min_matches=50",
             scene=WALL,
             noise=0.2,
         )
@@ -210,14 +210,14 @@ def test_a_plane_is_accepted_after_several_frames() -> None:
             assert "looks planar" in reason
 
 
-def test_planes_seen_with_an_earlier_reference_do_not_count() -> None:
+def test_planes_seen_with_an_earlier_reference_do_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
     """A camera that turns while it moves on looks a while as if before a plane: so do the first frames after a turn."""
     poses = torch.stack([pose(), *[TURNED] * 3, pose(), TURNED])
+    monkeypatch.setattr(initialization, "MAX_REFERENCE_AGE", 4)
     start, reason = tried(
         poses,
         "initialization.min_planar_frames=4",
-        "initialization.max_reference_age=4",
-        "initialization.min_points=30",
+        "initialization.min_matches=50",
         scene=WALL,
         noise=0.2,
     )
@@ -251,11 +251,12 @@ def seen(angles: list[float], errors: float = 0.0, mask: bool = True) -> Triangu
     )
 
 
-def good(angles: list[float], sigma: float = 1.0, off: float = 0.0, **rest: Any) -> list[bool]:
+def good(
+    angles: list[float], sigma: float = 1.0, off: float = 0.0, mask: bool = True, config: Config = DEFAULT
+) -> list[bool]:
     """Which points are good that are seen under angles, off by a multiple of the noise."""
-    triangulated, settings = seen(angles, mask=rest.pop("mask", True)), InitializationConfig(**rest)
     ones = torch.ones(len(angles), dtype=torch.float64)
-    return is_good(triangulated, off**2 * ones, sigma * ones, CAMERA, settings).tolist()
+    return is_good(seen(angles, mask=mask), off**2 * ones, sigma * ones, CAMERA, config).tolist()
 
 
 def test_a_point_is_good_when_its_depth_is_certain_to_a_tenth() -> None:
@@ -267,35 +268,37 @@ def test_a_point_is_good_when_its_depth_is_certain_to_a_tenth() -> None:
 
 
 def test_with_the_parallax_criterion_a_point_needs_an_angle() -> None:
-    assert good([math.radians(3.01), math.radians(2.99)], criterion="parallax") == [True, False]
+    assert good([math.radians(3.01), math.radians(2.99)], config=PARALLAX) == [True, False]
 
 
-def reason_for(count: int, total: int, matches: int, share: float = 0.15, **changes: object) -> str:
+def reason_for(count: int, total: int, matches: int, share: float = 0.15, config: Config = DEFAULT) -> str:
     good = torch.arange(total) < count
-    settings = replace(InitializationConfig(), **changes)  # type: ignore[arg-type]
-    return str(check_two_view_map(good, seen([math.radians(4.9)] * total), matches, settings, share) or "")
+    return str(check_two_view_map(good, seen([math.radians(4.9)] * total), matches, config, share) or "")
 
 
-def test_rejected_initializations_have_a_reason() -> None:
+def test_rejected_initializations_have_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     assert reason_for(60, 100, 100) == ""
     assert reason_for(59, 100, 100) == "too little parallax: 59 points have enough, 60 are needed"
     assert reason_for(60, 100, 400) == ""
     assert reason_for(60, 100, 401).startswith("depths too uncertain: 60 of 401 known well, 15%")
     assert reason_for(60, 100, 100, share=0.61).startswith("depths too uncertain")
     assert (
-        reason_for(60, 100, 400, criterion="parallax")
+        reason_for(60, 100, 400, config=PARALLAX)
         == "too little parallax: 4.9 degrees in the mean, 5.0 are needed"
     )
-    assert reason_for(60, 100, 1000, criterion="parallax", min_mean_parallax_deg=4.8) == ""
+    assert (
+        reason_for(39, 100, 400, config=PARALLAX)
+        == "too little parallax: 39 points have enough, 40 are needed"
+    )
+    monkeypatch.setattr(initialization, "PAPER_MEAN_PARALLAX_DEG", 4.8)
+    assert reason_for(60, 100, 1000, config=PARALLAX) == ""
 
 
 def test_most_points_must_lie_in_front() -> None:
     for behind, fine in ((20, True), (21, False)):
         some = seen([0.1] * 100)
         some = replace(some, mask=torch.arange(100) >= behind)
-        reason = check_two_view_map(
-            torch.ones(100, dtype=torch.bool), some, 100, InitializationConfig(), 0.15
-        )
+        reason = check_two_view_map(torch.ones(100, dtype=torch.bool), some, 100, DEFAULT, 0.15)
         assert (reason is None) is fine
         assert fine or str(reason) == "matches behind a camera: only 79% lie in front of both"
 

@@ -14,6 +14,7 @@ from torch import Tensor
 from tests.walks import Walk, arc
 from torchslam import SLAM, Matches, Run, load_config
 from torchslam.errors import ConfigError
+from torchslam.system import map_start
 from torchslam.tracking.matcher import DescriptorMatcher, nearest_keypoints
 from torchslam.types import FrameFeatures, Matcher, MatchPrior, State
 
@@ -88,14 +89,15 @@ class Counting(Wrapped):
         return super().__call__(view_1, view_2, prior)
 
 
-def test_a_matcher_is_called_in_all_stages() -> None:
+def test_a_matcher_is_called_in_all_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     """A walk, a look backwards that loses it, and the walk again."""
     poses = arc(36)
     behind = poses[18:20].clone()
     behind[:, :3, :3] *= torch.tensor([-1.0, 1.0, -1.0], dtype=torch.float64)  # half a turn about y
     walk = Walk(torch.cat([poses[:18], behind, poses[12:22]]))
-    matcher, initialization = Counting(), replace(CONFIG.initialization, provisional_frames=8)
-    run = SLAM(walk.camera, replace(CONFIG, initialization=initialization), matcher=matcher).run(walk)
+    monkeypatch.setattr(map_start, "PROVISIONAL_FRAMES", 8)
+    matcher = Counting()
+    run = SLAM(walk.camera, CONFIG, matcher=matcher).run(walk)
     states = [result.state for result in run.results]
     assert states[18:20] == [State.LOST, State.LOST]
     assert states[-1] is State.TRACKING

@@ -11,13 +11,24 @@ from torch import Tensor
 
 from tests.map.simulated import estimate_at
 from tests.scene import pose
-from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_exp
 from torchslam.map.atlas import TrackingState
-from torchslam.tracking.pose_validation import SURE_INLIERS, Certainty, Verdict, check_pose, deviations, jump
+from torchslam.tracking.pose_validation import (
+    MAX_POSITION_STD,
+    MAX_ROTATION_STD_DEG,
+    MAX_SQUARED_ERROR,
+    MAX_TURN_DEG,
+    MIN_COVERAGE_RATIO,
+    MIN_EXPLAINED_RATIO,
+    SURE_INLIERS,
+    Certainty,
+    Verdict,
+    check_pose,
+    deviations,
+    jump,
+)
 from torchslam.types import PoseEstimate, Reason, Rejection
 
-SETTINGS = PoseValidationConfig()
 HERE = pose(0.3, -0.2, 0.1, 0.2, 0.1, -0.3)
 
 
@@ -29,7 +40,7 @@ def verdict(
     estimate: PoseEstimate, expected: Tensor | None = None, error: float = 0.9, explained_ratio: float = 1.0
 ) -> Verdict:
     averages = replace(TrackingState.empty(HERE), error=error, explained_ratio=explained_ratio)
-    return check_pose(estimate, expected, averages, SETTINGS)
+    return check_pose(estimate, expected, averages)
 
 
 def doubt(estimate: PoseEstimate, expected: Tensor | None = None, **averages: float) -> str:
@@ -49,18 +60,18 @@ def test_half_of_the_matches_must_agree() -> None:
 
 
 def test_errors_averaged_over_frames_must_be_noise() -> None:
-    assert doubt(seen(), error=SETTINGS.max_squared_error - 0.01) == ""
-    assert doubt(seen(), error=SETTINGS.max_squared_error) == ""
+    assert doubt(seen(), error=MAX_SQUARED_ERROR - 0.01) == ""
+    assert doubt(seen(), error=MAX_SQUARED_ERROR) == ""
     assert doubt(seen(), error=9.0).startswith("the matches of the last frames are off by 3.0 times")
 
 
 def test_coverage_of_the_image_must_suffice() -> None:
-    assert doubt(seen(coverage_ratio=SETTINGS.min_coverage_ratio)) == ""
-    assert doubt(seen(coverage_ratio=SETTINGS.min_coverage_ratio - 0.01)).startswith("only 19% of the image")
+    assert doubt(seen(coverage_ratio=MIN_COVERAGE_RATIO)) == ""
+    assert doubt(seen(coverage_ratio=MIN_COVERAGE_RATIO - 0.01)).startswith("only 19% of the image")
 
 
 def test_the_explained_fraction_must_suffice_over_many_frames() -> None:
-    least = SETTINGS.min_explained_ratio
+    least = MIN_EXPLAINED_RATIO
     assert doubt(seen(), explained_ratio=least) == ""
     assert doubt(seen(explained_ratio=0.0)) == ""  # one frame alone proves nothing
     assert doubt(seen(), explained_ratio=least - 0.01).startswith(
@@ -81,7 +92,7 @@ def test_deviations_are_relative_to_depth_and_in_degrees() -> None:
 
 
 def test_the_position_must_be_certain_relative_to_depth() -> None:
-    limit = SETTINGS.max_position_std
+    limit = MAX_POSITION_STD
     assert doubt(seen(covariance=covariance(2.99 * limit), depth=3.0)) == ""
     assert doubt(seen(covariance=covariance(3.01 * limit), depth=3.0)).startswith(
         "the position is known to 0.017"
@@ -89,7 +100,7 @@ def test_the_position_must_be_certain_relative_to_depth() -> None:
 
 
 def test_the_rotation_must_be_certain() -> None:
-    limit = math.radians(SETTINGS.max_rotation_std_deg)
+    limit = math.radians(MAX_ROTATION_STD_DEG)
     assert doubt(seen(covariance=covariance(rotation=0.99 * limit))) == ""
     assert "the rotation is known to 0.91 degrees" in doubt(
         seen(covariance=covariance(rotation=1.01 * limit))
@@ -101,7 +112,7 @@ def test_the_motion_must_be_plausible() -> None:
     assert doubt(seen(), pose(1.99) @ HERE) == ""
     assert doubt(seen(), pose(2.01) @ HERE) == "jumped by 0.50 of the scene's depth and 0 degrees"
     assert doubt(seen(depth=3.9), side @ HERE).startswith("jumped by 0.51")
-    turn = math.radians(SETTINGS.max_turn_deg)
+    turn = math.radians(MAX_TURN_DEG)
     few, enough = seen(SURE_INLIERS - 1), seen(SURE_INLIERS)
     assert doubt(few, pose(0, 0, 0, 0.99 * turn) @ HERE) == ""
     odd = pose(0, 0, 0, 1.01 * turn) @ HERE
@@ -124,7 +135,7 @@ def test_a_scene_without_depth_is_uncertain() -> None:
 
 # --- what a pose is good for ------------------------------------------------------------------------------------
 
-TURNED = pose(0, 0, 0, 1.01 * math.radians(SETTINGS.max_turn_deg)) @ HERE
+TURNED = pose(0, 0, 0, 1.01 * math.radians(MAX_TURN_DEG)) @ HERE
 FAR = pose(2.01) @ HERE  # more than half the depth
 
 

@@ -6,9 +6,10 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
-from torchslam.config import load_config
+from torchslam.config import Config, load_config
 from torchslam.geometry import SharedCamera
 from torchslam.map.atlas import Submap
+from torchslam.tracking import localizer, pose_validation, relocalization
 from torchslam.tracking.data_association import match_keyframe, match_points
 from torchslam.tracking.matcher import max_distance
 from torchslam.tracking.relocalization import Relocalizer
@@ -20,19 +21,16 @@ FAR = Scene(SCENE.points_w, SCENE.sizes, SCENE.descriptors.flip(0) ^ 255)  # of 
 ANYWHERE = pose(-0.3, 0.1, 0.2, 0.05, 0.1, -0.1)
 
 
-def relocalizer(*overrides: str) -> Relocalizer:
-    config = load_config(None, overrides)
-    return Relocalizer(Tracker(SharedCamera(CAMERA), config), config)
+def relocalizer() -> Relocalizer:
+    return Relocalizer(Tracker(SharedCamera(CAMERA), Config()))
 
 
 def submaps() -> tuple[Submap, Submap]:
     return submap_of_scene(SCENE, sideways(6)), submap_of_scene(FAR, sideways(6), number=1)
 
 
-def found(
-    T_cw: Tensor, candidates: list[tuple[Submap, int]], *overrides: str, noise: float = 0.3
-) -> Submap | None:
-    located = relocalizer(*overrides).locate(SCENE.view(50, T_cw, noise=noise), candidates)
+def found(T_cw: Tensor, candidates: list[tuple[Submap, int]], noise: float = 0.3) -> Submap | None:
+    located = relocalizer().locate(SCENE.view(50, T_cw, noise=noise), candidates)
     if located is None:
         return None
     submap, estimate = located
@@ -56,18 +54,17 @@ def test_the_first_candidate_with_a_pose_is_used() -> None:
     assert found(ANYWHERE, []) is None
 
 
-def test_the_number_of_candidates_is_bounded() -> None:
+def test_the_number_of_candidates_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     right, wrong = submaps()
     others = [submap_of_scene(FAR, sideways(2), number=number) for number in range(3, 6)]
     candidates = [(other, 0) for other in others]
     assert found(ANYWHERE, [*candidates, (right, 0)]) is None
     assert found(ANYWHERE, [*candidates[:2], (right, 0)]) is right
-    assert found(ANYWHERE, [*candidates, (right, 0)], "relocalization.max_candidates=4") is right
+    monkeypatch.setattr(relocalization, "MAX_CANDIDATES", 4)
+    assert found(ANYWHERE, [*candidates, (right, 0)]) is right
     # neighbors of a failed candidate are not tried and do not count
-    assert (
-        found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)], "relocalization.max_candidates=2")
-        is right
-    )
+    monkeypatch.setattr(relocalization, "MAX_CANDIDATES", 2)
+    assert found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)]) is right
 
 
 def test_neighbors_of_a_candidate_that_failed_in_another_submap_are_tried() -> None:
@@ -75,17 +72,22 @@ def test_neighbors_of_a_candidate_that_failed_in_another_submap_are_tried() -> N
     assert found(ANYWHERE, [(wrong, 3), (right, 3)]) is right
 
 
-def test_candidate_neighborhoods_have_the_size_of_the_local_map() -> None:
+def test_candidate_neighborhoods_have_the_size_of_the_local_map(monkeypatch: pytest.MonkeyPatch) -> None:
     right, _ = submaps()
-    localizer = relocalizer("tracking.local_keyframes=2").tracker.localizer
-    assert localizer.local_keyframes(right.map, 5).tolist() == [5, 4, 3]
+    monkeypatch.setattr(localizer, "LOCAL_KEYFRAMES", 2)
+    assert relocalizer().tracker.localizer.local_keyframes(right.map, 5).tolist() == [5, 4, 3]
 
 
-def test_an_uncertain_pose_does_not_relocalize() -> None:
+def test_an_uncertain_pose_does_not_relocalize(monkeypatch: pytest.MonkeyPatch) -> None:
     right, _ = submaps()
-    assert found(ANYWHERE, [(right, 0)], "pose_validation.max_position_std=1e-6") is None
-    assert found(ANYWHERE, [(right, 0)], "pose_validation.max_squared_error=1e-3") is None
-    assert found(ANYWHERE, [(right, 0)], "pose_validation.max_jump=1e-9") is right  # nothing was expected
+    for limit, value, is_found in (
+        ("MAX_POSITION_STD", 1e-6, False),
+        ("MAX_SQUARED_ERROR", 1e-3, False),
+        ("MAX_JUMP", 1e-9, True),  # nothing was expected
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(pose_validation, limit, value)
+            assert (found(ANYWHERE, [(right, 0)]) is right) is is_found
 
 
 def test_a_candidate_matches_by_its_own_descriptors() -> None:

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, sideways
-from torchslam.config import MatchingConfig, StaticOverlayConfig
+from torchslam.config import Config
 from torchslam.geometry import SharedCamera
 from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_segments
 from torchslam.types import FrameFeatures
@@ -45,10 +45,8 @@ def with_logo(
     )
 
 
-def overlay_detector(**changes: float) -> StaticOverlayDetector:
-    return StaticOverlayDetector(
-        SharedCamera(CAMERA), replace(StaticOverlayConfig(), **changes), MatchingConfig()
-    )
+def overlay_detector() -> StaticOverlayDetector:
+    return StaticOverlayDetector(SharedCamera(CAMERA), Config())
 
 
 def observed(by: StaticOverlayDetector, T_cw: Tensor, *, logo: bool = True, **options: float) -> list[int]:
@@ -77,9 +75,6 @@ def test_before_detection_nothing_is_masked() -> None:
     view = with_logo(SCENE.view(9, sideways(1)[0]))
     assert by.mask_out(view) is view
     assert not by.covers(view.keypoints).any()
-    more = overlay_detector(min_evidence=3)
-    observed(more, turning(3))
-    assert more.mask_out(view) is view
 
 
 def test_cells_around_a_static_keypoint_are_masked() -> None:
@@ -193,10 +188,6 @@ def test_external_evidence_counts_equally() -> None:
         for _ in range(times):
             by.add(pixels[:enough])
         assert bool(by.covers(pixels[:enough]).all()) is known
-    off = overlay_detector(enabled=False)
-    off.add(pixels)
-    off.add(pixels)
-    assert not off.covers(pixels).any()
 
 
 def test_distances_from_segments() -> None:

@@ -24,6 +24,8 @@ from tests.scene import (
 from torchslam.config import load_config
 from torchslam.geometry import SharedCamera, se3_exp, se3_inverse, transform
 from torchslam.map.atlas import EMA_RATE, Submap
+from torchslam.tracking import data_association, localizer
+from torchslam.tracking import tracker as tracker_module
 from torchslam.tracking.data_association import (
     GRID,
     MATURE_OBSERVATIONS,
@@ -82,15 +84,17 @@ def test_tracking_continues_from_a_keyframe() -> None:
     assert torch.equal(tracking.local_points, here.map.observed_points(torch.arange(4)))
 
 
-def test_the_local_map_is_bounded() -> None:
-    here, few = submap(6), tracker("tracking.local_keyframes=2")
+def test_the_local_map_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(localizer, "LOCAL_KEYFRAMES", 2)
+    here, few = submap(6), tracker()
     few.reset_to_keyframe(here, 0)
     assert here.tracking.local_keyframes.tolist() == [0, 1, 2]  # the nearest share most
     assert torch.equal(here.tracking.local_points, here.map.observed_points(torch.arange(3)))
 
 
-def test_the_local_map_may_be_the_recently_seen_points() -> None:
-    here, recent = submap(4), tracker("tracking.recent_frames=5")
+def test_the_local_map_may_be_the_recently_seen_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tracker_module, "RECENT_FRAMES", 5)
+    here, recent = submap(4), tracker("paper.brute_force=true")
     last_seen = here.map.points["last_seen_frame"]
     last_seen[:] = 10
     last_seen[:20] = 15
@@ -113,7 +117,7 @@ def test_a_prediction_repeats_the_last_motion() -> None:
     torch.testing.assert_close(here.tracking.velocity, se3_exp(STEP), atol=1e-7, rtol=0)
     torch.testing.assert_close(follower.predict(here), path[2], atol=1e-7, rtol=0)
     torch.testing.assert_close(here.T_cw, path[1], atol=1e-7, rtol=0)
-    torch.testing.assert_close(tracker("tracking.motion_model=false").predict(here), here.T_cw)
+    torch.testing.assert_close(tracker("paper.brute_force=true").predict(here), here.T_cw)
     here.tracking.velocity = None
     torch.testing.assert_close(follower.predict(here), here.T_cw)
 
@@ -256,17 +260,19 @@ def few(here: Submap, count: int) -> None:
     tracker().reset_to_keyframe(here, here.map.num_keyframes - 1)
 
 
-@pytest.mark.parametrize(("setting", "count"), [("min_matches", 30), ("min_inliers", 30)])
-def test_too_few_points_give_no_pose(setting: str, count: int) -> None:
+@pytest.mark.parametrize("limit", ["MIN_MATCHES", "MIN_INLIERS"])
+def test_too_few_points_give_no_pose(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    count = 30
     here = submap(2)
     few(here, count)
     view = SCENE.view(50, sideways(1, start=0.1)[0])
-    enough = followed(here.fork(), view, tracker(f"tracking.{setting}={count}"))
-    assert enough.inliers == count
-    assert tracker(f"tracking.{setting}={count + 1}").track(here.fork(), view) is None
+    monkeypatch.setattr(localizer, limit, count)
+    assert followed(here.fork(), view).inliers == count
+    monkeypatch.setattr(localizer, limit, count + 1)
+    assert tracker().track(here.fork(), view) is None
 
 
-def test_enough_matches_must_be_inliers() -> None:
+def test_enough_matches_must_be_inliers(monkeypatch: pytest.MonkeyPatch) -> None:
     here = submap(2)
     few(here, 40)
     view = SCENE.view(50, sideways(1, start=0.1)[0])
@@ -274,9 +280,11 @@ def test_enough_matches_must_be_inliers() -> None:
     off = view.keypoints.clone()
     off[wrong, 1] += 4.5 * view.scales[wrong]  # near enough to match, too far to agree
     spoiled = replace(view, keypoints=off)
-    estimate = followed(here.fork(), spoiled, tracker("tracking.min_inliers=28"))
+    monkeypatch.setattr(localizer, "MIN_INLIERS", 28)
+    estimate = followed(here.fork(), spoiled)
     assert (estimate.inliers, estimate.matches) == (28, 40)
-    assert tracker("tracking.min_inliers=29").track(here.fork(), spoiled) is None
+    monkeypatch.setattr(localizer, "MIN_INLIERS", 29)
+    assert tracker().track(here.fork(), spoiled) is None
 
 
 def located(here: Submap, view: FrameFeatures, T_cw: Tensor) -> PoseEstimate | None:
@@ -423,10 +431,8 @@ def test_coverage_counts_cells_with_a_fifth_of_the_expected_points() -> None:
 # --- correspondences --------------------------------------------------------------------------------------------
 
 
-def projected(
-    here: Submap, T_cw: Tensor, angle: float = 60.0, scales: tuple[float, float] = (0.1, 50.0)
-) -> Projected:
-    return project_points(here.map, here.map.valid_points(), T_cw, CAMERA, angle, scales)
+def projected(here: Submap, T_cw: Tensor, scales: tuple[float, float] = (0.1, 50.0)) -> Projected:
+    return project_points(here.map, here.map.valid_points(), T_cw, CAMERA, scales)
 
 
 def test_the_expected_scale_falls_with_the_distance() -> None:
@@ -445,7 +451,7 @@ def test_the_expected_scale_falls_with_the_distance() -> None:
 
 
 @pytest.mark.parametrize("limit", [20.0, 40.0])
-def test_points_seen_from_another_side_are_excluded(limit: float) -> None:
+def test_points_seen_from_another_side_are_excluded(limit: float, monkeypatch: pytest.MonkeyPatch) -> None:
     here = submap(1)
     here.map.points["is_valid"][here.map.keyframes["point_ids"][0].clamp(min=0)] = True
     middle = torch.tensor([0.0, 0.0, 4.0], dtype=torch.float64)
@@ -456,7 +462,8 @@ def test_points_seen_from_another_side_are_excluded(limit: float) -> None:
     rays = here.map.positions_w - camera_center(T_cw)
     between = (rays * here.map.positions_w).sum(-1) / (rays.norm(dim=-1) * here.map.positions_w.norm(dim=-1))
     alike = torch.rad2deg(between.acos()) < limit
-    kept = projected(here, T_cw, limit).ids
+    monkeypatch.setattr(data_association, "MAX_VIEW_ANGLE_DEG", limit)
+    kept = projected(here, T_cw).ids
     assert alike[kept].all()
     assert 0 < len(kept) < 300
     pixels, valid = CAMERA.project(transform(T_cw, here.map.positions_w))

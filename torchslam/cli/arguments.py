@@ -51,8 +51,8 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
         "--camera",
         metavar="CAMERA",
         help="FX,FY,CX,CY[,K1,K2,P1,P2,K3] in pixels; a calibration file (OpenCV, ROS, Kalibr, ORB-SLAM3, COLMAP, "
-        f"nerfstudio); a preset ({PRESETS}); an initial guess that is refined from the images: fov=65 (degrees), "
-        "f=0.8w (image widths), exif; or auto (estimated from the images). Overrides the calibration of the sequence",
+        f"nerfstudio); a preset ({PRESETS}); a guess to refine: fov=65 (degrees), f=0.8w (image widths), exif; or "
+        "auto. Overrides the calibration of the sequence",
     )
     reading = parser.add_argument_group("frame selection")
     reading.add_argument("--start", default=0, metavar="N|TIME", help="first frame: 120, 12.5s or 1:30")
@@ -118,6 +118,12 @@ def sequence(options: argparse.Namespace, camera: Calibration | None = None) -> 
 
 def add_config(parser: argparse.ArgumentParser) -> None:
     """Add the arguments for the configuration."""
+    add_settings(parser)
+    add_named_settings(parser)
+
+
+def add_settings(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments for a file of settings and for single ones."""
     parser.add_argument(
         "--config",
         metavar="FILE|NAME",
@@ -131,30 +137,36 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         metavar="SECTION.KEY=VALUE",
         help="change one setting, for example features.num_keypoints=2000; can be repeated",
     )
-    parser.add_argument(
+
+
+def add_named_settings(parser: argparse.ArgumentParser) -> argparse._ArgumentGroup:
+    """Add the settings that have an option of their own, in groups; return the group of the camera."""
+    features = parser.add_argument_group("features")
+    features.add_argument(
         "--features",
         metavar="NAME",
         help=f"feature extractor (features.kind): {', '.join(CHOICES['features.kind'])}, kornia:NAME, "
         "a plugin, or PACKAGE:NAME",
     )
-    parser.add_argument(
+    features.add_argument(
         "--weights",
         metavar="FILE|NAME",
         help="weights of a learned feature extractor (features.weights); by default those of its own name",
     )
-    parser.add_argument(
+    features.add_argument(
         "--matcher",
         metavar="NAME",
         help="matcher (matching.matcher): descriptors, lightglue, kornia:NAME, a plugin, or PACKAGE:NAME",
     )
-    parser.add_argument(
+    camera = parser.add_argument_group("error of the given camera")
+    camera.add_argument(
         "--camera-std",
         type=float,
         metavar="RATIO",
         help="relative standard deviation of the given focal length (camera.std): 0.02 if neither this nor the "
         "calibration file says otherwise; 0: the camera is exact",
     )
-    parser.add_argument(
+    camera.add_argument(
         "--readout",
         type=_readout,
         default=AUTO,
@@ -162,8 +174,10 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         help="time from the exposure of the first row of an image to the last (camera.readout): milliseconds, "
         f"{', '.join(READOUTS_MS)}, 0 for a global shutter, or auto, the default: found where the images show one",
     )
-    parser.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
-    parser.add_argument("--seed", type=int, metavar="N", help="seed of the random number generators (seed)")
+    others = parser.add_argument_group("other settings")
+    others.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
+    others.add_argument("--seed", type=int, metavar="N", help="seed of the random number generators (seed)")
+    return camera
 
 
 def config(options: argparse.Namespace) -> Config:
@@ -256,7 +270,7 @@ def add_device(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_processes(parser: argparse.ArgumentParser) -> None:
+def add_processes(parser: argparse._ActionsContainer) -> None:
     """Add the argument for the number of processes."""
     parser.add_argument(
         "--processes",

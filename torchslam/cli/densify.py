@@ -77,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     arguments.add_device(parser)
 
 
-def add_options(parser: argparse.ArgumentParser) -> None:
+def add_options(parser: argparse._ActionsContainer) -> None:
     """Add the arguments of dense depth that `torchslam run` has as well; it has no others."""
     parser.set_defaults(images=None, aggregation=None)
     parser.add_argument(

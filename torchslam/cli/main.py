@@ -181,7 +181,9 @@ def build_parser(chosen: str) -> argparse.ArgumentParser:
             name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter
         )
         if name == chosen:
-            command.description, add_arguments, execute = load_command(name)
+            about, add_arguments, execute = load_command(name)
+            # Its first line before the options, so that these are on the first screen.
+            command.description, _, command.epilog = about.partition("\n\n")
             add_arguments(command)
             command.set_defaults(execute=execute)
     return parser

@@ -100,30 +100,14 @@ class Checkpoints:
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the arguments of `torchslam run`."""
+    """Add the arguments of `torchslam run`: first those that most people need, then the others in groups."""
+    parser.usage = f"{parser.prog} PATH --output DIR [options]"
     arguments.add_sequence(parser)
     arguments.add_output(parser)
     existing = parser.add_mutually_exclusive_group()
     existing.add_argument("--overwrite", action="store_true", help="replace the results in the folder")
     existing.add_argument(
         "--resume", action="store_true", help="continue from the checkpoint in the folder, if there is one"
-    )
-    parser.add_argument(
-        "--map",
-        type=Path,
-        metavar="DIR|FILE",
-        help="continue a saved map: a map file, or a results folder, whose configuration is the default for --config",
-    )
-    parser.add_argument(
-        "--localize", action="store_true", help="with --map: only localize, without changing the map"
-    )
-    parser.add_argument(
-        "--checkpoint",
-        type=arguments.at_least(0),
-        default=CHECKPOINT_EVERY,
-        metavar="N",
-        help="save the state at most every N keyframes, and what global mapping finds, for --resume; 0: never "
-        "(default: %(default)s)",
     )
     parser.add_argument(
         "--mapping",
@@ -133,22 +117,41 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "online: frame by frame alone; global: always as a whole as well (default: %(default)s)",
     )
     parser.add_argument(
+        "--dense", action="store_true", help="compute dense depth after the run, as `torchslam densify` does"
+    )
+    parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
+    arguments.add_device(parser)
+    arguments.add_settings(parser)
+    sessions = parser.add_argument_group("further sessions in a map")
+    sessions.add_argument(
+        "--map",
+        type=Path,
+        metavar="DIR|FILE",
+        help="continue a saved map: a map file, or a results folder, whose configuration is the default for --config",
+    )
+    sessions.add_argument(
+        "--localize", action="store_true", help="with --map: only localize, without changing the map"
+    )
+    execution = parser.add_argument_group("execution")
+    arguments.add_processes(execution)
+    execution.add_argument(
+        "--checkpoint",
+        type=arguments.at_least(0),
+        default=CHECKPOINT_EVERY,
+        metavar="N",
+        help="save the state at most every N keyframes, and what global mapping finds, for --resume; 0: never "
+        "(default: %(default)s)",
+    )
+    execution.add_argument(
+        "--video", action="store_true", help=f"write {VIDEO}: the frames with their tracked keypoints"
+    )
+    arguments.add_named_settings(parser).add_argument(
         "--refine-camera",
         action="store_true",
         help=f"the given focal length and distortion may be wrong: as --camera-std {ROUGH_STD:g}",
     )
-    parser.add_argument("--view", action="store_true", help="show the run live in rerun (extra `rerun`)")
-    parser.add_argument(
-        "--video", action="store_true", help=f"write {VIDEO}: the frames with their tracked keypoints"
-    )
-    parser.add_argument(
-        "--dense", action="store_true", help="compute dense depth after the run, as `torchslam densify` does"
-    )
-    add_options(parser)
+    add_options(parser.add_argument_group("dense depth", "with --dense"))
     arguments.add_metric(parser)
-    arguments.add_device(parser)
-    arguments.add_processes(parser)
-    arguments.add_config(parser)
 
 
 def execute(options: argparse.Namespace) -> int:

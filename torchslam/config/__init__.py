@@ -9,50 +9,36 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from torchslam.config.schema import Settings, choices, merge_settings, scale_pixel_settings, setting, to_toml
+from torchslam.config.schema import Settings, choices, merge_settings, setting, to_toml
 from torchslam.config.sections import (
-    BundleAdjustmentConfig,
     CameraConfig,
     DenseConfig,
     FeaturesConfig,
     GlobalMappingConfig,
-    IndependentMotionConfig,
     InitializationConfig,
     KeyframesConfig,
     LoopClosingConfig,
-    MappingConfig,
     MatchingConfig,
-    MeasurementConfig,
     MetricConfig,
-    PoseValidationConfig,
-    RelocalizationConfig,
+    PaperConfig,
     SimulatedConfig,
-    StaticOverlayConfig,
-    TrackingConfig,
 )
 from torchslam.errors import ConfigError
 
 __all__ = [
     "CHOICES",
-    "BundleAdjustmentConfig",
     "CameraConfig",
     "Config",
     "DenseConfig",
     "FeaturesConfig",
     "GlobalMappingConfig",
-    "IndependentMotionConfig",
     "InitializationConfig",
     "KeyframesConfig",
     "LoopClosingConfig",
-    "MappingConfig",
     "MatchingConfig",
-    "MeasurementConfig",
     "MetricConfig",
-    "PoseValidationConfig",
-    "RelocalizationConfig",
+    "PaperConfig",
     "SimulatedConfig",
-    "StaticOverlayConfig",
-    "TrackingConfig",
     "load_config",
     "to_toml",
 ]
@@ -66,7 +52,12 @@ class Config(Settings):
     for a value that is not allowed.
     """
 
-    seed: int = setting(0, "Seed of the random number generators.", low=0, high=2**63 - 1)
+    seed: int = setting(
+        0,
+        "Seed of the random number generators; other seeds show how much results vary.",
+        low=0,
+        high=2**63 - 1,
+    )
     scale: str = setting(
         "unit",
         "Length unit of the map; unit: the median depth of the initial map is 1.",
@@ -76,28 +67,13 @@ class Config(Settings):
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     simulated: SimulatedConfig = field(default_factory=SimulatedConfig)
     matching: MatchingConfig = field(default_factory=MatchingConfig)
-    measurement: MeasurementConfig = field(default_factory=MeasurementConfig)
     initialization: InitializationConfig = field(default_factory=InitializationConfig)
-    tracking: TrackingConfig = field(default_factory=TrackingConfig)
-    static_overlay: StaticOverlayConfig = field(default_factory=StaticOverlayConfig)
-    independent_motion: IndependentMotionConfig = field(default_factory=IndependentMotionConfig)
-    pose_validation: PoseValidationConfig = field(default_factory=PoseValidationConfig)
-    relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
     keyframes: KeyframesConfig = field(default_factory=KeyframesConfig)
-    mapping: MappingConfig = field(default_factory=MappingConfig)
     loop_closing: LoopClosingConfig = field(default_factory=LoopClosingConfig)
-    bundle_adjustment: BundleAdjustmentConfig = field(default_factory=BundleAdjustmentConfig)
     global_mapping: GlobalMappingConfig = field(default_factory=GlobalMappingConfig)
     dense: DenseConfig = field(default_factory=DenseConfig)
     metric: MetricConfig = field(default_factory=MetricConfig)
-
-    def for_size(self, size: tuple[int, int]) -> Config:
-        """Return the configuration for images of a size (width, height).
-
-        Settings in pixels refer to the reduced images and are scaled to the given size. Settings in units of the
-        keypoint scale are not, since the scale itself is larger.
-        """
-        return scale_pixel_settings(self, self.features.reduction(size))
+    paper: PaperConfig = field(default_factory=PaperConfig)
 
 
 CHOICES = choices(Config)

@@ -78,17 +78,15 @@ def setting(
     above: float = -math.inf,
     choices: tuple[str, ...] = (),
     also: float | None = None,
-    grows: bool = False,
     group: str = "",
 ) -> Value:
     """Declare a field of a Settings class with its allowed values, see `Allowed`; non-negative without `low`.
 
     Args:
         about: description, for `to_toml` and the documentation.
-        grows: whether the value is an image length that `scale_pixel_settings` scales.
     """
     allowed = Allowed(low, high, above, choices, also, group)
-    return field(default=default, metadata={"allowed": allowed, "about": about, "grows": grows})
+    return field(default=default, metadata={"allowed": allowed, "about": about})
 
 
 @dataclass(frozen=True)
@@ -170,21 +168,6 @@ def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
                 pending.append((f"{prefix}{key}.", value))
             else:
                 yield prefix + key, value
-
-
-def scale_pixel_settings(config: Section, factor: float) -> Section:
-    """Return the configuration with every setting that `grows` multiplied by a factor, clipped to its range."""
-    changes: dict[str, Any] = {}
-    for name in _declared(type(config)):
-        value = getattr(config, name)
-        if isinstance(value, Settings):
-            changes[name] = scale_pixel_settings(value, factor)
-    changes |= {
-        f.name: min(factor * getattr(config, f.name), f.metadata["allowed"].high)
-        for f in fields(config)
-        if f.metadata.get("grows")
-    }
-    return replace(config, **changes)
 
 
 def to_toml(config: Settings, commented: bool = False) -> str:

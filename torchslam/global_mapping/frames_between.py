@@ -30,10 +30,9 @@ class FramePoser:
 
         Args:
             sensor: Of all views.
-            config: For the size of the images.
+            config: Of the tracker.
         """
         self.tracker = Tracker(SharedCamera(sensor.camera, sensor.readout), config)
-        self.config = config
 
     @torch.no_grad()
     def pose(
@@ -96,7 +95,7 @@ class FramePoser:
                 view.index, view.timestamp, State.LOST, None, reasons=(Explanation(Reason.NOT_FOUND),)
             )
         state = single_frame_state(submap.tracking, estimate)
-        rejection = check_pose(estimate, None, state, self.config.pose_validation).rejection
+        rejection = check_pose(estimate, None, state).rejection
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
         return StepResult(
             view.index,

@@ -204,13 +204,12 @@ class GlobalMapper:
     ) -> None:
         self.camera = camera.to(device).to(torch.float64)
         self.config = mapping_config(config)
-        self.scaled = self.config.for_size(camera.size)
         self.given = given
         self.sequence = source(sequence, self.config, self.camera)
         self.extract: Extractor | None = None
         if not self.sequence.brings_features:
             self.extract = kept or image_extractor(self.config, device, extractor)
-        self.matcher = make_matcher(self.scaled.matching, matcher, camera.size, self.scaled.features.kind)
+        self.matcher = make_matcher(self.config.matching, matcher, camera.size, self.config.features.kind)
         self.progress = progress
         self.saved = saved or SavedStages(None, self.sequence, config)
         self.skipped: list[str] = []
@@ -234,7 +233,7 @@ class GlobalMapper:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
-        matcher = self.saved.matcher(PairMatcher(views, self.camera, self.matcher, self.scaled))
+        matcher = self.saved.matcher(PairMatcher(views, self.camera, self.matcher, self.config))
         pairs = build_view_graph(matcher, lambda done, most: self.progress("matches", done, most))
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
@@ -268,7 +267,7 @@ class GlobalMapper:
         """What pairs of images say of a reconstruction."""
         rows, _, found = made
         known = torch.zeros(len(views), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
-        reduction = self.scaled.features.reduction(self.camera.size)
+        reduction = self.config.features.reduction(self.camera.size)
         return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction)
 
     def _learned(
@@ -290,7 +289,7 @@ class GlobalMapper:
             if view is not None:
                 found[row] = view if before is None else before.at_middle_row([view])[0]
         matcher = PairMatcher(
-            [found.get(row, view) for row, view in enumerate(views)], self.camera, own.matcher, own.scaled
+            [found.get(row, view) for row, view in enumerate(views)], self.camera, own.matcher, own.config
         )
         self.progress("learned matches", 0, 1)
         pairs = matcher.match((one, other) for one, other in ends if one in found and other in found)
@@ -354,7 +353,7 @@ class GlobalMapper:
             self.progress(words, 0, 1)
 
         coarse = adjust_coarsely(observed, T_cw, self.given, camera, log)
-        matcher = PairMatcher(plain, self.camera, self.matcher, self.scaled)
+        matcher = PairMatcher(plain, self.camera, self.matcher, self.config)
         self.progress("weak links", 0, 1)
         stronger = strengthen(matcher, pairs[:own], coarse.T_cw, coarse.camera)
         observed = self._tracks(stronger + pairs[own:], views)
@@ -397,7 +396,7 @@ class GlobalMapper:
         fill_submap(submap, views, rows, observed, found)
         slam_map = submap.map
         slam_map.set_noise(squared_errors(slam_map, slam_map.observations(), found.camera))
-        poser = FramePoser(SensorModel(found.camera, self.readout), self.scaled)
+        poser = FramePoser(SensorModel(found.camera, self.readout), self.config)
         mapped = {view.index: view for view in views}
         frames = range(len(self.sequence)) if frames is None else frames
         results = poser.pose(submap, self._all_views(frames, mapped), given_cw)

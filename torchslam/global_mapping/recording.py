@@ -168,7 +168,7 @@ def map_recording(
         sequence, camera, config, given, device, progress=progress, saved=saved, kept=features
     )
     made = mapper.run(online.results, online)
-    reduction = mapper.scaled.features.reduction(camera.size)
+    reduction = mapper.config.features.reduction(camera.size)
 
     def checked(run: Run) -> MapCheck:
         own = run.camera.to(camera.params)
@@ -220,7 +220,7 @@ def check_run(run: Run, matched: KeyframePairs | None = None) -> MapCheck | None
         return None
     T_cw, views, pairs = run.map.T_cw[run.map.keyframe_rows(run.session)], *found[1:]
     known = torch.ones(len(views), dtype=torch.bool, device="cpu")
-    reduction = run.config.for_size(run.camera.size).features.reduction(run.camera.size)
+    reduction = run.config.features.reduction(run.camera.size)
     links = scale_links(run.graph, run.session)
     return check_map(T_cw, known, views, pairs, run.camera, None, reduction, links)
 
@@ -232,15 +232,15 @@ def keyframe_pairs(run: Run) -> KeyframePairs | None:
     if len(rows) < 3 or run.config.features.kind == "simulated":
         return None
     views = [run.map.frame_features(row) for row in rows]
-    scaled = run.config.for_size(run.camera.size)
-    matcher = make_matcher(scaled.matching, None, run.camera.size, scaled.features.kind)
+    config = run.config
+    matcher = make_matcher(config.matching, None, run.camera.size, config.features.kind)
     near = [
         (row, row + distance)
         for row in range(len(rows))
         for distance in CHECKED_DISTANCES
         if row + distance < len(rows)
     ]
-    found = PairMatcher(views, run.camera, matcher, scaled).match(near + similar_places(views))
+    found = PairMatcher(views, run.camera, matcher, config).match(near + similar_places(views))
     pairs = [pair for pair in found if pair.second - pair.first < FAR or len(pair) >= LOOP_MATCHES]
     return run.map.T_cw[rows], views, pairs
 

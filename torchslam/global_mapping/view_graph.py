@@ -80,7 +80,7 @@ class PairMatcher:
         views: features of all images.
         camera: of all images.
         matcher: of two views.
-        config: for the size of the images.
+        config: reduction of the images, and the seed.
     """
 
     def __init__(self, views: list[FrameFeatures], camera: Camera, matcher: Matcher, config: Config) -> None:

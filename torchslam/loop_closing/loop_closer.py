@@ -22,7 +22,7 @@ from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import match_in_keyframes, merge_points
 from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
-from torchslam.tracking.relocalization import Candidate
+from torchslam.tracking.relocalization import MAX_CANDIDATES, Candidate
 from torchslam.types import FrameFeatures, Matcher
 
 MIN_ESSENTIAL_WEIGHT = 100
@@ -73,9 +73,7 @@ class LoopCloser:
     def query(self, view: FrameFeatures) -> list[Candidate]:
         """Return relocalization candidates in all submaps, most similar first."""
         keys, _ = self.keyframe_database.query(view.descriptors, view.mask)
-        found = (
-            self.atlas.find(key) for key in keys[: 3 * self.config.relocalization.max_candidates].tolist()
-        )
+        found = (self.atlas.find(key) for key in keys[: 3 * MAX_CANDIDATES].tolist())
         return [candidate for candidate in found if candidate is not None]
 
     def precheck(self, submap: Submap, keyframe: int) -> None:
@@ -164,10 +162,10 @@ def fuse_and_adjust(
     here = neighborhood(submap.map, keyframe, _VISIT_KEYFRAMES)
     there = neighborhood(submap.map, matched_keyframe, _VISIT_KEYFRAMES)
     fuse_landmarks(submap.map, here, there, camera, config)
-    if config.loop_closing.global_bundle_adjustment and config.bundle_adjustment.local:
-        adjust_all(submap.map, camera, config.bundle_adjustment)
+    if not config.paper.unrefined:
+        adjust_all(submap.map, camera)
         fuse_landmarks(submap.map, here, there, camera, config)
-        adjust_all(submap.map, camera, config.bundle_adjustment)
+        adjust_all(submap.map, camera)
 
 
 def fuse_with_earlier_visits(submap: Submap, keyframe: int, camera: Camera, config: Config) -> None:

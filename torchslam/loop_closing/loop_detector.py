@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Int
 from torch import Tensor
 
-from torchslam.config import Config, LoopClosingConfig
+from torchslam.config import Config
 from torchslam.geometry import SharedCamera, se3_inverse, sim3_scale
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
@@ -24,9 +24,13 @@ from torchslam.types import Matcher
 
 _AROUND = 20
 """Keyframes that share most points with the new one: their places are known. Tried at this value only."""
-_NUM_VERIFYING = 5
-"""Covisible keyframes that may verify a candidate; `loop_closing.min_confirming_keyframes` of them must. Tried at this
-value only."""
+_MAX_CANDIDATES = 3
+"""Places that are verified for a keyframe, the most similar first; each takes a Sim(3). Tried at this value only."""
+_NUM_VERIFYING, _MIN_VERIFYING = 5, 2
+"""Covisible keyframes that may verify a candidate, and those that must. Tried at these values only."""
+_MAX_DRIFT, _MAX_DRIFT_DEG, _MAX_DRIFT_SCALE = 0.2, 20.0, 5.0
+"""Largest plausible drift along a loop: ratio of the position to the length of the path, degrees, and factor of the
+scale, which drifts most. Tried with a factor of the scale of 2 and 5."""
 _SAME_SCALE, _SAME_DEG, _SAME_SHARE = 1.2, 5.0, 0.1
 """Largest difference of two consistent relations: ratio of scales, degrees, and distance relative to the depth of the
 scene. Wide: lookalike places differ by meters and tens of degrees. Tried at these values only."""
@@ -91,7 +95,6 @@ class LoopDetector:
         keyframe_database: KeyframeDatabase,
         matcher: Matcher | None = None,
     ) -> None:
-        self.config = config
         self.atlas = atlas
         self.keyframe_database = keyframe_database
         self.estimator = RelativeSim3Estimator(camera, config, matcher)
@@ -113,9 +116,9 @@ class LoopDetector:
         known = two_hop_covisible(slam_map, keyframe)
         keys, _ = self.keyframe_database.query_by_key(slam_map.key(keyframe))
         taken: list[tuple[Submap, Tensor]] = [(submap, known)]
-        for key in keys[: 4 * self.config.loop_closing.max_candidates].tolist():
+        for key in keys[: 4 * _MAX_CANDIDATES].tolist():
             found = self.atlas.find(key)
-            if found is None or len(taken) > self.config.loop_closing.max_candidates:
+            if found is None or len(taken) > _MAX_CANDIDATES:
                 continue
             other, matched_keyframe = found
             if any(other is one and bool((near == matched_keyframe).any()) for one, near in taken):
@@ -130,16 +133,14 @@ class LoopDetector:
         relation = self.estimator.estimate(submap.map, keyframe, other.map, matched_keyframe)
         if relation is None:
             return None
-        if submap is other and not is_plausible_drift(
-            submap, keyframe, matched_keyframe, relation, self.config.loop_closing
-        ):
+        if submap is other and not is_plausible_drift(submap, keyframe, matched_keyframe, relation):
             return None
         near = neighborhood(other.map, matched_keyframe)
         covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
         sure = sum(
             self.estimator.verify(relation, submap.map, one, other.map, near) for one in covisible.tolist()
         )
-        return relation if sure >= self.config.loop_closing.min_confirming_keyframes else None
+        return relation if sure >= _MIN_VERIFYING else None
 
 
 def two_hop_covisible(slam_map: Map, keyframe: int) -> Int[Tensor, " R"]:
@@ -149,9 +150,7 @@ def two_hop_covisible(slam_map: Map, keyframe: int) -> Int[Tensor, " R"]:
     return torch.unique(torch.cat([near.new_tensor([keyframe]), near, further]))
 
 
-def is_plausible_drift(
-    submap: Submap, keyframe: int, matched_keyframe: int, relation: RelativeSim3, settings: LoopClosingConfig
-) -> bool:
+def is_plausible_drift(submap: Submap, keyframe: int, matched_keyframe: int, relation: RelativeSim3) -> bool:
     """Whether drift along the path between two keyframes can explain the Sim(3) of a loop.
 
     The Sim(3) between places that only look alike is mostly larger. The path is that of the keyframes between the two,
@@ -169,9 +168,9 @@ def is_plausible_drift(
     moved = float(torch.linalg.vector_norm(S[:3, :3] @ here + S[:3, 3] - here))
     turned = float(torch.rad2deg(rotation_angle(S[:3, :3] / scale)))
     return (
-        moved <= settings.max_drift * length
-        and turned <= settings.max_drift_deg
-        and 1 / settings.max_drift_scale <= scale <= settings.max_drift_scale
+        moved <= _MAX_DRIFT * length
+        and turned <= _MAX_DRIFT_DEG
+        and 1 / _MAX_DRIFT_SCALE <= scale <= _MAX_DRIFT_SCALE
     )
 
 

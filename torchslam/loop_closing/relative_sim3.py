@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import (
+    CHI_SQUARE_95,
     SharedCamera,
     estimate_similarity,
     passes_gate,
@@ -33,6 +34,11 @@ this value only."""
 _AROUND = 10
 """Covisible keyframes whose points are searched for in the other map, as many as ORB-SLAM3 takes. Tried at this value
 only."""
+_MIN_MATCHES = 40
+"""Points of the other map that a keyframe must observe where the Sim(3) predicts them; half as many in the other
+direction, and by another keyframe. Tried at this value only."""
+_MIN_SHARED = 20
+"""Points that both maps must have, whose depths give the scale. Tried at this value only."""
 _NEEDED = 12
 """Inliers of the first similarity, three times its minimal sample and more. Tried at this value only."""
 _CONFIDENCE, _MOST_SAMPLES = 0.9999, 3000
@@ -77,17 +83,16 @@ class RelativeSim3Estimator:
         T_12 = self._first_guess(map_1, keyframe_1, map_2, keyframe_2)
         if T_12 is None:
             return None
-        settings = self.config.loop_closing
         points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
         ids, keypoints = self.match(map_2, points_2, T_12, map_1, keyframe_1)
-        if len(ids) < settings.min_matches:
+        if len(ids) < _MIN_MATCHES:
             return None
         T_12, agrees = self._refined(map_2, ids, T_12, map_1, keyframe_1, keypoints)
         ids, keypoints = ids[agrees], keypoints[agrees]
         own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
         is_shared = own >= 0
         shared = int(is_shared.sum())
-        if len(ids) < settings.min_matches or shared < settings.min_sim3_points:
+        if len(ids) < _MIN_MATCHES or shared < _MIN_SHARED:
             return None
         # One pose has no scale, but the depths of points that both maps have do.
         T_11 = map_1.T_cw[keyframe_1]
@@ -97,7 +102,7 @@ class RelativeSim3Estimator:
         points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
         T_21 = transfer_pose(map_2.T_cw[keyframe_2], S_21)
         back, _ = self.match_inliers(map_1, points_1, T_21, map_2, keyframe_2)
-        if len(back) < settings.min_matches // 2:
+        if len(back) < _MIN_MATCHES // 2:
             return None
         return RelativeSim3(S_21, len(ids), len(back), shared)
 
@@ -107,7 +112,7 @@ class RelativeSim3Estimator:
         """Whether another keyframe of map 1 observes points of keyframes of map 2 where the Sim(3) predicts them."""
         T_o2 = transfer_pose(map_1.T_cw[other], sim3_inverse(relation.S_21))
         ids, _ = self.match_inliers(map_2, map_2.observed_points(near_2), T_o2, map_1, other)
-        return len(ids) >= self.config.loop_closing.min_matches // 2
+        return len(ids) >= _MIN_MATCHES // 2
 
     def match(
         self,
@@ -119,8 +124,7 @@ class RelativeSim3Estimator:
     ) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
         """Match points of a map to the keypoints of another map's keyframe, whose pose in this map is T_cw."""
         view = other.frame_features(keyframe)
-        angle = self.config.tracking.max_view_angle_deg
-        near = project_points(slam_map, point_ids, T_cw, self.camera.current, angle, view.scale_range)
+        near = project_points(slam_map, point_ids, T_cw, self.camera.current, view.scale_range)
         pairs = match_projected_points(slam_map, near, view, _RADIUS_PX, self.guided_matcher)
         return pairs.first, pairs.second
 
@@ -139,7 +143,7 @@ class RelativeSim3Estimator:
         errors = view.noise[keypoints].squared_reprojection(
             points_c, view.keypoints[keypoints], self.camera.current
         )
-        good = passes_gate(errors, _GATE_WIDENING**2 * self.config.measurement.max_chi_square)
+        good = passes_gate(errors, _GATE_WIDENING**2 * CHI_SQUARE_95)
         return ids[good], keypoints[good]
 
     def _first_guess(

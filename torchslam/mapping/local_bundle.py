@@ -18,7 +18,6 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.config import BundleAdjustmentConfig
 from torchslam.geometry import CHI_SQUARE_95, Camera, SharedCamera, passes_gate, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.robust import middle_variance
@@ -31,6 +30,12 @@ from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
 from torchslam.utils.indexing import distinct, is_among, ranks_among, true_indices
 
+LOCAL_WINDOW = 8
+"""Keyframes with free poses in a local adjustment. Tried at this value only."""
+MAX_FIXED_KEYFRAMES = 12
+"""Fixed keyframes of a local adjustment at most. Tried at this value only."""
+LOCAL_ITERATIONS, GLOBAL_ITERATIONS = 6, 15
+"""Iterations of a local and of a global adjustment at most. Tried at these values only."""
 LOCAL_TOLERANCE = 1e-4
 """Predicted relative reduction of the cost that ends a local adjustment; the next keyframe moves the map by more."""
 WHOLE_TOLERANCE = 1e-2
@@ -65,22 +70,17 @@ Solver = Callable[..., Callable[[], Any]]
 """Starts a pure function of a module, given with its arguments; the result waits for what it returns."""
 
 
-def select_window(
-    slam_map: Map,
-    keyframe: int,
-    camera: Camera,
-    settings: BundleAdjustmentConfig,
-) -> BundleWindow | None:
+def select_window(slam_map: Map, keyframe: int, camera: Camera) -> BundleWindow | None:
     """Select a keyframe, the keyframes most covisible with it and their points; None if there is nothing to adjust.
 
     Other keyframes that observe these points are fixed, and so is the first keyframe of the map.
     """
-    covisible = slam_map.covisible_keyframes(keyframe, settings.local_window - 1)
+    covisible = slam_map.covisible_keyframes(keyframe, LOCAL_WINDOW - 1)
     free = torch.cat([covisible.new_tensor([keyframe]), covisible])
     free = free[free != 0]
     shared = slam_map.count_observed(slam_map.observed_points(free))
     shared[free] = 0
-    fixed = top_rows(shared, settings.max_fixed_keyframes, least=1)
+    fixed = top_rows(shared, MAX_FIXED_KEYFRAMES, least=1)
     return build_window(slam_map, free, fixed, camera)
 
 
@@ -109,7 +109,6 @@ def solve_here(function: Callable[..., Any], *arguments: Any) -> Callable[[], An
 def adjust_all(
     slam_map: Map,
     camera: Camera,
-    settings: BundleAdjustmentConfig,
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
     tolerance: float = BUNDLE_OPTIONS.tolerance,
@@ -119,7 +118,6 @@ def adjust_all(
     Args:
         slam_map: The map.
         camera: The camera of all keyframes.
-        settings: Number of iterations.
         progress: Called before each iteration; if it raises, the map stays as it was.
         calibration: The given camera with its error: the camera is adjusted as well; None: it is exact.
         tolerance: Predicted relative reduction of the cost that ends it.
@@ -131,7 +129,7 @@ def adjust_all(
     window = build_window(slam_map, everyone[1:], everyone[:1], camera)
     if window is None:
         return camera
-    solution = solve_window(window.problem, settings, progress, calibration, tolerance)
+    solution = solve_window(window.problem, progress, calibration, tolerance)
     camera = camera if calibration is None else solution.camera
     apply_solution(slam_map, window, solution.T_cw, solution.points_w, camera)
     return camera
@@ -139,7 +137,6 @@ def adjust_all(
 
 def solve_window(
     problem: BundleProblem,
-    settings: BundleAdjustmentConfig,
     progress: Progress | None = None,
     calibration: CameraMeasurement | None = None,
     tolerance: float = BUNDLE_OPTIONS.tolerance,
@@ -153,7 +150,7 @@ def solve_window(
         free_camera=free,
         progress=progress,
         check=False,
-        options=MAP_OPTIONS.replace(iterations=settings.global_iterations, tolerance=tolerance),
+        options=MAP_OPTIONS.replace(iterations=GLOBAL_ITERATIONS, tolerance=tolerance),
     )
 
 
@@ -239,7 +236,7 @@ class ApplyAt(Enum):
 
     NOW = "now"
     BEFORE_NEXT_FRAME = "before the next frame is tracked"
-    AFTER_DELAY = "after `bundle_adjustment.delay_frames` more frames"
+    AFTER_DELAY = "after `mapper.DELAY_FRAMES` more frames"
 
 
 @dataclass
@@ -293,8 +290,8 @@ class AsyncBundleAdjustment(SolvedElsewhere):
     where it is solved.
     """
 
-    def __init__(self, camera: SharedCamera, settings: BundleAdjustmentConfig) -> None:
-        self.camera, self.settings = camera, settings
+    def __init__(self, camera: SharedCamera) -> None:
+        self.camera = camera
         self._pending: _Adjustment | None = None
 
     @property
@@ -344,12 +341,12 @@ class AsyncBundleAdjustment(SolvedElsewhere):
             return
         slam_map, camera = pending.slam_map, pending.camera
         if pending.keyframe is not None:
-            window = select_window(slam_map, pending.keyframe, camera, self.settings)
-            solve, iterations = solve_local, self.settings.local_iterations
+            window = select_window(slam_map, pending.keyframe, camera)
+            solve, iterations = solve_local, LOCAL_ITERATIONS
         else:
             everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
             window = build_window(slam_map, everyone[1:], everyone[:1], camera)
-            solve, iterations = solve_whole, self.settings.global_iterations
+            solve, iterations = solve_whole, GLOBAL_ITERATIONS
         if window is not None:
             pending.window = window
             pending.solution = self.solver(solve, window.problem, iterations)

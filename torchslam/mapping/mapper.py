@@ -22,8 +22,20 @@ from torchslam.tracking.tracker import Tracker
 from torchslam.types import Explanation, FrameFeatures, Matcher, PoseEstimate, Reason, Rejection, TwoViewMap
 from torchslam.utils.timing import Stopwatch
 
+NUM_PARTNERS = 5
+"""Keyframes against which new points are triangulated; twice as many are searched for duplicates. Tried at this value
+only."""
+DELAY_FRAMES = 2
+"""Frames tracked before the result of a local bundle adjustment is applied, which a worker process computes meanwhile.
+Tried from 0 to 3, with errors that differ by a tenth."""
+MIN_FOUND_RATIO = 0.25
+"""Ratio of the frames that found a point to those in which it was visible: ORB-SLAM's. Tried at this value only."""
+MIN_POINTS = 80
+"""Tracked points below which a frame becomes a keyframe, since they will soon be too few. Tried at this value only."""
 RECENT_KEYFRAMES = 3
 """Number of keyframes after its first one for which a point may be culled."""
+MIN_EXPLAINED_RATIO = 0.8
+"""Ratio of the frames since the reference frame that must have a pose in a new map. Tried at this value only."""
 MIN_POSE_SUPPORT = 0.5
 """Ratio of a frame's matches that must be inliers for the frame to support a new map: a majority."""
 LIVE_MIN_OVERLAP = 0.4
@@ -46,7 +58,7 @@ class Mapper:
         self.camera = camera
         self.config = config
         self.clock = clock
-        self.adjustment = AsyncBundleAdjustment(camera, config.bundle_adjustment)
+        self.adjustment = AsyncBundleAdjustment(camera)
         self.matcher = matcher
 
     def start(self, slam_map: Map, start: TwoViewMap) -> tuple[int, int]:
@@ -82,31 +94,27 @@ class Mapper:
         Returns:
             The row of the keyframe.
         """
-        settings = self.config.mapping
+        is_plain = self.config.paper.last_keyframe
         with self.clock("mapping"):
             keyframe = slam_map.add_keyframe(
                 view.weighed(estimate.keypoints, estimate.weights), estimate.T_cw
             )
             slam_map.add_observations(keyframe, estimate.keypoints, estimate.point_ids)
-            if settings.cull:
+            if not is_plain:
                 self.cull_recent_points(slam_map, keyframe)
-            neighbors = slam_map.covisible_keyframes(keyframe, 2 * settings.num_partners)
-            last = range(keyframe - 1, max(keyframe - 1 - settings.num_partners, -1), -1)
-            partners = (
-                neighbors if settings.triangulation_partners == "covisible" else slam_map.index_tensor(*last)
-            )
-            partners = partners[: settings.num_partners]
+            neighbors = slam_map.covisible_keyframes(keyframe, 2 * NUM_PARTNERS)
+            partners = slam_map.index_tensor(keyframe - 1) if is_plain else neighbors[:NUM_PARTNERS]
             normalize = self.camera.undistortion.normalize
             triangulate_against(
                 slam_map, keyframe, partners, self.camera.current, self.config, self.matcher, normalize
             )
             slam_map.update_appearance(slam_map.index_tensor(keyframe))
-            if settings.fuse:
+            if not is_plain:
                 fuse(slam_map, keyframe, neighbors, self.camera.current, self.config)
-        if self.config.bundle_adjustment.local:
+        if not self.config.paper.unrefined:
             is_delayed = apply_at is ApplyAt.AFTER_DELAY
             with self.clock("bundle"):
-                due = view.index + self.config.bundle_adjustment.delay_frames if is_delayed else None
+                due = view.index + DELAY_FRAMES if is_delayed else None
                 self.adjustment.request(slam_map, keyframe, due)
                 if not is_delayed:
                     self.adjustment.start()
@@ -125,7 +133,9 @@ class Mapper:
         Renumbers rows, see `Map.version`.
         """
         with self.clock("mapping"):
-            culled = cull_keyframes(submap, self.config.keyframes) if self.config.mapping.cull else None
+            culled = (
+                None if self.config.paper.last_keyframe else cull_keyframes(submap, self.config.keyframes)
+            )
             compacted = compact(submap)
         if culled is None or compacted is None:
             return culled or compacted
@@ -137,8 +147,8 @@ class Mapper:
         recent = torch.nonzero(points["first_keyframe"] >= keyframe - RECENT_KEYFRAMES)[:, 0]
         recent = recent[points["is_valid"][recent]]
         age = keyframe - points["first_keyframe"][recent]
-        least = self.config.mapping.min_found_ratio
-        is_rarely_found = points["times_found"][recent] < least * points["times_visible"][recent].float()
+        visible = points["times_visible"][recent].float()
+        is_rarely_found = points["times_found"][recent] < MIN_FOUND_RATIO * visible
         is_unconfirmed = (
             (age >= 2) & (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
         )
@@ -169,10 +179,9 @@ def initial_scale(start: TwoViewMap, kind: str) -> float:
 class MapInitializer:
     """Initializes an empty submap from two views and checks it with the frames between them."""
 
-    def __init__(self, tracker: Tracker, mapper: Mapper, min_explained: float) -> None:
+    def __init__(self, tracker: Tracker, mapper: Mapper) -> None:
         self.tracker = tracker
         self.mapper = mapper
-        self.min_explained = min_explained  # ratio of frames
 
     def build(self, submap: Submap, start: TwoViewMap, views: list[FrameFeatures]) -> Rejection | None:
         """Build the first map of two views and pose the frames between them; return why it is rejected, or None.
@@ -183,7 +192,7 @@ class MapInitializer:
         self.tracker.reset_to_keyframe(submap, first)
         explained = [self._explains(submap, view) for view in views]
         self.tracker.reset_to_keyframe(submap, second)
-        if sum(explained) < self.min_explained * len(explained):
+        if sum(explained) < MIN_EXPLAINED_RATIO * len(explained):
             return Rejection.of(Reason.FRAMES_UNEXPLAINED, count=sum(explained), frames=len(explained))
         return None
 
@@ -216,7 +225,7 @@ def keyframe_reason(
     newest = slam_map.num_keyframes - 1
     age = abs(view.index - int(slam_map.keyframes["frame_index"][newest]))
     overlap = overlap_with_reference(estimate, submap)
-    if age < max(1, settings.min_interval) or (age < view.backlog and overlap > LIVE_MIN_OVERLAP):
+    if age < 1 or (age < view.backlog and overlap > LIVE_MIN_OVERLAP):
         return None
     around = torch.cat([tracking.local_keyframes, tracking.local_keyframes.new_tensor([newest])])
     translation, rotation = pose_distance(estimate.T_cw, slam_map.T_cw[around], estimate.depth)
@@ -225,7 +234,7 @@ def keyframe_reason(
         if bool(has_moved.all()):
             return Explanation.of(Reason.MOVED, ratio=float(translation.min()))
         return Explanation.of(Reason.TURNED, degrees=float(rotation[~has_moved].min()))
-    if estimate.inliers < settings.min_points:
+    if estimate.inliers < MIN_POINTS:
         return Explanation.of(Reason.FEW_POINTS, count=estimate.inliers)
     if overlap < settings.min_overlap:
         return Explanation.of(Reason.LOW_OVERLAP, ratio=overlap)

@@ -32,6 +32,12 @@ from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_line
 from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchPrior
 
+MIN_BASELINE = 0.01
+"""Least baseline to a keyframe, relative to the median depth there. Tried at this value only."""
+MAX_EPIPOLAR_PX = 2.0
+"""Largest distance of a match from its epipolar line, pixels at the finest pyramid level. Tried at this value only."""
+MIN_PARALLAX_DEG = 1.0
+"""Least parallax of a new point, degrees. Tried at this value only."""
 RADIUS_PX = 3.0
 """Search radius around the projection in fusion, at the finest pyramid level."""
 
@@ -58,7 +64,7 @@ def triangulate_against(
         matcher: A custom matcher; by default descriptors along epipolar lines.
         normalize: A faster equivalent of `camera.normalize`.
     """
-    neighbors = neighbors[has_baseline(slam_map, keyframe, neighbors, config.mapping.min_baseline)]
+    neighbors = neighbors[has_baseline(slam_map, keyframe, neighbors, MIN_BASELINE)]
     if len(neighbors) == 0:
         return
     here, there = (
@@ -66,17 +72,16 @@ def triangulate_against(
         for rows in (slam_map.index_tensor(keyframe), neighbors)
     )
     T_21 = slam_map.T_cw[neighbors] @ se3_inverse(slam_map.T_cw[keyframe])
-    epipolar_px = config.mapping.max_epipolar_px
     if matcher is None or isinstance(matcher, DescriptorMatcher):
         limit = max_distance(here.features.descriptors, config.matching)
         found = NewPointMatches(
-            *match_along_epipolar_lines(here, there, T_21, camera, epipolar_px, limit), None
+            *match_along_epipolar_lines(here, there, T_21, camera, MAX_EPIPOLAR_PX, limit), None
         )
     else:
         views = [free_view(slam_map, row) for row in (keyframe, *neighbors.tolist())]
-        priors = [MatchPrior(T_21=each, camera=camera, epipolar_px=epipolar_px) for each in T_21]
+        priors = [MatchPrior(T_21=each, camera=camera, epipolar_px=MAX_EPIPOLAR_PX) for each in T_21]
         found = NewPointMatches(*match_each(matcher, views, here, there, priors))
-    _triangulate(slam_map, keyframe, neighbors, here, there, found, camera, config)
+    _triangulate(slam_map, keyframe, neighbors, here, there, found, camera)
 
 
 class NewPointMatches(NamedTuple):
@@ -101,10 +106,8 @@ def _triangulate(
     there: FreeKeypoints,
     found: NewPointMatches,
     camera: Camera,
-    config: Config,
 ) -> None:
     """Triangulate matches and add the points that pass all checks."""
-    settings, limit = config.mapping, config.measurement.max_chi_square
     T_1w, T_2w = slam_map.T_cw[keyframe], slam_map.T_cw[neighbors][found.which]
     seen_1, seen_2 = (0, found.at_1, None), (found.which, found.at_2, None)
     pixels = here.features.keypoints[seen_1], there.features.keypoints[seen_2]
@@ -115,8 +118,8 @@ def _triangulate(
     good = seen.mask
     for T_cw, noise, seen_at in ((T_1w, noise_1, pixels[0]), (T_2w, noise_2, pixels[1])):
         points_c = transform(T_cw, seen.points_w)
-        good &= passes_gate(noise.squared_reprojection(points_c, seen_at, camera), limit)
-    good &= seen.angles > math.radians(settings.min_parallax_deg)
+        good &= passes_gate(noise.squared_reprojection(points_c, seen_at, camera))
+    good &= seen.angles > math.radians(MIN_PARALLAX_DEG)
     sizes = tuple(size[found.which] for size in slam_map.scale_ranges(neighbors))
     good &= has_consistent_scale(seen.points_w, T_1w, T_2w, scale_1, scale_2, sizes)
     keep = torch.nonzero(good)[:, 0]
@@ -244,10 +247,10 @@ def match_in_keyframes(
     """
     if len(keyframes) == 0 or len(point_ids) == 0:
         return point_ids[:0], point_ids[:0]
-    table, points, angle = slam_map.keyframes, slam_map.points, config.tracking.max_view_angle_deg
+    table, points = slam_map.keyframes, slam_map.points
     features = slam_map.features(keyframes)
     T_cw, sizes = slam_map.T_cw[keyframes], slam_map.scale_ranges(keyframes)
-    pixels, scales, visible = predict_observations(slam_map, point_ids, T_cw, camera, angle, sizes)
+    pixels, scales, visible = predict_observations(slam_map, point_ids, T_cw, camera, sizes)
     visible &= ~slam_map.observation_mask(keyframes, point_ids)
     somewhere = torch.nonzero(visible.any(0))[:, 0]
     point_ids = point_ids[somewhere]
@@ -267,7 +270,7 @@ def match_in_keyframes(
     errors = slam_map.keypoint_noise(keyframe, keypoint).squared(
         pixels[which, row] - table["keypoints"][keyframe, keypoint]
     )
-    agrees = passes_gate(errors, config.measurement.max_chi_square)
+    agrees = passes_gate(errors)
     ids, keyframe, keypoint = ids[agrees], keyframe[agrees], keypoint[agrees]
     taken = table["point_ids"][keyframe, keypoint]
     is_free = taken < 0

@@ -199,7 +199,7 @@ class _Refinement:
         if len(self.views) < MIN_VIEWS:
             self.failure = f"no map: {len(self.views)} images with a pose are not enough"
             return
-        self.pairs = build_view_graph(PairMatcher(self.views, mapper.camera, mapper.matcher, mapper.scaled))
+        self.pairs = build_view_graph(PairMatcher(self.views, mapper.camera, mapper.matcher, mapper.config))
         self.held_back = choose_held_back(self.pairs)
         self.used = [pair for row, pair in enumerate(self.pairs) if row not in self.held_back]
         if not self.used:
@@ -265,7 +265,7 @@ class _Refinement:
         return {frame: self.given_cw[frame] for frame in self.frames}
 
     def _check(self, T_cw: Tensor, known: Tensor, camera: Camera) -> MapCheck:
-        reduction = self.mapper.scaled.features.reduction(camera.size)
+        reduction = self.mapper.config.features.reduction(camera.size)
         return check_map(T_cw, known, self.views, self.pairs, camera, self.held_back, reduction)
 
     def _tracks(self) -> ObservedTracks:

@@ -9,9 +9,12 @@ from enum import Enum
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.config import InitializationConfig
 from torchslam.map.atlas import TrackingState
 from torchslam.types import FrameFeatures, PoseEstimate
+
+MAX_UNPOSED_FRAMES = 1000
+"""Frames without a pose that are kept and posed once there is a map: more than those since the reference frame, with
+which a map may begin, and about 100 MB of ORB features. Tried at this value only."""
 
 
 class FrameStatus(Enum):
@@ -47,11 +50,10 @@ class HeldFrame:
 class FrameLog:
     """Frames of a session by index, with their status; frames with a final pose are not in it.
 
-    Of the unposed ones the latest are kept: `max_unposed_frames`, and those that a new map may begin with.
+    Of the unposed ones the latest `MAX_UNPOSED_FRAMES` are kept.
     """
 
-    def __init__(self, settings: InitializationConfig) -> None:
-        self.settings = settings
+    def __init__(self) -> None:
         self._frames: dict[int, tuple[FrameStatus, FrameFeatures | HeldFrame]] = {}
 
     def status(self, index: int) -> FrameStatus | None:
@@ -77,8 +79,7 @@ class FrameLog:
         """Log frames without a pose."""
         self._log(FrameStatus.UNPOSED, {view.index: view for view in views})
         unposed = self._of(FrameStatus.UNPOSED)
-        kept = max(self.settings.max_unposed_frames, self.settings.max_reference_age)
-        self.forget(unposed[: max(0, len(unposed) - kept)])
+        self.forget(unposed[: max(0, len(unposed) - MAX_UNPOSED_FRAMES)])
 
     def hold(self, frame: HeldFrame) -> None:
         """Log a frame with a pose that later frames have to confirm."""
@@ -108,7 +109,7 @@ class FrameLog:
 
     def copy(self) -> FrameLog:
         """A log of the same frames, which later frames do not change."""
-        copied = FrameLog(self.settings)
+        copied = FrameLog()
         copied._frames = dict(self._frames)
         return copied
 

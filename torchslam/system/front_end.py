@@ -196,7 +196,6 @@ class Simulated:
             depth_far=settings.depth_far,
             noise_px=settings.noise_px,
             outliers=settings.outlier_ratio,
-            dropout=settings.dropout_ratio,
             scales=settings.with_scales,
             seed=config.seed,
         )

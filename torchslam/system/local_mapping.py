@@ -8,7 +8,7 @@ from torchslam.mapping.mapper import LIVE_MIN_OVERLAP, keyframe_reason, overlap_
 from torchslam.system.frame_log import HeldFrame
 from torchslam.system.savepoint import Savepoint
 from torchslam.system.session import SystemContext
-from torchslam.tracking.pose_validation import Certainty, Verdict, check_pose
+from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, Certainty, Verdict, check_pose
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate
 
 MAX_CONSECUTIVE_FAILURES = 5
@@ -107,7 +107,7 @@ def locate(
     if estimate is not None:
         expected_T_cw = prior_T_cw if has_velocity else None
         averages = submap.tracking.averaged_with(estimate)
-        verdict = check_pose(estimate, expected_T_cw, averages, context.config.pose_validation)
+        verdict = check_pose(estimate, expected_T_cw, averages)
     tracker.commit(submap, view, estimate)
     return None if estimate is None or verdict is None else (estimate, verdict)
 
@@ -160,7 +160,7 @@ class BackwardTracking:
                     self.mapping.add_frame(submap, view, estimate)
                     log.forget([view.index])
                     continue
-                doubted = doubted or Savepoint(submap, context.config.pose_validation.num_confirming_frames)
+                doubted = doubted or Savepoint(submap, NUM_CONFIRMING_FRAMES)
                 self.mapping.add_tentative_keyframe(doubted, view, estimate)
                 doubted.count(verdict.rejection)
                 hold(context, doubted, view, estimate)

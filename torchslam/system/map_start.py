@@ -11,6 +11,8 @@ from torchslam.system.session import SystemContext
 from torchslam.tracking.initialization import Initializer, contradicting_initialization
 from torchslam.types import FrameFeatures, Rejection, TwoViewMap
 
+PROVISIONAL_FRAMES = 20
+"""Tracked frames after which a new map is no longer discarded when tracking is lost. Tried at this value only."""
 CHECK_INTERVAL = 5
 """Tracked frames between two checks of a provisional map; a turning camera soon no longer sees what the first frame
 saw. Tried at this value only."""
@@ -24,10 +26,7 @@ class MapStart:
 
     def __init__(self, context: SystemContext, backward: BackwardTracking) -> None:
         self.context, self.backward = context, backward
-        self.settings = context.config.initialization
-        self.map_initializer = MapInitializer(
-            context.tracker, context.mapper, self.settings.min_explained_ratio
-        )
+        self.map_initializer = MapInitializer(context.tracker, context.mapper)
         self.restart()
 
     def restart(self) -> None:
@@ -112,7 +111,7 @@ class MapStart:
             context.loop_closer.add(submap.map, keyframe)
         known = set(submap.posed_frames.frames["frame_index"].tolist()) if len(submap.posed_frames) else set()
         active_map.submap = submap
-        active_map.provisional = Savepoint(submap, self.settings.provisional_frames)
+        active_map.provisional = Savepoint(submap, PROVISIONAL_FRAMES)
         self.add_frames(view for view in views if view.index in known)
         return None
 

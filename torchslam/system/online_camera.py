@@ -20,7 +20,13 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.geometry.undistorted import Undistortion
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.mapping.local_bundle import MAP_OPTIONS, AsyncBundleAdjustment, SolvedElsewhere, adjust_all
+from torchslam.mapping.local_bundle import (
+    GLOBAL_ITERATIONS,
+    MAP_OPTIONS,
+    AsyncBundleAdjustment,
+    SolvedElsewhere,
+    adjust_all,
+)
 from torchslam.optim.rolling_shutter import ONLINE_FRAMES
 from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor
 
@@ -28,8 +34,8 @@ FIRST_KEYFRAMES, MAX_KEYFRAMES, GROWTH = 6, 100, 1.3
 """Keyframes of the map at the first estimate and the last one, and their ratio from one to the next. Tried from 6 to 8
 and from 1.2 to 1.5: with later ones, more frames of kitti07 have the error of the given camera."""
 ESTIMATE_FRAMES, ADJUST_FRAMES = 15, 8
-"""Frames after which an estimate is taken, and after which the map that is adjusted by it is, at least. Tried from 3 and
-2 on: the errors of kitti07 and tsukuba change by up to a third, without order."""
+"""Least frames after which an estimate is taken, and after which the map that is adjusted by it is. Tried from 3 and 2
+on: the errors of kitti07 and tsukuba change by up to a third, without order."""
 ESTIMATE_RATIO, ADJUST_RATIO = 1.5, 0.25
 """The same in frames per keyframe of the map, for larger ones: with 73 keyframes of redkitchen, an estimate takes 2.2 s
 of another process and the adjustment .2 s; frames at full speed take 15 to 25 ms. With 1 and 0 frames waited for up to
@@ -84,7 +90,7 @@ class OnlineCamera(SolvedElsewhere):
         self, camera: SharedCamera, config: Config, atlas: Atlas, adjustment: AsyncBundleAdjustment
     ) -> None:
         self.camera, self.atlas, self.adjustment = camera, atlas, adjustment
-        self.settings = config.bundle_adjustment
+        self.is_refined = not config.paper.unrefined
         self.given = CameraMeasurement.of(camera.current, config.camera.std) if config.camera.std else None
         self.prior = SensorPrior(self.given, given_readout(config.camera))
         camera.use(SensorModel(camera.current, self.prior.readout if self.prior.readout.is_given else None))
@@ -135,11 +141,11 @@ class OnlineCamera(SolvedElsewhere):
             return
         keyframes = submap.map.num_keyframes
         is_wanted = self.given is not None or self.prior.readout.is_sought
-        if not is_wanted or not self.settings.local or not self.next_check <= keyframes <= MAX_KEYFRAMES:
+        if not is_wanted or not self.is_refined or not self.next_check <= keyframes <= MAX_KEYFRAMES:
             return
         self.next_check = math.ceil(keyframes * GROWTH)
         graph = submap.posed_frames.graph(submap.map, self.camera.model)
-        options = MAP_OPTIONS.replace(iterations=self.settings.global_iterations, tolerance=TOLERANCE)
+        options = MAP_OPTIONS.replace(iterations=GLOBAL_ITERATIONS, tolerance=TOLERANCE)
         result = self.solver(estimate_sensor, graph, self.prior, options, ONLINE_FRAMES)
         self._pending = _Estimate(
             submap, frame + max(ESTIMATE_FRAMES, int(ESTIMATE_RATIO * keyframes)), result
@@ -168,7 +174,7 @@ class OnlineCamera(SolvedElsewhere):
         for other in self.atlas:
             if other is not submap:
                 other.correct_keyframes(found.sensor)
-                adjust_all(other.map, found.sensor.camera, self.settings)
+                adjust_all(other.map, found.sensor.camera)
 
     def forget(self) -> None:
         """Forget an estimate of a map that is no longer the active one."""

@@ -366,7 +366,7 @@ class FinalAdjustment:
             config: the configuration.
             measured: the given camera with its error; None if it is exact.
         """
-        self.sensor, self.settings = sensor, config.bundle_adjustment
+        self.sensor, self.is_wanted = sensor, not config.paper.unrefined
         self.prior = SensorPrior(measured, given_readout(config.camera))
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
@@ -375,7 +375,7 @@ class FinalAdjustment:
     def adjust(
         self, atlas: Atlas, session: int, progress: Progress | None = None, settled: bool = False
     ) -> None:
-        """Adjust all submaps, if so configured. The main one determines the camera; the others follow.
+        """Adjust all submaps, unless they stay unrefined. The main one determines the camera; the others follow.
 
         Args:
             atlas: the submaps.
@@ -384,7 +384,7 @@ class FinalAdjustment:
             settled: keyframes and points are at a minimum already, and what is far from it has been removed.
         """
         main = atlas.main(session)
-        if main is None or not (self.settings.local and self.settings.global_at_end):
+        if main is None or not self.is_wanted:
             return
         self._adjust(main, self.prior.camera, progress, settled, is_main=True)
         for submap in atlas:
@@ -401,7 +401,7 @@ class FinalAdjustment:
     ) -> None:
         if not settled:
             camera = self.sensor.camera if given is None else with_radial_terms(self.sensor.camera)
-            self._use(adjust_all(submap.map, camera, self.settings, progress, given, ROUGH.tolerance))
+            self._use(adjust_all(submap.map, camera, progress, given, ROUGH.tolerance))
         self.given = given or self.given
         submap.posed_frames.remove_outliers(submap.map, self.sensor)
         if not settled:

@@ -108,7 +108,6 @@ class SystemContext:
     """The components of one session.
 
     Attributes:
-        config: Configuration for images of the camera's size, see `Config.for_size`.
         log: The frames whose poses are not final.
         active_map: The active submap and the savepoints.
     """

@@ -61,8 +61,7 @@ class SLAM:
 
     Args:
         camera: The camera of all frames.
-        config: The configuration; the default one if None. Settings in pixels are those of images as
-            `features.max_image_pixels` reduces them, and are scaled for larger ones.
+        config: The configuration; the default one if None.
         extractor: The extractor, from images to `Features`, such as `ORB()`; the configured one if None. Frames that
             bring their own features, as those of `front_end.Simulated`, are not passed to it.
         matcher: The matcher of two views, see `types.Matcher`, or one of kornia; the configured one if None.
@@ -86,11 +85,10 @@ class SLAM:
         )  # unknown to worker processes
         self.make_extractor: Callable[[], Extractor] = partial(checked_extractor, self.config, self.camera)
         self.clock = Stopwatch()
-        scaled = self.scaled_config = self.config.for_size(camera.size)
-        self.matcher = make_matcher(scaled.matching, matcher, camera.size, scaled.features.kind)
+        self.matcher = make_matcher(self.config.matching, matcher, camera.size, self.config.features.kind)
         self.shared_camera = SharedCamera(self.camera)
-        self.tracker = Tracker(self.shared_camera, scaled, self.matcher)
-        self.mapper = Mapper(self.shared_camera, scaled, self.clock, self.matcher)
+        self.tracker = Tracker(self.shared_camera, self.config, self.matcher)
+        self.mapper = Mapper(self.shared_camera, self.config, self.clock, self.matcher)
         self.reset()
 
     def reset(self) -> None:
@@ -137,12 +135,12 @@ class SLAM:
         self.last_features: FrameFeatures | None = None  # of the last frame, before masking
         self.tracker = self.tracker.for_session(session.mapping)
         self.mapper.adjustment.drop()
-        self.loop_closer = LoopCloser(self.shared_camera, self.scaled_config, self.atlas, self.matcher)
-        self.scene_filter = SceneFilter(self.shared_camera, self.scaled_config)
+        self.loop_closer = LoopCloser(self.shared_camera, self.config, self.atlas, self.matcher)
+        self.scene_filter = SceneFilter(self.shared_camera, self.config)
         self.online_camera = OnlineCamera(self.shared_camera, self.config, self.atlas, self.mapper.adjustment)
         self._context = SystemContext(
             camera=self.shared_camera,
-            config=self.scaled_config,
+            config=self.config,
             clock=self.clock,
             matcher=self.matcher,
             tracker=self.tracker,
@@ -151,7 +149,7 @@ class SLAM:
             loop_closer=self.loop_closer,
             scene_filter=self.scene_filter,
             online_camera=self.online_camera,
-            log=FrameLog(self.config.initialization),
+            log=FrameLog(),
             active_map=ActiveMap(submap),
         )
         self._state_machine = StateMachine(self._context)

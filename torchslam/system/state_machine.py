@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 from torchslam.map.atlas import Submap
 from torchslam.mapping.culling import remove_masked_observations
-from torchslam.mapping.local_bundle import ApplyAt
+from torchslam.mapping.local_bundle import LOCAL_WINDOW, ApplyAt
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, hold, locate
 from torchslam.system.maintenance import Maintenance
 from torchslam.system.map_start import MapStart
@@ -22,9 +22,14 @@ from torchslam.system.modes import TRANSITIONS
 from torchslam.system.savepoint import Savepoint
 from torchslam.system.session import SystemContext
 from torchslam.tracking.non_static import NO_MOVEMENT, FilteredView
-from torchslam.tracking.pose_validation import SURE_INLIERS, Certainty, Verdict
+from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, SURE_INLIERS, Certainty, Verdict
 from torchslam.tracking.relocalization import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason
+
+FRAMES_BEFORE_NEW_SUBMAP = 20
+"""Lost frames before a new submap may be initialized, so that the camera can come back. Tried at this value only."""
+NUM_RELOCALIZED_FRAMES = 4
+"""Certain frames in a row after a relocalization before mapping resumes. Tried at this value only."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ class StateMachine:
         self.backward = BackwardTracking(context, self.mapping)
         self.map_start = MapStart(context, self.backward)
         self.maintenance = Maintenance(context, self.map_start)
-        self.relocalizer = Relocalizer(context.tracker, context.config)
+        self.relocalizer = Relocalizer(context.tracker)
         self.num_lost = 0  # frames since the camera was lost
 
     def step(self, filtered: FilteredView) -> FrameOutcome:
@@ -138,18 +143,15 @@ class StateMachine:
 
     def _apply_at(self) -> ApplyAt:
         """When the adjustment around a new keyframe is applied: soon, as long as it moves the whole map."""
-        settings = self.context.config.bundle_adjustment
-        if settings.delay_frames == 0:
-            return ApplyAt.NOW
-        is_small = self.active_map.current.map.num_keyframes < settings.local_window
+        is_small = self.active_map.current.map.num_keyframes < LOCAL_WINDOW
         if is_small or self.active_map.provisional is not None:
             return ApplyAt.BEFORE_NEXT_FRAME
         return ApplyAt.AFTER_DELAY
 
     def _hold(self, view: FrameFeatures, estimate: PoseEstimate, verdict: Verdict) -> FrameOutcome:
         """Hold a frame back; enough certain frames in a row confirm all that are held back."""
-        active_map, settings = self.active_map, self.context.config.pose_validation
-        doubted = active_map.doubted or Savepoint(active_map.current, settings.num_confirming_frames)
+        active_map = self.active_map
+        doubted = active_map.doubted or Savepoint(active_map.current, NUM_CONFIRMING_FRAMES)
         if verdict.certainty is not Certainty.WRONG and _may_extend(doubted, estimate, verdict):
             self.mapping.add_tentative_keyframe(doubted, view, estimate)
         doubted.count(verdict.rejection)
@@ -225,7 +227,7 @@ class StateMachine:
             if found is not None:
                 return self._relocalize(view, *found)
         context.log.unpose(view)
-        waits = self.num_lost <= context.config.relocalization.frames_before_new_submap
+        waits = self.num_lost <= FRAMES_BEFORE_NEW_SUBMAP
         if has_submaps and (waits or not context.session.mapping):
             return FrameOutcome([Reason.LOST])
         rejection = self.map_start.step(view)
@@ -235,9 +237,9 @@ class StateMachine:
 
     def _relocalize(self, view: FrameFeatures, submap: Submap, estimate: PoseEstimate) -> FrameOutcome:
         """Track in the submap from here; the next frames have to confirm the pose."""
-        context, needed = self.context, self.context.config.relocalization.num_confirming_frames
+        context = self.context
         context.tracker.start_at_estimate(submap, view, estimate)
-        doubted = Savepoint(submap, needed, is_relocalized=True)
+        doubted = Savepoint(submap, NUM_RELOCALIZED_FRAMES, is_relocalized=True)
         hold(context, doubted, view, estimate)
         self.active_map.submap, self.active_map.doubted = submap, doubted
         return FrameOutcome([Reason.RELOCALIZED], submap, estimate)

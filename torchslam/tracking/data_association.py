@@ -21,6 +21,9 @@ from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matc
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, MatchPrior
 from torchslam.utils.indexing import is_among
 
+MAX_VIEW_ANGLE_DEG = 60.0
+"""Largest angle between the current and the last viewing direction of a point, degrees: ORB-SLAM's. Tried at this value
+only."""
 GRID = (8, 6)
 """Columns and rows of the image cells: squares at 4:3, 80 px wide at 640 x 480. Tried at this value only."""
 MAX_MATCHES_PER_CELL = 5
@@ -67,16 +70,13 @@ def project_points(
     ids: Int[Tensor, " M"],
     T_cw: Float[Tensor, "4 4"],
     camera: Camera,
-    max_view_angle_deg: float,
     scale_range: tuple[float, float],
 ) -> Projected:
     """The valid points in front of the camera, in the image and seen from a similar direction as before.
 
     Predicted scales are clamped to `scale_range`, the scales of the detector.
     """
-    pixels, scales, visible = predict_observations(
-        slam_map, ids, T_cw, camera, max_view_angle_deg, scale_range
-    )
+    pixels, scales, visible = predict_observations(slam_map, ids, T_cw, camera, scale_range)
     kept = torch.nonzero(visible)[:, 0]
     ids = ids[kept]
     return Projected(ids, pixels[kept], scales[kept], slam_map.points["angles"][ids])
@@ -87,7 +87,6 @@ def predict_observations(
     ids: Int[Tensor, " N"],
     T_cw: Float[Tensor, "*batch 4 4"],
     camera: Camera,
-    max_view_angle_deg: float,
     scale_range: tuple[float, float] | tuple[Float[Tensor, "*batch 1"], Float[Tensor, "*batch 1"]],
 ) -> tuple[Float[Tensor, "*batch N 2"], Float[Tensor, "*batch N"], Bool[Tensor, "*batch N"]]:
     """Predicted pixels, scales and visibility of points in cameras; `scale_range` as in `project_points`."""
@@ -97,7 +96,7 @@ def predict_observations(
     rays_w = positions_w + (T_cw[..., :3, :3].mT @ T_cw[..., :3, 3:]).mT
     distance = torch.linalg.vector_norm(rays_w, dim=-1).clamp(min=1e-12)
     cosine = (rays_w * points["view_directions_w"][ids]).sum(-1) / distance
-    least = math.cos(math.radians(max_view_angle_deg))
+    least = math.cos(math.radians(MAX_VIEW_ANGLE_DEG))
     valid &= points["is_valid"][ids]  # the local map may contain points that were removed since
     scales = (points["scale_distance"][ids] / distance).clamp(*scale_range)
     return pixels, scales, valid & camera.in_image(pixels) & (cosine > least)

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.config import Config, InitializationConfig
+from torchslam.config import Config
 from torchslam.geometry import (
     Camera,
     KeypointNoise,
@@ -30,9 +30,27 @@ from torchslam.geometry.robust import NORMAL_MEDIAN, Kernel
 from torchslam.map.atlas import Submap
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.tracking.matcher import make_matcher, run_matcher
-from torchslam.tracking.turning_camera import TurningCamera
+from torchslam.tracking.turning_camera import THRESHOLD_PX, TurningCamera
 from torchslam.types import FrameFeatures, Matcher, Reason, Rejection, TwoViewMap
 
+MIN_MOTION_PX = 2.0
+"""Median motion of the matches below which the camera stands still, pixels of reduced images. Tried at this value
+only."""
+MAX_STATIC_PX = 1.0
+"""Largest motion of a match that stays in place, pixels of reduced images. Tried at this value only."""
+MIN_POINTS_RATIO = 0.6
+"""Points of the initial map, relative to `initialization.min_matches`: 60 for 100. Tried at this value only."""
+MAX_DEPTH_STD = 0.1
+"""Relative standard deviation of the depth up to which a point is good. Tried at this value only."""
+MIN_GOOD_RATIO = 0.15
+"""Ratio of good points to matches. Tried at 0.15 and 0.4."""
+MIN_PLANAR_RATIO = 0.5
+"""The same in a planar scene. Tried at this value only."""
+MAX_REFERENCE_AGE = 300
+"""Frames after which the reference frame is replaced. Tried at 60 and 300."""
+PAPER_POINTS, PAPER_PARALLAX_DEG, PAPER_MEAN_PARALLAX_DEG = 40, 3.0, 5.0
+"""With `paper.parallax`: good points of the initial map, the parallax of a good point, and the mean of all, degrees, as
+in the paper's system."""
 TRIANGULATION_GATE_SIGMA = 3.0
 """Largest error of a triangulated point before refinement, in units of the noise."""
 MIN_IN_FRONT_RATIO = 0.8
@@ -90,6 +108,9 @@ class Initializer:
         self.camera = camera
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.config = config
+        reduction = config.features.reduction(camera.current.size)
+        self.threshold_px = THRESHOLD_PX * reduction
+        self.min_motion_px, self.max_static_px = MIN_MOTION_PX * reduction, MAX_STATIC_PX * reduction
         self._reference: FrameFeatures | None = None
         self.turning = TurningCamera(camera, config, self.matcher)
         self._most_matches = 0  # of the reference with a view
@@ -108,7 +129,7 @@ class Initializer:
     def step(self, view: FrameFeatures) -> TwoViewMap | Rejection:
         """Try to initialize a map with the next frame."""
         self.static_pixels = self.static_pixels[:0]
-        if self._reference is None or self.num_views >= self.config.initialization.max_reference_age:
+        if self._reference is None or self.num_views >= MAX_REFERENCE_AGE:
             self._refer_to(view)
             return Rejection(Reason.NEW_REFERENCE)
         self.num_views += 1
@@ -137,21 +158,21 @@ class Initializer:
 
     def _relate(self, matches: ViewMatches) -> TwoViewMap | Rejection:
         """Initialize from matches with the reference, unless the camera stands still."""
-        settings, view = self.config.initialization, matches.view
+        view = matches.view
         motion = torch.linalg.vector_norm(matches.pixels[1] - matches.pixels[0], dim=-1)
         moved = float(motion.median())
-        if moved >= settings.min_motion_px:
+        if moved >= self.min_motion_px:
             scene = self._scene(matches, motion)
             if scene is None:
                 return Rejection(Reason.STATIC_AMBIGUOUS)
             return self._relate_moving(matches.of(scene), scene_only=False)
         if len(motion) < MIN_MATCHED_RATIO * int(self.reference.mask.sum()):
-            self.static_pixels = matches.pixels[1][motion < settings.max_static_px]
+            self.static_pixels = matches.pixels[1][motion < self.max_static_px]
             self._refer_to(view)
             return Rejection(Reason.STATIC_REMAINDER)
         # Either the camera stands still, or most of what matches does not belong to the scene: a logo, a subtitle.
-        moving = motion >= settings.min_motion_px
-        if int(moving.sum()) < settings.min_matches:
+        moving = motion >= self.min_motion_px
+        if int(moving.sum()) < self.config.initialization.min_matches:
             return Rejection.of(Reason.STATIONARY, pixels=moved)
         result = self._relate_moving(matches.of(moving), scene_only=True)
         if isinstance(result, TwoViewMap):
@@ -178,21 +199,20 @@ class Initializer:
         self, matches: ViewMatches, relative: RelativePose, scene_only: bool
     ) -> TwoViewMap | Rejection:
         """`_relate_moving` with the model that the threshold alone determines."""
-        settings = self.config.initialization
         model = relative.model[0]
         if scene_only and model != "essential":
             return Rejection.of(Reason.MOVING_OBJECT, model=model)
         if model == "rotation":
             return Rejection(Reason.PURE_ROTATION)
         self.num_planar_views += model == "homography"
-        if model == "homography" and self.num_planar_views < settings.min_planar_frames:
+        if model == "homography" and self.num_planar_views < self.config.initialization.min_planar_frames:
             # Motion from a scene that is nearly a plane is far off; with more parallax its depth mostly shows.
             if self.num_planar_views.bit_count() == 1:  # the 1st, 2nd, 4th, ...: a test takes long
                 self.planar_reason = self._turns_only(matches, relative)
             return self.planar_reason or Rejection(Reason.PLANAR_SCENE)
         if not bool(relative.success[0]):
             return Rejection.of(Reason.AMBIGUOUS_MOTION, model=model)
-        min_good_ratio = settings.min_planar_ratio if model == "homography" else settings.min_good_ratio
+        min_good_ratio = MIN_PLANAR_RATIO if model == "homography" else MIN_GOOD_RATIO
         found = self._triangulate(matches.of(relative.inliers[0]), relative.T_21[0], min_good_ratio)
         if isinstance(found, Rejection):
             return found
@@ -208,8 +228,7 @@ class Initializer:
             matches: the matches.
             rough: the relative pose by the threshold.
         """
-        settings = self.config.initialization
-        near = self._offsets(rough.T_21_essential[0], matches) < 2 * settings.threshold_px
+        near = self._offsets(rough.T_21_essential[0], matches) < 2 * self.threshold_px
         turned, turns = self.turning.fit(*matches.pixels, near)
         matches = replace(matches, pixels=self.turning.at_middle_rows(matches.pixels, turns))
         relative = self._relative_pose(matches, kernel="cauchy")
@@ -221,7 +240,7 @@ class Initializer:
         noise = min(max(float(across) / (math.sqrt(2) * NORMAL_MEDIAN), LEAST_NOISE), 1.0)
         if self.turning.explains(turned, inliers, NOISE_SIGMAS * noise):
             return None
-        found = self._triangulate(matches.of(inliers), relative.T_21[0], settings.min_good_ratio, noise)
+        found = self._triangulate(matches.of(inliers), relative.T_21[0], MIN_GOOD_RATIO, noise)
         return found if isinstance(found, TwoViewMap) else None
 
     def _offsets(self, T_21: Float[Tensor, "4 4"], matches: ViewMatches) -> Float[Tensor, " M"]:
@@ -237,7 +256,7 @@ class Initializer:
         if self.turning.std == 0 or not bool(inliers.any()):
             return None
         turned, _ = self.turning.fit(*matches.pixels, inliers)
-        if not self.turning.explains(turned, inliers, self.config.initialization.threshold_px):
+        if not self.turning.explains(turned, inliers, self.threshold_px):
             return None
         return Rejection.of(Reason.PURE_ROTATION_OTHER_FOCAL, focal=float(turned.camera.focal))
 
@@ -248,7 +267,7 @@ class Initializer:
         what the camera turns around: they are on their epipolar lines and not behind the camera.
         """
         everything = torch.ones_like(motion, dtype=torch.bool)
-        still = motion < self.config.initialization.max_static_px
+        still = motion < self.max_static_px
         if (
             int(still.sum()) < MIN_STATIC_RATIO * len(motion)
             or int((~still).sum()) < self.config.initialization.min_matches
@@ -261,8 +280,7 @@ class Initializer:
         across, along = epipolar_offsets(
             others.T_21_essential[0], *static.pixels, self.camera.current, self.camera.current
         )
-        threshold = self.config.initialization.threshold_px
-        explained = (across.abs() < threshold) & (along > -threshold)
+        explained = (across.abs() < self.threshold_px) & (along > -self.threshold_px)
         if float(explained.double().mean()) >= MIN_EXPLAINED_RATIO:
             return everything
         self.static_pixels = static.pixels[1]
@@ -276,7 +294,7 @@ class Initializer:
             pixels_2[None],
             camera_1=self.camera.current,
             camera_2=self.camera.current,
-            threshold=self.config.initialization.threshold_px,
+            threshold=self.threshold_px,
             seed=self.config.seed,
             kernel=kernel,
             min_samples=64,
@@ -293,7 +311,6 @@ class Initializer:
             min_good_ratio: least ratio of the matches whose depth is known.
             noise_level: of the keypoints, in units of what is assumed.
         """
-        settings = self.config.initialization
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         view, first, second = matches.view, matches.first, matches.second
         pixels_1, pixels_2 = matches.pixels
@@ -312,19 +329,25 @@ class Initializer:
         )
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
         errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera.current)
-        good = is_good(seen, errors.amax(0), noise_level * noise.gate_sigma, self.camera.current, settings)
-        rejection = check_two_view_map(good, seen, len(first), settings, min_good_ratio)
+        good = is_good(seen, errors.amax(0), noise_level * noise.gate_sigma, self.camera.current, self.config)
+        rejection = check_two_view_map(good, seen, len(first), self.config, min_good_ratio)
         if rejection:
             return rejection
         keep = torch.nonzero(good)[:, 0]
         poses, points_w, accurate = refine_pair(
             T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], noise[keep], self.camera.current
         )
-        if int(accurate.sum()) < settings.min_points:
-            count = int(accurate.sum())
-            return Rejection.of(Reason.FEW_REFINED_POINTS, count=count, needed=settings.min_points)
+        if (count := int(accurate.sum())) < (least := min_points(self.config)):
+            return Rejection.of(Reason.FEW_REFINED_POINTS, count=count, needed=least)
         keep = keep[accurate]
         return TwoViewMap(self.reference, view, poses, points_w[accurate], first[keep], second[keep])
+
+
+def min_points(config: Config) -> int:
+    """The number of points that an initial map needs."""
+    return (
+        PAPER_POINTS if config.paper.parallax else round(MIN_POINTS_RATIO * config.initialization.min_matches)
+    )
 
 
 def is_good(
@@ -332,33 +355,32 @@ def is_good(
     errors: Float[Tensor, " M"],
     sigmas: Float[Tensor, " M"],
     camera: Camera,
-    settings: InitializationConfig,
+    config: Config,
 ) -> Bool[Tensor, " M"]:
     """Triangulated points that are known well enough for a map.
 
-    With the criterion "uncertainty": the standard deviation of a depth z seen under the parallax a is about
-    z sigma / (f a) for a keypoint known to sigma pixels, so a point counts when sigma / (f a) is small.
-    With "parallax": when the angle is large enough.
+    The standard deviation of a depth z seen under the parallax a is about z sigma / (f a) for a keypoint known to sigma
+    pixels, so a point counts when sigma / (f a) is small. With `paper.parallax`: when the angle is large enough.
 
     Args:
         seen: the triangulated points.
         errors: the larger of the two squared errors, in units of the noise.
         sigmas: standard deviations of the keypoints, pixels.
         camera: of both views.
-        settings: the criterion and its threshold.
+        config: the criterion.
     """
     is_close = passes_gate(errors, TRIANGULATION_GATE_SIGMA**2)
-    if settings.criterion == "parallax":
-        return seen.mask & is_close & (seen.angles >= math.radians(settings.min_parallax_deg))
+    if config.paper.parallax:
+        return seen.mask & is_close & (seen.angles >= math.radians(PAPER_PARALLAX_DEG))
     relative_std = sigmas / (camera.focal * seen.angles.clamp(min=1e-9))
-    return seen.mask & is_close & (relative_std < settings.max_depth_std)
+    return seen.mask & is_close & (relative_std < MAX_DEPTH_STD)
 
 
 def check_two_view_map(
     good: Bool[Tensor, " M"],
     seen: Triangulation,
     matches: int,
-    settings: InitializationConfig,
+    config: Config,
     min_good_ratio: float,
 ) -> Rejection | None:
     """Why triangulated points are not enough for a map; None if they are."""
@@ -366,10 +388,10 @@ def check_two_view_map(
     in_front = float(seen.mask.float().mean())
     if in_front < MIN_IN_FRONT_RATIO:
         return Rejection.of(Reason.BEHIND_CAMERA, ratio=in_front)
-    if count < settings.min_points:
-        return Rejection.of(Reason.FEW_PARALLAX_POINTS, count=count, needed=settings.min_points)
-    if settings.criterion == "parallax":
-        mean, least = math.degrees(float(seen.angles[seen.mask].mean())), settings.min_mean_parallax_deg
+    if count < min_points(config):
+        return Rejection.of(Reason.FEW_PARALLAX_POINTS, count=count, needed=min_points(config))
+    if config.paper.parallax:
+        mean, least = math.degrees(float(seen.angles[seen.mask].mean())), PAPER_MEAN_PARALLAX_DEG
         return Rejection.of(Reason.LOW_MEAN_PARALLAX, mean=mean, needed=least) if mean < least else None
     if count < min_good_ratio * matches:
         return Rejection.of(Reason.UNCERTAIN_DEPTHS, count=count, matches=matches, ratio=min_good_ratio)
@@ -434,7 +456,7 @@ def contradicting_initialization(
         config: The configuration.
         matcher: The matcher; the configured one if None.
     """
-    threshold_px = config.initialization.threshold_px
+    threshold_px = THRESHOLD_PX * config.features.reduction(camera.size)
     T_1w, T_2w = submap.posed_frames.T_cw(submap.map)[0], submap.T_cw
     T_21 = T_2w @ se3_inverse(T_1w)
     pairs = run_matcher(make_matcher(config.matching, matcher, features=config.features.kind), first, last)

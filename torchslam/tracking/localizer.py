@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.geometry import (
+    CHI_SQUARE_95,
     KeypointNoise,
     SharedCamera,
     UndistortedKeypoints,
@@ -30,8 +31,21 @@ from torchslam.tracking.data_association import (
     subsample_per_cell,
 )
 from torchslam.tracking.matcher import DescriptorMatcher
+from torchslam.tracking.pose_validation import MIN_INLIER_RATIO
 from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate
 
+REFINE_RADIUS_PX = 5.0
+"""Search radius around points projected with the estimated pose, pixels of the finest pyramid level. Tried at this
+value only."""
+THRESHOLD_PX = 3.0
+"""Inlier threshold of the initial pose, pixels of reduced images: twice that of two views, since map points have errors
+as well. Tried at this value only."""
+MIN_MATCHES = 20
+"""Matches with which a pose is tried, and mature ones with which the others are left out. Tried at this value only."""
+MIN_INLIERS = 20
+"""Matches and inliers without which a frame has no pose. Tried at this value only."""
+LOCAL_KEYFRAMES = 12
+"""Keyframes of the local map besides the reference keyframe. Tried at this value only."""
 OUTLIER_GATE_FACTOR = 4.0
 """Factor on the chi-square gate before the first refinement: matches up to twice as far off may become inliers."""
 
@@ -42,9 +56,7 @@ class Localizer:
     def __init__(self, camera: SharedCamera, config: Config) -> None:
         self.camera = camera
         self.guided_matcher = DescriptorMatcher(config.matching)
-        self.settings = config.tracking
-        self.max_chi_square = config.measurement.max_chi_square
-        self.min_inlier_ratio = config.pose_validation.min_inlier_ratio
+        self.threshold_px = THRESHOLD_PX * config.features.reduction(camera.current.size)
         self.seed = config.seed
 
     def locate(
@@ -72,7 +84,7 @@ class Localizer:
             estimate = self._locate(slam_map, view, pairs, local_points, expected_T_cw)
             if estimate is not None and (best is None or estimate.inliers > best.inliers):
                 best = estimate
-            if best is not None and best.inliers >= self.min_inlier_ratio * best.matches:
+            if best is not None and best.inliers >= MIN_INLIER_RATIO * best.matches:
                 break
         return best
 
@@ -85,10 +97,10 @@ class Localizer:
         expected_T_cw: Tensor | None,
     ) -> PoseEstimate | None:
         """PnP by the matches, then guided matching of all local points, then robust refinement."""
-        settings, point_ids, keypoints = self.settings, pairs.first, pairs.second
-        if len(point_ids) < settings.min_matches:
+        point_ids, keypoints = pairs.first, pairs.second
+        if len(point_ids) < MIN_MATCHES:
             return None
-        chosen = select_mature(slam_map.points["times_found"][point_ids], settings.min_matches)
+        chosen = select_mature(slam_map.points["times_found"][point_ids], MIN_MATCHES)
         chosen = chosen[subsample_per_cell(view.keypoints[keypoints[chosen]], self.camera.current.size)]
         undistorted = self.camera.undistortion(view.keypoints)
         points_w = slam_map.positions_w[point_ids[chosen]]
@@ -97,16 +109,16 @@ class Localizer:
             return None
         candidates = self._local_points_with(slam_map, point_ids, local_points)
         near = self.project(slam_map, candidates, T_cw, view)
-        guided = match_projected_points(slam_map, near, view, settings.refine_radius_px, self.guided_matcher)
+        guided = match_projected_points(slam_map, near, view, REFINE_RADIUS_PX, self.guided_matcher)
         ids, at, noise = guided.first, guided.second, view.noise[guided.second]
-        if len(ids) < settings.min_inliers:
+        if len(ids) < MIN_INLIERS:
             return None
         weights = weights_of(pairs, guided, len(view.mask))
         noise = noise if weights is None else noise.with_explicit_information().scaled(weights)
         refined, errors, inliers = self._refine(
             slam_map, T_cw, ids, view.keypoints[at], undistorted[at], noise
         )
-        if int(inliers.sum()) < settings.min_inliers:
+        if int(inliers.sum()) < MIN_INLIERS:
             return None
         T_cw, seen = refined.T_cw, ids[inliers]
         return PoseEstimate(
@@ -127,7 +139,7 @@ class Localizer:
         self, points_w: Tensor, seen: UndistortedKeypoints, expected_T_cw: Tensor | None
     ) -> Float[Tensor, "4 4"] | None:
         """Initial pose: the one near the expected pose, or else by RANSAC."""
-        threshold = self.settings.threshold_px
+        threshold = self.threshold_px
         T_cw = None if expected_T_cw is None else nearby_pose(expected_T_cw, points_w, seen, threshold)
         return (
             start_pose(points_w, seen, self.camera.current.size, threshold, self.seed)
@@ -139,8 +151,7 @@ class Localizer:
         self, slam_map: Map, point_ids: Int[Tensor, " N"], T_cw: Float[Tensor, "4 4"], view: FrameFeatures
     ) -> Projected:
         """The points that a view at a pose should observe, see `project_points`."""
-        max_angle = self.settings.max_view_angle_deg
-        return project_points(slam_map, point_ids, T_cw, self.camera.current, max_angle, view.scale_range)
+        return project_points(slam_map, point_ids, T_cw, self.camera.current, view.scale_range)
 
     def _local_points_with(self, slam_map: Map, point_ids: Tensor, local_points: Tensor) -> Tensor:
         """The local points, or those around the matched points if these are elsewhere in the map."""
@@ -151,7 +162,7 @@ class Localizer:
 
     def local_keyframes(self, slam_map: Map, keyframe: int) -> Int[Tensor, " K"]:
         """A keyframe and those that share most points with it."""
-        covisible = slam_map.covisible_keyframes(keyframe, self.settings.local_keyframes)
+        covisible = slam_map.covisible_keyframes(keyframe, LOCAL_KEYFRAMES)
         return torch.cat([covisible.new_tensor([keyframe]), covisible])
 
     def _refine(
@@ -172,10 +183,10 @@ class Localizer:
         linearization = problem.linearize(T_cw)
         mask = passes_gate(
             linearization.squared / noise.gate_factor**2,
-            OUTLIER_GATE_FACTOR * self.max_chi_square,
+            OUTLIER_GATE_FACTOR * CHI_SQUARE_95,
         )
         old = mask & (slam_map.points["times_found"][ids] >= MATURE_OBSERVATIONS)
-        if int(old.sum()) >= self.settings.min_matches:
+        if int(old.sum()) >= MIN_MATCHES:
             mask = old
         weights = grid_weights(pixels, self.camera.current.size)
         kernels: tuple[RobustKernel, ...] = ("cauchy", "huber")
@@ -183,7 +194,7 @@ class Localizer:
             refined = problem.minimize(linearization, weights * mask, kernel)
             linearization = refined.linearization
             errors = linearization.squared / noise.gate_factor**2
-            mask = passes_gate(errors, self.max_chi_square)
+            mask = passes_gate(errors)
             if int(mask.sum()) < 6:
                 break
         return refined, errors, mask

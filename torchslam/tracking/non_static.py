@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchslam.config import Config, IndependentMotionConfig, MatchingConfig
+from torchslam.config import Config
 from torchslam.features import match_by_projection
 from torchslam.geometry import SharedCamera, estimate_relative_pose, se3_inverse, transform
 from torchslam.tracking.data_association import cell_numbers, match_views
@@ -22,6 +22,25 @@ from torchslam.tracking.matcher import max_distance
 from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_segments
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
 
+FRAME_INTERVAL = 5
+"""Frames between two comparisons. Tried at this value only."""
+MIN_ERROR = 4.0
+"""Least distance of a match from every position that a static point could have, units of the keypoints' noise. Tried at
+this value only."""
+THRESHOLD_PX = 2.0
+"""Inlier threshold of the motion that an object's matches share, pixels of reduced images. Tried at this value only."""
+SEARCH_PX = 16.0
+"""Search radius around the position that the object's last motion predicts, pixels of reduced images. Tried at this
+value only."""
+MIN_MATCHES = 20
+"""Matches that must share a motion. Tried at this value only."""
+MIN_OUTLIER_RATIO = 0.5
+"""Ratio of the matches inconsistent with the scene that must share the motion: a majority. Tried at this value only."""
+MAX_AREA_RATIO = 2.0
+"""Image area of the object, relative to the area that agrees with the map, above which the pose is in doubt. Tried at
+this value only."""
+MAX_UNSEEN_FRAMES = 150
+"""Frames for which an object is followed that is not seen to move: 5 s at 30 Hz. Tried at this value only."""
 _DEPTHS = (0.05, 0.1, 0.2, 0.4, 0.7, 1.0, 1.5, 3.0, 30.0, 1000.0)
 """Depths between which a point of the scene projects to a polyline, relative to the scene's median depth: steps that
 are nearly even in the image, from what is close to the lens to infinity."""
@@ -101,12 +120,10 @@ NO_MOVEMENT = Movement()
 class IndependentMotion:
     """Detects one group of keypoints that moves against the scene, and follows it."""
 
-    def __init__(
-        self, camera: SharedCamera, settings: IndependentMotionConfig, matching: MatchingConfig
-    ) -> None:
+    def __init__(self, camera: SharedCamera, config: Config) -> None:
         self.camera = camera
-        self.settings = settings
-        self.matching = matching
+        self.matching = config.matching
+        self.reduction = config.features.reduction(camera.current.size)
         self._mover: _Mover | None = None
         self._last: _Observation | None = None  # with the keypoints that belonged then
         self._frames_since_comparison = 0
@@ -123,7 +140,7 @@ class IndependentMotion:
         self._frames_since_motion += 1
         if self._mover is not None:
             self._mover = self._followed(self._mover, view)
-        if self._mover is not None and self._frames_since_comparison >= 2 * self.settings.frame_interval:
+        if self._mover is not None and self._frames_since_comparison >= 2 * FRAME_INTERVAL:
             self._compare(view, None, 0.0)
         if self._mover is None:
             return view
@@ -132,9 +149,9 @@ class IndependentMotion:
     def observe(self, view: FrameFeatures, estimate: PoseEstimate) -> Movement:
         """Compare a posed frame, with all its keypoints, with one some frames earlier."""
         mover, seen = self._mover, view.keypoints[estimate.keypoints]
-        if mover is not None and self._area(mover.pixels) > self.settings.max_area_ratio * self._area(seen):
+        if mover is not None and self._area(mover.pixels) > MAX_AREA_RATIO * self._area(seen):
             return Movement(Rejection.of(Reason.MOVING_MAJORITY))
-        if self._last is None or self._frames_since_comparison >= self.settings.frame_interval:
+        if self._last is None or self._frames_since_comparison >= FRAME_INTERVAL:
             return self._compare(view, estimate.T_cw, estimate.depth)
         return NO_MOVEMENT
 
@@ -143,16 +160,13 @@ class IndependentMotion:
         matches = match_by_projection(
             mover.descriptors[None],
             (mover.pixels + mover.motion)[None],
-            self.settings.search_px,
+            SEARCH_PX * self.reduction,
             view.features,
             scales=mover.scales[None],
             max_distance=max_distance(view.descriptors, self.matching),
         )
         found = matches.mask[0]
-        if (
-            int(found.sum()) < self.settings.min_matches
-            or self._frames_since_motion > self.settings.max_unseen_frames
-        ):
+        if int(found.sum()) < MIN_MATCHES or self._frames_since_motion > MAX_UNSEEN_FRAMES:
             return None
         motion = (view.keypoints[matches.indices_2[0][found]] - mover.pixels[found]).median(0).values
         return _Mover.of(view, self._is_near_group(view.keypoints, mover.pixels + motion, mover.rest), motion)
@@ -168,7 +182,7 @@ class IndependentMotion:
             return NO_MOVEMENT
         frames = view.index - last.view.index
         first, second = match_views(last.view, view, self.matching)
-        strays = self._errors(last, look, first, second) > self.settings.min_error_px
+        strays = self._errors(last, look, first, second) > MIN_ERROR
         patience = last.patience[first] - int(T_cw is not None and last.T_cw is not None)
         known = ~strays & (patience > 0)
         moving = self._rigid_group(last.view, view, first, second, strays)
@@ -250,19 +264,19 @@ class IndependentMotion:
     ) -> Int[Tensor, " R"]:
         """Rows of those matches `among` that one rigid motion explains; none if these are too few."""
         rows = torch.nonzero(among)[:, 0]
-        if len(rows) < self.settings.min_matches:
+        if len(rows) < MIN_MATCHES:
             return rows[:0]
         motion = estimate_relative_pose(
             earlier.keypoints[first[rows]][None],
             view.keypoints[second[rows]][None],
             camera_1=self.camera.current,
             camera_2=self.camera.current,
-            threshold=self.settings.threshold_px,
+            threshold=THRESHOLD_PX * self.reduction,
             kernel="truncated",
             min_samples=64,
         )
         group = rows[motion.inliers[0]]
-        enough = max(self.settings.min_matches, self.settings.min_outlier_ratio * len(rows))
+        enough = max(MIN_MATCHES, MIN_OUTLIER_RATIO * len(rows))
         return group if len(group) >= enough else rows[:0]
 
     def _is_near_group(
@@ -298,12 +312,11 @@ class FilteredView:
 
 
 class SceneFilter:
-    """Masks out keypoints of static overlays and moving objects, as far as each is enabled."""
+    """Masks out keypoints of static overlays and moving objects."""
 
     def __init__(self, camera: SharedCamera, config: Config) -> None:
-        self.config = config
-        self.static_overlay = StaticOverlayDetector(camera, config.static_overlay, config.matching)
-        self.independent_motion = IndependentMotion(camera, config.independent_motion, config.matching)
+        self.static_overlay = StaticOverlayDetector(camera, config)
+        self.independent_motion = IndependentMotion(camera, config)
 
     def mask_out(self, view: FrameFeatures) -> FilteredView:
         """Mask out what is known not to belong to the scene; moving objects are followed from frame to frame."""
@@ -312,14 +325,10 @@ class SceneFilter:
 
     def detect_independent_motion(self, filtered: FilteredView, estimate: PoseEstimate) -> Movement:
         """Detect keypoints that move against the scene, given the frame's pose."""
-        if not self.config.independent_motion.enabled:
-            return NO_MOVEMENT
         return self.independent_motion.observe(filtered.without_overlays, estimate)
 
     def update_overlay(self, filtered: FilteredView, T_cw: Float[Tensor, "4 4"], depth: float) -> bool:
         """Update the overlays with a frame and its pose; return whether there are new ones."""
-        if not self.config.static_overlay.enabled:
-            return False
         return self.static_overlay.observe(filtered.whole, T_cw, depth) > 0
 
     def forget_last(self) -> None:

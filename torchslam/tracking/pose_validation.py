@@ -13,12 +13,27 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.config import PoseValidationConfig
 from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.map.atlas import TrackingState
 from torchslam.types import PoseEstimate, Reason, Rejection
 
+MIN_INLIER_RATIO = 0.5
+"""Ratio of inliers to matches around the predicted pixels: a majority. Tried at this value only."""
+MAX_POSITION_STD, MAX_ROTATION_STD_DEG = 0.017, 0.9
+"""Largest standard deviations of the position, relative to the median depth of the tracked points, and of the rotation,
+degrees: about 0.9 degrees seen from the scene, or by the camera. Tried at these values only."""
+MAX_JUMP, MAX_TURN_DEG = 0.5, 20.0
+"""Largest distance from the predicted position, relative to the median depth, and rotation from the predicted
+orientation, degrees. Tried at these values only."""
+MAX_SQUARED_ERROR = 1.3
+"""Largest median squared error in units of the noise, averaged over ten frames. Tried at 1.05 and 1.3."""
+MIN_EXPLAINED_RATIO = 0.3
+"""Ratio of the image area with keypoints that the map explains, averaged over ten frames. Tried at this value only."""
+MIN_COVERAGE_RATIO = 0.2
+"""Ratio of the image area with expected map points that inliers cover. Tried at this value only."""
+NUM_CONFIRMING_FRAMES = 2
+"""Certain frames in a row that confirm an uncertain pose. Tried at this value only."""
 SURE_INLIERS = 60
 """Number of inliers with which a large turn is believed: where views are far apart, the motion model fails."""
 
@@ -67,7 +82,6 @@ def check_pose(
     estimate: PoseEstimate,
     predicted_T_cw: Float[Tensor, "4 4"] | None,
     averages: TrackingState,
-    settings: PoseValidationConfig,
 ) -> Verdict:
     """Validate a pose by itself, and by the agreement of the recent images with the map.
 
@@ -75,42 +89,39 @@ def check_pose(
         estimate: The pose.
         predicted_T_cw: The pose that the motion model predicts; None without a prediction.
         averages: A tracking state with the averages over the frames up to this one, see `TrackingState.averaged_with`.
-        settings: Thresholds.
     """
-    quality = check_pose_quality(estimate, predicted_T_cw, settings)
-    return Verdict(quality or check_map_agreement(estimate, averages, settings))
+    quality = check_pose_quality(estimate, predicted_T_cw)
+    return Verdict(quality or check_map_agreement(estimate, averages))
 
 
 def check_pose_quality(
-    estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"] | None, settings: PoseValidationConfig
+    estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"] | None
 ) -> Rejection | None:
     """Why a pose is wrong by its own matches, its covariance or its motion; None if it is plausible."""
     ratio = estimate.inliers / max(estimate.matches, 1)
-    if ratio < settings.min_inlier_ratio:
+    if ratio < MIN_INLIER_RATIO:
         return Rejection.of(Reason.LOW_INLIER_RATIO, ratio=ratio, matches=estimate.matches)
     position, rotation = deviations(estimate)
-    if position > settings.max_position_std:
+    if position > MAX_POSITION_STD:
         return Rejection.of(Reason.UNCERTAIN_POSITION, std=position)
-    if rotation > settings.max_rotation_std_deg:
+    if rotation > MAX_ROTATION_STD_DEG:
         return Rejection.of(Reason.UNCERTAIN_ROTATION, degrees=rotation)
     if predicted_T_cw is None:
         return None
     moved, turned = jump(estimate, predicted_T_cw)
-    is_turn_odd = turned > settings.max_turn_deg and estimate.inliers < SURE_INLIERS
-    if moved > settings.max_jump or is_turn_odd:
+    is_turn_odd = turned > MAX_TURN_DEG and estimate.inliers < SURE_INLIERS
+    if moved > MAX_JUMP or is_turn_odd:
         return Rejection.of(Reason.JUMP, translation=moved, degrees=turned)
     return None
 
 
-def check_map_agreement(
-    estimate: PoseEstimate, averages: TrackingState, settings: PoseValidationConfig
-) -> Rejection | None:
+def check_map_agreement(estimate: PoseEstimate, averages: TrackingState) -> Rejection | None:
     """Why the recent images disagree with what the map predicts; None if they agree."""
-    if averages.error > settings.max_squared_error:
+    if averages.error > MAX_SQUARED_ERROR:
         return Rejection.of(Reason.LARGE_ERRORS, sigma=averages.error**0.5)
-    if averages.explained_ratio < settings.min_explained_ratio:
+    if averages.explained_ratio < MIN_EXPLAINED_RATIO:
         return Rejection.of(Reason.LOW_EXPLAINED_RATIO, ratio=averages.explained_ratio)
-    if estimate.coverage_ratio < settings.min_coverage_ratio:
+    if estimate.coverage_ratio < MIN_COVERAGE_RATIO:
         return Rejection.of(Reason.LOW_COVERAGE_RATIO, ratio=estimate.coverage_ratio)
     return None
 

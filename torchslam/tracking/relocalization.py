@@ -7,13 +7,15 @@ from dataclasses import replace
 
 from torch import Tensor
 
-from torchslam.config import Config
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
 from torchslam.tracking.data_association import match_keyframe
 from torchslam.tracking.pose_validation import check_pose
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, MatchIndices, PoseEstimate
+
+MAX_CANDIDATES = 3
+"""Places that are tried for a frame, the most similar first. Tried at this value only."""
 
 Candidate = tuple[Submap, int]
 """A keyframe that may show the same place: its submap and row."""
@@ -22,10 +24,8 @@ Candidate = tuple[Submap, int]
 class Relocalizer:
     """Poses a frame in a known map without a predicted pose."""
 
-    def __init__(self, tracker: Tracker, config: Config) -> None:
+    def __init__(self, tracker: Tracker) -> None:
         self.tracker = tracker
-        self.validation = config.pose_validation
-        self.max_candidates = config.relocalization.max_candidates
 
     def locate(
         self, view: FrameFeatures, candidates: Iterable[Candidate]
@@ -36,7 +36,7 @@ class Relocalizer:
         """
         tried: list[tuple[Submap, Tensor]] = []
         for submap, keyframe in candidates:
-            if len(tried) == self.max_candidates:
+            if len(tried) == MAX_CANDIDATES:
                 return None
             if any(submap is other and bool((near == keyframe).any()) for other, near in tried):
                 continue
@@ -46,7 +46,7 @@ class Relocalizer:
             )
             if estimate is not None:
                 state = single_frame_state(submap.tracking, estimate)
-                if check_pose(estimate, None, state, self.validation).rejection is None:
+                if check_pose(estimate, None, state).rejection is None:
                     return submap, estimate
             tried.append((submap, near))
         return None

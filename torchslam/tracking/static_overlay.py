@@ -12,13 +12,29 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.config import MatchingConfig, StaticOverlayConfig
+from torchslam.config import Config
 from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, SharedCamera, se3_inverse, transform
 from torchslam.tracking.data_association import image_cells
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures
 
+MIN_MOTION_PX = 4.0
+"""Image motion that a point of the scene must have had between the compared frames, pixels of reduced images. Tried at
+this value only."""
+MIN_MOVING_RATIO = 0.5
+"""Ratio of the keypoints that must have moved before two frames are compared. Tried at this value only."""
+RADIUS_PX = 1.5
+"""Distance within which a keypoint counts as not having moved, pixels of reduced images. Tried at this value only."""
+CELL_PX = 4.0
+"""Size of the cells that accumulate evidence, pixels of reduced images: corners move slightly under noise. Tried at
+this value only."""
+MAX_DISTANCE_RATIO = 0.6
+"""Largest descriptor distance, relative to the limit of ordinary matching. Tried at this value only."""
+MIN_KEYPOINTS = 8
+"""Static keypoints below which they are a coincidence. Tried at this value only."""
+MIN_EVIDENCE = 2
+"""Comparisons in which a cell must have been static before it is masked. Tried at this value only."""
 _DEPTHS = (0.3, 1.0, 3.0, 30.0)
 """Possible depths of a keypoint, relative to the scene's median depth; fewer than for moving objects, as only those
 keypoints count that move far whatever their depth. Tried at these values only."""
@@ -55,26 +71,27 @@ class _Reference:
 class StaticOverlayDetector:
     """Collects evidence of static overlays in a grid of image cells."""
 
-    def __init__(self, camera: SharedCamera, settings: StaticOverlayConfig, matching: MatchingConfig) -> None:
+    def __init__(self, camera: SharedCamera, config: Config) -> None:
         self.camera = camera
-        self.settings = settings
-        self.matching = matching
+        self.matching = config.matching
         width, height = camera.current.size
-        shape = (int(height // settings.cell_px) + 1, int(width // settings.cell_px) + 1)
+        self.reduction = config.features.reduction((width, height))
+        self.cell_px = CELL_PX * self.reduction
+        shape = (int(height // self.cell_px) + 1, int(width // self.cell_px) + 1)
         self.evidence = torch.zeros(shape, dtype=torch.int64, device=camera.current.params.device)
         self._last: _Reference | None = None
         self._pause = 0
 
     def mask_out(self, view: FrameFeatures) -> FrameFeatures:
         """The view without the keypoints of known overlays."""
-        if not bool((self.evidence >= self.settings.min_evidence).any()):
+        if not bool((self.evidence >= MIN_EVIDENCE).any()):
             return view
         return replace(view, mask=view.mask & ~self.covers(view.keypoints))
 
     def covers(self, pixels: Float[Tensor, "N 2"]) -> Bool[Tensor, " N"]:
         """Which pixels belong to a known overlay."""
         row, column = self._cells(pixels)
-        return self.evidence[row, column] >= self.settings.min_evidence
+        return self.evidence[row, column] >= MIN_EVIDENCE
 
     def observe(self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float) -> int:
         """Compare a posed frame with an earlier one.
@@ -101,17 +118,17 @@ class StaticOverlayDetector:
         must_move[last.view.mask] = moving
         self._last = _Reference.of(view, T_cw, depth, self.camera.current)
         stayed = self._stayed(last.view, view, must_move)
-        before = int((self.evidence >= self.settings.min_evidence).sum())
-        if len(stayed) < self.settings.min_keypoints:
-            self.evidence[self.evidence < self.settings.min_evidence] = 0
+        before = int((self.evidence >= MIN_EVIDENCE).sum())
+        if len(stayed) < MIN_KEYPOINTS:
+            self.evidence[self.evidence < MIN_EVIDENCE] = 0
             self._pause = _PAUSE
             return 0
         self._add(stayed)
-        return int((self.evidence >= self.settings.min_evidence).sum()) - before
+        return int((self.evidence >= MIN_EVIDENCE).sum()) - before
 
     def add(self, pixels: Float[Tensor, "M 2"]) -> None:
         """Add evidence from another source: pixels that stayed in place while the scene moved."""
-        if self.settings.enabled and len(pixels) >= self.settings.min_keypoints:
+        if len(pixels) >= MIN_KEYPOINTS:
             self._add(pixels)
 
     def restore(self, evidence: Int[Tensor, "R C"]) -> None:
@@ -126,11 +143,11 @@ class StaticOverlayDetector:
         """Whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
         moved, valid = self.camera.current.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
         distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
-        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > self.settings.min_motion_px
+        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > MIN_MOTION_PX * self.reduction
 
     def _is_far(self, must_move: Bool[Tensor, " N"]) -> bool:
         """Whether the camera moved far enough for a comparison: enough of the keypoints had to move."""
-        return int(must_move.sum()) >= self.settings.min_moving_ratio * len(must_move)
+        return int(must_move.sum()) >= MIN_MOVING_RATIO * len(must_move)
 
     def _stayed(
         self, earlier: FrameFeatures, view: FrameFeatures, candidates: Bool[Tensor, " N"]
@@ -140,10 +157,10 @@ class StaticOverlayDetector:
         matches = match_by_projection(
             earlier.descriptors[rows][None],
             earlier.keypoints[rows][None],
-            self.settings.radius_px,
+            RADIUS_PX * self.reduction,
             view.features,
             scales=earlier.scales[rows][None],
-            max_distance=self.settings.max_distance_ratio * max_distance(view.descriptors, self.matching),
+            max_distance=MAX_DISTANCE_RATIO * max_distance(view.descriptors, self.matching),
             ratio=None,
         )
         return view.keypoints[matches.indices_2[0][matches.mask[0]]]
@@ -160,7 +177,7 @@ class StaticOverlayDetector:
     def _cells(self, pixels: Float[Tensor, "N 2"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
         """Rows and columns of `evidence` for pixels."""
         rows, columns = self.evidence.shape
-        size = (self.settings.cell_px, self.settings.cell_px)
+        size = (self.cell_px, self.cell_px)
         column, row = image_cells(pixels, size, grid=(1, 1), shape=(columns, rows))
         return row, column
 

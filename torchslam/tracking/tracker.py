@@ -21,6 +21,12 @@ from torchslam.tracking.localizer import Localizer, match_projected_points
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
 
+SEARCH_RADIUS_PX, WIDE_RADIUS_PX = 12.0, 36.0
+"""Search radius around a projected point, pixels of the finest pyramid level, and that of the second search, made if
+the first has too few matches. Tried at these values only."""
+RECENT_FRAMES = 60
+"""Frames whose points are matched in place of the local map with `paper.brute_force`, as in the paper's system."""
+
 
 class Tracker:
     """Tracks the camera against the local map: the keyframes covisible with the reference keyframe, and their points.
@@ -37,7 +43,7 @@ class Tracker:
         self.camera = camera
         self.localizer = Localizer(camera, config)
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
-        self.settings = config.tracking
+        self.brute_force = config.paper.brute_force
         self.matching = config.matching
         self.counts = counts
 
@@ -73,11 +79,10 @@ class Tracker:
     def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Float[Tensor, "4 4"]) -> TrackingState:
         """The tracking state of a frame with this pose and reference keyframe, and its local map."""
         local_keyframes = self.localizer.local_keyframes(slam_map, keyframe)
-        recent = self.settings.recent_frames if self.counts else 0
-        if recent:
+        if self.brute_force and self.counts:
             last_seen = slam_map.points["last_seen_frame"]
             local_points = torch.nonzero(
-                (last_seen > last_seen.max() - recent) & slam_map.points["is_valid"]
+                (last_seen > last_seen.max() - RECENT_FRAMES) & slam_map.points["is_valid"]
             )[:, 0]
         else:
             local_points = slam_map.observed_points(local_keyframes)
@@ -93,7 +98,7 @@ class Tracker:
 
     def predict(self, submap: Submap) -> Float[Tensor, "4 4"]:
         """Predicted pose of the next frame, by constant velocity."""
-        if submap.tracking.velocity is None or not self.settings.motion_model:
+        if submap.tracking.velocity is None or self.brute_force:
             return submap.T_cw
         return reorthonormalized(submap.tracking.velocity @ submap.T_cw)
 
@@ -137,14 +142,13 @@ class Tracker:
 
     def _candidates(self, submap: Submap, view: FrameFeatures, T_cw: Tensor) -> Iterator[MatchIndices]:
         """Sets of matches by ever wider search: near the predicted pixels, in a wider window, in the whole image."""
-        slam_map, tracking, settings = submap.map, submap.tracking, self.settings
-        if settings.guided_matching:
+        slam_map, tracking = submap.map, submap.tracking
+        if not self.brute_force:
             alive = tracking.last_inlier_points[slam_map.points["is_valid"][tracking.last_inlier_points]]
             near = self.localizer.project(slam_map, alive, T_cw, view)
-            yield match_projected_points(slam_map, near, view, settings.search_radius_px, self.matcher)
+            yield match_projected_points(slam_map, near, view, SEARCH_RADIUS_PX, self.matcher)
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
-            wide = settings.search_radius_px * settings.wide_radius_factor
-            yield match_projected_points(slam_map, local, view, wide, self.matcher)
+            yield match_projected_points(slam_map, local, view, WIDE_RADIUS_PX, self.matcher)
         else:
             local = self.localizer.project(slam_map, tracking.local_points, T_cw, view)
         yield match_points(slam_map, local.ids, view, self.matching)

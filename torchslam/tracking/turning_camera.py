@@ -22,6 +22,8 @@ from torchslam.geometry.two_view import TRANSFER_WIDTH
 from torchslam.tracking.matcher import run_matcher
 from torchslam.types import FrameFeatures, Matcher
 
+THRESHOLD_PX = 1.5
+"""Inlier threshold of the two-view models, pixels of reduced images. Tried at this value only."""
 RATE_VIEWS = 3
 """Views that tell how fast the camera turns at the first or the last of them: two intervals, with which the rate is
 extrapolated by half an interval. Tried at this value only."""
@@ -46,7 +48,7 @@ class TurningCamera:
 
     def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher) -> None:
         self.camera, self.matcher = camera, matcher
-        self.threshold_px = config.initialization.threshold_px
+        self.threshold_px = THRESHOLD_PX * config.features.reduction(camera.current.size)
         self.min_matches = config.initialization.min_matches
         self.std = relative_focal_std(config.camera)
         self.seeks_readout = config.camera.readout_std > 0
