@@ -93,7 +93,7 @@ def describe_search(search: ViewGraphFocal | None, camera: Camera) -> str:
         return f"focal length {_with_error(focal, focal * float(search.std))} px by {pairs} image pairs"
     return (
         f"{pairs} image pairs do not determine it ({DEGENERATE}): "
-        f"the focal length of {focal:.0f} px is a guess to start with"
+        f"the focal length of {focal:.0f} px is an initial guess"
     )
 
 

@@ -140,7 +140,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights",
         metavar="FILE|NAME",
-        help="weights of a learned feature extractor (features.weights); by default those of its own name",
+        help="weights of a learned feature extractor (features.weights); by default those with the name of the extractor",
     )
     parser.add_argument(
         "--matcher",
@@ -152,7 +152,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         type=float,
         metavar="RATIO",
         help="relative standard deviation of the given focal length (camera.std): 0.02 if neither this nor the "
-        "calibration file says otherwise; 0: the camera is exact",
+        "calibration file states it; 0: the camera is exact",
     )
     parser.add_argument(
         "--readout",
@@ -160,7 +160,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
         default=AUTO,
         metavar="MS",
         help="time from the exposure of the first row of an image to the last (camera.readout): milliseconds, "
-        f"{', '.join(READOUTS_MS)}, 0 for a global shutter, or auto, the default: found where the images show one",
+        f"{', '.join(READOUTS_MS)}, 0 for a global shutter, or auto, the default: estimated from the images",
     )
     parser.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
     parser.add_argument("--seed", type=int, metavar="N", help="seed of the random number generators (seed)")
@@ -190,7 +190,7 @@ def overrides(options: argparse.Namespace) -> list[str]:
 
 def add_metric(parser: argparse.ArgumentParser) -> None:
     """Add the options that give the map meters: those of `metric.options.KINDS`."""
-    group = parser.add_argument_group("meters", "what is known of lengths; each can be repeated")
+    group = parser.add_argument_group("meters", "measurements that determine the scale; each can be repeated")
     about = {each.name: each.metadata["about"] for each in fields(MetricConfig)}
     for option in (option for kind in KINDS for option in kind.options):
         words = about[option.name].replace("%", "%%")

@@ -226,7 +226,7 @@ class GlobalMapper:
         """
         if learned_config(self.config) is not None and self.extract is None:
             raise ConfigError(
-                "global_mapping.learned_links requires images; the recording brings its features"
+                "global_mapping.learned_links requires images; the recording has precomputed features"
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
         views = self._saved_views(images)
@@ -318,7 +318,7 @@ class GlobalMapper:
         ends = [(pair.first, pair.second) for pair in pairs]
         edges = torch.tensor(ends, dtype=torch.int64, device=device).view(-1, 2)
         if len(edges) == 0:
-            return f"no map: no two of {len(views)} images see the same"
+            return f"no map: no two of {len(views)} images show the same scene"
         R_21 = torch.stack([pair.T_21[:3, :3] for pair in pairs])
         weights = R_21.new_tensor([float(len(pair)) for pair in pairs])
         weights = weights / weights.mean() / ROTATION_STD_RAD**2

@@ -431,7 +431,7 @@ def _as_seen(
         raise ValueError(
             f"{jumped} of {len(moved)} keypoints are up to {float(moved.max()):.0f} px from where the graph has them: "
             "their rows hold other keypoints now. Use features of `extract(images, graph)`, of an extractor with "
-            "`read`, or build the graph anew"
+            "`read`, or build the graph again"
         )
     return replace(run, pixels=pixels, weights=weights, camera=camera)
 

@@ -123,7 +123,7 @@ def given_options(config: MetricConfig, brought: Mapping[str, str] | None = None
         is_asked = own[first.name] == AUTO
         if is_asked and first.name not in brought:
             raise ConfigError(
-                f"{first.flag} {AUTO}: the recording brings none along; name the file or folder"
+                f"{first.flag} {AUTO}: the recording contains none; give the file or folder"
             )
         is_taken = is_asked or (not own[first.name] and config.own and not kind.on_request)
         if is_taken and first.name in brought:

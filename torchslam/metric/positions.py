@@ -78,7 +78,7 @@ class PositionSource:
             return _unmeasured(f"only {len(path.timestamps)} frames have a pose")
         if self.fixes.timestamps is None:
             if view.sequence is None:
-                return _unmeasured(f"{self.fixes.path} has positions of images, which are not at hand")
+                return _unmeasured(f"{self.fixes.path} has positions of images, which are not available")
             names = [view.sequence.file_name(index) for index in view.frame_index.tolist()]
             found = self._by_names(names, path)
         else:
@@ -97,7 +97,7 @@ class PositionSource:
         found = rows >= 0
         if not bool(found.any()):
             raise MeasurementError(
-                f"{self.fixes.path}: no image is called as those in it, such as {self.fixes.names[0]}"
+                f"{self.fixes.path}: no image has one of its names, such as {self.fixes.names[0]}"
             )
         positions_e, std, has_height = self._local(rows[found])
         positions_w = path.T_wc[found, :3, 3]
@@ -190,7 +190,7 @@ class PositionSource:
             self._check_swapped(pairs)
             return _unmeasured(
                 f"{len(pairs)} positions over {extent:.1f} m scatter by {fit.noise[0]:.1f} m about the camera's path: "
-                f"the scale is known to {fit.relative_std:.0%} only"
+                f"the scale is uncertain by {fit.relative_std:.0%}"
             )
         if float(fit.up_w @ path.up_w) < UPSIDE_DOWN:
             self._check_swapped(pairs, better=1.0)
@@ -234,8 +234,8 @@ class PositionSource:
             notes += clock_notes(self.fixes.path, offset, fit.offset_std)
         if line:
             notes.append(
-                f"{self.fixes.path}: the positions lie on a line: the turn about it is the one in which the images are "
-                "upright"
+                f"{self.fixes.path}: the positions lie on a line; the rotation about it is chosen such that the images "
+                "are upright"
             )
         return notes
 

@@ -133,7 +133,7 @@ class SensorDepth:
         notes = []
         if not self.images.said:
             notes.append(
-                f"{self.images.source} is taken to have {units:g} units per meter; --depth FOLDER:SCALE says otherwise"
+                f"{self.images.source}: assuming {units:g} units per meter; --depth FOLDER:SCALE states another number"
             )
         if unreadable:
             notes.append(f"{len(unreadable)} depth images cannot be read, the first one: {unreadable[0]}")

@@ -239,8 +239,8 @@ class WorkerPool:
             worker.end()
             if not isinstance(error, OSError | EOFError):
                 raise
-            reason = "does not answer" if isinstance(error, BlockingIOError) else "has ended"
-            warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=4)
+            reason = "does not answer" if isinstance(error, BlockingIOError) else "died"
+            warnings.warn(f"a worker process {reason}; continuing without it", stacklevel=4)
 
 
 class SharedTasks(WorkerPool):

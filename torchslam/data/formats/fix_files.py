@@ -129,7 +129,7 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
     if empty:
         said.append(f"{path}: left out {empty} rows without a position")
     if doubled:
-        said.append(f"{path}: left out {doubled} positions of a time that another one has")
+        said.append(f"{path}: skipped {doubled} positions with a duplicate time")
     times = [row.time for row in kept if row.time is not None]
     return Fixes(
         Path(path),
@@ -296,7 +296,7 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         time = parse_moment(children.get("time", ""))
         if time is None:
             raise MeasurementError(
-                f"{where}: no time; a route that was planned says nothing about the images"
+                f"{where}: no time; a planned route cannot be used"
             )
         latitude, longitude, altitude = (
             math.nan if text == "nan" else parse_number(text, where, MeasurementError)
@@ -316,7 +316,7 @@ def _tag(element: ElementTree.Element) -> str:
 def _read_nmea(path: Path, text: str) -> Fixes:
     """GGA, which has the altitude, with the date of the RMC of the same time. Source: NMEA 0183.
 
-    Without RMC the times are seconds since midnight, UTC. Lines with a wrong sum are left out, with a note.
+    Without RMC the times are seconds since midnight, UTC. Lines with a wrong checksum are skipped, with a note.
     """
     rows: list[tuple[str, list[str]]] = []
     damaged = 0
@@ -332,7 +332,7 @@ def _read_nmea(path: Path, text: str) -> Fixes:
             damaged += 1
             continue
         rows.append((f"{path}:{number}", body.split(",")))
-    notes = [f"{path}: left out {damaged} lines with a wrong sum"] if damaged else []
+    notes = [f"{path}: skipped {damaged} lines with a wrong checksum"] if damaged else []
     return checked_fixes(path, _nmea_rows(rows), notes)
 
 

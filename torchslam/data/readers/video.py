@@ -104,7 +104,7 @@ class VideoSequence(Sequence):
         ratio = aspect if self._camera is None else float(self._camera.fy / self._camera.fx)
         if abs(ratio / aspect - 1) > MAX_ASPECT_ERROR:
             contradiction = (
-                f"the file says that its pixels are {aspect_text(aspect)}, wide to high, so fy should be "
+                f"the file declares pixels of {aspect_text(aspect)}, width to height, so fy should be "
                 f"{aspect:.4g} fx; the given camera has {ratio:.4g}"
             )
             self.notes = (*self.notes, contradiction)

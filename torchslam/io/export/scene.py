@@ -359,7 +359,7 @@ def _image_rows(
     is_of_files, start = any(present), f"{source.path}: not the sequence of this run"
     if is_of_files and not source.files:
         raise ResultsError(
-            f"{source.path}: the results do not say which image each frame was: run again, or --no-images"
+            f"{source.path}: the results do not state the image of each frame: run again, or --no-images"
         )
     if source.files and not is_of_files:
         raise ResultsError(
