@@ -81,7 +81,7 @@ def find_camera(
 
 
 def describe_search(search: ViewGraphFocal | None, camera: Camera) -> str:
-    """Describe the camera that pairs of images gave, or say that they do not determine it."""
+    """Describe the camera that pairs of images gave, or the reason why they do not determine it."""
     focal = float(camera.focal)
     if search is None:
         return (

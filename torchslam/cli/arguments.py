@@ -140,7 +140,7 @@ def add_config(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--weights",
         metavar="FILE|NAME",
-        help="weights of a learned feature extractor (features.weights); by default those with the name of the extractor",
+        help="weights of a learned feature extractor (features.weights); by default those with its name",
     )
     parser.add_argument(
         "--matcher",

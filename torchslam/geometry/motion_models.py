@@ -180,7 +180,7 @@ def _leans(
 
     Little parallax is spread over all matches, none of which is clearly off. Noise, of whatever size and tail, has no
     direction: the cosine of twice the angle to the line is zero on average, and one half in square. Matches count by
-    their squared distance, which tells most where parallax adds to Gaussian noise, up to that of `_FARTHEST`.
+    their squared distance, which is most powerful where parallax adds to Gaussian noise, up to that of `_FARTHEST`.
 
     squared: as of `Fits`; variance: variance of the noise, by the essential matrix
     """
@@ -355,7 +355,7 @@ def in_front(
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
     """The pose with most inliers in front of both cameras among the four of an essential matrix.
 
-    A match counts by its parallax in thresholds, up to one: the depth of far points says nothing.
+    A match counts by its parallax in thresholds, up to one: matches with little parallax do not determine depths.
     """
     R, t = twisted(R, t)
     is_ahead, parallax = ahead_and_parallax(views, R, t)

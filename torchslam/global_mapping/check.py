@@ -268,9 +268,9 @@ def _median_depth(depths: Collection[PairDepths]) -> float:
 def _triplets(
     depths: dict[int, PairDepths], pairs: Sequence[ViewPair], posed: Sequence[bool], agrees: Sequence[bool]
 ) -> tuple[list[_Triplet], int]:
-    """The triplets of agreeing pairs that determine a ratio of scales, and the number of those with an image without a pose.
+    """The triplets of agreeing pairs that determine a ratio of scales; the number of those with an unposed image.
 
-    By wrong relative poses, depths mean nothing.
+    Depths by wrong relative poses are meaningless.
     """
     before: dict[int, list[int]] = {}
     after: dict[int, list[int]] = {}

@@ -49,7 +49,7 @@ class OdometrySource:
     Attributes:
         path: of the file.
         odometry: poses of the sensor, in meters.
-        clock: what the user says about its clock.
+        clock: the clock of the file as given by the user.
     """
 
     path: Path

@@ -38,7 +38,7 @@ MIN_AGREEING = 0.5
 MAX_RELATIVE_STD = 0.25
 """Relative standard error from which on a scale is no measurement: positions then hardly differ beyond their noise."""
 SWAPPED = 3.0
-"""How much nearer a path must be to positions with latitude and longitude exchanged before it is said that they are."""
+"""How much nearer a path must be to positions with latitude and longitude exchanged before a note is written."""
 LINE_UP_STD = math.radians(15.0)
 """Standard error of up from which on positions do not constrain the rotation about their line."""
 UPSIDE_DOWN = -0.5
@@ -56,7 +56,7 @@ SAID = 3.0
 SECOND_PASS = 0.1
 """Seconds of a clock's error from which on the path is looked up again: it is straight for less."""
 LISTED = 3
-"""Positions that are named singly where they do not agree."""
+"""Most positions off the path that are listed one by one."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class PositionSource:
 
     Attributes:
         fixes: the positions.
-        clock: what the user says about their clock.
+        clock: the clock of the file as given by the user.
     """
 
     fixes: Fixes
@@ -172,7 +172,7 @@ class PositionSource:
 
         return found_shift(cost_at, path.duration, SEARCH_STEP, SEARCH_GAIN)
 
-    # --- what it says ----------------------------------------------------------------------------------------
+    # --- the result ----------------------------------------------------------------------------------------
 
     def _fitted(self, pairs: PositionPairs, path: CameraPath, clock_std: float) -> PositionFit | Unmeasured:
         if len(pairs) < MIN_POSITIONS:

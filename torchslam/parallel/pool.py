@@ -56,7 +56,7 @@ class WorkerLostError(Exception):
 
 
 class RemoteError(Exception):
-    """Traceback of an exception in a worker, as the cause of the one that is raised here."""
+    """Traceback of an exception in a worker, as the cause of the exception raised here."""
 
 
 @dataclass(eq=False)

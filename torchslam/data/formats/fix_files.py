@@ -60,7 +60,7 @@ class Fix(NamedTuple):
         latitude: degrees; NaN where the receiver had no position.
         longitude: degrees.
         altitude: meters, above the sea or the ellipsoid or the start; NaN if unknown.
-        time: seconds; None where `name` says whose position it is.
+        time: seconds; None where `name` identifies the image.
         name: of an image.
         std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
     """
@@ -295,9 +295,7 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         children = {_tag(child): (child.text or "").strip() for child in point}
         time = parse_moment(children.get("time", ""))
         if time is None:
-            raise MeasurementError(
-                f"{where}: no time; a planned route cannot be used"
-            )
+            raise MeasurementError(f"{where}: no time; a planned route cannot be used")
         latitude, longitude, altitude = (
             math.nan if text == "nan" else parse_number(text, where, MeasurementError)
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))

@@ -45,7 +45,7 @@ QUIET = 2.0
 MANY = 100
 """Frames that are skipped with a progress bar."""
 MAX_ASPECT_ERROR = 0.02
-"""Relative error of fy / fx of a given camera before a note says that the file contradicts it."""
+"""Relative error of fy / fx of a given camera before a note reports that the file contradicts it."""
 
 
 class Bar(tqdm):

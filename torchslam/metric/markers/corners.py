@@ -163,7 +163,7 @@ class _Part:
 
 
 def _from_one_end(graph: RunGraph, group: list[Sighting]) -> list[Sighting]:
-    """Count the corners of a chessboard from the same end in all frames: nothing on it says which one is the first.
+    """Count the corners of a chessboard from the same end in all frames: the board does not mark the first one.
 
     From one sighting to the next in time, the direction from the first to the last corner changes by less than a right
     angle in the world.
