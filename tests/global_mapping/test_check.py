@@ -100,9 +100,7 @@ def test_a_right_map_agrees(recording: Recording) -> None:
     assert (found.triplets, found.consistent) == (180, 180)  # of 1, 2, 3 before and after, but for the ends
     assert found.used_agreeing == found.score == 1
     assert (found.certain, found.uncertain) == (tuple(range(24)), ())
-    assert found.sentence() == (
-        "100% of 66 held-out image pairs agree, and 100% of 180 ratios of scales"
-    )
+    assert found.sentence() == ("100% of 66 held-out image pairs agree, and 100% of 180 ratios of scales")
 
 
 def test_frames_are_those_of_the_images() -> None:

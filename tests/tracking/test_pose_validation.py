@@ -51,7 +51,9 @@ def test_half_of_the_matches_must_agree() -> None:
 def test_errors_averaged_over_frames_must_be_noise() -> None:
     assert doubt(seen(), error=SETTINGS.max_squared_error - 0.01) == ""
     assert doubt(seen(), error=SETTINGS.max_squared_error) == ""
-    assert doubt(seen(), error=9.0).startswith("the median error of the matches of the last frames is 3.0 times")
+    assert doubt(seen(), error=9.0).startswith(
+        "the median error of the matches of the last frames is 3.0 times"
+    )
 
 
 def test_coverage_of_the_image_must_suffice() -> None:
@@ -83,17 +85,13 @@ def test_deviations_are_relative_to_depth_and_in_degrees() -> None:
 def test_the_position_must_be_certain_relative_to_depth() -> None:
     limit = SETTINGS.max_position_std
     assert doubt(seen(covariance=covariance(2.99 * limit), depth=3.0)) == ""
-    assert doubt(seen(covariance=covariance(3.01 * limit), depth=3.0)).startswith(
-        "position uncertainty 1.7%"
-    )
+    assert doubt(seen(covariance=covariance(3.01 * limit), depth=3.0)).startswith("position uncertainty 1.7%")
 
 
 def test_the_rotation_must_be_certain() -> None:
     limit = math.radians(SETTINGS.max_rotation_std_deg)
     assert doubt(seen(covariance=covariance(rotation=0.99 * limit))) == ""
-    assert "rotation uncertainty 0.91 degrees" in doubt(
-        seen(covariance=covariance(rotation=1.01 * limit))
-    )
+    assert "rotation uncertainty 0.91 degrees" in doubt(seen(covariance=covariance(rotation=1.01 * limit)))
 
 
 def test_the_motion_must_be_plausible() -> None:

@@ -54,7 +54,8 @@ def search_focal(
         config: of the run.
         device: of torch.
         progress: called with the number of images done, and of all.
-        extract: extracts SIFT features of an image, at least `NUM_KEYPOINTS`, the strongest first; None: SIFT with this number.
+        extract: extracts SIFT features of an image, at least `NUM_KEYPOINTS`, the strongest first; None: SIFT with
+            this number.
 
     Returns:
         fx with its standard error, and `success` if the pairs determine it; None if no two images could be matched.
