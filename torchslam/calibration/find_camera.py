@@ -106,7 +106,7 @@ def with_stated_std(config: Config, sequence: Sequence) -> Config:
 
 
 def camera_remark(finished: Run, found: str) -> str:
-    """Describe the camera of a run: how it was found, its error, and whether the run contradicts the given one.
+    """Describe the camera of a run: its source, its error, and whether the run contradicts the given one.
 
     Only a complete first session can contradict an exact one.
 

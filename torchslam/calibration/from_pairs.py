@@ -1,7 +1,7 @@
 """The focal length of an unknown camera from pairs of images, before anything is mapped, within a bounded time.
 
 Fundamental matrices of images at several distances in time, around places spread over the recording, need no camera;
-the focal length is the one that makes essential matrices of them (`geometry.view_graph_focal`).
+the focal length turns them into essential matrices (`geometry.view_graph_focal`).
 """
 
 from __future__ import annotations

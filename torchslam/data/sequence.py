@@ -149,7 +149,7 @@ class Sequence(ABC):
 
     @property
     def is_live(self) -> bool:
-        """Whether each frame is there only once, when it comes, also where only so many are taken."""
+        """Whether each frame is available only once, when it arrives, also where a limit is set."""
         return not len(self.timestamps)
 
     def indices(self, start: int = 0) -> Iterable[int]:

@@ -124,7 +124,7 @@ def run_metrics(
     - `online_posed`: frames with a pose in the main submap when it was reported frame by frame.
     - `fps`, `ms_median`, `ms_p95`: time of `SLAM.step`, without image decoding; `fps` is the inverse of the mean.
       Those of the online stage where the global map was kept; 0 if no frame was processed online.
-      `ms_longest`: the longest time of a frame after the one that initialized the map.
+      `ms_longest`: the longest time of a frame after the frame that initialized the map.
     - `metric`: how well the unit of the main submap is known to be a meter, see `map.unit.MetricUnit`, or None;
       `unmeasured`: why sources of meters said nothing.
     - With ground truth: the errors of the evaluation, and `online_ate_m`, that of the poses as reported online

@@ -23,7 +23,7 @@ PARTS = 5
 """Straight parts of a stretch over which the path of the camera is measured: a car turns by less than 10 degrees in
 one."""
 MIN_STRETCHES = 4
-"""Fewer say nothing of how far they are apart."""
+"""From fewer, their scatter cannot be estimated."""
 STANDING = 0.15
 """Part of the typical length of a stretch below which it is not used: the vehicle stands, or nearly."""
 SEARCH_STEP = 0.1

@@ -33,7 +33,7 @@ class ScaleLinks:
     Attributes:
         frames: frame of each keyframe, ascending.
         std: standard deviation of the logarithm of the scale after each keyframe but the last to that before;
-            infinite where nothing ties it.
+            infinite where no point connects the two sides.
     """
 
     frames: tuple[int, ...]

@@ -359,7 +359,7 @@ def _serve_when_imported(connection: Connection) -> None:
 def _serve(connection: Connection, task: bytes) -> None:
     """Answer calls.
 
-    Threads receive and send, so that neither this process nor the one that asks waits for the other one to receive.
+    Threads receive and send, so that neither process waits for the other one to receive.
     """
     received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()

@@ -2,7 +2,7 @@
 
 OpenCV does not look whether FFmpeg has converted a frame. From FFmpeg 7.1 on (OpenCV 4.13), interlaced frames are not:
 `retrieve` still returns True, with what lies in its buffer, which is the frame before or memory of anything else. Only
-FFmpeg's log tells. It is read where a frame may be such a one: the first one, and one that repeats the one before.
+FFmpeg's log reports it. It is read where a frame may be such a one: the first one, and one that repeats the one before.
 """
 
 from __future__ import annotations

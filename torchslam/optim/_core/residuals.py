@@ -60,7 +60,7 @@ class ReprojectionData:
         return ReprojectionData(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
-# Projecting a point ends in so many roundings of a pixel's coordinates, with room to spare.
+# Bound on the rounding error of a projection, in roundings of a pixel's coordinates.
 _ROUNDINGS = 16.0
 
 
