@@ -40,8 +40,8 @@ _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
-# A best sample of which this share of the matches, and this many, are clearly off: no fit brings these below the share
-# above. Among few matches an essential matrix has many inliers by accident.
+# A best sample of which this share of the matches is clearly off, of at least this many in all: no fit brings these
+# below the share above. Among few matches an essential matrix has many inliers by accident.
 _HOPELESS, _MANY = 0.25, 50
 _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
 # Alignment of the errors with the epipolar lines: by this many deviations, two more than a direction needs that was not
