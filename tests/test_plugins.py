@@ -88,8 +88,8 @@ def test_the_same_object_serves_slam_and_clips() -> None:
         ("nowhere_at_all:x", "no package 'nowhere_at_all' can be imported"),
         ("torchslam.nowhere:x", "no package 'torchslam.nowhere' can be imported"),
         (f"{HERE}:nothing", f"'{HERE}' has no 'nothing'"),
-        (f"{HERE}:number", "int is nothing that can be called"),
-        (f"{HERE}:Failing", "cannot be made: RuntimeError: no licence"),
+        (f"{HERE}:number", "int cannot be called"),
+        (f"{HERE}:Failing", "cannot be instantiated: RuntimeError: no licence"),
     ],
 )
 def test_a_wrong_name_is_one_line_and_status_2(

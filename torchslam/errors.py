@@ -1,4 +1,4 @@
-"""The errors that torchslam raises. A message says what is wrong, where, and what to do."""
+"""The errors that torchslam raises. A message states what is wrong, where, and what to do."""
 
 from torchslam.utils.text import printable, without_credentials
 
@@ -54,7 +54,7 @@ class DownloadError(TorchslamError):
 
 
 class InitializationError(TorchslamError):
-    """No map could be initialized; the message says why (standstill, pure rotation, too few matches)."""
+    """No map could be initialized; the message has the reason (standstill, pure rotation, too few matches)."""
 
 
 class ConvergenceError(TorchslamError):

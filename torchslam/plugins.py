@@ -93,9 +93,9 @@ def load(
         except ConfigError:
             raise
         except Exception as error:
-            raise ConfigError(f"{what}: cannot be made: {_words(error)}") from error
+            raise ConfigError(f"{what}: cannot be instantiated: {_words(error)}") from error
     if not callable(part):
-        raise ConfigError(f"{what}: {type(part).__name__} is nothing that can be called")
+        raise ConfigError(f"{what}: {type(part).__name__} cannot be called")
     called: Callable[..., Any] = part
     return called
 

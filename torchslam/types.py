@@ -401,23 +401,23 @@ def check_ascending(times: Float[Tensor, " N"], wrong: Bool[Tensor, " M"]) -> No
 
 
 class Reason(StrEnum):
-    """Why a frame has no pose, an uncertain one or became a keyframe: the kinds of `StepResult.reasons`.
+    """Kinds of `StepResult.reasons`: why a frame has no pose, has an uncertain pose or became a keyframe.
 
     Texts with fields in braces belong to an `Explanation`, which has the numbers.
     """
 
     NEW_REFERENCE = "took a reference frame"
     STARTED = "map initialized"
-    STARTED_ANEW = "later frames contradict the start: map initialized anew"
+    STARTED_ANEW = "later frames contradict the start: map initialized again"
     RELOCALIZED = "relocalized"
     LOST = "lost"
-    LOST_AT_START = "lost right after the start: starting anew"
+    LOST_AT_START = "lost right after the start: starting again"
     STATIC_OVERLAY = "static overlay masked out"
     INDEPENDENT_MOTION = "{count} independently moving keypoints masked out"
     UNCONFIRMED = "to be confirmed by {count} more frames"
 
     # keyframes
-    MOVED = "moved by {ratio:.2f} of the depth of the scene"
+    MOVED = "moved by {ratio:.2f} of the scene depth"
     TURNED = "turned by {degrees:.1f} degrees"
     FEW_POINTS = "sees only {count} points of the map"
     LOW_OVERLAP = "sees {ratio:.0%} of the points of its reference keyframe"
@@ -428,10 +428,10 @@ class Reason(StrEnum):
         "too few matches with the reference frame: {count}, {needed} are needed; "
         "views may be too far apart, or blurred"
     )
-    STATIC_AMBIGUOUS = "some of the image stays in place, and it is not clear what moves"
-    STATIC_REMAINDER = "what still matches stays in place, the rest has gone: took a new reference frame"
+    STATIC_AMBIGUOUS = "part of the image is static, and the motion of the rest is unclear"
+    STATIC_REMAINDER = "only static parts of the image still match: took a new reference frame"
     STATIONARY = "the camera stands still: the image moved by {pixels:.1f} px"
-    STATIONARY_IN_PART = "{ratio:.0%} of the image stands still, and of the rest: {rejection}"
+    STATIONARY_IN_PART = "{ratio:.0%} of the image is static; the rest: {rejection}"
     MOVING_OBJECT = "possible moving object in front of a stationary camera: a {model} explains it"
     PURE_ROTATION = "the camera only turns: a rotation explains the matches"
     PURE_ROTATION_OTHER_FOCAL = (
@@ -442,21 +442,21 @@ class Reason(StrEnum):
     AMBIGUOUS_MOTION = "ambiguous motion: the {model} allows several"
     BEHIND_CAMERA = "matches behind a camera: only {ratio:.0%} lie in front of both"
     FEW_PARALLAX_POINTS = "too little parallax: {count} points have enough, {needed} are needed"
-    LOW_MEAN_PARALLAX = "too little parallax: {mean:.1f} degrees in the mean, {needed} are needed"
-    UNCERTAIN_DEPTHS = "depths too uncertain: {count} of {matches} known well, {ratio:.0%} are needed"
+    LOW_MEAN_PARALLAX = "too little parallax: {mean:.1f} degrees on average, {needed} are needed"
+    UNCERTAIN_DEPTHS = "depths too uncertain: {count} of {matches} are certain, {ratio:.0%} are needed"
     FEW_REFINED_POINTS = "too few points survive refinement: {count}, {needed} are needed"
     FRAMES_UNEXPLAINED = "bad start: it explains {count} of {frames} frames"
 
     # pose validation
     LOW_INLIER_RATIO = "only {ratio:.0%} of {matches} matches agree with the pose"
-    UNCERTAIN_POSITION = "the position is known to {std:.3f} of the scene's depth"
-    UNCERTAIN_ROTATION = "the rotation is known to {degrees:.2f} degrees"
-    JUMP = "jumped by {translation:.2f} of the scene's depth and {degrees:.0f} degrees"
-    LARGE_ERRORS = "the matches of the last frames are off by {sigma:.1f} times their noise in the median"
+    UNCERTAIN_POSITION = "position uncertainty {std:.1%} of the scene depth"
+    UNCERTAIN_ROTATION = "rotation uncertainty {degrees:.2f} degrees"
+    JUMP = "jumped by {translation:.2f} of the scene depth and {degrees:.0f} degrees"
+    LARGE_ERRORS = "the median error of the matches of the last frames is {sigma:.1f} times their noise"
     LOW_EXPLAINED_RATIO = "the map explains only {ratio:.0%} of the image"
-    LOW_COVERAGE_RATIO = "only {ratio:.0%} of the image shows what the map expects there"
-    MOVING_MAJORITY = "most of the image moves by itself"
-    WEAK_LINK = "nothing ties this part to the rest of the map, or the check contradicts the tie"
+    LOW_COVERAGE_RATIO = "only {ratio:.0%} of the image looks as the map predicts"
+    MOVING_MAJORITY = "most of the image moves independently"
+    WEAK_LINK = "weakly connected to the main map, or the check contradicts the connection"
     MOVING_REMAINDER = "{count} matches in the rest of the image move against the map"
 
     # without an online map

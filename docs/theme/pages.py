@@ -13,6 +13,7 @@ from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
 
 ROOT = Path(__file__).resolve().parents[2]
+REPOSITORY = "https://github.com/torchslam/torchslam"
 OUTSIDE = ("experiments/**/*.md", "experiments/**/*.png", "CONTRIBUTING.md", "CHANGELOG.md")
 """Files of the repository that become part of the site at their own path."""
 
@@ -32,9 +33,11 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Page, config: MkDocsConfig, files: Files) -> str:
-    """Make the links of files from outside into docs/ relative to docs/."""
+    """Make the links of files from outside into docs/ relative to docs/, and those to the main README absolute."""
     if (ROOT / "docs" / page.file.src_uri).exists():
         return markdown
+    home = "../" * page.file.src_uri.count("/") + "README.md"  # is not part of the site
+    markdown = markdown.replace(f"]({home}", f"]({REPOSITORY}")
     return markdown.replace("](docs/", "](").replace("../docs/", "../")
 
 

@@ -209,7 +209,8 @@ def test_missing_images_are_reported(
     path.write_text(json.dumps(json.loads(path.read_text()) | {"source": None}))
     assert densify(results) == 2
     assert (
-        "metrics.json: does not say where the images are; give them with --images" in capsys.readouterr().err
+        "metrics.json: the location of the images is unknown; give it with --images"
+        in capsys.readouterr().err
     )
 
 

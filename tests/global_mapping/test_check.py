@@ -100,9 +100,7 @@ def test_a_right_map_agrees(recording: Recording) -> None:
     assert (found.triplets, found.consistent) == (180, 180)  # of 1, 2, 3 before and after, but for the ends
     assert found.used_agreeing == found.score == 1
     assert (found.certain, found.uncertain) == (tuple(range(24)), ())
-    assert found.sentence() == (
-        "100% of 66 image pairs that mapping did not use agree, and 100% of 180 ratios of scales"
-    )
+    assert found.sentence() == ("100% of 66 held-out image pairs agree, and 100% of 180 ratios of scales")
 
 
 def test_frames_are_those_of_the_images() -> None:
@@ -572,7 +570,7 @@ def test_only_pairs_that_mapping_did_not_use_are_counted() -> None:
     everything = check(WALK, pairs=pairs)
     assert (everything.pairs, everything.agreeing) == (45, 44)
     assert everything.score == found.score
-    assert check(WALK, pairs=pairs, held_back=()).sentence() == "no image pairs that mapping did not use"
+    assert check(WALK, pairs=pairs, held_back=()).sentence() == "no held-out image pairs"
 
 
 def test_nothing_to_check_is_not_right() -> None:
@@ -621,8 +619,8 @@ def test_the_score_is_a_product_of_shares() -> None:
 
 
 def test_a_check_in_words() -> None:
-    assert a_check(triplets=0).sentence() == "90% of 10 image pairs that mapping did not use agree"
-    words = "90% of 10 image pairs that mapping did not use agree, and 50% of 8 ratios of scales"
+    assert a_check(triplets=0).sentence() == "90% of 10 held-out image pairs agree"
+    words = "90% of 10 held-out image pairs agree, and 50% of 8 ratios of scales"
     assert a_check(consistent=4).sentence() == words
     first = "between frames 0 and 1 the scale differs by 25%"
     rest = "between frames 1 and 2 the scale differs by 25%; between frames 2 and 3 the scale differs by 25%"

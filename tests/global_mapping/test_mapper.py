@@ -411,7 +411,7 @@ def so3_rigid(angle: float) -> Tensor:
 def test_points_of_three_images_are_needed() -> None:
     pairs = [SCENE.pair(0, 1), SCENE.pair(2, 3)]
     assert reconstructing().reconstruct(SCENE.views, pairs) == "no map: no point is seen by 3 of 20 images"
-    assert reconstructing().reconstruct(SCENE.views, []) == "no map: no two of 20 images see the same"
+    assert reconstructing().reconstruct(SCENE.views, []) == "no map: no two of 20 images show the same scene"
     three = [
         replace(pair, keypoints_1=pair.keypoints_1[:40], keypoints_2=pair.keypoints_2[:40])
         for pair in (SCENE.pair(0, 3), SCENE.pair(3, 6))
@@ -448,7 +448,7 @@ def test_two_images_are_too_few() -> None:
 
 def test_images_that_share_nothing_are_reported() -> None:
     made = map_whole(at(0, 900, 2000), "simulated.depth_far=0.7")
-    assert_failed(made, "no map: no two of 3 images see the same", 3)
+    assert_failed(made, "no map: no two of 3 images show the same scene", 3)
     assert made.pairs == []
     assert [each.index for each in made.run.results] == [0, 1, 2]
     assert [each.timestamp for each in made.run.results] == pytest.approx([0.0, 0.1, 0.2])

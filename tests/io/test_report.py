@@ -106,9 +106,7 @@ def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
     assert found["check"]["score"] == pytest.approx(0.8 * 0.9 * 3 / 9)
     assert found["check"]["breaks"] == ["between frames 3 and 4 the scale differs by 20%"]
     row = summary(run_metrics(run) | found)["check"]
-    assert row.startswith(
-        "mapped as a whole: 75% of 4 image pairs that mapping did not use agree, and 90% of 10"
-    )
+    assert row.startswith("global mapping: 75% of 4 held-out image pairs agree, and 90% of 10")
     assert check_metrics(None) == {}
     assert check_metrics(MappedRecording(run, run, None, Mapping.ONLINE, ""))["check"] is None
 

@@ -263,7 +263,7 @@ def test_the_run_continues_without_a_killed_worker() -> None:
         adjusting.request(slam_map, 4, due=12)
         os.kill(solver._workers[0].process.pid or 0, signal.SIGKILL)
         solver._workers[0].process.join()
-        with pytest.warns(UserWarning, match="has ended"):
+        with pytest.warns(UserWarning, match="died"):
             adjusting.apply(slam_map)
         assert_same(slam_map, adjusted())
         slam_map = perturbed_map(1)

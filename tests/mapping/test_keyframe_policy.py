@@ -44,8 +44,8 @@ def test_a_tenth_of_the_depth_makes_a_keyframe() -> None:
     submap = submap_of_scene(SCENE, sideways(1))
     step = SETTINGS.max_translation * depth(submap, pose())
     assert why(submap, pose(0.99 * step)) == ""
-    assert why(submap, pose(1.01 * step)) == "moved by 0.10 of the depth of the scene"
-    assert why(submap, pose(0, -2.0 * step)) == "moved by 0.20 of the depth of the scene"
+    assert why(submap, pose(1.01 * step)) == "moved by 0.10 of the scene depth"
+    assert why(submap, pose(0, -2.0 * step)) == "moved by 0.20 of the scene depth"
 
 
 def test_twelve_degrees_make_a_keyframe() -> None:

@@ -98,7 +98,7 @@ def test_what_is_used_on_request_alone() -> None:
     assert given_options(MetricConfig(depth="auto"), brought) == asked
     assert given_options(MetricConfig(depth="auto", own=False), brought) == asked
     assert given_options(MetricConfig(depth="other:5000"), brought) == {"depth": (("other:5000",),)}
-    with pytest.raises(ConfigError, match="--depth auto: the recording brings none along"):
+    with pytest.raises(ConfigError, match="--depth auto: the recording contains none"):
         given_options(MetricConfig(depth="auto"))
 
 

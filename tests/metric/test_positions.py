@@ -115,11 +115,11 @@ def test_positions_of_images() -> None:
     fixes = Fixes(FILE, known.geodetic, known.std, None, names)
     images = [f"images/a/{row}.jpg" for row in range(len(times))]
     assert abs(error(measure(PositionSource(fixes), view_of(times, T_ec, images)))) < 1e-6
-    with pytest.raises(MeasurementError, match=r"no image is called as those in it, such as a/0\.jpg"):
+    with pytest.raises(MeasurementError, match=r"no image has one of its names, such as a/0\.jpg"):
         PositionSource(fixes).measure(view_of(times, T_ec, ["x"] * len(times)))
     silent = PositionSource(fixes).measure(view_of(times, T_ec))
     assert isinstance(silent, Unmeasured)
-    assert "not at hand" in silent.reason
+    assert "not available" in silent.reason
 
 
 def test_a_line_leaves_the_turn_about_it_open() -> None:

@@ -117,7 +117,7 @@ def test_odometry_that_turns_otherwise() -> None:
     poses[305:] = poses[305] @ turn @ se3_inverse(poses[305]) @ poses[305:]
     found = measure(OdometrySource(FILE, Trajectory(times, poses)), view_of(times, T_ec))
     assert abs(error(found)) < 0.004
-    assert "turn otherwise than the camera" in found.notes[0]
+    assert "rotate differently from the camera" in found.notes[0]
 
 
 def test_the_lever_arm_and_the_rotation_between_two_sensors() -> None:

@@ -112,7 +112,7 @@ def test_the_source_continues_without_the_worker(reader: LivePrefetcher) -> None
     reader[0], reader[1]
     reader._call = reader.submit(reader._next)  # not answered yet
     os.kill(reader._workers[0].process.pid or 0, signal.SIGKILL)
-    with pytest.warns(UserWarning, match="has ended"):
+    with pytest.warns(UserWarning, match="died"):
         frame = reader[2]
     assert frame.index == 2
     assert frame.features is None

@@ -123,7 +123,7 @@ def test_an_error_is_raised_by_the_caller_with_its_traceback(error: Exception) -
 def test_a_killed_worker_is_reported_once(pool: WorkerPool) -> None:
     wait_until_ready(pool)
     calls = [pool.submit(None), pool.submit(torch.eye(2))]
-    with pytest.warns(UserWarning, match="has ended: going on without it"), pytest.raises(WorkerLostError):
+    with pytest.warns(UserWarning, match="died; continuing without it"), pytest.raises(WorkerLostError):
         pool.result(calls[0])
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -138,7 +138,7 @@ def test_a_worker_that_cannot_make_its_function_is_reported() -> None:
     with WorkerPool(1, fail, FrameError("it has no task")) as pool:
         wait_until_ready(pool)
         pool._workers[0].process.join(PATIENCE)
-        with pytest.warns(UserWarning, match="has ended: going on without it"):
+        with pytest.warns(UserWarning, match="died; continuing without it"):
             assert pool.submit() is None
 
 
@@ -147,7 +147,7 @@ def test_a_new_interpreter_killed_while_it_starts_is_reported(monkeypatch: pytes
     with WorkerPool(1, multiplier, torch.ones(1)) as pool:
         pool._workers[0].process.kill()
         pool._workers[0].process.join()
-        with pytest.warns(UserWarning, match="has ended: going on without it"):
+        with pytest.warns(UserWarning, match="died; continuing without it"):
             assert pool.submit(torch.eye(2)) is None
 
 
@@ -163,7 +163,7 @@ def test_a_stopped_worker_is_given_up(pool: WorkerPool, monkeypatch: pytest.Monk
     assert call is not None
     monkeypatch.setattr("torchslam.parallel.pool.RESPONSE_TIMEOUT_S", 0.2)
     with (
-        pytest.warns(UserWarning, match="does not answer: going on without it"),
+        pytest.warns(UserWarning, match="does not answer; continuing without it"),
         pytest.raises(WorkerLostError),
     ):
         pool.result(call)
@@ -190,7 +190,7 @@ def test_a_worker_killed_while_it_sends_a_result_is_not_waited_for() -> None:
         first, second = pool.submit(True), pool.submit(False)
         assert first is not None
         assert second is not None
-        with pytest.warns(UserWarning, match="has ended"), pytest.raises(WorkerLostError):
+        with pytest.warns(UserWarning, match="died"), pytest.raises(WorkerLostError):
             pool.result(first)
         assert pool.result(second) == ask(pool, False) == second.worker.process.pid  # goes on
     assert multiprocessing.active_children() == []
@@ -203,7 +203,7 @@ def test_a_stopped_worker_takes_no_calls_larger_than_its_pipe(monkeypatch: pytes
     with WorkerPool(1, multiplier, torch.ones(1)) as pool:
         wait_until_ready(pool)
         os.kill(pool._workers[0].process.pid or 0, signal.SIGSTOP)
-        with pytest.warns(UserWarning, match="does not answer: going on without it"):
+        with pytest.warns(UserWarning, match="does not answer; continuing without it"):
             assert pool.submit(torch.zeros(10_000_000)) is None
         assert multiprocessing.active_children() == []
 

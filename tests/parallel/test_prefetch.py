@@ -148,7 +148,7 @@ def test_the_run_continues_without_a_killed_worker(sequence: Sequence) -> None:
         assert check_same(frames, sequence, 1)
         os.kill(frames._workers[0].process.pid or 0, signal.SIGKILL)
         frames._workers[0].process.join()
-        with pytest.warns(UserWarning, match="has ended: going on without it"):
+        with pytest.warns(UserWarning, match="died; continuing without it"):
             theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
     assert not all(theirs[4:])
 

@@ -54,7 +54,7 @@ def test_each_task_is_done_once_by_all_processes(tmp_path: Path, processes: int)
 def test_the_tasks_of_a_killed_worker_are_done_here(tmp_path: Path) -> None:
     with SharedTasks(die_elsewhere, (tmp_path, os.getpid()), 3) as shared:
         wait_until_ready(shared)
-        with pytest.warns(UserWarning, match="going on without it"):
+        with pytest.warns(UserWarning, match="continuing without it"):
             assert sum(1 for _ in shared.run(TASKS)) == len(TASKS)
     assert {path.read_text() for path in tmp_path.iterdir()} == {str(os.getpid())}
     assert len(list(tmp_path.iterdir())) == len(TASKS)

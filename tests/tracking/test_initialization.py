@@ -280,11 +280,11 @@ def test_rejected_initializations_have_a_reason(monkeypatch: pytest.MonkeyPatch)
     assert reason_for(60, 100, 100) == ""
     assert reason_for(59, 100, 100) == "too little parallax: 59 points have enough, 60 are needed"
     assert reason_for(60, 100, 400) == ""
-    assert reason_for(60, 100, 401).startswith("depths too uncertain: 60 of 401 known well, 15%")
+    assert reason_for(60, 100, 401).startswith("depths too uncertain: 60 of 401 are certain, 15%")
     assert reason_for(60, 100, 100, share=0.61).startswith("depths too uncertain")
     assert (
         reason_for(60, 100, 400, config=PARALLAX)
-        == "too little parallax: 4.9 degrees in the mean, 5.0 are needed"
+        == "too little parallax: 4.9 degrees on average, 5.0 are needed"
     )
     assert (
         reason_for(39, 100, 400, config=PARALLAX)

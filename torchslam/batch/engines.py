@@ -28,7 +28,7 @@ LOST = (
     f"its process died {RETRIES + 1} times, or could not start: "
     "not enough memory, or torchslam is not installed where it ran"
 )
-"""What the table says of a row without a result."""
+"""Error in the table for a row without a result."""
 
 
 @dataclass(frozen=True)
@@ -217,7 +217,7 @@ def run_batch(
         on_progress: Receives the columns of each finished task of the shard.
 
     Returns:
-        The columns of the shard's tasks in the order of the tasks; `is_new` says whether they were run now.
+        The columns of the shard's tasks in the order of the tasks; `is_new`: whether they were run now.
 
     Raises:
         ConfigError: The engine is not available.

@@ -81,7 +81,7 @@ def find_camera(
 
 
 def describe_search(search: ViewGraphFocal | None, camera: Camera) -> str:
-    """Describe the camera that pairs of images gave, or say that they do not determine it."""
+    """Describe the camera that pairs of images gave, or the reason why they do not determine it."""
     focal = float(camera.focal)
     if search is None:
         return (
@@ -93,7 +93,7 @@ def describe_search(search: ViewGraphFocal | None, camera: Camera) -> str:
         return f"focal length {_with_error(focal, focal * float(search.std))} px by {pairs} image pairs"
     return (
         f"{pairs} image pairs do not determine it ({DEGENERATE}): "
-        f"the focal length of {focal:.0f} px is a guess to start with"
+        f"the focal length of {focal:.0f} px is an initial guess"
     )
 
 
@@ -106,7 +106,7 @@ def with_stated_std(config: Config, sequence: Sequence) -> Config:
 
 
 def camera_remark(finished: Run, found: str) -> str:
-    """Describe the camera of a run: how it was found, its error, and whether the run contradicts the given one.
+    """Describe the camera of a run: its source, its error, and whether the run contradicts the given one.
 
     Only a complete first session can contradict an exact one.
 

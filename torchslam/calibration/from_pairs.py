@@ -1,7 +1,7 @@
 """The focal length of an unknown camera from pairs of images, before anything is mapped, within a bounded time.
 
 Fundamental matrices of images at several distances in time, around places spread over the recording, need no camera;
-the focal length is the one that makes essential matrices of them (`geometry.view_graph_focal`).
+the focal length turns them into essential matrices (`geometry.view_graph_focal`).
 """
 
 from __future__ import annotations
@@ -54,7 +54,8 @@ def search_focal(
         config: of the run.
         device: of torch.
         progress: called with the number of images done, and of all.
-        extract: extracts SIFT features of an image, at least `NUM_KEYPOINTS`, the strongest first; None: so many.
+        extract: extracts SIFT features of an image, at least `NUM_KEYPOINTS`, the strongest first; None: SIFT with
+            this number.
 
     Returns:
         fx with its standard error, and `success` if the pairs determine it; None if no two images could be matched.
@@ -114,7 +115,7 @@ def _fundamental(
             CONFIDENCE,
             MAX_SAMPLES,
         )
-    except cv2.error:  # so OpenCV says of some degenerate matches that it found no matrix
+    except cv2.error:  # OpenCV raises for some degenerate matches
         return None
     if F is None or F.shape != (3, 3) or np.count_nonzero(mask) < MIN_MATCHES:
         return None

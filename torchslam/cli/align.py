@@ -1,10 +1,10 @@
-"""Give meters to a finished run, from what is known of lengths: markers, clicked points, the camera's height.
+"""Scale a finished run to meters by markers, clicked lengths, the camera height, or other measurements.
 
 The options are those of `torchslam run`. Map, trajectories, metrics, plots and viewer of the results folder are written
-anew; exports that follow are in meters. Dense depth of the folder is removed: `torchslam densify` computes it again.
-Measurements of a run that is in meters already are compared with its unit, which stays.
+again; later exports are in meters. Dense depth of the folder is removed: `torchslam densify` computes it again.
+If the run is in meters already, its scale is kept, and the measurements are compared with it.
 
-Exit status: 0 done, 2 an error, 3 nothing measured the unit, and nothing was changed.
+Exit status: 0 done, 2 an error, 3 no source determined the scale, and nothing was changed.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ from torchslam.utils.files import write_whole
 DONE = 0
 """Exit status of a run in meters."""
 NOTHING = 3
-"""Exit status where nothing measured the unit."""
+"""Exit status where no source determined the scale."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -75,7 +75,7 @@ def execute(options: argparse.Namespace) -> int:
     sources = sources_of(given_options(load_config(None, arguments.metric_overrides(options)).metric))
     if not sources:
         flags = ", ".join(kind.options[0].flag for kind in KINDS)
-        raise ConfigError(f"nothing to measure with: give one of {flags}")
+        raise ConfigError(f"no source of scale: give one of {flags}")
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
     metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
@@ -94,7 +94,7 @@ def execute(options: argparse.Namespace) -> int:
     for line in unmeasured:
         warn(line)
     if not moved:
-        say(f"{directory}: nothing measured the unit; nothing was changed")
+        say(f"{directory}: no source determined the scale; nothing was changed")
         return NOTHING
     metrics = _write(directory, metrics, saved, moved, unmeasured)
     for line in (metrics["metric"] or {}).get("remarks", ()):
@@ -106,7 +106,7 @@ def execute(options: argparse.Namespace) -> int:
 def _images(
     directory: Path, metrics: dict[str, Any], saved: SavedAtlas, submap: Submap, elsewhere: str | None
 ) -> Images | None:
-    """The images of the run, by its frames; None where they are not at hand, which is said."""
+    """The images of the run, by its frames; None and a message where they are not available."""
     source = read_image_source(directory, metrics, saved.atlas, elsewhere)
     if source is None:
         return None
@@ -145,7 +145,7 @@ def _write(
         path.unlink()
     if gone:
         say(
-            f"dense depth was in another unit and is removed; `torchslam densify {directory}` computes it again"
+            f"dense depth had another scale and is removed; `torchslam densify {directory}` computes it again"
         )
         metrics.pop("dense", None)
     metric = by_number[main].metric

@@ -151,7 +151,7 @@ def add_named_settings(parser: argparse.ArgumentParser) -> argparse._ArgumentGro
     features.add_argument(
         "--weights",
         metavar="FILE|NAME",
-        help="weights of a learned feature extractor (features.weights); by default those of its own name",
+        help="weights of a learned feature extractor (features.weights); by default those with its name",
     )
     features.add_argument(
         "--matcher",
@@ -164,7 +164,7 @@ def add_named_settings(parser: argparse.ArgumentParser) -> argparse._ArgumentGro
         type=float,
         metavar="RATIO",
         help="relative standard deviation of the given focal length (camera.std): 0.02 if neither this nor the "
-        "calibration file says otherwise; 0: the camera is exact",
+        "calibration file states it; 0: the camera is exact",
     )
     camera.add_argument(
         "--readout",
@@ -172,7 +172,7 @@ def add_named_settings(parser: argparse.ArgumentParser) -> argparse._ArgumentGro
         default=AUTO,
         metavar="MS",
         help="time from the exposure of the first row of an image to the last (camera.readout): milliseconds, "
-        f"{', '.join(READOUTS_MS)}, 0 for a global shutter, or auto, the default: found where the images show one",
+        f"{', '.join(READOUTS_MS)}, 0 for a global shutter, or auto, the default: estimated from the images",
     )
     others = parser.add_argument_group("other settings")
     others.add_argument("--scale", choices=CHOICES["scale"], help="length unit of the map (scale)")
@@ -204,7 +204,7 @@ def overrides(options: argparse.Namespace) -> list[str]:
 
 def add_metric(parser: argparse.ArgumentParser) -> None:
     """Add the options that give the map meters: those of `metric.options.KINDS`."""
-    group = parser.add_argument_group("meters", "what is known of lengths; each can be repeated")
+    group = parser.add_argument_group("meters", "measurements that determine the scale; each can be repeated")
     about = {each.name: each.metadata["about"] for each in fields(MetricConfig)}
     for option in (option for kind in KINDS for option in kind.options):
         words = about[option.name].replace("%", "%%")

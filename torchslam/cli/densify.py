@@ -125,7 +125,7 @@ def densify_results(directory: Path, options: argparse.Namespace) -> dict[str, s
     source = read_image_source(directory, metrics, saved.atlas, options.images)
     if source is None:
         raise ResultsError(
-            f"{directory / METRICS}: does not say where the images are; give them with --images"
+            f"{directory / METRICS}: the location of the images is unknown; give it with --images"
         )
     scene = scene_of(submap, saved.camera, int(metrics["session"]), every is None, readout_of(metrics))
     size = map_size(options.resolution, pinhole_within(scene.camera).size)

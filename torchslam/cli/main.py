@@ -38,7 +38,7 @@ COMMANDS = {
     ),
     "align": (
         "align",
-        "give meters to a finished run, from what is known of lengths: markers, clicked points, the camera's height",
+        "scale a finished run to meters by markers, clicked lengths, the camera height, or other measurements",
     ),
     "densify": (
         "densify",

@@ -56,7 +56,7 @@ class StopSignals:
         return self._is_wanted
 
     def begin(self, phase: str) -> None:
-        """Enter a phase and forget earlier signals; `phase` tells the user when the run will stop."""
+        """Enter a phase and forget earlier signals; `phase` is shown to the user: when the run will stop."""
         self._phase, self._is_wanted = phase, False
         for number in SIGNALS:
             signal.signal(number, self._wish)
@@ -100,7 +100,7 @@ class _Bar:
 
     Args:
         stop_signals: the signal handler.
-        phase: tells the user when the run will stop.
+        phase: shown to the user: when the run will stop.
     """
 
     def __init__(self, stop_signals: StopSignals, phase: str) -> None:

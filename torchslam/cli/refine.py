@@ -2,9 +2,9 @@
 
 The input is a COLMAP model, a transforms.json or a TUM trajectory, for example of a phone, a network or another SLAM
 system. Features are matched and triangulated; then poses, points and, where the images contradict it, the focal length
-are adjusted. The results are those of `torchslam run`, in the frame and unit of the given poses, or in meters where one
-of the options says what is known of lengths; refined/ has the poses in their original format, with covariances. Images
-without a pose and poses without an image are ignored.
+are adjusted. The results are those of `torchslam run`, in the frame and unit of the given poses, or in meters with one
+of the options for metric scale; refined/ has the poses in their original format, with covariances. Images without a
+pose and poses without an image are ignored.
 
 Exit status: 0 done, 2 an error, 3 no map could be built from the images.
 """

@@ -38,7 +38,7 @@ class Calibration:
         source: origin of the numbers, for messages.
         size: (width, height) of the images, if known.
         guessed: True if only approximate.
-        std: relative standard deviation of the focal length, if the source says so.
+        std: relative standard deviation of the focal length, if the source states it.
         as_stored: True if it is of a program that ignores the orientation in the EXIF block of images.
         unit: of a guess: "px" (pixels), "w" (image widths) or "diagonal" (image diagonals).
         others: the cameras of the same source for images of other sizes.
@@ -119,7 +119,7 @@ class Calibration:
         )
 
     def _check_center(self, size: Size) -> None:
-        """Raise CalibrationError if the principal point says that the camera is for another size."""
+        """Raise CalibrationError if the principal point implies another image size."""
         center = self.params[2], self.params[3]
         off = max(abs(at - (side - 1) / 2) for at, side in zip(center, size, strict=True))
         if off <= MAX_OFF_CENTER * max(size):

@@ -63,7 +63,7 @@ class Sequence(ABC):
         timestamps: (N,) float64 seconds, strictly increasing.
         groundtruth: the true trajectory at its own rate, or None.
         notes: remarks for the user on how it was read, one line each.
-        camera_std: relative standard deviation of the camera's focal length, if its calibration says so.
+        camera_std: relative standard deviation of the camera's focal length, if its calibration states it.
         pixel_aspect: width to height of a pixel; the fy / fx of a camera that is not known yet.
         counted_until: where images have no times and are counted at some rate, half an interval after the last one.
         measurements: settings of the section `metric` that the dataset brings along, by name: files of its own sensors.
@@ -132,7 +132,7 @@ class Sequence(ABC):
 
     @camera.setter
     def camera(self, camera: Camera) -> None:
-        """Another one, or one that was found out. Raises CalibrationError for another size than the images have."""
+        """Another camera, or an estimated one. Raises CalibrationError for another size than the images have."""
         self._camera, self.calibrated, self.camera_std = self._checked(camera), Calibrated.GIVEN, None
 
     def _checked(self, camera: Camera) -> Camera:
@@ -149,7 +149,7 @@ class Sequence(ABC):
 
     @property
     def is_live(self) -> bool:
-        """Whether each frame is there only once, when it comes, also where only so many are taken."""
+        """Whether each frame is available only once, when it arrives, also where a limit is set."""
         return not len(self.timestamps)
 
     def indices(self, start: int = 0) -> Iterable[int]:

@@ -16,7 +16,7 @@ MAX_BYTES = 1 << 27
 MAX_DIGITS = 19
 """Maximum number of digits of an integer; nanoseconds since 1970 have 19."""
 UNIX_UNITS = {13: 10**3, 16: 10**6, 19: 10**9}
-"""Parts of a second that a number of so many digits counts since 1970, from 2001 to 2286."""
+"""Parts of a second that a number with this many digits counts since 1970, from 2001 to 2286."""
 MAX_SECONDS = 1e11
 """The year 5138."""
 MAX_LINE = 1 << 16

@@ -1,7 +1,7 @@
 """How probable it is that a depth is right within 5 %: logistic models of what the estimation found.
 
 The constants are those of largest likelihood on the sensor's depth of a handheld indoor recording and on the exact
-depth of a rendered room, of equal weight; `experiments/dense/README.md` says how well they hold.
+depth of a rendered room, of equal weight; `experiments/dense/README.md` has their accuracy.
 """
 
 from __future__ import annotations

@@ -153,7 +153,7 @@ def _content(
     camera: Camera,
     about: dict[str, Any],
 ) -> Iterator[bytes]:
-    """The bytes of a file, in pieces: a header that says where each tensor is, and the tensors.
+    """The bytes of a file, in pieces: a header with the place of each tensor, and the tensors.
 
     Args:
         shapes: of the tensors.

@@ -38,7 +38,7 @@ HALF_RADIUS, FULL_RADIUS = 3, 3
 
 
 class Estimate(NamedTuple):
-    """Depth of views, and what tells how certain it is.
+    """Depth of views, and the values that determine its confidence.
 
     Attributes:
         inverse_depth: 1 / map units, positive.

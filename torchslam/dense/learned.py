@@ -1,7 +1,7 @@
 """A small network that rates depth: how probable it is that what semi-global aggregation found is right.
 
 It reads the image and the minima of the aggregated costs at half and at full size, in a U-net at half size.
-`examples/train_depth.py` trains it; `experiments/dense/README.md` says what it gains.
+`examples/train_depth.py` trains it; `experiments/dense/README.md` has its gain.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ KEYPOINTS_PER_CELL = 8  # keypoints of a cell if they were spread evenly
 
 @dataclass(frozen=True)
 class Corners:
-    """The chosen corners of a batch of images, N in all, and the pyramid they were found in.
+    """The chosen corners of a batch of images, N in all, and the pyramid in which they were detected.
 
     Attributes:
         levels: from `build_levels`.

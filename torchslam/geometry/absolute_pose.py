@@ -58,7 +58,7 @@ class AbsolutePose:
     """Absolute poses of B cameras.
 
     Attributes:
-        T_cw: world to camera; the identity where no pose was found.
+        T_cw: world to camera; the identity where there is no pose.
         inliers: points within the threshold of their pixel, in front of the camera.
         success: whether the inliers are significant and not all on one line.
         score: sum over the points of 1 - min((error / threshold)^2, 1).

@@ -23,7 +23,7 @@ FOCAL, K1, K2 = range(3)
 OBSERVATION_VARIANCE = 9.0
 """`CameraMeasurement.observation_variance` before a recording has said anything: a point's errors in neighboring frames
 are alike, and parts of a trajectory disagree by two to five formal errors. `torchslam.optim.camera_evidence` finds 0.05
-to 2 at the end of a run: until then, what the recording says counts for little. Tried at this value only."""
+to 2 at the end of a run: until then, the recording has little weight. Tried at this value only."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class CameraMeasurement:
     Attributes:
         camera: The mean.
         directions: Columns along which the parameters may be wrong, each by one standard deviation.
-        observation_variance: Variance of an observation as far as it tells something about the camera, in units of the
+        observation_variance: Variance of an observation as far as it determines the camera, in units of the
             stated one. Where a bundle adjustment has observations with their stated weights, the information of the
             camera is multiplied by it.
     """
@@ -93,7 +93,7 @@ class CameraMeasurement:
 
 
 MAX_DEPARTURE = 5.0
-"""Standard deviations by which a camera that was found may differ from the given one."""
+"""Standard deviations by which an estimated camera may differ from the given one."""
 
 
 def may_be_same(found: Camera, given: Camera, std: float) -> bool:

@@ -40,11 +40,11 @@ _TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
-# A best sample of which so many matches are clearly off: no fit brings these below the share above. Among few matches
-# an essential matrix finds many by accident.
+# A best sample of which this share of the matches is clearly off, of at least this many in all: no fit brings these
+# below the share above. Among few matches an essential matrix has many inliers by accident.
 _HOPELESS, _MANY = 0.25, 50
 _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so far off
-# Alignment of the errors with the epipolar lines: by so many deviations, two more than a direction needs that was not
+# Alignment of the errors with the epipolar lines: by this many deviations, two more than a direction needs that was not
 # chosen to fit; and on average as where the variance along the lines is twice that across, since the noise of keypoints
 # on edges has a direction of its own.
 _MIN_LEAN_SIGMAS, _MIN_LEAN = 4.0, 1 / 3
@@ -139,7 +139,7 @@ def choose(
 
     Args:
         by_noise: also require that all matches together do not contradict it by the direction of their
-            errors. Keypoint noise has a long tail, so many errors of a few pixels do not refute a rotation.
+            errors. Keypoint noise has a long tail, so that many errors of a few pixels do not refute a rotation.
             But noise has any direction, while parallax lies along the epipolar lines, in one sense. Noise
             along image edges can lie along the lines too, but in both senses.
     """
@@ -180,7 +180,7 @@ def _leans(
 
     Little parallax is spread over all matches, none of which is clearly off. Noise, of whatever size and tail, has no
     direction: the cosine of twice the angle to the line is zero on average, and one half in square. Matches count by
-    their squared distance, which tells most where parallax adds to Gaussian noise, up to that of `_FARTHEST`.
+    their squared distance, which is most powerful where parallax adds to Gaussian noise, up to that of `_FARTHEST`.
 
     squared: as of `Fits`; variance: variance of the noise, by the essential matrix
     """
@@ -322,7 +322,7 @@ def is_no_accident(
     chance: Float[Tensor, " B"],
     by_noise: bool,
 ) -> Bool[Tensor, " B"]:
-    """Test whether so many matches, spread as they are, are within the threshold by no accident.
+    """Test whether this number of matches, distributed as they are, cannot be within the threshold by chance.
 
     With `by_noise`, the range that the noise explains, often much less than the threshold, is tried as well; a
     rotation is determined by two matches, not five, and a wrong match is as near with less than the squared chance.
@@ -355,7 +355,7 @@ def in_front(
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]]:
     """The pose with most inliers in front of both cameras among the four of an essential matrix.
 
-    A match counts by its parallax in thresholds, up to one: the depth of far points says nothing.
+    A match counts by its parallax in thresholds, up to one: matches with little parallax do not determine depths.
     """
     R, t = twisted(R, t)
     is_ahead, parallax = ahead_and_parallax(views, R, t)

@@ -314,7 +314,7 @@ def is_unlikely(
 
 
 def _log_tail_alarms(count: int, available: int, size: int, chance: float) -> float:
-    """For one problem: the samples there are, times the chance of so many among the other rows."""
+    """For one problem: the number of samples, times the chance of this many inliers among the other rows."""
     rest = available - size
     share = (count - size) / rest if rest > 0 else 0.0
     chance = max(chance, 1e-12)

@@ -47,7 +47,7 @@ class RelativePose:
         inliers: matches within the threshold of the chosen model.
         success: whether rotation and direction are determined: the inliers are significant, the motion is no
             pure rotation, and the plane, if any, is not ambiguous.
-        model: B strings, "essential", "homography" (as far as the matches tell, the scene is a plane) or
+        model: B strings, "essential", "homography" (a plane explains the matches) or
             "rotation".
         model_index: indices of these models, in this order.
         ambiguous: whether the matches lie on a plane and two motions explain them; T_21 is the more likely one.

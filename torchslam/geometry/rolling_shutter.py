@@ -134,7 +134,7 @@ def global_shutter_pixels(
     row. A keypoint stays where it is if one of the two is invalid.
 
     Args:
-        pixels: keypoints, as they were found.
+        pixels: detected keypoints.
         T_cw: pose of the frame of each keypoint.
         velocities: of that frame, per second, see `row_poses`.
         points_w: the point of each keypoint.

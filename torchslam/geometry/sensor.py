@@ -1,4 +1,4 @@
-"""The sensor model: what turns a point of the scene into a keypoint.
+"""The sensor model: the map from a point of the scene to a keypoint.
 
 Camera, readout of the shutter and noise are one value, replaced as a whole. The keypoints of a frame are corrected by
 it once (`SensorModel.at_middle_row`); from then on every stage works with the keypoints of a global shutter.
@@ -43,7 +43,7 @@ class SensorModel:
         """Where a global shutter would have seen the keypoints of K frames, while their middle rows were exposed.
 
         Args:
-            detected: pixels at which keypoints were found.
+            detected: pixels of the detected keypoints.
             velocities: left perturbations of the poses of the frames per second, translation first.
             depths: of the points that the keypoints see, along the optical axis.
             rays: x/z and y/z of the keypoints; computed if None.
@@ -59,7 +59,7 @@ class SensorModel:
 
 
 class SharedCamera:
-    """The sensor model that the components of a running system share; it changes where the run finds a better one.
+    """The sensor model that the components of a running system share; it changes when the run adopts another one.
 
     Attributes:
         model: The sensor model of the map as it is now.

@@ -218,7 +218,7 @@ def _alternatives(hint: Any) -> Iterator[Any]:
 
 
 def _argument(name: str, hint: Any) -> _Argument | None:
-    """What a type hint says about tensors; None where it says nothing."""
+    """The requirements of a type hint on tensors; None where it has none."""
     options = [each for each in _alternatives(hint) if each is not NoneType]
     arrays = [each for each in options if isinstance(each, type) and issubclass(each, AbstractArray)]
     classes = tuple(each for each in options if isinstance(each, type) and _is_record(each))

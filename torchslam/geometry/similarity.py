@@ -158,7 +158,7 @@ class Similarity:
     """Similarities between the coordinates of B pairs of cameras.
 
     Attributes:
-        S_21: from camera 1 to camera 2; the identity where none was found.
+        S_21: from camera 1 to camera 2; the identity where there is none.
         inliers: pairs of points within the threshold of their pixels in both images.
         success: whether the inliers are significant and not all on one line.
         score: sum over the pairs of 1 - min((larger error / threshold)^2, 1).

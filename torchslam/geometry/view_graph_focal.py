@@ -40,7 +40,7 @@ _LARGEST = 3.03  # deviations: 99 % of the lengths of such a vector are shorter
 _LEVEL_ROUNDS = 4  # of the noise level and the best of the grid, which hardly change after the second
 _BEND_ROUNDS = 10  # of reweighting, for the grid only: Newton's method does the rest
 _NEWTON_STEPS, _HALVINGS = 20, 20  # about five steps are needed
-_ROUNDING = 1e-12  # of the cost and of its minimum: what Newton's method cannot tell
+_ROUNDING = 1e-12  # of the cost and of its minimum: the resolution of Newton's method
 _MAX_STD = 0.1  # relative; beyond it a focal length counts as unknown
 _RISE = 9.0  # of the cost, three deviations, that any focal length further away than three times `_MAX_STD` must have
 _MIN_MATCHES = 20  # of a pair: the noise of fewer cannot be told
@@ -91,7 +91,7 @@ def focal_from_fundamentals(
         F_21: in pixels, x_2^T F_21 x_1 = 0, of any scale and of rank two; one that is not finite is left out.
         principal_point: pixels.
         size: width and height of the images, pixels; sets the range of the search.
-        weights: of the pairs, not negative, as if there were so many of each; one by default.
+        weights: of the pairs, not negative, as if each were present that many times; one by default.
 
     Returns:
         The focal length. Its gradient to F_21 and weights is that of the minimum (implicit function theorem), with
@@ -134,7 +134,7 @@ def focal_from_pairs(
         mask: inliers of F_21; a pair with fewer than 20 is left out.
         principal_point: pixels.
         size: width and height of the images, pixels; sets the range of the search.
-        weights: of the pairs, not negative, as if there were so many of each; one by default.
+        weights: of the pairs, not negative, as if each were present that many times; one by default.
         threshold: pixels, about the noise of one coordinate or somewhat more.
         k1_std: standard deviation of the camera's k1 around zero: it is estimated too, as its error would be one of
             the focal length. 0.03 (0.01 to 1 were tried) is that of a camera called undistorted; zero for none.

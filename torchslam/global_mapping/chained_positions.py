@@ -1,7 +1,7 @@
-"""Positions of cameras from the baselines of pairs: what two-view geometry leaves open are the lengths.
+"""Positions of cameras from the baselines of pairs, whose lengths two-view geometry does not determine.
 
-Two pairs that share an image tell the ratio of their lengths, by the depths of keypoints of the shared image that both
-see. The logarithms of all lengths are the least squares of these ratios, and the positions that of the baselines.
+Two pairs that share an image determine the ratio of their lengths, by the depths of keypoints of the shared image that
+both see. The logarithms of all lengths are the least squares of these ratios, and the positions that of the baselines.
 Unlike positions from rays alone, of which parts collapse where few tracks cross, neighbors keep their scale.
 
 Both are differences of unknowns of nodes along edges, solved by iteratively reweighted least squares (Holland and
@@ -65,7 +65,7 @@ def chained_positions(
 def pair_lengths(
     pairs: Sequence[ViewPair], views: Sequence[FrameFeatures], camera: Camera
 ) -> Float[Tensor, " P"]:
-    """The lengths of the baselines of pairs, in a common unit; 1 for pairs that nothing ties to others."""
+    """The lengths of the baselines of pairs, in a common unit; 1 for pairs that share no image with others."""
     rays = ViewRays.by(camera, views)
     depths = [PairDepths.of(pair.T_21, rays, pair) for pair in pairs]
     around: dict[int, list[tuple[int, int]]] = {}

@@ -45,7 +45,7 @@ MAX_SCALE_ERROR = math.log(1.08)
 """Largest departure of a ratio of scales from one, besides two standard errors. Tried on maps bent by hand, by 10, 20
 and 50 %: 20 % is found, and right maps depart by 1 to 3 %."""
 MIN_SPANNING = 3
-"""Least number of pairs or triplets that tell whether the map fits together at a moment."""
+"""Least number of pairs or triplets that decide whether the map fits together at a moment."""
 MAX_LINK_STD = 0.02
 """Standard deviation of the logarithm of the scale across a moment, by the map, from which on it is a weak link: four
 of them are as much as `MAX_SCALE_ERROR`. Right maps have up to 0.004 but for their first and last keyframes."""
@@ -102,16 +102,16 @@ class Break:
 
 @dataclass(frozen=True)
 class MapCheck:
-    """What image pairs and triplets say of a map.
+    """Agreement of image pairs and triplets with a map.
 
     Attributes:
         images: number of images, those without a pose included.
-        pairs: number of verified image pairs that mapping did not use, images without a pose included.
+        pairs: number of verified held-out image pairs, images without a pose included.
         agreeing: number of those that agree with the map.
-        triplets: number of triplets that tell a ratio of scales, images without a pose included.
+        triplets: number of triplets that determine a ratio of scales, images without a pose included.
         consistent: number of those that agree with the map.
         used_agreeing: share of all pairs, used or not, that agree.
-        distance_px: median distance of the matches of pairs that mapping did not use from where the map allows them.
+        distance_px: median distance of the matches of held-out pairs from where the map allows them.
         evidence: of each of these pairs, the logarithm of how much better than chance the map predicts its matches and
             the ratios of scales that it is part of; 0 where it does not.
         breaks: moments at which the map does not fit together, or may not, in the order of time.
@@ -147,7 +147,7 @@ class MapCheck:
 
     @property
     def weak_links(self) -> int:
-        """Number of moments at which nothing tells whether the scale is the same."""
+        """Number of moments across which the map does not determine the scale."""
         return sum(each.kind is BreakKind.UNKNOWN for each in self.breaks)
 
     def doubting(self, frames: Collection[int]) -> MapCheck:
@@ -164,8 +164,8 @@ class MapCheck:
     def sentence(self) -> str:
         """The check in a sentence."""
         if not self.pairs:
-            return "no image pairs that mapping did not use"
-        words = f"{self.agreeing / self.pairs:.0%} of {self.pairs} image pairs that mapping did not use agree"
+            return "no held-out image pairs"
+        words = f"{self.agreeing / self.pairs:.0%} of {self.pairs} held-out image pairs agree"
         if self.triplets:
             words += f", and {self.consistent / self.triplets:.0%} of {self.triplets} ratios of scales"
         if self.breaks:
@@ -203,7 +203,7 @@ def check_map(
         views: features of the images.
         pairs: verified pairs of the images.
         camera: of all images.
-        held_back: rows of the pairs that mapping did not use; None: all.
+        held_back: rows of the held-out pairs; None: all.
         reduction: factor by which images are reduced before features are found.
         links: how well the map ties the scale across its moments; None: weak links are not sought.
     """
@@ -268,9 +268,9 @@ def _median_depth(depths: Collection[PairDepths]) -> float:
 def _triplets(
     depths: dict[int, PairDepths], pairs: Sequence[ViewPair], posed: Sequence[bool], agrees: Sequence[bool]
 ) -> tuple[list[_Triplet], int]:
-    """The triplets of agreeing pairs that tell a ratio of scales, and the number of those with an image without a pose.
+    """The triplets of agreeing pairs that determine a ratio of scales; the number of those with an unposed image.
 
-    By wrong relative poses, depths mean nothing.
+    Depths by wrong relative poses are meaningless.
     """
     before: dict[int, list[int]] = {}
     after: dict[int, list[int]] = {}
@@ -296,7 +296,7 @@ def _evidence(distances_px: Array, triplets: Sequence[_Triplet]) -> Array:
 
     Args:
         distances_px: median distances of the matches of pairs from where the map allows them; infinite without a pose.
-        triplets: that tell a ratio of scales.
+        triplets: that determine a ratio of scales.
     """
     found = _likelihood_ratio(distances_px, PAIR_STD_PX, CHANCE_PX)
     sums, counts = np.zeros_like(found), np.zeros_like(found)

@@ -1,4 +1,4 @@
-"""Depths of the matches of a pair of images by its relative pose; what two pairs with a common image tell by them."""
+"""Depths of the matches of an image pair by its relative pose; the ratio of scales of two pairs that share an image."""
 
 from __future__ import annotations
 

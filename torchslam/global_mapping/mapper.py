@@ -1,4 +1,4 @@
-"""The global mapper: from a recording, and what an online run says of it, to a run like any other."""
+"""The global mapper: from a recording and its online run to a run like any other."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ MIN_GENERAL = 0.2
 """Least share of pairs that determine a direction of motion: a camera that only turns has none, or, with a wrong focal
 length, a few; walks have 0.8 and more."""
 HELD_BACK = 10
-"""One in so many verified pairs is not used for mapping, so that it can tell whether the map is right."""
+"""One in this many verified pairs is held out from mapping, for the check of the map."""
 HELD_BACK_DISTANCE = 2
 """Least distance in images of pairs that are held back: pairs of neighbors keep the images together."""
 SAVED_TOGETHER = 50
@@ -91,10 +91,10 @@ class GlobalMap:
     """The result of global mapping.
 
     Attributes:
-        run: a run like any other; without a submap where `run.failure` says why.
+        run: a run like any other; without a submap where `run.failure` has the reason.
         views: features of the images that were mapped, by row, learned ones included.
         pairs: all verified pairs of them.
-        held_back: rows of the pairs that mapping did not use.
+        held_back: rows of the held-out pairs.
         doubtful: frames of images that only learned features hold, in a map that pairs contradict somewhere.
     """
 
@@ -106,7 +106,7 @@ class GlobalMap:
 
     @property
     def held_back_times(self) -> Float[Tensor, " U"]:
-        """The middle of the two images of each pair that mapping did not use, seconds."""
+        """The middle of the two images of each held-out pair, seconds."""
         return middle_times(self.views, self.pairs, self.held_back)
 
 
@@ -122,7 +122,7 @@ def middle_times(
 
 
 Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
-"""Rows of the views that have a pose, the tracks in all views, and what was found."""
+"""Rows of the views that have a pose, the tracks in all views, and the reconstruction."""
 
 
 def mapping_config(config: Config) -> Config:
@@ -174,7 +174,7 @@ def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]
 
 
 class GlobalMapper:
-    """Maps the frames of a recording as a whole.
+    """Maps the frames of a recording, all at once.
 
     Args:
         sequence: the recording.
@@ -225,7 +225,7 @@ class GlobalMapper:
         """
         if learned_config(self.config) is not None and self.extract is None:
             raise ConfigError(
-                "global_mapping.learned_links requires images; the recording brings its features"
+                "global_mapping.learned_links requires images; the recording has precomputed features"
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
         views = self._saved_views(images)
@@ -264,7 +264,7 @@ class GlobalMapper:
         pairs: list[ViewPair],
         held_back: frozenset[int],
     ) -> MapCheck:
-        """What pairs of images say of a reconstruction."""
+        """The check of a reconstruction by pairs of images."""
         rows, _, found = made
         known = torch.zeros(len(views), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
         reduction = self.config.features.reduction(self.camera.size)
@@ -307,7 +307,8 @@ class GlobalMapper:
             learned: more keypoints of the same images, with verified pairs.
 
         Returns:
-            Rows of the views that have a pose, the tracks in all views, and what was found; or why there is no map.
+            Rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason why there
+            is no map.
         """
         self.progress("rotations", 0, 1)
         device = self.camera.params.device
@@ -317,7 +318,7 @@ class GlobalMapper:
         ends = [(pair.first, pair.second) for pair in pairs]
         edges = torch.tensor(ends, dtype=torch.int64, device=device).view(-1, 2)
         if len(edges) == 0:
-            return f"no map: no two of {len(views)} images see the same"
+            return f"no map: no two of {len(views)} images show the same scene"
         R_21 = torch.stack([pair.T_21[:3, :3] for pair in pairs])
         weights = R_21.new_tensor([float(len(pair)) for pair in pairs])
         weights = weights / weights.mean() / ROTATION_STD_RAD**2

@@ -45,7 +45,7 @@ class Relation(Enum):
 
     GENERAL = "rotation and direction"
     PLANE = "rotation; two directions are possible"
-    ROTATION = "rotation; the camera only turned, as far as the matches tell"
+    ROTATION = "rotation; a rotation alone explains the matches"
 
 
 @dataclass(frozen=True)

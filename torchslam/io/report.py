@@ -80,19 +80,19 @@ def readout_metrics(finished: Run) -> dict[str, float] | None:
 
 
 def shake_remark(finished: Run) -> str:
-    """Say that the camera shakes within an image, as residuals that depend on the row show; empty if it does not."""
+    """Describe a camera that shakes within an image, by residuals that depend on the row; empty if it does not."""
     found = finished.shutter
     if found is None or not found.is_shaken:
         return ""
     return (
-        "the rows of an image seem to be exposed one after the other, and the camera shakes within an image (the row "
-        f"explains {found.by_row:.0%} of the squared errors, the column {found.by_column:.0%}), which is not modeled: "
-        "poses in fast turns are less exact"
+        "rolling shutter, and the camera shakes within an image, which is not modeled (the row explains "
+        f"{found.by_row:.0%} of the squared errors, the column {found.by_column:.0%}): poses in fast turns are less "
+        "accurate"
     )
 
 
 def check_metrics(mapped: MappedRecording | None) -> dict[str, Any]:
-    """How a recording was mapped, and what image pairs say of the map; empty where it was not checked."""
+    """The mapping that was kept, and the check of its map; empty where it was not checked."""
     if mapped is None:
         return {}
     check = mapped.check
@@ -124,7 +124,7 @@ def run_metrics(
     - `online_posed`: frames with a pose in the main submap when it was reported frame by frame.
     - `fps`, `ms_median`, `ms_p95`: time of `SLAM.step`, without image decoding; `fps` is the inverse of the mean.
       Those of the online stage where the global map was kept; 0 if no frame was processed online.
-      `ms_longest`: the longest time of a frame after the one that initialized the map.
+      `ms_longest`: the longest time of a frame after the frame that initialized the map.
     - `metric`: how well the unit of the main submap is known to be a meter, see `map.unit.MetricUnit`, or None;
       `unmeasured`: why sources of meters said nothing.
     - With ground truth: the errors of the evaluation, and `online_ate_m`, that of the poses as reported online
@@ -256,7 +256,7 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
     if metrics.get("dropped"):
         rows["dropped"] = f"{metrics['dropped']} frames (processing too slow)"
     if latency := metrics.get("latency_ms"):
-        rows["latency"] = f"{latency['median']:.0f} ms in the median, {latency['p95']:.0f} ms at 95 %"
+        rows["latency"] = f"{latency['median']:.0f} ms median, {latency['p95']:.0f} ms at 95 %"
     if metrics["initialized_at"] is None:
         return rows | {"map": "none"}
     rows |= {
@@ -272,7 +272,7 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
             f"{metrics['track_length']:.1f} frames, {metrics['uncertain'] / frames:.1%} of the frames uncertain"
         )
     if metrics.get("check"):
-        how = {"online": "frame by frame", "global": "mapped as a whole"}[metrics["mapping"]]
+        how = {"online": "frame by frame", "global": "global mapping"}[metrics["mapping"]]
         rows["check"] = f"{how}: {metrics['check']['sentence']}"
     rows |= _describe_submaps(metrics)
     rows |= {"camera": metrics["camera"]} if metrics.get("camera") else {}
@@ -285,20 +285,20 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
 
 
 def unit_words(metrics: Mapping[str, Any]) -> str:
-    """Describe the unit of lengths in a line: how well it is known to be a meter, or what would tell."""
+    """Describe the scale in a line: its error if it is metric, else the options that determine it."""
     metric = metrics.get("metric")
     if metric is not None:
         return str(metric["sentence"])
     flags = ", ".join(kind.options[0].flag for kind in KINDS)
-    return f"the unit is arbitrary; it is a meter with one of {flags}"
+    return f"scale is arbitrary; for meters use {flags}"
 
 
 def readout_words(readout: Mapping[str, Any]) -> str:
     """Describe the entry `readout` of metrics.json."""
-    source = f"given: {readout['given_ms']:g} ms" if readout["given_ms"] else "found"
+    source = f"given: {readout['given_ms']:g} ms" if readout["given_ms"] else "estimated"
     return (
-        f"{readout['ms']:.1f} ± {readout['std_ms']:.1f} ms from the first row to the last ({source}): a rolling "
-        "shutter, which the final poses take into account"
+        f"{readout['ms']:.1f} ± {readout['std_ms']:.1f} ms from the first row to the last ({source}): "
+        "rolling shutter, corrected in the final poses"
     )
 
 

@@ -45,7 +45,7 @@ KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
 MAP = "map.safetensors"
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
-STAGES = "global_mapping"  # folder with what global mapping has found, while a run is going on
+STAGES = "global_mapping"  # folder of the saved stages of global mapping, during a run
 POINT_CLOUD = "map.ply"
 DENSE_CLOUD = "dense.ply"  # of the main submap, z up as in POINT_CLOUD
 MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
@@ -343,7 +343,7 @@ def source_of(path: str, fps: float | None, sequence: Sequence) -> dict[str, Any
 def read_image_source(
     directory: Path, metrics: dict[str, Any], submaps: Iterable[Submap], elsewhere: str | None = None
 ) -> ImageSource | None:
-    """Read where the images of a run are, and by what they are found; None if a run does not say where.
+    """Read where the images of a run are, and by what they are found; None if they are not stated.
 
     Args:
         directory: the results folder.

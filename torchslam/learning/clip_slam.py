@@ -382,7 +382,7 @@ class ClipSLAM(nn.Module):
         """The graph of one clip, or None and the reason why no map was initialized."""
         check_features(features, images, type(self.extractor).__name__)
         features = features.to(camera.params.device)
-        # The camera is the one that poses are differentiated by. A clip is too short for the patience of a run.
+        # Poses are differentiated by this camera. A clip is too short for the patience of a run.
         start = self.config.initialization
         start = replace(start, min_planar_frames=min(start.min_planar_frames, len(images) // 2))
         config = replace(self.config, camera=CameraConfig(std=0.0, readout_std=0.0), initialization=start)
@@ -394,7 +394,7 @@ class ClipSLAM(nn.Module):
         run = finish(slam, [slam.step(frame) for frame in frames], skipped=[], interrupted=False)
         if run.main is None:
             return None, run.failure
-        # With the stated noise: training moves the keypoints away from those of which a noise was found.
+        # With the stated noise: training moves the keypoints away from those whose noise was estimated.
         graph = run.main.posed_frames.graph(run.map, SensorModel(run.camera))
         return graph, run.failure
 
@@ -431,7 +431,7 @@ def _as_seen(
         raise ValueError(
             f"{jumped} of {len(moved)} keypoints are up to {float(moved.max()):.0f} px from where the graph has them: "
             "their rows hold other keypoints now. Use features of `extract(images, graph)`, of an extractor with "
-            "`read`, or build the graph anew"
+            "`read`, or build the graph again"
         )
     return replace(run, pixels=pixels, weights=weights, camera=camera)
 

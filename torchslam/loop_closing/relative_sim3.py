@@ -149,7 +149,7 @@ class RelativeSim3Estimator:
     def _first_guess(
         self, map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int
     ) -> Float[Tensor, "4 4"] | None:
-        """The pose of keyframe 1 in map 2, from points that both keyframes observe; None if none was found."""
+        """The pose of keyframe 1 in map 2, from points that both keyframes observe; None if there is none."""
         view_1, view_2 = map_1.frame_features(keyframe_1), map_2.frame_features(keyframe_2)
         points_1 = map_1.keyframes["point_ids"][keyframe_1]
         points_2 = map_2.keyframes["point_ids"][keyframe_2]

@@ -113,7 +113,7 @@ def compact(submap: Submap) -> RowRemap | None:
 
 
 def is_worth_compacting(submap: Submap) -> bool:
-    """Test whether so many rows are invalid that removing them costs O(1) for each of them."""
+    """Test whether enough rows are invalid that removing them costs O(1) for each of them."""
     rows, valid = len(submap.map.points), submap.map.num_points
     invalid = rows - valid
     return (

@@ -27,7 +27,7 @@ from torchslam.map.unit import MetricUnit
 from torchslam.utils.files import check_regular, parse_json, write_whole
 
 FORMAT = 2
-"""Number of the file format; docs/versions.md says which version reads which."""
+"""Number of the file format; docs/versions.md lists which version reads which."""
 TABLES: dict[str, Schema] = {
     "points": POINTS,
     "keyframes": KEYFRAMES,

@@ -270,7 +270,7 @@ class Map:
 
         Args:
             keyframes: Rows; None: all.
-            as_detected: Whether the pixels are those at which keypoints were found, in place of those of a global
+            as_detected: Whether the pixels are those of the detected keypoints, in place of those of a global
                 shutter.
         """
         if keyframes is None:

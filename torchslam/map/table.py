@@ -81,7 +81,7 @@ KEYFRAMES: Schema = {
     "frame_index": Column((), "int", "index in the sequence of its session"),
     "timestamp": Column((), "float", "seconds"),
     "keypoints": Column(("N", 2), "float", "pixels of a global shutter, at the time of the middle row"),
-    "detected": Column(("N", 2), "float", "pixels at which the keypoints were found"),
+    "detected": Column(("N", 2), "float", "pixels of the detected keypoints"),
     "scales": Column(("N",), "float", "pixels"),
     "angles": Column(("N",), "float", "radians"),
     "descriptors": Column(("N", "D"), "descriptor", "descriptors of the keypoints"),

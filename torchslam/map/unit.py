@@ -44,10 +44,10 @@ class UnitSource:
 
     Attributes:
         source: what measured, in words.
-        meters_per_unit: as it says.
+        meters_per_unit: length of a map unit, meters.
         relative_std: its relative standard error.
         count, unit: how many of what, such as 12 "markers".
-        apart: relative standard deviation of the single ones; None where it says nothing of them.
+        apart: relative standard deviation of the single measurements; None where unknown.
         rejected: one line for each single one that contradicts the others.
         notes: other remarks for the user, one line each.
     """

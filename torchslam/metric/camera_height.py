@@ -43,7 +43,7 @@ RADIUS_X, RADIUS_Y = 3, 2
 SAMPLE_SHARE = 1 / 600
 """Distance of the samples of a window in widths of the image; at least a pixel."""
 RANGE, STEPS = 2.0, 32
-"""The search reaches from the guess by sparse points divided by RANGE to that times RANGE, in so many steps."""
+"""The search reaches from the guess by sparse points divided by RANGE to that times RANGE, in this number of steps."""
 GUESS_QUANTILE = 0.85
 """Of the heights of the map points below the camera: most of them lie between the ground and the camera."""
 LEAST_POINTS = 5
@@ -104,7 +104,7 @@ class CameraHeight:
 
 
 def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
-    """Heights of the camera above the ground in the frames in which it was found, map units."""
+    """Heights of the camera above the ground in the frames in which the ground was detected, map units."""
     T_cw = view.T_cw.detach().cpu().double()
     centers_w = se3_inverse(T_cw)[:, :3, 3]
     windows = _Windows.of(view.camera.to("cpu"))

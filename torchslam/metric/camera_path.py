@@ -100,7 +100,7 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class Clock:
-    """What the user says about a clock.
+    """A clock as given by the user.
 
     Attributes:
         seconds: that are added to the file's times to give those of the images.
@@ -128,7 +128,7 @@ def parse_clock(text: str, option: str) -> Clock:
 
 
 def clocks_of(given: Given, option: str) -> list[tuple[str, Clock]]:
-    """The files of `--OPTION FILE`, each with what `--OPTION-clock` says of it; once, it is said of all.
+    """The files of `--OPTION FILE`, each with its `--OPTION-clock`; a single one holds for all.
 
     Raises MeasurementError for a clock that is none, or where their numbers differ.
     """
@@ -144,7 +144,7 @@ def clocks_of(given: Given, option: str) -> list[tuple[str, Clock]]:
 
 
 def clock_notes(file: Path, shift: float, std: float | None = None) -> list[str]:
-    """What is said of a clock if that of the images is so many seconds ahead, and of the error if it is known."""
+    """Notes about a clock if that of the images is this many seconds ahead, with the error if it is known."""
     if not shift:
         return []
     error = "" if std is None else f" ± {std:.2f}"
@@ -194,8 +194,8 @@ def found_shift(
     """Seconds that the clock of the images is ahead, in steps; zero unless another one fits far better.
 
     Args:
-        cost_at: minus the logarithm of the likelihood, up to a constant, if it is so many seconds ahead; None where too
-            little is left to tell.
+        cost_at: minus the logarithm of the likelihood, up to a constant, if it is this many seconds ahead; None where
+            too few samples are left.
         duration: of the recording, seconds.
         step: between the clocks that are tried, seconds.
         least_gain: logarithm of the likelihood ratio from which on another clock is believed.

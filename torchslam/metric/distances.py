@@ -20,7 +20,7 @@ UNIT_STD = 0.01
 """Relative standard deviation of the unit of a map from place to place, by its drift: two lengths in different places
 differ by about that much, however well their ends are found (redkitchen, against its depth images)."""
 MAX_RELATIVE_STD = 0.5
-"""Relative error of a length from which on it says nothing."""
+"""Relative error of a length from which on it is not used."""
 
 
 @dataclass(frozen=True)
@@ -155,7 +155,7 @@ class Distances:
 
 
 def measure_distance(view: SubmapView, distance: Distance) -> ScaleMeasurement | str:
-    """The unit of a submap by one length; or say why it says nothing."""
+    """The unit of a submap by one length, or the reason why it has none."""
     first = locate_pixel(view, distance.first.frame, distance.first.pixel)
     if not isinstance(first, LocatedPixel):
         return first

@@ -1,7 +1,7 @@
 """Depth of a pixel of a posed frame: the same small window in frames around it, along the ray of the pixel.
 
-Every hypothesis of depth puts the window somewhere into the other images; the zero-mean normalized correlation says how
-alike they look there. One pixel costs some tenths of a second, a depth map seconds.
+Every hypothesis of depth puts the window somewhere into the other images; the zero-mean normalized correlation measures
+how alike they look there. One pixel costs some tenths of a second, a depth map seconds.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ REFINED = 65
 BESIDE = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
 """Directions of the clicks beside that of the user; two and two are opposite."""
 LAYER_EVERY = 2
-"""Every so many hypotheses are tried for the windows that have the pixel on their border."""
+"""Every n-th hypothesis, with this n, is tried for the windows that have the pixel on their border."""
 FRAMES = 12
 """Other frames that are compared at most, spread over those with a fitting parallax."""
 ANGLES_DEG = (1.5, 15.0)
-"""Parallax of these frames: less says little of depth, more makes the window look different."""
+"""Parallax of these frames: less determines depth poorly, more makes the window look different."""
 RADII = 4, 8, 12
 """Of the windows, in samples: a larger one where a smaller one finds nothing, or several places."""
 SAMPLE_SHARE = 1 / 500
@@ -43,7 +43,7 @@ BEST_SHARE = 0.6
 LEAST_FRAMES = 3
 """Frames without which there is no depth."""
 LEAST_SCORE = 0.6
-"""Correlation below which nothing was found."""
+"""Correlation below which a search has failed."""
 AGREEING = 3
 """Steps of the first search by which the best depth of a single frame may differ."""
 AGREEING_SHARE = 0.4
@@ -184,7 +184,7 @@ def _maximum(at: Float[Tensor, " N"], scores: Float[Tensor, " N"]) -> float:
 
 @dataclass(frozen=True)
 class _Sweep:
-    """A window of a frame, and the other frames in which it is looked for."""
+    """A window of a frame, and the other frames that are searched for it."""
 
     view: SubmapView
     T_cw: Float[Tensor, "4 4"]

@@ -58,7 +58,7 @@ OUTLYING = 9.0
 
 
 class InertialReason(StrEnum):
-    """Why an inertial sensor says what it says."""
+    """Outcome of the inertial alignment."""
 
     MEASURED = "measured"
     NO_OVERLAP = "no three seconds of posed frames lie within the times of the samples"

@@ -152,8 +152,8 @@ def standard_errors(
 ) -> tuple[float, float]:
     """Standard errors of the scale, relative, and of gravity's direction, rad; infinite where it is not determined.
 
-    Both grow where the scales of single stretches, with all else as found, differ by more than they should. That of the
-    scale contains the error of the share of noise that was taken out.
+    Both grow where the scales of single stretches, with all else fixed at the solution, differ by more
+    than their errors. That of the scale contains the error of the share of noise that was taken out.
     """
     total = equations.summed(counted, prior)
     down = x[1:4] / x[1:4].norm()

@@ -64,7 +64,7 @@ class InertialSource:
 
 
 def _notes(found: InertialAlignment) -> tuple[str, ...]:
-    """What was found of the sensor."""
+    """The estimates of the sensor."""
     if found.rotation is None:
         return ()
     turn = math.degrees(float(found.rotation.bias.norm()))

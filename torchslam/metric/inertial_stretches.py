@@ -161,7 +161,7 @@ def _chained(
 
 
 def _attitudes(R_wb: Tensor, chained: Tensor, valid: Tensor) -> Float[Tensor, "S 3 3"]:
-    """Attitude of the body at the start of each stretch: the mean over its nodes of what the map says of it."""
+    """Attitude of the body at the start of each stretch: the mean over its nodes, by the map."""
     apart = R_wb @ chained.mT
     middle = apart[:, 0]
     weights = valid[..., None] / valid.sum(-1)[:, None, None]

@@ -49,7 +49,7 @@ class OdometrySource:
     Attributes:
         path: of the file.
         odometry: poses of the sensor, in meters.
-        clock: what the user says about its clock.
+        clock: the clock of the file as given by the user.
     """
 
     path: Path
@@ -89,11 +89,11 @@ class OdometrySource:
         if bool(strange.any()):
             notes.append(
                 f"{self.path}: {int(strange.sum())} of {int(known.sum())} stretches, the first one at "
-                f"{float(middles[strange][0]):.1f} s, turn otherwise than the camera and do not count"
+                f"{float(middles[strange][0]):.1f} s, rotate differently from the camera and do not count"
             )
         notes += clock_notes(self.path, shift)
         notes.append(
-            f"{self.path}: the camera is {float(lever.norm()):.2f} m from the sensor, as its turns show"
+            f"{self.path}: the camera is {float(lever.norm()):.2f} m from the sensor, estimated from rotations"
         )
         stretches = Stretches(middles, lengths_w, lengths, known & turned_alike)
         return measured(stretches, ScaleSource.ODOMETRY, "the odometry", tuple(notes))

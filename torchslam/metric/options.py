@@ -24,7 +24,7 @@ SEPARATOR = ";"
 FILES = frozenset({"FILE", "FOLDER[:SCALE]", "CAMERA"})
 """Words of options that may be names of files."""
 AUTO = "auto"
-"""A word in place of a file: the one that the dataset brings along, as in `--depth auto`."""
+"""A word in place of a file: the file of the dataset, as in `--depth auto`."""
 
 Given = Mapping[str, tuple[tuple[str, ...], ...]]
 """By the name of an option: its words, for each time that it was given. Options that were not given are missing."""
@@ -109,7 +109,7 @@ def given_options(config: MetricConfig, brought: Mapping[str, str] | None = None
     Args:
         config: the settings.
         brought: settings by name, as `Sequence.measurements`; those of a kind that the configuration sets itself do not
-            count. If `config.own` is False, only those count for which the configuration says `AUTO`.
+            count. If `config.own` is False, only those count whose setting is `AUTO`.
 
     Raises:
         ConfigError: an option has another number of words than it needs, the option that it belongs to is missing, or
@@ -122,9 +122,7 @@ def given_options(config: MetricConfig, brought: Mapping[str, str] | None = None
         first, *details = kind.options
         is_asked = own[first.name] == AUTO
         if is_asked and first.name not in brought:
-            raise ConfigError(
-                f"{first.flag} {AUTO}: the recording brings none along; name the file or folder"
-            )
+            raise ConfigError(f"{first.flag} {AUTO}: the recording contains none; give the file or folder")
         is_taken = is_asked or (not own[first.name] and config.own and not kind.on_request)
         if is_taken and first.name in brought:
             own[first.name] = ""

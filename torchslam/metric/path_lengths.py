@@ -17,15 +17,15 @@ from torchslam.metric.slow_noise import scale_of_series
 from torchslam.metric.source import Unmeasured
 
 STRETCH = 1.0
-"""Seconds of a stretch: long enough that noise of single poses does not matter, short enough to tell slips from
+"""Seconds of a stretch: long enough that noise of single poses does not matter, short enough to separate slips from
 drift."""
 PARTS = 5
 """Straight parts of a stretch over which the path of the camera is measured: a car turns by less than 10 degrees in
 one."""
 MIN_STRETCHES = 4
-"""Fewer say nothing of how far they are apart."""
+"""From fewer, their scatter cannot be estimated."""
 STANDING = 0.15
-"""Part of the typical length of a stretch below which it says nothing: the vehicle stands, or nearly."""
+"""Part of the typical length of a stretch below which it is not used: the vehicle stands, or nearly."""
 SEARCH_STEP = 0.1
 """Seconds between the clocks that are tried."""
 SEARCH_GAIN = 18.0

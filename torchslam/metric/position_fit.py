@@ -183,7 +183,7 @@ def _robust_start(pairs: PositionPairs) -> _Model:
 def _scatter(
     residuals: Float[Tensor, "N 3"], inliers: Bool[Tensor, " N"], pairs: PositionPairs
 ) -> Float[Tensor, "N 3"]:
-    """Standard deviations along the axes: those that were stated, times what the residuals say of them."""
+    """Standard deviations along the axes: the stated ones, scaled by the residuals."""
     known = _known(pairs) & inliers[:, None]
     stated = torch.cat((pairs.std[:, :1].expand(-1, 2), pairs.std[:, 1:]), dim=-1)
     typical = stated.nanmedian(0).values

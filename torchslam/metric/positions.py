@@ -38,7 +38,7 @@ MIN_AGREEING = 0.5
 MAX_RELATIVE_STD = 0.25
 """Relative standard error from which on a scale is no measurement: positions then hardly differ beyond their noise."""
 SWAPPED = 3.0
-"""How much nearer a path must be to positions with latitude and longitude exchanged before it is said that they are."""
+"""How much nearer a path must be to positions with latitude and longitude exchanged before a note is written."""
 LINE_UP_STD = math.radians(15.0)
 """Standard error of up from which on positions do not constrain the rotation about their line."""
 UPSIDE_DOWN = -0.5
@@ -56,7 +56,7 @@ SAID = 3.0
 SECOND_PASS = 0.1
 """Seconds of a clock's error from which on the path is looked up again: it is straight for less."""
 LISTED = 3
-"""Positions that are named singly where they do not agree."""
+"""Most positions off the path that are listed one by one."""
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class PositionSource:
 
     Attributes:
         fixes: the positions.
-        clock: what the user says about their clock.
+        clock: the clock of the file as given by the user.
     """
 
     fixes: Fixes
@@ -78,7 +78,7 @@ class PositionSource:
             return _unmeasured(f"only {len(path.timestamps)} frames have a pose")
         if self.fixes.timestamps is None:
             if view.sequence is None:
-                return _unmeasured(f"{self.fixes.path} has positions of images, which are not at hand")
+                return _unmeasured(f"{self.fixes.path} has positions of images, which are not available")
             names = [view.sequence.file_name(index) for index in view.frame_index.tolist()]
             found = self._by_names(names, path)
         else:
@@ -97,7 +97,7 @@ class PositionSource:
         found = rows >= 0
         if not bool(found.any()):
             raise MeasurementError(
-                f"{self.fixes.path}: no image is called as those in it, such as {self.fixes.names[0]}"
+                f"{self.fixes.path}: no image has one of its names, such as {self.fixes.names[0]}"
             )
         positions_e, std, has_height = self._local(rows[found])
         positions_w = path.T_wc[found, :3, 3]
@@ -172,7 +172,7 @@ class PositionSource:
 
         return found_shift(cost_at, path.duration, SEARCH_STEP, SEARCH_GAIN)
 
-    # --- what it says ----------------------------------------------------------------------------------------
+    # --- the result ----------------------------------------------------------------------------------------
 
     def _fitted(self, pairs: PositionPairs, path: CameraPath, clock_std: float) -> PositionFit | Unmeasured:
         if len(pairs) < MIN_POSITIONS:
@@ -190,7 +190,7 @@ class PositionSource:
             self._check_swapped(pairs)
             return _unmeasured(
                 f"{len(pairs)} positions over {extent:.1f} m scatter by {fit.noise[0]:.1f} m about the camera's path: "
-                f"the scale is known to {fit.relative_std:.0%} only"
+                f"the scale is uncertain by {fit.relative_std:.0%}"
             )
         if float(fit.up_w @ path.up_w) < UPSIDE_DOWN:
             self._check_swapped(pairs, better=1.0)
@@ -234,8 +234,8 @@ class PositionSource:
             notes += clock_notes(self.fixes.path, offset, fit.offset_std)
         if line:
             notes.append(
-                f"{self.fixes.path}: the positions lie on a line: the turn about it is the one in which the images are "
-                "upright"
+                f"{self.fixes.path}: the positions lie on a line; the rotation about it is chosen such that the images "
+                "are upright"
             )
         return notes
 

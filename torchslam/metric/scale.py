@@ -39,7 +39,7 @@ class ScaleSource(StrEnum):
 
 @dataclass(frozen=True)
 class ScaleMeasurement:
-    """What one source says about the unit of one submap.
+    """The measurement of the unit of one submap by one source.
 
     Attributes:
         source: where it comes from.
@@ -99,7 +99,7 @@ def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
     """Average the logarithms of the scales, weighted by their information.
 
     Where measurements contradict each other, the error grows by their disagreement (the Birge ratio, 1932), and each
-    contradiction is named.
+    contradiction is listed.
 
     Raises:
         MeasurementError: there is no measurement.

@@ -1,4 +1,4 @@
-"""Depth images of a sensor beside the camera as a source of meters: how deep it says that the points of the map are.
+"""Depth images of a sensor beside the camera as a source of meters: its depths of the points of the map.
 
 The depths of a point in a frame, by the sensor and by the map, have the ratio of their units. The sensor is assumed at
 the place of the camera, with its axes; what it is aside, some centimeters, is part of the stated error.
@@ -32,9 +32,9 @@ IMAGES = 60
 """Depth images that are read at most, evenly over the recording; with 20 and with 100 redkitchen's scale is the same to
 .1 %."""
 LEAST_IMAGES = 3
-"""Images without which nothing says how far they are apart."""
+"""Fewest images whose scatter is estimated."""
 LEAST_POINTS = 10
-"""Points of an image without which it says nothing."""
+"""Fewest points of an image that give a scale."""
 PATCH = 5
 """Pixels of the side of the patch around a point, of which all must have depth, and one depth."""
 NOISE = 1.5e-3
@@ -133,7 +133,7 @@ class SensorDepth:
         notes = []
         if not self.images.said:
             notes.append(
-                f"{self.images.source} is taken to have {units:g} units per meter; --depth FOLDER:SCALE says otherwise"
+                f"{self.images.source}: assuming {units:g} units per meter; --depth FOLDER:SCALE states another number"
             )
         if unreadable:
             notes.append(f"{len(unreadable)} depth images cannot be read, the first one: {unreadable[0]}")

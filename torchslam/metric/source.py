@@ -1,4 +1,4 @@
-"""What a source of metric measurements is: it is shown a finished submap, and says what it knows of its unit."""
+"""The interface of a source of metric measurements: from a finished submap to a measurement of its unit."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class SubmapView:
         submap: map and posed frames.
         camera: of all frames.
         session: the session whose frames the measurements belong to.
-        sequence: the images of the session; None where they are not at hand.
+        sequence: the images of the session; None where they are not available.
         readout: of a rolling shutter; None: a global one.
     """
 
@@ -72,7 +72,7 @@ class SubmapView:
 
 @dataclass(frozen=True)
 class Unmeasured:
-    """A source that says nothing about a submap.
+    """A source without a result for a submap.
 
     Attributes:
         source: which one.

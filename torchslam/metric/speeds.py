@@ -35,7 +35,7 @@ class SpeedSource:
 
     Attributes:
         speeds: the speeds.
-        clock: what the user says about their clock.
+        clock: the clock of the file as given by the user.
     """
 
     speeds: Speeds

@@ -34,8 +34,8 @@ from torchslam.optim.pose_graph._sparse_cholesky import (
     factorize_sparse,
 )
 
-# Edges from one view are compared with so many that follow, ascending by the other view: in a complete graph of K views
-# there are K^3 / 6 triangles. Neighbors in a sequence have neighboring numbers.
+# Edges from one view are compared with this number of following ones, ascending by the other view: in a complete graph
+# of K views there are K^3 / 6 triangles. Neighbors in a sequence have neighboring numbers.
 _TRIANGLE_REACH = 32
 # Of the squared width from one kernel to the next, as in Yang et al. With 1.1 (2.5 times slower) a few more of the
 # graphs with 40 % of wrong edges end at the best minimum, with 2.0 fewer.

@@ -208,10 +208,10 @@ def camera_evidence(
     options: SolverOptions = GRAPH_OPTIONS,
     when: Shaped[Tensor, " K"] | None = None,
 ) -> CameraEvidence | None:
-    """What a bundle adjustment says about its camera. Detached.
+    """Compute the evidence of a bundle adjustment about its camera. Detached.
 
-    `camera_evidence(problem, given).estimate().departure` says by how many standard errors the images contradict the
-    given camera, in the directions that the stretches of the recording agree on.
+    `camera_evidence(problem, given).estimate().departure` is the number of standard errors by which the images
+    contradict the given camera, in the directions that the stretches of the recording agree on.
 
     Args:
         problem: at its minimum, with the camera found there.

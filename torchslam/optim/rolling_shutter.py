@@ -34,7 +34,7 @@ from torchslam.optim.model_choice import Gain
 from torchslam.optim.run_graph import ObservationGraph
 
 MIN_FRAMES, MAX_FRAMES = 12, 60
-"""Frames of a test, evenly distributed over a run; more would take longer than they tell."""
+"""Frames of a test, evenly distributed over a run; more take longer without a clearer result."""
 ONLINE_FRAMES = 30
 """Most frames of a test while a run goes on. Tried from 20 to 60: on four recordings the readout is the same within its
 error, which is up to 1.6 times as large with 20. A test of 30 takes .08 CPU s."""

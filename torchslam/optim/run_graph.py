@@ -81,7 +81,7 @@ class ObservationGraph:
         camera: one for all frames.
         is_keyframe: Keyframes and points are solved together, the other frames against the points.
         submap: submap of each frame, 0 if omitted. Submaps share nothing but the camera.
-        calibration: the given camera with its error, from which `camera` was found; None: `camera` is exact.
+        calibration: the given camera with its error, the prior of `camera`; None: `camera` is exact.
         readout: of a rolling shutter, for which `pixels` are not corrected; None: a global shutter.
     """
 
@@ -362,7 +362,7 @@ def solve_graph(
             camera is fixed where there is none.
         options: how to minimize; gradients reach pixels, weights and camera, or the calibration where that is a prior.
         progress: called before each iteration of a bundle adjustment.
-        frame_factors: measured motions or distances between keyframes of one submap, or errors of one's own, with rows
+        frame_factors: measured motions or distances between keyframes of one submap, or custom residuals, with rows
             of the graph's frames.
         depth_prior: depths of the observations. Those of frames that are not keyframes do not count.
 
@@ -646,7 +646,7 @@ def _solve(
         for submap in graph.submaps
     ]
     bundles = adjust(submaps)
-    # Rows of all graphs, one after the other, as `concatenate_graphs` has them; `submap` tells the graphs apart.
+    # Rows of all graphs, one after the other, as `concatenate_graphs` has them; `submap` distinguishes the graphs.
     joined = concatenate_graphs([_plain(graph, number) for number, graph in enumerate(graphs)])
     frame_starts, point_starts = _starts([g.T_cw for g in graphs]), _starts([g.points_w for g in graphs])
     frames = torch.cat([submap.keyframes + frame_starts[submap.graph] for submap in submaps])

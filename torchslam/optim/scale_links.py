@@ -33,7 +33,7 @@ class ScaleLinks:
     Attributes:
         frames: frame of each keyframe, ascending.
         std: standard deviation of the logarithm of the scale after each keyframe but the last to that before;
-            infinite where nothing ties it.
+            infinite where no point connects the two sides.
     """
 
     frames: tuple[int, ...]
@@ -107,7 +107,7 @@ def scale_stds(
 
 
 def _point_information(problem: BundleProblem, options: SolverOptions) -> Float[Tensor, "O 3 3"]:
-    """What each observation says about its point with its frame fixed, by the weight that the kernel gives it."""
+    """Information of each observation about its point with its frame fixed, weighted by the kernel."""
     T_cw, frame = problem.T_cw[problem.frame_index], problem.frame_index
     points_c = transform(T_cw, problem.points_w[problem.point_index][:, None])[:, 0]
     pixels, is_valid, J, _ = problem.camera.project_with_jacobians(points_c)

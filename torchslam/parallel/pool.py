@@ -56,7 +56,7 @@ class WorkerLostError(Exception):
 
 
 class RemoteError(Exception):
-    """Traceback of an exception in a worker, as the cause of the one that is raised here."""
+    """Traceback of an exception in a worker, as the cause of the exception raised here."""
 
 
 @dataclass(eq=False)
@@ -239,8 +239,8 @@ class WorkerPool:
             worker.end()
             if not isinstance(error, OSError | EOFError):
                 raise
-            reason = "does not answer" if isinstance(error, BlockingIOError) else "has ended"
-            warnings.warn(f"another process of this run {reason}: going on without it", stacklevel=4)
+            reason = "does not answer" if isinstance(error, BlockingIOError) else "died"
+            warnings.warn(f"a worker process {reason}; continuing without it", stacklevel=4)
 
 
 class SharedTasks(WorkerPool):
@@ -359,7 +359,7 @@ def _serve_when_imported(connection: Connection) -> None:
 def _serve(connection: Connection, task: bytes) -> None:
     """Answer calls.
 
-    Threads receive and send, so that neither this process nor the one that asks waits for the other one to receive.
+    Threads receive and send, so that neither process waits for the other one to receive.
     """
     received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()

@@ -153,7 +153,7 @@ def reader(
 
 
 def prefetch_obstacle(sequence: Sequence, slam: _System) -> str:
-    """Message that says why the frames of a sequence cannot be prefetched; empty if they can."""
+    """The reason why the frames of a sequence cannot be prefetched; empty if they can."""
     if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"
     if slam.has_custom_components:

@@ -3,7 +3,7 @@
 given poses -> images -> view graph -> rounds from the given poses, or anew where the images contradict them -> camera
             -> the other frames -> one graph of all frames, with covariances -> frame and unit of the given poses
 
-The pairs of images that this did not use decide between the given and the refined poses.
+The held-out pairs of images decide between the given and the refined poses.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ class _Refinement:
 
     @torch.no_grad()
     def keep_given_unless_improved(self, is_free: bool) -> bool:
-        """Whether the given poses are kept, by pairs that mapping did not use; a better camera counts as improved."""
+        """Whether the given poses are kept, by held-out pairs; a better camera counts as improved."""
         before, after = self.before, self.after
         improved = after.distance_px < IMPROVED * before.distance_px
         improved = improved or after.used_agreeing > before.used_agreeing + MORE_AGREE

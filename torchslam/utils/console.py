@@ -58,5 +58,5 @@ OPENCV = (
 
 
 def with_install_hint(error: ModuleNotFoundError) -> ModuleNotFoundError:
-    """Return an error that says how to install OpenCV if that is missing, any other error unchanged."""
+    """Return an error with the command that installs OpenCV if that is missing, any other error unchanged."""
     return ModuleNotFoundError(OPENCV, name="cv2") if error.name == "cv2" else error

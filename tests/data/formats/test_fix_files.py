@@ -125,7 +125,7 @@ def test_nmea_past_midnight(tmp_path: Path) -> None:
     assert "left out 1 rows without a position" in fixes.notes[0]
     damaged = read(tmp_path, "log.nmea", with_sums(NMEA).replace("48", "49", 1))
     assert len(damaged) == 1
-    assert "1 lines with a wrong sum" in damaged.notes[0]
+    assert "1 lines with a wrong checksum" in damaged.notes[0]
 
 
 def test_csv_by_times_and_by_names(tmp_path: Path) -> None:

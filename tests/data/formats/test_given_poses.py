@@ -92,7 +92,7 @@ def test_images_are_matched_by_the_end_of_their_names() -> None:
         -1,
     ]
     assert given.rows(Named("x/2.png", "x/1.png")).tolist() == [2, -1]
-    with pytest.raises(TrajectoryError, match=r"no image is called as those in it, such as a/1\.png"):
+    with pytest.raises(TrajectoryError, match=r"no image has one of its names, such as a/1\.png"):
         given.rows(Named("x/3.png"))
 
 

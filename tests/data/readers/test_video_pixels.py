@@ -184,7 +184,7 @@ def test_a_given_camera_that_contradicts_the_pixels_is_kept_and_named(clip: Path
     assert contradicting.camera.params.tolist() == [60, 60, 31.5, 23.5]
     (note,) = contradicting.notes
     assert note == (
-        "the file says that its pixels are 4:3, wide to high, so fy should be 1.333 fx; the given camera has 1"
+        "the file declares pixels of 4:3, width to height, so fy should be 1.333 fx; the given camera has 1"
     )
 
 

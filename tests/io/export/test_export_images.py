@@ -114,7 +114,7 @@ def test_a_missing_image_is_named(seen: ExportedScene, folder: Path) -> None:
 
 def test_times_that_were_counted_find_no_images(seen: ExportedScene, folder: Path, tmp_path: Path) -> None:
     """Results of earlier versions, and frames that are files in one of run and sequence alone."""
-    with pytest.raises(ResultsError, match=r"do not say which image each frame was: run again"):
+    with pytest.raises(ResultsError, match=r"do not state the image of each frame: run again"):
         open_images(ImageSource(str(folder / "rgb"), fps=10.0), seen)
     with pytest.raises(ResultsError, match=r"film\.avi: not the sequence .* files such as 0\.png"):
         open_images(source(film(tmp_path, seen.camera)), seen)

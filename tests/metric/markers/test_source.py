@@ -123,7 +123,7 @@ def test_a_marker_that_is_there_twice_is_named() -> None:
     found, _ = measured("aruco-4x4:0.1", {3: 1.0, 5: 1.0}, twice=True)
     assert isinstance(found, ScaleMeasurement)
     assert found.count == 1
-    assert found.rejected == ("aruco-4x4 3 is there twice: not used",)
+    assert found.rejected == ("aruco-4x4 3 appears twice: not used",)
 
 
 def test_without_markers_or_images_it_says_why() -> None:

@@ -269,7 +269,7 @@ def _is_fisheye(name: str, of: str, source: str) -> bool:
 
 
 def _from_tree(path: Path, tree: Tree) -> Calibration:
-    """The first camera of a file of keys; what is said above it holds for it, too."""
+    """The first camera of a file of keys; keys above it hold for it, too."""
     source = str(path)
     for chain in _mappings({**tree, **_nested_camera(tree)}):
         keys = Keys({key: value for each in reversed(chain) for key, value in each.items()}, source)

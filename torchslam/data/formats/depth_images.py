@@ -33,7 +33,7 @@ SEVEN_SCENES_DEPTH = "frame-*.depth.png"
 FIVE_THOUSANDTHS, MILLIMETERS = 5000.0, 1000.0
 """Units per meter, of TUM and ICL-NUIM, and of most others."""
 FAR = 65535
-"""A value that says, as 0, that nothing was measured; it is the largest one."""
+"""The largest value; like 0, it marks pixels without a measurement."""
 BOUNDS_M = 0.05, 200.0
 """Meters that the middle depth of an image may have; beyond, its unit is another one. Sensors see .2 to 20 m, rendered
 scenes more."""
@@ -48,7 +48,7 @@ class DepthImages:
         paths: of the files, in the order of their names or times.
         timestamps: seconds; None where only the names say to which image each belongs.
         units_per_meter: of their values.
-        said: whether the user or the layout of the dataset says the unit.
+        said: whether the user or the layout of the dataset states the unit.
     """
 
     source: Path

@@ -60,7 +60,7 @@ class Fix(NamedTuple):
         latitude: degrees; NaN where the receiver had no position.
         longitude: degrees.
         altitude: meters, above the sea or the ellipsoid or the start; NaN if unknown.
-        time: seconds; None where `name` says whose position it is.
+        time: seconds; None where `name` identifies the image.
         name: of an image.
         std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
     """
@@ -129,7 +129,7 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
     if empty:
         said.append(f"{path}: left out {empty} rows without a position")
     if doubled:
-        said.append(f"{path}: left out {doubled} positions of a time that another one has")
+        said.append(f"{path}: skipped {doubled} positions with a duplicate time")
     times = [row.time for row in kept if row.time is not None]
     return Fixes(
         Path(path),
@@ -295,9 +295,7 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         children = {_tag(child): (child.text or "").strip() for child in point}
         time = parse_moment(children.get("time", ""))
         if time is None:
-            raise MeasurementError(
-                f"{where}: no time; a route that was planned says nothing about the images"
-            )
+            raise MeasurementError(f"{where}: no time; a planned route cannot be used")
         latitude, longitude, altitude = (
             math.nan if text == "nan" else parse_number(text, where, MeasurementError)
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
@@ -316,7 +314,7 @@ def _tag(element: ElementTree.Element) -> str:
 def _read_nmea(path: Path, text: str) -> Fixes:
     """GGA, which has the altitude, with the date of the RMC of the same time. Source: NMEA 0183.
 
-    Without RMC the times are seconds since midnight, UTC. Lines with a wrong sum are left out, with a note.
+    Without RMC the times are seconds since midnight, UTC. Lines with a wrong checksum are skipped, with a note.
     """
     rows: list[tuple[str, list[str]]] = []
     damaged = 0
@@ -332,7 +330,7 @@ def _read_nmea(path: Path, text: str) -> Fixes:
             damaged += 1
             continue
         rows.append((f"{path}:{number}", body.split(",")))
-    notes = [f"{path}: left out {damaged} lines with a wrong sum"] if damaged else []
+    notes = [f"{path}: skipped {damaged} lines with a wrong checksum"] if damaged else []
     return checked_fixes(path, _nmea_rows(rows), notes)
 
 

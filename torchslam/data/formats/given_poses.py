@@ -83,7 +83,7 @@ class GivenPoses:
         """
         if self.timestamps is None:
             found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
-            how = f"no image is called as those in it, such as {self.names[0]}"
+            how = f"no image has one of its names, such as {self.names[0]}"
         else:
             found = _by_time(self.timestamps, sequence.timestamps)
             until = sequence.counted_until

@@ -42,7 +42,7 @@ MAX_PIXELS = 1 << 26
 def write_image(path: Path, pixels: UInt8[np.ndarray, "H W *channels"]) -> None:
     """Write gray or BGR pixels in the format that the suffix names; any name of a folder will do.
 
-    OpenCV's own writer takes UTF-8 names only, and says by a return value that it failed.
+    OpenCV's own writer takes UTF-8 names only, and reports a failure by its return value.
 
     Raises:
         ResultsError: If the file cannot be written.

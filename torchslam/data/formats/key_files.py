@@ -26,7 +26,7 @@ TIGHT_KEY = re.compile(r"^( *(?:- +)?[A-Za-z_][\w.]*):(?=[^\s/:])", re.MULTILINE
 def read_tree(text: str, suffix: str) -> Tree | None:
     """Read the text of a file, by its first character or its suffix; None if it is none of these.
 
-    Raises ValueError, which says what is wrong.
+    Raises ValueError with the reason.
     """
     start = text.lstrip()
     if start.startswith("{"):

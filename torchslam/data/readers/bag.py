@@ -42,7 +42,7 @@ MAX_RECORDING, MAX_METADATA = 1 << 44, 1 << 22
 MAX_FILES = 10_000
 """Files of a recording that are looked at: six days, one each minute."""
 SAMPLES = 20
-"""Images in which the brightest pixel is looked for, where they have 16 bits."""
+"""Number of 16-bit images that are searched for the brightest pixel."""
 
 # https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them gray.
 GRAY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}

@@ -2,7 +2,7 @@
 
 OpenCV does not look whether FFmpeg has converted a frame. From FFmpeg 7.1 on (OpenCV 4.13), interlaced frames are not:
 `retrieve` still returns True, with what lies in its buffer, which is the frame before or memory of anything else. Only
-FFmpeg's log tells. It is read where a frame may be such a one: the first one, and one that repeats the one before.
+FFmpeg's log reports it. It is read where a frame may be such a one: the first one, and one that repeats the one before.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ from torchslam.errors import FrameError, SequenceError
 STDERR = 2
 """File descriptor to which FFmpeg writes its log."""
 SAMPLED = 16
-"""Every so many rows are compared with the frame before."""
+"""Step of the rows that are compared with the previous frame."""
 FAILURE = re.compile(rb"(Cannot convert interlaced)|: fmt:\S+ csp:")
-"""What FFmpeg's log says of a conversion that failed: from which format to which, and why."""
+"""Line of FFmpeg's log about a failed conversion: from which format to which, and why."""
 
 SILENCING = ("OPENCV_FFMPEG_DEBUG", "OPENCV_FFMPEG_LOGLEVEL")
 """Variables that send FFmpeg's log elsewhere, or silence it. OpenCV looks at them when it first opens a video."""
@@ -36,7 +36,7 @@ _LOCK = threading.Lock()
 
 
 def open_capture(source: str) -> cv2.VideoCapture:
-    """Open a video or a stream; FFmpeg's errors go to the error stream, whatever the environment says."""
+    """Open a video or a stream; FFmpeg's errors go to the error stream, whatever the environment variables are."""
     hidden = {name: os.environ.pop(name) for name in SILENCING if name in os.environ}
     try:
         return cv2.VideoCapture(source)
@@ -108,7 +108,7 @@ class Retriever:
 
 
 def _retrieve_with_log(capture: Retrievable) -> tuple[bool, np.ndarray, re.Match[bytes] | None]:
-    """Retrieve a frame; also what the log says of a failure. Other lines go on to the error stream."""
+    """Retrieve a frame; also the log of a failure. Other lines go on to the error stream."""
     with _LOCK, tempfile.TemporaryFile() as log:
         try:
             kept = os.dup(STDERR)

@@ -45,7 +45,7 @@ QUIET = 2.0
 MANY = 100
 """Frames that are skipped with a progress bar."""
 MAX_ASPECT_ERROR = 0.02
-"""Relative error of fy / fx of a given camera before a note says that the file contradicts it."""
+"""Relative error of fy / fx of a given camera before a note reports that the file contradicts it."""
 
 
 class Bar(tqdm):
@@ -104,7 +104,7 @@ class VideoSequence(Sequence):
         ratio = aspect if self._camera is None else float(self._camera.fy / self._camera.fx)
         if abs(ratio / aspect - 1) > MAX_ASPECT_ERROR:
             contradiction = (
-                f"the file says that its pixels are {aspect_text(aspect)}, wide to high, so fy should be "
+                f"the file declares pixels of {aspect_text(aspect)}, width to height, so fy should be "
                 f"{aspect:.4g} fx; the given camera has {ratio:.4g}"
             )
             self.notes = (*self.notes, contradiction)

@@ -302,7 +302,7 @@ def _furniture(painter: Painter) -> list[Rectangle]:
 
 
 def _turned(rectangles: list[Rectangle], turns: int) -> list[Rectangle]:
-    """The same rectangles, textures shared, after so many quarter turns."""
+    """The same rectangles, textures shared, after this number of quarter turns."""
     R = np.linalg.matrix_power(QUARTER_TURN, turns)
     return [
         Rectangle(R @ one.origin, R @ one.axis_u, R @ one.axis_v, one.size, one.texture) for one in rectangles

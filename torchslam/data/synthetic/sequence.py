@@ -140,7 +140,7 @@ def _open(path: str, camera: GivenCamera | None, rate: float | None) -> Sequence
     if camera is None:
         return sequence
     if not (isinstance(camera, Calibration) and camera.guessed):
-        raise CalibrationError(f"{path}: rendered sequences have a camera of their own")
+        raise CalibrationError(f"{path}: rendered sequences have a fixed camera")
     return sequence.with_camera(camera.camera(sequence.size), Calibrated.GUESSED)
 
 

@@ -329,7 +329,7 @@ def open_images(
         otherwise: what to do without them, for the error.
     """
     times = dict(zip(scene.frame_ids.tolist(), scene.timestamps.tolist(), strict=True))
-    if is_live(source.path):  # nor is it connected to because a results folder says so
+    if is_live(source.path):  # nor is it opened because of a results folder
         raise ResultsError(f"{source.path}: a live source gives each image once; {otherwise}")
     try:
         camera = None
@@ -359,7 +359,7 @@ def _image_rows(
     is_of_files, start = any(present), f"{source.path}: not the sequence of this run"
     if is_of_files and not source.files:
         raise ResultsError(
-            f"{source.path}: the results do not say which image each frame was: run again, or --no-images"
+            f"{source.path}: the results do not state the image of each frame: run again, or --no-images"
         )
     if source.files and not is_of_files:
         raise ResultsError(
@@ -398,7 +398,7 @@ def _check_example(sequence: Sequence, source: ImageSource, rows: Mapping[int, i
         return
     try:
         found = sequence.image(rows[example.frame_id])
-    except FrameError:  # is said when it is needed
+    except FrameError:  # reported when it is needed
         return
     if found.shape != example.image.shape or not _is_same_picture(found, example.image):
         raise ResultsError(

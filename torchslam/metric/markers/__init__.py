@@ -1,1 +1,1 @@
-"""Printed markers and boards: what they are, where an image shows them, and what their size says of the unit."""
+"""Printed markers and boards: their definition, their detection in images, and the scale from their size."""

@@ -20,7 +20,7 @@ CORNER_STD_PX = 0.15
 MIN_ANGLE_DEG = 1.0
 """Least parallax of a corner: below, the size of a marker is unknown to a few percent."""
 MAX_ERROR_PX = 5.0
-"""Largest median reprojection error of a marker's corners in the poses of the run: else it moves, or is there twice."""
+"""Largest median reprojection error of a marker's corners in the poses of the run: else it moves, or appears twice."""
 MIN_CORNERS = 3
 """Least corners of a target, so that its size is no single edge."""
 
@@ -97,7 +97,7 @@ def add_corners(
         target = targets[number]
         frames = [sighting.frame for sighting in group]
         if len(set(frames)) < len(frames):
-            dropped.append(f"{target.name(identity)} is there twice: not used")
+            dropped.append(f"{target.name(identity)} appears twice: not used")
             continue
         if target.kind is TargetKind.CHESSBOARD:
             group = _from_one_end(graph, group)
@@ -163,7 +163,7 @@ class _Part:
 
 
 def _from_one_end(graph: RunGraph, group: list[Sighting]) -> list[Sighting]:
-    """Count the corners of a chessboard from the same end in all frames: nothing on it says which one is the first.
+    """Count the corners of a chessboard from the same end in all frames: the board does not mark the first one.
 
     From one sighting to the next in time, the direction from the first to the last corner changes by less than a right
     angle in the world.
@@ -199,7 +199,7 @@ def _place(graph: RunGraph, group: list[Sighting], target: Target, identity: int
     if int(good.sum()) < MIN_CORNERS:
         return None, "is seen from too few places"
     if float(found.errors[good][mask[good]].median()) > MAX_ERROR_PX:
-        return None, "is not in one place"
+        return None, "moves"
     corner, seen_in = torch.nonzero(mask[good], as_tuple=True)
     sides = _sides_px(pixels)
     return (

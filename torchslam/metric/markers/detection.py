@@ -32,7 +32,7 @@ class Detection:
 
     Attributes:
         identity: id of a marker; 0 for a board.
-        rows: of the corners that were found, in `Target.corners`.
+        rows: of the detected corners, in `Target.corners`.
         pixels: where they are.
     """
 

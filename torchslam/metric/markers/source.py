@@ -138,7 +138,7 @@ class _Sizes:
 
 
 def log_sizes(targets: Sequence[PlacedTarget], points_w: Float[Tensor, "N 3"]) -> Float[Tensor, " T"]:
-    """Logarithms of the meters per unit that each target says, differentiable in the points.
+    """Logarithms of the meters per unit by each target, differentiable in the points.
 
     Its size is the root mean square distance of its corners from their center.
     """
@@ -155,7 +155,7 @@ def log_sizes(targets: Sequence[PlacedTarget], points_w: Float[Tensor, "N 3"]) -
 def scale_of_targets(
     with_corners: GraphWithCorners, solution: GraphSolution, pixels: Float[Tensor, "O 2"]
 ) -> ScaleMeasurement:
-    """The unit by all targets of an adjusted graph; a target that contradicts the others does not count, and is named.
+    """The unit by all targets of an adjusted graph; a target that contradicts the others does not count and is listed.
 
     Args:
         with_corners: the graph and its targets.

@@ -60,7 +60,7 @@ class ReprojectionData:
         return ReprojectionData(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
-# Projecting a point ends in so many roundings of a pixel's coordinates, with room to spare.
+# Bound on the rounding error of a projection, in roundings of a pixel's coordinates.
 _ROUNDINGS = 16.0
 
 
@@ -239,7 +239,7 @@ def gauss_newton_expansion(
 
     The curvature of the projection is left out.
 
-    `use_curvature`, broadcastable to (..., N), says where the kernel's curvature counts. Across the residual of an
+    `use_curvature`, broadcastable to (..., N), selects where the kernel's curvature counts. Across the residual of an
     outlier the Hessian is positive, along it negative: the negative part then counts as flat, which keeps the matrix
     positive semi-definite and converges several times faster close to the optimum. Elsewhere the curvature counts as
     zero (iteratively reweighted least squares), which descends from afar.

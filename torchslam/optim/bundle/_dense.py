@@ -46,7 +46,7 @@ from torchslam.optim.bundle._problem import (
 )
 from torchslam.optim.bundle._schur import Marginals
 
-# An observation of the sparse equations costs as much as so many cells of a grid.
+# An observation of the sparse equations costs as much as this number of cells of a grid.
 _MAX_CELLS_PER_OBSERVATION = 8
 
 
@@ -339,7 +339,7 @@ def factorize_dense(
 
 
 def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
-    """Mean (B,) of the diagonal, without the rows that only fill up: each problem has the one that it has alone."""
+    """Mean (B,) of the diagonal, without padding: for each problem the same as for it alone."""
     diagonal = reduced.diagonal(dim1=-2, dim2=-1)
     if free.all():
         return diagonal.mean(-1)

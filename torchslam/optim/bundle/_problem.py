@@ -50,7 +50,7 @@ class BundleProblem:
         pose_prior: T_cw (K, 4, 4) and information (K, 6, 6), zero for frames without a prior.
         camera_prior: prior on the parameters of free cameras.
         depth_prior: measured depths of the observed points.
-        frame_factors: measured motions or distances between frames, or errors of one's own. A batch with factors or
+        frame_factors: measured motions or distances between frames, or custom residuals. A batch with factors or
             depths is solved one problem after the other.
     """
 

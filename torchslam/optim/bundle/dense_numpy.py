@@ -145,7 +145,7 @@ class _Bundle:
         centers_w = -np.einsum("fji,fj->fi", poses[:, :, :3], poses[:, :, 3])
         origin, centers_w = centers_w[self.anchors[0] if len(self.anchors) else 0], centers_w[: self.num_free]
         motions = np.zeros((self.num_free, 6, 1 if len(self.anchors) else 7))
-        motions[:, :3, 0] = centers_w - origin  # its sign says nothing
+        motions[:, :3, 0] = centers_w - origin  # its sign is arbitrary
         if not len(self.anchors):  # translations along and rotations about the axes of the world
             motions[:, :3, 1:4] = motions[:, 3:, 4:] = np.eye(3)
             x, y, z = centers_w.T

@@ -82,7 +82,7 @@ class PoseObservations:
             self.metric = focal.square()  # (2, 1) or (B, 2, 1)
 
     def expand(self, T_cw: Float[Tensor, "B 4 4"], use_curvature: Bool[Tensor, " B"]) -> PoseModel:
-        """The model at T_cw (B, 4, 4); `use_curvature` (B,) says where to add the curvature term."""
+        """The model at T_cw (B, 4, 4); `use_curvature` (B,) selects where to add the curvature term."""
         points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self.points_w)
         rows, (cost, weight, curvature_term) = (
             self._pinhole(points_c) if self.pinhole else self._general(points_c)

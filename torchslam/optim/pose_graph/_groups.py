@@ -138,5 +138,5 @@ class Rotations:
 
 
 def group_of(dims: int) -> Group:
-    """The group whose tangent vectors have so many dimensions: 3, 6 or 7."""
+    """The group whose tangent vectors have this number of dimensions: 3, 6 or 7."""
     return Rotations() if dims == 3 else Similarities(dims)

@@ -103,7 +103,7 @@ def build_pose_graph_layout(
 
 # A long loop resists bending as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
 _DAMPING_SHARE = 1e-4
-# The error of an edge ends in so many roundings of the largest coordinate, with room to spare. A start along a tree of
+# Bound on the rounding error of an edge, in roundings of the largest coordinate. A start along a tree of
 # edges without a loop is off the minimum by these alone.
 _ROUNDINGS = 16.0
 
