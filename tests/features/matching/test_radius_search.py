@@ -68,7 +68,7 @@ def test_the_nearest_of_the_pairs_is_found(seed: int, ratio: float | None, pairs
     with simulated_accelerator() if HAS_SIMULATED_ACCELERATOR else nullcontext(torch.device("cpu")) as other:
         for where in (torch.device("cpu"), other):
             inputs = (tensor.to(where) for tensor in (row, column, distance))
-            found = [x.tolist() for x in nearest_per_row(*inputs, 30, scales.to(where), ratio, 9)]
+            found = [x.tolist() for x in nearest_per_row(*inputs, scales.to(where), ratio, 9)]
             assert list(zip(*found, strict=True)) == expected
 
 

@@ -6,6 +6,8 @@ A radius search finds the keypoints within a radius of predicted pixels, and the
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,14 +33,7 @@ from torchslam.types import Features, Matches
 
 Array = NDArray[Any]
 
-_BAND_HEIGHT = 32.0  # pixels, of the bands of keypoints that the torch backend searches
-# Pixels from one band to the next, and from one image to the next, where keypoints stand in one row. Far more than
-# images have; a wider window takes in keypoints outside of its radius, which are then left out.
-_BAND_OFFSET, _IMAGE_OFFSET = 2.0**20, 2.0**36
-_CELL_WIDTH, _CELL_HEIGHT = (
-    8.0,
-    32.0,
-)  # pixels, in the NumPy backend: a window is some runs of cells, one per row
+_CELL_WIDTH, _CELL_HEIGHT = 8.0, 32.0  # pixels: a window is some runs of cells, one per row
 _MAX_COLUMNS, _MAX_ROWS = 256, 64  # of cells: those of larger images are larger
 
 
@@ -61,31 +56,15 @@ def pairs_within_radius(
     Returns:
         Flat rows b * M + i, ascending, and flat columns b * N + j; the columns of a row are in no particular order.
     """
-    if keypoints.is_cpu:
-        inputs = pixels.double(), radius.double(), mask, keypoints.double(), keypoint_mask
-        found = _pairs_within_radius_numpy(*(tensor.detach().numpy() for tensor in inputs))
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
-    # Keypoints are sorted by band, then by x: what a window takes of a band is one run in that order.
-    x, y = keypoints.double().unbind(-1)
-    at_x, at_y = pixels.double().unbind(-1)
-    low, high = torch.floor((at_y - radius) / _BAND_HEIGHT), torch.floor((at_y + radius) / _BAND_HEIGHT)
-    spans = int((high - low).amax()) + 1
-    bands = low[..., None] + torch.arange(spans, device=low.device)
-    places, starts = torch.floor(y / _BAND_HEIGHT) * _BAND_OFFSET + x, bands * _BAND_OFFSET
-    if len(mask) > 1:
-        image = torch.arange(len(mask), device=mask.device)[:, None] * _IMAGE_OFFSET
-        places, starts = places + image, starts + image[..., None]
-    keys, order = places.masked_fill(~keypoint_mask, torch.inf).flatten().sort(stable=True)
-    left = torch.searchsorted(keys, starts + (at_x - radius)[..., None])
-    right = torch.searchsorted(keys, starts + (at_x + radius)[..., None], right=True)
-    right = torch.where((bands <= high[..., None]) & mask[..., None], right, left)
-    run, place = expand_runs(left.flatten(), right.flatten())
-    row, column = torch.div(run, spans, rounding_mode="floor"), order.index_select(0, place)
-    columns, rows = keypoints.flatten(0, 1).unbind(1), pixels.flatten(0, 1).unbind(1)
-    off_x, off_y = (columns[k].index_select(0, column) - rows[k].index_select(0, row) for k in (0, 1))
-    squared = off_x.square_().add_(off_y.square_())
-    near = torch.nonzero(squared <= radius.flatten().square().index_select(0, row))[:, 0]
-    return row.index_select(0, near), column.index_select(0, near)
+    inputs = pixels.double(), radius.double(), mask, keypoints.double(), keypoint_mask
+    row, column = _by_numpy(_pairs_within_radius, *inputs)
+    return row, column
+
+
+def _by_numpy(function: Callable[..., tuple[Array, ...]], *tensors: Tensor) -> tuple[Tensor, ...]:
+    """A function of arrays for tensors on any device: a call of NumPy costs about a third of one of PyTorch."""
+    found = function(*(tensor.detach().cpu().numpy() for tensor in tensors))
+    return tuple(torch.from_numpy(array).to(tensors[0].device) for array in found)
 
 
 @without_autocast
@@ -101,20 +80,14 @@ def expand_runs(
     Returns:
         The run of each number, ascending, and the numbers.
     """
-    if starts.is_cpu:
-        found = _expand_runs_numpy(starts.numpy(), ends.numpy())
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1])
-    counts = ends - starts
-    run = torch.repeat_interleave(counts)
-    shift = starts - (counts.cumsum(0) - counts)
-    return run, torch.arange(run.shape[0], device=run.device) + shift.index_select(0, run)
+    run, number = _by_numpy(_expand_runs, starts, ends)
+    return run, number
 
 
 def nearest_per_row(
     row: Int[Tensor, " M"],
     column: Int[Tensor, " M"],
     distance: Int[Tensor, " M"],
-    rows: int,
     scales: Float[Tensor, " N"],
     ratio: float | None,
     limit: int | float,
@@ -127,7 +100,6 @@ def nearest_per_row(
         row: rows of the pairs, ascending.
         column: columns of the pairs.
         distance: of the pairs.
-        rows: number of rows.
         scales: of the columns.
         ratio: the nearest must be closer than `ratio` times the nearest other column of its scale; None: no test.
         limit: largest distance, finite.
@@ -135,38 +107,15 @@ def nearest_per_row(
     Returns:
         Rows, ascending, their columns and their distances.
     """
-    if row.is_cpu:
-        pairs = row.numpy(), column.numpy(), distance.numpy()
-        found = _nearest_of_pairs_numpy(*pairs, scales.detach().numpy(), ratio, limit)
-        return torch.from_numpy(found[0]), torch.from_numpy(found[1]), torch.from_numpy(found[2]).float()
-    columns = len(scales)
-    # One number for distance and column: the least is the nearest; ties go to the lowest column.
-    keys = distance * columns + column
-    unset = (int(limit) + 1) * columns
-    best = row.new_full((rows,), unset).scatter_reduce_(0, row, keys, "amin")
-    nearest, chosen = torch.div(best, columns, rounding_mode="floor"), best % columns
-    accepted = nearest <= limit
-    if ratio is not None:
-        of_nearest = scales.index_select(0, chosen).index_select(0, row)
-        rival = (scales.index_select(0, column) / of_nearest - 1).abs_() < SAME_SCALE
-        rival &= keys != best.index_select(0, row)
-        others = torch.where(rival, distance.float(), torch.inf)
-        second = others.new_full((rows,), torch.inf).scatter_reduce_(0, row, others, "amin")
-        accepted &= nearest < ratio * second
-    first = torch.nonzero(accepted)[:, 0]
-    partner = chosen.index_select(0, first)
-    # Likewise of the rows that share a column.
-    keys = nearest.index_select(0, first) * rows + first
-    least = keys.new_full((columns,), unset * rows).scatter_reduce_(0, partner, keys, "amin")
-    kept = torch.nonzero(least.index_select(0, partner) == keys)[:, 0]
-    first = first.index_select(0, kept)
-    return first, partner.index_select(0, kept), nearest.index_select(0, first).float()
+    function = partial(_nearest_of_pairs, ratio=ratio, limit=limit)
+    first, partner, nearest = _by_numpy(function, row, column, distance, scales)
+    return first, partner, nearest.float()
 
 
-def _pairs_within_radius_numpy(
+def _pairs_within_radius(
     pixels: Array, radius: Array, mask: Array, keypoints: Array, keypoint_mask: Array
 ) -> tuple[Array, Array]:
-    """`pairs_within_radius` on the CPU."""
+    """`pairs_within_radius` of arrays."""
     (x, y), (at_x, at_y) = (np.ascontiguousarray(xy.reshape(-1, 2).T) for xy in (keypoints, pixels))
     reach = radius.reshape(-1)
     across = _CellAxis.of(x, _CELL_WIDTH, _MAX_COLUMNS)
@@ -178,10 +127,10 @@ def _pairs_within_radius_numpy(
     top, bottom = (down.cell_of(side) for side in (at_y - reach, at_y + reach))
     first = top * columns + left + _first_cells(mask.shape, down.number * columns)
     bands = np.where(mask.reshape(-1), bottom - top + 1, 0)
-    window, band = _expand_runs_numpy(np.zeros_like(bands), bands)
+    window, band = _expand_runs(np.zeros_like(bands), bands)
     begin = first.take(window) + band * columns
     end = begin + (right - left + 1).take(window)
-    run, place = _expand_runs_numpy(starts.take(begin), starts.take(end))
+    run, place = _expand_runs(starts.take(begin), starts.take(end))
     row, column = window.take(run), order.take(place)
 
     squared = x.take(column) - at_x.take(row)
@@ -193,8 +142,8 @@ def _pairs_within_radius_numpy(
     return row.take(near), column.take(near)
 
 
-def _expand_runs_numpy(starts: Array, ends: Array) -> tuple[Array, Array]:
-    """`expand_runs` on the CPU."""
+def _expand_runs(starts: Array, ends: Array) -> tuple[Array, Array]:
+    """`expand_runs` of arrays."""
     counts = ends - starts
     run = np.repeat(np.arange(len(counts), dtype=np.int64), counts)
     return run, np.arange(len(run), dtype=np.int64) + (starts - (np.cumsum(counts) - counts)).take(run)
@@ -239,7 +188,7 @@ def _first_cells(shape: tuple[int, ...], cells: int) -> Array | int:
     return 0 if batch == 1 else np.repeat(np.arange(batch, dtype=np.int64) * cells, rows)
 
 
-def _nearest_of_pairs_numpy(
+def _nearest_of_pairs(
     row: Array,
     column: Array,
     distance: Array,
@@ -247,7 +196,7 @@ def _nearest_of_pairs_numpy(
     ratio: float | None,
     limit: int | float,
 ) -> tuple[Array, Array, Array]:
-    """`nearest_per_row` on the CPU."""
+    """`nearest_per_row` of arrays."""
     if len(row) == 0:
         return row, column, distance
     is_first = np.empty(len(row), dtype=bool)
@@ -347,7 +296,7 @@ def match_by_projection(
         bits = 8 * descriptors.shape[-1]
         limit = bits if max_distance is None else min(max_distance, bits)
         distances = hamming_between(*pairs)
-        found = nearest_per_row(row, column, distances, batch * rows, keypoint_scales, ratio, limit)
+        found = nearest_per_row(row, column, distances, keypoint_scales, ratio, limit)
         return _scattered(*found, batch, rows, columns)
     distances = pair_distances(*pairs)
     best, accepted, distance = best_per_row(row, column, distances, keypoint_scales, batch * rows, ratio)
