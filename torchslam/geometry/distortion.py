@@ -146,7 +146,7 @@ def _brown_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
     x, y = xy.unbind(-1)
     xx, yy, xy2 = x * x, y * y, 2 * x * y
     r2 = xx + yy
-    powers = r2, r2 * r2, r2 * r2 * r2
+    powers: tuple[Tensor, ...] = (r2, r2 * r2, r2 * r2 * r2)
     if k.shape[-1] > 5:
         below, radial = _denominator(r2, k), _radial_factor(r2, k)
         powers = tuple(power / below for power in powers)

@@ -155,10 +155,10 @@ def estimate_relative_pose(
         cameras = camera_1.with_params(params_1), camera_2.with_params(params_2)
         return TwoViews.of(pixels_1, pixels_2, *cameras, threshold, mask, weights)
 
-    effort = seed, confidence, min_samples, max_samples
+    effort = confidence, min_samples, max_samples
     with torch.no_grad():
         detached = views(*(x.detach() for x in inputs))
-        found = find_relative_pose(detached, weights, camera_2, threshold, kernel, model, *effort)
+        found = find_relative_pose(detached, weights, camera_2, threshold, kernel, model, seed, effort)
     T_21 = attach_relative_pose(found, views(*inputs), kernel) if needs_gradient(*inputs) else found.T_21
     return _answer(T_21, found)
 

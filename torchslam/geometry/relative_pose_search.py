@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -83,17 +83,18 @@ def find_relative_pose(
     kernel: Kernel,
     wanted: Model,
     seed: int,
-    *effort: Any,
+    effort: tuple[float, int, int],
 ) -> FoundPose:
     """Fit all models, choose one per pair, and take the pose from it.
 
-    All arguments are as of `estimate_relative_pose`; effort: its confidence, min_samples and max_samples.
+    weights, kernel, wanted model and seed are as of `estimate_relative_pose`; effort: its confidence, min_samples and
+    max_samples.
     """
     width, height = camera_2.size
     mask = views.mask
     # The probability that a wrong match is within the threshold of an epipolar line.
-    chance = 2 * threshold * math.hypot(width, height) / (width * height)
-    chance = chance * _mean_width(mask, None if weights is None else weights.detach(), views.x_1.dtype)
+    by_area = 2 * threshold * math.hypot(width, height) / (width * height)
+    chance = by_area * _mean_width(mask, None if weights is None else weights.detach(), views.x_1.dtype)
     generator = torch.Generator().manual_seed(seed)
     R, t, noise, near = _fit_motion(views, kernel, effort, generator)
     views, by_noise = views.in_units(noise[:, None]), kernel != "truncated"
@@ -192,7 +193,7 @@ def _choose(
 
 
 def _fit_motion(
-    views: TwoViews, kernel: Kernel, effort: tuple[Any, ...], generator: torch.Generator
+    views: TwoViews, kernel: Kernel, effort: tuple[float, int, int], generator: torch.Generator
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, " B"], Bool[Tensor, "B N"]]:
     """R and t of essential matrices, their unit in thresholds, and the matches of the fit."""
     R, t = search(
