@@ -13,6 +13,7 @@ import torch
 from tests.global_mapping.synthetic import CAMERA
 from torchslam import SLAM, open_sequence
 from torchslam.config import Config, load_config
+from torchslam.geometry import SensorModel
 from torchslam.global_mapping import recording
 from torchslam.global_mapping.check import Break, BreakKind, MapCheck
 from torchslam.global_mapping.recording import MappedRecording, Mapping, check_run, map_recording, with_doubts
@@ -37,7 +38,7 @@ class FakeRun(Run):
 def a_run(posed: int = 100, frames: int = 100, lost: int = 0, failure: str = "") -> FakeRun:
     states = [State.LOST] * lost + [State.TRACKING] * (frames - lost)
     results = [StepResult(row, 0.1 * row, state, None) for row, state in enumerate(states)]
-    return FakeRun((), CAMERA, Config(), results, [], False, failure, posed=posed)
+    return FakeRun((), SensorModel(CAMERA), Config(), results, [], False, failure, posed=posed)
 
 
 PAIRS = 40

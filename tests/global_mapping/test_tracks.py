@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -15,7 +16,6 @@ from tests.global_mapping.synthetic import EYE, Recording, arc, ball, line, rand
 from torchslam.geometry import se3_exp, se3_inverse, so3_exp
 from torchslam.global_mapping.tracks import (
     MIN_PARALLAX,
-    TrackPoints,
     Tracks,
     join_matches,
     largest_part,
@@ -167,10 +167,18 @@ def looking(points_w: Tensor, centers_w: Tensor, tracks: Tracks) -> tuple[Tensor
     return torch.nn.functional.normalize(points_w[tracks.track] - centers_w, dim=-1), centers_w
 
 
+class Found(NamedTuple):
+    points_w: Tensor
+    agrees: Tensor
+    parallax_rad: Tensor
+
+
 def triangulated(
-    tracks: Tracks, rays_w: Tensor, centers_w: Tensor, tolerance: float = TOLERANCE
-) -> TrackPoints:
-    return triangulate_tracks(tracks, rays_w, centers_w, rays_w.new_full((len(tracks),), tolerance))
+    tracks: Tracks, rays_w: Tensor, centers_w: Tensor, tolerance: float | Tensor = TOLERANCE
+) -> Found:
+    tolerances = torch.as_tensor(tolerance, dtype=rays_w.dtype).expand(len(tracks))
+    found = triangulate_tracks(tracks, rays_w, centers_w, tolerances)
+    return Found(*found, parallax(tracks, centers_w, *found))
 
 
 def turned(rays_w: Tensor, row: int, angle: float) -> Tensor:
@@ -253,7 +261,7 @@ def test_the_tolerance_is_that_of_each_observation(factor: float, agrees: bool) 
     tolerance = torch.full((24,), 1e-3, dtype=torch.float64)
     tolerance[19] = 0.004
     rays_w = turned(turned(rays_w, 7, factor * 1e-3), 19, factor * 0.004)
-    found = triangulate_tracks(tracks, rays_w, centers_w, tolerance)
+    found = triangulated(tracks, rays_w, centers_w, tolerance)
     assert found.agrees.tolist() == [row not in (7, 19) or agrees for row in range(24)]
 
 

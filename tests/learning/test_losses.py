@@ -17,10 +17,10 @@ from tests.learning.test_clip_slam import FRAMES, BentExtractor, clip_of, deriva
 from tests.walks import Walk, arc, still
 from torchslam import Camera, ClipSLAM, clip_loss
 from torchslam.errors import ClipError
+from torchslam.evaluation import ate, rpe
 from torchslam.geometry import rigid, se3_exp, se3_inverse, sim3_exp, so3_exp, transform
 from torchslam.learning.clip_slam import clip_mean
 from torchslam.learning.losses import (
-    ate,
     clip_reprojection,
     epipolar_loss,
     motion_difference,
@@ -29,7 +29,6 @@ from torchslam.learning.losses import (
     pose_nll,
     relative_ate,
     reprojection_loss,
-    rpe,
 )
 
 CAMERA = Camera.radial_tangential(400.0, 410.0, 159.5, 119.5, -0.05, 0.02, 1e-3, -1e-3, size=(320, 240))

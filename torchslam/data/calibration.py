@@ -12,6 +12,7 @@ import torch
 from torchslam.data.text_file import numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
+from torchslam.geometry.distortion import MODELS
 from torchslam.utils.files import write_whole
 
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "rational": (12,), "fisheye": (8,)}
@@ -248,12 +249,6 @@ CALIBRATION = "calibration.txt"
 ESTIMATED_HEADER = "# torchslam: camera estimated from the images"
 IMAGE_SIZE = "size of the images"
 FOCAL_STD = "relative standard error of the focal length"
-PARAMETER_NAMES = {
-    "pinhole": "fx fy cx cy",
-    "radial_tangential": "fx fy cx cy k1 k2 p1 p2 k3",
-    "rational": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
-    "fisheye": "fx fy cx cy k1 k2 k3 k4",
-}
 
 
 def is_found(path: Path) -> bool:
@@ -283,7 +278,7 @@ def write_calibration(path: Path, camera: Camera, remarks: list[str], std: float
     lines = [
         ESTIMATED_HEADER,
         *(f"# {remark}" for remark in (*remarks, *stated)),
-        f"# {PARAMETER_NAMES[camera.model]}",
+        " ".join(("# fx fy cx cy", *MODELS[camera.model].coefficients)),
         model + numbers,
     ]
     write_whole(path, ("\n".join(lines) + "\n").encode())

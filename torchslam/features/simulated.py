@@ -5,7 +5,8 @@ from __future__ import annotations
 import math
 
 import torch
-from jaxtyping import Bool, Float, Shaped
+import torch.nn.functional as F
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.features.contract import BINARY_BYTES
@@ -147,24 +148,17 @@ class SimulatedFeatures:
             torch.rand(len(ids), 1, generator=generator, dtype=torch.float32, device="cpu") < self.outliers
         )
         keypoints = torch.where(is_outlier, anywhere * pixels.new_tensor([width - 1, height - 1]), keypoints)
-        return self._padded(keypoints, scales, angle[ids], self.descriptors[ids]).to(device)
+        missing = self.num_keypoints - len(ids)
 
-    def _padded(
-        self,
-        keypoints: Float[Tensor, "M 2"],
-        scales: Float[Tensor, " M"],
-        angles: Float[Tensor, " M"],
-        descriptors: Shaped[Tensor, "M 32"],
-    ) -> Features:
-        """Features of `num_keypoints` rows, those beyond the keypoints masked."""
-        n, N = len(keypoints), self.num_keypoints
-        mask = torch.arange(N, device="cpu") < n
-        ones = torch.ones(1, N, dtype=keypoints.dtype, device="cpu")
+        def padded(rows: Tensor, value: float = 0.0) -> Tensor:
+            return F.pad(rows, (0, 0) * (rows.ndim - 1) + (0, missing), value=value)[None]
+
+        mask = torch.arange(self.num_keypoints, device="cpu") < len(ids)
         return Features(
-            torch.cat([keypoints, keypoints.new_zeros(N - n, 2)])[None],
-            ones,
-            torch.cat([scales, scales.new_ones(N - n)])[None],
-            torch.cat([angles, angles.new_zeros(N - n)])[None],
-            torch.cat([descriptors, descriptors.new_zeros(N - n, BINARY_BYTES)])[None],
+            padded(keypoints),
+            keypoints.new_ones(1, self.num_keypoints),
+            padded(scales, 1.0),
+            padded(angle[ids]),
+            padded(self.descriptors[ids]),
             mask[None],
-        )
+        ).to(device)

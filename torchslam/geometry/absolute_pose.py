@@ -120,14 +120,10 @@ def estimate_absolute_pose(
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)
     pixels = torch.where(mask[..., None], pixels, 0.0)
-    T_cw, success, squared, score = find_absolute_pose(
-        points_w.detach(),
-        pixels.detach(),
-        camera.with_params(camera.params.detach()),
-        threshold,
-        mask,
-        *(seed, confidence, max_samples),
-    )
+    with torch.inference_mode():  # less work per operation than without gradients only
+        problem = _Problem.of(points_w.detach(), pixels.detach(), camera, threshold, mask)
+        results = problem.solve(seed, confidence, max_samples)
+    T_cw, success, squared, score = (result.clone() for result in results)  # fit for graphs
     mask = mask & success[:, None]
     if needs_gradient(points_w, pixels, camera.params):
         used = (squared < FINAL_WIDTH**2) & mask
@@ -205,7 +201,9 @@ class _Search:
     @classmethod
     def of(cls, points: Tensor, xy: Tensor, scale: Tensor, mask: Tensor, is_single: bool = False) -> _Search:
         homogeneous = torch.cat((points, torch.ones_like(points[..., :1])), dim=-1).mT
-        return cls(points, unit_rays(xy), homogeneous, xy, scale, mask, is_single)
+        rays = torch.nn.functional.pad(xy, (0, 1), value=1.0)
+        rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
+        return cls(points, rays, homogeneous, xy, scale, mask, is_single)
 
     def select(self, rows: Tensor) -> _Search:
         """Some of the problems."""
@@ -230,11 +228,7 @@ class _Search:
 
     def propose(self, count: int, generator: torch.Generator) -> tuple[ModelState, Tensor, Tensor]:
         """The best pose from `count` minimal samples, locally optimized, its score and its support."""
-        P = (
-            self._candidates_of_one(count, generator)
-            if self.is_single
-            else self._candidates(count, generator)
-        )
+        P = (self._candidates_of_one if self.is_single else self._candidates)(count, generator)
         if P.shape[1] == 0:
             none = torch.zeros_like(self.xy[:, 0, 0])
             return (P.new_zeros(len(P), 3, 4),), none - torch.inf, none
@@ -355,12 +349,6 @@ class _Problem:
         return P
 
 
-def unit_rays(normalized: Float[Tensor, "*batch N 2"]) -> Float[Tensor, "*batch N 3"]:
-    """Directions of unit length of undistorted coordinates."""
-    rays = torch.nn.functional.pad(normalized, (0, 1), value=1.0)
-    return rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-
-
 def is_success(
     inliers: Bool[Tensor, "B N"],
     mask: Bool[Tensor, "B N"],
@@ -382,24 +370,6 @@ def is_success(
     centered = torch.where(inliers, points - mean, 0.0)
     spread = torch.linalg.eigvalsh(centered.mT @ centered)
     return significant & (spread[:, 1] > _ON_A_LINE * spread[:, 2])
-
-
-def find_absolute_pose(
-    points_w: Float[Tensor, "B N 3"],
-    pixels: Float[Tensor, "B N 2"],
-    camera: Camera,
-    threshold: float,
-    mask: Bool[Tensor, "B N"],
-    *effort: Any,
-) -> tuple[Tensor, ...]:
-    """T_cw (B, 4, 4), success (B,), squared errors in thresholds (B, N) and score (B,), without gradient.
-
-    Args:
-        effort: seed, confidence and max_samples of `estimate_absolute_pose`.
-    """
-    with torch.inference_mode():  # less work per operation than without gradients only
-        results = _Problem.of(points_w, pixels, camera, threshold, mask).solve(*effort)
-    return tuple(result.clone() for result in results)  # fit for graphs
 
 
 def attach_absolute_pose(

@@ -73,7 +73,7 @@ class Camera:
             raise ValueError(f"size of a camera must be (width, height) in pixels, not {self.size}")
         if self.params.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"params of a camera must be float32 or float64, not {self.params.dtype}")
-        expected = 4 + distortion.MODELS[self.model].num_params
+        expected = 4 + len(distortion.MODELS[self.model].coefficients)
         if self.params.shape[-1:] != (expected,):
             shape = tuple(self.params.shape)
             raise ValueError(f"a {self.model} camera has {expected} parameters, but params has shape {shape}")
@@ -162,7 +162,7 @@ class Camera:
             )
         by_count = {0: "pinhole", 4: "radial_tangential", 5: "radial_tangential"}
         model = "fisheye" if fisheye else by_count.get(k.shape[-1], "rational")
-        count = distortion.MODELS[model].num_params
+        count = len(distortion.MODELS[model].coefficients)
         k = torch.nn.functional.pad(k[..., :count], (0, max(0, count - k.shape[-1])))
         return Camera(model, torch.cat((pinhole, k.expand(*pinhole.shape[:-1], count)), dim=-1), size)
 

@@ -31,6 +31,7 @@ class Distortion:
     """One model, as functions of undistorted coordinates xy and coefficients k.
 
     Attributes:
+        coefficients: names of the coefficients, in OpenCV's order.
         distort: (xy, k) -> distorted coordinates (..., N, 2).
         slope: (xy, k) -> d distorted / d xy (..., N, 2, 2).
         coefficient_slope: (xy, k) -> d distorted / d k (..., N, 2, K).
@@ -39,7 +40,7 @@ class Distortion:
         coordinate: undistorted radius -> what the limit limits.
     """
 
-    num_params: int
+    coefficients: tuple[str, ...]
     distort: Callable[[Tensor, Tensor], Tensor]
     slope: Callable[[Tensor, Tensor], Tensor]
     coefficient_slope: Callable[[Tensor, Tensor], Tensor]
@@ -99,37 +100,20 @@ def _stack_columns(*columns: Tensor) -> Tensor:
     return torch.stack(columns).movedim(0, -1)
 
 
-# --- no distortion ---
-
-
-def _identity(xy: Tensor, k: Tensor) -> Tensor:
-    return xy
-
-
-def _identity_slope(xy: Tensor, k: Tensor) -> Tensor:
-    return torch.eye(2, dtype=xy.dtype, device=xy.device).expand(*xy.shape, 2)
-
-
-def _identity_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
-    return xy.new_zeros(*xy.shape, 0)
-
-
-def _identity_undistort(xy: Tensor, k: Tensor, limit: Tensor) -> Tensor:
-    return xy
-
-
-def _no_limit(k: Tensor) -> Tensor:
-    return k.new_full(k.shape[:-1], torch.inf)
-
-
-# --- radial and tangential (Brown, 1966) ---
+# --- radial and tangential (Brown, 1966); rational: the radial factor over 1 + k4 r^2 + k5 r^4 + k6 r^6 (Claus and
+# Fitzgibbon, 2005, as in OpenCV), where there are eight coefficients ---
 
 
 def _radial_factor(r2: Tensor, k: Tensor) -> Tensor:
-    return 1 + r2 * (k[..., 0] + r2 * (k[..., 1] + r2 * k[..., 4]))
+    radial = 1 + r2 * (k[..., 0] + r2 * (k[..., 1] + r2 * k[..., 4]))
+    return radial / _denominator(r2, k) if k.shape[-1] > 5 else radial
 
 
-def _radial_tangential(xy: Tensor, k: Tensor) -> Tensor:
+def _denominator(r2: Tensor, k: Tensor) -> Tensor:
+    return 1 + r2 * (k[..., 5] + r2 * (k[..., 6] + r2 * k[..., 7]))
+
+
+def _brown(xy: Tensor, k: Tensor) -> Tensor:
     x, y = xy.unbind(-1)
     p1, p2 = k[..., 2], k[..., 3]
     r2, xy2 = x * x + y * y, 2 * x * y
@@ -139,28 +123,40 @@ def _radial_tangential(xy: Tensor, k: Tensor) -> Tensor:
     )
 
 
-def _radial_tangential_slope(xy: Tensor, k: Tensor) -> Tensor:
+def _brown_slope(xy: Tensor, k: Tensor) -> Tensor:
     """d distorted / d xy. (..., 2, 2)."""
     x, y = xy.unbind(-1)
-    k1, k2, p1, p2, k3 = k.unbind(-1)
+    k1, k2, p1, p2, k3, *below = k.unbind(-1)
     r2 = x * x + y * y
     radial = _radial_factor(r2, k)
-    slope = 2 * (k1 + r2 * (2 * k2 + r2 * 3 * k3))  # d radial / d x = slope x
+    slope = k1 + r2 * (2 * k2 + r2 * 3 * k3)
+    if below:
+        k4, k5, k6 = below
+        slope = 2 * (slope - radial * (k4 + r2 * (2 * k5 + r2 * 3 * k6))) / _denominator(r2, k)
+    else:
+        slope = 2 * slope  # d radial / d x = slope x
     cross = slope * x * y + 2 * (p1 * x + p2 * y)
     xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
     yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
     return _stack_columns(xx, cross, cross, yy).unflatten(-1, (2, 2))
 
 
-def _radial_tangential_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
-    """d distorted / d k. (..., 2, 5)."""
+def _brown_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
+    """d distorted / d k. (..., 2, K)."""
     x, y = xy.unbind(-1)
     xx, yy, xy2 = x * x, y * y, 2 * x * y
     r2 = xx + yy
-    r4 = r2 * r2
-    r6 = r4 * r2
-    columns = (x * r2, x * r4, xy2, r2 + 2 * xx, x * r6, y * r2, y * r4, r2 + 2 * yy, xy2, y * r6)
-    return _stack_columns(*columns).unflatten(-1, (2, 5))
+    powers: tuple[Tensor, ...] = (r2, r2 * r2, r2 * r2 * r2)
+    if k.shape[-1] > 5:
+        below, radial = _denominator(r2, k), _radial_factor(r2, k)
+        powers = tuple(power / below for power in powers)
+    columns = []
+    for u, tangential in ((x, (xy2, r2 + 2 * xx)), (y, (r2 + 2 * yy, xy2))):
+        a, b, c = (u * power for power in powers)
+        columns += [a, b, *tangential, c]
+        if k.shape[-1] > 5:
+            columns += [-radial * a, -radial * b, -radial * c]
+    return _stack_columns(*columns).unflatten(-1, (2, k.shape[-1]))
 
 
 def _invert(
@@ -192,50 +188,6 @@ def _invert(
 def _radial_tangential_limit(k: Tensor) -> Tensor:
     """The radius at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing."""
     return first_positive_root(torch.stack((3 * k[..., 0], 5 * k[..., 1], 7 * k[..., 4]), dim=-1)).sqrt()
-
-
-# --- rational: the radial factor over 1 + k4 r^2 + k5 r^4 + k6 r^6 (Claus and Fitzgibbon, 2005, as in OpenCV) ---
-
-
-def _denominator(r2: Tensor, k: Tensor) -> Tensor:
-    return 1 + r2 * (k[..., 5] + r2 * (k[..., 6] + r2 * k[..., 7]))
-
-
-def _rational(xy: Tensor, k: Tensor) -> Tensor:
-    x, y = xy.unbind(-1)
-    p1, p2 = k[..., 2], k[..., 3]
-    r2, xy2 = x * x + y * y, 2 * x * y
-    radial = _radial_factor(r2, k) / _denominator(r2, k)
-    return _stack_columns(
-        x * radial + p1 * xy2 + p2 * (r2 + 2 * x * x), y * radial + p2 * xy2 + p1 * (r2 + 2 * y * y)
-    )
-
-
-def _rational_slope(xy: Tensor, k: Tensor) -> Tensor:
-    """d distorted / d xy. (..., 2, 2)."""
-    x, y = xy.unbind(-1)
-    k1, k2, p1, p2, k3, k4, k5, k6 = k.unbind(-1)
-    r2 = x * x + y * y
-    below = _denominator(r2, k)
-    radial = _radial_factor(r2, k) / below
-    slope_above = k1 + r2 * (2 * k2 + r2 * 3 * k3)
-    slope_below = k4 + r2 * (2 * k5 + r2 * 3 * k6)
-    slope = 2 * (slope_above - radial * slope_below) / below  # d radial / d x = slope x
-    cross = slope * x * y + 2 * (p1 * x + p2 * y)
-    xx = radial + slope * x * x + 2 * p1 * y + 6 * p2 * x
-    yy = radial + slope * y * y + 6 * p1 * y + 2 * p2 * x
-    return _stack_columns(xx, cross, cross, yy).unflatten(-1, (2, 2))
-
-
-def _rational_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
-    """d distorted / d k. (..., 2, 8)."""
-    r2 = xy.square().sum(-1)
-    below = _denominator(r2, k)
-    radial = _radial_factor(r2, k) / below
-    tangential = _radial_tangential_coefficient_slope(xy, k)[..., 2:4]
-    powers = torch.stack((r2, r2 * r2, r2 * r2 * r2), dim=-1) / below[..., None]
-    above = xy[..., None] * powers[..., None, :]  # k1, k2, k3; those of k4, k5, k6 differ by a factor
-    return torch.cat((above[..., :2], tangential, above[..., 2:], -radial[..., None, None] * above), dim=-1)
 
 
 def _rational_limit(k: Tensor) -> Tensor:
@@ -329,28 +281,31 @@ def _fisheye_limit(k: Tensor) -> Tensor:
 
 MODELS = {
     "pinhole": Distortion(
-        0, _identity, _identity_slope, _identity_coefficient_slope, _identity_undistort, _no_limit, torch.abs
-    ),
-    "radial_tangential": Distortion(
-        5,
-        _radial_tangential,
-        _radial_tangential_slope,
-        _radial_tangential_coefficient_slope,
-        partial(_invert, _radial_tangential, _radial_tangential_slope),
-        _radial_tangential_limit,
+        (),
+        lambda xy, k: xy,
+        lambda xy, k: torch.eye(2, dtype=xy.dtype, device=xy.device).expand(*xy.shape, 2),
+        lambda xy, k: xy.new_zeros(*xy.shape, 0),
+        lambda xy, k, limit: xy,
+        lambda k: k.new_full(k.shape[:-1], torch.inf),
         torch.abs,
     ),
-    "rational": Distortion(
-        8,
-        _rational,
-        _rational_slope,
-        _rational_coefficient_slope,
-        partial(_invert, _rational, _rational_slope),
-        _rational_limit,
-        torch.abs,
-    ),
+    **{
+        name: Distortion(
+            coefficients,
+            _brown,
+            _brown_slope,
+            _brown_coefficient_slope,
+            partial(_invert, _brown, _brown_slope),
+            limit,
+            torch.abs,
+        )
+        for name, coefficients, limit in (
+            ("radial_tangential", ("k1", "k2", "p1", "p2", "k3"), _radial_tangential_limit),
+            ("rational", ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"), _rational_limit),
+        )
+    },
     "fisheye": Distortion(
-        4,
+        ("k1", "k2", "k3", "k4"),
         _fisheye,
         _fisheye_slope,
         _fisheye_coefficient_slope,

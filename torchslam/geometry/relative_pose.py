@@ -143,7 +143,9 @@ def estimate_relative_pose(
     if 0 in pixels_1.shape or pixels_1.shape[1] < 5:
         given = pixels_1, pixels_2, camera_1.params, camera_2.params, *([] if weights is None else [weights])
         return _nothing(pixels_1, given)
-    mask = _usable(pixels_1, pixels_2, mask, weights)
+    finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
+    finite = finite if weights is None else finite & (weights > 0) & torch.isfinite(weights)
+    mask = finite if mask is None else mask & finite
     pixels_1, pixels_2 = (torch.where(mask[..., None], pixels, 0.0) for pixels in (pixels_1, pixels_2))
     inputs = [pixels_1, pixels_2, camera_1.params, camera_2.params, *([] if weights is None else [weights])]
 
@@ -153,10 +155,10 @@ def estimate_relative_pose(
         cameras = camera_1.with_params(params_1), camera_2.with_params(params_2)
         return TwoViews.of(pixels_1, pixels_2, *cameras, threshold, mask, weights)
 
-    effort = seed, confidence, min_samples, max_samples
+    effort = confidence, min_samples, max_samples
     with torch.no_grad():
         detached = views(*(x.detach() for x in inputs))
-        found = find_relative_pose(detached, weights, mask, camera_2, threshold, kernel, model, *effort)
+        found = find_relative_pose(detached, weights, camera_2, threshold, kernel, model, seed, effort)
     T_21 = attach_relative_pose(found, views(*inputs), kernel) if needs_gradient(*inputs) else found.T_21
     return _answer(T_21, found)
 
@@ -175,18 +177,6 @@ def _answer(T_21: Float[Tensor, "B 4 4"], found: FoundPose) -> RelativePose:
         found.scores[2],
         found.T_essential,
     )
-
-
-def _usable(
-    pixels_1: Float[Tensor, "B N 2"],
-    pixels_2: Float[Tensor, "B N 2"],
-    mask: Bool[Tensor, "B N"] | None,
-    weights: Float[Tensor, "B N"] | None,
-) -> Bool[Tensor, "B N"]:
-    """Matches inside the mask that are finite and have a weight."""
-    finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
-    finite = finite if weights is None else finite & (weights > 0) & torch.isfinite(weights)
-    return finite if mask is None else mask & finite
 
 
 def _nothing(pixels: Float[Tensor, "B N 2"], given: Sequence[Tensor]) -> RelativePose:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -47,15 +47,6 @@ _KERNEL_ITERATIONS = 20
 _LEAST_NOISE = 1 / 64  # thresholds; of exact matches
 
 
-class _Effort(NamedTuple):
-    """Effort of the search: as the arguments of `estimate_relative_pose`."""
-
-    seed: int
-    confidence: float
-    min_samples: int
-    max_samples: int
-
-
 class FoundPose(NamedTuple):
     """The pose of the chosen model, and what it is based on.
 
@@ -87,49 +78,31 @@ class FoundPose(NamedTuple):
 def find_relative_pose(
     views: TwoViews,
     weights: Float[Tensor, "B N"] | None,
-    mask: Bool[Tensor, "B N"],
     camera_2: Camera,
     threshold: float,
     kernel: Kernel,
     wanted: Model,
-    *effort: Any,
+    seed: int,
+    effort: tuple[float, int, int],
 ) -> FoundPose:
-    """The search of `estimate_relative_pose`; effort: seed, confidence, min_samples and max_samples of it."""
-    width, height = camera_2.size
-    # The probability that a wrong match is within the threshold of an epipolar line.
-    chance = 2 * threshold * math.hypot(width, height) / (width * height)
-    chances = chance * _mean_width(mask, None if weights is None else weights.detach(), views.x_1.dtype)
-    return _search(views, chances, wanted, kernel, _Effort(*effort))
+    """Fit all models, choose one per pair, and take the pose from it.
 
-
-class _Chosen(NamedTuple):
-    """R, t of the chosen model, and `normal` of its plane, which leaves two motions where it is `ambiguous`.
-
-    R_E, t_E: of the essential matrix; squared: errors of the three models, or of the first, in units of the noise
+    weights, kernel, wanted model and seed are as of `estimate_relative_pose`; effort: its confidence, min_samples and
+    max_samples.
     """
-
-    R: Float[Tensor, "B 3 3"]
-    t: Float[Tensor, "B 3"]
-    normal: Float[Tensor, "B 3"]
-    model: Int[Tensor, " B"]
-    ambiguous: Bool[Tensor, " B"]
-    R_E: Float[Tensor, "B 3 3"]
-    t_E: Float[Tensor, "B 3"]
-    squared: Float[Tensor, "_ B N"]
-
-
-def _search(
-    views: TwoViews, chance: Float[Tensor, " B"], wanted: Model, kernel: Kernel, effort: _Effort
-) -> FoundPose:
-    """Fit all models, choose one per pair, and take the pose from it."""
-    generator = torch.Generator().manual_seed(effort.seed)
+    width, height = camera_2.size
+    mask = views.mask
+    # The probability that a wrong match is within the threshold of an epipolar line.
+    by_area = 2 * threshold * math.hypot(width, height) / (width * height)
+    chance = by_area * _mean_width(mask, None if weights is None else weights.detach(), views.x_1.dtype)
+    generator = torch.Generator().manual_seed(seed)
     R, t, noise, near = _fit_motion(views, kernel, effort, generator)
     views, by_noise = views.in_units(noise[:, None]), kernel != "truncated"
     if wanted == "essential":
         chosen = _essential(views, R, t)
     else:
         chosen = _choose(views, fit_models(views, R, t, generator, by_noise), noise, chance, by_noise)
-    mask, model = views.mask, chosen.model
+    model = chosen.model
     squared = chosen.squared[model, torch.arange(len(mask), device=mask.device)]
     in_thresholds = chosen.squared * noise[:, None].square()
     inliers = (squared * noise[:, None].square() < 1) & mask
@@ -149,6 +122,22 @@ def _search(
         torch.nn.functional.pad(scores, (0, 0, 0, len(MODELS) - len(scores))),
         torch.where(found, rigid(chosen.R_E, chosen.t_E), eye),
     )
+
+
+class _Chosen(NamedTuple):
+    """R, t of the chosen model, and `normal` of its plane, which leaves two motions where it is `ambiguous`.
+
+    R_E, t_E: of the essential matrix; squared: errors of the three models, or of the first, in units of the noise
+    """
+
+    R: Float[Tensor, "B 3 3"]
+    t: Float[Tensor, "B 3"]
+    normal: Float[Tensor, "B 3"]
+    model: Int[Tensor, " B"]
+    ambiguous: Bool[Tensor, " B"]
+    R_E: Float[Tensor, "B 3 3"]
+    t_E: Float[Tensor, "B 3"]
+    squared: Float[Tensor, "_ B N"]
 
 
 def _width(by_noise: bool) -> float:
@@ -204,16 +193,14 @@ def _choose(
 
 
 def _fit_motion(
-    views: TwoViews, kernel: Kernel, effort: _Effort, generator: torch.Generator
+    views: TwoViews, kernel: Kernel, effort: tuple[float, int, int], generator: torch.Generator
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, " B"], Bool[Tensor, "B N"]]:
     """R and t of essential matrices, their unit in thresholds, and the matches of the fit."""
     R, t = search(
         lambda rows, count: propose_essential(views.select(rows), count, generator, kernel != "truncated"),
         views.mask.sum(-1),
         5,
-        effort.confidence,
-        effort.min_samples,
-        effort.max_samples,
+        *effort,
         as_needed=kernel != "truncated",
     )
     R, t, one = _rotations(R)[:, None], t[:, None], R.new_ones(len(R))

@@ -305,52 +305,39 @@ def _prior(k1: Tensor, k1_std: float) -> Tensor:
 def _solve(graph: _Graph, k1_std: float, scale: float, dtype: torch.dtype) -> ViewGraphFocal:
     """The minimum of the cost, how certain it is, and its gradient."""
     with torch.no_grad():
-        found = _minimum(_Graph(*(x.detach() for x in graph)), k1_std)
-    at = found.at
-    if found.success and needs_gradient(*graph):
-        at = found.at + _step(graph, found, k1_std)
+        fixed = _Graph(*(x.detach() for x in graph))
+        profile = _search(fixed, k1_std)
+        found = _polished(fixed, profile, k1_std)
+        std = _standard_error(fixed, profile, found, k1_std)
+        squares = _squares(fixed, found[:1].exp()).at(_bend_of(found, k1_std))
+        errors = (squares[0] / profile.level).sqrt()
+        success = bool(std < _MAX_STD) and _is_bounded(profile, float(found[0]))
+    at = found
+    if success and needs_gradient(*graph):
+
+        def objective(step: Float[Tensor, "1 D"]) -> Float[Tensor, "1"]:
+            return _cost(graph, found + step[0], profile.level, k1_std)[None]
+
+        at = found + implicit_step(objective, found[None])[0]  # a step of zero that has the gradient
     used = graph.weights > 0
     return ViewGraphFocal(
         (scale * at[0].exp()).to(dtype),
-        found.std.to(dtype),
-        torch.where(used, found.errors, torch.nan).to(dtype),
-        used & (found.errors < _LARGEST),
-        torch.tensor(found.success, device=used.device),
-        (at[1] if k1_std > 0 else torch.zeros_like(at[0])).to(dtype),
+        std.to(dtype),
+        torch.where(used, errors, torch.nan).to(dtype),
+        used & (errors < _LARGEST),
+        torch.tensor(success, device=used.device),
+        _bend_of(at, k1_std)[0].to(dtype),
     )
 
 
-def _step(graph: _Graph, found: _Minimum, k1_std: float) -> Float[Tensor, " D"]:
-    """Zero, with the gradient of the minimum."""
-
-    def objective(step: Float[Tensor, "1 D"]) -> Float[Tensor, "1"]:
-        return _cost(graph, found.at + step[0], found.level, k1_std)[None]
-
-    return implicit_step(objective, found.at[None])[0]
-
-
-class _Minimum(NamedTuple):
-    """The logarithm of the focal length and, if it is sought, k1; what is known about them; and the noise level."""
-
-    at: Float[Tensor, " D"]
-    std: Float[Tensor, ""]
-    errors: Float[Tensor, " M"]
-    success: bool
-    level: float
-
-
-def _minimum(graph: _Graph, k1_std: float) -> _Minimum:
-    profile = _search(graph, k1_std)
-    at = _polished(graph, profile, k1_std)
-    std = _standard_error(graph, profile, at, k1_std)
-    squares = _squares(graph, at[:1].exp()).at(at[1:2] if k1_std > 0 else torch.zeros_like(at[:1]))
-    success = bool(std < _MAX_STD) and _is_bounded(profile, float(at[0]))
-    return _Minimum(at, std, (squares[0] / profile.level).sqrt(), success, profile.level)
+def _bend_of(at: Float[Tensor, " D"], k1_std: float) -> Float[Tensor, " 1"]:
+    """k1, where it is sought, else zero."""
+    return at[1:2] if k1_std > 0 else torch.zeros_like(at[:1])
 
 
 def _cost(graph: _Graph, at: Float[Tensor, " D"], level: float, k1_std: float) -> Float[Tensor, ""]:
     """The cost with the logarithm of the focal length and, if it is sought, k1."""
-    k1 = at[1:2] if k1_std > 0 else torch.zeros_like(at[:1])
+    k1 = _bend_of(at, k1_std)
     squares = _squares(graph, at[:1].exp()).at(k1)
     return (_costs(squares, graph.weights, level).sum(-1) + _prior(k1, k1_std))[0]
 

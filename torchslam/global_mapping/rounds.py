@@ -126,8 +126,7 @@ class ObservedTracks:
         """The points of all tracks by given poses; `gate`: standard deviations up to which observations agree."""
         tolerance = gate * self.noise.sigmas / camera.focal
         found = triangulate_tracks(self.tracks, *self.rays(T_cw, camera), tolerance)
-        made = Reconstruction(T_cw, camera, found.points_w, found.agrees)
-        return self.filter(made, gate)
+        return self.filter(Reconstruction(T_cw, camera, *found), gate)
 
     def complete(self, found: Reconstruction, gate: float) -> Reconstruction:
         """Try all observations, and other points where more observations agree with these than with the present ones.

@@ -116,28 +116,15 @@ def longest_tracks(tracks: Tracks, per_view: int) -> Bool[Tensor, " N"]:
     return chosen
 
 
-@dataclass(frozen=True)
-class TrackPoints:
-    """Points of tracks.
-
-    Attributes:
-        points_w: positions, those of the best hypothesis where nothing agrees.
-        agrees: the observations that agree with their point.
-        parallax_rad: angle between the most different rays of agreeing observations, zero where fewer than two agree.
-    """
-
-    points_w: Float[Tensor, "N 3"]
-    agrees: Bool[Tensor, " O"]
-    parallax_rad: Float[Tensor, " N"]
-
-
 def triangulate_tracks(
     tracks: Tracks,
     rays_w: Float[Tensor, "O 3"],
     centers_w: Float[Tensor, "O 3"],
     tolerance_rad: Float[Tensor, " O"],
-) -> TrackPoints:
-    """Find the point of each track by consensus of its rays.
+) -> tuple[Float[Tensor, "N 3"], Bool[Tensor, " O"]]:
+    """Find the point of each track by consensus of its rays, and the observations that agree with it.
+
+    Where nothing agrees, the point is that of the best hypothesis.
 
     Args:
         tracks: N of them.
@@ -160,9 +147,7 @@ def triangulate_tracks(
         best_score = torch.where(is_better, score, best_score)
     agrees = ray_errors(rays_w, centers_w, best_points[tracks.track]) < tolerance_rad
     points_w = _nearest_to_rays(tracks, rays_w, centers_w, agrees, best_points)
-    errors = ray_errors(rays_w, centers_w, points_w[tracks.track])
-    agrees = errors < tolerance_rad
-    return TrackPoints(points_w, agrees, parallax(tracks, centers_w, points_w, agrees))
+    return points_w, ray_errors(rays_w, centers_w, points_w[tracks.track]) < tolerance_rad
 
 
 def ray_errors(

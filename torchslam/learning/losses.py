@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.evaluation import ate, rpe
+from torchslam.evaluation import ate
 from torchslam.geometry import (
     Camera,
     essential_from_pose,
@@ -29,19 +29,6 @@ from torchslam.geometry import (
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import Kernel, robustify
 from torchslam.learning.clip_slam import ClipPoses
-
-__all__ = [
-    "ate",
-    "clip_reprojection",
-    "epipolar_loss",
-    "motion_difference",
-    "path_length",
-    "pose_errors",
-    "pose_nll",
-    "relative_ate",
-    "reprojection_loss",
-    "rpe",
-]
 
 
 @full_precision

@@ -19,6 +19,7 @@ from torchslam.data.calibration import Calibration, Size, read_numbers
 from torchslam.data.formats.key_files import MAX_DEPTH, Tree, merged, read_tree
 from torchslam.data.text_file import numbered_lines, parse_floats, read_text
 from torchslam.errors import CalibrationError
+from torchslam.geometry.distortion import MODELS
 from torchslam.geometry.transforms import HALF_PIXEL
 from torchslam.utils.files import JSON_BYTES
 
@@ -55,23 +56,22 @@ OF_A_CAMERA = (
     *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye"),
 )
 """Keys of a transforms.json that a frame may have, too."""
-BROWN_KEYS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
-FISHEYE_KEYS = ("k1", "k2", "k3", "k4")
 LOOKS_LIKE_DISTORTION = re.compile(r"dist(?!an)|coef|fisheye|^(camera1?)?(k[1-9]|p[1-9])$|^xi$")
 """Of keys that were not used."""
 NOTHING = ("", "none", "null", "~")
 
-# COLMAP, src/colmap/sensor/models.h: where each parameter goes among fx fy cx cy and the distortion.
+# COLMAP, src/colmap/sensor/models.h: where each parameter goes among fx fy cx cy and the distortion, of a fisheye where
+# the name ends so.
 COLMAP_MODELS = {
-    "SIMPLE_PINHOLE": ("f cx cy", "pinhole"),
-    "PINHOLE": ("fx fy cx cy", "pinhole"),
-    "SIMPLE_RADIAL": ("f cx cy k1", "radial_tangential"),
-    "RADIAL": ("f cx cy k1 k2", "radial_tangential"),
-    "OPENCV": ("fx fy cx cy k1 k2 p1 p2", "radial_tangential"),
-    "FULL_OPENCV": ("fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6", "radial_tangential"),
-    "SIMPLE_RADIAL_FISHEYE": ("f cx cy k1", "fisheye"),
-    "RADIAL_FISHEYE": ("f cx cy k1 k2", "fisheye"),
-    "OPENCV_FISHEYE": ("fx fy cx cy k1 k2 k3 k4", "fisheye"),
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
 COLMAP_LINE = re.compile(r"\d+\s+[A-Z][A-Z_0-9]+\s+\d{1,9}\s+\d{1,9}\s", re.ASCII)
 
@@ -356,7 +356,7 @@ def _flag(keys: Keys, key: str) -> bool:
 def _coefficients(keys: Keys, fisheye: bool, prefix: str, source: str) -> list[float]:
     """In OpenCV's order: of one list, or of keys of their own."""
     found = keys.value(*DISTORTION)
-    names = FISHEYE_KEYS if fisheye else BROWN_KEYS
+    names = MODELS["fisheye" if fisheye else "rational"].coefficients
     if found is None:
         return _single_coefficients(keys, names, prefix)
     name, value = found[0], _value(keys, *DISTORTION)
@@ -432,16 +432,16 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
         raise CalibrationError(
             f"{path}: camera model {model} is not known; there are {', '.join(COLMAP_MODELS)}"
         )
-    keys, kind = COLMAP_MODELS[model][0].split(), COLMAP_MODELS[model][1]
+    keys = COLMAP_MODELS[model].split()
     numbers = parse_floats(" ".join(words), str(path), CalibrationError)
     if len(numbers) != len(keys):
         raise CalibrationError(f"{path}: {model} has the parameters {' '.join(keys)}, got {len(numbers)}")
     values = dict(zip(keys, numbers, strict=True))
     fx, fy = (values.get(key, values.get("f", 0.0)) for key in ("fx", "fy"))
-    coefficients = [values.get(key, 0.0) for key in (FISHEYE_KEYS if kind == "fisheye" else BROWN_KEYS)]
+    kind = "fisheye" if model.endswith("FISHEYE") else ""
+    coefficients = [values.get(key, 0.0) for key in MODELS[kind or "rational"].coefficients]
     intrinsics = [fx, fy, values["cx"] - HALF_PIXEL, values["cy"] - HALF_PIXEL]
-    model = "fisheye" if kind == "fisheye" else ""
-    found = checked(intrinsics, coefficients, str(path), model, (int(width), int(height)))
+    found = checked(intrinsics, coefficients, str(path), kind, (int(width), int(height)))
     return replace(found, as_stored=True)
 
 

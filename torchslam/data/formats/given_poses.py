@@ -235,7 +235,7 @@ def _binary_camera(path: Path) -> Calibration:
             raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
         number, model, width, height = struct.unpack_from("<IiQQ", data, 8)
         name = MODEL_NAMES.get(model, str(model))
-        keys = COLMAP_MODELS.get(name, ("",))[0].split()
+        keys = COLMAP_MODELS.get(name, "").split()
         params = struct.unpack_from(f"<{len(keys)}d", data, 32)
     except (OSError, struct.error) as cause:
         raise CalibrationError(f"{path}: not COLMAP's cameras: {cause}") from cause

@@ -35,6 +35,22 @@ MAX_ASPECT = 4.0
 _LOCK = threading.Lock()
 
 
+class Capture(Protocol):
+    """The part of cv2.VideoCapture that is used."""
+
+    def grab(self) -> bool:
+        """Wait for the next frame; False at the end."""
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        """Decode the last frame, BGR; False if it is damaged."""
+
+    def get(self, property_id: int) -> float:
+        """Return a property, one of cv2.CAP_PROP_*; 0 if it is unknown."""
+
+    def release(self) -> None:
+        """Close the source."""
+
+
 def open_capture(source: str) -> cv2.VideoCapture:
     """Open a video or a stream; FFmpeg's errors go to the error stream, whatever the environment variables are."""
     hidden = {name: os.environ.pop(name) for name in SILENCING if name in os.environ}
@@ -44,7 +60,7 @@ def open_capture(source: str) -> cv2.VideoCapture:
         os.environ.update(hidden)
 
 
-def pixel_aspect(capture: HasProperties, where: str) -> float:
+def pixel_aspect(capture: Capture, where: str) -> float:
     """Return width to height of a pixel as it is shown, which may be turned; 1 where the source does not say.
 
     Raises SequenceError for pixels that no camera has.
@@ -61,20 +77,6 @@ def pixel_aspect(capture: HasProperties, where: str) -> float:
     return 1 / aspect if capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90 else aspect
 
 
-class HasProperties(Protocol):
-    """The part of cv2.VideoCapture that `pixel_aspect` uses."""
-
-    def get(self, property_id: int) -> float:
-        """Return a property, one of cv2.CAP_PROP_*; 0 if it is unknown."""
-
-
-class Retrievable(Protocol):
-    """The part of cv2.VideoCapture that `Retriever` uses."""
-
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        """Decode the last frame that was grabbed, BGR; False if it is damaged."""
-
-
 class Retriever:
     """Retrieves the frames of one capture, and refuses those that were not converted.
 
@@ -83,7 +85,7 @@ class Retriever:
         command: how the video is converted to one without interlaced frames, for messages.
     """
 
-    def __init__(self, capture: Retrievable, command: str) -> None:
+    def __init__(self, capture: Capture, command: str) -> None:
         self._capture, self._command = capture, command
         self._before: np.ndarray | None = None
 
@@ -107,7 +109,7 @@ class Retriever:
         return image
 
 
-def _retrieve_with_log(capture: Retrievable) -> tuple[bool, np.ndarray, re.Match[bytes] | None]:
+def _retrieve_with_log(capture: Capture) -> tuple[bool, np.ndarray, re.Match[bytes] | None]:
     """Retrieve a frame; also the log of a failure. Other lines go on to the error stream."""
     with _LOCK, tempfile.TemporaryFile() as log:
         try:

@@ -29,10 +29,7 @@ TRUTH = Path("state_groundtruth_estimate0") / "data.csv"
 
 
 def _open_euroc(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """The left camera of a EuRoC recording; `camera` overrides `sensor.yaml`.
-
-    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
-    """
+    """The left camera of a EuRoC recording; `camera` overrides `sensor.yaml`."""
     folder = Path(path)
     root = _root(folder)
     sensor = root / "cam0" / "sensor.yaml"

@@ -50,7 +50,6 @@ def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     """A KITTI odometry sequence, left gray images before left color ones; `camera` overrides `calib.txt`.
 
     Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` next to `sequences/NN`.
-    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     base = Path(path)
     folder = next(base / name for name in CAMERAS if (base / name).is_dir())
@@ -119,7 +118,6 @@ def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -
     The calibration is read from the drive or the folder of its day: the rectified one, or for a drive `..._extract`
     that of the raw images. The ground truth is that of `oxts/`, if both calib_velo_to_cam.txt and calib_imu_to_velo.txt
     exist.
-    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     drive = Path(path)
     folder = _raw_camera(drive) or drive / RAW_CAMERAS[0]

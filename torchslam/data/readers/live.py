@@ -10,7 +10,6 @@ import weakref
 from collections import deque
 from collections.abc import Callable
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -20,7 +19,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
-from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
+from torchslam.data.readers.capture import Capture, Retriever, open_capture, pixel_aspect
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
@@ -38,22 +37,6 @@ EXIT_PATIENCE = 2.0
 """Seconds for which a process waits for the threads of sources when it exits."""
 STALE = 0.5
 """Age in seconds above which the frame read on opening is discarded."""
-
-
-class Capture(Protocol):
-    """The subset of cv2.VideoCapture that a live source uses."""
-
-    def grab(self) -> bool:
-        """Wait for the next frame; False at the end."""
-
-    def retrieve(self) -> tuple[bool, np.ndarray]:
-        """Decode the last frame, BGR; False if it is damaged."""
-
-    def get(self, property_id: int) -> float:
-        """Return a property, one of cv2.CAP_PROP_*."""
-
-    def release(self) -> None:
-        """Close the source."""
 
 
 class LiveSequence(Sequence):

@@ -54,7 +54,6 @@ def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> Imag
     """A folder of ETH3D-SLAM or TUM RGB-D; `camera` overrides the folder's calibration.
 
     The archives of TUM contain no calibration; their name identifies the published camera.
-    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
     """
     folder = Path(path)
     entries = [
@@ -80,10 +79,7 @@ def _with_depth(sequence: ImageSequence, path: Path, camera: str = "") -> ImageS
 
 
 def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """A trajectory of the living room or the office.
-
-    Raises SequenceError, CalibrationError or TrajectoryError naming the file.
-    """
+    """A trajectory of the living room or the office."""
     folder = Path(path)
     rate = rate or DEFAULT_RATE
     found = find_frames(folder / "rgb")
@@ -103,7 +99,6 @@ def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None
     """One sequence (`seq-01`), at the Kinect's 30 frames per second, with the poses of its depth camera.
 
     The dataset gives no calibration of the color camera; without `camera` its nominal focal length is a guess.
-    Raises SequenceError, CalibrationError or TrajectoryError naming the file.
     """
     folder = Path(path)
     found = match_pattern(str(folder / SEVEN_SCENES_COLOR))
@@ -142,10 +137,7 @@ def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:
 
 
 def _open_tartanair(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """The left camera of a trajectory; the dataset has no times, so that `rate` or 30 frames per second are taken.
-
-    Raises SequenceError, CalibrationError or TrajectoryError naming file and line.
-    """
+    """The left camera of a trajectory; the dataset has no times, so that `rate` or 30 frames per second are taken."""
     folder = Path(path)
     name = _tartanair_camera(folder) or TARTANAIR_CAMERAS[0]
     found = find_frames(folder / f"image_{name}")

@@ -22,6 +22,7 @@ from torchslam.dense.cloud import PointCloud
 from torchslam.dense.depth_maps import DepthMaps
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
+from torchslam.geometry.distortion import MODELS
 from torchslam.geometry.transforms import corner_camera, opengl
 from torchslam.io.export.depths import MAX_POINTS, depth_png
 from torchslam.io.export.ply import write_cloud, write_ply
@@ -32,25 +33,20 @@ POINT_CLOUD = "sparse_pc.ply"
 DENSE_CLOUD = "dense_pc.ply"
 IMAGES = "images"
 DEPTHS = "depths"
-# The names of the parameters in the order of ours; nerfstudio's formulas are OpenCV's.
-MODELS = {
-    "pinhole": ("PINHOLE", ()),
-    "radial_tangential": ("OPENCV", ("k1", "k2", "p1", "p2", "k3")),
-    "fisheye": ("OPENCV_FISHEYE", ("k1", "k2", "k3", "k4")),
-}
+NAMES = {"pinhole": "PINHOLE", "radial_tangential": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
+"""Names of camera models; the formulas and names of their coefficients are OpenCV's."""
 
 
 def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
     """The camera's entries of transforms.json. Raises ResultsError for a model that it cannot hold."""
-    if camera.model not in MODELS:
+    if camera.model not in NAMES:
         raise ResultsError(
             f"nerfstudio has no {camera.model} camera: export to colmap, whose FULL_OPENCV holds it, or with "
             "--undistort"
         )
-    model, distortion = MODELS[camera.model]
-    names = ("fl_x", "fl_y", "cx", "cy", *distortion)
+    names = ("fl_x", "fl_y", "cx", "cy", *MODELS[camera.model].coefficients)
     params = corner_camera(camera).params.tolist()
-    about = {"camera_model": model, "w": camera.width, "h": camera.height}
+    about = {"camera_model": NAMES[camera.model], "w": camera.width, "h": camera.height}
     return about | dict(zip(names, params, strict=True))
 
 

@@ -11,6 +11,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchslam.io.export.recording import gaps
 from torchslam.io.plots import style
 from torchslam.types import Trajectory
 
@@ -43,7 +44,7 @@ class _Scene:
     point_covariances: np.ndarray
     groundtruth: np.ndarray
     labels: tuple[str, str, str]
-    gaps: np.ndarray
+    gaps: list[int]
 
 
 def plot_scene(
@@ -133,7 +134,7 @@ def _scene(
         point_covariances=_turned(point_covariances_w, len(points), upright)[finite],
         groundtruth=truth @ upright.T,
         labels=labels,
-        gaps=_gaps(style.to_numpy(trajectory.timestamps)),
+        gaps=gaps(trajectory.timestamps),
     )
 
 
@@ -142,14 +143,6 @@ def _turned(covariances_w: Tensor | None, count: int, upright: np.ndarray) -> np
     if covariances_w is None:
         return np.zeros((count, 3, 3))
     return upright @ style.to_numpy(covariances_w) @ upright.T
-
-
-def _gaps(timestamps: np.ndarray) -> np.ndarray:
-    """Rows before which the path is broken: more than five usual intervals without a pose."""
-    if len(timestamps) < 3:
-        return np.zeros(0, dtype=int)
-    intervals = np.diff(timestamps)
-    return np.flatnonzero(intervals > 5.0 * np.median(intervals)) + 1
 
 
 def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit: str) -> None:

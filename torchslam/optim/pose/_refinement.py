@@ -25,6 +25,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     SolverReason,
     check_minimum,
     minimize_batch,
+    select_models,
 )
 from torchslam.optim._core.linear import diagonal_floor, factorize
 from torchslam.optim._core.options import POSE_OPTIONS, SolverOptions
@@ -234,16 +235,7 @@ class PoseProblem:
         return retract(model.T_cw, xi), -0.5 * (xi * model.gradient).sum(-1)
 
     def select(self, accept: Tensor, new: PoseModel, old: PoseModel) -> PoseModel:
-        if accept.all():
-            return new
-        matrix, vector = accept[:, None, None], accept[:, None]
-        return PoseModel(
-            torch.where(matrix, new.T_cw, old.T_cw),
-            torch.where(accept, new.cost, old.cost),
-            torch.where(vector, new.gradient, old.gradient),
-            torch.where(matrix, new.hessian, old.hessian),
-            torch.where(matrix, new.curvature_term, 0.0),
-        )
+        return select_models(accept, new, old._replace(curvature_term=torch.zeros_like(old.curvature_term)))
 
     def covariance(self, T_cw: Float[Tensor, "B 4 4"]) -> Float[Tensor, "B 6 6"]:
         """Covariances (B, 6, 6) at minima, zero where the pose is not determined."""

@@ -7,10 +7,8 @@ optimized as such, every step would cost (6 / 3)^3 times as much for the same re
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import torch
-from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.geometry.lie import (
@@ -26,53 +24,9 @@ from torchslam.geometry.lie import (
 from torchslam.optim._core.tangent import pull_back_sim3, push_sim3, retract_sim3
 
 
-class Group(Protocol):
-    """A matrix group with tangent vectors of D = `dims` numbers; matrices are (n, n).
-
-    A logarithm has D numbers that are an edge's error, and then those that stay as they are.
-    """
-
-    @property
-    def dims(self) -> int: ...
-
-    def inverse(self, S: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch n n"]: ...
-
-    def log(self, S: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch all"]: ...
-
-    def left_jacobian_inverse(self, log: Float[Tensor, "*batch all"]) -> Float[Tensor, "*batch D D"]:
-        """The derivative of log(exp(xi) S) in xi at zero."""
-        ...
-
-    def adjoint(self, S: Float[Tensor, "*batch n n"]) -> Float[Tensor, "*batch D D"]:
-        """Ad with S exp(xi) = exp(Ad xi) S."""
-        ...
-
-    def bracket(self, force: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D D"]:
-        """Half of force . [a, b] as a bilinear form a^T M b of tangent vectors."""
-        ...
-
-    def retract(
-        self, S: Float[Tensor, "*batch n n"], xi: Float[Tensor, "*batch D"]
-    ) -> Float[Tensor, "*batch n n"]:
-        """exp(xi) S."""
-        ...
-
-    def push(
-        self, S: Float[Tensor, "*batch n n"], xi: Float[Tensor, "*batch D"]
-    ) -> Float[Tensor, "*batch n n"]:
-        """The change of S, to first order, when it moves along xi."""
-        ...
-
-    def pull_back(
-        self, S: Float[Tensor, "*batch n n"], grad_S: Float[Tensor, "*batch n n"]
-    ) -> Float[Tensor, "*batch D"]:
-        """The gradient in xi, at zero, of a loss with gradient `grad_S` at exp(xi) S."""
-        ...
-
-
 @dataclass(frozen=True)
 class Similarities:
-    """Sim(3), or with six dimensions its elements of fixed scale."""
+    """Sim(3), or with six dimensions its elements of fixed scale; matrices (..., n, n), tangent vectors (..., D)."""
 
     dims: int
 
@@ -80,15 +34,19 @@ class Similarities:
         return sim3_inverse(S)
 
     def log(self, S: Tensor) -> Tensor:
+        """D numbers that are an edge's error, and then those that stay as they are."""
         return sim3_log(S)
 
     def left_jacobian_inverse(self, log: Tensor) -> Tensor:
+        """(..., D, D) the derivative of log(exp(xi) S) in xi at zero."""
         return sim3_left_jacobian_inverse(log)[..., : self.dims, : self.dims]
 
     def adjoint(self, S: Tensor) -> Tensor:
+        """(..., D, D) Ad with S exp(xi) = exp(Ad xi) S."""
         return sim3_adjoint(S)[..., : self.dims, : self.dims]
 
     def bracket(self, force: Tensor) -> Tensor:
+        """(..., D, D) half of force . [a, b] as a bilinear form a^T M b of tangent vectors."""
         v, omega = skew(force[..., :3]), skew(force[..., 3:6])
         M = torch.cat((torch.cat((torch.zeros_like(v), -v), -1), torch.cat((-v, -omega), -1)), dim=-2)
         if self.dims == 7:
@@ -97,18 +55,21 @@ class Similarities:
         return 0.5 * M
 
     def retract(self, S: Tensor, xi: Tensor) -> Tensor:
+        """exp(xi) S."""
         return retract_sim3(S, xi)
 
     def push(self, S: Tensor, xi: Tensor) -> Tensor:
+        """The change of S, to first order, when it moves along xi."""
         return push_sim3(S, xi)
 
     def pull_back(self, S: Tensor, grad_S: Tensor) -> Tensor:
+        """The gradient in xi, at zero, of a loss with gradient `grad_S` at exp(xi) S."""
         return pull_back_sim3(S, grad_S)[..., : self.dims]
 
 
 @dataclass(frozen=True)
 class Rotations:
-    """SO(3)."""
+    """SO(3), with the operations of `Similarities`."""
 
     dims: int = 3
 
@@ -135,6 +96,9 @@ class Rotations:
 
     def pull_back(self, S: Tensor, grad_S: Tensor) -> Tensor:
         return torch.linalg.cross(S, grad_S, dim=-2).sum(-1)
+
+
+Group = Similarities | Rotations
 
 
 def group_of(dims: int) -> Group:
