@@ -115,7 +115,7 @@ def test_a_readout_is_a_row_of_the_summary(run: Run) -> None:
     known = replace(run, sensor=replace(run.sensor, readout=Readout.known(0.0, 0.1).updated(0.028, 0.001)))
     found = {"readout": readout_metrics(known)}
     assert summary(run_metrics(run) | found)["readout"].startswith(
-        "28.0 ± 1.0 ms from the first row to the last (found)"
+        "28.0 ± 1.0 ms from the first row to the last (estimated)"
     )
     assert "readout" not in summary(run_metrics(run) | {"readout": readout_metrics(run)})
 
