@@ -102,7 +102,7 @@ def test_where_nothing_measures_nothing_is_changed(results: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("words", "what"),
     [
-        ([], "nothing to measure with: give one of --marker"),
+        ([], "no source of scale: give one of --marker"),
         (["--marker", "apriltag-1h1:0.1"], "no family apriltag-1h1"),
         (["--distance", "1:2,3", "1:2,4", "long"], "no length in meters"),
         (["--distance", "1:2,3", "1:9999,4", "2"], "outside of the image"),

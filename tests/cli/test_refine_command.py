@@ -157,7 +157,7 @@ def test_a_rendered_sequence_takes_the_camera_of_the_poses(
 ) -> None:
     poses = write("colmap", given, tmp_path)
     assert main(["refine", "synthetic:room?frames=2", "--poses", str(poses), "-o", str(tmp_path / "a")]) == 2
-    assert "no pose is that of an image of room: no image is called" in capsys.readouterr().err
+    assert "no pose is that of an image of room: no image has one of its names" in capsys.readouterr().err
 
 
 def test_images_with_an_orientation_are_refined_as_colmap_saw_them(

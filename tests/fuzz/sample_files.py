@@ -29,7 +29,7 @@ OVERRIDES = (
     "initialization.min_matches=40",
 )
 CONFIG = load_config(None, OVERRIDES)
-WALK = Walk(arc(30)[:14])
+WALK = Walk(arc(30))
 SMALL_CAMERA = Camera.pinhole(8.0, 8.0, 5.5, 3.5, size=(12, 8))
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.learning.test_clip_slam import CONFIG, FRAMES, BentExtractor, clip_of, derivative
+from tests.learning.test_clip_slam import FRAMES, BentExtractor, clip_of, derivative
 from tests.walks import Walk, arc, still
 from torchslam import Camera, ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
 from torchslam.errors import ClipError
@@ -72,7 +72,7 @@ def test_a_clip_graph_is_detached(walk: Walk) -> None:
 def test_the_gradient_through_a_stored_graph_agrees_with_finite_differences(walk: Walk) -> None:
     images, truth = clip_of(walk)
     extractor = BentExtractor(walk, bend=0.01)
-    clip_slam = ClipSLAM(extractor, config=CONFIG)
+    clip_slam = ClipSLAM(extractor)
     graph = clip_slam.build_graph(images, walk.camera)
 
     def loss(bend: float, focal: Tensor | float) -> Tensor:

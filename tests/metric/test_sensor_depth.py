@@ -102,7 +102,7 @@ def test_the_scale_of_the_values_is_that_of_the_option(
     assert isinstance(source, SensorDepth)
     found = measure(source, view)
     assert abs(error(found)) < 0.002
-    assert "is taken to have 1000 units per meter" in found.notes[0]
+    assert "assuming 1000 units per meter" in found.notes[0]
 
 
 def test_a_list_is_matched_by_times(world: NamedWorld, view: SubmapView, tmp_path: Path) -> None:
