@@ -181,7 +181,9 @@ def test_a_moving_object_before_a_static_camera_is_no_scene() -> None:
         [views[0], replace(views[1], keypoints=keypoints)], "initialization.min_matches=50"
     )
     assert start is None
-    assert re_any(reason, "possible moving object in front of a stationary camera", "the motion of the rest is unclear")
+    assert re_any(
+        reason, "possible moving object in front of a stationary camera", "the motion of the rest is unclear"
+    )
 
 
 def test_a_rotating_camera_gives_no_depth() -> None:
