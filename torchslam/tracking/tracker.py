@@ -98,7 +98,9 @@ class Tracker:
 
     def predict(self, submap: Submap) -> Float[Tensor, "4 4"]:
         """Predicted pose of the next frame, by constant velocity."""
-        if submap.tracking.velocity is None or self.brute_force:
+        if self.brute_force:
+            return reorthonormalized(submap.T_cw)
+        if submap.tracking.velocity is None:
             return submap.T_cw
         return reorthonormalized(submap.tracking.velocity @ submap.T_cw)
 
