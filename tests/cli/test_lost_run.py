@@ -18,6 +18,7 @@ from torchslam.cli.main import main
 from torchslam.data import read_trajectory
 from torchslam.global_mapping import recording
 from torchslam.global_mapping.check import MapCheck
+from torchslam.system import online_run
 from torchslam.system.run import RunProgress, finish, run_frames, run_sequence
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
@@ -109,6 +110,26 @@ def test_where_the_map_of_the_whole_is_not_right_the_run_goes_on(
     found = run("auto")
     assert steps == list(range(FRAMES))
     assert found["mapping_reason"] == "tracking was lost in 1 frames"
+
+
+def test_ctrl_c_after_the_run_went_on_does_not_end_it_twice(
+    run: Run, steps: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ends = []
+
+    def counted(*given: Any) -> Any:
+        ends.append(len(steps))
+        return finish(*given)
+
+    def stop(*given: Any) -> None:
+        given[8]()  # go_on
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(online_run, "finish", counted)
+    monkeypatch.setattr(recording, "map_recording", stop)
+    assert run("auto")["interrupted"]
+    assert steps == list(range(FRAMES))
+    assert ends == [FRAMES]
 
 
 def test_ctrl_c_keeps_the_frames_so_far(

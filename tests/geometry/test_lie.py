@@ -10,6 +10,7 @@ from torch import Tensor
 from torch.autograd import gradcheck
 
 from torchslam import geometry as g
+from torchslam.geometry.lie import se3_exp_transform
 
 ANGLES = (0.0, 1e-9, 1e-5, 1e-3, 0.4999, 0.5001, 1.0, 2.0, 3.0, math.pi - 1e-4)
 
@@ -48,6 +49,14 @@ def test_exp_agrees_with_matrix_exponential_and_log_inverts_it(exp, log, size: i
         expected = torch.from_numpy(expm(algebra(row).numpy()))
         torch.testing.assert_close(matrix, expected, atol=1e-11, rtol=1e-11)
     torch.testing.assert_close(log(T), xi, atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+def test_points_move_under_exp_as_under_its_matrix(angle: float) -> None:
+    xi, points = tangent(angle, 6), axis_angle(3.0, seed=5)
+    expected = g.transform(g.se3_exp(xi), points[:, None])[:, 0]
+    torch.testing.assert_close(se3_exp_transform(xi, points), expected, atol=1e-13, rtol=0)
+    assert gradcheck(se3_exp_transform, (xi.requires_grad_(), points.requires_grad_()))
 
 
 @pytest.mark.parametrize("angle", [*ANGLES, math.pi])

@@ -115,6 +115,17 @@ def test_velocities_are_those_of_a_constant_motion_without_gaps() -> None:
     torch.testing.assert_close(velocities, 25 * TWIST.expand(20, 6))
 
 
+def test_velocities_of_some_frames_are_those_of_all() -> None:
+    times = torch.arange(20, dtype=torch.float64) / 25
+    T_cw = se3_exp(torch.arange(20)[:, None] ** 1.5 * TWIST)
+    every, is_central = frame_velocities(T_cw, times)
+    rows = torch.tensor([0, 7, 19])
+    some, same = frame_velocities(T_cw, times, frames=rows)
+    torch.testing.assert_close(some[rows], every[rows], rtol=0.0, atol=1e-14)
+    assert int(some.any(-1).sum()) == 3
+    assert torch.equal(same, is_central)
+
+
 def test_a_frame_between_two_gaps_has_no_velocity() -> None:
     times = torch.tensor([0.0, 0.04, 0.08, 0.3, 0.6, 0.64], dtype=torch.float64)
     velocities, is_central = frame_velocities(se3_exp(torch.arange(6)[:, None] * TWIST), times)

@@ -131,6 +131,14 @@ def test_a_given_readout_is_improved_by_any_evidence() -> None:
     assert shutter.std < known.std
 
 
+def test_a_readout_in_use_stays_where_the_residuals_determine_none() -> None:
+    run, used = graph(frames=8), Readout.known(0.0, 0.03).updated(0.02, 0.001)
+    found = estimate(replace(run, readout=used), prior(1.0, SOUGHT))
+    assert found.shutter is None
+    assert found.sensor.readout is used
+    assert not found.has_other_readout
+
+
 def test_an_exact_camera_is_not_estimated() -> None:
     """Only its readout is."""
     found = estimate(graph(0.9, factor=1.04), SensorPrior(None, SOUGHT))

@@ -11,7 +11,7 @@ from torch import Tensor
 from tests.scene import CAMERA, Scene
 from torchslam import load_config
 from torchslam.geometry import SharedCamera, se3_inverse, so3_exp, so3_log
-from torchslam.geometry.rolling_shutter import row_fractions
+from torchslam.geometry.rolling_shutter import Readout, row_fractions
 from torchslam.geometry.rotating_camera import RotatingCamera
 from torchslam.tracking import initialization
 from torchslam.tracking.initialization import LEAVING_INTERVAL, Initializer
@@ -89,11 +89,13 @@ def test_a_camera_that_only_turns_starts_none(readout: float, noise: float) -> N
     assert Reason.PURE_ROTATION in reasons
 
 
-def fitted(views: list[FrameFeatures]) -> tuple[TurningCamera, RotatingCamera, Tensor, tuple[Tensor, Tensor]]:
-    """The fit to the first and the last of some views."""
-    config = load_config(None, ["initialization.min_matches=60"])
+def fitted(
+    views: list[FrameFeatures], known: Readout | None = None, *overrides: str
+) -> tuple[TurningCamera, RotatingCamera, Tensor, tuple[Tensor, Tensor]]:
+    """The fit to the first and the last of some views, with the readout of the sensor model."""
+    config = load_config(None, ["initialization.min_matches=60", *overrides])
     matcher = make_matcher(config.matching, features=config.features.kind)
-    turning = TurningCamera(SharedCamera(CAMERA), config, matcher)
+    turning = TurningCamera(SharedCamera(CAMERA, known), config, matcher)
     turning.refer_to(views[0])
     for view in views[1:]:
         turning.add(view)
@@ -116,6 +118,23 @@ def test_the_turns_during_a_readout_are_measured() -> None:
     R_21 = (T_cw[-1] @ se3_inverse(T_cw[0]))[:3, :3]
     mapped, _ = CAMERA.project(CAMERA.unproject(middle_1) @ R_21.mT)
     assert float((mapped - middle_2).norm(dim=-1).median()) < 0.7
+
+
+def test_a_readout_that_is_known_is_not_fitted() -> None:
+    views = views_of(walk(14, 0.0), 0.6, noise=0.1)
+    interval = views[1].timestamp - views[0].timestamp
+    turning, found, turns, pixels = fitted(views, Readout.known(0.6 * interval, 0.01 * interval))
+    assert float(found.readout) == 0.0
+    rates = torch.tensor([0.04, 0.04 + 0.002 * 13], dtype=torch.float64)
+    torch.testing.assert_close(turns[:, 1], -0.6 * rates, atol=0, rtol=0.05)
+    everything = torch.ones(len(pixels[0]), dtype=torch.bool)
+    assert turning.explains(found, everything, 0.6)
+
+
+def test_an_excluded_readout_is_not_fitted() -> None:
+    _, found, turns, _ = fitted(views_of(walk(14, 0.0), 0.6, noise=0.1), None, "camera.readout_std=0")
+    assert float(found.readout) == 0.0
+    assert not bool(turns.any())
 
 
 def test_a_global_shutter_has_no_readout() -> None:

@@ -211,6 +211,7 @@ class _Screen(Observer):
         stop_signals: a signal ends the run after the frame or the step.
         checkpoints: of the run.
         watching: the viewers.
+        may_map: whether the recording may be mapped as a whole after its last frame, which is worth a checkpoint.
     """
 
     def __init__(
@@ -220,9 +221,10 @@ class _Screen(Observer):
         stop_signals: StopSignals,
         checkpoints: Checkpoints,
         watching: FrameViewers,
+        may_map: bool,
     ) -> None:
         self.slam, self.sequence, self.stop_signals = slam, sequence, stop_signals
-        self.checkpoints, self.watching = checkpoints, watching
+        self.checkpoints, self.watching, self.may_map = checkpoints, watching, may_map
         self.latencies: list[float] = []  # milliseconds from capture to pose, of a live source
 
     @contextmanager
@@ -242,7 +244,7 @@ class _Screen(Observer):
         """Show a frame, and write a checkpoint if one is due."""
         if self.sequence.is_live:
             self.latencies.append(1e3 * (time.time() - result.timestamp))
-        self.checkpoints.offer(at_once=self.stop_signals.is_wanted or is_last)
+        self.checkpoints.offer(at_once=self.stop_signals.is_wanted or (self.may_map and is_last))
         self.watching.show(result)
         self._frames.update(result)
 
@@ -278,7 +280,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         sequence = source(sequence, config, slam.camera)
         watching = viewers.enter_context(_watching(slam, sequence, options))
         checkpoints = Checkpoints(options.output, options.checkpoint, slam, so_far, sequence)
-        screen = _Screen(slam, sequence, stop_signals, checkpoints, watching)
+        screen = _Screen(slam, sequence, stop_signals, checkpoints, watching, may_map)
         is_watched = options.view or options.video  # then this process needs the images
         online = OnlineRun(slam, watching.sequence, so_far, 1 if is_watched else options.processes, screen)
         stages = options.output / STAGES if options.checkpoint else None

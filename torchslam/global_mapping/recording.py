@@ -116,7 +116,7 @@ def run_recording(
                 )
             run = mapped.run
         except KeyboardInterrupt:
-            run = replace(run if go_on is None else online.end(), interrupted=True)
+            run = replace(online.end(), interrupted=True)
     if run.interrupted and sources:
         return replace(run, unmeasured=(UNMEASURED,)), mapped
     try:

@@ -80,7 +80,9 @@ def estimate_sensor(
     if prior.readout.is_sought or prior.readout.is_given:
         for _ in range(READOUT_STEPS):
             shutter = find_rolling_shutter(replace(graph, readout=readout), readout_frames, for_shaking)
-            readout = readout_by(shutter, prior.readout)
+            readout = (
+                readout_by(shutter, prior.readout) or readout
+            )  # the one in use stays where none is better
             if readout is None:
                 break
     held = SensorEstimate(

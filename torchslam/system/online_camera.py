@@ -154,7 +154,8 @@ class OnlineCamera(SolvedElsewhere):
     def _take(self, submap: Submap, found: SensorEstimate, frame: int) -> None:
         """Have the map adjusted by another model."""
         if found.is_change:
-            self.camera.use(SensorModel(self.camera.current, found.sensor.readout), self.camera.undistortion)
+            before = replace(self.camera.model, readout=found.sensor.readout)
+            self.camera.use(before, self.camera.undistortion)
             submap.correct_keyframes(self.camera.model)
             prepared = None
             if found.has_other_camera:

@@ -35,9 +35,6 @@ class Observer:
 class OnlineRun:
     """A run frame by frame, which may stop where tracking is lost and go on later.
 
-    Attributes:
-        is_finished: whether all frames were processed, or the run was ended.
-
     Args:
         slam: the system.
         sequence: the frames.
@@ -57,7 +54,12 @@ class OnlineRun:
         self.slam, self.sequence, self.processes = slam, sequence, processes
         self.so_far = RunProgress() if so_far is None else so_far
         self.observer = Observer() if observer is None else observer
-        self.is_finished = False
+        self._finished: Run | None = None
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether all frames were processed, or the run was ended."""
+        return self._finished is not None
 
     def run(self, until_lost: bool = False) -> Run:
         """Process the frames that are left; with `until_lost` the run may stop before its end, unadjusted."""
@@ -87,7 +89,8 @@ class OnlineRun:
             return self.end(interrupted)
 
     def end(self, interrupted: bool = True) -> Run:
-        """Adjust the map of the frames so far; the others are not processed."""
-        self.is_finished = True
-        so_far = self.so_far
-        return finish(self.slam, so_far.results, so_far.skipped, interrupted, self.observer.adjusting)
+        """Adjust the map of the frames so far, once; the others are not processed."""
+        if self._finished is None:
+            results, skipped = self.so_far.results, self.so_far.skipped
+            self._finished = finish(self.slam, results, skipped, interrupted, self.observer.adjusting)
+        return self._finished
