@@ -28,6 +28,7 @@ from torchslam.system.online_camera import (
     FIRST_KEYFRAMES,
     GROWTH,
     MAX_KEYFRAMES,
+    OnlineCamera,
 )
 from torchslam.system.run import RunProgress, run_sequence
 
@@ -118,20 +119,25 @@ def test_a_right_camera_stays() -> None:
     assert focal_error(found.camera) < 0.01
 
 
-def half() -> tuple[SLAM, RunProgress]:
-    """A system after its camera was changed."""
+def run_until(is_enough: Callable[[OnlineCamera], bool]) -> tuple[SLAM, RunProgress]:
+    """A system that may write a checkpoint, once its sensor is as it should be."""
     slam, so_far = SLAM(given(OFF), config()), RunProgress()
 
     class Enough(BaseException):
         pass
 
     def stop(_: StepResult) -> None:
-        if slam.online_camera.changes and slam.can_checkpoint:
+        if is_enough(slam.online_camera) and slam.can_checkpoint:
             raise Enough
 
     with pytest.raises(Enough):
         run_sequence(slam, seen(), stop, so_far)
     return slam, so_far
+
+
+def half() -> tuple[SLAM, RunProgress]:
+    """A system after its camera was changed."""
+    return run_until(lambda sensor: bool(sensor.changes))
 
 
 def test_a_resumed_run_goes_on_with_the_camera_that_was_found(corrected: Run, tmp_path: Path) -> None:
@@ -252,17 +258,8 @@ def test_nothing_is_estimated_where_nothing_may_change(settings: tuple[str, ...]
 
 def test_a_checkpoint_has_the_estimate_that_is_pending(tmp_path: Path) -> None:
     """The graph of the estimate is gone when the run goes on, so that its result is kept."""
-    slam, so_far, path = SLAM(given(OFF), config()), RunProgress(), tmp_path / "checkpoint.safetensors"
-
-    class Enough(BaseException):
-        pass
-
-    def stop(_: StepResult) -> None:
-        if slam.online_camera.is_pending and slam.can_checkpoint:
-            raise Enough
-
-    with pytest.raises(Enough):
-        run_sequence(slam, seen(), stop, so_far)
+    path = tmp_path / "checkpoint.safetensors"
+    slam, so_far = run_until(lambda sensor: sensor.is_pending)
     write_checkpoint(path, slam, so_far, seen())
     resumed, _ = read_checkpoint(path, seen(), config())
     one, other = slam.online_camera.pending, resumed.online_camera.pending
