@@ -22,7 +22,7 @@ from torchslam.data.sequence import Sequence
 from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
 from torchslam.system.front_end import Simulated
-from torchslam.system.run import finish
+from torchslam.system.online_run import finish
 from torchslam.system.slam import SLAM
 from torchslam.types import Frame, StepResult, Trajectory
 

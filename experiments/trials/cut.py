@@ -16,7 +16,7 @@ from torchslam.cli.run import CHECKPOINT_EVERY, Checkpoints
 from torchslam.config import Config
 from torchslam.io.results import CHECKPOINT
 from torchslam.system.checkpoint import read_checkpoint
-from torchslam.system.run import RunProgress, run_sequence
+from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 
@@ -52,4 +52,4 @@ def _run_until_killed(
         if so_far.next >= share * len(sequence):
             os.kill(os.getpid(), signal.SIGKILL)
 
-    run_sequence(slam, sequence, after_frame, so_far)
+    OnlineRun(slam, sequence, so_far, observer=Observer(after_frame)).run()

@@ -23,7 +23,8 @@ from torchslam.config import Config, load_config
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.geometry import se3_inverse, so3_log
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
-from torchslam.system.run import Run, RunProgress, run_sequence
+from torchslam.system.online_run import OnlineRun, RunProgress
+from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 from torchslam.types import Frame, State, StepResult
 
@@ -90,7 +91,7 @@ def perform(trial: Trial, more: Rows[str] = ()) -> tuple[Outcome, Run]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         start = time.process_time()
-        run = run_sequence(slam, sequence, None, so_far)
+        run = OnlineRun(slam, sequence, so_far).run()
         seconds = time.process_time() - start
     assert known <= set(final_poses(run)), "frames tracked before the last checkpoint lost their poses"
     return _outcome(run, sequence, seconds, taken), run

@@ -19,7 +19,7 @@ from torchslam.data import read_trajectory
 from torchslam.global_mapping import recording
 from torchslam.global_mapping.check import MapCheck
 from torchslam.system import online_run
-from torchslam.system.run import RunProgress, finish, run_frames, run_sequence
+from torchslam.system.online_run import Observer, OnlineRun, finish
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 SETTINGS += ["simulated.noise_px=0.05"]
@@ -61,16 +61,18 @@ def run(steps: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Ru
 
 def test_frames_until_one_is_lost_and_the_others_later_are_the_whole_run() -> None:
     config = load_config(None, SETTINGS)
-    whole = run_sequence(SLAM(WALK.camera, config), WALK)
-    slam, so_far = SLAM(WALK.camera, config), RunProgress()
+    whole = OnlineRun(SLAM(WALK.camera, config), WALK).run()
     seen: list[int] = []
-    assert not run_frames(slam, WALK, so_far, lambda result: seen.append(result.index), until_lost=True)
-    assert seen == list(range(LOST + 1))
-    assert so_far.next == LOST + 1
-    assert not run_frames(slam, WALK, so_far, until_lost=True)  # it was lost before
-    assert so_far.next == LOST + 1
-    assert run_frames(slam, WALK, so_far)
-    parts = finish(slam, so_far.results, so_far.skipped, interrupted=False)
+    run = OnlineRun(
+        SLAM(WALK.camera, config), WALK, observer=Observer(lambda result: seen.append(result.index))
+    )
+    for _ in range(2):  # the second time it was lost before
+        run.run(until_lost=True)
+        assert not run.is_finished
+        assert seen == list(range(LOST + 1))
+        assert run.so_far.next == LOST + 1
+    parts = run.run()
+    assert run.is_finished
     assert len(parts.results) == FRAMES
     assert torch.equal(parts.trajectory.T_wc, whole.trajectory.T_wc)
 

@@ -53,7 +53,7 @@ from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import solve_graph
 from torchslam.system.checkpoint import read_checkpoint
 from torchslam.system.front_end import Simulated
-from torchslam.system.run import run_sequence
+from torchslam.system.online_run import OnlineRun
 from torchslam.system.session import Session
 from torchslam.tracking.lightglue import LightGlue
 
@@ -379,7 +379,7 @@ def _settings(root: Path) -> None:
     """A run ends whatever the numbers of its settings are."""
     config = load_config(None, [*OVERRIDES, _argument(root)])
     with contextlib.suppress(InitializationError):
-        run_sequence(SLAM(WALK.camera, config), WALK)
+        OnlineRun(SLAM(WALK.camera, config), WALK).run()
 
 
 def _whole(config: Config) -> None:

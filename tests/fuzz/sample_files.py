@@ -22,7 +22,7 @@ from torchslam.io.export.scene import scene_of
 from torchslam.io.report import run_metrics
 from torchslam.io.results import write_results
 from torchslam.system.checkpoint import write_checkpoint
-from torchslam.system.run import RunProgress, run_sequence
+from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 
 OVERRIDES = (
     *("features.kind=simulated", "features.num_keypoints=120", "simulated.points_per_view=120"),
@@ -45,7 +45,7 @@ def sample_files() -> dict[str, Files]:
                 (root / "checkpoint").mkdir()
                 write_checkpoint(root / "checkpoint" / "checkpoint.safetensors", slam, so_far, WALK)
 
-        run = run_sequence(slam, WALK, settled, so_far)
+        run = OnlineRun(slam, WALK, so_far, observer=Observer(settled)).run()
         assert run.main is not None
         assert (root / "checkpoint").exists()
         write_results(run, WALK, run_metrics(run) | {"source": "walk", "camera": ""}, root / "results")

@@ -10,8 +10,8 @@ import torch
 from tests.walks import Walk, arc
 from torchslam import SLAM, Run, evaluate, load_config
 from torchslam.map.atlas import Atlas
-from torchslam.system import run as final
-from torchslam.system.run import FinalAdjustment
+from torchslam.system import final_adjustment as final
+from torchslam.system.final_adjustment import FinalAdjustment
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 WALK = Walk(arc(60)[:30])

@@ -21,7 +21,7 @@ from torchslam.features import SimulatedFeatures
 from torchslam.mapping.local_bundle import ApplyAt
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import Simulated, WithFeatures
-from torchslam.system.run import RunProgress, run_sequence
+from torchslam.system.online_run import OnlineRun, RunProgress
 from torchslam.system.state_machine import StateMachine
 from torchslam.types import Frame
 
@@ -125,7 +125,7 @@ def test_a_resumed_run_with_information_ends_with_the_same_bytes(tmp_path: Path)
     slam.confirm_map()
     write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
     slam, so_far = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG)
-    resumed = run_sequence(slam, SAID, so_far=so_far)
+    resumed = OnlineRun(slam, SAID, so_far).run()
     assert resumed.map.keyframes["information"].shape[-1] == 3
     torch.testing.assert_close(resumed.trajectory.T_wc, whole.trajectory.T_wc, atol=1e-3, rtol=0)
 

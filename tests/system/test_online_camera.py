@@ -30,7 +30,7 @@ from torchslam.system.online_camera import (
     MAX_KEYFRAMES,
     OnlineCamera,
 )
-from torchslam.system.run import RunProgress, run_sequence
+from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
 SETTINGS += ["simulated.noise_px=0.2"]
@@ -131,7 +131,7 @@ def run_until(is_enough: Callable[[OnlineCamera], bool]) -> tuple[SLAM, RunProgr
             raise Enough
 
     with pytest.raises(Enough):
-        run_sequence(slam, seen(), stop, so_far)
+        OnlineRun(slam, seen(), so_far, observer=Observer(stop)).run()
     return slam, so_far
 
 
@@ -147,7 +147,7 @@ def test_a_resumed_run_goes_on_with_the_camera_that_was_found(corrected: Run, tm
     resumed, loaded = read_checkpoint(path, seen(), config())
     assert torch.equal(resumed.shared_camera.current.params, slam.shared_camera.current.params)
     assert not torch.equal(resumed.shared_camera.current.params[:4], resumed.camera.params[:4])
-    whole = run_sequence(resumed, seen(), so_far=loaded)
+    whole = OnlineRun(resumed, seen(), loaded).run()
     assert torch.equal(whole.trajectory.T_wc, corrected.trajectory.T_wc)
     assert [change.frame for change in whole.camera_changes] == [c.frame for c in corrected.camera_changes]
 
@@ -208,7 +208,7 @@ def test_no_frame_waits_for_an_estimate() -> None:
         return calls(*arguments)
 
     with slam.online_camera.solved_by(solver):
-        run_sequence(slam, seen())
+        OnlineRun(slam, seen()).run()
     assert slam.online_camera.solver is begin
     assert len(calls.begun) > 2
     assert keyframes[0] >= FIRST_KEYFRAMES
@@ -238,7 +238,7 @@ def test_the_estimate_is_by_the_given_camera_and_the_one_in_use() -> None:
         return solve_here(function, graph, prior, *more)
 
     with slam.online_camera.solved_by(solver):
-        run_sequence(slam, seen())
+        OnlineRun(slam, seen()).run()
     assert len(priors) == 1
     assert torch.equal(cameras[0].params[:4], slam.camera.params[:4])
     assert cameras[-1] is slam.online_camera.changes[-1].camera
@@ -252,7 +252,7 @@ def test_the_estimate_is_by_the_given_camera_and_the_one_in_use() -> None:
 def test_nothing_is_estimated_where_nothing_may_change(settings: tuple[str, ...]) -> None:
     slam = SLAM(given(1.0), config(*settings))
     with slam.online_camera.solved_by(lambda *arguments: pytest.fail("an estimate was begun")):
-        run_sequence(slam, seen())
+        OnlineRun(slam, seen()).run()
     assert slam.online_camera.changes == []
 
 
@@ -282,7 +282,7 @@ def test_no_checkpoint_while_the_whole_map_is_adjusted() -> None:
             adjusted += 1
             assert not slam.can_checkpoint
 
-    run_sequence(slam, seen(), look)
+    OnlineRun(slam, seen(), observer=Observer(look)).run()
     assert adjusted > 0
 
 

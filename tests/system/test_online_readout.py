@@ -13,7 +13,7 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import SensorModel
 from torchslam.map.file import read_tensors, write_tensors
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
-from torchslam.system.run import RunProgress, run_sequence
+from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 from torchslam.tracking.non_static import NO_MOVEMENT, SceneFilter
 
 ROOM = open_sequence("synthetic:room?readout=30&pace=2", limit=60)
@@ -108,7 +108,7 @@ def test_a_resumed_run_goes_on_with_the_readout(tmp_path: Path, monkeypatch: pyt
             raise Enough
 
     with pytest.raises(Enough):
-        run_sequence(slam, ROOM, stop, so_far)
+        OnlineRun(slam, ROOM, so_far, observer=Observer(stop)).run()
     write_checkpoint(path, slam, so_far, ROOM)
     resumed, loaded = read_checkpoint(path, ROOM, Config())
     assert resumed.shared_camera.model.readout == slam.shared_camera.model.readout

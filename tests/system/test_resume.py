@@ -33,7 +33,7 @@ from torchslam.map.file import read_atlas, read_tensors, write_atlas, write_tens
 from torchslam.mapping import local_bundle, mapper
 from torchslam.system import map_start, state_machine
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
-from torchslam.system.run import RunProgress, run_sequence
+from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 # Without any noise, what a run says of its camera would be looked for to the last bit, in hundreds of iterations.
@@ -67,7 +67,7 @@ def half(config: Config = CONFIG) -> tuple[SLAM, RunProgress]:
             raise PowerCut
 
     with pytest.raises(PowerCut):
-        run_sequence(slam, WALK, cut, so_far)
+        OnlineRun(slam, WALK, so_far, observer=Observer(cut)).run()
     return slam, so_far
 
 
@@ -118,7 +118,7 @@ def test_a_checkpoint_restores_the_state(checkpoint: Path) -> None:
 def test_a_resumed_run_equals_an_uninterrupted_one(checkpoint: Path, tmp_path: Path) -> None:
     whole = SLAM(WALK.camera, CONFIG).run(WALK)
     slam, so_far = read_checkpoint(checkpoint, WALK, CONFIG)
-    resumed = run_sequence(slam, WALK, None, so_far)
+    resumed = OnlineRun(slam, WALK, so_far).run()
     for name, run in (("whole", whole), ("resumed", resumed)):
         write_atlas(tmp_path / name, run.submaps, run.camera, run.sessions)
     assert (tmp_path / "whole").read_bytes() == (tmp_path / "resumed").read_bytes()
@@ -142,13 +142,13 @@ def test_a_pending_adjustment_is_finished_after_resuming(
             raise PowerCut
 
     with pytest.raises(PowerCut):
-        run_sequence(slam, WALK, cut, so_far)
+        OnlineRun(slam, WALK, so_far, observer=Observer(cut)).run()
     write_checkpoint(tmp_path / "checkpoint", slam, so_far, WALK)
     resumed, loaded = read_checkpoint(tmp_path / "checkpoint", WALK, CONFIG)
     assert resumed.mapper.adjustment.is_pending
     assert resumed.mapper.adjustment.due == slam.mapper.adjustment.due
     assert resumed.mapper.adjustment.is_due_before_next_frame is (window == 1000)
-    run = run_sequence(resumed, WALK, None, loaded)
+    run = OnlineRun(resumed, WALK, loaded).run()
     assert torch.equal(run.trajectory.T_wc, whole.trajectory.T_wc)
     assert torch.equal(run.online.T_wc, whole.online.T_wc)
 

@@ -56,8 +56,7 @@ from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import write_run
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import KeptFeatures, source
-from torchslam.system.online_run import Observer, OnlineRun
-from torchslam.system.run import RunProgress
+from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 from torchslam.utils.console import say, table, warn

@@ -50,6 +50,7 @@ from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.model_choice import predictive_gain
 from torchslam.optim.rotation_averaging import solve_rotations
+from torchslam.system.final_adjustment import FinalAdjustment
 from torchslam.system.front_end import (
     Extractor,
     FeatureExtractor,
@@ -58,7 +59,7 @@ from torchslam.system.front_end import (
     image_extractor,
     source,
 )
-from torchslam.system.run import FinalAdjustment, Run
+from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher, prepare_view
 from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, Reason, State, StepResult
 

@@ -24,7 +24,7 @@ from torchslam.geometry import Camera, KeypointNoise, SensorModel
 from torchslam.geometry.gating import times
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graphs
-from torchslam.system.run import finish
+from torchslam.system.online_run import finish
 from torchslam.system.slam import SLAM
 from torchslam.types import Features, Frame
 

@@ -46,7 +46,7 @@ class _Estimator(Protocol):
         """Estimate elsewhere while the context is entered."""
 
 
-class _System(Protocol):
+class RunningSystem(Protocol):
     """The part of `torchslam.system.slam.SLAM` that workers need."""
 
     camera: Camera
@@ -101,7 +101,7 @@ def best_number(sequence: Sequence, start: int) -> int:
 
 @contextmanager
 def with_workers(
-    sequence: Sequence, slam: _System, processes: int | None, start: int = 0
+    sequence: Sequence, slam: RunningSystem, processes: int | None, start: int = 0
 ) -> Iterator[Frames]:
     """The frames of a sequence from `start` on, for a run that uses workers while this is entered.
 
@@ -139,7 +139,7 @@ def with_workers(
 
 
 def reader(
-    sequence: Sequence, slam: _System, processes: int, is_asked_for: bool
+    sequence: Sequence, slam: RunningSystem, processes: int, is_asked_for: bool
 ) -> FeaturePrefetcher | LivePrefetcher | None:
     """The prefetcher of a sequence; None if frames cannot or should not be prefetched."""
     obstacle = prefetch_obstacle(sequence, slam)
@@ -152,7 +152,7 @@ def reader(
     return FeaturePrefetcher(sequence, slam.make_extractor, slam.clock, max(1, processes - 2))
 
 
-def prefetch_obstacle(sequence: Sequence, slam: _System) -> str:
+def prefetch_obstacle(sequence: Sequence, slam: RunningSystem) -> str:
     """The reason why the frames of a sequence cannot be prefetched; empty if they can."""
     if sequence.brings_features or slam.config.features.kind == "simulated":
         return "simulated features need no images"

@@ -27,7 +27,7 @@ from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_su
 from torchslam.optim.sensor_estimate import SensorEstimate
 from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.online_camera import CameraChange
-from torchslam.system.run import RunProgress
+from torchslam.system.online_run import RunProgress
 from torchslam.system.session import Session
 from torchslam.system.slam import SLAM
 from torchslam.types import Explanation, Reason, State, StepResult

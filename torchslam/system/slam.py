@@ -29,7 +29,6 @@ from torchslam.map.posed_frames import PosedFrames
 from torchslam.mapping.mapper import Mapper
 from torchslam.metric.options import given_options, sources_of
 from torchslam.metric.source import MetricSource
-from torchslam.parallel.workers import with_workers
 from torchslam.system.frame_log import FrameLog, FrameStatus
 from torchslam.system.front_end import (
     Extractor,
@@ -43,7 +42,8 @@ from torchslam.system.front_end import (
 from torchslam.system.metric_run import run_in_meters
 from torchslam.system.modes import Mode
 from torchslam.system.online_camera import OnlineCamera
-from torchslam.system.run import Run, run_sequence
+from torchslam.system.online_run import Observer, OnlineRun
+from torchslam.system.run import Run
 from torchslam.system.session import ActiveMap, Session, SystemContext
 from torchslam.system.state_machine import FrameOutcome, StateMachine
 from torchslam.tracking.matcher import make_matcher, prepare_view
@@ -251,8 +251,7 @@ class SLAM:
         """
         measurements = [*sources_of(given_options(self.config.metric, sequence.measurements)), *measurements]
         sequence = source(sequence, self.config, self.camera)
-        with with_workers(sequence, self, processes) as frames:
-            finished = run_sequence(self, sequence, progress, frames=frames)
+        finished = OnlineRun(self, sequence, None, processes, Observer(progress)).run()
         return run_in_meters(finished, sequence, measurements) if self.mapping else finished
 
     @torch.inference_mode()

@@ -18,8 +18,7 @@ from torchslam.data import open_sequence
 from torchslam.data.readers.live import LiveSequence
 from torchslam.data.sequence import Sequence
 from torchslam.evaluation import evaluate
-from torchslam.parallel.workers import with_workers
-from torchslam.system.run import run_sequence
+from torchslam.system.online_run import Observer, OnlineRun
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult, Trajectory
 
@@ -70,8 +69,7 @@ def main() -> None:
     def after_frame(result: StepResult) -> None:
         latencies.append(1e3 * (time.time() - result.timestamp))
 
-    with with_workers(live, slam, options.processes) as frames:
-        finished = run_sequence(slam, live, after_frame, frames=frames)
+    finished = OnlineRun(slam, live, None, options.processes, Observer(after_frame)).run()
     median, p95 = torch.tensor(latencies).quantile(torch.tensor([0.5, 0.95])).tolist()
     print(
         f"{options.name} at {options.rate:g} Hz: {len(finished.results)} frames, {live.dropped} dropped "

@@ -16,8 +16,7 @@ from experiments.common import parser_of
 from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.data.trajectories import write_trajectory
-from torchslam.parallel.workers import with_workers
-from torchslam.system.run import run_sequence
+from torchslam.system.online_run import Observer, OnlineRun
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 
@@ -39,8 +38,7 @@ def main() -> None:
         ends.append(time.perf_counter())
 
     start_up, begin = cpu_seconds(), time.perf_counter()
-    with with_workers(sequence, slam, arguments.processes) as frames:
-        finished = run_sequence(slam, sequence, after_frame, frames=frames)
+    finished = OnlineRun(slam, sequence, None, arguments.processes, Observer(after_frame)).run()
     write_trajectory(arguments.trajectory, finished.trajectory)
     totals = torch.tensor([result.stage_ms["total"] for result in finished.results])
     figures = {
