@@ -20,8 +20,8 @@ from torchslam.system.front_end import Simulated
 from torchslam.system.local_mapping import locate
 from torchslam.system.maintenance import Maintenance
 from torchslam.system.modes import Mode
-from torchslam.system.session import SystemContext
 from torchslam.tracking.pose_validation import Verdict
+from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection, StepResult
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
@@ -46,9 +46,9 @@ def judge(
     """Judge tracked frames by their index: forward in time in `state_machine`, backward in `local_mapping`."""
 
     def judged(
-        context: SystemContext, submap: Submap, view: FrameFeatures, is_sure: bool
+        tracker: Tracker, submap: Submap, view: FrameFeatures, is_sure: bool
     ) -> tuple[PoseEstimate, Verdict] | None:
-        located, judgment = locate(context, submap, view, is_sure), judgment_of(view.index)
+        located, judgment = locate(tracker, submap, view, is_sure), judgment_of(view.index)
         return None if located is None or judgment is NO_POSE else (located[0], Verdict(judgment))
 
     monkeypatch.setattr(module, "locate", judged)

@@ -14,7 +14,7 @@ from torchslam import SLAM
 from torchslam.map.atlas import Submap
 from torchslam.system import savepoint as savepoints
 from torchslam.system.frame_log import FrameStatus, HeldFrame
-from torchslam.system.local_mapping import MAX_CONSECUTIVE_FAILURES, BackwardTracking, LocalMapping
+from torchslam.system.local_mapping import MAX_CONSECUTIVE_FAILURES, LocalMapping
 from torchslam.system.savepoint import Savepoint
 from torchslam.tracking import pose_validation
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
@@ -230,9 +230,7 @@ def test_frames_before_a_relocalized_one_are_tracked_from_it(monkeypatch: pytest
     assert estimate is not None
     context.log.forget([97])
     context.log.hold(HeldFrame(held, estimate, pose(), 0))
-    BackwardTracking(context, LocalMapping(context)).from_frame(
-        walk.submap, HeldFrame(view, estimate, pose(), 0)
-    )
+    walk.backward.from_frame(walk.submap, HeldFrame(view, estimate, pose(), 0))
     assert walk.posed == [95, 94]
     assert walk.unposed == [99, 98]
     assert context.log.status(96) is FrameStatus.HELD

@@ -207,11 +207,9 @@ def test_poses_of_two_submaps_are_not_compared() -> None:
     for index in range(2 * EVERY):
         view = frame(index)
         by.mask_out(view)
-        if index == EVERY - 1:
-            by.forget_last()
-        said = by.observe(
-            view, estimate(view, camera_at(index) @ pose(3.0 * (index >= EVERY), 0, 0), torch.arange(50))
-        )
+        is_late = index >= EVERY
+        T_cw = camera_at(index) @ pose(3.0 * is_late, 0, 0)
+        said = by.observe(view, estimate(view, T_cw, torch.arange(50)), (int(is_late), 0))
         assert said == Movement()
 
 

@@ -88,6 +88,8 @@ class Submap:
         map: Keyframes and points.
         posed_frames: All frames with a pose in the map.
         num_cull_checked: Number of leading keyframes that keyframe culling has already checked.
+        epoch: Changes when poses from before it cannot be compared with those after it: the keyframes were corrected as
+            a whole, or tracking started anew.
         metric: How well the unit is known to be a meter; None where it is arbitrary.
     """
 
@@ -96,12 +98,18 @@ class Submap:
     map: Map = field(default_factory=Map)
     posed_frames: PosedFrames = field(default_factory=PosedFrames)
     num_cull_checked: int = 0
+    epoch: int = 0
     metric: MetricUnit | None = None
 
     @classmethod
     def empty(cls, number: int, like: Float[Tensor, "..."]) -> Submap:
         """Create an empty submap with the device and floating-point type of `like`."""
         return cls(number, TrackingState.empty(like))
+
+    @property
+    def world(self) -> tuple[int, int]:
+        """What poses have to share to be compared with each other: the submap and its epoch."""
+        return self.number, self.epoch
 
     @property
     def T_cw(self) -> Float[Tensor, "4 4"]:
@@ -127,6 +135,7 @@ class Submap:
         The scale of S_cw changes the map unit around the keyframe. Points follow the keyframe that created them, posed
         frames and the tracking state their reference keyframe.
         """
+        self.epoch += 1
         points, first_keyframe, scale = self.map.points, self.map.points["first_keyframe"], sim3_scale(S_cw)
         points["positions_w"][:], points["covariances_w"][:], points["view_directions_w"][:] = carry_points(
             points["positions_w"],
@@ -171,6 +180,7 @@ class Submap:
             local_keyframes=tracking.local_keyframes + keyframes,
             local_points=tracking.local_points + points,
         )
+        self.epoch += 1
         other.map, other.posed_frames = Map(), PosedFrames()
 
 

@@ -2,24 +2,40 @@
 
 from __future__ import annotations
 
+from torchslam.config import KeyframesConfig
+from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Submap
 from torchslam.mapping.local_bundle import ApplyAt
-from torchslam.mapping.mapper import LIVE_MIN_OVERLAP, keyframe_reason, overlap_with_reference
-from torchslam.system.frame_log import HeldFrame
+from torchslam.mapping.mapper import LIVE_MIN_OVERLAP, Mapper, keyframe_reason, overlap_with_reference
+from torchslam.system.frame_log import FrameLog, HeldFrame
 from torchslam.system.savepoint import Savepoint
-from torchslam.system.session import SystemContext
 from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, Certainty, Verdict, check_pose
+from torchslam.tracking.tracker import Tracker
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate
+from torchslam.utils.timing import Stopwatch
 
 MAX_CONSECUTIVE_FAILURES = 5
 """Frames in a row without a plausible pose that end backward tracking. Tried at this value only."""
 
 
 class LocalMapping:
-    """Adds frames to a submap and inserts keyframes."""
+    """Adds frames to a submap and inserts keyframes.
 
-    def __init__(self, context: SystemContext) -> None:
-        self.context, self.adjustment = context, context.mapper.adjustment
+    Args:
+        tracker, mapper, loop_closer, log: of the session.
+        keyframes: when a frame becomes a keyframe; None: never, frames are only localized.
+    """
+
+    def __init__(
+        self,
+        tracker: Tracker,
+        mapper: Mapper,
+        loop_closer: LoopCloser,
+        log: FrameLog,
+        keyframes: KeyframesConfig | None,
+    ) -> None:
+        self.tracker, self.mapper, self.loop_closer = tracker, mapper, loop_closer
+        self.log, self.keyframes, self.adjustment = log, keyframes, mapper.adjustment
 
     def add_frame(
         self,
@@ -33,23 +49,21 @@ class LocalMapping:
         While an adjustment is pending there is no other keyframe: it is applied after this frame instead. That of the
         whole map takes longer: it is waited for as long as enough of the map is seen.
         """
-        context = self.context
-        context.tracker.count_visible(submap.map, estimate)
+        self.tracker.count_visible(submap.map, estimate)
         reason = self._keyframe_reason(submap, view, estimate)
         if reason and self.adjustment.is_pending:
             if not self.adjustment.is_whole or overlap_with_reference(estimate, submap) <= LIVE_MIN_OVERLAP:
                 self.adjustment.set_deadline(view.index)
             reason = None
         if reason:
-            keyframe = context.mapper.insert(submap.map, view, estimate, apply_at)
-            context.loop_closer.add(submap.map, keyframe)
-            context.tracker.reset_to_keyframe(submap, keyframe)
-        context.tracker.count_found(submap.map, estimate)
+            keyframe = self.mapper.insert(submap.map, view, estimate, apply_at)
+            self.loop_closer.add(submap.map, keyframe)
+            self.tracker.reset_to_keyframe(submap, keyframe)
+        self.tracker.count_found(submap.map, estimate)
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
-        if reason and context.camera.model.readout is not None:
-            submap.correct_keyframes(
-                context.camera.model, newest=2
-            )  # the frame after the one before is known now
+        sensor = self.mapper.camera.model
+        if reason and sensor.readout is not None:
+            submap.correct_keyframes(sensor, newest=2)  # the frame after the one before is known now
         return reason
 
     def add_tentative_keyframe(
@@ -60,23 +74,23 @@ class LocalMapping:
         Without new points a moving camera would be lost before its pose is confirmed. Tentative keyframes are not in
         the keyframe database, and their points are not culled.
         """
-        submap, mapper = savepoint.submap, self.context.mapper
+        submap, mapper = savepoint.submap, self.mapper
         if not self._keyframe_reason(submap, view, estimate):
             return
         if self.adjustment.is_pending:
             mapper.apply_adjustment(submap.map)
         savepoint.save_map()
-        self.context.tracker.reset_to_keyframe(submap, mapper.insert(submap.map, view, estimate))
+        self.tracker.reset_to_keyframe(submap, mapper.insert(submap.map, view, estimate))
 
     def commit(self, savepoint: Savepoint) -> list[HeldFrame]:
         """Add the frames that were held back since a savepoint, and keep its tentative keyframes; return the frames."""
-        context, submap = self.context, savepoint.submap
+        submap = savepoint.submap
         for keyframe in savepoint.keyframes:
-            context.loop_closer.add(submap.map, keyframe)
-        frames = context.log.take_held(savepoint.frames)
+            self.loop_closer.add(submap.map, keyframe)
+        frames = self.log.take_held(savepoint.frames)
         for frame in frames:
-            context.tracker.count_visible(submap.map, frame.estimate)
-            context.tracker.count_found(submap.map, frame.estimate)
+            self.tracker.count_visible(submap.map, frame.estimate)
+            self.tracker.count_found(submap.map, frame.estimate)
             submap.posed_frames.add(frame.view, frame.estimate, frame.T_cr, frame.reference)
         savepoint.commit()
         return frames
@@ -84,23 +98,26 @@ class LocalMapping:
     def _keyframe_reason(
         self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate
     ) -> Explanation | None:
-        if not self.context.session.mapping:
-            return None
-        return keyframe_reason(view, estimate, submap, self.context.config.keyframes)
+        return None if self.keyframes is None else keyframe_reason(view, estimate, submap, self.keyframes)
+
+    def hold(self, savepoint: Savepoint, view: FrameFeatures, estimate: PoseEstimate) -> None:
+        """Hold a frame back, with its pose relative to the map as it is now."""
+        savepoint.frames.append(view.index)
+        self.log.hold(HeldFrame.of(view, estimate, savepoint.submap.tracking))
 
 
 def locate(
-    context: SystemContext, submap: Submap, view: FrameFeatures, is_sure: bool
+    tracker: Tracker, submap: Submap, view: FrameFeatures, is_sure: bool
 ) -> tuple[PoseEstimate, Verdict] | None:
     """Track a frame in a submap and judge its pose; None if it has none.
 
     Args:
-        context: The components of the session.
+        tracker: Of the session.
         submap: The submap, with the tracking state after the frame before.
         view: The frame.
         is_sure: Whether the poses before are certain.
     """
-    tracker, has_velocity = context.tracker, submap.tracking.velocity is not None
+    has_velocity = submap.tracking.velocity is not None
     prior_T_cw = tracker.predict(submap)
     estimate = tracker.track(submap, view, prior_T_cw, is_sure)
     verdict = None
@@ -112,28 +129,23 @@ def locate(
     return None if estimate is None or verdict is None else (estimate, verdict)
 
 
-def hold(context: SystemContext, savepoint: Savepoint, view: FrameFeatures, estimate: PoseEstimate) -> None:
-    """Hold a frame back, with its pose relative to the map as it is now."""
-    savepoint.frames.append(view.index)
-    context.log.hold(HeldFrame.of(view, estimate, savepoint.submap.tracking))
-
-
 class BackwardTracking:
     """Poses logged frames by tracking backward in time, once there is a map."""
 
-    def __init__(self, context: SystemContext, mapping: LocalMapping) -> None:
-        self.context, self.mapping = context, mapping
+    def __init__(self, mapping: LocalMapping, clock: Stopwatch) -> None:
+        self.mapping, self.clock = mapping, clock
+        self.tracker, self.log = mapping.tracker, mapping.log
 
     def from_first_keyframe(self, submap: Submap) -> None:
         """Pose the frames from before the first keyframe of a submap."""
         backward = submap.fork()
-        self.context.tracker.reset_to_keyframe(backward, 0)
+        self.tracker.reset_to_keyframe(backward, 0)
         self._track(backward, before=int(submap.map.keyframes["frame_index"][0]))
 
     def from_frame(self, submap: Submap, frame: HeldFrame) -> None:
         """Pose the frames from before a relocalized frame."""
         backward = submap.fork()
-        self.context.tracker.start_at_estimate(backward, frame.view, frame.estimate)
+        self.tracker.start_at_estimate(backward, frame.view, frame.estimate)
         self._track(backward, before=frame.view.index)
 
     def _track(self, submap: Submap, before: int) -> None:
@@ -142,13 +154,13 @@ class BackwardTracking:
         What is held back at the earliest frame is kept, as forward in time at the end of a run. Tracking ends after
         `MAX_CONSECUTIVE_FAILURES`, and what is held back then is unposed again.
         """
-        context, log = self.context, self.context.log
+        log = self.log
         doubted: Savepoint | None = None
         failures = 0
-        with context.clock("backwards"):
+        with self.clock("backwards"):
             for unposed in reversed(log.unposed(before)):
-                view = context.tracker.at_middle_row(submap, unposed)
-                found = locate(context, submap, view, is_sure=doubted is None)
+                view = self.tracker.at_middle_row(submap, unposed)
+                found = locate(self.tracker, submap, view, is_sure=doubted is None)
                 if found is None or found[1].certainty is Certainty.WRONG or found[1].is_jump:
                     failures += 1
                     if failures == MAX_CONSECUTIVE_FAILURES:
@@ -163,7 +175,7 @@ class BackwardTracking:
                 doubted = doubted or Savepoint(submap, NUM_CONFIRMING_FRAMES)
                 self.mapping.add_tentative_keyframe(doubted, view, estimate)
                 doubted.count(verdict.rejection)
-                hold(context, doubted, view, estimate)
+                self.mapping.hold(doubted, view, estimate)
                 if not doubted.is_open or doubted.is_full:
                     self.mapping.commit(doubted)
                 doubted = doubted if doubted.is_open else None

@@ -35,7 +35,7 @@ class Maintenance:
         with self.context.clock("bundle"):
             self.adjustment.start()
         if self.adjustment.is_due_before_next_frame:
-            self._apply()
+            self.context.mapper.apply_adjustment(self.active_map.current.map)
             submap = self.active_map.current
             self.context.tracker.reset_to_keyframe(submap, submap.map.num_keyframes - 1)
             self._close_and_cull()
@@ -51,7 +51,7 @@ class Maintenance:
             if is_keyframe:
                 self._close_and_cull()
         elif frame is None or (not is_keyframe and self.adjustment.is_due(frame)):
-            self._apply()
+            self.context.mapper.apply_adjustment(self.active_map.current.map)
             self._close_and_cull()
         elif not is_keyframe:
             self._precheck_loop()
@@ -70,12 +70,6 @@ class Maintenance:
                     self._close(found)
                     break
                 context.loop_closer.fuse_with_earlier_visits(submap, keyframe)
-
-    def _apply(self) -> None:
-        before = self.context.camera.model
-        self.context.mapper.apply_adjustment(self.active_map.current.map)
-        if self.context.camera.model is not before:
-            self.context.scene_filter.forget_last()  # its pose was one of the map before
 
     def _close_and_cull(self) -> None:
         """Close a loop at the newest keyframe, cull keyframes, compact the map, and estimate the sensor."""
@@ -112,4 +106,3 @@ class Maintenance:
         if self.active_map.doubted is not None:  # where no more could be held back
             self.active_map.doubted.submap = submap
         context.tracker.reset_to_keyframe(submap, keyframe + since)
-        context.scene_filter.forget_last()  # its pose was one of the map before

@@ -132,7 +132,4 @@ class MapStart:
             start = contradicting_initialization(
                 submap, views[0], views[-1], context.camera.current, context.config, context.matcher
             )
-            is_replaced = start is not None and not self._create(start, views)
-        if is_replaced:
-            context.scene_filter.forget_last()  # its pose was one of the discarded map
-        return is_replaced
+            return start is not None and not self._create(start, views)

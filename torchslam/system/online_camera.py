@@ -168,6 +168,7 @@ class OnlineCamera(SolvedElsewhere):
         self, submap: Submap, found: SensorEstimate, prepared: Callable[[], Undistortion] | None
     ) -> None:
         """Use a model by which a submap was just adjusted; `prepared`: the undistortion of another camera."""
+        submap.epoch += 1
         self.camera.use(found.sensor, self.camera.undistortion if prepared is None else prepared())
         self.changes.append(
             CameraChange(_newest_frame(submap), found.sensor.camera, found.departure, found.sensor.readout)

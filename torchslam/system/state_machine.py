@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from torchslam.map.atlas import Submap
 from torchslam.mapping.culling import remove_masked_observations
 from torchslam.mapping.local_bundle import LOCAL_WINDOW, ApplyAt
-from torchslam.system.local_mapping import BackwardTracking, LocalMapping, hold, locate
+from torchslam.system.local_mapping import BackwardTracking, LocalMapping, locate
 from torchslam.system.maintenance import Maintenance
 from torchslam.system.map_start import MapStart
 from torchslam.system.modes import TRANSITIONS
@@ -54,8 +54,11 @@ class StateMachine:
 
     def __init__(self, context: SystemContext) -> None:
         self.context, self.active_map = context, context.active_map
-        self.mapping = LocalMapping(context)
-        self.backward = BackwardTracking(context, self.mapping)
+        keyframes = context.config.keyframes if context.session.mapping else None
+        self.mapping = LocalMapping(
+            context.tracker, context.mapper, context.loop_closer, context.log, keyframes
+        )
+        self.backward = BackwardTracking(self.mapping, context.clock)
         self.map_start = MapStart(context, self.backward)
         self.maintenance = Maintenance(context, self.map_start)
         self.relocalizer = Relocalizer(context.tracker)
@@ -76,13 +79,13 @@ class StateMachine:
         filtered = self._at_middle_row(submap, filtered)
         view = filtered.view
         with self.context.clock("tracking"):
-            located = locate(self.context, submap, view, is_sure=self.active_map.doubted is None)
+            located = locate(self.context.tracker, submap, view, is_sure=self.active_map.doubted is None)
         if located is None:
             return self._lose(view)
         estimate, verdict = located
         motion = NO_MOVEMENT
         if verdict.certainty is Certainty.CERTAIN:
-            motion = self.context.scene_filter.detect_independent_motion(filtered, estimate)
+            motion = self.context.scene_filter.detect_independent_motion(filtered, estimate, submap.world)
             verdict = Verdict(motion.rejection)
         if verdict.certainty is Certainty.CERTAIN and self.active_map.doubted is None:
             return self._map(filtered, estimate, motion.note)
@@ -128,7 +131,7 @@ class StateMachine:
         context, view, active_map = self.context, filtered.view, self.active_map
         reason = self.mapping.add_frame(active_map.current, view, estimate, self._apply_at())
         has_new_overlay = context.session.mapping and context.scene_filter.update_overlay(
-            filtered, active_map.current.T_cw, estimate.depth
+            filtered, active_map.current.T_cw, estimate.depth, active_map.current.world
         )
         at_once = has_new_overlay or self.map_start.is_almost_confirmed
         self.maintenance.after_frame(None if at_once else view.index, is_keyframe=reason is not None)
@@ -155,7 +158,7 @@ class StateMachine:
         if verdict.certainty is not Certainty.WRONG and _may_extend(doubted, estimate, verdict):
             self.mapping.add_tentative_keyframe(doubted, view, estimate)
         doubted.count(verdict.rejection)
-        hold(self.context, doubted, view, estimate)
+        self.mapping.hold(doubted, view, estimate)
         reasons = [verdict.rejection or doubted.reason] if doubted.is_open else []
         active_map.doubted = doubted
         if doubted.is_full or not doubted.is_open:
@@ -190,7 +193,6 @@ class StateMachine:
         is_discarded = self.map_start.end()
         active_map.submap = None
         self.map_start.restart()
-        context.scene_filter.forget_last()
         self.num_lost = 0
         return FrameOutcome([Reason.LOST_AT_START if is_discarded else Reason.LOST])
 
@@ -240,7 +242,7 @@ class StateMachine:
         context = self.context
         context.tracker.start_at_estimate(submap, view, estimate)
         doubted = Savepoint(submap, NUM_RELOCALIZED_FRAMES, is_relocalized=True)
-        hold(context, doubted, view, estimate)
+        self.mapping.hold(doubted, view, estimate)
         self.active_map.submap, self.active_map.doubted = submap, doubted
         return FrameOutcome([Reason.RELOCALIZED], submap, estimate)
 

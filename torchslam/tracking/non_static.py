@@ -65,12 +65,14 @@ class _Observation:
         T_cw: its pose; None if it has none.
         depth: median depth of the scene.
         patience: comparisons for which a keypoint still belongs to the moving object.
+        world: of the pose, see `Submap.world`.
     """
 
     view: FrameFeatures
     T_cw: Float[Tensor, "4 4"] | None
     depth: float
     patience: Int[Tensor, " N"]
+    world: tuple[int, int]
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,6 @@ class IndependentMotion:
         self._frames_since_comparison = 0
         self._frames_since_motion = 0  # against the scene
 
-    def forget_last(self) -> None:
-        """Compare the next frame with no earlier one: its pose is in another submap."""
-        if self._last is not None:
-            self._last = replace(self._last, T_cw=None)
-
     def mask_out(self, view: FrameFeatures) -> FrameFeatures:
         """Follow the moving object to this view, and return the view without its keypoints."""
         self._frames_since_comparison += 1
@@ -141,18 +138,22 @@ class IndependentMotion:
         if self._mover is not None:
             self._mover = self._followed(self._mover, view)
         if self._mover is not None and self._frames_since_comparison >= 2 * FRAME_INTERVAL:
-            self._compare(view, None, 0.0)
+            self._compare(view, None, 0.0, (0, 0))
         if self._mover is None:
             return view
         return replace(view, mask=view.mask & ~self._mover.belongs)
 
-    def observe(self, view: FrameFeatures, estimate: PoseEstimate) -> Movement:
-        """Compare a posed frame, with all its keypoints, with one some frames earlier."""
+    def observe(
+        self, view: FrameFeatures, estimate: PoseEstimate, world: tuple[int, int] = (0, 0)
+    ) -> Movement:
+        """Compare a posed frame, with all its keypoints, with one some frames earlier; `world`: see `Submap.world`."""
+        if self._last is not None and self._last.world != world:
+            self._last = replace(self._last, T_cw=None)
         mover, seen = self._mover, view.keypoints[estimate.keypoints]
         if mover is not None and self._area(mover.pixels) > MAX_AREA_RATIO * self._area(seen):
             return Movement(Rejection.of(Reason.MOVING_MAJORITY))
         if self._last is None or self._frames_since_comparison >= FRAME_INTERVAL:
-            return self._compare(view, estimate.T_cw, estimate.depth)
+            return self._compare(view, estimate.T_cw, estimate.depth, world)
         return NO_MOVEMENT
 
     def _followed(self, mover: _Mover, view: FrameFeatures) -> _Mover | None:
@@ -171,12 +172,14 @@ class IndependentMotion:
         motion = (view.keypoints[matches.indices_2[0][found]] - mover.pixels[found]).median(0).values
         return _Mover.of(view, self._is_near_group(view.keypoints, mover.pixels + motion, mover.rest), motion)
 
-    def _compare(self, view: FrameFeatures, T_cw: Tensor | None, depth: float) -> Movement:
+    def _compare(
+        self, view: FrameFeatures, T_cw: Tensor | None, depth: float, world: tuple[int, int]
+    ) -> Movement:
         """Compare with the last observation: what moves against the scene, and what of the object moves rigidly."""
         last = self._last
         none = torch.zeros_like(view.mask, dtype=torch.int64)
         guess = none if self._mover is None else _NEARBY_PATIENCE * self._mover.belongs
-        look = _Observation(view, T_cw, depth, guess)
+        look = _Observation(view, T_cw, depth, guess, world)
         self._last, self._frames_since_comparison = look, 0
         if last is None or view.session != last.view.session:
             return NO_MOVEMENT
@@ -323,15 +326,14 @@ class SceneFilter:
         without_overlays = self.static_overlay.mask_out(view)
         return FilteredView(self.independent_motion.mask_out(without_overlays), without_overlays, view)
 
-    def detect_independent_motion(self, filtered: FilteredView, estimate: PoseEstimate) -> Movement:
-        """Detect keypoints that move against the scene, given the frame's pose."""
-        return self.independent_motion.observe(filtered.without_overlays, estimate)
+    def detect_independent_motion(
+        self, filtered: FilteredView, estimate: PoseEstimate, world: tuple[int, int]
+    ) -> Movement:
+        """Detect keypoints that move against the scene, given the frame's pose and its `Submap.world`."""
+        return self.independent_motion.observe(filtered.without_overlays, estimate, world)
 
-    def update_overlay(self, filtered: FilteredView, T_cw: Float[Tensor, "4 4"], depth: float) -> bool:
-        """Update the overlays with a frame and its pose; return whether there are new ones."""
-        return self.static_overlay.observe(filtered.whole, T_cw, depth) > 0
-
-    def forget_last(self) -> None:
-        """Compare the next frame with no earlier one: its pose is in another submap."""
-        self.static_overlay.forget_last()
-        self.independent_motion.forget_last()
+    def update_overlay(
+        self, filtered: FilteredView, T_cw: Float[Tensor, "4 4"], depth: float, world: tuple[int, int]
+    ) -> bool:
+        """Update the overlays with a frame, its pose and its `Submap.world`; return whether there are new ones."""
+        return self.static_overlay.observe(filtered.whole, T_cw, depth, world) > 0

@@ -53,19 +53,28 @@ class _Reference:
         T_wc: its pose.
         pixels: of its keypoints.
         points_c: their points at the possible depths.
+        world: of the pose, see `Submap.world`.
     """
 
     view: FrameFeatures
     T_wc: Float[Tensor, "4 4"]
     pixels: Float[Tensor, "N 2"]
     points_c: Float[Tensor, "D N 3"]
+    world: tuple[int, int]
 
     @classmethod
-    def of(cls, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float, camera: Camera) -> _Reference:
+    def of(
+        cls,
+        view: FrameFeatures,
+        T_cw: Float[Tensor, "4 4"],
+        depth: float,
+        world: tuple[int, int],
+        camera: Camera,
+    ) -> _Reference:
         pixels = view.keypoints[view.mask]
         rays = camera.unproject(pixels)
         depths = depth * rays.new_tensor(_DEPTHS)
-        return cls(view, se3_inverse(T_cw), pixels, rays / rays[:, 2:] * depths[:, None, None])
+        return cls(view, se3_inverse(T_cw), pixels, rays / rays[:, 2:] * depths[:, None, None], world)
 
 
 class StaticOverlayDetector:
@@ -93,20 +102,23 @@ class StaticOverlayDetector:
         row, column = self._cells(pixels)
         return self.evidence[row, column] >= MIN_EVIDENCE
 
-    def observe(self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float) -> int:
+    def observe(
+        self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float, world: tuple[int, int] = (0, 0)
+    ) -> int:
         """Compare a posed frame with an earlier one.
 
         Args:
             view: the frame, with all its keypoints.
             T_cw: its pose.
             depth: median depth of the scene.
+            world: of the pose, see `Submap.world`.
 
         Returns:
             The number of cells that became known overlays.
         """
         last = self._last
-        if last is None or view.session != last.view.session:
-            self._last = _Reference.of(view, T_cw, depth, self.camera.current)
+        if last is None or view.session != last.view.session or last.world != world:
+            self._last = _Reference.of(view, T_cw, depth, world, self.camera.current)
             return 0
         self._pause -= 1
         if self._pause >= 0 or not self._is_far(self._must_move(last, T_cw, _STRIDE)):
@@ -116,7 +128,7 @@ class StaticOverlayDetector:
             return 0
         must_move = view.mask.new_zeros(len(last.view.mask))
         must_move[last.view.mask] = moving
-        self._last = _Reference.of(view, T_cw, depth, self.camera.current)
+        self._last = _Reference.of(view, T_cw, depth, world, self.camera.current)
         stayed = self._stayed(last.view, view, must_move)
         before = int((self.evidence >= MIN_EVIDENCE).sum())
         if len(stayed) < MIN_KEYPOINTS:
@@ -134,10 +146,6 @@ class StaticOverlayDetector:
     def restore(self, evidence: Int[Tensor, "R C"]) -> None:
         """Continue from the evidence of a checkpoint."""
         self.evidence.copy_(evidence)
-
-    def forget_last(self) -> None:
-        """Compare the next frame with no earlier one: its pose is in another submap."""
-        self._last = None
 
     def _must_move(self, last: _Reference, T_cw: Float[Tensor, "4 4"], step: int = 1) -> Bool[Tensor, " N"]:
         """Whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""

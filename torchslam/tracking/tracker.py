@@ -189,6 +189,7 @@ class Tracker:
         """Start the tracking state at a frame that was posed without one."""
         best = int(submap.map.count_observed(estimate.point_ids).argmax())
         self._update_last_seen(submap.map, view, estimate)
+        submap.epoch += 1
         submap.tracking = replace(
             self._at_keyframe(submap.map, best, estimate.T_cw),
             velocity=None,
