@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.global_mapping.synthetic import CAMERA, Recording, arc, ball, line, wall
 from torchslam.geometry import se3_inverse, transform
-from torchslam.global_mapping.depth_ratios import PairDepths, ViewRays, depth_ratio
+from torchslam.global_mapping.baselines import PairDepths, ViewRays, depth_ratio
 from torchslam.global_mapping.view_graph import ViewPair
 
 WALK = Recording.of(line(4, 0.4), wall(200, 1.2))
@@ -21,7 +21,7 @@ def depths_of(recording: Recording, pair: ViewPair, scale: float = 1.0) -> PairD
     """The depths by the true relative pose, its translation longer by a factor."""
     T_21 = recording.T_cw[pair.second] @ se3_inverse(recording.T_cw[pair.first])
     T_21[:3, 3] *= scale
-    return PairDepths.of(T_21, ViewRays.by(CAMERA, recording.views), pair)
+    return PairDepths.of(T_21, ViewRays(CAMERA, recording.views), pair)
 
 
 def distances(recording: Recording, row: int) -> Tensor:

@@ -182,7 +182,7 @@ def test_a_run_that_the_check_contradicts_is_mapped_as_a_whole(world: World) -> 
     world.checks[False] = a_check(0.9, predicted=0)
     kept = world.map(a_run())
     assert kept.kept is Mapping.GLOBAL
-    assert kept.check is world.checks[True]
+    assert kept.check == world.checks[True]
     assert kept.why == f"the check of the online map failed: {world.online_check.sentence()}"
 
 
@@ -225,7 +225,7 @@ def test_the_map_that_predicts_the_held_out_pairs_better_is_kept(
     assert made.kept is kept
     assert made.run is (world.whole if kept is Mapping.GLOBAL else online)
     assert made.online is online
-    assert made.check is world.checks[kept is Mapping.GLOBAL]
+    assert made.check == world.checks[kept is Mapping.GLOBAL]
 
 
 def test_without_any_map_the_whole_one_must_be_right(world: World) -> None:

@@ -185,18 +185,21 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
         (put("camera.params", 0, float("nan")), "not finite numbers with a positive focal length"),
         (put("camera.params", 1, -100.0), "not finite numbers with a positive focal length"),
         (change("camera.params", Tensor.half), "not a row of numbers"),
-        (without(P + "is_valid"), "submap 0, points: missing is_valid"),
-        (without(K + "mask"), "submap 0, keyframes: missing mask"),
-        (lambda tensors: tensors.__setitem__(P + "colour", torch.zeros(120)), "points: unknown colour"),
+        (without(P + "is_valid"), "submap 0, points: missing or unknown columns: is_valid"),
+        (without(K + "mask"), "submap 0, keyframes: missing or unknown columns: mask"),
+        (
+            lambda tensors: tensors.__setitem__(P + "colour", torch.zeros(120)),
+            "points: missing or unknown columns: colour",
+        ),
         (
             lambda tensors: tensors.__setitem__("submaps.0.trees.age", torch.zeros(1)),
-            "unknown tensor trees.age",
+            "unknown tensor submaps.0.trees.age",
         ),
         (
             lambda tensors: tensors.__setitem__("submaps.1.points.age", torch.zeros(1)),
-            "unknown tensors: submaps.1",
+            "unknown tensor submaps.1",
         ),
-        (lambda tensors: tensors.__setitem__("trees", torch.zeros(1)), "unknown tensors: trees"),
+        (lambda tensors: tensors.__setitem__("trees", torch.zeros(1)), "unknown tensor trees"),
         (
             change(P + "positions_w", lambda rows: rows[:, :2]),
             r"positions_w: rows must have the shape \(3,\)",
@@ -283,7 +286,7 @@ def test_a_long_chain_of_replacements_is_no_cycle(path: Path) -> None:
         ({"sessions": -1}, "must be numbers"),
         ({"sessions": None}, "must be numbers"),
         ({"sessions": 1}, "session from 0 to 1, there are 0 to 0"),
-        ({"submaps": []}, "unknown tensors"),
+        ({"submaps": []}, "unknown tensor"),
     ],
 )
 def test_inconsistent_metadata_are_refused(path: Path, changes: dict[str, Any], message: str) -> None:

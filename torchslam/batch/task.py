@@ -33,7 +33,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
 from torchslam.data.transforms import WithGroundTruth
 from torchslam.errors import SequenceError
-from torchslam.global_mapping.learned_links import learned_config
+from torchslam.global_mapping.links import learned_config
 from torchslam.global_mapping.mapper import mapping_config
 from torchslam.global_mapping.recording import run_recording
 from torchslam.io.report import compute_metrics

@@ -35,7 +35,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
-from torchslam.global_mapping.learned_links import learned_config
+from torchslam.global_mapping.links import learned_config
 from torchslam.global_mapping.mapper import features_to_keep, mapping_config
 from torchslam.global_mapping.recording import Mapping, run_recording
 from torchslam.io.export.mesh import import_open3d

@@ -15,17 +15,20 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError
-from torchslam.geometry import Camera, SensorModel, so3_log
+from torchslam.geometry import Camera, SensorModel, rigid, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
-from torchslam.global_mapping.chained_positions import chained_positions
+from torchslam.global_mapping.baselines import chained_positions
 from torchslam.global_mapping.check import MapCheck, check_map
-from torchslam.global_mapping.frames_between import FramePoser
-from torchslam.global_mapping.learned_links import (
+from torchslam.global_mapping.frames_between import pose_frames
+from torchslam.global_mapping.links import (
     MIN_LEARNED_MATCHES,
     LearnedPairs,
+    Links,
     learned_config,
     open_links,
+    pairs_across,
+    strengthen,
     with_learned,
 )
 from torchslam.global_mapping.rounds import (
@@ -44,8 +47,7 @@ from torchslam.global_mapping.view_graph import (
     build_view_graph,
     connected_views,
 )
-from torchslam.global_mapping.weak_links import pairs_across, strengthen
-from torchslam.map.atlas import Atlas, Submap
+from torchslam.map.atlas import Atlas
 from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.model_choice import predictive_gain
@@ -60,7 +62,7 @@ from torchslam.system.front_end import (
 )
 from torchslam.system.run import FinalAdjustment, Run
 from torchslam.tracking.matcher import make_matcher, prepare_view
-from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, Reason, State, StepResult
+from torchslam.types import Explanation, FrameFeatures, Matcher, Reason, State, StepResult
 
 SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 """Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
@@ -80,7 +82,6 @@ HELD_BACK_DISTANCE = 2
 SAVED_TOGETHER = 50
 """Images whose features are saved in one file, 80 MB. So many, some seconds of work, are lost when a run is killed.
 Tried at this value only."""
-
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, what is done of it, and all that is to be done."""
@@ -128,17 +129,12 @@ Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
 def mapping_config(config: Config) -> Config:
     """The configuration of global mapping: SIFT in place of the default features, unless others were chosen."""
     settings = config.global_mapping
-    features = config.features
-    if features.kind != Config().features.kind:
+    if config.features.kind != Config().features.kind:
         return config
+    sizes = {"num_keypoints": settings.num_keypoints, "max_image_pixels": settings.max_image_pixels}
     return replace(
         config,
-        features=replace(
-            features,
-            kind="sift",
-            num_keypoints=settings.num_keypoints,
-            max_image_pixels=settings.max_image_pixels,
-        ),
+        features=replace(config.features, kind="sift", **sizes),
         matching=replace(config.matching, max_ratio=SIFT_RATIO, max_cosine_distance=SIFT_DISTANCE),
     )
 
@@ -264,19 +260,13 @@ class GlobalMapper:
         pairs: list[ViewPair],
         held_back: frozenset[int],
     ) -> MapCheck:
-        """The check of a reconstruction by pairs of images."""
         rows, _, found = made
         known = torch.zeros(len(views), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
         reduction = self.config.features.reduction(self.camera.size)
         return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction)
 
-    def _learned(
-        self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]], before: Run | None
-    ) -> LearnedPairs | None:
-        """Views and pairs with learned features around links; None if not asked for, or if nothing holds.
-
-        Their keypoints are corrected for a rolling shutter by the run `before`, as those of the views are.
-        """
+    def _learned(self, views: list[FrameFeatures], links: Links, before: Run | None) -> LearnedPairs | None:
+        """Views and pairs with learned features around links; None if not asked for, or if nothing holds."""
         config = learned_config(self.config)
         if config is None or not links:
             return None
@@ -285,7 +275,7 @@ class GlobalMapper:
         found: dict[int, FrameFeatures] = {}
         for row in sorted({row for pair in ends for row in pair}):
             self.progress("learned features", len(found), len(views))
-            view = next(own.views([views[row].index]))
+            view = own.view(views[row].index)
             if view is not None:
                 found[row] = view if before is None else before.at_middle_row([view])[0]
         matcher = PairMatcher(
@@ -329,12 +319,10 @@ class GlobalMapper:
         held = (off < MAX_ROTATION_ERROR_RAD).tolist()
         own = sum(held[:own])
         pairs = [pair for pair, holds in zip(pairs, held, strict=True) if holds]
-        general = sum(pair.relation is Relation.GENERAL for pair in pairs)
-        if general < MIN_GENERAL * len(pairs):
-            return (
-                f"no map: the camera stands still, only turns, or sees a plane in {len(pairs) - general} of "
-                f"{len(pairs)} pairs of images"
-            )
+        others = sum(pair.relation is not Relation.GENERAL for pair in pairs)
+        if len(pairs) - others < MIN_GENERAL * len(pairs):
+            about = f"{others} of {len(pairs)} pairs of images"
+            return f"no map: the camera stands still, only turns, or sees a plane in {about}"
         rows = connected_views(pairs, len(views))
         connected = set(rows.tolist())
         own = sum(pair.first in connected for pair in pairs[:own])
@@ -343,11 +331,9 @@ class GlobalMapper:
         if observed.tracks.count == 0:
             return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
         self.progress("positions", 0, 1)
-        T_cw = torch.eye(4, dtype=R_21.dtype, device=device).repeat(len(views), 1, 1)
-        T_cw[:, :3, :3] = average.R_cw
         camera = self.camera if self.given is None else self.given.camera
         centers_w = chained_positions(pairs, average.R_cw, views, self.camera)
-        T_cw[:, :3, 3] = -(average.R_cw @ centers_w[..., None])[..., 0]
+        T_cw = rigid(average.R_cw, -(average.R_cw @ centers_w[..., None])[..., 0])
         self.progress("adjustment", 0, 1)
 
         def log(words: str) -> None:
@@ -366,7 +352,6 @@ class GlobalMapper:
 
     @staticmethod
     def _tracks(pairs: list[ViewPair], views: list[FrameFeatures]) -> ObservedTracks:
-        """The tracks of pairs that enough images see."""
         tracks = join_matches(pairs, len(views), len(views[0].mask))
         tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
         return ObservedTracks.of(tracks, views)
@@ -394,14 +379,17 @@ class GlobalMapper:
         """
         atlas = Atlas(self.camera.params)
         submap = atlas.create()
-        fill_submap(submap, views, rows, observed, found)
-        slam_map = submap.map
-        slam_map.set_noise(squared_errors(slam_map, slam_map.observations(), found.camera))
-        poser = FramePoser(SensorModel(found.camera, self.readout), self.config)
-        mapped = {view.index: view for view in views}
-        frames = range(len(self.sequence)) if frames is None else frames
-        results = poser.pose(submap, self._all_views(frames, mapped), given_cw)
-        final = FinalAdjustment(SensorModel(found.camera, self.readout), self.config, self.given)
+        tracks, former = observed.tracks.select(found.agrees)
+        row_of = torch.full((len(views),), -1, device=rows.device)
+        row_of[rows] = torch.arange(len(rows), device=rows.device)
+        tracks = replace(tracks, view=row_of[tracks.view])
+        own = [views[row] for row in rows.tolist()]
+        submap.map = make_map(own, found.T_cw[rows], tracks, found.points_w[former])
+        submap.map.set_noise(squared_errors(submap.map, submap.map.observations(), found.camera))
+        sensor = SensorModel(found.camera, self.readout)
+        every = self._all_views(range(len(self.sequence)) if frames is None else frames, views)
+        results = pose_frames(submap, every, sensor, self.config, given_cw)
+        final = FinalAdjustment(sensor, self.config, self.given)
         if not keep:
             final.adjust(
                 atlas, 0, lambda done, most: self.progress("final adjustment", done, most), settled=True
@@ -427,7 +415,7 @@ class GlobalMapper:
             found: list[FrameFeatures | None] = []
             for done, index in enumerate(own, len(views)):
                 self.progress("features", done, len(images))
-                found += self.views([index])
+                found.append(self.view(index))
             return found
 
         for start in range(0, len(images), SAVED_TOGETHER):
@@ -435,22 +423,17 @@ class GlobalMapper:
             views += self.saved.views(own, partial(find, own))
         return [view for view in views if view is not None]
 
-    def views(self, indices: Rows[int]) -> Iterator[FrameFeatures | None]:
-        """The features of frames; None for those that cannot be read, which are counted once."""
-        for index in indices:
-            try:
-                frame = self.sequence[index]
-                if frame.features is None or frame.image.numel():
-                    check_size(frame, self.camera)
-            except FrameError as error:
-                if str(error) not in self.skipped:
-                    warnings.warn(f"skipped a frame: {error}", stacklevel=2)
-                    self.skipped.append(str(error))
-                yield None
-                continue
-            yield self._view(frame)
-
-    def _view(self, frame: Frame) -> FrameFeatures:
+    def view(self, index: int) -> FrameFeatures | None:
+        """The features of a frame; None if it cannot be read, which is counted once."""
+        try:
+            frame = self.sequence[index]
+            if frame.features is None or frame.image.numel():
+                check_size(frame, self.camera)
+        except FrameError as error:
+            if str(error) not in self.skipped:
+                warnings.warn(f"skipped a frame: {error}", stacklevel=2)
+                self.skipped.append(str(error))
+            return None
         features = frame.features
         if self.extract is not None:
             with torch.inference_mode():
@@ -458,16 +441,14 @@ class GlobalMapper:
         assert features is not None
         return prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
 
-    def _all_views(self, frames: Rows[int], mapped: dict[int, FrameFeatures]) -> Iterator[FrameFeatures]:
+    def _all_views(self, frames: Rows[int], views: list[FrameFeatures]) -> Iterator[FrameFeatures]:
         """Frames in order, those that were mapped without extracting their features again."""
+        mapped = {view.index: view for view in views}
         for done, index in enumerate(frames):
             self.progress("frames between", done, len(frames))
-            if index in mapped:
-                yield mapped[index]
-                continue
-            for view in self.views([index]):
-                if view is not None:
-                    yield view
+            view = mapped[index] if index in mapped else self.view(index)
+            if view is not None:
+                yield view
 
     def _failed(self, reason: str, views: list[FrameFeatures], pairs: list[ViewPair]) -> GlobalMap:
         reasons = (Explanation.of(Reason.OTHER, text=reason),)
@@ -482,23 +463,6 @@ def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:
     """Rows of the pairs that mapping does not use: one in ten of those that are no direct neighbors in time."""
     far = [row for row, pair in enumerate(pairs) if pair.second - pair.first >= HELD_BACK_DISTANCE]
     return frozenset(far[HELD_BACK // 2 :: HELD_BACK])
-
-
-def fill_submap(
-    submap: Submap,
-    views: list[FrameFeatures],
-    rows: Int[Tensor, " K"],
-    observed: ObservedTracks,
-    found: Reconstruction,
-) -> None:
-    """Make the map of a submap from the posed views and the points with observations that agree."""
-    tracks, former = observed.tracks.select(found.agrees)
-    row_of = torch.full((len(views),), -1, device=rows.device)
-    row_of[rows] = torch.arange(len(rows), device=rows.device)
-    tracks = replace(tracks, view=row_of[tracks.view])
-    submap.map = make_map(
-        [views[row] for row in rows.tolist()], found.T_cw[rows], tracks, found.points_w[former]
-    )
 
 
 def poses_of(run: Run, views: list[FrameFeatures]) -> tuple[Float[Tensor, "K 4 4"], Tensor]:

@@ -133,10 +133,6 @@ class Table:
         """The number of rows in use."""
         return self._size
 
-    def __contains__(self, name: str) -> bool:
-        """Test whether a column exists."""
-        return name in self._columns
-
     def __getitem__(self, name: str) -> Shaped[Tensor, "R ..."]:
         """Return a view of a column."""
         return self._columns[name][: self._size]
@@ -176,15 +172,14 @@ class Table:
         self._size = min(size, self._size)
 
     def _check(self, rows: dict[str, Tensor]) -> None:
-        if rows.keys() != self.schema.keys():
-            raise ValueError(f"columns are {sorted(self.schema)}, not {sorted(rows)}")
-        counts = {name: len(values) for name, values in rows.items()}
-        if len(set(counts.values())) != 1:
-            raise ValueError(f"the columns of one append differ in length: {counts}")
+        if wrong := rows.keys() ^ self.schema.keys():
+            raise ValueError(f"missing or unknown columns: {', '.join(sorted(wrong))}")
+        counts = set(map(len, rows.values()))
+        if len(counts) != 1:
+            raise ValueError(f"the columns have {min(counts)} to {max(counts)} rows")
         for name, values in rows.items():
-            wrong = self.schema[name].mismatch(values)
-            if wrong:
-                raise ValueError(f"column {name}: {wrong}")
+            if mismatch := self.schema[name].mismatch(values):
+                raise ValueError(f"column {name}: {mismatch}")
 
     def _grown(self, name: str, values: Tensor, size: int) -> Tensor:
         old = self._columns.get(name)

@@ -193,7 +193,7 @@ class _Refinement:
     ) -> None:
         """given_cw: by frame of the sequence; of frames without a pose, any."""
         self.mapper, self.frames, self.given_cw = mapper, frames, given_cw
-        self.views = [view for view in mapper.views(chosen) if view is not None]
+        self.views = [view for view in map(mapper.view, chosen) if view is not None]
         self.pairs: list[ViewPair] = []
         self.failure = ""
         if len(self.views) < MIN_VIEWS:

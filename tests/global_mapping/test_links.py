@@ -13,9 +13,7 @@ from torch import Tensor
 from tests.global_mapping.synthetic import CAMERA, Recording, disturbed, line, wall
 from torchslam.config import Config
 from torchslam.geometry import se3_inverse
-from torchslam.global_mapping.mapper import SIFT_DISTANCE, SIFT_RATIO, mapping_config
-from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
-from torchslam.global_mapping.weak_links import (
+from torchslam.global_mapping.links import (
     ACROSS,
     match_guided,
     near_epipolar_line,
@@ -23,6 +21,8 @@ from torchslam.global_mapping.weak_links import (
     strengthen,
     weak_links,
 )
+from torchslam.global_mapping.mapper import SIFT_DISTANCE, SIFT_RATIO, mapping_config
+from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import FrameFeatures, Matches, MatchPrior
 

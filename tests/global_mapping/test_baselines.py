@@ -14,8 +14,8 @@ from torch import Tensor
 from tests.global_mapping.synthetic import CAMERA, Recording, arc, ball, line, rand, randn, wall
 from torchslam.evaluation import ate
 from torchslam.geometry import rigid, se3_inverse
-from torchslam.global_mapping import chained_positions as module
-from torchslam.global_mapping.chained_positions import chained_positions, pair_lengths, solve_differences
+from torchslam.global_mapping import baselines as module
+from torchslam.global_mapping.baselines import chained_positions, pair_lengths, solve_differences
 from torchslam.global_mapping.view_graph import Relation, ViewPair
 
 WALK = Recording.of(line(10), wall(200, 2.3))
@@ -117,7 +117,7 @@ def test_uncertain_ratios_count_less(monkeypatch: pytest.MonkeyPatch) -> None:
     noisy = Recording.of(line(3), wall(40, 0.5), noise_px=2.0)
     pair_lengths(noisy.pairs(1, 2), noisy.views, CAMERA)
     one, other = noisy.pairs(1)
-    rays = module.ViewRays.by(CAMERA, noisy.views)
+    rays = module.ViewRays(CAMERA, noisy.views)
     depths = [module.PairDepths.of(pair.T_21, rays, pair) for pair in (one, other)]
     ratio = module.depth_ratio(depths[0], 1, depths[1], 0)
     assert ratio is not None
