@@ -15,12 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry import SensorModel, sim3_inverse, sim3_scale
-from torchslam.geometry.transforms import (
-    carry_points,
-    covariances_with_unit,
-    with_unit,
-    without_scale,
-)
+from torchslam.geometry.transforms import carry_points, covariances_with_unit, with_unit, without_scale
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.map.unit import MetricUnit
@@ -70,12 +65,9 @@ class TrackingState:
 
     def averaged_with(self, estimate: PoseEstimate) -> TrackingState:
         """The same state with the averages over the frames up to that of an estimate."""
-        return replace(
-            self,
-            error=self.error + EMA_RATE * (estimate.error - self.error),
-            explained_ratio=self.explained_ratio
-            + EMA_RATE * (estimate.explained_ratio - self.explained_ratio),
-        )
+        error = self.error + EMA_RATE * (estimate.error - self.error)
+        explained = self.explained_ratio + EMA_RATE * (estimate.explained_ratio - self.explained_ratio)
+        return replace(self, error=error, explained_ratio=explained)
 
 
 @dataclass
@@ -184,23 +176,15 @@ class Atlas:
     def __init__(
         self, like: Float[Tensor, "..."], submaps: Iterable[Submap] = (), num_created: int = 0
     ) -> None:
-        """Create an atlas.
-
-        Args:
-            like: Tensor whose device and floating-point type new submaps get.
-            submaps: Submaps to start with.
-            num_created: Number of submaps ever created.
-        """
+        """like: tensor whose device and floating-point type new submaps get; submaps: to start with."""
         self._like = like
         self._submaps = list(submaps)
         self.num_created = num_created
 
     def __len__(self) -> int:
-        """The number of submaps."""
         return len(self._submaps)
 
     def __iter__(self) -> Iterator[Submap]:
-        """Iterate over the submaps."""
         return iter(self._submaps)
 
     def create(self) -> Submap:
@@ -225,11 +209,8 @@ class Atlas:
 
     def find(self, key: int) -> tuple[Submap, int] | None:
         """Return the submap and the row of the keyframe with this key, or None."""
-        for submap in self._submaps:
-            row = submap.map.row(key)
-            if row >= 0:
-                return submap, row
-        return None
+        found = ((submap, submap.map.row(key)) for submap in self._submaps)
+        return next(((submap, row) for submap, row in found if row >= 0), None)
 
 
 def main_submap(submaps: Iterable[Submap], session: int | None = None) -> Submap | None:

@@ -108,19 +108,13 @@ def _leave_points(slam_map: Map, removed: Bool[Tensor, " K"], replacement: Int[T
 
 
 def compact(submap: Submap) -> RowRemap | None:
-    """Remove the rows of invalid points if that is worth its cost; return the new rows, or None if nothing changed."""
-    return remove_invalid_rows(submap) if is_worth_compacting(submap) else None
-
-
-def is_worth_compacting(submap: Submap) -> bool:
-    """Test whether enough rows are invalid that removing them costs O(1) for each of them."""
-    rows, valid = len(submap.map.points), submap.map.num_points
-    invalid = rows - valid
-    return (
-        invalid > MIN_INVALID_ROWS
-        and invalid > valid
-        and _MAX_REWRITTEN * invalid > len(submap.posed_frames.observations)
-    )
+    """Remove invalid rows if they are so many that it costs O(1) for each; return the new rows, or None."""
+    valid = submap.map.num_points
+    invalid = len(submap.map.points) - valid
+    rewritten = len(submap.posed_frames.observations)
+    if invalid <= max(MIN_INVALID_ROWS, valid) or _MAX_REWRITTEN * invalid <= rewritten:
+        return None
+    return remove_invalid_rows(submap)
 
 
 def remove_invalid_rows(submap: Submap) -> RowRemap:

@@ -56,11 +56,9 @@ POINTS: Schema = {
     "covariances_w": Column((3, 3), "float", "covariance of the position; zero where unknown"),
     "descriptors": Column(("D",), "descriptor", "descriptor of the newest observation"),
     "colors": Column((3,), "byte", "red, green, blue in the images; black where unknown"),
-    "view_directions_w": Column(
-        (3,), "float", "unit direction from the newest observing keyframe to the point"
-    ),
+    "view_directions_w": Column((3,), "float", "unit direction from the newest observing keyframe"),
     "scale_distance": Column(
-        (), "float", "keypoint scale times distance in the newest observation: px times map units"
+        (), "float", "keypoint scale times distance, newest observation: px times map units"
     ),
     "angles": Column((), "float", "keypoint orientation of the newest observation, radians"),
     "last_seen_frame": Column((), "int", "index of the last frame that tracked the point"),
@@ -86,11 +84,7 @@ KEYFRAMES: Schema = {
     "angles": Column(("N",), "float", "radians"),
     "descriptors": Column(("N", "D"), "descriptor", "descriptors of the keypoints"),
     "mask": Column(("N",), "bool", "true for valid keypoints"),
-    "information": Column(
-        ("N", "I"),
-        "float",
-        "information of the keypoints, px^-2. I = 0: from the scale; 1: isotropic; 3: xx, xy, yy",
-    ),
+    "information": Column(("N", "I"), "float", "px^-2. I = 0: from the scale; 1: isotropic; 3: xx, xy, yy"),
     "point_ids": Column(("N",), "int", "row of the point that each keypoint observes, or -1"),
 }
 """Columns of the keyframes."""
@@ -124,13 +118,11 @@ class Table:
     """
 
     def __init__(self, schema: Schema) -> None:
-        """Create an empty table."""
         self.schema = schema
         self._columns: dict[str, Tensor] = {}
         self._size = 0
 
     def __len__(self) -> int:
-        """The number of rows in use."""
         return self._size
 
     def __getitem__(self, name: str) -> Shaped[Tensor, "R ..."]:
@@ -182,11 +174,9 @@ class Table:
                 raise ValueError(f"column {name}: {mismatch}")
 
     def _grown(self, name: str, values: Tensor, size: int) -> Tensor:
-        old = self._columns.get(name)
-        if old is not None and len(old) >= size:
+        old = self._columns.get(name, values.new_zeros(0, *values.shape[1:]))
+        if len(old) >= size:
             return old
-        capacity = max(64, size, 2 * (0 if old is None else len(old)))
-        new = torch.zeros(capacity, *values.shape[1:], dtype=values.dtype, device=values.device)
-        if old is not None:
-            new[: self._size] = old[: self._size]
+        new = values.new_zeros(max(64, size, 2 * len(old)), *values.shape[1:])
+        new[: self._size] = old[: self._size]
         return new
