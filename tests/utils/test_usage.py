@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from torchslam.utils.usage import cpu_seconds, peak_memory_mb
+from torchslam.utils.timing import cpu_seconds, peak_memory_mb
 
 BUSY = "import time\nblock = bytearray({megabytes} * 10**6)\nwhile time.process_time() < {seconds}: pass"
 

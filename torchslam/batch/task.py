@@ -43,8 +43,8 @@ from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.front_end import source
 from torchslam.system.online_run import OnlineRun
 from torchslam.system.slam import SLAM
+from torchslam.utils.console import without_credentials
 from torchslam.utils.files import fingerprint
-from torchslam.utils.text import without_credentials
 
 TIMES = "times.json"
 TIMED = ("fps", "ms_median", "ms_p95", "ms_longest", "stage_ms")

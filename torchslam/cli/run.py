@@ -61,7 +61,7 @@ from torchslam.system.run import RunProgress
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 from torchslam.utils.console import say, table, warn
-from torchslam.utils.usage import cpu_seconds, peak_memory_mb
+from torchslam.utils.timing import cpu_seconds, peak_memory_mb
 
 DONE = 0
 """Exit status with a map."""

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -31,6 +31,7 @@ from torchslam.features.weights import weights_file
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.global_mapping.rounds import ObservedTracks, Reconstruction
 from torchslam.global_mapping.view_graph import FAR, MIN_MATCHES, THRESHOLD_PX, PairMatcher, ViewPair
+from torchslam.map.map import KEYPOINT_COLUMNS
 from torchslam.tracking.matcher import DescriptorMatcher, run_matcher
 from torchslam.types import FrameFeatures, MatchIndices, MatchPrior
 
@@ -63,9 +64,6 @@ verified matches 66 % have a rotation that is off by more than 5 degrees, of tho
 HELD = 50
 """Points that images on both sides of a moment must agree on so that SIFT holds the link. On office_loop, whose every
 image is posed, the fewest are 68. Tried at 30 and 50."""
-
-_COLUMNS = "keypoints", "detected", "scales", "angles", "descriptors", "mask", "information"
-"""Attributes of `FrameFeatures` with a row per keypoint."""
 
 Links = Sequence[tuple[list[int], list[int]]]
 """The images nearest before each link, ascending, and those after it."""
@@ -244,7 +242,7 @@ def with_learned(
         for row, view in enumerate(views)
     ]
     for row, own in learned.items():
-        for name in _COLUMNS:
+        for name in KEYPOINT_COLUMNS:
             column, new = getattr(more[row], name), getattr(own, name)[matched[row]]
             if name == "descriptors":
                 new = pad(new, (0, column.shape[1] - new.shape[1]))  # what they lack in width is zero
@@ -263,8 +261,8 @@ def with_learned(
 def _in_rows(view: FrameFeatures, count: int) -> FrameFeatures:
     """A copy of the view with rows that are no keypoints after its own, `count` in all."""
     new = count - len(view.mask)
-    columns = {}
-    for name in _COLUMNS:
+    columns: dict[str, Any] = {}
+    for name in KEYPOINT_COLUMNS:
         column = getattr(view, name)
         rest = (0, 0) * (column.ndim - 1)
         columns[name] = pad(column, (*rest, 0, new), value=float(name in ("scales", "information")))

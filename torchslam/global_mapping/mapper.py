@@ -131,10 +131,15 @@ def mapping_config(config: Config) -> Config:
     settings = config.global_mapping
     if config.features.kind != Config().features.kind:
         return config
-    sizes = {"num_keypoints": settings.num_keypoints, "max_image_pixels": settings.max_image_pixels}
+    features = replace(
+        config.features,
+        kind="sift",
+        num_keypoints=settings.num_keypoints,
+        max_image_pixels=settings.max_image_pixels,
+    )
     return replace(
         config,
-        features=replace(config.features, kind="sift", **sizes),
+        features=features,
         matching=replace(config.matching, max_ratio=SIFT_RATIO, max_cosine_distance=SIFT_DISTANCE),
     )
 

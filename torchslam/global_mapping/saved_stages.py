@@ -144,7 +144,7 @@ def _checksum(columns: _Columns) -> int:
     """CRC-32 of names and bytes."""
     found = 0
     for name in sorted(columns):
-        found = zlib.crc32(columns[name].cpu().contiguous().numpy(), zlib.crc32(name.encode(), found))
+        found = zlib.crc32(columns[name].cpu().contiguous().numpy().data, zlib.crc32(name.encode(), found))
     return found
 
 

@@ -7,7 +7,7 @@ holds for each keypoint the row of the point that it observes, or -1 (the data a
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -294,12 +294,13 @@ class Map:
     def frame_features(self, keyframe: int) -> FrameFeatures:
         """Return the features of a keyframe."""
         table = self.keyframes
+        columns: dict[str, Any] = {name: table[name][keyframe] for name in KEYPOINT_COLUMNS}
         return FrameFeatures(
             index=int(table["frame_index"][keyframe]),
             timestamp=float(table["timestamp"][keyframe]),
             session=int(table["session"][keyframe]),
             image=self.images.get(self.key(keyframe)) if self.images else None,
-            **{name: table[name][keyframe] for name in KEYPOINT_COLUMNS},
+            **columns,
         )
 
     def covisibility_weights(self, keyframes: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:

@@ -29,8 +29,6 @@ from functools import partial
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import torch
@@ -40,15 +38,8 @@ from torchslam.utils.forks import close_decoders
 
 RESPONSE_TIMEOUT_S = 60.0
 """A worker that was stopped is given up after this time; a frame or a local adjustment takes less than a second."""
-
 AHEAD = 2
 """Tasks that each worker is sent at a time, so that it need not wait while this process does one of its own."""
-
-READY = b""
-"""First message of a worker that is a new interpreter, once its imports are done."""
-
-THREADS = Path("/proc/self/task")
-"""Folder with one entry for each thread of this process, on Linux."""
 
 
 class WorkerLostError(Exception):
@@ -100,7 +91,7 @@ class _Worker:
     def is_ready(self) -> bool:
         """Return whether calls are accepted. Raises OSError or EOFError if the process has ended."""
         if self.task is not None and self.connection.poll():
-            self.connection.recv_bytes()  # READY
+            self.connection.recv_bytes()  # its imports are done
             self.connection.send_bytes(self.task)
             self.task = None
         return self.task is None
@@ -114,8 +105,7 @@ class _Worker:
     def receive(self, timeout: float) -> bool:
         """Receive the answer of the first call that has none; return False if it does not come in time.
 
-        Raises:
-            OSError, EOFError: The process has ended; BlockingIOError if it stopped within an answer.
+        Raises OSError or EOFError if the process has ended, BlockingIOError if it stopped within an answer.
         """
         if not self.connection.poll(timeout):
             return False
@@ -159,9 +149,7 @@ class WorkerPool:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end()
 
     def _end(self) -> None:
@@ -290,7 +278,9 @@ def can_fork() -> bool:
 
     The use of a GPU does not survive a fork either. Elsewhere than on Linux the system's libraries may have threads.
     """
-    return sys.platform == "linux" and len(list(THREADS.iterdir())) == 1 and not torch.cuda.is_initialized()
+    if sys.platform != "linux" or torch.cuda.is_initialized():
+        return False
+    return len(os.listdir("/proc/self/task")) == 1  # an entry for each thread
 
 
 @contextmanager
@@ -352,49 +342,34 @@ def _serve_in_fork(theirs: Connection, ours: Connection, task: bytes) -> None:
 
 def _serve_when_imported(connection: Connection) -> None:
     """Answer calls in a new interpreter, which has imported everything to find this function."""
-    connection.send_bytes(READY)
+    connection.send_bytes(b"")
     _serve(connection, connection.recv_bytes())
 
 
 def _serve(connection: Connection, task: bytes) -> None:
-    """Answer calls.
-
-    Threads receive and send, so that neither process waits for the other one to receive.
-    """
+    """Answer calls. Threads receive and send, so that neither process waits for the other one to receive."""
     received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_receive, args=(connection, received), daemon=True).start()
-    threading.Thread(target=_send, args=(connection, answers), daemon=True).start()
+    for ends in ((connection.recv_bytes, received.put), (answers.get, connection.send_bytes)):
+        threading.Thread(target=_forward, args=ends, daemon=True).start()
     threads, niceness, make, parts = pickle.loads(task)
     torch.set_num_threads(threads)
     if hasattr(os, "nice"):  # not on Windows
         os.nice(niceness)
     answer = make(*parts)
     while True:
-        answers.put(_call(answer, received.get()))
+        question = received.get()
+        try:
+            with torch.inference_mode():
+                answers.put(_pack((answer(*pickle.loads(question)), "")))
+        except Exception as error:
+            answers.put(_pack((error, traceback.format_exc())))
 
 
-def _receive(connection: Connection, received: queue.SimpleQueue[bytes]) -> None:
-    """Receive calls; end with the parent, which may have been killed: nobody waits for the answers."""
+def _forward(take: Callable[[], bytes], give: Callable[[bytes], object]) -> None:
+    """Pass messages on; end with the parent, which may have been killed: nobody waits for the answers."""
     try:
         while True:
-            received.put(connection.recv_bytes())
+            give(take())
     except (OSError, EOFError):
         os._exit(1)
-
-
-def _send(connection: Connection, answers: queue.SimpleQueue[bytes]) -> None:
-    try:
-        while True:
-            connection.send_bytes(answers.get())
-    except OSError:
-        os._exit(1)
-
-
-def _call(answer: Callable[..., object], question: bytes) -> bytes:
-    """The packed result of a call and no traceback, or its exception and the traceback."""
-    try:
-        with torch.inference_mode():
-            return _pack((answer(*pickle.loads(question)), ""))
-    except Exception as error:
-        return _pack((error, traceback.format_exc()))
