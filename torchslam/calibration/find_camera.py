@@ -92,7 +92,7 @@ def describe_search(search: ViewGraphFocal | None, camera: Camera) -> str:
     if search.success:
         return f"focal length {_with_error(focal, focal * float(search.std))} px by {pairs} image pairs"
     return (
-        f"{pairs} image pairs do not determine it ({DEGENERATE}): "
+        f"{pairs} image pairs do not determine it (pure rotation, straight motion and planes do not determine it): "
         f"the focal length of {focal:.0f} px is an initial guess"
     )
 
@@ -121,7 +121,10 @@ def camera_remark(finished: Run, found: str) -> str:
             return f"{found}; over all frames {described}"
         described += f" (given {float(given.camera.focal):.1f} px)"
         stated = finished.config.camera.std
-        if not _may_contradict(given, finished.calibration, stated):
+        # The found focal length is the mean of the given one and that by the images alone, weighted by information.
+        share = 1 - (finished.calibration.focal_std / given.focal_std) ** 2 if given.focal_std > 0 else 0.0
+        departure = abs(_focal_ratio(given.camera, finished.calibration.camera))
+        if departure <= LEAST_DEPARTURE * stated * share:
             return described
         better = better_camera(finished.graph, given.camera)
         if better is None or abs(_focal_ratio(given.camera, better.camera)) < MIN_SIGMAS * stated:
@@ -134,15 +137,6 @@ def camera_remark(finished: Run, found: str) -> str:
     if found:
         return "; but over all frames ".join(filter(None, (found, against)))
     return f"{against}; {REMEDY}" if against else ""
-
-
-def _may_contradict(given: CameraMeasurement, found: CameraMeasurement, stated: float) -> bool:
-    """Whether the focal length by the images alone may be `MIN_SIGMAS` of its stated error from the given one.
-
-    The found one is the mean of the two, weighted by their information.
-    """
-    share = 1 - (found.focal_std / given.focal_std) ** 2 if given.focal_std > 0 else 0.0
-    return abs(_focal_ratio(given.camera, found.camera)) > LEAST_DEPARTURE * stated * share
 
 
 def describe_calibration(found: CameraMeasurement) -> str:
@@ -163,8 +157,6 @@ LEAST_DEPARTURE = 0.5 * MIN_SIGMAS
 """Stated standard deviations that the images alone must seem off before `better_camera` adjusts all keyframes. Tried at
 this value only."""
 REMEDY = "--refine-camera estimates a better one"
-CONSEQUENCE = "poses and map may be badly wrong"
-DEGENERATE = "pure rotation, straight motion and planes do not determine it"
 
 
 def better_camera(graph: ObservationGraph, given: Camera) -> CameraMeasurement | None:
@@ -203,7 +195,7 @@ def contradiction(given: Camera, better: CameraMeasurement, used: Camera) -> str
         number = f"{focal:.0f} px or {'more' if off > 0 else 'less'}"
     words = f"the images agree better with a focal length of {number} than with {was:.0f} px"
     is_far = abs(_focal_ratio(used, better.camera)) > LARGE_RATIO
-    return f"{words}; {CONSEQUENCE}" if is_far else words
+    return f"{words}; poses and map may be badly wrong" if is_far else words
 
 
 def _focal_ratio(given: Camera, found: Camera) -> float:

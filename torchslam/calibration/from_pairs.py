@@ -84,17 +84,15 @@ def search_focal(
         if extract is not None:
             features = features.rows(slice(NUM_KEYPOINTS))
         views[index] = FrameFeatures.of(frame, features, sequence.camera.params.double())
-    matched: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor]] = {}
+    matched: dict[tuple[int, int], tuple[Tensor, Tensor, Tensor] | None] = {}
     scale = config.features.reduction(sequence.camera.size)
     for start in starts:
         around = [start + offset for offset in OFFSETS if start + offset in views]
         for one, other in combinations(around, 2):
             if (one, other) not in matched:
-                pair = _fundamental(views[one], views[other], config, scale)
-                if pair is not None:
-                    matched[one, other] = pair
-    widest = sorted(matched, key=lambda pair: pair[0] - pair[1])[:MAX_PAIRS]
-    chosen = [matched[pair] for pair in widest]
+                matched[one, other] = _fundamental(views[one], views[other], config, scale)
+    widest = sorted(matched, key=lambda pair: pair[0] - pair[1])
+    chosen = [pair for pair in (matched[ends] for ends in widest) if pair is not None][:MAX_PAIRS]
     return _solve(chosen, sequence.camera, scale) if chosen else None
 
 
@@ -108,12 +106,7 @@ def _fundamental(
     pixels_1, pixels_2 = one.keypoints[at_1].cpu(), other.keypoints[at_2].cpu()
     try:
         F, mask = cv2.findFundamentalMat(
-            pixels_1.numpy(),
-            pixels_2.numpy(),
-            cv2.USAC_MAGSAC,
-            THRESHOLD_PX * scale,
-            CONFIDENCE,
-            MAX_SAMPLES,
+            pixels_1.numpy(), pixels_2.numpy(), cv2.USAC_MAGSAC, THRESHOLD_PX * scale, CONFIDENCE, MAX_SAMPLES
         )
     except cv2.error:  # OpenCV raises for some degenerate matches
         return None

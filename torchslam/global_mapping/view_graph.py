@@ -103,14 +103,11 @@ class PairMatcher:
         held: dict[int, ViewPair] = {}
         for start in range(0, len(order), _PAIRS_AT_ONCE):
             rows = order[start : start + _PAIRS_AT_ONCE]
-            held |= {
-                row: pair
-                for row, pair in zip(rows, self._verified([found[row] for row in rows]), strict=True)
-                if pair is not None
-            }
+            held |= {rows[at]: pair for at, pair in self._verified([found[row] for row in rows]).items()}
         return [held[row] for row in sorted(held)]
 
-    def _verified(self, found: list[tuple[int, int, Tensor, Tensor]]) -> list[ViewPair | None]:
+    def _verified(self, found: list[tuple[int, int, Tensor, Tensor]]) -> dict[int, ViewPair]:
+        """The pairs that hold, by their place in a batch."""
         size = max(len(at_1) for _, _, at_1, _ in found)
         pixels = self.camera.params.new_zeros(2, len(found), size, 2)
         mask = torch.zeros(len(found), size, dtype=torch.bool, device=pixels.device)
@@ -130,16 +127,14 @@ class PairMatcher:
             kernel="truncated",
             min_samples=_MIN_SAMPLES,
         )
-        pairs: list[ViewPair | None] = []
+        pairs = {}
         for row, (one, other, at_1, at_2) in enumerate(found):
             inliers = relative.inliers[row, : len(at_1)]
-            count = int(inliers.sum())
-            if count < MIN_MATCHES or count < MIN_RATIO * len(at_1):
-                pairs.append(None)
+            if int(inliers.sum()) < max(MIN_MATCHES, MIN_RATIO * len(at_1)):
                 continue
             relation = Relation.GENERAL if bool(relative.success[row]) else Relation.PLANE
             relation = Relation.ROTATION if relative.model[row] == "rotation" else relation
-            pairs.append(ViewPair(one, other, at_1[inliers], at_2[inliers], relative.T_21[row], relation))
+            pairs[row] = ViewPair(one, other, at_1[inliers], at_2[inliers], relative.T_21[row], relation)
         return pairs
 
 

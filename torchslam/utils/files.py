@@ -137,9 +137,9 @@ def whole_folder(path: Path) -> Iterator[Path]:
     part.mkdir()
     try:
         yield part
-        for file in part.rglob("*"):
-            if file.is_file():
-                _sync_file(file)
+        for path_of_file in filter(Path.is_file, part.rglob("*")):
+            with path_of_file.open("rb+") as file:
+                os.fsync(file.fileno())
         if path.exists():
             path.rename(old)
         part.rename(path)
@@ -148,11 +148,6 @@ def whole_folder(path: Path) -> Iterator[Path]:
         raise
     _sync_folder(path.parent)
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _sync_file(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
 
 
 def _sync_folder(folder: Path) -> None:
