@@ -123,22 +123,3 @@ def test_the_ratio_is_a_median_with_its_error() -> None:
     assert robust is not None
     assert robust.log_ratio == pytest.approx(0.6)
     assert robust.std < 0.05
-
-
-def test_each_pair_has_its_own_noise_and_image() -> None:
-    """The noise of the first may be too large where that of the second is not, and so for the images."""
-    few = torch.ones(12)
-    exact, noisy = depths(few, 0.01), depths(few, 0.3)
-    assert depth_ratio(exact, 0, exact, 0) is not None
-    assert depth_ratio(exact, 0, noisy, 0) is None
-    assert depth_ratio(noisy, 0, exact, 0) is None
-    table, doubled = np.ones(12), np.full(12, 2.0)
-    both = PairDepths((table, doubled), (0.01 * table, 0.3 * table))
-    found = depth_ratio(exact, 1, PairDepths((table, doubled), (0.01 * table, 0.01 * table)), 1)
-    assert found is not None
-    assert found.log_ratio == pytest.approx(math.log(2))
-    assert depth_ratio(both, 0, both, 0) is not None
-    assert depth_ratio(both, 1, both, 0) is not None
-    worse = PairDepths((table, table), (0.01 * table, 0.3 * table))
-    assert depth_ratio(worse, 1, exact, 0) is None
-    assert depth_ratio(exact, 0, worse, 1) is None

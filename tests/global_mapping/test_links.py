@@ -21,7 +21,7 @@ from torchslam.global_mapping.links import (
     strengthen,
     weak_links,
 )
-from torchslam.global_mapping.mapper import SIFT_DISTANCE, SIFT_RATIO, mapping_config
+from torchslam.global_mapping.mapper import mapping_config
 from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import FrameFeatures, Matches, MatchPrior
@@ -174,9 +174,3 @@ def test_other_matchers_receive_the_pose() -> None:
     assert prior.T_21 is T_21
     assert prior.camera is CAMERA
     assert prior.epipolar_px == 12
-
-
-def test_descriptors_of_a_pair_are_those_of_sift() -> None:
-    """The constants of guided matching are factors on those of the mapper."""
-    matching = mapping_config(Config()).matching
-    assert (matching.max_ratio, matching.max_cosine_distance) == (SIFT_RATIO, SIFT_DISTANCE)

@@ -167,16 +167,6 @@ def test_a_recording_with_lost_frames_is_mapped_as_a_whole(world: World, online:
     assert world.checked_online == (not why)
 
 
-def test_the_online_run_comes_with_the_whole_map(world: World) -> None:
-    """As far as it went: its times are those that are reported."""
-    begun, ended = a_run(posed=9, frames=10, lost=1), a_run(posed=60)
-    kept = world.map(begun, go_on=lambda: ended)
-    assert (kept.run, kept.online) == (world.whole, begun)
-    world.whole = a_run(posed=99)  # one frame has no pose: the run goes on
-    kept = world.map(begun, go_on=lambda: ended)
-    assert (kept.run, kept.online) == (world.whole, ended)
-
-
 def test_a_run_that_the_check_contradicts_is_mapped_as_a_whole(world: World) -> None:
     world.online_check = a_check(is_broken=True)
     world.checks[False] = a_check(0.9, predicted=0)
@@ -277,14 +267,6 @@ def test_a_run_that_was_lost_goes_on_only_where_the_whole_map_is_not_right(world
     kept = world.map(begun, go_on=go_on)
     assert (kept.run, kept.check) == (ended, world.online_check)
     assert len(asked) == 3
-
-
-def test_the_camera_is_given_with_its_error(world: World) -> None:
-    world.map(a_run(posed=1), Mapping.GLOBAL, "camera.std=0.03")
-    assert world.given.focal_std == pytest.approx(0.03)
-    assert torch.equal(world.given.camera.params[:4], CAMERA.params.double())
-    world.map(a_run(posed=1), Mapping.GLOBAL, "camera.std=0")
-    assert world.given is None
 
 
 def test_frames_that_the_mapper_doubts_are_uncertain(world: World) -> None:

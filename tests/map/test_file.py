@@ -70,15 +70,6 @@ def test_submaps_and_camera_round_trip(path: Path, submaps: list[Submap], camera
     assert torch.equal(saved.camera.params, camera.params)
 
 
-def test_a_loaded_map_can_be_extended(path: Path) -> None:
-    loaded, _ = read_map(path)
-    before = loaded.num_points
-    loaded.add_points(
-        torch.zeros(2, 3, dtype=torch.float64), torch.zeros(2, 32, dtype=torch.uint8), keyframe=0
-    )
-    assert loaded.num_points == before + 2
-
-
 def test_saving_is_deterministic_also_after_loading(
     path: Path, submaps: list[Submap], camera: Camera
 ) -> None:

@@ -180,23 +180,6 @@ def test_a_loaded_map_has_the_same_index(tmp_path: Path) -> None:
     check(loaded)
 
 
-def test_the_index_grows_with_the_observations_of_a_point() -> None:
-    slam_map = make_map(40, 2)
-    for keyframe in range(40):
-        slam_map.add_observations(keyframe, torch.tensor([keyframe % KEYPOINTS]), torch.tensor([1]))
-    check(slam_map)
-    slam_map.remove_observations(torch.arange(0, 40, 2), torch.arange(0, 40, 2) % KEYPOINTS)
-    check(slam_map)
-
-
-def test_slots_are_returned_in_the_requested_order() -> None:
-    index = ObservationIndex(torch.tensor([[0, -1, 1], [1, 0, -1]]))
-    which, slots = index.observations_of(torch.tensor([1, 0, 5]))
-    assert sorted(zip(which.tolist(), slots.tolist(), strict=True)) == [(0, 2), (0, 3), (1, 0), (1, 4)]
-    index.remove(torch.tensor([1]), torch.tensor([2]))
-    assert index.padded_slots(torch.tensor([1]))[0].tolist()[:2] == [3, -1]
-
-
 @given(st.lists(st.integers(0, 5), max_size=20), st.integers(1, 6), st.integers(1, 4))
 def test_the_most_frequent_equal_those_of_a_full_sort(counts: list[int], limit: int, least: int) -> None:
     values = torch.tensor(counts, dtype=torch.int64)

@@ -33,13 +33,6 @@ def test_capacity_doubles_so_most_appends_do_not_move_the_storage() -> None:
     assert len(pointers) <= 6
 
 
-def test_a_column_is_a_view_of_the_storage() -> None:
-    table = Table(NUMBER)
-    table.append(number=torch.zeros(3))
-    table["number"][1] = 5.0
-    assert table["number"].tolist() == [0.0, 5.0, 0.0]
-
-
 def test_stored_tensors_are_detached() -> None:
     table = Table(NUMBER)
     table.append(number=torch.ones(2, requires_grad=True) * 2)
