@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any
 
 import pytest
 import torch
@@ -305,42 +304,6 @@ def test_a_track_that_joins_two_points_becomes_the_one_that_most_see() -> None:
         assert float((pixels[:, row] - shown[:, other]).norm(dim=-1).max()) > 10
 
 
-class Steps:
-    """What the rounds do, in order, in place of doing it: every call says which observations agree next."""
-
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, agreeing: Callable[[int], int]) -> None:
-        self.done: list[tuple[Any, ...]] = []
-        self.triangulated = 0
-        steps = self
-
-        def adjusted(observed: ObservedTracks, found: Reconstruction, *options: Any) -> Reconstruction:
-            steps.done.append(("adjust", observed.tracks.count, *options[:3]))
-            return replace(
-                found, T_cw=found.T_cw + 1, camera=found.camera.with_params(found.camera.params + 1)
-            )
-
-        def filtered(self: ObservedTracks, found: Reconstruction, gate: float) -> Reconstruction:
-            steps.done.append(("filter", self.tracks.count, gate))
-            return found
-
-        def triangulated(self: ObservedTracks, T_cw: Tensor, camera: Camera, gate: float) -> Reconstruction:
-            steps.done.append(("triangulate", self.tracks.count, gate))
-            agrees = torch.arange(len(self.tracks)) < agreeing(steps.triangulated)
-            steps.triangulated += 1
-            return Reconstruction(T_cw, camera, SCENE.points_w[: self.tracks.count], agrees)
-
-        def completed(self: ObservedTracks, found: Reconstruction, gate: float) -> Reconstruction:
-            steps.done.append(("complete", self.tracks.count, gate))
-            agrees = torch.arange(len(self.tracks)) < agreeing(steps.triangulated)
-            steps.triangulated += 1
-            return replace(found, agrees=agrees)
-
-        monkeypatch.setattr(rounds, "adjust", adjusted)
-        monkeypatch.setattr(ObservedTracks, "complete", completed)
-        monkeypatch.setattr(ObservedTracks, "filter", filtered)
-        monkeypatch.setattr(ObservedTracks, "triangulate", triangulated)
-
-
 @pytest.mark.parametrize(
     ("changes", "done"),
     [
@@ -360,10 +323,22 @@ def test_rounds_end_when_little_changes(
     totals = [500]
     for change in changes:
         totals.append(totals[-1] + change)
-    steps = Steps(monkeypatch, lambda number: totals[number])
+    agreeing, steps = iter(totals), list[str]()
+
+    def answer(step: str) -> Callable[..., Reconstruction]:
+        def do(*arguments: object, **more: object) -> Reconstruction:
+            steps.append(step)
+            agrees = torch.arange(len(SCENE.tracks)) < next(agreeing)
+            return replace(exact(SCENE), agrees=agrees)
+
+        return do
+
+    monkeypatch.setattr(rounds, "adjust", lambda observed, found, *options: found)
+    monkeypatch.setattr(ObservedTracks, "complete", answer("complete"))
+    monkeypatch.setattr(ObservedTracks, "triangulate", answer("triangulate"))
     words: list[str] = []
     found = adjust_in_rounds(SCENE.observed, SCENE.T_cw, None, CAMERA, False, words.append)
-    assert [step[0] for step in steps.done] == ["triangulate", *["adjust", "complete"] * done]
+    assert steps == ["triangulate", *["complete"] * done]
     assert int(found.agrees.sum()) == totals[done]
     assert (
         words[-1]

@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Callable
 from dataclasses import fields, replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -49,6 +51,11 @@ def saved(tmp_path: Path) -> Callable[..., SavedStages]:
     return lambda *overrides: SavedStages(tmp_path / "stages", WALK, config(*overrides))
 
 
+def matcher(find: Callable[[], list], views: list[FrameFeatures] = VIEWS) -> Any:
+    """Finds given pairs."""
+    return SimpleNamespace(views=views, match=lambda ends: find())
+
+
 def without_truth(view: FrameFeatures) -> FrameFeatures:
     return replace(view, T_cw_groundtruth=None)
 
@@ -58,10 +65,10 @@ def test_stages_are_read_as_they_were_saved(saved: Callable[..., SavedStages]) -
     for _ in range(2):
         found = saved().views(images, views)
         assert all(map(equal, found, map(without_truth, VIEWS)))
-        assert all(map(equal, saved().pairs(VIEWS, ENDS, pairs), PAIRS))
+        assert all(map(equal, saved().pairs(matcher(pairs), ENDS), PAIRS))
     assert views.times == pairs.times == 1
     nothing = Counted([])
-    assert [saved().pairs(VIEWS, [(2, 3)], nothing) for _ in range(2)] == [[], []]
+    assert [saved().pairs(matcher(nothing), [(2, 3)]) for _ in range(2)] == [[], []]
     assert nothing.times == 1
 
 
@@ -72,9 +79,9 @@ def test_stages_of_anything_else_are_not_read(saved: Callable[..., SavedStages])
     saved("seed=3").views(images[:2], views)
     saved().views(images[1:3], views)
     assert views.times == 3
-    saved().pairs(VIEWS, ENDS, pairs)
-    saved().pairs(VIEWS, ENDS[:2], pairs)
-    saved().pairs(VIEWS[::-1], ENDS, pairs)
+    saved().pairs(matcher(pairs), ENDS)
+    saved().pairs(matcher(pairs), ENDS[:2])
+    saved().pairs(matcher(pairs, VIEWS[::-1]), ENDS)
     assert pairs.times == 3
 
 
@@ -99,7 +106,7 @@ def test_a_damaged_file_is_reported_and_computed_again(saved: Callable[..., Save
     column = "scales" if name == "views" else "keypoints_1"
 
     def read() -> list:
-        return saved().views([0, 1, 2, 3], stage) if name == "views" else saved().pairs(VIEWS, ENDS, stage)
+        return saved().views([0, 1, 2, 3], stage) if name == "views" else saved().pairs(matcher(stage), ENDS)
 
     read()
     (path,) = saved().folder.glob(f"{name}_*")
@@ -124,7 +131,7 @@ def test_only_stages_are_deleted(saved: Callable[..., SavedStages], tmp_path: Pa
     folder = tmp_path / "stages"
     delete_stages(folder)
     saved().views([0, 1, 2, 3], lambda: VIEWS)
-    saved().pairs(VIEWS, ENDS, lambda: PAIRS)
+    saved().pairs(matcher(lambda: PAIRS), ENDS)
     (folder / "views_1.safetensors.part").write_bytes(b"of a killed run")
     (folder / "notes.txt").write_text("mine")
     delete_stages(folder)

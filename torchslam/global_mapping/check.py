@@ -355,7 +355,7 @@ def _breaks(
         if kind is not None:
             apart.append(Break(views[before].index, views[after].index, kind, ratio))
         stretch_of[after] = len(apart)
-    label = _tied(np.arange(len(apart) + 1), stretch_of, ends, good * sizes, sizes, spans, right)
+    label = _tied(stretch_of, len(apart) + 1, ends, good * sizes, sizes, triplets)
     breaks = [found for number, found in enumerate(apart) if label[number] != label[number + 1]]
     if disagree(~near, good):
         first, last = ends[~near & ~good][0].tolist()
@@ -367,53 +367,44 @@ def _breaks(
 
 
 def _tied(
-    label: NDArray[np.int64],
     stretch_of: NDArray[np.int64],
+    count: int,
     ends: NDArray[np.int64],
     agreeing: NDArray[np.int64],
     matches: NDArray[np.int64],
-    spans: NDArray[np.int64],
-    right: NDArray[np.bool_],
+    triplets: _Triplets,
 ) -> NDArray[np.int64]:
     """The part that each stretch belongs to: two are one where nearly all pairs and triplets between them agree.
 
     The two parts that the most right triplets tie are joined first; then all is counted anew.
 
     Args:
-        label: a part for each stretch.
-        stretch_of: stretch of each image.
+        stretch_of: stretch of each image, of `count` ones.
         ends: images of pairs, both in some stretch.
         agreeing: matches of the pairs, zero where the pair does not agree.
         matches: matches of the pairs.
-        spans: images of triplets.
-        right: whether their ratios of scales agree.
+        triplets: of which each tells of both of its pairs.
     """
-    sides = np.concatenate([spans[:, :2], spans[:, 1:]])  # the pairs of each triplet
-    ratios = np.concatenate([right, right]).astype(np.float64)
+
+    def between(images: NDArray[np.int64], values: NDArray[Any]) -> Array:
+        """(count, count) sums over pairs of images between two stretches."""
+        one, other = stretch_of[images].T
+        sums = np.bincount(one * count + other, values, count * count).reshape(count, count)
+        return sums + sums.T
+
+    sides = np.concatenate([triplets.images[:, :2], triplets.images[:, 1:]])
+    right = np.tile(triplets.agrees, 2)
+    sums = np.stack(
+        [between(ends, agreeing), between(sides, right), between(ends, matches), between(sides, right | True)]
+    )
+    label = np.arange(count)
     while True:
-        part = label[stretch_of]
-        tied = _shares(part[ends], agreeing, matches, len(label))
-        counts = _shares(part[sides], ratios, np.ones(len(ratios)), len(label))
-        able = [
-            (counts[key][0], key)
-            for key in counts.keys() & tied.keys()
-            if counts[key][0] >= MIN_SPANNING and all(whole[key][1] >= TIED for whole in (tied, counts))
-        ]
-        if not able:
+        shares = np.divide(sums[:2], sums[2:], out=np.zeros((2, count, count)), where=sums[2:] > 0)
+        able = np.triu((shares >= TIED).all(axis=0) & (sums[1] >= MIN_SPANNING), 1)
+        if not able.any():
             return label
-        _, (one, other) = max(able, key=lambda each: (each[0], -each[1][0], -each[1][1]))
-        label = np.where(label == other, one, label)
-
-
-def _shares(
-    parts: NDArray[np.int64], agreeing: NDArray[Any], whole: NDArray[Any], count: int
-) -> dict[tuple[int, int], tuple[float, float]]:
-    """What agrees between two different parts, and its share, by their numbers, the lower one first."""
-    low, high = parts.min(axis=1), parts.max(axis=1)
-    across = low != high
-    keys, which = np.unique(low[across] * count + high[across], return_inverse=True)
-    sums = np.bincount(which, agreeing[across]), np.bincount(which, whole[across])
-    return {
-        (int(key) // count, int(key) % count): (agrees, agrees / every)
-        for key, agrees, every in zip(keys, *(each.tolist() for each in sums), strict=True)
-    }
+        one, other = np.unravel_index(np.where(able, sums[1], -1.0).argmax(), able.shape)
+        label[label == other] = one
+        sums[:, one] += sums[:, other]
+        sums[:, :, one] += sums[:, :, other]
+        sums[:, other] = sums[:, :, other] = 0

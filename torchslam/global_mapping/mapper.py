@@ -39,7 +39,7 @@ from torchslam.global_mapping.rounds import (
     adjust_in_rounds,
 )
 from torchslam.global_mapping.saved_stages import SavedStages
-from torchslam.global_mapping.tracks import join_matches, make_map
+from torchslam.global_mapping.tracks import make_map
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
     Relation,
@@ -234,8 +234,8 @@ class GlobalMapper:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
-        matcher = self.saved.matcher(PairMatcher(views, self.camera, self.matcher, self.config))
-        pairs = build_view_graph(matcher, lambda done, most: self.progress("matches", done, most))
+        matcher = PairMatcher(views, self.camera, self.matcher, self.config)
+        pairs = build_view_graph(matcher, partial(self.progress, "matches"), self.saved.pairs)
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
         found = self.reconstruct(views, used)
@@ -332,7 +332,7 @@ class GlobalMapper:
         connected = set(rows.tolist())
         own = sum(pair.first in connected for pair in pairs[:own])
         pairs = [pair for pair in pairs if pair.first in connected]
-        observed = self._tracks(pairs, views)
+        observed = ObservedTracks.join(pairs, views)
         if observed.tracks.count == 0:
             return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
         self.progress("positions", 0, 1)
@@ -348,18 +348,12 @@ class GlobalMapper:
         matcher = PairMatcher(plain, self.camera, self.matcher, self.config)
         self.progress("weak links", 0, 1)
         stronger = strengthen(matcher, pairs[:own], coarse.T_cw, coarse.camera)
-        observed = self._tracks(stronger + pairs[own:], views)
+        observed = ObservedTracks.join(stronger + pairs[own:], views)
         found = adjust_in_rounds(observed, coarse.T_cw, self.given, coarse.camera, False, log)
         seen = torch.unique(observed.tracks.view[found.agrees])
         if len(seen) < MIN_VIEWS:
             return f"no map: {len(views)} images agree on no points; the camera may only turn"
         return seen, observed, found
-
-    @staticmethod
-    def _tracks(pairs: list[ViewPair], views: list[FrameFeatures]) -> ObservedTracks:
-        tracks = join_matches(pairs, len(views), len(views[0].mask))
-        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
-        return ObservedTracks.of(tracks, views)
 
     def finish(
         self,
@@ -396,9 +390,7 @@ class GlobalMapper:
         results = pose_frames(submap, every, sensor, self.config, given_cw)
         final = FinalAdjustment(sensor, self.config, self.given)
         if not keep:
-            final.adjust(
-                atlas, 0, lambda done, most: self.progress("final adjustment", done, most), settled=True
-            )
+            final.adjust(atlas, 0, partial(self.progress, "final adjustment"), settled=True)
         return Run(
             tuple(atlas),
             final.sensor,

@@ -78,19 +78,11 @@ class SavedStages:
 
         return self._stage(VIEWS, list(images), find, pack, unpack)
 
-    def matcher(self, matcher: PairMatcher) -> PairMatcher:
-        """A matcher that saves each of its results."""
-        return _SavingMatcher(matcher, self)
-
-    def pairs(
-        self,
-        views: Sequence[FrameFeatures],
-        ends: Sequence[tuple[int, int]],
-        find: Callable[[], list[ViewPair]],
-    ) -> list[ViewPair]:
-        """The pairs of views that hold, of those with the given rows."""
-        of = [[view.index for view in views], list(ends)]
-        return self._stage(PAIRS, of, find, _packed_pairs, _unpacked_pairs)
+    def pairs(self, matcher: PairMatcher, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
+        """The pairs that hold, as `PairMatcher.match`."""
+        ends = list(pairs)
+        of = [[view.index for view in matcher.views], ends]
+        return self._stage(PAIRS, of, lambda: matcher.match(ends), _packed_pairs, _unpacked_pairs)
 
     def _stage(
         self,
@@ -117,16 +109,6 @@ class SavedStages:
             self.folder.mkdir(exist_ok=True)
             write_tensors(path, columns, {"format": FORMAT, "checksum": _checksum(columns)})
         return found
-
-
-class _SavingMatcher(PairMatcher):
-    def __init__(self, matcher: PairMatcher, saved: SavedStages) -> None:
-        super().__init__(matcher.views, matcher.camera, matcher.matcher, matcher.config)
-        self._saved = saved
-
-    def match(self, pairs: Iterable[tuple[int, int]]) -> list[ViewPair]:
-        ends = list(pairs)
-        return self._saved.pairs(self.views, ends, lambda: super(_SavingMatcher, self).match(ends))
 
 
 def delete_stages(folder: Path) -> None:

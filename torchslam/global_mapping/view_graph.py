@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -139,17 +140,21 @@ class PairMatcher:
 
 
 def build_view_graph(
-    matcher: PairMatcher, progress: Callable[[int, int], None] = lambda done, most: None
+    matcher: PairMatcher,
+    progress: Callable[[int, int], None] = lambda done, most: None,
+    match: Callable[[PairMatcher, Iterable[tuple[int, int]]], list[ViewPair]] | None = None,
 ) -> list[ViewPair]:
     """Match every image with its neighbors in time and with images of similar places.
 
     Args:
         matcher: of the images, which are in the order of time.
         progress: called with the number of distances and places done, and of all.
+        match: matches pairs by the matcher, or knows the result; None: `PairMatcher.match`.
 
     Returns:
         The pairs that hold, by first, then second image.
     """
+    find = partial(match, matcher) if match else matcher.match
     count = len(matcher.views)
     distances = [distance for distance in NEAR if distance < count]
     far = FAR
@@ -161,12 +166,12 @@ def build_view_graph(
     for done, distance in enumerate(distances):
         progress(done, len(distances) + 1)
         rows = held if distance >= FAR else range(count)
-        found = matcher.match((row, row + distance) for row in rows if row + distance < count)
+        found = find((row, row + distance) for row in rows if row + distance < count)
         pairs += found
         held = [pair.first for pair in found]
     progress(len(distances), len(distances) + 1)
     known = {(pair.first, pair.second) for pair in pairs}
-    pairs += matcher.match(pair for pair in similar_places(matcher.views) if pair not in known)
+    pairs += find(pair for pair in similar_places(matcher.views) if pair not in known)
     return sorted(pairs, key=lambda pair: (pair.first, pair.second))
 
 
