@@ -57,8 +57,7 @@ def find_camera(
         on_progress: Receives messages.
         extract: As in `search_focal`.
 
-    Returns:
-        The sequence with its camera and the error of this, and a description of the camera.
+    Returns the sequence with its camera and the error of this, and a description of the camera.
     """
     if config.features.kind == "simulated":
         raise ConfigError("simulated features are made with the camera, so it cannot be estimated")
@@ -108,11 +107,8 @@ def with_stated_std(config: Config, sequence: Sequence) -> Config:
 def camera_remark(finished: Run, found: str) -> str:
     """Describe the camera of a run: its source, its error, and whether the run contradicts the given one.
 
-    Only a complete first session can contradict an exact one.
-
-    Args:
-        finished: The run.
-        found: Description by `find_camera`, empty for a given camera.
+    Only a complete first session can contradict an exact one. `found`: as `find_camera` describes it, empty for a
+    given camera.
     """
     given = finished.given
     if given is not None and finished.calibration is not None:
@@ -162,13 +158,8 @@ REMEDY = "--refine-camera estimates a better one"
 def better_camera(graph: ObservationGraph, given: Camera) -> CameraMeasurement | None:
     """Estimate the camera of a run's keyframes with a standard deviation of `ROUGH_STD` around the given one.
 
-    Args:
-        graph: Of a run.
-        given: The camera to compare with.
-
-    Returns:
-        The camera with its error; None where stretches of the recording do not predict each other better with it, or
-        where its focal length is that of the given one within its error.
+    None where stretches of the recording do not predict each other better with it, or where its focal length is that
+    of the given one within its error.
     """
     evidence = keyframe_evidence(graph, CameraMeasurement.of(given, ROUGH_STD), OPTIONS)
     if evidence is None or not evidence.gain(given).is_worth():
@@ -182,13 +173,7 @@ def better_camera(graph: ObservationGraph, given: Camera) -> CameraMeasurement |
 
 
 def contradiction(given: Camera, better: CameraMeasurement, used: Camera) -> str:
-    """Describe that the images contradict a given focal length.
-
-    Args:
-        given: The given camera.
-        better: The result of `better_camera`.
-        used: The camera of the map.
-    """
+    """Describe that the images contradict a given focal length, by `better_camera`; `used`: the camera of the map."""
     was, focal, off = float(given.focal), float(better.camera.focal), _focal_ratio(given, better.camera)
     number = _with_error(focal, focal * better.focal_std)
     if abs(off) > LARGE_RATIO:

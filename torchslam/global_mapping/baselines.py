@@ -51,12 +51,7 @@ Array = NDArray[np.float64]
 
 
 class ViewRays:
-    """The directions of all keypoints of images, computed once: an image is in many pairs.
-
-    Attributes:
-        views: unit directions in the camera, by image.
-        focal: focal length of the camera, pixels.
-    """
+    """Unit directions of all keypoints of images, computed once: an image is in many pairs. `focal` in pixels."""
 
     def __init__(self, camera: Camera, views: Sequence[FrameFeatures]) -> None:
         self.views: list[Float[Tensor, "_ 3"]] = [camera.unproject(view.keypoints) for view in views]
@@ -69,12 +64,7 @@ class ViewRays:
 
 @dataclass(frozen=True)
 class PairDepths:
-    """Inverse depths of the matches of a pair, as seen from its first and from its second image.
-
-    Attributes:
-        inverse: per keypoint of either image; NaN for those without a match.
-        sigma: the noise of each.
-    """
+    """Inverse depths of a pair in either image, per keypoint, NaN for those without a match, and their noise."""
 
     inverse: tuple[Array, Array]
     sigma: tuple[Array, Array]
@@ -110,11 +100,7 @@ class DepthRatio(NamedTuple):
 def depth_ratio(one: PairDepths, at_one: int, other: PairDepths, at_other: int) -> DepthRatio | None:
     """Compare the inverse depths of the keypoints of a shared image by two pairs; None if too few can be compared.
 
-    Args:
-        one: of a pair.
-        at_one: which of its images is shared, 0 or 1.
-        other: of another pair, whose inverse depths are divided by those of the first.
-        at_other: which of its images is shared.
+    `at_one` and `at_other`: which image of either pair is shared, 0 or 1. Depths of the other are divided by the first.
     """
     a, b = one.inverse[at_one], other.inverse[at_other]
     # Comparisons with NaN are false: a keypoint that one pair does not match takes no part.

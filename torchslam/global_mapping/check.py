@@ -380,9 +380,7 @@ def _tied(
 
     Args:
         stretch_of: stretch of each image, of `count` ones.
-        ends: images of pairs, both in some stretch.
-        agreeing: matches of the pairs, zero where the pair does not agree.
-        matches: matches of the pairs.
+        ends: images of pairs, both in some stretch, with the numbers of their `matches` and of those `agreeing`.
         triplets: of which each tells of both of its pairs.
     """
 

@@ -30,17 +30,14 @@ def pose_frames(
     config: Config,
     given_cw: dict[int, Float[Tensor, "4 4"]] | None = None,
 ) -> list[StepResult]:
-    """Add all views to the posed frames of a submap, in order.
+    """Add all views to the posed frames of a submap, whose map has some of them as keyframes, in order.
 
     Args:
-        submap: Whose map has some of the views as keyframes.
-        views: In the order of time; each is needed once.
-        sensor: Of all views.
-        config: Of the tracker.
-        given_cw: Poses of the views by another program, by frame.
-
-    Returns:
-        One result per view, with its given pose as online pose, or else with its own.
+        submap: receives the frames.
+        views: in the order of time; each is needed once.
+        sensor: of all views.
+        config: of the tracker.
+        given_cw: poses of the views by another program, by frame: these are the online poses then.
     """
     tracker = Tracker(SharedCamera(sensor.camera, sensor.readout), config)
     row_of = {index: row for row, index in enumerate(submap.map.keyframes["frame_index"].tolist())}

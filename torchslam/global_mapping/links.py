@@ -170,13 +170,9 @@ class LearnedPairs(NamedTuple):
 
 
 def learned_config(config: Config) -> Config | None:
-    """The configuration of global mapping with learned features in place of SIFT; None if they are not asked for.
+    """The configuration of the mapper with learned features in place of SIFT; None if they are not asked for.
 
-    Args:
-        config: of global mapping, see `mapping_config`.
-
-    Raises:
-        ConfigError: the weights are not on this machine, or the features are not SIFT with its own matcher.
+    Raises ConfigError if the weights are not on this machine, or the features are not SIFT with its own matcher.
     """
     if not config.global_mapping.learned_links:
         return None
@@ -219,12 +215,9 @@ def points_across(observed: ObservedTracks, found: Reconstruction) -> Int[Tensor
 def with_learned(
     views: Sequence[FrameFeatures], learned: Mapping[int, FrameFeatures], pairs: Sequence[ViewPair]
 ) -> LearnedPairs:
-    """Append those learned keypoints to images that are in pairs, in rows that are free, or else in more rows for all.
+    """Append learned keypoints that are in pairs to images, in rows that are free, or else in more rows for all.
 
-    Args:
-        views: all images, with as many rows each.
-        learned: learned features of some of them, by row.
-        pairs: verified, of the learned features.
+    views: all images, with as many rows each; learned: features of some of them, by row
     """
     matched = {row: torch.zeros_like(view.mask) for row, view in learned.items()}
     for pair in pairs:

@@ -159,13 +159,7 @@ def features_to_keep(
 
 
 def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
-    """The frames that are mapped: evenly over the recording, and all where tracking was lost or doubtful.
-
-    Args:
-        count: number of frames.
-        results: of an online run, if there was one.
-        most: largest number of frames, of those that are spread evenly.
-    """
+    """The frames that are mapped: at most so many evenly over the recording, and all that were lost or uncertain."""
     stride = -(-count // most)
     chosen = set(range(0, count, stride))
     doubtful = [result.index for result in results if result.state in (State.LOST, State.UNCERTAIN)]
@@ -220,9 +214,8 @@ class GlobalMapper:
     def run(self, results: Rows[StepResult] = (), before: Run | None = None) -> GlobalMap:
         """Map the recording.
 
-        Args:
-            results: of an online run over it, whose doubtful frames are mapped as well.
-            before: that run, whose readout and velocities correct keypoints for a rolling shutter.
+        results: of an online run over it, whose doubtful frames are mapped as well
+        before: that run, whose readout and velocities correct keypoints for a rolling shutter
         """
         if learned_config(self.config) is not None and self.extract is None:
             raise ConfigError(
@@ -296,14 +289,8 @@ class GlobalMapper:
     ) -> Reconstructed | str:
         """Rotations, positions and rounds of adjustment of the largest connected set of views.
 
-        Args:
-            views: features of the images.
-            pairs: verified pairs of them.
-            learned: more keypoints of the same images, with verified pairs.
-
-        Returns:
-            Rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason why there
-            is no map.
+        Returns the rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason
+        why there is no map. `learned`: more keypoints of the same images, with verified pairs.
         """
         self.progress("rotations", 0, 1)
         device = self.camera.params.device
@@ -370,8 +357,7 @@ class GlobalMapper:
         Args:
             views: of the mapped images.
             rows: of the views that have a pose.
-            observed: the tracks.
-            found: poses, camera and points.
+            observed, found: the tracks, and poses, camera and points.
             frames: to be posed, all if None.
             given_cw: poses of these frames by another program, by frame.
             keep: keep poses and camera as they are, those of frames between as given, instead of adjusting them.

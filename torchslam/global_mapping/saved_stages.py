@@ -39,13 +39,9 @@ _Columns = dict[str, Tensor]
 
 
 class SavedStages:
-    """Computes stages, or reads what an earlier run saved of them.
+    """Computes stages of a run, or reads what an earlier run saved of them, onto a device.
 
-    Args:
-        folder: created with the first stage that is saved; None: nothing is saved or read.
-        sequence: of the run.
-        config: of the run.
-        device: of what is read.
+    folder: created with the first stage that is saved; None: nothing is saved or read
     """
 
     def __init__(

@@ -101,16 +101,9 @@ def read_map(path: str | Path) -> tuple[Map, Camera]:
 def pack_submaps(
     submaps: Iterable[Submap], camera: Camera, sessions: int, num_created: int | None = None
 ) -> tuple[dict[str, Shaped[Tensor, "..."]], dict[str, Any]]:
-    """Convert submaps to tensors and a JSON description.
+    """Convert submaps to tensors by name and a JSON description, with the frames of so many sessions.
 
-    Args:
-        submaps: All submaps.
-        camera: The camera of all submaps.
-        sessions: Number of sessions to keep.
-        num_created: Number of submaps ever created; by default the highest number in use plus one.
-
-    Returns:
-        The tensors by name, and the description.
+    num_created: number of submaps ever created; by default the highest number in use plus one
     """
     submaps = list(submaps)
     tensors, numbers = {CAMERA: camera.params}, []
@@ -139,14 +132,8 @@ def unpack_submaps(
 ) -> SavedAtlas:
     """Check and convert the tensors and the description that `pack_submaps` made.
 
-    Args:
-        path: The file that error messages name.
-        tensors: By name.
-        about: The description.
-        device: Of the submaps.
-
     Raises:
-        ResultsError: They are not a valid map.
+        ResultsError: They are not a valid map; its message names the path.
     """
     try:
         numbers, num_created, sessions = _numbers(about)

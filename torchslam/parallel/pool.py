@@ -62,9 +62,7 @@ class Call:
 class _Worker:
     """A worker process, which answers calls in their order, and the connection to it.
 
-    Attributes:
-        task: For the worker to begin with, until it was sent.
-        waiting: Calls without an answer.
+    task: for the worker to begin with, until it was sent; waiting: calls without an answer
     """
 
     process: BaseProcess
@@ -179,9 +177,7 @@ class WorkerPool:
     def result(self, call: Call) -> Any:
         """Wait for the result of a call.
 
-        Raises:
-            WorkerLostError: If there will be none.
-            Exception: What the call raised, with its traceback as the cause.
+        Raises WorkerLostError if there will be none, and what the call raised, with its traceback as the cause.
         """
         while call.answer is None:
             if call.worker not in self._workers:
@@ -232,9 +228,7 @@ class WorkerPool:
 
 
 class SharedTasks(WorkerPool):
-    """Workers that help this process with tasks while this is entered.
-
-    Tasks that a worker did not finish, because it was killed, are done here.
+    """Workers that help this process with tasks while this is entered; what a killed one left undone is done here.
 
     Args:
         do: (*parts, *task) -> None does a task; a function of a module, since workers import it.

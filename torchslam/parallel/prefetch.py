@@ -30,13 +30,8 @@ Extractor = Callable[[Frame], Features]
 class FeaturePrefetcher(WorkerPool):
     """The frames of a sequence with their features; each is to be read once, in the order of its index.
 
-    The workers run while this is entered. Frames are read in this process until a worker has started, and after one
-    was killed.
-
-    Args:
-        make_extractor: called in each worker
-        clock: records the time spent waiting for features as "features"
-        processes: number of workers
+    The workers, which call `make_extractor`, run while this is entered. Frames are read in this process until a worker
+    has started, and after one was killed. `clock` records the time spent waiting as "features".
     """
 
     def __init__(
@@ -77,11 +72,8 @@ class FeaturePrefetcher(WorkerPool):
 class LivePrefetcher(WorkerPool):
     """The frames of a live source; each is to be read once, in order.
 
-    The worker runs while this is entered. Frames whose features it did not extract come without.
-
-    Args:
-        make_extractor: called in the worker
-        clock: records the time spent waiting for features as "features"
+    The worker runs while this is entered. Frames whose features it did not extract come without. `clock` records the
+    time spent waiting as "features".
     """
 
     def __init__(self, sequence: Sequence, make_extractor: Callable[[], Extractor], clock: Stopwatch) -> None:

@@ -33,15 +33,12 @@ def check_regular(path: str | Path, limit: int, what: str) -> None:
 
 
 def read_bytes(path: str | Path, limit: int, what: str) -> bytes:
-    """Read the content of a regular file.
+    """Read the content of a regular file of at most `limit` bytes.
 
-    Args:
-        path: the file.
-        limit: maximum number of bytes.
-        what: name of this kind of file, for the message "more than the 100 bytes of a text".
+    what: name of this kind of file, for the message "more than the 100 bytes of a text"
 
     Raises:
-        OSError: for a missing file, anything but a regular file, or more bytes than `limit`.
+        OSError: for a missing file, anything but a regular file, or more bytes.
     """
     try:
         # Without O_NONBLOCK, opening a pipe waits for a writer.
