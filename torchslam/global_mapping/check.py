@@ -387,7 +387,8 @@ def _tied(
     def between(images: NDArray[np.int64], values: NDArray[Any]) -> Array:
         """(count, count) sums over pairs of images between two stretches."""
         one, other = stretch_of[images].T
-        sums = np.bincount(one * count + other, values, count * count).reshape(count, count)
+        cells = one * count + other
+        sums = np.bincount(cells, values.astype(np.float64), count * count).reshape(count, count)
         return sums + sums.T
 
     sides = np.concatenate([triplets.images[:, :2], triplets.images[:, 1:]])

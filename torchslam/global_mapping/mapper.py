@@ -62,7 +62,7 @@ from torchslam.system.front_end import (
 )
 from torchslam.system.run import FinalAdjustment, Run
 from torchslam.tracking.matcher import make_matcher, prepare_view
-from torchslam.types import Explanation, FrameFeatures, Matcher, Reason, State, StepResult
+from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
 
 SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 """Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
@@ -178,7 +178,6 @@ class GlobalMapper:
         given: the camera with its error; None: it is exact.
         device: of torch.
         extractor: feature extractor; the configured one if None.
-        matcher: of two views; the configured one if None.
         progress: receives stages.
         saved: the costly stages of a run that was ended, and of this one; None: they are not saved.
         kept: features that were extracted before, by `features_to_keep`; None: there are none.
@@ -192,7 +191,6 @@ class GlobalMapper:
         given: CameraMeasurement | None,
         device: torch.device | str = "cpu",
         extractor: FeatureExtractor | None = None,
-        matcher: Matcher | None = None,
         progress: Progress = lambda stage, done, most: None,
         saved: SavedStages | None = None,
         kept: KeptFeatures | None = None,
@@ -204,7 +202,7 @@ class GlobalMapper:
         self.extract: Extractor | None = None
         if not self.sequence.brings_features:
             self.extract = kept or image_extractor(self.config, device, extractor)
-        self.matcher = make_matcher(self.config.matching, matcher, camera.size, self.config.features.kind)
+        self.matcher = make_matcher(self.config.matching, None, camera.size, self.config.features.kind)
         self.progress = progress
         self.saved = saved or SavedStages(None, self.sequence, config)
         self.skipped: list[str] = []

@@ -114,7 +114,9 @@ def with_workers(
         wanted = 1
     with ExitStack() as others:
         ahead = reader(sequence, slam, wanted, is_asked_for=processes is not None)
-        frames: Frames = sequence if ahead is None else others.enter_context(ahead)
+        if ahead is not None:
+            others.enter_context(ahead)
+        frames: Frames = sequence if ahead is None else ahead
         if slam.mapping and wanted > (1 if ahead is None else 2):
             # One for each: a local adjustment, which is due in two frames, would wait for an estimate of the sensor.
             adjusting, estimating = map(others.enter_context, (SolverWorker(), SolverWorker(NICENESS)))
