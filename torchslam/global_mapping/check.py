@@ -388,8 +388,8 @@ def _tied(
         """(count, count) sums over pairs of images between two stretches."""
         one, other = stretch_of[images].T
         cells = one * count + other
-        sums = np.bincount(cells, values.astype(np.float64), count * count).reshape(count, count)
-        return sums + sums.T
+        sums = np.bincount(cells, values, count * count).reshape(count, count)
+        return np.asarray(sums + sums.T, dtype=np.float64)
 
     sides = np.concatenate([triplets.images[:, :2], triplets.images[:, 1:]])
     right = np.tile(triplets.agrees, 2)

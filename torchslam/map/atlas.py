@@ -63,6 +63,21 @@ class TrackingState:
         eye = torch.eye(4, dtype=like.dtype, device=like.device)
         return cls(eye, -1, 0, None, none, none, none)
 
+    def renumbered(self, keyframes: Int[Tensor, " K"], points: Int[Tensor, " L"]) -> TrackingState:
+        """The same state with new rows of keyframes and points, -1 where they were removed."""
+        local, seen, last = (
+            keyframes[self.local_keyframes],
+            points[self.local_points],
+            self.last_inlier_points,
+        )
+        return replace(
+            self,
+            reference=int(keyframes[self.reference]) if self.reference >= 0 else -1,
+            last_inlier_points=points[last][points[last] >= 0],
+            local_keyframes=local[local >= 0],
+            local_points=seen[seen >= 0],
+        )
+
     def averaged_with(self, estimate: PoseEstimate) -> TrackingState:
         """The same state with the averages over the frames up to that of an estimate."""
         error = self.error + EMA_RATE * (estimate.error - self.error)
@@ -155,14 +170,10 @@ class Submap:
             other.transform(S_ab)
         keyframes, points = self.map.append(other.map)
         self.posed_frames.append(other.posed_frames, keyframes, points)
-        tracking = other.tracking
-        self.tracking = replace(
-            tracking,
-            reference=tracking.reference + keyframes,
-            last_inlier_points=tracking.last_inlier_points + points,
-            local_keyframes=tracking.local_keyframes + keyframes,
-            local_points=tracking.local_points + points,
-        )
+        device = self.map.T_cw.device
+        keyframe_rows = torch.arange(keyframes, len(self.map.keyframes), device=device)
+        point_rows = torch.arange(points, len(self.map.points), device=device)
+        self.tracking = other.tracking.renumbered(keyframe_rows, point_rows)
         other.map, other.posed_frames = Map(), PosedFrames()
 
 

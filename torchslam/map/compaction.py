@@ -5,7 +5,7 @@ All rows that the submap refers to are renumbered; rows kept elsewhere follow by
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Int
@@ -72,16 +72,9 @@ def remove_keyframes(submap: Submap, keyframes: Int[Tensor, " R"]) -> RowRemap:
     slam_map.mark_renumbered()
     if len(posed_frames):
         posed_frames.frames["reference_keyframe"][:] = rows[posed_frames.frames["reference_keyframe"]]
-    alive, tracking = slam_map.points["is_valid"], submap.tracking
-    local = rows[tracking.local_keyframes]
-    submap.tracking = replace(
-        tracking,
-        reference=int(rows[tracking.reference]) if tracking.reference >= 0 else -1,
-        local_keyframes=local[local >= 0],
-        local_points=tracking.local_points[alive[tracking.local_points]],
-        last_inlier_points=tracking.last_inlier_points[alive[tracking.last_inlier_points]],
-    )
-    return RowRemap(rows, torch.arange(len(slam_map.points), device=device), rows[replacement])
+    points = torch.arange(len(slam_map.points), device=device)
+    submap.tracking = submap.tracking.renumbered(rows, points.where(slam_map.points["is_valid"], NO_POINT))
+    return RowRemap(rows, points, rows[replacement])
 
 
 def replacement_keyframe(slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"]) -> int:
@@ -120,7 +113,7 @@ def compact(submap: Submap) -> RowRemap | None:
 
 def remove_invalid_rows(submap: Submap) -> RowRemap:
     """Remove the rows of invalid points; observations of merged points become those of their replacements."""
-    slam_map, tracking = submap.map, submap.tracking
+    slam_map = submap.map
     alive = slam_map.points["is_valid"]
     kept = torch.nonzero(alive)[:, 0]
     rows = torch.where(alive, torch.cumsum(alive, 0) - 1, NO_POINT)
@@ -129,7 +122,6 @@ def remove_invalid_rows(submap: Submap) -> RowRemap:
     for column in (slam_map.keyframes["point_ids"], slam_map.points["replaced_by"]):
         column[:] = torch.where(column >= 0, rows[column], NO_POINT)
     slam_map.mark_renumbered()
-    local, last = rows[tracking.local_points], rows[tracking.last_inlier_points]
-    submap.tracking = replace(tracking, local_points=local[local >= 0], last_inlier_points=last[last >= 0])
     everyone = torch.arange(slam_map.num_keyframes, device=rows.device)
+    submap.tracking = submap.tracking.renumbered(everyone, rows)
     return RowRemap(everyone, rows, everyone)

@@ -23,7 +23,7 @@ import traceback
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import resource_tracker
@@ -189,6 +189,13 @@ class WorkerPool:
         if trace:
             raise found from RemoteError(trace)
         return found
+
+    def result_or(self, call: Call | None, here: Callable[[], Any]) -> Any:
+        """Wait for the result of a call; return that of `here` if it was not accepted, or if its worker was lost."""
+        if call is not None:
+            with suppress(WorkerLostError):
+                return self.result(call)
+        return here()
 
     def answered(self, calls: Sequence[Call], timeout: float | None) -> list[Call]:
         """Wait until `result` returns or raises at once for some of the calls; returns these."""

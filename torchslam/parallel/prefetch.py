@@ -14,7 +14,7 @@ import torch
 
 from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import FrameError
-from torchslam.parallel.pool import Call, WorkerLostError, WorkerPool
+from torchslam.parallel.pool import Call, WorkerPool
 from torchslam.types import Features, Frame
 from torchslam.utils.timing import Stopwatch
 
@@ -48,25 +48,15 @@ class FeaturePrefetcher(WorkerPool):
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError if it cannot be read or does not fit the camera."""
-        self._request_after(index)
-        call = self._requested.pop(index, None)
-        if call is not None:
-            try:
-                with self._clock("features"):
-                    frame: Frame = self.result(call)
-                return frame
-            except WorkerLostError:
-                pass
-        return self._sequence[index]
-
-    def _request_after(self, index: int) -> None:
-        """Request the frames after `index`, once a worker has started."""
         until = min(index + 1 + AHEAD * self.count, len(self._sequence))
         for later in range(max(index + 1, self._next), until):
             call = self.submit(later)
             if call is None:
-                return
+                break
             self._requested[later], self._next = call, later + 1
+        with self._clock("features"):
+            frame: Frame | None = self.result_or(self._requested.pop(index, None), lambda: None)
+        return self._sequence[index] if frame is None else frame
 
 
 class LivePrefetcher(WorkerPool):
@@ -87,19 +77,12 @@ class LivePrefetcher(WorkerPool):
         taken, self._next = self._next, None
         if isinstance(taken, FrameError):
             raise taken
-        frame = self._sequence[index] if taken is None else self._with_features(taken)
-        self._take_next(index + 1)
-        return replace(frame, backlog=self._sequence.backlog + (self._next is not None))
-
-    def _with_features(self, frame: Frame) -> Frame:
+        frame = self._sequence[index] if taken is None else taken
         call, self._call = self._call, None
-        if call is None:
-            return frame
-        try:
-            with self._clock("features"):
-                return replace(frame, features=self.result(call))
-        except WorkerLostError:
-            return frame
+        with self._clock("features"):
+            features = self.result_or(call, lambda: frame.features)
+        self._take_next(index + 1)
+        return replace(frame, features=features, backlog=self._sequence.backlog + (self._next is not None))
 
     def _take_next(self, index: int) -> None:
         """Take the next frame from the source and submit it, if it has arrived and the worker has started."""

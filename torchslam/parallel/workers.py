@@ -12,7 +12,7 @@ import os
 import statistics
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,7 +22,7 @@ from torchslam.data.sequence import Frames, Sequence
 from torchslam.geometry import Camera
 from torchslam.mapping.local_bundle import Solver
 from torchslam.mapping.mapper import Mapper
-from torchslam.parallel.pool import WorkerLostError, WorkerPool, can_fork
+from torchslam.parallel.pool import WorkerPool, can_fork
 from torchslam.parallel.prefetch import NICENESS, Extractor, FeaturePrefetcher, LivePrefetcher
 from torchslam.utils.console import say
 from torchslam.utils.forks import close_decoders
@@ -162,11 +162,4 @@ class SolverWorker(WorkerPool):
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         call = self.submit(function, *arguments)
-
-        def answer() -> Any:
-            if call is not None:
-                with suppress(WorkerLostError):
-                    return self.result(call)
-            return function(*arguments)
-
-        return answer
+        return partial(self.result_or, call, partial(function, *arguments))
