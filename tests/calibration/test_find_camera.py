@@ -217,12 +217,3 @@ def test_a_straight_path_does_not_determine_the_camera(
     given = straight(truth, 0.9)
     graph = simulated(straight(truth), noise=0.5, twists=twists, frames=16)
     assert better_camera(replace(graph, camera=given), given) is None
-
-
-def test_the_submap_with_most_keyframes_is_used(
-    simulated: Callable[..., ObservationGraph], truth: Camera
-) -> None:
-    graph = simulated(frames=40)
-    submaps = replace(graph, submap=(torch.arange(40) >= 10).long())
-    assert submaps.main_submap == 1
-    assert replace(submaps, is_keyframe=torch.arange(40) < 15).main_submap == 0

@@ -591,15 +591,6 @@ def test_a_check_in_words() -> None:
     assert str(Break(3, 5, BreakKind.UNKNOWN)) == unknown
 
 
-def test_pairs_that_contradict_the_map_tie_nothing_together() -> None:
-    """Two of them are too few to call the poses wrong, but they join no parts, however many matches they have."""
-    inside = [pair for pair in WALK.pairs(*NEAR) if pair.second <= 9 or pair.first >= 10]
-    wrong = [contradicting(WALK, *ends) for ends in ((9, 10), (8, 10))]
-    assert min(len(pair) for pair in wrong) >= 100
-    found = check(WALK, pairs=[*inside, *wrong], links=loose(WALK, 9))
-    assert [each.kind for each in found.breaks] == [BreakKind.UNKNOWN]
-
-
 def test_frames_can_be_doubted() -> None:
     check = MapCheck(5, 4, 4, 3, 3, 1.0, 0.2, torch.zeros(4), (), (0, 2, 4, 6), (8,))
     doubted = check.doubting({4, 8, 10})

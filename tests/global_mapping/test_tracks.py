@@ -261,16 +261,6 @@ def test_parallel_rays_have_no_parallax() -> None:
     assert float(found.parallax_rad.max()) < 1e-3 * MIN_PARALLAX
 
 
-def test_nearly_parallel_rays_still_have_their_point() -> None:
-    """At a parallax of a fifty thousandth the point is where they meet, not a point far ahead."""
-    tracks = tracks_of(2)
-    points_w = torch.tensor([[0.3, 0.1, 5.0e4]], dtype=torch.float64)
-    centers_w = torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64)
-    found = triangulated(tracks, *looking(points_w, centers_w, tracks))
-    torch.testing.assert_close(found.points_w, points_w, rtol=1e-4, atol=0)
-    assert float(found.parallax_rad) == pytest.approx(2e-5, rel=1e-4)
-
-
 def test_points_have_the_least_angles_to_their_rays() -> None:
     """Distances from rays are divided by that from the camera: checked by linear least squares."""
     tracks = tracks_of(6)
@@ -313,12 +303,6 @@ def test_angles_between_rays_and_points_are_known() -> None:
     off = torch.tensor([[0, 0, 2], [aside, 0, 3], [0, 5, 0], [0, 0, -1], [0, 0, 0]], dtype=torch.float64)
     found = torch.rad2deg(ray_errors(ray, centers_w, centers_w + off))
     torch.testing.assert_close(found, torch.tensor([0.0, 0.2, 90, 180, 180]).double(), atol=1e-6, rtol=0)
-
-
-def test_no_tracks_have_no_points() -> None:
-    empty = torch.zeros(0, 3, dtype=torch.float64)
-    found = triangulated(tracks_of(), empty, empty)
-    assert (len(found.points_w), len(found.agrees), len(found.parallax_rad)) == (0, 0, 0)
 
 
 # --- the map ---------------------------------------------------------------------------------------------------

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from tests.scene import Scene, sideways, submap_of_scene
-from torchslam.map.map import NO_POINT, Map
+from torchslam.map.map import Map
 from torchslam.optim import Marginals
 from torchslam.types import FrameFeatures
 
@@ -65,24 +65,6 @@ def test_covisibility(small_map: Map) -> None:
     assert small_map.covisible_keyframes(1, 1, min_shared=1).tolist() == [0]
     assert small_map.observed_points(torch.tensor([1, 2])).tolist() == [0, 1, 2, 3, 4, 5]
     assert small_map.points["times_observed"].tolist() == [2] * 6
-
-
-def test_invalidated_points_have_no_observations_and_keep_their_ids(small_map: Map) -> None:
-    small_map.remove_points(torch.tensor([0, 4]))
-    assert small_map.num_points == 4
-    assert small_map.valid_points().tolist() == [1, 2, 3, 5]
-    assert small_map.observed_points(torch.tensor([0, 1, 2])).tolist() == [1, 2, 3, 5]
-
-
-def test_merging_moves_observations_and_keeps_one_per_keyframe(small_map: Map) -> None:
-    small_map.merge_points(torch.tensor([4]), torch.tensor([0]))
-    assert small_map.keyframes["point_ids"][2, 0] == 0  # had seen 4 alone: moved
-    assert (
-        small_map.keyframes["point_ids"][1, 4] == NO_POINT
-    )  # had seen both: the observation of 4 is dropped
-    assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 2]
-    assert not small_map.points["is_valid"][4]
-    assert small_map.points["times_found"][0] == 2
 
 
 def test_merged_points_resolve_to_their_final_replacement(small_map: Map) -> None:
