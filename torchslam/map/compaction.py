@@ -16,7 +16,6 @@ from torchslam.map.atlas import Submap
 from torchslam.map.map import NO_POINT, Map
 
 MIN_INVALID_ROWS = 4096  # fewer are not worth a compaction
-_COVISIBLE = 8  # most covisible keyframes of which the nearest replaces a removed one
 _MAX_REWRITTEN = 64  # rows of frame observations that may be rewritten per row of an invalid point
 
 
@@ -81,7 +80,7 @@ def replacement_keyframe(slam_map: Map, keyframe: int, removed: Bool[Tensor, " K
     """Return the nearest of the most covisible keyframes, without the removed ones."""
     seen = slam_map.keyframes["point_ids"][keyframe]
     shared = slam_map.count_observed(seen[seen >= 0]).masked_fill(removed, -1)
-    best = torch.sort(shared, descending=True, stable=True).indices[:_COVISIBLE]
+    best = torch.sort(shared, descending=True, stable=True).indices[:8]  # the most covisible ones
     best = best[~removed[best]]
     centers_w = se3_inverse(slam_map.T_cw[torch.cat([best.new_tensor([keyframe]), best])])[:, :3, 3]
     return int(best[torch.linalg.vector_norm(centers_w[1:] - centers_w[0], dim=-1).argmin()])

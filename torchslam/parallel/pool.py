@@ -27,7 +27,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from typing import Any, Self
 
@@ -100,7 +100,7 @@ class _Worker:
         self.waiting.append(call := Call(self))
         return call
 
-    def receive(self, timeout: float) -> bool:
+    def receive(self, timeout: float | None) -> bool:
         """Receive the answer of the first call that has none; return False if it does not come in time.
 
         Raises OSError or EOFError if the process has ended, BlockingIOError if it stopped within an answer.
@@ -197,20 +197,13 @@ class WorkerPool:
                 return self.result(call)
         return here()
 
-    def answered(self, calls: Sequence[Call], timeout: float | None) -> list[Call]:
-        """Wait until `result` returns or raises at once for some of the calls; returns these."""
-        if self._have_ended(calls):
-            timeout = 0
-        asked = [each for each in self._workers if each.waiting]
-        answering = wait([each.connection for each in asked], timeout)
-        for worker in asked:
-            if worker.connection in answering:
-                with self._lost_on_error(worker):
-                    worker.receive(0)
-        return self._have_ended(calls)
-
-    def _have_ended(self, calls: Sequence[Call]) -> list[Call]:
-        return [call for call in calls if call.answer is not None or call.worker not in self._workers]
+    def has_answer(self, call: Call, timeout: float | None) -> bool:
+        """Whether `result` returns or raises at once, after some seconds at most, or however many if None."""
+        while call.answer is None and call.worker in self._workers:
+            with self._lost_on_error(call.worker):
+                if not call.worker.receive(timeout):
+                    return False
+        return True
 
     def _is_ready(self, worker: _Worker) -> bool:
         with self._lost_on_error(worker):
@@ -252,26 +245,21 @@ class SharedTasks(WorkerPool):
 
         Raises what a task raises, here or in a worker.
         """
-        waiting = deque(tasks)
-        calls: dict[Call, tuple[Any, ...]] = {}
+        waiting, calls = deque(tasks), list[tuple[Call, tuple[Any, ...]]]()
         while waiting or calls:
             while waiting and len(calls) < AHEAD * self.count:
                 call = self.submit(*waiting[0])
                 if call is None:
                     break
-                calls[call] = waiting.popleft()
-            is_busy = bool(waiting)
-            if is_busy:
+                calls.append((call, waiting.popleft()))
+            if waiting:
                 self._do(*waiting.popleft())
                 yield
-            for call in self.answered(list(calls), 0 if is_busy else None):
-                task = calls.pop(call)
-                try:
-                    self.result(call)
-                except WorkerLostError:
-                    waiting.append(task)
-                else:
-                    yield
+            asked, timeout = (calls, 0) if waiting else (calls[:1], None)
+            for each in [each for each in asked if self.has_answer(each[0], timeout)]:
+                calls.remove(each)
+                self.result_or(each[0], partial(self._do, *each[1]))
+                yield
 
 
 def can_fork() -> bool:
