@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
@@ -16,6 +17,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.global_mapping import rounds
 from torchslam.global_mapping.rounds import COARSE, ObservedTracks, Reconstruction, adjust, adjust_in_rounds
 from torchslam.global_mapping.tracks import Tracks
+from torchslam.optim import BundleProblem
 
 SCENE = Recording.of(arc(10, 120.0, 2.5), ball(100))
 NOISY = Recording.of(arc(10, 120.0, 2.5), ball(80), noise_px=0.2, wrong=0.2, seed=12)
@@ -256,6 +258,28 @@ def test_only_observations_that_agree_are_adjusted() -> None:
     kept = found.agrees & ~stays[observed.tracks.track]
     assert float(observed.errors(adjusted)[kept].median()) < 1
     assert torch.equal(found.points_w, NOISY.points_w)
+
+
+def test_the_problem_has_the_noise_and_the_camera(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each observation its own weight; the camera is free along the directions of its error, with its prior."""
+    calls: list[tuple[BundleProblem, Any]] = []
+    solve = rounds.solve_bundle
+
+    def spy(problem: BundleProblem, *, free_camera: Any, **more: Any) -> Any:
+        calls.append((problem, free_camera))
+        return solve(problem, free_camera=free_camera, **more)
+
+    monkeypatch.setattr(rounds, "solve_bundle", spy)
+    scales = 1 + torch.arange(100, dtype=torch.float64) / 100
+    observed = ObservedTracks.of(SCENE.tracks, [replace(view, scales=scales) for view in SCENE.views])
+    found = replace(exact(SCENE), agrees=torch.arange(len(observed.tracks)) % 3 > 0)
+    measured = CameraMeasurement.of(CAMERA, 0.02)
+    adjust(observed, replace(found, camera=measured.camera), "cauchy", 6.0, 1e-3, measured)
+    ((problem, free),) = calls
+    torch.testing.assert_close(problem.weights, 4 / scales[SCENE.tracks.keypoint[found.agrees]] ** 2)
+    assert torch.equal(free, measured.directions)
+    assert problem.camera_prior is not None
+    assert torch.equal(problem.camera_prior.params, measured.camera.params)
 
 
 # --- all rounds ------------------------------------------------------------------------------------------------

@@ -257,17 +257,8 @@ def test_a_signal_to_the_process_group_ends_the_run_with_results(
     tmp_path: Path, method: str, number: int, status: int, when: str
 ) -> None:
     line = ["run", "synthetic:room?frames=50000&blank=1", "-o", str(tmp_path / "out"), *SET]
-    command = [
-        sys.executable,
-        "-c",
-        RUN,
-        method,
-        *line,
-        "--processes",
-        "2",
-        "--set",
-        "paper.unrefined=true",
-    ]
+    line += ["--processes", "2", "--set", "paper.unrefined=true"]
+    command = [sys.executable, "-c", RUN, method, *line]
     with (tmp_path / "err").open("w+") as errors:
         child = subprocess.Popen(command, stderr=errors, stdout=errors, start_new_session=True)
         until = time.monotonic() + PATIENCE

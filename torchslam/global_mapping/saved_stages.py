@@ -97,7 +97,7 @@ class SavedStages:
                 if about.get("checksum") != _checksum(saved):
                     raise ResultsError("its content has another checksum")
                 return unpack({column: rows.to(self.device) for column, rows in saved.items()})
-            except ResultsError as error:
+            except (ResultsError, TypeError) as error:
                 warnings.warn(f"{path}: damaged, so it is computed again: {error}", stacklevel=2)
         found = find()
         columns = pack(found)
