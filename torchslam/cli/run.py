@@ -23,8 +23,7 @@ from pathlib import Path
 
 import torch
 
-from torchslam.calibration.find_camera import ROUGH_STD, find_camera, with_stated_std
-from torchslam.calibration.from_pairs import NUM_KEYPOINTS
+from torchslam.calibration.find_camera import NUM_KEYPOINTS, ROUGH_STD, find_camera, with_stated_std
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
