@@ -183,13 +183,13 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
         ),
         (
             lambda tensors: tensors.__setitem__("submaps.0.trees.age", torch.zeros(1)),
-            "unknown tensor submaps.0.trees.age",
+            "unknown tensors: submaps.0.trees.age",
         ),
         (
             lambda tensors: tensors.__setitem__("submaps.1.points.age", torch.zeros(1)),
-            "unknown tensor submaps.1",
+            "unknown tensors: submaps.1",
         ),
-        (lambda tensors: tensors.__setitem__("trees", torch.zeros(1)), "unknown tensor trees"),
+        (lambda tensors: tensors.__setitem__("trees", torch.zeros(1)), "unknown tensors: trees"),
         (
             change(P + "positions_w", lambda rows: rows[:, :2]),
             r"positions_w: rows must have the shape \(3,\)",
@@ -269,7 +269,7 @@ def test_a_long_chain_of_replacements_is_no_cycle(path: Path) -> None:
         ({"sessions": -1}, "must be numbers"),
         ({"sessions": None}, "must be numbers"),
         ({"sessions": 1}, "session from 0 to 1, there are 0 to 0"),
-        ({"submaps": []}, "unknown tensor"),
+        ({"submaps": []}, "unknown tensors"),
     ],
 )
 def test_inconsistent_metadata_are_refused(path: Path, changes: dict[str, Any], message: str) -> None:

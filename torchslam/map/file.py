@@ -138,13 +138,16 @@ def unpack_submaps(
     try:
         numbers, num_created, sessions = _numbers(about)
         camera = _check_camera(about["camera"], tensors.get(CAMERA))
+        unknown: list[str] = []
         columns: Columns = {f"submaps.{number}.{table}": {} for number in numbers for table in TABLES}
         for name, rows in tensors.items():
             table, _, column = name.rpartition(".")
             if table in columns:
                 columns[table][column] = rows
             elif name != CAMERA:
-                raise ValueError(f"unknown tensor {name}")
+                unknown.append(name)
+        if unknown:
+            raise ValueError(f"unknown tensors: {', '.join(sorted(unknown)[:3])}")
         submaps = []
         for number in numbers:
             own = {table: columns[f"submaps.{number}.{table}"] for table in TABLES}
