@@ -1,6 +1,6 @@
 """The errors that torchslam raises. A message states what is wrong, where, and what to do."""
 
-from torchslam.utils.text import printable, without_credentials
+from torchslam.utils.console import printable, without_credentials
 
 LONGEST = 2000
 """Largest number of characters of a message; what it quotes from a file may be of any length."""

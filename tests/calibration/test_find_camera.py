@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from tests.walks import Walk, turn
-from torchslam.calibration import from_pairs, keyframe_evidence, search_focal
+from torchslam.calibration import find_camera as module
+from torchslam.calibration import keyframe_evidence, search_focal
 from torchslam.calibration.find_camera import (
     GUESS_STD,
     LEAST_STD,
@@ -66,13 +67,13 @@ def test_pairs_of_images_give_the_focal_length(searched: ViewGraphFocal) -> None
     assert searched.success
     assert float(searched.focal) == pytest.approx(500.0, rel=0.05)
     assert abs(float(searched.focal) - 500.0) < 4 * float(searched.std) * 500.0
-    assert from_pairs.PLACES < len(searched.errors) <= from_pairs.MAX_PAIRS
+    assert module.PLACES < len(searched.errors) <= module.MAX_PAIRS
 
 
 @pytest.mark.slow
 def test_features_of_mapping_give_the_same_focal_length(room: Sequence, searched: ViewGraphFocal) -> None:
     """The strongest of them, extracted once."""
-    kept = features_to_keep(Config(), room.size, from_pairs.NUM_KEYPOINTS)
+    kept = features_to_keep(Config(), room.size, module.NUM_KEYPOINTS)
     assert kept is not None
     found = search_focal(room, Config(), CPU, lambda done, most: None, kept)
     assert found is not None
@@ -95,7 +96,7 @@ def test_features_of_mapping_give_the_same_focal_length(room: Sequence, searched
     ],
 )
 def test_other_features_are_not_shared(settings: list[str], size: tuple[int, int]) -> None:
-    assert features_to_keep(load_config(None, settings), size, from_pairs.NUM_KEYPOINTS) is None
+    assert features_to_keep(load_config(None, settings), size, module.NUM_KEYPOINTS) is None
 
 
 def test_the_camera_is_written_with_its_error_and_read_again(
@@ -217,12 +218,3 @@ def test_a_straight_path_does_not_determine_the_camera(
     given = straight(truth, 0.9)
     graph = simulated(straight(truth), noise=0.5, twists=twists, frames=16)
     assert better_camera(replace(graph, camera=given), given) is None
-
-
-def test_the_submap_with_most_keyframes_is_used(
-    simulated: Callable[..., ObservationGraph], truth: Camera
-) -> None:
-    graph = simulated(frames=40)
-    submaps = replace(graph, submap=(torch.arange(40) >= 10).long())
-    assert submaps.main_submap == 1
-    assert replace(submaps, is_keyframe=torch.arange(40) < 15).main_submap == 0

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from torchslam.calibration import from_pairs
-from torchslam.calibration.from_pairs import _fundamental, _solve
+from torchslam.calibration import find_camera
+from torchslam.calibration.find_camera import _fundamental, _solve
 from torchslam.config import Config
 from torchslam.data.transforms import scale_camera
 from torchslam.geometry import Camera, rigid, so3_exp
@@ -64,7 +64,7 @@ def test_matches_without_a_matrix_are_left_out(monkeypatch: pytest.MonkeyPatch) 
     matches = torch.tensor(list(map(float, NO_MODEL.split()))).view(-1, 4)
     one, other = (SimpleNamespace(keypoints=matches[:, side]) for side in (slice(0, 2), slice(2, 4)))
     every = torch.arange(len(matches))
-    monkeypatch.setattr(from_pairs, "match_views", lambda *_: (every, every))
+    monkeypatch.setattr(find_camera, "match_views", lambda *_: (every, every))
     assert _fundamental(one, other, Config(), 1.0) is None
 
     def raises(*arguments: np.ndarray) -> None:

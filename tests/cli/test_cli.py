@@ -23,7 +23,7 @@ from torchslam.config import load_config
 from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.map.file import read_map
-from torchslam.utils.usage import cpu_seconds, peak_memory_mb
+from torchslam.utils.timing import cpu_seconds, peak_memory_mb
 
 ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]

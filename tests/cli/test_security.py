@@ -21,7 +21,7 @@ from torchslam.data.opening import full_name
 from torchslam.errors import ConfigError, SequenceError, TorchslamError, TrajectoryError
 from torchslam.features.weights import read_weights
 from torchslam.plugins import ALLOWED
-from torchslam.utils.text import printable, without_credentials
+from torchslam.utils.console import printable, without_credentials
 
 ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500", "--processes", "1"]

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from experiments.benchmarks.bal import ceres, cost, distinct, disturbed, ours, read_bal, write_bal
+from experiments.benchmarks.bal import ceres, cost, disturbed, ours, read_bal, write_bal
 from torchslam.geometry import Camera, se3_exp, so3_exp, transform
 from torchslam.optim import BundleProblem
 
@@ -58,11 +58,3 @@ def test_the_minimum_with_all_9_numbers_free_is_that_of_ceres() -> None:
     row, expected = ours(problem, 50, gradient=False, free=True), ceres(problem, 100, free=True)
     assert float(row[2]) == pytest.approx(float(expected[2]), abs=0.11)
     assert float(row[2]) < 1.0 * len(frames)
-
-
-def test_rows_that_say_the_same_are_shown_once() -> None:
-    rows = [["torchslam", "5", "1.0", "0.10", "none"], ["torchslam", "5", "1.0", "0.11", "none"]]
-    assert distinct([*rows, ["torchslam", "5", "1.0", "0.11", "0.05"]]) == [
-        rows[0],
-        ["torchslam", "5", "1.0", "0.11", "0.05"],
-    ]

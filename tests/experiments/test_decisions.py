@@ -24,9 +24,9 @@ from experiments.decisions.cases import (
     rendered_cases,
 )
 from experiments.decisions.measure import bent, deformation_of
-from experiments.decisions.rendered import MOTIONS, Event, Path, RenderedSequence, smooth_step
+from experiments.decisions.rendered import MOTIONS, Path, RenderedSequence
 from experiments.decisions.run import groups, records, run_group
-from experiments.decisions.table import ROWS, Counted, columns_of
+from experiments.decisions.table import ROWS, Counted
 from tests.walks import arc
 from torchslam.data import open_sequence
 from torchslam.geometry import Camera, se3_inverse, so3_log
@@ -136,14 +136,6 @@ def test_a_path_stops_only_in_its_events_and_rotates_in_its_pans(scene: str, mot
         assert turned == pytest.approx(abs(event.turn), abs=0.02)
     assert float(steps[standing].max() if stops else 0.0) < 1e-6
     assert float(steps[~standing].median()) > 1e-3
-
-
-def test_a_fast_turn_rotates_while_the_camera_moves() -> None:
-    event = Event(40.0, 10.0, False, 0.5)
-    time = np.array([39.0, 40.0, 45.0, 50.0, 60.0])
-    np.testing.assert_allclose(event.yaw(time), [0, 0, 0.25, 0.5, 0.5])
-    np.testing.assert_array_equal(event.speed(time), 1.0)
-    np.testing.assert_allclose(smooth_step(np.array([-1.0, 0.5, 2.0])), [0, 0.5, 1])
 
 
 def _sequence(readout_ms: float, seed: int = 5) -> RenderedSequence:
@@ -384,15 +376,6 @@ def test_a_case_without_a_map_counts_only_as_that() -> None:
     }
 
 
-def test_the_final_map_is_worse_by_its_ratio() -> None:
-    errors = _columns()["errors"]
-    cases = [
-        _columns(name=str(worse), errors=errors | {"ate_final": worse * errors["ate_online"]})
-        for worse in (1.0, 1.04, 1.06)
-    ]
-    assert _count("final ATE worse than online by more than 5 %", *cases) == (1, 3)
-
-
 def test_intervals_are_those_of_wilson() -> None:
     low, high = Counted(0, 10).interval()
     assert (low, high) == (pytest.approx(0.0, abs=1e-12), pytest.approx(0.2775, abs=1e-4))
@@ -400,22 +383,3 @@ def test_intervals_are_those_of_wilson() -> None:
     assert (low, high) == (pytest.approx(0.2366, abs=1e-4), pytest.approx(0.7634, abs=1e-4))
     assert Counted(5, 10).cell() == "5 of 10: 50% (24% to 76%)"
     assert Counted(0, 0).cell() == "-"
-
-
-def test_cases_are_in_the_column_of_their_kind_and_half() -> None:
-    cases = [_columns(), _columns(kind="parts", half="held-out")]
-    sizes = {name: len(some) for name, some in columns_of(cases).items()}
-    assert sizes == {
-        "rendered, tuning": 1,
-        "rendered, held-out": 0,
-        "parts, tuning": 0,
-        "parts, held-out": 1,
-    }
-
-
-def test_names_of_errors_are_those_that_missed_or_alarmed() -> None:
-    bad = _columns(name="bad", changes=[_change(focal=490.0)])
-    found = ROWS["exact camera changed online"]([_columns(), bad])
-    assert found.names == ("bad",)
-    found = table.bent_found(table.RIGHT)([_columns()])
-    assert found.names == ("rendered-000 1.15",)

@@ -9,9 +9,9 @@ import torch
 from PIL import Image
 
 from experiments.report.animation import save_animation
-from experiments.report.flight import GROUND, SIZE, between, draw_flight, smoothed, splat
+from experiments.report.flight import GROUND, SIZE, draw_flight, splat
 from tests.box_room import box_cloud, box_depths
-from torchslam.geometry import Camera, rigid, so3_exp
+from torchslam.geometry import Camera
 from torchslam.types import Trajectory
 
 CAMERA = Camera.pinhole(40.0, 40.0, 31.5, 23.5, size=(64, 48))
@@ -28,29 +28,6 @@ def test_the_nearest_point_is_in_front_and_the_larger_one_the_nearer_one() -> No
     assert is_blue.sum() == 9  # of the last one alone: the first is behind, the third behind the eye
     assert np.all(image[~is_red & ~is_blue] == GROUND)
     assert np.argwhere(is_blue).mean(axis=0).round().tolist() == [24, 36]  # of pixel (36.5, 23.5)
-
-
-def test_a_smoothed_path_turns_and_moves_with_the_camera() -> None:
-    angles = torch.linspace(0.0, 1.0, 21, dtype=torch.float64)
-    zero = torch.zeros_like(angles)
-    T_wc = rigid(
-        so3_exp(torch.stack((zero, angles, zero), dim=-1)), torch.stack((angles, zero, zero), dim=-1)
-    )
-    made = smoothed(T_wc, 3)
-    torch.testing.assert_close(made[3:-3], T_wc[3:-3])  # steady, as it is
-    torch.testing.assert_close(made[:, :3, :3] @ made[:, :3, :3].mT, torch.eye(3).double().expand(21, 3, 3))
-
-
-def test_between_two_poses_half_of_the_way_and_half_of_the_turn() -> None:
-    T_wc = EYE.repeat(2, 1, 1)
-    T_wc[1] = rigid(
-        so3_exp(torch.tensor([0.0, 0.8, 0.0], dtype=torch.float64)), torch.tensor([2.0, 0, 0]).double()
-    )
-    half = rigid(
-        so3_exp(torch.tensor([0.0, 0.4, 0.0], dtype=torch.float64)), torch.tensor([1.0, 0, 0]).double()
-    )
-    torch.testing.assert_close(between(T_wc, 0.5), half)
-    torch.testing.assert_close(between(T_wc, 1.0), T_wc[1])
 
 
 def test_a_flight_through_a_room_shows_its_walls_and_the_path(tmp_path: Path) -> None:

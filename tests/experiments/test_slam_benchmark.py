@@ -4,13 +4,10 @@ from __future__ import annotations
 
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
-from experiments.benchmarks.slam import run, stages
-from torchslam.io.results import write_frames
-from torchslam.types import State, StepResult
+from experiments.benchmarks.slam import run
 
 OURS = ["ours", "ours, one process"]
 
@@ -32,30 +29,3 @@ def test_rows_are_medians_of_their_runs() -> None:
     assert cells == ["kitti07, 160", "ours", "12.0", "50", "20.0", "40", "0.2000", "160 of 160"]
     assert run.systems(True) == [*OURS, "ORB-SLAM3"]
     assert run.systems(False) == OURS
-
-
-def test_missing_orb_slam3_is_reported(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.delenv("ORB_SLAM3_PYTHON", raising=False)
-    assert run.find_peer() is None
-    assert "ORB-SLAM3: skipped; set ORB_SLAM3_PYTHON" in capsys.readouterr().out
-
-
-def test_a_profile_is_printed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    times = [{"features": 20.0, "total": 20.0}, {"features": 10.0, "mapping": 30.0, "total": 40.0}]
-    write_frames(
-        tmp_path / "frames.csv",
-        [
-            StepResult(index, float(index), State.TRACKING, None, is_keyframe=index == 1, stage_ms=each)
-            for index, each in enumerate(times)
-        ],
-    )
-    monkeypatch.setattr(sys, "argv", ["stages", str(tmp_path)])
-    stages.main()
-    out = capsys.readouterr().out
-    assert "2 frames, 1 keyframes" in out
-    assert "| features | 2 | 15.0 | 15.0 | 30.0 | 50% |" in out
-    assert "| mapping | 1 | 30.0 | 15.0 | 30.0 | 50% |" in out

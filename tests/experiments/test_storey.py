@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import numpy as np
 import torch
 
-from experiments.storey import PLAIN, storey
+from experiments.storey import storey
 from tests.data.test_synthetic import _built, _degrees_between, _distance, _path
-from torchslam.data.synthetic.scene import COVERAGE, surface
 
 
 def test_the_building_walk_is_smooth_rotates_in_place_and_returns() -> None:
@@ -23,15 +21,6 @@ def test_the_building_walk_is_smooth_rotates_in_place_and_returns() -> None:
     assert float((positions[1160:1260] - positions[:100]).norm(dim=-1).max()) < 0.15
     assert float(_degrees_between(R_wc[1160:1260], R_wc[:100]).max()) < 25
     assert float((positions[:1100] - positions[0]).norm(dim=-1).max()) > 11
-
-
-def test_a_surface_with_less_texture_has_fewer_edges() -> None:
-    plain, full = (
-        surface(np.random.default_rng(0), (1.5, 1.5), 0.004, 32, coverage).astype(np.float32)
-        for coverage in (PLAIN, COVERAGE)
-    )
-    edges = [(np.abs(np.diff(image, axis=1)) > 10).mean() for image in (plain, full)]
-    assert 0.02 * edges[1] < edges[0] < 0.4 * edges[1]
 
 
 def test_the_walk_avoids_walls_and_furniture() -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.common import add_engine, available, metrics_of_runs, row_of, run_cases
+from experiments.common import add_engine, available, metrics_of_runs, row_of
 from experiments.trials import run as trials
 from tests.batch.conftest import ROOM, SETTINGS
 from torchslam.errors import SequenceError
@@ -69,14 +69,3 @@ def test_a_failing_trial_ends_with_an_error(tmp_path: Path, monkeypatch: pytest.
     monkeypatch.setattr(trials, "perform", wrong)
     with pytest.raises(SystemExit, match="AssertionError: no pose any more"):
         attempted(monkeypatch, tmp_path)
-
-
-def test_results_keep_the_order_of_the_cases(tmp_path: Path) -> None:
-    reported: list[int] = []
-    found = run_cases(
-        lambda case: {"twice": 2 * case["n"]},
-        [{"n": n} for n in (2, 1)],
-        options(tmp_path),
-        lambda columns: reported.append(columns["twice"]),
-    )
-    assert [columns["twice"] for columns in found] == reported == [4, 2]

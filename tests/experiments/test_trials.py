@@ -17,7 +17,7 @@ from experiments.trials.edited import Edited, Shot, fitted, shots, strangers
 from experiments.trials.faults import FAULTS, halved
 from experiments.trials.gradient import SETTINGS, Round
 from experiments.trials.judging import FAR, TURNED_DEG, extent, moves, robust_similarity, wrong
-from experiments.trials.outcome import HEADER, cells, furthest, misled, online_poses, states_in_short
+from experiments.trials.outcome import HEADER, cells, furthest, misled, online_poses
 from experiments.trials.run import NOT_RUN, chosen, rows_in, write
 from experiments.trials.trials import TRIALS, Trial, drone, turning
 from tests.sample_run import *  # noqa: F403  fixtures of a run that tracked, lost itself and came back
@@ -123,11 +123,6 @@ def test_drift_is_distributed_over_the_whole_path() -> None:
     assert float(alone.max()) > FAR * path
 
 
-def test_three_poses_cannot_be_wrong() -> None:
-    truth = arc(3)
-    assert not wrong(shifted(truth, slice(0, 1), 9.0), truth, 0.1).any()
-
-
 def walk_with(bad: range) -> tuple[Edited, dict[int, Tensor]]:
     """A walk whose last five frames show something else, and poses of all of it, some of them wrong."""
     walk = Walk(arc(N))
@@ -211,68 +206,6 @@ def test_kidnapped_frames_have_no_pose() -> None:
     assert len(made.groundtruth) == 10
 
 
-def test_light_noise_and_blur() -> None:
-    assert (edits.exposure_step(GRAY, 39) == GRAY).all()
-    assert (edits.exposure_step(GRAY, 40) == GRAY // 4).all()
-    assert (edits.exposure_step(GRAY, 80) == GRAY).all()
-    assert not edits.black(GRAY, 0).any()
-    levels = np.array([0, 20, 85, 86, 255], np.uint8)
-    assert edits.brighter(3.0)(levels, 0).tolist() == [0, 60, 255, 255, 255]
-    flat = np.full((200, 200), 128, np.uint8)
-    assert edits.noise(25.0)(flat, 3).std() == pytest.approx(25.0, rel=0.03)
-    assert (edits.noise(25.0)(flat, 3) != edits.noise(25.0)(flat, 4)).mean() > 0.9
-    darkened = edits.vignette(np.full((60, 80), 200, np.uint8), 0)
-    assert darkened[30, 40] == 200
-    assert darkened[0, 0] == 20
-    assert darkened[30, 0] == round(200 * (1 - 0.9 * 0.64))  # 40 of 50 pixels from the middle
-    dot = np.zeros((21, 21), np.uint8)
-    dot[10, 10] = 180
-    expected = np.zeros_like(dot)
-    expected[10, 6:15] = 20
-    assert (edits.motion_blur(9)(dot, 0) == expected).all()
-    assert edits.motion_blur(9)(dot, 7)[6, 10] > 15  # 91 degrees: along the column
-
-
-def test_an_occluder_enters_from_the_left_and_circles() -> None:
-    """A strip of 16 of 64 pixels; 80 pixels are its way."""
-    texture = np.broadcast_to(np.arange(64, dtype=np.uint8), (48, 64))
-    edit = edits.occluder(texture, 0.25, 4)
-    blank = np.full((48, 64), 200, np.uint8)
-    assert (edit(blank, 0) == 200).all()
-    assert (edit(blank, 1)[:, :5] == [12, 13, 14, 15, 200]).all()
-    assert (edit(blank, 10)[0, 23:41] == [200, *range(16), 200]).all()
-    assert (edit(blank, 21) == edit(blank, 1)).all()
-
-
-def test_watermarks_lie_at_their_position() -> None:
-    blank = np.full((480, 640), 128, np.uint8)
-    small = edits.small_logo()(blank, 0) != 128
-    assert small[8:40, 8:72].all() | (edits.logo((64, 32)) == 128).any()
-    assert not small[40:].any()
-    assert not small[:, 72:].any()
-    large = edits.overlay((640, 480))(blank, 0)
-    assert (large[10:70, 10:170] == edits.logo((160, 60))).all()
-    assert (large[:60, 320:] == 255).any()
-    assert (large[70:] == 128).all()
-
-
-def test_a_rolling_shutter_shifts_rows_by_a_sine() -> None:
-    ramp = np.broadcast_to(np.arange(0, 192, 3, dtype=np.uint8), (48, 64))
-    bent = edits.rolling(6.0)(ramp, 0)[:, 20:40].astype(float) - ramp[:, 20:40]
-    expected = 18 * np.sin(2 * np.pi * np.arange(48) / 48)
-    assert np.abs(bent - expected[:, None]).max() < 0.6
-    later = edits.rolling(6.0)(ramp, 9)[:, 20:40].astype(float) - ramp[:, 20:40]
-    assert (later == bent).all()
-
-
-def test_dirt_is_gray_and_stays() -> None:
-    edit = edits.lens_dirt((320, 240))
-    white = np.full((240, 320), 255, np.uint8)
-    assert (edit(white, 0) == edit(white, 9)).all()
-    assert edit(white, 0).min() < 150
-    assert (edit(white, 0) == 255).mean() > 0.02
-
-
 def test_halved_cameras_see_points_at_the_middle_of_four_pixels() -> None:
     camera = Walk(arc(2)).camera
     point = torch.tensor([[0.2, -0.1, 1.0]], dtype=torch.float64)
@@ -340,12 +273,6 @@ def test_the_table_keeps_earlier_rows(tmp_path: Path, monkeypatch: pytest.Monkey
     assert NOT_RUN in readme.read_text()
     assert readme.read_text().startswith("above\n")
     assert len(HEADER) == 8
-
-
-def test_states_are_abbreviated() -> None:
-    states = [State.INITIALIZING, State.INITIALIZING, State.TRACKING, State.UNCERTAIN, State.LOST]
-    assert states_in_short(states) == "i2 T1 U1 L1"
-    assert states_in_short([State.TRACKING, State.LOST] * 5) == "T1 L1 T1 L1 T1 L1 T1 L1 …"
 
 
 def test_a_rotating_start_has_the_poses_of_the_rotation(data_dir: Path) -> None:

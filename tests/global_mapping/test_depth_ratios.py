@@ -11,7 +11,7 @@ from torch import Tensor
 
 from tests.global_mapping.synthetic import CAMERA, Recording, arc, ball, line, wall
 from torchslam.geometry import se3_inverse, transform
-from torchslam.global_mapping.depth_ratios import PairDepths, ViewRays, depth_ratio
+from torchslam.global_mapping.baselines import PairDepths, ViewRays, depth_ratio
 from torchslam.global_mapping.view_graph import ViewPair
 
 WALK = Recording.of(line(4, 0.4), wall(200, 1.2))
@@ -21,7 +21,7 @@ def depths_of(recording: Recording, pair: ViewPair, scale: float = 1.0) -> PairD
     """The depths by the true relative pose, its translation longer by a factor."""
     T_21 = recording.T_cw[pair.second] @ se3_inverse(recording.T_cw[pair.first])
     T_21[:3, 3] *= scale
-    return PairDepths.of(T_21, ViewRays.by(CAMERA, recording.views), pair)
+    return PairDepths.of(T_21, ViewRays(CAMERA, recording.views), pair)
 
 
 def distances(recording: Recording, row: int) -> Tensor:
@@ -123,22 +123,3 @@ def test_the_ratio_is_a_median_with_its_error() -> None:
     assert robust is not None
     assert robust.log_ratio == pytest.approx(0.6)
     assert robust.std < 0.05
-
-
-def test_each_pair_has_its_own_noise_and_image() -> None:
-    """The noise of the first may be too large where that of the second is not, and so for the images."""
-    few = torch.ones(12)
-    exact, noisy = depths(few, 0.01), depths(few, 0.3)
-    assert depth_ratio(exact, 0, exact, 0) is not None
-    assert depth_ratio(exact, 0, noisy, 0) is None
-    assert depth_ratio(noisy, 0, exact, 0) is None
-    table, doubled = np.ones(12), np.full(12, 2.0)
-    both = PairDepths((table, doubled), (0.01 * table, 0.3 * table))
-    found = depth_ratio(exact, 1, PairDepths((table, doubled), (0.01 * table, 0.01 * table)), 1)
-    assert found is not None
-    assert found.log_ratio == pytest.approx(math.log(2))
-    assert depth_ratio(both, 0, both, 0) is not None
-    assert depth_ratio(both, 1, both, 0) is not None
-    worse = PairDepths((table, table), (0.01 * table, 0.3 * table))
-    assert depth_ratio(worse, 1, exact, 0) is None
-    assert depth_ratio(exact, 0, worse, 1) is None

@@ -14,7 +14,7 @@ from torchslam.cli.main import main
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.errors import ConfigError
-from torchslam.global_mapping.learned_links import (
+from torchslam.global_mapping.links import (
     HELD,
     LearnedPairs,
     learned_config,

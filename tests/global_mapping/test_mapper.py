@@ -9,8 +9,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.global_mapping.synthetic import (
@@ -95,17 +93,6 @@ def test_images_are_spread_evenly(count: int, most: int, chosen: list[int]) -> N
     assert choose_images(count, [], most) == chosen
 
 
-@given(st.integers(1, 2000), st.integers(1, 400))
-def test_as_many_images_are_taken_as_may_be(count: int, most: int) -> None:
-    """A smaller distance between them would be too many."""
-    chosen = choose_images(count, [], most)
-    assert 1 <= len(chosen) <= most
-    assert chosen[0] == 0
-    stride = chosen[1] - chosen[0] if len(chosen) > 1 else count
-    assert chosen == list(range(0, count, stride))
-    assert stride == 1 or len(chosen) == 1 or -(-count // (stride - 1)) > most
-
-
 def test_doubtful_frames_are_mapped_as_well() -> None:
     """Lost and uncertain ones, unless they are more than all others may be; those beyond the end are none."""
     states = {1: State.LOST, 2: State.TRACKING, 3: State.INITIALIZING, 6: State.UNCERTAIN, 8: State.LOST}
@@ -169,18 +156,6 @@ def test_a_recording_is_mapped_as_a_whole(mapped: GlobalMap) -> None:
     assert torch.equal(run.camera.params, WALK.camera.params.double())
     assert (run.given, run.calibration) == (None, None)
     assert run.config.features.kind == "simulated"
-
-
-def test_the_check_calls_it_right(mapped: GlobalMap) -> None:
-    """By the pairs that were held back, too; of these none are neighbors."""
-    held = [mapped.pairs[row] for row in sorted(mapped.held_back)]
-    assert 3 <= len(held) <= len(mapped.pairs) / 10
-    assert all(pair.second - pair.first >= 2 for pair in held)
-    T_cw, known = poses_of(mapped.run, mapped.views)
-    assert bool(known.all())
-    found = check_map(T_cw, known, mapped.views, mapped.pairs, mapped.run.camera, mapped.held_back)
-    assert found.is_right
-    assert (found.pairs, found.agreeing) == (len(held), len(held))
 
 
 def test_poses_of_images_are_those_of_the_run(mapped: GlobalMap) -> None:
@@ -446,27 +421,12 @@ def test_two_images_are_too_few() -> None:
     assert_failed(map_whole(WALK.part(0, 2)), "no map: 2 images are too few", 2)
 
 
-def test_images_that_share_nothing_are_reported() -> None:
-    made = map_whole(at(0, 900, 2000), "simulated.depth_far=0.7")
-    assert_failed(made, "no map: no two of 3 images show the same scene", 3)
-    assert made.pairs == []
-    assert [each.index for each in made.run.results] == [0, 1, 2]
-    assert [each.timestamp for each in made.run.results] == pytest.approx([0.0, 0.1, 0.2])
-
-
 @pytest.mark.parametrize("noise", ["0", "0.3"])
 @pytest.mark.parametrize("walk", [still(12), turn(12)], ids=["still", "turn"])
 def test_without_motion_there_is_no_map(walk: Tensor, noise: str) -> None:
     made = map_whole(Walk(walk), f"simulated.noise_px={noise}")
     assert made.run.failure.startswith("no map: the camera")
     assert_failed(made, made.run.failure, 12)
-
-
-def test_points_of_two_images_are_reported() -> None:
-    """Two images here and two images there: there are matches, but no point is seen three times."""
-    made = map_whole(at(0, 60, 2000, 2060), "simulated.depth_near=0.4", "simulated.depth_far=0.7")
-    assert_failed(made, "no map: no point is seen by 3 of 4 images", 4)
-    assert [(pair.first, pair.second) for pair in made.pairs] == [(0, 1), (2, 3)]
 
 
 def test_a_part_that_nothing_ties_to_the_map_is_lost() -> None:
@@ -518,13 +478,6 @@ def test_unreadable_frames_are_skipped_and_counted_once() -> None:
     ]
     assert len(made.run.trajectory) == 27
     assert [view.index for view in made.views] == [index for index in range(0, 30, 2) if index not in (4, 8)]
-
-
-def test_a_recording_that_cannot_be_read_has_no_map() -> None:
-    with pytest.warns(UserWarning, match="skipped a frame"):
-        made = map_whole(Damaged(walk_arc(6), set(range(6))))
-    assert_failed(made, "no map: 0 images are too few", 0)
-    assert len(made.run.skipped) == 6
 
 
 # --- images ----------------------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.global_mapping.synthetic import EYE, Recording, arc, ball, line, rand, randn, view_pair
+from tests.global_mapping.synthetic import Recording, arc, ball, line, rand, randn, view_pair
 from torchslam.geometry import se3_exp, se3_inverse, so3_exp
 from torchslam.global_mapping.tracks import (
     MIN_PARALLAX,
@@ -60,22 +60,6 @@ def test_connected_matches_are_one_track() -> None:
         *((3, 1, 0), (3, 3, 1)),
     ]
     assert (tracks.count, len(tracks), tracks.lengths.tolist()) == (4, 9, [3, 2, 2, 2])
-
-
-def test_there_may_be_more_tracks_than_images() -> None:
-    matches = [(row, (3 * row) % 8) for row in range(8)]
-    tracks = join_matches([view_pair(0, 1, *matches)], views=2, keypoints=8)
-    assert rows(tracks) == [(row, *node) for row, both in enumerate(matches) for node in enumerate(both)]
-
-
-def test_two_keypoints_of_one_image_are_both_left_out() -> None:
-    """Nobody knows which is right; the rest stays if it is of two images."""
-    around = [view_pair(0, 1, (0, 0)), view_pair(1, 2, (0, 0)), view_pair(0, 2, (0, 1))]
-    assert rows(join_matches(around, views=3, keypoints=4)) == [(0, 0, 0), (0, 1, 0)]
-    assert join_matches([view_pair(0, 1, (0, 0), (1, 0))], views=2, keypoints=4).count == 0
-    # The same keypoint of another track in that image is not concerned.
-    tracks = join_matches([*around, view_pair(0, 2, (3, 3)), view_pair(1, 2, (3, 3))], views=3, keypoints=4)
-    assert rows(tracks) == [(0, 0, 0), (0, 1, 0), (1, 0, 3), (1, 1, 3), (1, 2, 3)]
 
 
 def test_no_matches_are_no_tracks() -> None:
@@ -127,20 +111,6 @@ def test_tracks_with_enough_observations_left_are_selected() -> None:
 
 
 # --- the longest tracks ----------------------------------------------------------------------------------------
-
-
-def test_the_longest_tracks_of_some_image_are_chosen() -> None:
-    """Of each image the longest one; of equal ones the first. A track is taken as a whole."""
-    track = torch.tensor([0, 0, 1, 1, 1, 2, 2, 3, 3, 3, 3])
-    view = torch.tensor([0, 1, 0, 1, 2, 2, 3, 1, 2, 4, 5])
-    tracks = Tracks(track, view, torch.zeros_like(track))
-    assert longest_tracks(tracks, 1).tolist() == [False, True, True, True]  # of images 0, 3, and 1, 2, 4, 5
-    assert longest_tracks(tracks, 2).tolist() == [True, True, True, True]
-    assert longest_tracks(tracks, 0).tolist() == [False] * 4
-    assert longest_tracks(tracks_of(2, 2, 2), 2).tolist() == [True, True, False]
-    single = Tracks(torch.tensor([0, 0, 1]), torch.tensor([1, 2, 0]), torch.zeros(3, dtype=torch.int64))
-    assert longest_tracks(single, 1).tolist() == [True, True]
-    assert longest_tracks(tracks_of(), 5).tolist() == []
 
 
 @given(st.integers(0, 1000), st.integers(1, 4))
@@ -277,17 +247,6 @@ def test_points_behind_the_cameras_do_not_agree() -> None:
     assert float(found.parallax_rad[2]) > 0.1
 
 
-def test_two_rays_that_nearly_miss_each_other_still_agree() -> None:
-    """No camera's own center, from which its ray has no error, is a better point than the one between both rays."""
-    tracks = tracks_of(2)
-    centers_w = torch.tensor([[-1.0, 0, 0], [1, 0, 0]], dtype=torch.float64)
-    targets_w = torch.tensor([[0.0, 0.016, 2], [0, -0.016, 2]], dtype=torch.float64)
-    rays_w = torch.nn.functional.normalize(targets_w - centers_w, dim=-1)
-    found = triangulated(tracks, rays_w, centers_w)  # 0.016 / sqrt(5) is 0.72 of the tolerance
-    assert found.agrees.tolist() == [True, True]
-    torch.testing.assert_close(found.points_w, torch.tensor([[0.0, 0, 2]]).double(), atol=1e-3, rtol=0)
-
-
 def test_parallel_rays_have_no_parallax() -> None:
     """They agree with a point far ahead of both; where the camera did not move, there is none."""
     tracks = tracks_of(2, 2, 2)
@@ -300,16 +259,6 @@ def test_parallel_rays_have_no_parallax() -> None:
     assert float(found.points_w[1, 2]) == pytest.approx(1e6, rel=1e-5)
     assert found.points_w[2].tolist() == [2, 3, 4]
     assert float(found.parallax_rad.max()) < 1e-3 * MIN_PARALLAX
-
-
-def test_nearly_parallel_rays_still_have_their_point() -> None:
-    """At a parallax of a fifty thousandth the point is where they meet, not a point far ahead."""
-    tracks = tracks_of(2)
-    points_w = torch.tensor([[0.3, 0.1, 5.0e4]], dtype=torch.float64)
-    centers_w = torch.tensor([[0.0, 0, 0], [1, 0, 0]], dtype=torch.float64)
-    found = triangulated(tracks, *looking(points_w, centers_w, tracks))
-    torch.testing.assert_close(found.points_w, points_w, rtol=1e-4, atol=0)
-    assert float(found.parallax_rad) == pytest.approx(2e-5, rel=1e-4)
 
 
 def test_points_have_the_least_angles_to_their_rays() -> None:
@@ -356,12 +305,6 @@ def test_angles_between_rays_and_points_are_known() -> None:
     torch.testing.assert_close(found, torch.tensor([0.0, 0.2, 90, 180, 180]).double(), atol=1e-6, rtol=0)
 
 
-def test_no_tracks_have_no_points() -> None:
-    empty = torch.zeros(0, 3, dtype=torch.float64)
-    found = triangulated(tracks_of(), empty, empty)
-    assert (len(found.points_w), len(found.agrees), len(found.parallax_rad)) == (0, 0, 0)
-
-
 # --- the map ---------------------------------------------------------------------------------------------------
 
 
@@ -389,12 +332,6 @@ def test_a_map_has_the_observations_of_the_tracks() -> None:
     torch.testing.assert_close(made.points["descriptors"][order], newest)
     seen_w = torch.nn.functional.normalize(points_w - torch.tensor([0.5, 0, 0]), dim=-1)
     torch.testing.assert_close(made.points["view_directions_w"][order], seen_w)
-
-
-def test_a_map_without_points_has_its_images() -> None:
-    recording = Recording.of(line(2), torch.tensor([0.0, 0, 4]) + ball(12))
-    made = make_map(recording.views, EYE.repeat(2, 1, 1), tracks_of(), torch.zeros(0, 3, dtype=torch.float64))
-    assert (made.num_keyframes, len(made.positions_w)) == (2, 0)
 
 
 @pytest.mark.parametrize("shared", [4, 5])

@@ -25,7 +25,6 @@ from tests.global_mapping.synthetic import (
     wall,
 )
 from torchslam.config import Config, load_config
-from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, rigid, se3_exp, so3_exp
 from torchslam.global_mapping import view_graph
 from torchslam.global_mapping.view_graph import (
@@ -187,27 +186,6 @@ def test_the_model_of_the_matches_gives_the_relation(
     assert matcher_of(RECORDING).match([(0, 1)])[0].relation is relation
 
 
-def test_pairs_are_verified_in_batches_of_about_as_many_matches(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seventy pairs, 32 at once, the smallest first; what pads them is masked, and the answers go to their pairs."""
-    estimate = fake(monkeypatch)
-    pair = RECORDING.pair(2, 3)
-    counts = [30 + (37 * row) % 70 for row in range(70)]
-    found = [(2, 3, pair.keypoints_1[:count], pair.keypoints_2[:count]) for count in counts]
-    held = matcher_of(RECORDING).verify(found)
-    assert [len(pair) for pair in held] == counts
-    assert [tuple(mask.shape) for mask in estimate.masks] == [(32, 61), (32, 93), (6, 99)]
-    assert [mask.sum(1).tolist() for mask in estimate.masks] == [
-        list(range(30, 62)),
-        list(range(62, 94)),
-        list(range(94, 100)),
-    ]
-    for pixels, view, keypoints in zip(
-        estimate.pixels[0], RECORDING.views[2:], (pair.keypoints_1, pair.keypoints_2), strict=True
-    ):
-        torch.testing.assert_close(pixels[3, :33], view.keypoints[keypoints[:33]])
-    assert [int(pair.T_21[0, 0]) for pair in held] == [(count - 30) % 32 for count in counts]
-
-
 def test_the_threshold_is_one_and_a_half_pixels_of_the_reduced_image(monkeypatch: pytest.MonkeyPatch) -> None:
     """The truncated kernel sets it for all of the search, which is a short one and has the seed of the run."""
     estimate = fake(monkeypatch)
@@ -242,14 +220,6 @@ def test_too_few_matches_are_not_even_verified(monkeypatch: pytest.MonkeyPatch) 
     ]
     assert held[0].keypoints_1.tolist() == list(range(MIN_MATCHES + 1))
     assert held[0].keypoints_2.tolist() == list(range(50, 51 + MIN_MATCHES))
-
-
-def test_a_wrong_matcher_is_named() -> None:
-    def nothing(one: FrameFeatures, other: FrameFeatures, prior: MatchPrior | None) -> Matches:
-        return None  # type: ignore[return-value]
-
-    with pytest.raises(ConfigError, match="matcher nothing: must return"):
-        PairMatcher(RECORDING.views, CAMERA, nothing, CONFIG).match([(0, 1)])
 
 
 # --- which pairs are tried -------------------------------------------------------------------------------------
@@ -340,12 +310,6 @@ def test_similar_places_are_tried_once(monkeypatch: pytest.MonkeyPatch) -> None:
     ends = [(pair.first, pair.second) for pair in pairs]
     assert ends == sorted(set(ends))
     assert [pair for pair in ends if pair[1] - pair[0] > 15] == [(0, 16), (0, 18), (2, 18), (2, 19), (3, 19)]
-
-
-def test_progress_counts_distances_and_the_similar_places() -> None:
-    calls: list[tuple[int, int]] = []
-    build_view_graph(FakeMatcher(4), lambda done, most: calls.append((done, most)))
-    assert calls == [(0, 4), (1, 4), (2, 4), (3, 4)]
 
 
 class FakePlaces:

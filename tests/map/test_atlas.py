@@ -78,21 +78,6 @@ def test_the_nearest_of_the_most_covisible_keyframes_is_the_replacement() -> Non
         assert replacement_keyframe(slam_map, 2, gone) == int(distance.argmin())
 
 
-def test_only_the_most_covisible_keyframes_can_be_replacements() -> None:
-    """With a single candidate, the one that shares most is taken, though another is nearer."""
-    T_cw = sideways(3)
-    T_cw[1, 0, 3], T_cw[2, 0, 3] = -0.1, 0.4
-    slam_map = submap_of_scene(Scene.of(200), T_cw).map
-    seen = slam_map.observed_points(torch.tensor([1]))
-    slam_map.remove_observations(
-        torch.ones(len(seen) - 3, dtype=torch.int64),
-        torch.nonzero(slam_map.keyframes["point_ids"][1] >= 0)[3:, 0],
-    )
-    gone = torch.tensor([True, False, False])
-    assert replacement_keyframe(slam_map, 0, gone, count=1) == 2
-    assert replacement_keyframe(slam_map, 0, gone, count=2) == 1
-
-
 def test_row_remaps_compose() -> None:
     one = RowRemap(torch.tensor([0, -1, 1]), torch.tensor([1, -1, 0, 2]), torch.tensor([0, 1, 1]))
     two = RowRemap(torch.tensor([-1, 0]), torch.tensor([2, -1, 0]), torch.tensor([0, 0]))

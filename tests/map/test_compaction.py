@@ -69,13 +69,6 @@ def test_the_other_keyframes_keep_their_observations(submap: Submap) -> None:
     check(submap.map)
 
 
-def test_the_replacement_of_a_keyframe_is_near_and_is_kept(submap: Submap) -> None:
-    replacement = remove_keyframes(submap, GONE).replacement
-    assert replacement.tolist()[::2] == [0, 1, 2, 4]
-    assert replacement[1] in (0, 1)  # old rows 0 and 2, its neighbors on the way
-    assert replacement[3] in (1, 2)
-
-
 def test_points_are_assigned_to_a_keyframe_that_observes_them(submap: Submap) -> None:
     made_by_gone = torch.isin(submap.map.points["first_keyframe"], GONE)
     assert int(made_by_gone.sum()) > 0
@@ -109,19 +102,6 @@ def test_the_graph_keeps_observations_of_removed_keyframes(submap: Submap) -> No
     expected = {key: where for key, where in seen_points(old).items() if where not in gone_points}
     assert seen_points(new) == expected
     assert all(pairs(old)[key] == pixel for key, pixel in pairs(new).items())
-
-
-@pytest.mark.parametrize("forgotten", [0, 5])
-def test_the_other_frames_are_unchanged(submap: Submap, forgotten: int) -> None:
-    keypoints = torch.nonzero(submap.map.keyframes["point_ids"][3] >= 0)[:forgotten, 0]
-    submap.map.remove_observations(torch.full_like(keypoints, 3), keypoints)
-    before = copy.deepcopy(submap.posed_frames)
-    own = torch.isin(before.observations["frame_row"], 3 * GONE)  # every third frame is a keyframe
-    remove_keyframes(submap, GONE)
-    kept = ~torch.isin(submap.posed_frames.observations["frame_row"], 3 * GONE)
-    for name, column in submap.posed_frames.observations.columns().items():
-        assert torch.equal(column[kept], before.observations[name][~own]), name
-    assert int((~kept).sum()) == int(own.sum()) - forgotten
 
 
 def test_a_keyframe_whose_frame_was_never_added_becomes_a_frame(submap: Submap) -> None:
@@ -175,25 +155,6 @@ def test_compaction_only_renumbers_points(submap: Submap) -> None:
     for name in ("local_points", "last_inlier_points"):
         held = getattr(before.tracking, name)
         assert torch.equal(getattr(submap.tracking, name), rows[held[alive[held]]]), name
-    check(submap.map)
-
-
-def test_observations_of_a_merged_point_move_to_its_replacement(submap: Submap) -> None:
-    merged = torch.isin(submap.posed_frames.observations["point_ids"], torch.tensor([2, 5, 6, 9]))
-    count = int(merged.sum())
-    rows = remove_invalid_rows(thinned(submap)).points
-    assert int((submap.posed_frames.observations["point_ids"] == rows[9]).sum()) == count
-
-
-def test_a_compacted_submap_can_be_extended(submap: Submap) -> None:
-    remove_invalid_rows(thinned(submap))
-    remove_keyframes(submap, GONE)
-    ids = submap.map.add_points(
-        torch.zeros(2, 3, dtype=torch.float64), torch.zeros(2, 32, dtype=torch.uint8), 0
-    )
-    assert ids.tolist() == [len(submap.map.points) - 2, len(submap.map.points) - 1]
-    free = torch.nonzero(submap.map.keyframes["point_ids"][4] < 0)[:2, 0]
-    submap.map.add_observations(4, free, ids)
     check(submap.map)
 
 

@@ -70,15 +70,6 @@ def test_submaps_and_camera_round_trip(path: Path, submaps: list[Submap], camera
     assert torch.equal(saved.camera.params, camera.params)
 
 
-def test_a_loaded_map_can_be_extended(path: Path) -> None:
-    loaded, _ = read_map(path)
-    before = loaded.num_points
-    loaded.add_points(
-        torch.zeros(2, 3, dtype=torch.float64), torch.zeros(2, 32, dtype=torch.uint8), keyframe=0
-    )
-    assert loaded.num_points == before + 2
-
-
 def test_saving_is_deterministic_also_after_loading(
     path: Path, submaps: list[Submap], camera: Camera
 ) -> None:
@@ -185,12 +176,14 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
         (put("camera.params", 0, float("nan")), "not finite numbers with a positive focal length"),
         (put("camera.params", 1, -100.0), "not finite numbers with a positive focal length"),
         (change("camera.params", Tensor.half), "not a row of numbers"),
-        (without(P + "is_valid"), "submap 0, points: missing is_valid"),
-        (without(K + "mask"), "submap 0, keyframes: missing mask"),
-        (lambda tensors: tensors.__setitem__(P + "colour", torch.zeros(120)), "points: unknown colour"),
+        (without(P + "is_valid"), "submap 0, points: missing or unknown columns: is_valid"),
+        (
+            lambda tensors: tensors.__setitem__(P + "colour", torch.zeros(120)),
+            "points: missing or unknown columns: colour",
+        ),
         (
             lambda tensors: tensors.__setitem__("submaps.0.trees.age", torch.zeros(1)),
-            "unknown tensor trees.age",
+            "unknown tensors: submaps.0.trees.age",
         ),
         (
             lambda tensors: tensors.__setitem__("submaps.1.points.age", torch.zeros(1)),
@@ -205,7 +198,6 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
             change(P + "positions_w", Tensor.float),
             "positions_w: torch.float32 but the camera is torch.float64",
         ),
-        (change(K + "timestamp", Tensor.float), "timestamp: torch.float32"),
         (change(P + "is_valid", Tensor.long), "is_valid: must be of kind bool"),
         (change(P + "is_valid", lambda rows: rows[:-1]), "the columns have 119 to 120 rows"),
         (
@@ -216,9 +208,6 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
         (change(P + "descriptors", Tensor.double), "descriptors of several types"),
         (put(P + "positions_w", 0, float("inf")), "positions_w: not finite"),
         (put(F + "T_cr", 0, float("nan")), "T_cr: not finite"),
-        (put(P + "covariances_w", 0, float("nan")), "covariances_w: not finite"),
-        (put(P + "view_directions_w", 0, float("inf")), "view_directions_w: not finite"),
-        (put(K + "covariances", 0, float("nan")), "covariances: not finite"),
         (put(K + "angles", 0, float("nan")), "angles: not finite"),
         (put(K + "T_cw", 0, 0.5), "T_cw: not rigid transforms"),
         (change(K + "T_cw", lambda rows: 1.01 * rows), "T_cw: not rigid transforms"),
@@ -230,7 +219,6 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
         (put(P + "positions_w", 3, -1e13), r"positions_w: beyond 1e\+12"),
         (put(K + "keypoints", 3, 1e300), r"keypoints: beyond 1e\+12"),
         (put(P + "first_keyframe", 5, 6), "first_keyframe from 0 to 6, there are 0 to 5"),
-        (put(P + "first_keyframe", 5, -1), "first_keyframe from -1 to 5, there are 0 to 5"),
         (put(P + "replaced_by", 5, 120), "replaced_by from -1 to 120, there are -1 to 119"),
         (put(P + "replaced_by", 5, 5), "replaced_by has a cycle"),
         (
@@ -238,8 +226,6 @@ P, K, F, O = (f"submaps.0.{table}." for table in ("points", "keyframes", "frames
             "replaced_by has a cycle",
         ),
         (put(K + "point_ids", 0, 120), "point_ids from -1 to 120, there are -1 to 119"),
-        (put(K + "point_ids", 0, -2), "point_ids from -2"),
-        (put(K + "session", 0, 2), "session from 0 to 2, there are 0 to 1"),
         (put(F + "session", 0, -1), "session from -1 to 1, there are 0 to 1"),
         (put(K + "frame_index", 1, 0), "two keyframes have the same session and frame index"),
         (put(K + "frame_index", 1, -1), "frame_index from -1 to 25, there are 0"),

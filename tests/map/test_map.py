@@ -4,12 +4,10 @@ import math
 
 import pytest
 import torch
-from hypothesis import given
-from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.scene import Scene, sideways, submap_of_scene
-from torchslam.map.map import NO_POINT, Map
+from torchslam.map.map import Map
 from torchslam.optim import Marginals
 from torchslam.types import FrameFeatures
 
@@ -69,30 +67,6 @@ def test_covisibility(small_map: Map) -> None:
     assert small_map.points["times_observed"].tolist() == [2] * 6
 
 
-def test_observers_of_points(small_map: Map) -> None:
-    sees = small_map.observation_mask(torch.tensor([2, 0]), torch.tensor([5, 0, 4, 3]))
-    assert sees.tolist() == [[True, False, True, False], [False, True, False, True]]
-    assert small_map.observation_mask(torch.tensor([1]), torch.tensor([], dtype=torch.int64)).shape == (1, 0)
-
-
-def test_invalidated_points_have_no_observations_and_keep_their_ids(small_map: Map) -> None:
-    small_map.remove_points(torch.tensor([0, 4]))
-    assert small_map.num_points == 4
-    assert small_map.valid_points().tolist() == [1, 2, 3, 5]
-    assert small_map.observed_points(torch.tensor([0, 1, 2])).tolist() == [1, 2, 3, 5]
-
-
-def test_merging_moves_observations_and_keeps_one_per_keyframe(small_map: Map) -> None:
-    small_map.merge_points(torch.tensor([4]), torch.tensor([0]))
-    assert small_map.keyframes["point_ids"][2, 0] == 0  # had seen 4 alone: moved
-    assert (
-        small_map.keyframes["point_ids"][1, 4] == NO_POINT
-    )  # had seen both: the observation of 4 is dropped
-    assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 2]
-    assert not small_map.points["is_valid"][4]
-    assert small_map.points["times_found"][0] == 2
-
-
 def test_merged_points_resolve_to_their_final_replacement(small_map: Map) -> None:
     small_map.merge_points(torch.tensor([5]), torch.tensor([4]))
     small_map.merge_points(torch.tensor([4]), torch.tensor([0]))
@@ -115,34 +89,6 @@ def test_features_are_restored_from_a_keyframe(small_map: Map, generator: torch.
     assert (back.index, back.timestamp) == (view.index, view.timestamp)
     assert torch.equal(back.keypoints, view.keypoints)
     assert torch.equal(back.descriptors, view.descriptors)
-
-
-@given(
-    st.lists(
-        st.tuples(st.sampled_from(["invalidate", "replace", "forget"]), st.integers(0, 5), st.integers(0, 5)),
-        max_size=8,
-    )
-)
-def test_the_observation_count_agrees_with_the_table(changes: list[tuple[str, int, int]]) -> None:
-    slam_map = make_map(torch.Generator().manual_seed(0))
-    for change, one, other in changes:
-        alive = slam_map.points["is_valid"]
-        if change == "invalidate":
-            slam_map.remove_points(torch.tensor([one]))
-        elif change == "replace" and one != other and alive[one] and alive[other]:
-            slam_map.merge_points(torch.tensor([one]), torch.tensor([other]))
-        elif change == "forget" and slam_map.keyframes["point_ids"][1, one] >= 0:
-            slam_map.remove_observations(torch.tensor([1]), torch.tensor([one]))
-        seen = slam_map.keyframes["point_ids"]
-        assert torch.equal(slam_map.points["times_observed"], torch.bincount(seen[seen >= 0], minlength=6))
-        for row in seen:
-            assert len(torch.unique(row[row >= 0])) == int((row >= 0).sum())
-
-
-def test_several_points_merge_into_one(small_map: Map) -> None:
-    small_map.merge_points(torch.tensor([4, 5]), torch.tensor([0, 0]))
-    assert small_map.keyframes["point_ids"][2].tolist()[:2].count(0) == 1
-    assert small_map.points["times_observed"].tolist() == [3, 2, 2, 2, 0, 0]
 
 
 def test_covariances_are_stored_and_unknown_ones_are_kept(small_map: Map) -> None:

@@ -28,12 +28,6 @@ def test_the_prior_is_that_the_feature_extractor_states_the_truth() -> None:
     assert adjusted(slam_map, 1.0, 5) == pytest.approx(1.0)
 
 
-def test_larger_errors_are_found_after_some_adjustments() -> None:
-    slam_map = Map()
-    assert 1.0 < adjusted(slam_map, 3.0, 1) < 2.0
-    assert adjusted(slam_map, 3.0, 100) == pytest.approx(3.0)
-
-
 def test_it_is_never_below_what_is_stated_nor_above_what_is_noise() -> None:
     assert adjusted(Map(), 0.1, 50) == 1.0
     assert adjusted(Map(), 100.0, 50) == _MAX_NOISE_VARIANCE

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
-from tests.map.simulated import CAMERA
-from torchslam.map.atlas import Submap, TrackingState
-from torchslam.map.file import read_map, write_atlas
 from torchslam.map.map import NO_POINT, Map
 from torchslam.map.observation_index import ObservationIndex, first_of_each, top_rows
 from torchslam.types import FrameFeatures
@@ -163,38 +158,6 @@ def test_merging_agrees_with_a_scan_of_the_table(changes: list[Change], replacem
     expected = replaced_by_scan(before, old, new, len(slam_map.points))
     assert torch.equal(slam_map.keyframes["point_ids"], expected)
     check(slam_map)
-
-
-def test_a_loaded_map_has_the_same_index(tmp_path: Path) -> None:
-    slam_map = make_map(3, 8)
-    for keyframe, ids in ((0, [0, 1, 2]), (1, [1, 2, 3]), (2, [2, 7])):
-        slam_map.add_observations(keyframe, torch.arange(len(ids)), torch.tensor(ids))
-    write_atlas(
-        tmp_path / "map",
-        [Submap(0, TrackingState.empty(torch.zeros(0, dtype=torch.float64)), slam_map)],
-        CAMERA,
-    )
-    loaded, _ = read_map(tmp_path / "map")
-    check(loaded)
-    loaded.remove_points(torch.tensor([2]))
-    check(loaded)
-
-
-def test_the_index_grows_with_the_observations_of_a_point() -> None:
-    slam_map = make_map(40, 2)
-    for keyframe in range(40):
-        slam_map.add_observations(keyframe, torch.tensor([keyframe % KEYPOINTS]), torch.tensor([1]))
-    check(slam_map)
-    slam_map.remove_observations(torch.arange(0, 40, 2), torch.arange(0, 40, 2) % KEYPOINTS)
-    check(slam_map)
-
-
-def test_slots_are_returned_in_the_requested_order() -> None:
-    index = ObservationIndex(torch.tensor([[0, -1, 1], [1, 0, -1]]))
-    which, slots = index.observations_of(torch.tensor([1, 0, 5]))
-    assert sorted(zip(which.tolist(), slots.tolist(), strict=True)) == [(0, 2), (0, 3), (1, 0), (1, 4)]
-    index.remove(torch.tensor([1]), torch.tensor([2]))
-    assert index.padded_slots(torch.tensor([1]))[0].tolist()[:2] == [3, -1]
 
 
 @given(st.lists(st.integers(0, 5), max_size=20), st.integers(1, 6), st.integers(1, 4))

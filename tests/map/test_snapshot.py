@@ -60,11 +60,3 @@ def test_a_snapshot_restores_the_noise() -> None:
     slam_map.noise_variance = 3.0
     snapshot.restore(slam_map)
     assert slam_map.noise_variance == 1.5
-
-
-def test_a_snapshot_is_a_copy() -> None:
-    slam_map = simulated_submap().map
-    snapshot = MapSnapshot.of(slam_map)
-    positions = slam_map.positions_w.clone()
-    slam_map.positions_w[:] = 0.0
-    assert torch.equal(snapshot.points["positions_w"], positions)

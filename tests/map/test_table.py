@@ -33,13 +33,6 @@ def test_capacity_doubles_so_most_appends_do_not_move_the_storage() -> None:
     assert len(pointers) <= 6
 
 
-def test_a_column_is_a_view_of_the_storage() -> None:
-    table = Table(NUMBER)
-    table.append(number=torch.zeros(3))
-    table["number"][1] = 5.0
-    assert table["number"].tolist() == [0.0, 5.0, 0.0]
-
-
 def test_stored_tensors_are_detached() -> None:
     table = Table(NUMBER)
     table.append(number=torch.ones(2, requires_grad=True) * 2)
@@ -48,9 +41,9 @@ def test_stored_tensors_are_detached() -> None:
 
 def test_mismatched_columns_are_refused() -> None:
     table = Table(PLACES)
-    with pytest.raises(ValueError, match="differ in length"):
+    with pytest.raises(ValueError, match="the columns have 2 to 3 rows"):
         table.append(number=torch.zeros(2, dtype=torch.int64), place=torch.zeros(3, 3))
-    with pytest.raises(ValueError, match="columns are"):
+    with pytest.raises(ValueError, match="missing or unknown columns: place"):
         table.append(number=torch.zeros(2, dtype=torch.int64))
     with pytest.raises(ValueError, match="column place"):
         table.append(number=torch.zeros(2, dtype=torch.int64), place=torch.zeros(2, 4))

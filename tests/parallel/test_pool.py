@@ -133,15 +133,6 @@ def test_a_killed_worker_is_reported_once(pool: WorkerPool) -> None:
         assert pool.submit(torch.eye(2)) is None
 
 
-@pytest.mark.usefixtures("start_method")
-def test_a_worker_that_cannot_make_its_function_is_reported() -> None:
-    with WorkerPool(1, fail, FrameError("it has no task")) as pool:
-        wait_until_ready(pool)
-        pool._workers[0].process.join(PATIENCE)
-        with pytest.warns(UserWarning, match="died; continuing without it"):
-            assert pool.submit() is None
-
-
 def test_a_new_interpreter_killed_while_it_starts_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
     with WorkerPool(1, multiplier, torch.ones(1)) as pool:

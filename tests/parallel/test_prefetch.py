@@ -23,7 +23,6 @@ from tests.cli.test_cli import write_tum_folder
 from tests.data.mp4 import write_mp4
 from tests.parallel.test_pool import PATIENCE, wait_until_ready
 from torchslam import Features, Frame, load_config
-from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.errors import FrameError
@@ -129,18 +128,6 @@ def test_few_frames_are_requested_ahead() -> None:
         assert sorted(frames._requested) == [*range(12, 20)]
 
 
-def test_a_worker_that_has_not_started_is_not_waited_for(
-    sequence: Sequence, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("torchslam.parallel.pool.can_fork", lambda: False)
-    with ahead(sequence) as frames:
-        start = time.monotonic()
-        assert not check_same(frames, sequence, 0)
-        assert time.monotonic() - start < 1  # torch alone takes longer to import
-        assert frames._requested == {}
-    assert multiprocessing.active_children() == []
-
-
 @pytest.mark.usefixtures("patient")
 def test_the_run_continues_without_a_killed_worker(sequence: Sequence) -> None:
     with ahead(sequence) as frames:
@@ -151,40 +138,6 @@ def test_the_run_continues_without_a_killed_worker(sequence: Sequence) -> None:
         with pytest.warns(UserWarning, match="died; continuing without it"):
             theirs = [check_same(frames, sequence, index) for index in range(2, FRAMES)]
     assert not all(theirs[4:])
-
-
-class Broken(Sequence):
-    """Fails as no frame should."""
-
-    def image(self, index: int) -> torch.Tensor:
-        if index == 2:
-            raise ZeroDivisionError("what is this?")
-        return torch.zeros(1, 1, *SIZE[::-1])
-
-    def image_name(self, index: int) -> str:
-        return f"broken#{index}"
-
-
-@pytest.mark.usefixtures("patient")
-def test_errors_are_raised_at_their_frame_and_the_worker_ends(sequence: Sequence) -> None:
-    broken = Broken("broken", "test", sequence.camera, torch.arange(5.0, dtype=torch.float64))
-    with ahead(broken) as frames:
-        assert [frames[index].index for index in range(2)] == [0, 1]
-        with pytest.raises(ZeroDivisionError) as raised:
-            frames[2]
-    assert "in image" in str(raised.value.__cause__)
-    assert multiprocessing.active_children() == []
-
-
-@pytest.mark.usefixtures("patient", "without_pictures")
-def test_one_or_two_processes_give_the_same_bytes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    outputs, folder = [tmp_path / "one", tmp_path / "two"], write_tum_folder(tmp_path / "room", frames=16)
-    for processes, output in enumerate(outputs, start=1):
-        assert main(["run", str(folder), "-o", str(output), *SET, "--processes", str(processes)]) == 0
-    assert "one process" not in capsys.readouterr().err
-    for name in ("trajectory.txt", "online.txt", "keyframes.txt", "map.safetensors", "map.ply"):
-        assert (outputs[0] / name).read_bytes() == (outputs[1] / name).read_bytes(), name
-    assert multiprocessing.active_children() == []
 
 
 RUN = """
@@ -304,17 +257,8 @@ def test_a_signal_to_the_process_group_ends_the_run_with_results(
     tmp_path: Path, method: str, number: int, status: int, when: str
 ) -> None:
     line = ["run", "synthetic:room?frames=50000&blank=1", "-o", str(tmp_path / "out"), *SET]
-    command = [
-        sys.executable,
-        "-c",
-        RUN,
-        method,
-        *line,
-        "--processes",
-        "2",
-        "--set",
-        "paper.unrefined=true",
-    ]
+    line += ["--processes", "2", "--set", "paper.unrefined=true"]
+    command = [sys.executable, "-c", RUN, method, *line]
     with (tmp_path / "err").open("w+") as errors:
         child = subprocess.Popen(command, stderr=errors, stdout=errors, start_new_session=True)
         until = time.monotonic() + PATIENCE

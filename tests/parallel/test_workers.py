@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-import torch
 
 from torchslam import load_config, open_sequence
 from torchslam.data.sequence import Sequence
@@ -127,17 +126,6 @@ def test_custom_components_stay_in_the_main_process() -> None:
     slam = SLAM(sequence.camera, CONFIG, extractor=OpenCVORB(300))
     assert who(sequence, slam, 3) == (type(sequence).__name__, True)
     assert "custom feature extractor" in prefetch_obstacle(sequence, slam)
-
-
-def test_more_processes_give_the_same_run() -> None:
-    """In a program of one's own, too."""
-    sequence = open_sequence("synthetic:room?frames=160").part(20, 38)
-    config = load_config(None, ["features.kind=opencv-orb", "features.num_keypoints=300"])
-    alone = SLAM(sequence.camera, config).run(sequence)
-    assert alone.map.num_keyframes > 1
-    several = SLAM(sequence.camera, config).run(sequence, processes=3)
-    assert [result.reason for result in several.results] == [result.reason for result in alone.results]
-    assert torch.equal(several.trajectory.T_wc, alone.trajectory.T_wc)
 
 
 @pytest.mark.usefixtures("no_processes")

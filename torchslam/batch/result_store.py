@@ -19,8 +19,8 @@ import torchslam
 from torchslam.data.synthetic import is_synthetic
 from torchslam.data.text_file import read_object
 from torchslam.errors import ResultsError, SequenceError, TorchslamError
+from torchslam.utils.console import printable, without_credentials
 from torchslam.utils.files import fingerprint, whole_folder, write_whole
-from torchslam.utils.text import printable, without_credentials
 
 RUNS = "runs"
 ERRORS = "errors"

@@ -14,8 +14,8 @@ from torchslam.batch.result_store import DONE, ERROR, NO_MAP, RUNS, Columns, rea
 from torchslam.batch.task import TIMES, Task, configuration
 from torchslam.data.text_file import read_object
 from torchslam.errors import ResultsError, TorchslamError
+from torchslam.utils.console import without_credentials
 from torchslam.utils.files import write_whole
-from torchslam.utils.text import without_credentials
 
 CSV = "table.csv"
 PARQUET = "table.parquet"

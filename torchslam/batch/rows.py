@@ -16,7 +16,7 @@ from torchslam.data.formats.csv_tables import read_cells
 from torchslam.data.synthetic import is_synthetic
 from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, parse_number
 from torchslam.errors import ConfigError, SequenceError
-from torchslam.utils.text import without_credentials
+from torchslam.utils.console import without_credentials
 
 MAX_BYTES = 1 << 26
 """Of a list: about half a million rows of a hundred characters."""

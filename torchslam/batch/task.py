@@ -33,7 +33,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.data.trajectories import read_trajectory
 from torchslam.data.transforms import WithGroundTruth
 from torchslam.errors import SequenceError
-from torchslam.global_mapping.learned_links import learned_config
+from torchslam.global_mapping.links import learned_config
 from torchslam.global_mapping.mapper import mapping_config
 from torchslam.global_mapping.recording import run_recording
 from torchslam.io.report import compute_metrics
@@ -43,8 +43,8 @@ from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.front_end import source
 from torchslam.system.online_run import OnlineRun
 from torchslam.system.slam import SLAM
+from torchslam.utils.console import without_credentials
 from torchslam.utils.files import fingerprint
-from torchslam.utils.text import without_credentials
 
 TIMES = "times.json"
 TIMED = ("fps", "ms_median", "ms_p95", "ms_longest", "stage_ms")

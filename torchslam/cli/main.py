@@ -17,8 +17,7 @@ from typing import Any, NoReturn
 
 import torchslam
 from torchslam.errors import TorchslamError
-from torchslam.utils.console import say, with_install_hint
-from torchslam.utils.text import printable, without_credentials
+from torchslam.utils.console import printable, say, with_install_hint, without_credentials
 
 ERROR = 2
 """Exit status of an error, as of argparse."""

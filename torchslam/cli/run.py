@@ -23,8 +23,7 @@ from pathlib import Path
 
 import torch
 
-from torchslam.calibration.find_camera import ROUGH_STD, find_camera, with_stated_std
-from torchslam.calibration.from_pairs import NUM_KEYPOINTS
+from torchslam.calibration.find_camera import NUM_KEYPOINTS, ROUGH_STD, find_camera, with_stated_std
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
 from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
@@ -35,7 +34,7 @@ from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.camera_measurement import may_be_same
-from torchslam.global_mapping.learned_links import learned_config
+from torchslam.global_mapping.links import learned_config
 from torchslam.global_mapping.mapper import features_to_keep, mapping_config
 from torchslam.global_mapping.recording import Mapping, run_recording
 from torchslam.io.export.mesh import import_open3d
@@ -60,7 +59,7 @@ from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 from torchslam.utils.console import say, table, warn
-from torchslam.utils.usage import cpu_seconds, peak_memory_mb
+from torchslam.utils.timing import cpu_seconds, peak_memory_mb
 
 DONE = 0
 """Exit status with a map."""

@@ -17,8 +17,8 @@ from typing import Any, ClassVar, TypeVar, get_type_hints
 
 from torchslam.errors import ConfigError
 from torchslam.plugins import ALLOWED, is_code_of_others, is_known, registered
+from torchslam.utils.console import is_unicode
 from torchslam.utils.files import read_text
-from torchslam.utils.text import is_unicode
 
 Value = TypeVar("Value", bool, int, float, str)
 Section = TypeVar("Section", bound="Settings")

@@ -28,7 +28,7 @@ from torchslam.data.sequence import Need, Reader, Sequence, exhaust
 from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
 from torchslam.data.transforms import Masked, cut, need, reduce_rate, resize
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
-from torchslam.utils.text import without_credentials
+from torchslam.utils.console import without_credentials
 
 # The first match is used: readers of specific layouts precede those of plain images.
 READERS = (

@@ -19,7 +19,7 @@ from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Features, Frame, Trajectory
-from torchslam.utils.text import printable, without_credentials
+from torchslam.utils.console import printable, without_credentials
 
 MAX_ASPECT_TERM = 100
 """Largest number in the ratio of the sides of a pixel, as it is shown."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.global_mapping.depth_ratios import (
+from torchslam.global_mapping.baselines import (
     MIN_PARALLAX_SIGMAS,
     Array,
     PairDepths,
@@ -152,14 +152,9 @@ class MapCheck:
 
     def doubting(self, frames: Collection[int]) -> MapCheck:
         """The same check with these frames among those that are not certain."""
-        doubted = sorted(set(self.certain) & set(frames))
-        if not doubted:
-            return self
-        return replace(
-            self,
-            certain=tuple(frame for frame in self.certain if frame not in doubted),
-            uncertain=tuple(sorted([*self.uncertain, *doubted])),
-        )
+        doubted = set(self.certain) & set(frames)
+        certain = tuple(frame for frame in self.certain if frame not in doubted)
+        return replace(self, certain=certain, uncertain=tuple(sorted([*self.uncertain, *doubted])))
 
     def sentence(self) -> str:
         """The check in a sentence."""
@@ -175,14 +170,26 @@ class MapCheck:
 
 
 @dataclass(frozen=True)
-class _Triplet:
-    first: int
-    middle: int
-    last: int
-    log_ratio: float  # of scales, later pair to earlier one
-    std: float
-    agrees: bool
-    pairs: tuple[int, int]
+class _Triplets:
+    """Pairs that share an image and determine a ratio of scales.
+
+    Attributes:
+        images: the first, the shared and the last one.
+        pairs: rows of the earlier and of the later pair.
+        log_ratio: of scales, later pair to earlier one, with its standard error `std`.
+        untold: number of triplets with an image without a pose.
+    """
+
+    images: NDArray[np.int64]
+    pairs: NDArray[np.int64]
+    log_ratio: Array
+    std: Array
+    untold: int
+
+    @property
+    def agrees(self) -> NDArray[np.bool_]:
+        """Which of the scales are the same."""
+        return np.abs(self.log_ratio) < MAX_SCALE_ERROR + 2 * self.std
 
 
 def check_map(
@@ -209,7 +216,7 @@ def check_map(
     """
     posed = known.tolist()
     T_cw = T_cw.to(camera.params)
-    rays = ViewRays.by(camera, views)
+    rays = ViewRays(camera, views)
     ends = torch.tensor(
         [(pair.first, pair.second) for pair in pairs], dtype=torch.int64, device=T_cw.device
     ).view(-1, 2)
@@ -227,7 +234,7 @@ def check_map(
     ]
     agrees = [distance < limit for distance in distances]
     unused = range(len(pairs)) if held_back is None else sorted(held_back)
-    triplets, untold = _triplets(depths, pairs, posed, agrees)
+    triplets = _triplets(depths, pairs, posed, agrees)
     breaks, parts = _breaks(posed, pairs, agrees, triplets, views, links)
     evidence = _evidence(np.array(distances) / reduction, triplets)
     largest = max(parts, key=len, default=[])
@@ -236,8 +243,8 @@ def check_map(
         len(views),
         len(unused),
         sum(agrees[row] for row in unused),
-        len(triplets) + untold,
-        sum(triplet.agrees for triplet in triplets),
+        len(triplets.std) + triplets.untold,
+        int(triplets.agrees.sum()),
         sum(agrees) / len(agrees) if agrees else 0.0,
         float(np.median([distances[row] for row in unused])) if len(unused) else 0.0,
         torch.from_numpy(evidence[list(unused)]),
@@ -267,17 +274,14 @@ def _median_depth(depths: Collection[PairDepths]) -> float:
 
 def _triplets(
     depths: dict[int, PairDepths], pairs: Sequence[ViewPair], posed: Sequence[bool], agrees: Sequence[bool]
-) -> tuple[list[_Triplet], int]:
-    """The triplets of agreeing pairs that determine a ratio of scales; the number of those with an unposed image.
-
-    Depths by wrong relative poses are meaningless.
-    """
+) -> _Triplets:
+    """The triplets of agreeing pairs that determine a ratio: depths by wrong relative poses are meaningless."""
     before: dict[int, list[int]] = {}
     after: dict[int, list[int]] = {}
     for row, pair in enumerate(pairs):
         after.setdefault(pair.first, []).append(row)
         before.setdefault(pair.second, []).append(row)
-    found, untold = [], 0
+    images, rows, ratios, untold = [], [], [], 0
     for middle in sorted(before.keys() & after.keys()):
         for one, other in product(before[middle], after[middle]):
             if one not in depths or other not in depths:
@@ -285,30 +289,27 @@ def _triplets(
                 continue
             ratio = depth_ratio(depths[one], 1, depths[other], 0) if agrees[one] and agrees[other] else None
             if ratio is not None and ratio.std < MAX_RATIO_STD:
-                is_one = abs(ratio.log_ratio) < MAX_SCALE_ERROR + 2 * ratio.std
-                spans = pairs[one].first, middle, pairs[other].second
-                found.append(_Triplet(*spans, ratio.log_ratio, ratio.std, is_one, (one, other)))
-    return found, untold
+                images.append((pairs[one].first, middle, pairs[other].second))
+                rows.append((one, other))
+                ratios.append(ratio)
+    log_ratio, std = np.array(ratios, dtype=np.float64).reshape(-1, 2).T
+    spans = np.array(images, dtype=np.int64).reshape(-1, 3)
+    return _Triplets(spans, np.array(rows, dtype=np.int64).reshape(-1, 2), log_ratio, std, untold)
 
 
-def _evidence(distances_px: Array, triplets: Sequence[_Triplet]) -> Array:
+def _evidence(distances_px: Array, triplets: _Triplets) -> Array:
     """For each pair, how much better than chance a map predicts it: logarithms of likelihood ratios, 0 at least.
 
-    Args:
-        distances_px: median distances of the matches of pairs from where the map allows them; infinite without a pose.
-        triplets: that determine a ratio of scales.
+    distances_px: median distances of the matches of pairs from where the map allows them; infinite without a pose
     """
     found = _likelihood_ratio(distances_px, PAIR_STD_PX, CHANCE_PX)
-    sums, counts = np.zeros_like(found), np.zeros_like(found)
-    for each in triplets:
-        ratio = _likelihood_ratio(np.array(each.log_ratio), math.hypot(RATIO_STD, each.std), CHANCE_LOG_RATIO)
-        for row in each.pairs:
-            sums[row] += ratio
-            counts[row] += 1
+    ratios = _likelihood_ratio(triplets.log_ratio, np.hypot(RATIO_STD, triplets.std), CHANCE_LOG_RATIO)
+    counts = np.bincount(triplets.pairs.ravel(), minlength=len(found))
+    sums = np.bincount(triplets.pairs.ravel(), ratios.repeat(2), minlength=len(found))
     return found + sums / np.maximum(counts, 1)
 
 
-def _likelihood_ratio(errors: Array, std: float, chance: float) -> Array:
+def _likelihood_ratio(errors: Array, std: float | Array, chance: float) -> Array:
     """Logarithm of the likelihood of normal errors among some by chance, to that of errors by chance alone.
 
     chance: width of the range in which errors by chance are equally probable
@@ -321,7 +322,7 @@ def _breaks(
     posed: Sequence[bool],
     pairs: Sequence[ViewPair],
     agrees: Sequence[bool],
-    triplets: Sequence[_Triplet],
+    triplets: _Triplets,
     views: Sequence[FrameFeatures],
     links: ScaleLinks | None,
 ) -> tuple[tuple[Break, ...], list[list[int]]]:
@@ -332,16 +333,13 @@ def _breaks(
     good = np.array([agrees[row] for row in told], dtype=bool)
     sizes = np.array([len(pairs[row]) for row in told])
     near = ends[:, 1] - ends[:, 0] < FAR
-    spans = np.array([(each.first, each.middle, each.last) for each in triplets], dtype=np.int64)
-    spans = spans.reshape(-1, 3)
-    right = np.array([each.agrees for each in triplets], dtype=bool)
-    ratios = np.array([each.log_ratio for each in triplets])
+    spans, right = triplets.images, triplets.agrees
 
     def disagree(chosen: NDArray[np.bool_], agreeing: NDArray[np.bool_]) -> bool:
         return bool(np.count_nonzero(chosen) >= MIN_SPANNING and agreeing[chosen].mean() < MIN_AGREEING)
 
-    apart: list[tuple[int, Break]] = []
-    stretches = [[rows[0]]] if rows else []
+    apart: list[Break] = []
+    stretch_of = np.zeros(len(posed), dtype=np.int64)
     for before, after in pairwise(rows):
         crossing = near & (ends[:, 0] <= before) & (ends[:, 1] >= after)
         around = spans[:, 1] == before
@@ -353,77 +351,59 @@ def _breaks(
         elif links is not None and links.weakest(views[before].index, views[after].index) > MAX_LINK_STD:
             kind = BreakKind.UNKNOWN
         elif disagree(around, right):
-            kind, ratio = BreakKind.SCALE, math.exp(float(np.median(ratios[around])))
-        if kind is None:
-            stretches[-1].append(after)
-            continue
-        stretches.append([after])
-        apart.append((len(stretches) - 1, Break(views[before].index, views[after].index, kind, ratio)))
-    label = _tied(stretches, len(posed), ends, good * sizes, sizes, spans, right)
-    breaks = [found for later, found in apart if label[later - 1] != label[later]]
+            kind, ratio = BreakKind.SCALE, math.exp(float(np.median(triplets.log_ratio[around])))
+        if kind is not None:
+            apart.append(Break(views[before].index, views[after].index, kind, ratio))
+        stretch_of[after] = len(apart)
+    label = _tied(stretch_of, len(apart) + 1, ends, good * sizes, sizes, triplets)
+    breaks = [found for number, found in enumerate(apart) if label[number] != label[number + 1]]
     if disagree(~near, good):
         first, last = ends[~near & ~good][0].tolist()
         breaks.append(Break(views[first].index, views[last].index, BreakKind.LOOP))
-    parts = [
-        [row for stretch, own in zip(stretches, label, strict=True) if own == part for row in stretch]
-        for part in dict.fromkeys(label)
-    ]
-    return tuple(sorted(breaks, key=lambda each: each.before)), parts
+    parts: dict[int, list[int]] = {}
+    for row in rows:
+        parts.setdefault(int(label[stretch_of[row]]), []).append(row)
+    return tuple(sorted(breaks, key=lambda each: each.before)), list(parts.values())
 
 
 def _tied(
-    stretches: Sequence[Sequence[int]],
-    images: int,
+    stretch_of: NDArray[np.int64],
+    count: int,
     ends: NDArray[np.int64],
     agreeing: NDArray[np.int64],
     matches: NDArray[np.int64],
-    spans: NDArray[np.int64],
-    right: NDArray[np.bool_],
-) -> list[int]:
+    triplets: _Triplets,
+) -> NDArray[np.int64]:
     """The part that each stretch belongs to: two are one where nearly all pairs and triplets between them agree.
 
     The two parts that the most right triplets tie are joined first; then all is counted anew.
 
     Args:
-        stretches: images of each.
-        images: number of images.
-        ends: images of pairs, both in some stretch.
-        agreeing: matches of the pairs, zero where the pair does not agree.
-        matches: matches of the pairs.
-        spans: images of triplets.
-        right: whether their ratios of scales agree.
+        stretch_of: stretch of each image, of `count` ones.
+        ends: images of pairs, both in some stretch, with the numbers of their `matches` and of those `agreeing`.
+        triplets: of which each tells of both of its pairs.
     """
-    label = list(range(len(stretches)))
-    stretch_of = np.zeros(images, dtype=np.int64)
-    for number, stretch in enumerate(stretches):
-        stretch_of[list(stretch)] = number
-    sides = np.concatenate([spans[:, :2], spans[:, 1:]])  # the pairs of each triplet
-    ratios = np.concatenate([right, right]).astype(np.float64)
+
+    def between(images: NDArray[np.int64], values: NDArray[Any]) -> Array:
+        """(count, count) sums over pairs of images between two stretches."""
+        one, other = stretch_of[images].T
+        cells = one * count + other
+        sums = np.bincount(cells, values, count * count).reshape(count, count)
+        return np.asarray(sums + sums.T, dtype=np.float64)
+
+    sides = np.concatenate([triplets.images[:, :2], triplets.images[:, 1:]])
+    right = np.tile(triplets.agrees, 2)
+    sums = np.stack(
+        [between(ends, agreeing), between(sides, right), between(ends, matches), between(sides, right | True)]
+    )
+    label = np.arange(count)
     while True:
-        part = np.array(label)[stretch_of] if label else stretch_of
-        by_pairs, by_triplets = part[ends], part[sides]
-        tied = _shares(by_pairs, agreeing, matches, len(label))
-        counts = _shares(by_triplets, ratios, np.ones(len(ratios)), len(label))
-        able = [
-            (counts[key][0], key)
-            for key in counts.keys() & tied.keys()
-            if counts[key][0] >= MIN_SPANNING and all(whole[key][1] >= TIED for whole in (tied, counts))
-        ]
-        if not able:
+        shares = np.divide(sums[:2], sums[2:], out=np.zeros((2, count, count)), where=sums[2:] > 0)
+        able = np.triu((shares >= TIED).all(axis=0) & (sums[1] >= MIN_SPANNING), 1)
+        if not able.any():
             return label
-        _, (one, other) = max(able, key=lambda each: (each[0], -each[1][0], -each[1][1]))
-        label = [one if own == other else own for own in label]
-
-
-def _shares(
-    parts: NDArray[np.int64], agreeing: NDArray[Any], whole: NDArray[Any], count: int
-) -> dict[tuple[int, int], tuple[float, float]]:
-    """What agrees between two different parts, and its share, by their numbers, the lower one first."""
-    low, high = parts.min(axis=1), parts.max(axis=1)
-    across = low != high
-    keys, which = np.unique(low[across] * count + high[across], return_inverse=True)
-    sums = np.bincount(which, agreeing[across]), np.bincount(which, whole[across])
-    return {
-        (int(key) // count, int(key) % count): (agrees, agrees / every)
-        for key, agrees, every in zip(keys, *(each.tolist() for each in sums), strict=True)
-    }
+        one, other = np.unravel_index(np.where(able, sums[1], -1.0).argmax(), able.shape)
+        label[label == other] = one
+        sums[:, one] += sums[:, other]
+        sums[:, :, one] += sums[:, :, other]
+        sums[:, other] = sums[:, :, other] = 0

@@ -15,17 +15,20 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError
-from torchslam.geometry import Camera, SensorModel, so3_log
+from torchslam.geometry import Camera, SensorModel, rigid, so3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
-from torchslam.global_mapping.chained_positions import chained_positions
+from torchslam.global_mapping.baselines import chained_positions
 from torchslam.global_mapping.check import MapCheck, check_map
-from torchslam.global_mapping.frames_between import FramePoser
-from torchslam.global_mapping.learned_links import (
+from torchslam.global_mapping.frames_between import pose_frames
+from torchslam.global_mapping.links import (
     MIN_LEARNED_MATCHES,
     LearnedPairs,
+    Links,
     learned_config,
     open_links,
+    pairs_across,
+    strengthen,
     with_learned,
 )
 from torchslam.global_mapping.rounds import (
@@ -36,7 +39,7 @@ from torchslam.global_mapping.rounds import (
     adjust_in_rounds,
 )
 from torchslam.global_mapping.saved_stages import SavedStages
-from torchslam.global_mapping.tracks import join_matches, make_map
+from torchslam.global_mapping.tracks import make_map
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
     Relation,
@@ -44,8 +47,7 @@ from torchslam.global_mapping.view_graph import (
     build_view_graph,
     connected_views,
 )
-from torchslam.global_mapping.weak_links import pairs_across, strengthen
-from torchslam.map.atlas import Atlas, Submap
+from torchslam.map.atlas import Atlas
 from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.model_choice import predictive_gain
@@ -61,7 +63,7 @@ from torchslam.system.front_end import (
 )
 from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher, prepare_view
-from torchslam.types import Explanation, Frame, FrameFeatures, Matcher, Reason, State, StepResult
+from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
 
 SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 """Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
@@ -81,7 +83,6 @@ HELD_BACK_DISTANCE = 2
 SAVED_TOGETHER = 50
 """Images whose features are saved in one file, 80 MB. So many, some seconds of work, are lost when a run is killed.
 Tried at this value only."""
-
 
 Progress = Callable[[str, int, int], None]
 """Called with the name of a stage, what is done of it, and all that is to be done."""
@@ -129,17 +130,17 @@ Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
 def mapping_config(config: Config) -> Config:
     """The configuration of global mapping: SIFT in place of the default features, unless others were chosen."""
     settings = config.global_mapping
-    features = config.features
-    if features.kind != Config().features.kind:
+    if config.features.kind != Config().features.kind:
         return config
+    features = replace(
+        config.features,
+        kind="sift",
+        num_keypoints=settings.num_keypoints,
+        max_image_pixels=settings.max_image_pixels,
+    )
     return replace(
         config,
-        features=replace(
-            features,
-            kind="sift",
-            num_keypoints=settings.num_keypoints,
-            max_image_pixels=settings.max_image_pixels,
-        ),
+        features=features,
         matching=replace(config.matching, max_ratio=SIFT_RATIO, max_cosine_distance=SIFT_DISTANCE),
     )
 
@@ -159,13 +160,7 @@ def features_to_keep(
 
 
 def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
-    """The frames that are mapped: evenly over the recording, and all where tracking was lost or doubtful.
-
-    Args:
-        count: number of frames.
-        results: of an online run, if there was one.
-        most: largest number of frames, of those that are spread evenly.
-    """
+    """The frames that are mapped: at most so many evenly over the recording, and all that were lost or uncertain."""
     stride = -(-count // most)
     chosen = set(range(0, count, stride))
     doubtful = [result.index for result in results if result.state in (State.LOST, State.UNCERTAIN)]
@@ -184,7 +179,6 @@ class GlobalMapper:
         given: the camera with its error; None: it is exact.
         device: of torch.
         extractor: feature extractor; the configured one if None.
-        matcher: of two views; the configured one if None.
         progress: receives stages.
         saved: the costly stages of a run that was ended, and of this one; None: they are not saved.
         kept: features that were extracted before, by `features_to_keep`; None: there are none.
@@ -198,7 +192,6 @@ class GlobalMapper:
         given: CameraMeasurement | None,
         device: torch.device | str = "cpu",
         extractor: FeatureExtractor | None = None,
-        matcher: Matcher | None = None,
         progress: Progress = lambda stage, done, most: None,
         saved: SavedStages | None = None,
         kept: KeptFeatures | None = None,
@@ -210,7 +203,7 @@ class GlobalMapper:
         self.extract: Extractor | None = None
         if not self.sequence.brings_features:
             self.extract = kept or image_extractor(self.config, device, extractor)
-        self.matcher = make_matcher(self.config.matching, matcher, camera.size, self.config.features.kind)
+        self.matcher = make_matcher(self.config.matching, None, camera.size, self.config.features.kind)
         self.progress = progress
         self.saved = saved or SavedStages(None, self.sequence, config)
         self.skipped: list[str] = []
@@ -220,9 +213,8 @@ class GlobalMapper:
     def run(self, results: Rows[StepResult] = (), before: Run | None = None) -> GlobalMap:
         """Map the recording.
 
-        Args:
-            results: of an online run over it, whose doubtful frames are mapped as well.
-            before: that run, whose readout and velocities correct keypoints for a rolling shutter.
+        results: of an online run over it, whose doubtful frames are mapped as well
+        before: that run, whose readout and velocities correct keypoints for a rolling shutter
         """
         if learned_config(self.config) is not None and self.extract is None:
             raise ConfigError(
@@ -234,8 +226,8 @@ class GlobalMapper:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
             return self._failed(f"no map: {len(views)} images are too few", views, [])
-        matcher = self.saved.matcher(PairMatcher(views, self.camera, self.matcher, self.config))
-        pairs = build_view_graph(matcher, lambda done, most: self.progress("matches", done, most))
+        matcher = PairMatcher(views, self.camera, self.matcher, self.config)
+        pairs = build_view_graph(matcher, partial(self.progress, "matches"), self.saved.pairs)
         held_back = choose_held_back(pairs)
         used = [pair for row, pair in enumerate(pairs) if row not in held_back]
         found = self.reconstruct(views, used)
@@ -265,19 +257,13 @@ class GlobalMapper:
         pairs: list[ViewPair],
         held_back: frozenset[int],
     ) -> MapCheck:
-        """The check of a reconstruction by pairs of images."""
         rows, _, found = made
         known = torch.zeros(len(views), dtype=torch.bool, device=rows.device).index_fill(0, rows, True)
         reduction = self.config.features.reduction(self.camera.size)
         return check_map(found.T_cw, known, views, pairs, found.camera, held_back, reduction)
 
-    def _learned(
-        self, views: list[FrameFeatures], links: Rows[tuple[list[int], list[int]]], before: Run | None
-    ) -> LearnedPairs | None:
-        """Views and pairs with learned features around links; None if not asked for, or if nothing holds.
-
-        Their keypoints are corrected for a rolling shutter by the run `before`, as those of the views are.
-        """
+    def _learned(self, views: list[FrameFeatures], links: Links, before: Run | None) -> LearnedPairs | None:
+        """Views and pairs with learned features around links; None if not asked for, or if nothing holds."""
         config = learned_config(self.config)
         if config is None or not links:
             return None
@@ -286,7 +272,7 @@ class GlobalMapper:
         found: dict[int, FrameFeatures] = {}
         for row in sorted({row for pair in ends for row in pair}):
             self.progress("learned features", len(found), len(views))
-            view = next(own.views([views[row].index]))
+            view = own.view(views[row].index)
             if view is not None:
                 found[row] = view if before is None else before.at_middle_row([view])[0]
         matcher = PairMatcher(
@@ -302,14 +288,8 @@ class GlobalMapper:
     ) -> Reconstructed | str:
         """Rotations, positions and rounds of adjustment of the largest connected set of views.
 
-        Args:
-            views: features of the images.
-            pairs: verified pairs of them.
-            learned: more keypoints of the same images, with verified pairs.
-
-        Returns:
-            Rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason why there
-            is no map.
+        Returns the rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason
+        why there is no map. `learned`: more keypoints of the same images, with verified pairs.
         """
         self.progress("rotations", 0, 1)
         device = self.camera.params.device
@@ -330,25 +310,21 @@ class GlobalMapper:
         held = (off < MAX_ROTATION_ERROR_RAD).tolist()
         own = sum(held[:own])
         pairs = [pair for pair, holds in zip(pairs, held, strict=True) if holds]
-        general = sum(pair.relation is Relation.GENERAL for pair in pairs)
-        if general < MIN_GENERAL * len(pairs):
-            return (
-                f"no map: the camera stands still, only turns, or sees a plane in {len(pairs) - general} of "
-                f"{len(pairs)} pairs of images"
-            )
+        others = sum(pair.relation is not Relation.GENERAL for pair in pairs)
+        if len(pairs) - others < MIN_GENERAL * len(pairs):
+            about = f"{others} of {len(pairs)} pairs of images"
+            return f"no map: the camera stands still, only turns, or sees a plane in {about}"
         rows = connected_views(pairs, len(views))
         connected = set(rows.tolist())
         own = sum(pair.first in connected for pair in pairs[:own])
         pairs = [pair for pair in pairs if pair.first in connected]
-        observed = self._tracks(pairs, views)
+        observed = ObservedTracks.join(pairs, views)
         if observed.tracks.count == 0:
             return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
         self.progress("positions", 0, 1)
-        T_cw = torch.eye(4, dtype=R_21.dtype, device=device).repeat(len(views), 1, 1)
-        T_cw[:, :3, :3] = average.R_cw
         camera = self.camera if self.given is None else self.given.camera
         centers_w = chained_positions(pairs, average.R_cw, views, self.camera)
-        T_cw[:, :3, 3] = -(average.R_cw @ centers_w[..., None])[..., 0]
+        T_cw = rigid(average.R_cw, -(average.R_cw @ centers_w[..., None])[..., 0])
         self.progress("adjustment", 0, 1)
 
         def log(words: str) -> None:
@@ -358,19 +334,12 @@ class GlobalMapper:
         matcher = PairMatcher(plain, self.camera, self.matcher, self.config)
         self.progress("weak links", 0, 1)
         stronger = strengthen(matcher, pairs[:own], coarse.T_cw, coarse.camera)
-        observed = self._tracks(stronger + pairs[own:], views)
+        observed = ObservedTracks.join(stronger + pairs[own:], views)
         found = adjust_in_rounds(observed, coarse.T_cw, self.given, coarse.camera, False, log)
         seen = torch.unique(observed.tracks.view[found.agrees])
         if len(seen) < MIN_VIEWS:
             return f"no map: {len(views)} images agree on no points; the camera may only turn"
         return seen, observed, found
-
-    @staticmethod
-    def _tracks(pairs: list[ViewPair], views: list[FrameFeatures]) -> ObservedTracks:
-        """The tracks of pairs that enough images see."""
-        tracks = join_matches(pairs, len(views), len(views[0].mask))
-        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
-        return ObservedTracks.of(tracks, views)
 
     def finish(
         self,
@@ -387,26 +356,26 @@ class GlobalMapper:
         Args:
             views: of the mapped images.
             rows: of the views that have a pose.
-            observed: the tracks.
-            found: poses, camera and points.
+            observed, found: the tracks, and poses, camera and points.
             frames: to be posed, all if None.
             given_cw: poses of these frames by another program, by frame.
             keep: keep poses and camera as they are, those of frames between as given, instead of adjusting them.
         """
         atlas = Atlas(self.camera.params)
         submap = atlas.create()
-        fill_submap(submap, views, rows, observed, found)
-        slam_map = submap.map
-        slam_map.set_noise(squared_errors(slam_map, slam_map.observations(), found.camera))
-        poser = FramePoser(SensorModel(found.camera, self.readout), self.config)
-        mapped = {view.index: view for view in views}
-        frames = range(len(self.sequence)) if frames is None else frames
-        results = poser.pose(submap, self._all_views(frames, mapped), given_cw)
-        final = FinalAdjustment(SensorModel(found.camera, self.readout), self.config, self.given)
+        tracks, former = observed.tracks.select(found.agrees)
+        row_of = torch.full((len(views),), -1, device=rows.device)
+        row_of[rows] = torch.arange(len(rows), device=rows.device)
+        tracks = replace(tracks, view=row_of[tracks.view])
+        own = [views[row] for row in rows.tolist()]
+        submap.map = make_map(own, found.T_cw[rows], tracks, found.points_w[former])
+        submap.map.set_noise(squared_errors(submap.map, submap.map.observations(), found.camera))
+        sensor = SensorModel(found.camera, self.readout)
+        every = self._all_views(range(len(self.sequence)) if frames is None else frames, views)
+        results = pose_frames(submap, every, sensor, self.config, given_cw)
+        final = FinalAdjustment(sensor, self.config, self.given)
         if not keep:
-            final.adjust(
-                atlas, 0, lambda done, most: self.progress("final adjustment", done, most), settled=True
-            )
+            final.adjust(atlas, 0, partial(self.progress, "final adjustment"), settled=True)
         return Run(
             tuple(atlas),
             final.sensor,
@@ -428,7 +397,7 @@ class GlobalMapper:
             found: list[FrameFeatures | None] = []
             for done, index in enumerate(own, len(views)):
                 self.progress("features", done, len(images))
-                found += self.views([index])
+                found.append(self.view(index))
             return found
 
         for start in range(0, len(images), SAVED_TOGETHER):
@@ -436,22 +405,17 @@ class GlobalMapper:
             views += self.saved.views(own, partial(find, own))
         return [view for view in views if view is not None]
 
-    def views(self, indices: Rows[int]) -> Iterator[FrameFeatures | None]:
-        """The features of frames; None for those that cannot be read, which are counted once."""
-        for index in indices:
-            try:
-                frame = self.sequence[index]
-                if frame.features is None or frame.image.numel():
-                    check_size(frame, self.camera)
-            except FrameError as error:
-                if str(error) not in self.skipped:
-                    warnings.warn(f"skipped a frame: {error}", stacklevel=2)
-                    self.skipped.append(str(error))
-                yield None
-                continue
-            yield self._view(frame)
-
-    def _view(self, frame: Frame) -> FrameFeatures:
+    def view(self, index: int) -> FrameFeatures | None:
+        """The features of a frame; None if it cannot be read, which is counted once."""
+        try:
+            frame = self.sequence[index]
+            if frame.features is None or frame.image.numel():
+                check_size(frame, self.camera)
+        except FrameError as error:
+            if str(error) not in self.skipped:
+                warnings.warn(f"skipped a frame: {error}", stacklevel=2)
+                self.skipped.append(str(error))
+            return None
         features = frame.features
         if self.extract is not None:
             with torch.inference_mode():
@@ -459,16 +423,14 @@ class GlobalMapper:
         assert features is not None
         return prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
 
-    def _all_views(self, frames: Rows[int], mapped: dict[int, FrameFeatures]) -> Iterator[FrameFeatures]:
+    def _all_views(self, frames: Rows[int], views: list[FrameFeatures]) -> Iterator[FrameFeatures]:
         """Frames in order, those that were mapped without extracting their features again."""
+        mapped = {view.index: view for view in views}
         for done, index in enumerate(frames):
             self.progress("frames between", done, len(frames))
-            if index in mapped:
-                yield mapped[index]
-                continue
-            for view in self.views([index]):
-                if view is not None:
-                    yield view
+            view = mapped[index] if index in mapped else self.view(index)
+            if view is not None:
+                yield view
 
     def _failed(self, reason: str, views: list[FrameFeatures], pairs: list[ViewPair]) -> GlobalMap:
         reasons = (Explanation.of(Reason.OTHER, text=reason),)
@@ -483,23 +445,6 @@ def choose_held_back(pairs: list[ViewPair]) -> frozenset[int]:
     """Rows of the pairs that mapping does not use: one in ten of those that are no direct neighbors in time."""
     far = [row for row, pair in enumerate(pairs) if pair.second - pair.first >= HELD_BACK_DISTANCE]
     return frozenset(far[HELD_BACK // 2 :: HELD_BACK])
-
-
-def fill_submap(
-    submap: Submap,
-    views: list[FrameFeatures],
-    rows: Int[Tensor, " K"],
-    observed: ObservedTracks,
-    found: Reconstruction,
-) -> None:
-    """Make the map of a submap from the posed views and the points with observations that agree."""
-    tracks, former = observed.tracks.select(found.agrees)
-    row_of = torch.full((len(views),), -1, device=rows.device)
-    row_of[rows] = torch.arange(len(rows), device=rows.device)
-    tracks = replace(tracks, view=row_of[tracks.view])
-    submap.map = make_map(
-        [views[row] for row in rows.tolist()], found.T_cw[rows], tracks, found.points_w[former]
-    )
 
 
 def poses_of(run: Run, views: list[FrameFeatures]) -> tuple[Float[Tensor, "K 4 4"], Tensor]:

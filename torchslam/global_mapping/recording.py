@@ -8,8 +8,6 @@ from enum import StrEnum
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
@@ -39,8 +37,8 @@ LOOP_MATCHES = 40
 
 UNMEASURED = "interrupted; `torchslam align` measures later"
 """Why an interrupted run has an arbitrary unit."""
-KeyframePairs = tuple[Float[Tensor, "K 4 4"], list[FrameFeatures], list[ViewPair]]
-"""Poses and features of keyframes, and their verified pairs."""
+KeyframePairs = tuple[list[FrameFeatures], list[ViewPair]]
+"""Features of keyframes, and their verified pairs."""
 
 
 class Mapping(StrEnum):
@@ -94,8 +92,7 @@ def run_recording(
         mapping: when to map as a whole; None: never, without a check, as of a live source or a known map.
         sources: of meters.
         device: of torch.
-        stages: as in `map_recording`.
-        features: as in `map_recording`.
+        stages, features: as in `map_recording`.
         all_frames: whether all frames are processed online, even after tracking was lost.
 
     Returns:
@@ -218,31 +215,25 @@ def check_run(run: Run, matched: KeyframePairs | None = None) -> MapCheck | None
     found = keyframe_pairs(run) if matched is None else matched
     if found is None:
         return None
-    T_cw, views, pairs = run.map.T_cw[run.map.keyframe_rows(run.session)], *found[1:]
-    known = torch.ones(len(views), dtype=torch.bool, device="cpu")
+    T_cw = run.map.T_cw[run.map.keyframe_rows(run.session)]
+    known = torch.ones(len(T_cw), dtype=torch.bool, device="cpu")
     reduction = run.config.features.reduction(run.camera.size)
-    links = scale_links(run.graph, run.session)
-    return check_map(T_cw, known, views, pairs, run.camera, None, reduction, links)
+    return check_map(T_cw, known, *found, run.camera, None, reduction, scale_links(run.graph, run.session))
 
 
 @torch.no_grad()
 def keyframe_pairs(run: Run) -> KeyframePairs | None:
-    """Poses and features of the keyframes of the main submap, and their verified pairs; None for fewer than three."""
+    """Features of the keyframes of the main submap, and their verified pairs; None for fewer than three."""
     rows = run.map.keyframe_rows(run.session).tolist()
     if len(rows) < 3 or run.config.features.kind == "simulated":
         return None
     views = [run.map.frame_features(row) for row in rows]
-    config = run.config
+    config, count = run.config, len(rows)
     matcher = make_matcher(config.matching, None, run.camera.size, config.features.kind)
-    near = [
-        (row, row + distance)
-        for row in range(len(rows))
-        for distance in CHECKED_DISTANCES
-        if row + distance < len(rows)
-    ]
+    near = [(row, row + step) for row in range(count) for step in CHECKED_DISTANCES if row + step < count]
     found = PairMatcher(views, run.camera, matcher, config).match(near + similar_places(views))
     pairs = [pair for pair in found if pair.second - pair.first < FAR or len(pair) >= LOOP_MATCHES]
-    return run.map.T_cw[rows], views, pairs
+    return views, pairs
 
 
 def with_doubts(run: Run, check: MapCheck | None) -> Run:
@@ -250,11 +241,9 @@ def with_doubts(run: Run, check: MapCheck | None) -> Run:
     if check is None or not check.uncertain:
         return run
     doubted, results = False, list[StepResult]()
-    uncertain = set(check.uncertain)
-    certain = set(check.certain)
+    doubts = dict.fromkeys(check.certain, False) | dict.fromkeys(check.uncertain, True)
     for result in run.results:
-        if result.index in uncertain or result.index in certain:
-            doubted = result.index in uncertain
+        doubted = doubts.get(result.index, doubted)
         if doubted and result.state is State.TRACKING:
             result = replace(result, state=State.UNCERTAIN, reasons=(Explanation(Reason.WEAK_LINK),))
         results.append(result)

@@ -21,11 +21,13 @@ from torchslam.geometry.robust import Kernel
 from torchslam.global_mapping.tracks import (
     MIN_PARALLAX,
     Tracks,
+    join_matches,
     largest_part,
     longest_tracks,
     parallax,
     triangulate_tracks,
 )
+from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import FrameFeatures
@@ -103,6 +105,13 @@ class ObservedTracks:
         )
         pixels, scales, information = columns
         return cls(tracks, pixels, KeypointNoise(scales, information).with_explicit_information())
+
+    @classmethod
+    def join(cls, pairs: list[ViewPair], views: list[FrameFeatures]) -> ObservedTracks:
+        """The tracks of the matches of pairs that at least `MIN_VIEWS` images see."""
+        tracks = join_matches(pairs, len(views), len(views[0].mask))
+        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
+        return cls.of(tracks, views)
 
     def select(self, keep: Bool[Tensor, " N"]) -> ObservedTracks:
         """Some of the tracks, renumbered."""

@@ -33,8 +33,7 @@ class Tracks:
 
     Attributes:
         track: number of the track of each observation, from 0 without gaps.
-        view: row of the image.
-        keypoint: row among its keypoints.
+        view, keypoint: rows of its image, and among the keypoints of that.
     """
 
     track: Int[Tensor, " O"]
@@ -66,10 +65,7 @@ class Tracks:
 def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
     """Join matches to tracks, their connected components, without observations by two keypoints of one image.
 
-    Args:
-        pairs: verified.
-        views: number of images.
-        keypoints: number of keypoints of an image.
+    `views` and `keypoints`: number of images, and of the keypoints of each.
     """
     none = torch.zeros(0, dtype=torch.int64, device=pairs[0].keypoints_1.device if pairs else "cpu")
     one = torch.cat([none, *(pair.first * keypoints + pair.keypoints_1 for pair in pairs)])
@@ -86,13 +82,9 @@ def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
 def largest_part(
     tracks: Tracks, agrees: Bool[Tensor, " O"], views: int, least_shared: int
 ) -> Bool[Tensor, " {views}"]:
-    """The largest set of images that shared points hold together.
+    """The largest set of images that points hold together, by the observations that agree.
 
-    Args:
-        tracks: observations of points.
-        agrees: those that count.
-        views: number of images.
-        least_shared: points that two images must share, each seen by no image between them, to hold together.
+    least_shared: points that two images must share, each seen by no image between them, to hold together
     """
     track, view = tracks.track[agrees], tracks.view[agrees]
     follows = track[1:] == track[:-1]
@@ -128,8 +120,7 @@ def triangulate_tracks(
 
     Args:
         tracks: N of them.
-        rays_w: unit directions of the observations.
-        centers_w: where they begin.
+        rays_w, centers_w: unit directions of the observations, and where they begin.
         tolerance_rad: angle to the point up to which an observation agrees.
     """
     length = tracks.lengths

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
+from functools import partial
 
 import torch
 from jaxtyping import Float, Int
@@ -103,14 +104,11 @@ class PairMatcher:
         held: dict[int, ViewPair] = {}
         for start in range(0, len(order), _PAIRS_AT_ONCE):
             rows = order[start : start + _PAIRS_AT_ONCE]
-            held |= {
-                row: pair
-                for row, pair in zip(rows, self._verified([found[row] for row in rows]), strict=True)
-                if pair is not None
-            }
+            held |= {rows[at]: pair for at, pair in self._verified([found[row] for row in rows]).items()}
         return [held[row] for row in sorted(held)]
 
-    def _verified(self, found: list[tuple[int, int, Tensor, Tensor]]) -> list[ViewPair | None]:
+    def _verified(self, found: list[tuple[int, int, Tensor, Tensor]]) -> dict[int, ViewPair]:
+        """The pairs that hold, by their place in a batch."""
         size = max(len(at_1) for _, _, at_1, _ in found)
         pixels = self.camera.params.new_zeros(2, len(found), size, 2)
         mask = torch.zeros(len(found), size, dtype=torch.bool, device=pixels.device)
@@ -130,31 +128,33 @@ class PairMatcher:
             kernel="truncated",
             min_samples=_MIN_SAMPLES,
         )
-        pairs: list[ViewPair | None] = []
+        pairs = {}
         for row, (one, other, at_1, at_2) in enumerate(found):
             inliers = relative.inliers[row, : len(at_1)]
-            count = int(inliers.sum())
-            if count < MIN_MATCHES or count < MIN_RATIO * len(at_1):
-                pairs.append(None)
+            if int(inliers.sum()) < max(MIN_MATCHES, MIN_RATIO * len(at_1)):
                 continue
             relation = Relation.GENERAL if bool(relative.success[row]) else Relation.PLANE
             relation = Relation.ROTATION if relative.model[row] == "rotation" else relation
-            pairs.append(ViewPair(one, other, at_1[inliers], at_2[inliers], relative.T_21[row], relation))
+            pairs[row] = ViewPair(one, other, at_1[inliers], at_2[inliers], relative.T_21[row], relation)
         return pairs
 
 
 def build_view_graph(
-    matcher: PairMatcher, progress: Callable[[int, int], None] = lambda done, most: None
+    matcher: PairMatcher,
+    progress: Callable[[int, int], None] = lambda done, most: None,
+    match: Callable[[PairMatcher, Iterable[tuple[int, int]]], list[ViewPair]] | None = None,
 ) -> list[ViewPair]:
     """Match every image with its neighbors in time and with images of similar places.
 
     Args:
         matcher: of the images, which are in the order of time.
         progress: called with the number of distances and places done, and of all.
+        match: matches pairs by the matcher, or knows the result; None: `PairMatcher.match`.
 
     Returns:
         The pairs that hold, by first, then second image.
     """
+    find = partial(match, matcher) if match else matcher.match
     count = len(matcher.views)
     distances = [distance for distance in NEAR if distance < count]
     far = FAR
@@ -166,12 +166,12 @@ def build_view_graph(
     for done, distance in enumerate(distances):
         progress(done, len(distances) + 1)
         rows = held if distance >= FAR else range(count)
-        found = matcher.match((row, row + distance) for row in rows if row + distance < count)
+        found = find((row, row + distance) for row in rows if row + distance < count)
         pairs += found
         held = [pair.first for pair in found]
     progress(len(distances), len(distances) + 1)
     known = {(pair.first, pair.second) for pair in pairs}
-    pairs += matcher.match(pair for pair in similar_places(matcher.views) if pair not in known)
+    pairs += find(pair for pair in similar_places(matcher.views) if pair not in known)
     return sorted(pairs, key=lambda pair: (pair.first, pair.second))
 
 

@@ -35,8 +35,8 @@ from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.map import Map
 from torchslam.system.run import Run
 from torchslam.types import Explanation, State, StepResult, Trajectory
+from torchslam.utils.console import is_unicode
 from torchslam.utils.files import write_whole
-from torchslam.utils.text import is_unicode
 
 TRAJECTORY = "trajectory.txt"
 OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number

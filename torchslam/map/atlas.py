@@ -15,12 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry import SensorModel, sim3_inverse, sim3_scale
-from torchslam.geometry.transforms import (
-    carry_points,
-    covariances_with_unit,
-    with_unit,
-    without_scale,
-)
+from torchslam.geometry.transforms import carry_points, covariances_with_unit, with_unit, without_scale
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.map.unit import MetricUnit
@@ -68,14 +63,26 @@ class TrackingState:
         eye = torch.eye(4, dtype=like.dtype, device=like.device)
         return cls(eye, -1, 0, None, none, none, none)
 
-    def averaged_with(self, estimate: PoseEstimate) -> TrackingState:
-        """The same state with the averages over the frames up to that of an estimate."""
+    def renumbered(self, keyframes: Int[Tensor, " K"], points: Int[Tensor, " L"]) -> TrackingState:
+        """The same state with new rows of keyframes and points, -1 where they were removed."""
+        local, seen, last = (
+            keyframes[self.local_keyframes],
+            points[self.local_points],
+            self.last_inlier_points,
+        )
         return replace(
             self,
-            error=self.error + EMA_RATE * (estimate.error - self.error),
-            explained_ratio=self.explained_ratio
-            + EMA_RATE * (estimate.explained_ratio - self.explained_ratio),
+            reference=int(keyframes[self.reference]) if self.reference >= 0 else -1,
+            last_inlier_points=points[last][points[last] >= 0],
+            local_keyframes=local[local >= 0],
+            local_points=seen[seen >= 0],
         )
+
+    def averaged_with(self, estimate: PoseEstimate) -> TrackingState:
+        """The same state with the averages over the frames up to that of an estimate."""
+        error = self.error + EMA_RATE * (estimate.error - self.error)
+        explained = self.explained_ratio + EMA_RATE * (estimate.explained_ratio - self.explained_ratio)
+        return replace(self, error=error, explained_ratio=explained)
 
 
 @dataclass
@@ -172,14 +179,10 @@ class Submap:
             other.transform(S_ab)
         keyframes, points = self.map.append(other.map)
         self.posed_frames.append(other.posed_frames, keyframes, points)
-        tracking = other.tracking
-        self.tracking = replace(
-            tracking,
-            reference=tracking.reference + keyframes,
-            last_inlier_points=tracking.last_inlier_points + points,
-            local_keyframes=tracking.local_keyframes + keyframes,
-            local_points=tracking.local_points + points,
-        )
+        device = self.map.T_cw.device
+        keyframe_rows = torch.arange(keyframes, len(self.map.keyframes), device=device)
+        point_rows = torch.arange(points, len(self.map.points), device=device)
+        self.tracking = other.tracking.renumbered(keyframe_rows, point_rows)
         self.epoch += 1
         other.map, other.posed_frames = Map(), PosedFrames()
 
@@ -194,23 +197,15 @@ class Atlas:
     def __init__(
         self, like: Float[Tensor, "..."], submaps: Iterable[Submap] = (), num_created: int = 0
     ) -> None:
-        """Create an atlas.
-
-        Args:
-            like: Tensor whose device and floating-point type new submaps get.
-            submaps: Submaps to start with.
-            num_created: Number of submaps ever created.
-        """
+        """like: tensor whose device and floating-point type new submaps get; submaps: to start with."""
         self._like = like
         self._submaps = list(submaps)
         self.num_created = num_created
 
     def __len__(self) -> int:
-        """The number of submaps."""
         return len(self._submaps)
 
     def __iter__(self) -> Iterator[Submap]:
-        """Iterate over the submaps."""
         return iter(self._submaps)
 
     def create(self) -> Submap:
@@ -235,11 +230,8 @@ class Atlas:
 
     def find(self, key: int) -> tuple[Submap, int] | None:
         """Return the submap and the row of the keyframe with this key, or None."""
-        for submap in self._submaps:
-            row = submap.map.row(key)
-            if row >= 0:
-                return submap, row
-        return None
+        found = ((submap, submap.map.row(key)) for submap in self._submaps)
+        return next(((submap, row) for submap, row in found if row >= 0), None)
 
 
 def main_submap(submaps: Iterable[Submap], session: int | None = None) -> Submap | None:

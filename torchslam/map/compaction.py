@@ -5,7 +5,7 @@ All rows that the submap refers to are renumbered; rows kept elsewhere follow by
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Int
@@ -71,23 +71,16 @@ def remove_keyframes(submap: Submap, keyframes: Int[Tensor, " R"]) -> RowRemap:
     slam_map.mark_renumbered()
     if len(posed_frames):
         posed_frames.frames["reference_keyframe"][:] = rows[posed_frames.frames["reference_keyframe"]]
-    alive, tracking = slam_map.points["is_valid"], submap.tracking
-    local = rows[tracking.local_keyframes]
-    submap.tracking = replace(
-        tracking,
-        reference=int(rows[tracking.reference]) if tracking.reference >= 0 else -1,
-        local_keyframes=local[local >= 0],
-        local_points=tracking.local_points[alive[tracking.local_points]],
-        last_inlier_points=tracking.last_inlier_points[alive[tracking.last_inlier_points]],
-    )
-    return RowRemap(rows, torch.arange(len(slam_map.points), device=device), rows[replacement])
+    points = torch.arange(len(slam_map.points), device=device)
+    submap.tracking = submap.tracking.renumbered(rows, points.where(slam_map.points["is_valid"], NO_POINT))
+    return RowRemap(rows, points, rows[replacement])
 
 
-def replacement_keyframe(slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"], count: int = 8) -> int:
-    """Return the nearest of the `count` most covisible keyframes, without the removed ones."""
+def replacement_keyframe(slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"]) -> int:
+    """Return the nearest of the most covisible keyframes, without the removed ones."""
     seen = slam_map.keyframes["point_ids"][keyframe]
     shared = slam_map.count_observed(seen[seen >= 0]).masked_fill(removed, -1)
-    best = torch.sort(shared, descending=True, stable=True).indices[:count]
+    best = torch.sort(shared, descending=True, stable=True).indices[:8]  # the most covisible ones
     best = best[~removed[best]]
     centers_w = se3_inverse(slam_map.T_cw[torch.cat([best.new_tensor([keyframe]), best])])[:, :3, 3]
     return int(best[torch.linalg.vector_norm(centers_w[1:] - centers_w[0], dim=-1).argmin()])
@@ -108,24 +101,18 @@ def _leave_points(slam_map: Map, removed: Bool[Tensor, " K"], replacement: Int[T
 
 
 def compact(submap: Submap) -> RowRemap | None:
-    """Remove the rows of invalid points if that is worth its cost; return the new rows, or None if nothing changed."""
-    return remove_invalid_rows(submap) if is_worth_compacting(submap) else None
-
-
-def is_worth_compacting(submap: Submap) -> bool:
-    """Test whether enough rows are invalid that removing them costs O(1) for each of them."""
-    rows, valid = len(submap.map.points), submap.map.num_points
-    invalid = rows - valid
-    return (
-        invalid > MIN_INVALID_ROWS
-        and invalid > valid
-        and _MAX_REWRITTEN * invalid > len(submap.posed_frames.observations)
-    )
+    """Remove invalid rows if they are so many that it costs O(1) for each; return the new rows, or None."""
+    valid = submap.map.num_points
+    invalid = len(submap.map.points) - valid
+    rewritten = len(submap.posed_frames.observations)
+    if invalid <= max(MIN_INVALID_ROWS, valid) or _MAX_REWRITTEN * invalid <= rewritten:
+        return None
+    return remove_invalid_rows(submap)
 
 
 def remove_invalid_rows(submap: Submap) -> RowRemap:
     """Remove the rows of invalid points; observations of merged points become those of their replacements."""
-    slam_map, tracking = submap.map, submap.tracking
+    slam_map = submap.map
     alive = slam_map.points["is_valid"]
     kept = torch.nonzero(alive)[:, 0]
     rows = torch.where(alive, torch.cumsum(alive, 0) - 1, NO_POINT)
@@ -134,7 +121,6 @@ def remove_invalid_rows(submap: Submap) -> RowRemap:
     for column in (slam_map.keyframes["point_ids"], slam_map.points["replaced_by"]):
         column[:] = torch.where(column >= 0, rows[column], NO_POINT)
     slam_map.mark_renumbered()
-    local, last = rows[tracking.local_points], rows[tracking.last_inlier_points]
-    submap.tracking = replace(tracking, local_points=local[local >= 0], last_inlier_points=last[last >= 0])
     everyone = torch.arange(slam_map.num_keyframes, device=rows.device)
+    submap.tracking = submap.tracking.renumbered(everyone, rows)
     return RowRemap(everyone, rows, everyone)

@@ -42,7 +42,6 @@ MAX_LENGTH = 1e12
 """Of a position in map units and of a pixel's coordinate: products of a few of them stay finite."""
 MAX_SKEW = 1e-3  # of a rotation: largest entry of R^T R - I
 
-
 Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; none if a table is empty."""
 
@@ -102,16 +101,9 @@ def read_map(path: str | Path) -> tuple[Map, Camera]:
 def pack_submaps(
     submaps: Iterable[Submap], camera: Camera, sessions: int, num_created: int | None = None
 ) -> tuple[dict[str, Shaped[Tensor, "..."]], dict[str, Any]]:
-    """Convert submaps to tensors and a JSON description.
+    """Convert submaps to tensors by name and a JSON description, with the frames of so many sessions.
 
-    Args:
-        submaps: All submaps.
-        camera: The camera of all submaps.
-        sessions: Number of sessions to keep.
-        num_created: Number of submaps ever created; by default the highest number in use plus one.
-
-    Returns:
-        The tensors by name, and the description.
+    num_created: number of submaps ever created; by default the highest number in use plus one
     """
     submaps = list(submaps)
     tensors, numbers = {CAMERA: camera.params}, []
@@ -140,33 +132,33 @@ def unpack_submaps(
 ) -> SavedAtlas:
     """Check and convert the tensors and the description that `pack_submaps` made.
 
-    Args:
-        path: The file that error messages name.
-        tensors: By name.
-        about: The description.
-        device: Of the submaps.
-
     Raises:
-        ResultsError: They are not a valid map.
+        ResultsError: They are not a valid map; its message names the path.
     """
     try:
         numbers, num_created, sessions = _numbers(about)
         camera = _check_camera(about["camera"], tensors.get(CAMERA))
-        expected = {f"submaps.{number}." for number in numbers}
-        unknown = [
-            name
-            for name in tensors
-            if name != CAMERA and not any(name.startswith(start) for start in expected)
-        ]
+        unknown: list[str] = []
+        columns: Columns = {f"submaps.{number}.{table}": {} for number in numbers for table in TABLES}
+        for name, rows in tensors.items():
+            table, _, column = name.rpartition(".")
+            if table in columns:
+                columns[table][column] = rows
+            elif name != CAMERA:
+                unknown.append(name)
         if unknown:
             raise ValueError(f"unknown tensors: {', '.join(sorted(unknown)[:3])}")
         submaps = []
         for number in numbers:
-            start = f"submaps.{number}."
-            own = {name[len(start) :]: rows for name, rows in tensors.items() if name.startswith(start)}
+            own = {table: columns[f"submaps.{number}.{table}"] for table in TABLES}
             submaps.append(_submap(number, own, camera, sessions, device))
-        _check_keys([submap.map for submap in submaps])
-        for submap, variance in zip(submaps, _noise_variances(about, len(submaps)), strict=True):
+        keys = [submap.map.keys for submap in submaps if submap.map.num_keyframes]
+        if keys and len(torch.unique(torch.cat(keys))) != sum(map(len, keys)):
+            raise ValueError("two keyframes have the same session and frame index")
+        variances = about["noise_variances"]
+        if not all(isinstance(each, float) and 1 <= each < math.inf for each in variances):
+            raise ValueError(f"noise_variances must be {len(numbers)} finite numbers from 1")
+        for submap, variance in zip(submaps, variances, strict=True):
             submap.map.noise_variance = variance
             unit = about.get("metric", {}).get(str(submap.number))
             submap.metric = None if unit is None else MetricUnit.from_dict(unit)
@@ -175,16 +167,6 @@ def unpack_submaps(
         raise ResultsError(f"{path}: not a whole torchslam map: {what}") from None
     like = camera.params.to(device)
     return SavedAtlas(Atlas(like, submaps, num_created), camera.with_params(like), sessions)
-
-
-def _noise_variances(about: dict[str, Any], count: int) -> list[float]:
-    """The noise of each map. Raises ValueError for something else."""
-    found = about["noise_variances"]
-    if not isinstance(found, list) or len(found) != count:
-        raise ValueError(f"noise_variances must have {count} numbers")
-    if not all(isinstance(each, float) and 1 <= each < math.inf for each in found):
-        raise ValueError("noise_variances must be finite numbers from 1")
-    return found
 
 
 def write_tensors(path: str | Path, tensors: dict[str, Shaped[Tensor, "..."]], about: dict[str, Any]) -> None:
@@ -232,13 +214,12 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Shaped[Tensor, "..."]], di
 def _tables(submap: Submap) -> dict[str, Table]:
     """Return the tables of a submap by their names in the file."""
     slam_map, posed_frames = submap.map, submap.posed_frames
-    return dict(
-        zip(
-            TABLES,
-            (slam_map.points, slam_map.keyframes, posed_frames.frames, posed_frames.observations),
-            strict=True,
-        )
-    )
+    return {
+        "points": slam_map.points,
+        "keyframes": slam_map.keyframes,
+        "frames": posed_frames.frames,
+        "observations": posed_frames.observations,
+    }
 
 
 def _kept(name: str, columns: dict[str, Tensor], submap: Submap, sessions: int) -> dict[str, Tensor]:
@@ -268,20 +249,22 @@ def _numbers(about: dict[str, Any]) -> tuple[list[int], int, int]:
 
 
 def _submap(
-    number: int, tensors: dict[str, Tensor], camera: Camera, sessions: int, device: torch.device | str
+    number: int, columns: Columns, camera: Camera, sessions: int, device: torch.device | str
 ) -> Submap:
-    """Check the columns `points.positions_w`, ... and build a submap of them."""
+    """Check the columns of a submap and build it of them."""
     submap = Submap.empty(number, camera.params.to(device))
-    columns: dict[str, dict[str, Tensor]] = {name: {} for name in TABLES}
-    for name, rows in tensors.items():
-        owner, _, column = name.partition(".")
-        if owner not in columns:
-            raise ValueError(f"submap {number} has an unknown tensor {name}")
-        columns[owner][column] = rows
-    _check_submap(number, columns, TABLES, camera.params.dtype, sessions)
-    for name, table in _tables(submap).items():
-        if columns[name]:
-            table.append(**{column: rows.to(device) for column, rows in columns[name].items()})
+    sizes: dict[str, int] = {}
+    try:
+        for name, table in _tables(submap).items():
+            if columns[name]:
+                table.append(**{column: rows.to(device) for column, rows in columns[name].items()})
+                _check_table(columns[name], TABLES[name], camera.params.dtype, sizes)
+        name = "references"
+        _check_rows(columns, sessions)
+    except ValueError as error:
+        raise ValueError(f"submap {number}, {name}: {error}") from None
+    if len({columns[name]["descriptors"].dtype for name in ("points", "keyframes") if columns[name]}) > 1:
+        raise ValueError(f"submap {number}: descriptors of several types")
     return submap
 
 
@@ -299,68 +282,19 @@ def _check_camera(about: dict[str, Any], params: Tensor | None) -> Camera:
     return Camera(about["model"], params, (width, height))
 
 
-def _check_submap(
-    number: int, columns: Columns, tables: dict[str, Schema], dtype: torch.dtype, sessions: int
-) -> None:
-    """Check columns against the schema, their sizes and types against each other, and their row references."""
-    sizes: dict[str, int] = {}
-    descriptors: set[torch.dtype] = set()
-    for name, schema in tables.items():
-        try:
-            _check_table(columns[name], schema, dtype, sizes, descriptors)
-        except ValueError as error:
-            raise ValueError(f"submap {number}, {name}: {error}") from None
-    try:
-        _check_rows(columns, sessions)
-    except ValueError as error:
-        raise ValueError(f"submap {number}: {error}") from None
-
-
-def _check_keys(maps: list[Map]) -> None:
-    """Check that no two keyframes of all maps have the same key."""
-    keys = [slam_map.keys for slam_map in maps if slam_map.num_keyframes]
-    if keys and len(torch.unique(torch.cat(keys))) != sum(map(len, keys)):
-        raise ValueError("two keyframes have the same session and frame index")
-
-
 def _check_table(
-    columns: dict[str, Tensor],
-    schema: Schema,
-    dtype: torch.dtype,
-    sizes: dict[str, int],
-    descriptors: set[torch.dtype],
+    columns: dict[str, Tensor], schema: Schema, dtype: torch.dtype, sizes: dict[str, int]
 ) -> None:
-    """Check one table against its schema; `sizes` and `descriptors` collect what all tables must agree on."""
-    if not columns:
-        return
-    missing, unknown = sorted(schema.keys() - columns.keys()), sorted(columns.keys() - schema.keys())
-    if missing or unknown:
-        raise ValueError(
-            "; ".join(
-                f"{what} {', '.join(names)}"
-                for what, names in (("missing", missing), ("unknown", unknown))
-                if names
-            )
-        )
-    lengths = {len(rows) for rows in columns.values() if rows.ndim}
+    """Check types and values of a table that fits its schema; `sizes` collects what all tables must agree on."""
     for name, rows in columns.items():
         column = schema[name]
-        wrong = column.mismatch(rows)
-        if wrong:
-            raise ValueError(f"{name}: {wrong}")
-        if len(lengths) > 1:
-            raise ValueError(f"the columns have {min(lengths)} to {max(lengths)} rows")
         for wanted, size in zip(column.shape, rows.shape[1:], strict=True):
             if isinstance(wanted, str) and sizes.setdefault(wanted, size) != size:
                 raise ValueError(f"{name}: {wanted} is {size}, elsewhere {sizes[wanted]}")
         if column.kind == "float" and rows.dtype != (torch.float64 if name == "timestamp" else dtype):
             raise ValueError(f"{name}: {rows.dtype} but the camera is {dtype}")
-        if column.kind == "descriptor":
-            descriptors.add(rows.dtype)
         if rows.is_floating_point():
             _check_numbers(name, rows)
-    if len(descriptors) > 1:
-        raise ValueError("descriptors of several types")
 
 
 def _check_numbers(name: str, rows: Tensor) -> None:
@@ -407,13 +341,8 @@ def _check_rows(columns: Columns, sessions: int) -> None:
             limit = "" if end is None else f" to {end - 1}"
             raise ValueError(f"{name} from {least} to {top_rows}, there are {low}{limit}")
     if points:
-        _check_replacements(points["replaced_by"])
-
-
-def _check_replacements(replaced_by: Tensor) -> None:
-    """Check that `replaced_by` has no cycle."""
-    replacement = torch.cat([replaced_by, replaced_by.new_tensor([-1])])  # NO_POINT reads the last entry
-    for _ in range(len(replaced_by).bit_length()):  # each round doubles the steps
-        replacement = replacement[replacement]
-    if bool((replacement >= 0).any()):
-        raise ValueError("replaced_by has a cycle")
+        replacement = torch.cat([points["replaced_by"], torch.tensor([-1])])  # -1 reads the last entry
+        for _ in range(len(replacement).bit_length()):  # each round doubles the steps
+            replacement = replacement[replacement]
+        if bool((replacement >= 0).any()):
+            raise ValueError("replaced_by has a cycle")

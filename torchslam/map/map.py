@@ -7,6 +7,7 @@ holds for each keypoint the row of the point that it observes, or -1 (the data a
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
@@ -30,6 +31,8 @@ _MAX_NOISE_VARIANCE = 4.0  # beyond it, errors are not noise
 _PRIOR_ADJUSTMENTS, _REMEMBERED_ADJUSTMENTS = 3, 20
 """Adjustments as which the prior counts, and over which the moving average reaches. Tried at these values only."""
 SESSION_BITS = 40  # of a key, below the number of the session: more frames than a session has
+KEYPOINT_COLUMNS = "keypoints", "detected", "scales", "angles", "descriptors", "mask", "information"
+"""Columns of a keyframe that are attributes of `FrameFeatures`, with a row per keypoint."""
 
 
 class Map:
@@ -46,7 +49,6 @@ class Map:
     """
 
     def __init__(self) -> None:
-        """Create an empty map."""
         self.points = Table(POINTS)
         self.keyframes = Table(KEYFRAMES)
         self.images: dict[int, Shaped[Tensor, "1 1 H W"]] = {}
@@ -85,8 +87,7 @@ class Map:
 
     def key(self, keyframe: int) -> int:
         """Return the key of a keyframe."""
-        session, frame = self.keyframes["session"][keyframe], self.keyframes["frame_index"][keyframe]
-        return (int(session) << SESSION_BITS) + int(frame)
+        return key_of(*(int(self.keyframes[name][keyframe]) for name in ("session", "frame_index")))
 
     def row(self, key: int) -> int:
         """Return the row of the keyframe with this key, or -1."""
@@ -156,21 +157,15 @@ class Map:
     def add_keyframe(self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"]) -> int:
         """Add a keyframe without observations and with unknown covariance; return its row."""
         if view.image is not None:
-            self.images[(view.session << SESSION_BITS) + view.index] = view.image
+            self.images[key_of(view.session, view.index)] = view.image
         ids = self.keyframes.append(
             T_cw=T_cw[None],
             covariances=T_cw.new_zeros(1, 6, 6),
             session=torch.tensor([view.session], device=T_cw.device),
             frame_index=torch.tensor([view.index], device=T_cw.device),
             timestamp=torch.tensor([view.timestamp], dtype=torch.float64, device=T_cw.device),
-            keypoints=view.keypoints[None],
-            detected=view.detected[None],
-            scales=view.scales[None],
-            angles=view.angles[None],
-            descriptors=view.descriptors[None],
-            mask=view.mask[None],
-            information=view.information[None],
             point_ids=torch.full((1, len(view.mask)), NO_POINT, device=T_cw.device),
+            **{name: getattr(view, name)[None] for name in KEYPOINT_COLUMNS},
         )
         return int(ids[0])
 
@@ -246,7 +241,6 @@ class Map:
 
     @property
     def _keypoints(self) -> int:
-        """The number of keypoints per keyframe."""
         return self.keyframes["point_ids"].shape[1]
 
     @property
@@ -266,13 +260,7 @@ class Map:
     def observations(
         self, keyframes: Int[Tensor, " B"] | None = None, as_detected: bool = False
     ) -> Observations:
-        """Return all observations by the given keyframes, or by all.
-
-        Args:
-            keyframes: Rows; None: all.
-            as_detected: Whether the pixels are those of the detected keypoints, in place of those of a global
-                shutter.
-        """
+        """Return all observations by the given keyframes, or by all, with pixels of a global shutter or as detected."""
         if keyframes is None:
             keyframes = torch.arange(self.num_keyframes, device=self.T_cw.device)
         table = self.keyframes["point_ids"][keyframes]
@@ -305,15 +293,14 @@ class Map:
 
     def frame_features(self, keyframe: int) -> FrameFeatures:
         """Return the features of a keyframe."""
-        row = {name: column[keyframe] for name, column in self.keyframes.columns().items()}
-        names = ("keypoints", "detected", "scales", "angles", "descriptors", "mask", "information")
+        table = self.keyframes
+        columns: dict[str, Any] = {name: table[name][keyframe] for name in KEYPOINT_COLUMNS}
         return FrameFeatures(
-            index=int(row["frame_index"]),
-            timestamp=float(row["timestamp"]),
-            session=int(row["session"]),
+            index=int(table["frame_index"][keyframe]),
+            timestamp=float(table["timestamp"][keyframe]),
+            session=int(table["session"][keyframe]),
             image=self.images.get(self.key(keyframe)) if self.images else None,
-            backlog=0,
-            **{name: row[name] for name in names},
+            **columns,
         )
 
     def covisibility_weights(self, keyframes: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:
@@ -389,16 +376,11 @@ class Map:
         A moving average of medians: a tenth of outliers does not matter. The first adjustments weigh more; the prior,
         that the feature extractor states the truth, counts as much as `_PRIOR_ADJUSTMENTS` of them.
         """
-        self._move_noise(
-            squared_errors, 1 / (_PRIOR_ADJUSTMENTS + min(self.num_keyframes, _REMEMBERED_ADJUSTMENTS))
-        )
+        adjustments = _PRIOR_ADJUSTMENTS + min(self.num_keyframes, _REMEMBERED_ADJUSTMENTS)
+        self.set_noise(squared_errors, 1 / adjustments)
 
-    def set_noise(self, squared_errors: Float[Tensor, " O"]) -> None:
-        """Set the variance of keypoints by the squared errors of a map at its minimum, within the same bounds."""
-        self._move_noise(squared_errors, 1.0)
-
-    def _move_noise(self, squared_errors: Float[Tensor, " O"], rate: float) -> None:
-        """Move the variance of keypoints by a share of the way to what squared errors show."""
+    def set_noise(self, squared_errors: Float[Tensor, " O"], rate: float = 1.0) -> None:
+        """Set the variance of keypoints by the squared errors of a map at its minimum, or move it there by a share."""
         if len(squared_errors) == 0:
             return
         found = float(squared_errors.median()) / _ADJUSTED_SQUARED_ERROR
@@ -497,18 +479,18 @@ class Map:
             column[rows[known]] = covariances[known]
 
 
-def key_of(sessions: Int[Tensor, "*shape"], frames: Int[Tensor, "*shape"]) -> Int[Tensor, "*shape"]:
-    """Return the keys of frames of sessions."""
+_Number = TypeVar("_Number", int, Tensor)
+
+
+def key_of(sessions: _Number, frames: _Number) -> _Number:
+    """Return the keys of frames of sessions: numbers, or tensors of one shape, int64."""
     return (sessions << SESSION_BITS) + frames
 
 
 def feature_mismatch(slam_map: Map, view: FrameFeatures, to_map: bool) -> str:
     """Describe why a frame's features cannot be compared with the map's; empty if they can.
 
-    Args:
-        slam_map: The map.
-        view: Features of the frame.
-        to_map: Whether frames become keyframes, which all need the same number of keypoints.
+    to_map: whether frames become keyframes, which all need the same number of keypoints
     """
     if slam_map.num_keyframes == 0:
         return ""
@@ -533,12 +515,6 @@ class MapSnapshot:
     """Copies of the columns that later keyframes may change, to restore the map when these are taken back.
 
     Rows must not be renumbered between `of` and `restore`.
-
-    Attributes:
-        points: All columns of the points.
-        keyframes: The mutable columns of the keyframes.
-        version: That of the map.
-        noise_variance: Likewise.
     """
 
     points: dict[str, Shaped[Tensor, "L ..."]]
@@ -560,7 +536,6 @@ class MapSnapshot:
 
     @property
     def num_keyframes(self) -> int:
-        """The number of keyframes at the time of the snapshot."""
         return len(self.keyframes["T_cw"])
 
     def restore(self, slam_map: Map) -> None:

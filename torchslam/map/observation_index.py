@@ -29,9 +29,7 @@ class ObservationIndex:
         # Half the memory of int64: enough for two million keyframes of a thousand keypoints.
         like = torch.empty(0, dtype=torch.int32, device=table.device)
         self._slots = like.new_full((_LEAST_ROWS, _LEAST_WIDTH), NO_SLOT)
-        self._row_of = like.new_zeros(
-            _LEAST_ROWS
-        )  # by point; row 0 stands for all points without observations
+        self._row_of = like.new_zeros(_LEAST_ROWS)  # by point; row 0 stands for all without observations
         self._free = torch.arange(_LEAST_ROWS, device=table.device).flip(0)  # a stack of rows without a point
         self._num_free = _LEAST_ROWS - 1
         flat = table.flatten()
@@ -57,10 +55,11 @@ class ObservationIndex:
         ids, counts = torch.unique_consecutive(order.values, return_counts=True)
         self._take_rows(ids)
         first = counts.cumsum(0) - counts
-        ranks = torch.arange(len(point_ids), device=ids.device) - first.repeat_interleave(counts)
         filled = (self.padded_slots(ids) >= 0).sum(1)
-        columns = filled.repeat_interleave(counts) + ranks
-        self._widen(int(columns.max()) + 1)
+        columns = torch.arange(len(point_ids), device=ids.device) + (filled - first).repeat_interleave(counts)
+        rows, width = self._slots.shape
+        if (needed := int(columns.max()) + 1) > width:
+            self._resize(rows, max(needed, 2 * width))
         self._slots[self._rows(order.values), columns] = slots[order.indices].to(self._slots.dtype)
 
     def remove(self, point_ids: Int[Tensor, " O"], slots: Int[Tensor, " O"]) -> None:
@@ -83,15 +82,11 @@ class ObservationIndex:
 
     def _rows(self, point_ids: Int[Tensor, " N"]) -> Int[Tensor, " N"]:
         """Return the rows of points."""
-        if len(point_ids) and int(point_ids.max()) >= len(self._row_of):
-            self._reach(int(point_ids.max()))
+        if len(point_ids) and (last := int(point_ids.max())) >= len(self._row_of):
+            with torch.inference_mode(False):
+                more = self._row_of.new_zeros(max(len(self._row_of), last + 1))
+                self._row_of = torch.cat([self._row_of, more])
         return self._row_of[point_ids].long()
-
-    @torch.inference_mode(False)
-    def _reach(self, point: int) -> None:
-        """Grow to hold at least all points up to this one."""
-        more = self._row_of.new_zeros(max(len(self._row_of), point + 1))
-        self._row_of = torch.cat([self._row_of, more])
 
     def _take_rows(self, point_ids: Int[Tensor, " N"]) -> None:
         """Assign a row to each of distinct points that has none."""
@@ -106,11 +101,6 @@ class ObservationIndex:
         left = self._num_free - len(new)
         self._row_of[new] = self._free[left : self._num_free].to(self._row_of.dtype)
         self._num_free = left
-
-    def _widen(self, width: int) -> None:
-        """Grow to hold this many observations of a point."""
-        if width > self._slots.shape[1]:
-            self._resize(len(self._slots), max(width, 2 * self._slots.shape[1]))
 
     def _resize(self, rows: int, width: int) -> None:
         old = self._slots

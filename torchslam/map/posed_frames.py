@@ -19,7 +19,7 @@ from torchslam.geometry import (
 )
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import frame_velocities, global_shutter_pixels
-from torchslam.map.map import SESSION_BITS, Map, key_of
+from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
 from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
@@ -39,7 +39,6 @@ class PosedFrames:
     """
 
     def __init__(self) -> None:
-        """Create tables without frames."""
         self.frames = Table(FRAMES)
         self.observations = Table(OBSERVATIONS)
 
@@ -47,7 +46,8 @@ class PosedFrames:
         self, view: FrameFeatures, estimate: PoseEstimate, T_cr: Float[Tensor, "4 4"], reference: int
     ) -> None:
         """Add a frame with pose T_cr relative to keyframe `reference` and its inlier observations."""
-        device, view = T_cr.device, view.weighed(estimate.keypoints, estimate.weights)
+        device, seen = T_cr.device, estimate.keypoints
+        view = view.weighed(seen, estimate.weights)
         row = self.frames.append(
             frame_index=torch.tensor([view.index], device=device),
             session=torch.tensor([view.session], device=device),
@@ -58,10 +58,10 @@ class PosedFrames:
         self.observations.append(
             frame_row=row.expand(estimate.inliers),
             point_ids=estimate.point_ids,
-            keypoint_index=estimate.keypoints,
-            pixels=view.detected[estimate.keypoints],
-            scales=view.scales[estimate.keypoints],
-            information=view.information[estimate.keypoints],
+            keypoint_index=seen,
+            pixels=view.detected[seen],
+            scales=view.scales[seen],
+            information=view.information[seen],
         )
 
     def __len__(self) -> int:
@@ -198,21 +198,21 @@ class PosedFrames:
             least_ratio: of its observations that must be near; else a frame keeps all, since its pose may be wrong.
         """
         T_cw, seen_by = self.T_cw(slam_map), self.observations["frame_row"]
-        velocities = None
-        if sensor.readout is not None:
-            velocities, _ = frame_velocities(T_cw, self.frames["timestamp"], self.frames["session"])
-        every = torch.arange(len(seen_by), device=T_cw.device)
+        velocities = None if sensor.readout is None else self._velocities(T_cw)
+        parts = torch.arange(len(seen_by), device=T_cw.device).split(_CHUNK)
         agrees = torch.cat(
-            [
-                self._agree(rows, T_cw, slam_map, sensor, chi_square, velocities)
-                for rows in every.split(_CHUNK)
-            ]
+            [self._agree(rows, T_cw, slam_map, sensor, chi_square, velocities) for rows in parts]
         )
         count = torch.bincount(seen_by, minlength=len(self))
         is_right = torch.bincount(seen_by[agrees], minlength=len(self)) >= least_ratio * count.float()
         kept = agrees | ~is_right[seen_by]
         if not bool(kept.all()):
             self.observations.keep(torch.nonzero(kept)[:, 0])
+
+    def _velocities(
+        self, T_cw: Float[Tensor, "F 4 4"], frames: Int[Tensor, " R"] | None = None
+    ) -> Float[Tensor, "F 6"]:
+        return frame_velocities(T_cw, self.frames["timestamp"], self.frames["session"], frames)[0]
 
     def _agree(
         self,
@@ -223,7 +223,6 @@ class PosedFrames:
         chi_square: float,
         velocities: Float[Tensor, "F 6"] | None,
     ) -> Bool[Tensor, " O"]:
-        """Test which observations are near their reprojection by the frames, which with a readout have velocities."""
         seen = {name: values[rows] for name, values in self.observations.columns().items()}
         points_w = slam_map.positions_w[slam_map.follow_merges(seen["point_ids"])]
         frame, pixels = seen["frame_row"], seen["pixels"]
@@ -238,14 +237,9 @@ class PosedFrames:
     def correct_keyframes(
         self, slam_map: Map, sensor: SensorModel, keyframes: Int[Tensor, " R"] | None = None
     ) -> None:
-        """Set the keypoints of keyframes to those of a global shutter, by the velocities of their frames.
+        """Set the keypoints of keyframes, by default of all, to those of a global shutter, by their velocities.
 
         Keypoints without a point count as at the median depth of the others.
-
-        Args:
-            slam_map: the map.
-            sensor: by which the keypoints are corrected.
-            keyframes: rows; None: all.
         """
         table = slam_map.keyframes
         rows = torch.arange(len(table), device=slam_map.T_cw.device) if keyframes is None else keyframes
@@ -255,9 +249,7 @@ class PosedFrames:
             return
         keys, order = self.keys.sort()
         frame = order[torch.searchsorted(keys, slam_map.keys[rows]).clamp_max(len(keys) - 1)]
-        velocities, _ = frame_velocities(
-            self.T_cw(slam_map), self.frames["timestamp"], self.frames["session"], frame
-        )
+        velocities = self._velocities(self.T_cw(slam_map), frame)
         is_posed = self.keys[frame] == slam_map.keys[rows]
         velocities = torch.where(is_posed[:, None], velocities[frame], 0.0)
         depths = transform(slam_map.T_cw[rows], slam_map.positions_w[ids.clamp_min(0)])[..., 2]
@@ -272,23 +264,18 @@ class PosedFrames:
         """Views with the keypoints of a global shutter, at the median depth of what their frames see.
 
         Views of other frames stay as they are.
-
-        Args:
-            views: of frames by their index, keypoints as they were detected.
-            slam_map: the map.
-            sensor: by which the keypoints are corrected.
         """
         if sensor.readout is None:
             return list(views)
         T_cw = self.T_cw(slam_map)
-        velocities, _ = frame_velocities(T_cw, self.frames["timestamp"], self.frames["session"])
+        velocities = self._velocities(T_cw)
         points_w = slam_map.positions_w[slam_map.follow_merges(self.observations["point_ids"])]
         seen_by = self.observations["frame_row"]
         depths = transform(T_cw[seen_by], points_w[:, None])[:, 0, 2]
         row_of = {key: row for row, key in enumerate(self.keys.tolist())}
         corrected = []
         for view in views:
-            row = row_of.get((view.session << SESSION_BITS) + view.index)
+            row = row_of.get(key_of(view.session, view.index))
             own = depths[:0] if row is None else depths[seen_by == row]
             if row is not None and len(own):
                 depth = own.median().expand(1, len(view.detected))

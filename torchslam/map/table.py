@@ -56,11 +56,9 @@ POINTS: Schema = {
     "covariances_w": Column((3, 3), "float", "covariance of the position; zero where unknown"),
     "descriptors": Column(("D",), "descriptor", "descriptor of the newest observation"),
     "colors": Column((3,), "byte", "red, green, blue in the images; black where unknown"),
-    "view_directions_w": Column(
-        (3,), "float", "unit direction from the newest observing keyframe to the point"
-    ),
+    "view_directions_w": Column((3,), "float", "unit direction from the newest observing keyframe"),
     "scale_distance": Column(
-        (), "float", "keypoint scale times distance in the newest observation: px times map units"
+        (), "float", "keypoint scale times distance, newest observation: px times map units"
     ),
     "angles": Column((), "float", "keypoint orientation of the newest observation, radians"),
     "last_seen_frame": Column((), "int", "index of the last frame that tracked the point"),
@@ -86,11 +84,7 @@ KEYFRAMES: Schema = {
     "angles": Column(("N",), "float", "radians"),
     "descriptors": Column(("N", "D"), "descriptor", "descriptors of the keypoints"),
     "mask": Column(("N",), "bool", "true for valid keypoints"),
-    "information": Column(
-        ("N", "I"),
-        "float",
-        "information of the keypoints, px^-2. I = 0: from the scale; 1: isotropic; 3: xx, xy, yy",
-    ),
+    "information": Column(("N", "I"), "float", "px^-2. I = 0: from the scale; 1: isotropic; 3: xx, xy, yy"),
     "point_ids": Column(("N",), "int", "row of the point that each keypoint observes, or -1"),
 }
 """Columns of the keyframes."""
@@ -124,18 +118,12 @@ class Table:
     """
 
     def __init__(self, schema: Schema) -> None:
-        """Create an empty table."""
         self.schema = schema
         self._columns: dict[str, Tensor] = {}
         self._size = 0
 
     def __len__(self) -> int:
-        """The number of rows in use."""
         return self._size
-
-    def __contains__(self, name: str) -> bool:
-        """Test whether a column exists."""
-        return name in self._columns
 
     def __getitem__(self, name: str) -> Shaped[Tensor, "R ..."]:
         """Return a view of a column."""
@@ -176,22 +164,19 @@ class Table:
         self._size = min(size, self._size)
 
     def _check(self, rows: dict[str, Tensor]) -> None:
-        if rows.keys() != self.schema.keys():
-            raise ValueError(f"columns are {sorted(self.schema)}, not {sorted(rows)}")
-        counts = {name: len(values) for name, values in rows.items()}
-        if len(set(counts.values())) != 1:
-            raise ValueError(f"the columns of one append differ in length: {counts}")
+        if wrong := rows.keys() ^ self.schema.keys():
+            raise ValueError(f"missing or unknown columns: {', '.join(sorted(wrong))}")
+        counts = set(map(len, rows.values()))
+        if len(counts) != 1:
+            raise ValueError(f"the columns have {min(counts)} to {max(counts)} rows")
         for name, values in rows.items():
-            wrong = self.schema[name].mismatch(values)
-            if wrong:
-                raise ValueError(f"column {name}: {wrong}")
+            if mismatch := self.schema[name].mismatch(values):
+                raise ValueError(f"column {name}: {mismatch}")
 
     def _grown(self, name: str, values: Tensor, size: int) -> Tensor:
-        old = self._columns.get(name)
-        if old is not None and len(old) >= size:
+        old = self._columns.get(name, values.new_zeros(0, *values.shape[1:]))
+        if len(old) >= size:
             return old
-        capacity = max(64, size, 2 * (0 if old is None else len(old)))
-        new = torch.zeros(capacity, *values.shape[1:], dtype=values.dtype, device=values.device)
-        if old is not None:
-            new[: self._size] = old[: self._size]
+        new = values.new_zeros(max(64, size, 2 * len(old)), *values.shape[1:])
+        new[: self._size] = old[: self._size]
         return new

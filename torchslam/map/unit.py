@@ -4,37 +4,32 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Self
+from typing import Any, Self, get_args, get_origin, get_type_hints
 
 MAX_TEXT = 1 << 12
 """Largest number of characters of a text in the record, and of entries in a list of it."""
 
 
-def _is_number(value: object) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+def _is(value: object, kind: Any) -> bool:
+    """Whether a value is of an annotated type: numbers are finite, texts and tuples, which may be lists, bounded."""
+    if get_origin(kind) is tuple:
+        if not isinstance(value, list | tuple) or len(value) > MAX_TEXT:
+            return False
+        kinds = get_args(kind)
+        kinds = kinds[:1] * len(value) if kinds[-1] is Ellipsis else kinds
+        return len(value) == len(kinds) and all(map(_is, value, kinds))
+    if get_args(kind):  # a union
+        return any(_is(value, each) for each in get_args(kind))
+    if kind in (int, float):
+        return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    return isinstance(value, kind) and (kind is not str or len(value) <= MAX_TEXT)
 
 
-def _is_positive(value: object) -> bool:
-    return _is_number(value) and float(value) > 0  # type: ignore[arg-type]
-
-
-def _is_text(value: object) -> bool:
-    return isinstance(value, str) and len(value) <= MAX_TEXT
-
-
-def _are_texts(value: object) -> bool:
-    return isinstance(value, list | tuple) and len(value) <= MAX_TEXT and all(map(_is_text, value))
-
-
-def _are_numbers(value: object, count: int) -> bool:
-    return isinstance(value, list | tuple) and len(value) == count and all(map(_is_number, value))
-
-
-def _check(record: object, checks: dict[str, Any]) -> None:
-    """Raise ValueError for a field of another kind."""
-    for name, is_right in checks.items():
+def _check(record: UnitSource | MetricUnit, *positive: str) -> None:
+    """Raise ValueError for a field of another type, or that must be positive and is not."""
+    for name, kind in get_type_hints(type(record)).items():
         value = getattr(record, name)
-        if not is_right(value):
+        if not _is(value, kind) or (name in positive and value <= 0):
             raise ValueError(f"{name} of the unit is {repr(value)[:100]}")
 
 
@@ -61,19 +56,8 @@ class UnitSource:
     rejected: tuple[str, ...]
     notes: tuple[str, ...] = ()
 
-    _CHECKS: ClassVar[dict[str, Any]] = {
-        "source": _is_text,
-        "meters_per_unit": _is_positive,
-        "relative_std": _is_positive,
-        "count": _is_number,
-        "unit": _is_text,
-        "apart": lambda value: value is None or _is_number(value),
-        "rejected": _are_texts,
-        "notes": _are_texts,
-    }
-
     def __post_init__(self) -> None:
-        _check(self, self._CHECKS)
+        _check(self, "meters_per_unit", "relative_std")
         for name in ("rejected", "notes"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
 
@@ -99,17 +83,10 @@ class MetricUnit:
     up_std: float | None = None
     origin: tuple[float, float, float] | None = None
 
-    _CHECKS: ClassVar[dict[str, Any]] = {
-        "relative_std": _is_positive,
-        "sources": lambda value: len(value) <= MAX_TEXT,
-        "contradictions": _are_texts,
-        "S_mw": lambda value: len(value) == 4 and all(_are_numbers(row, 4) for row in value),
-        "up_std": lambda value: value is None or _is_number(value),
-        "origin": lambda value: value is None or _are_numbers(value, 3),
-    }
-
     def __post_init__(self) -> None:
-        _check(self, self._CHECKS)
+        _check(self, "relative_std")
+        if [len(row) for row in self.S_mw] != [4, 4, 4, 4]:
+            raise ValueError("S_mw of the unit is no matrix of 4 x 4")
 
     @property
     def is_level(self) -> bool:
@@ -136,14 +113,9 @@ class MetricUnit:
 
     def as_dict(self) -> dict[str, Any]:
         """The record for JSON."""
-        own = {each.name: getattr(self, each.name) for each in fields(self)}
-        return own | {
-            "sources": [
-                {each.name: getattr(source, each.name) for each in fields(source)} for source in self.sources
-            ],
-            "sentence": self.sentence,
-            "remarks": list(self.remarks),
-        }
+        sources = [vars(source).copy() for source in self.sources]
+        about = {"sources": sources, "sentence": self.sentence, "remarks": list(self.remarks)}
+        return vars(self) | about
 
     @classmethod
     def from_dict(cls, record: dict[str, Any]) -> Self:

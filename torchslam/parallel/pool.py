@@ -23,14 +23,12 @@ import traceback
 import warnings
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
 from multiprocessing import resource_tracker
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from pathlib import Path
-from types import TracebackType
 from typing import Any, Self
 
 import torch
@@ -40,15 +38,8 @@ from torchslam.utils.forks import close_decoders
 
 RESPONSE_TIMEOUT_S = 60.0
 """A worker that was stopped is given up after this time; a frame or a local adjustment takes less than a second."""
-
 AHEAD = 2
 """Tasks that each worker is sent at a time, so that it need not wait while this process does one of its own."""
-
-READY = b""
-"""First message of a worker that is a new interpreter, once its imports are done."""
-
-THREADS = Path("/proc/self/task")
-"""Folder with one entry for each thread of this process, on Linux."""
 
 
 class WorkerLostError(Exception):
@@ -71,9 +62,7 @@ class Call:
 class _Worker:
     """A worker process, which answers calls in their order, and the connection to it.
 
-    Attributes:
-        task: For the worker to begin with, until it was sent.
-        waiting: Calls without an answer.
+    task: for the worker to begin with, until it was sent; waiting: calls without an answer
     """
 
     process: BaseProcess
@@ -100,7 +89,7 @@ class _Worker:
     def is_ready(self) -> bool:
         """Return whether calls are accepted. Raises OSError or EOFError if the process has ended."""
         if self.task is not None and self.connection.poll():
-            self.connection.recv_bytes()  # READY
+            self.connection.recv_bytes()  # its imports are done
             self.connection.send_bytes(self.task)
             self.task = None
         return self.task is None
@@ -111,11 +100,10 @@ class _Worker:
         self.waiting.append(call := Call(self))
         return call
 
-    def receive(self, timeout: float) -> bool:
+    def receive(self, timeout: float | None) -> bool:
         """Receive the answer of the first call that has none; return False if it does not come in time.
 
-        Raises:
-            OSError, EOFError: The process has ended; BlockingIOError if it stopped within an answer.
+        Raises OSError or EOFError if the process has ended, BlockingIOError if it stopped within an answer.
         """
         if not self.connection.poll(timeout):
             return False
@@ -159,9 +147,7 @@ class WorkerPool:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._end()
 
     def _end(self) -> None:
@@ -191,9 +177,7 @@ class WorkerPool:
     def result(self, call: Call) -> Any:
         """Wait for the result of a call.
 
-        Raises:
-            WorkerLostError: If there will be none.
-            Exception: What the call raised, with its traceback as the cause.
+        Raises WorkerLostError if there will be none, and what the call raised, with its traceback as the cause.
         """
         while call.answer is None:
             if call.worker not in self._workers:
@@ -206,20 +190,20 @@ class WorkerPool:
             raise found from RemoteError(trace)
         return found
 
-    def answered(self, calls: Sequence[Call], timeout: float | None) -> list[Call]:
-        """Wait until `result` returns or raises at once for some of the calls; returns these."""
-        if self._have_ended(calls):
-            timeout = 0
-        asked = [each for each in self._workers if each.waiting]
-        answering = wait([each.connection for each in asked], timeout)
-        for worker in asked:
-            if worker.connection in answering:
-                with self._lost_on_error(worker):
-                    worker.receive(0)
-        return self._have_ended(calls)
+    def result_or(self, call: Call | None, here: Callable[[], Any]) -> Any:
+        """Wait for the result of a call; return that of `here` if it was not accepted, or if its worker was lost."""
+        if call is not None:
+            with suppress(WorkerLostError):
+                return self.result(call)
+        return here()
 
-    def _have_ended(self, calls: Sequence[Call]) -> list[Call]:
-        return [call for call in calls if call.answer is not None or call.worker not in self._workers]
+    def has_answer(self, call: Call, timeout: float | None) -> bool:
+        """Whether `result` returns or raises at once, after some seconds at most, or however many if None."""
+        while call.answer is None and call.worker in self._workers:
+            with self._lost_on_error(call.worker):
+                if not call.worker.receive(timeout):
+                    return False
+        return True
 
     def _is_ready(self, worker: _Worker) -> bool:
         with self._lost_on_error(worker):
@@ -244,9 +228,7 @@ class WorkerPool:
 
 
 class SharedTasks(WorkerPool):
-    """Workers that help this process with tasks while this is entered.
-
-    Tasks that a worker did not finish, because it was killed, are done here.
+    """Workers that help this process with tasks while this is entered; what a killed one left undone is done here.
 
     Args:
         do: (*parts, *task) -> None does a task; a function of a module, since workers import it.
@@ -263,26 +245,21 @@ class SharedTasks(WorkerPool):
 
         Raises what a task raises, here or in a worker.
         """
-        waiting = deque(tasks)
-        calls: dict[Call, tuple[Any, ...]] = {}
+        waiting, calls = deque(tasks), list[tuple[Call, tuple[Any, ...]]]()
         while waiting or calls:
             while waiting and len(calls) < AHEAD * self.count:
                 call = self.submit(*waiting[0])
                 if call is None:
                     break
-                calls[call] = waiting.popleft()
-            is_busy = bool(waiting)
-            if is_busy:
+                calls.append((call, waiting.popleft()))
+            if waiting:
                 self._do(*waiting.popleft())
                 yield
-            for call in self.answered(list(calls), 0 if is_busy else None):
-                task = calls.pop(call)
-                try:
-                    self.result(call)
-                except WorkerLostError:
-                    waiting.append(task)
-                else:
-                    yield
+            asked, timeout = (calls, 0) if waiting else (calls[:1], None)
+            for each in [each for each in asked if self.has_answer(each[0], timeout)]:
+                calls.remove(each)
+                self.result_or(each[0], partial(self._do, *each[1]))
+                yield
 
 
 def can_fork() -> bool:
@@ -290,7 +267,9 @@ def can_fork() -> bool:
 
     The use of a GPU does not survive a fork either. Elsewhere than on Linux the system's libraries may have threads.
     """
-    return sys.platform == "linux" and len(list(THREADS.iterdir())) == 1 and not torch.cuda.is_initialized()
+    if sys.platform != "linux" or torch.cuda.is_initialized():
+        return False
+    return len(os.listdir("/proc/self/task")) == 1  # an entry for each thread
 
 
 @contextmanager
@@ -352,49 +331,34 @@ def _serve_in_fork(theirs: Connection, ours: Connection, task: bytes) -> None:
 
 def _serve_when_imported(connection: Connection) -> None:
     """Answer calls in a new interpreter, which has imported everything to find this function."""
-    connection.send_bytes(READY)
+    connection.send_bytes(b"")
     _serve(connection, connection.recv_bytes())
 
 
 def _serve(connection: Connection, task: bytes) -> None:
-    """Answer calls.
-
-    Threads receive and send, so that neither process waits for the other one to receive.
-    """
+    """Answer calls. Threads receive and send, so that neither process waits for the other one to receive."""
     received: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     answers: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_receive, args=(connection, received), daemon=True).start()
-    threading.Thread(target=_send, args=(connection, answers), daemon=True).start()
+    for ends in ((connection.recv_bytes, received.put), (answers.get, connection.send_bytes)):
+        threading.Thread(target=_forward, args=ends, daemon=True).start()
     threads, niceness, make, parts = pickle.loads(task)
     torch.set_num_threads(threads)
     if hasattr(os, "nice"):  # not on Windows
         os.nice(niceness)
     answer = make(*parts)
     while True:
-        answers.put(_call(answer, received.get()))
+        question = received.get()
+        try:
+            with torch.inference_mode():
+                answers.put(_pack((answer(*pickle.loads(question)), "")))
+        except Exception as error:
+            answers.put(_pack((error, traceback.format_exc())))
 
 
-def _receive(connection: Connection, received: queue.SimpleQueue[bytes]) -> None:
-    """Receive calls; end with the parent, which may have been killed: nobody waits for the answers."""
+def _forward(take: Callable[[], bytes], give: Callable[[bytes], object]) -> None:
+    """Pass messages on; end with the parent, which may have been killed: nobody waits for the answers."""
     try:
         while True:
-            received.put(connection.recv_bytes())
+            give(take())
     except (OSError, EOFError):
         os._exit(1)
-
-
-def _send(connection: Connection, answers: queue.SimpleQueue[bytes]) -> None:
-    try:
-        while True:
-            connection.send_bytes(answers.get())
-    except OSError:
-        os._exit(1)
-
-
-def _call(answer: Callable[..., object], question: bytes) -> bytes:
-    """The packed result of a call and no traceback, or its exception and the traceback."""
-    try:
-        with torch.inference_mode():
-            return _pack((answer(*pickle.loads(question)), ""))
-    except Exception as error:
-        return _pack((error, traceback.format_exc()))

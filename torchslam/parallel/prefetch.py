@@ -14,7 +14,7 @@ import torch
 
 from torchslam.data.sequence import EndOfSequence, Sequence
 from torchslam.errors import FrameError
-from torchslam.parallel.pool import Call, WorkerLostError, WorkerPool
+from torchslam.parallel.pool import Call, WorkerPool
 from torchslam.types import Features, Frame
 from torchslam.utils.timing import Stopwatch
 
@@ -30,13 +30,8 @@ Extractor = Callable[[Frame], Features]
 class FeaturePrefetcher(WorkerPool):
     """The frames of a sequence with their features; each is to be read once, in the order of its index.
 
-    The workers run while this is entered. Frames are read in this process until a worker has started, and after one
-    was killed.
-
-    Args:
-        make_extractor: called in each worker
-        clock: records the time spent waiting for features as "features"
-        processes: number of workers
+    The workers, which call `make_extractor`, run while this is entered. Frames are read in this process until a worker
+    has started, and after one was killed. `clock` records the time spent waiting as "features".
     """
 
     def __init__(
@@ -53,35 +48,22 @@ class FeaturePrefetcher(WorkerPool):
 
     def __getitem__(self, index: int) -> Frame:
         """Frame `index`. Raises FrameError if it cannot be read or does not fit the camera."""
-        self._request_after(index)
-        call = self._requested.pop(index, None)
-        if call is not None:
-            try:
-                with self._clock("features"):
-                    frame: Frame = self.result(call)
-                return frame
-            except WorkerLostError:
-                pass
-        return self._sequence[index]
-
-    def _request_after(self, index: int) -> None:
-        """Request the frames after `index`, once a worker has started."""
         until = min(index + 1 + AHEAD * self.count, len(self._sequence))
         for later in range(max(index + 1, self._next), until):
             call = self.submit(later)
             if call is None:
-                return
+                break
             self._requested[later], self._next = call, later + 1
+        with self._clock("features"):
+            frame: Frame | None = self.result_or(self._requested.pop(index, None), lambda: None)
+        return self._sequence[index] if frame is None else frame
 
 
 class LivePrefetcher(WorkerPool):
     """The frames of a live source; each is to be read once, in order.
 
-    The worker runs while this is entered. Frames whose features it did not extract come without.
-
-    Args:
-        make_extractor: called in the worker
-        clock: records the time spent waiting for features as "features"
+    The worker runs while this is entered. Frames whose features it did not extract come without. `clock` records the
+    time spent waiting as "features".
     """
 
     def __init__(self, sequence: Sequence, make_extractor: Callable[[], Extractor], clock: Stopwatch) -> None:
@@ -95,19 +77,12 @@ class LivePrefetcher(WorkerPool):
         taken, self._next = self._next, None
         if isinstance(taken, FrameError):
             raise taken
-        frame = self._sequence[index] if taken is None else self._with_features(taken)
-        self._take_next(index + 1)
-        return replace(frame, backlog=self._sequence.backlog + (self._next is not None))
-
-    def _with_features(self, frame: Frame) -> Frame:
+        frame = self._sequence[index] if taken is None else taken
         call, self._call = self._call, None
-        if call is None:
-            return frame
-        try:
-            with self._clock("features"):
-                return replace(frame, features=self.result(call))
-        except WorkerLostError:
-            return frame
+        with self._clock("features"):
+            features = self.result_or(call, lambda: frame.features)
+        self._take_next(index + 1)
+        return replace(frame, features=features, backlog=self._sequence.backlog + (self._next is not None))
 
     def _take_next(self, index: int) -> None:
         """Take the next frame from the source and submit it, if it has arrived and the worker has started."""

@@ -7,12 +7,12 @@ results.
 
 from __future__ import annotations
 
+import operator
 import os
 import statistics
-import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -22,8 +22,9 @@ from torchslam.data.sequence import Frames, Sequence
 from torchslam.geometry import Camera
 from torchslam.mapping.local_bundle import Solver
 from torchslam.mapping.mapper import Mapper
-from torchslam.parallel.pool import WorkerLostError, WorkerPool, can_fork
+from torchslam.parallel.pool import WorkerPool, can_fork
 from torchslam.parallel.prefetch import NICENESS, Extractor, FeaturePrefetcher, LivePrefetcher
+from torchslam.utils.console import say
 from torchslam.utils.forks import close_decoders
 from torchslam.utils.timing import Stopwatch
 
@@ -40,10 +41,7 @@ SAMPLES, SAMPLING_S = 5, 0.01
 
 
 class _Estimator(Protocol):
-    """The part of `torchslam.system.online_camera.OnlineCamera` that workers need."""
-
-    def solved_by(self, solver: Solver) -> AbstractContextManager[None]:
-        """Estimate elsewhere while the context is entered."""
+    def solved_by(self, solver: Solver) -> AbstractContextManager[None]: ...
 
 
 class RunningSystem(Protocol):
@@ -57,18 +55,14 @@ class RunningSystem(Protocol):
     make_extractor: Callable[[], Extractor]
 
     @property
-    def online_camera(self) -> _Estimator:
-        """What estimates the sensor model."""
+    def online_camera(self) -> _Estimator: ...
 
     @property
-    def mapping(self) -> bool:
-        """True if the run changes the map, False if frames are only localized."""
+    def mapping(self) -> bool: ...
 
-    def warm_up(self) -> None:
-        """Initialize ORB and PyTorch."""
+    def warm_up(self) -> None: ...
 
-    def precompute_undistortion(self) -> None:
-        """Compute the undistortion table of the camera."""
+    def precompute_undistortion(self) -> None: ...
 
 
 def processors() -> int:
@@ -116,22 +110,16 @@ def with_workers(
     slam.warm_up()
     if slam.camera.params.device.type != "cpu":
         if processes is not None and processes > 1:
-            print(
-                f"torchslam: one process is used, since the camera is on {slam.camera.params.device}",
-                file=sys.stderr,
-            )
+            say(f"one process is used, since the camera is on {slam.camera.params.device}")
         wanted = 1
     with ExitStack() as others:
-        frames: Frames = sequence
         ahead = reader(sequence, slam, wanted, is_asked_for=processes is not None)
         if ahead is not None:
             others.enter_context(ahead)
-            frames = ahead
+        frames: Frames = sequence if ahead is None else ahead
         if slam.mapping and wanted > (1 if ahead is None else 2):
             # One for each: a local adjustment, which is due in two frames, would wait for an estimate of the sensor.
-            adjusting, estimating = SolverWorker(), SolverWorker(NICENESS)
-            others.enter_context(adjusting)
-            others.enter_context(estimating)
+            adjusting, estimating = map(others.enter_context, (SolverWorker(), SolverWorker(NICENESS)))
             others.enter_context(slam.mapper.adjustment.solved_by(adjusting))
             others.enter_context(slam.online_camera.solved_by(estimating))
         slam.precompute_undistortion()  # while the workers start
@@ -145,7 +133,7 @@ def reader(
     obstacle = prefetch_obstacle(sequence, slam)
     if processes == 1 or obstacle:
         if processes > 1 and is_asked_for:
-            print(f"torchslam: frames are read in the main process: {obstacle}", file=sys.stderr)
+            say(f"frames are read in the main process: {obstacle}")
         return None
     if sequence.is_live:
         return LivePrefetcher(sequence, slam.make_extractor, slam.clock)
@@ -170,20 +158,8 @@ class SolverWorker(WorkerPool):
     """
 
     def __init__(self, niceness: int = 0) -> None:
-        super().__init__(1, partial, apply, niceness=niceness)
+        super().__init__(1, partial, operator.call, niceness=niceness)
 
     def __call__(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         call = self.submit(function, *arguments)
-
-        def answer() -> Any:
-            if call is not None:
-                with suppress(WorkerLostError):
-                    return self.result(call)
-            return function(*arguments)
-
-        return answer
-
-
-def apply(function: Callable[..., Any], *arguments: Any) -> Any:
-    """Call a function, in a worker."""
-    return function(*arguments)
+        return partial(self.result_or, call, partial(function, *arguments))

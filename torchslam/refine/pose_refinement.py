@@ -42,7 +42,6 @@ from torchslam.global_mapping.rounds import (
     Reconstruction,
     adjust_in_rounds,
 )
-from torchslam.global_mapping.tracks import join_matches
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
     Relation,
@@ -193,7 +192,7 @@ class _Refinement:
     ) -> None:
         """given_cw: by frame of the sequence; of frames without a pose, any."""
         self.mapper, self.frames, self.given_cw = mapper, frames, given_cw
-        self.views = [view for view in mapper.views(chosen) if view is not None]
+        self.views = [view for view in map(mapper.view, chosen) if view is not None]
         self.pairs: list[ViewPair] = []
         self.failure = ""
         if len(self.views) < MIN_VIEWS:
@@ -271,9 +270,7 @@ class _Refinement:
     def _tracks(self) -> ObservedTracks:
         connected = set(connected_views(self.used, len(self.views)).tolist())
         pairs = [pair for pair in self.used if pair.first in connected]
-        tracks = join_matches(pairs, len(self.views), len(self.views[0].mask))
-        tracks, _ = tracks.select(torch.ones_like(tracks.track, dtype=torch.bool), MIN_VIEWS)
-        return ObservedTracks.of(tracks, self.views)
+        return ObservedTracks.join(pairs, self.views)
 
     def _from_given(
         self, coarse: bool = False

@@ -1,10 +1,24 @@
-"""Terminal output: tables, lines, progress bars, and the message for a missing OpenCV. Imports no torch."""
+"""Terminal output: lines, tables and progress bars, and text from outside as it may be shown. Imports no torch."""
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping
 from typing import Any, TextIO
+
+INTERVAL = 5.0
+"""Seconds between two progress lines in a log."""
+OPENCV = (
+    "OpenCV is not installed (module cv2): pip install opencv-python-headless, or opencv-python if another package "
+    "needs its windows; install only one of them, since each overwrites the files of the other"
+)
+# Also with the single slash that a path leaves of `//`. A user name or a password may have any character but a space.
+_USER = re.compile(r"\b([A-Za-z][A-Za-z0-9+.-]+:/{1,2})\S*@")
+_ADDRESS = re.compile(r"\b[A-Za-z][A-Za-z0-9+.-]+:/{1,2}\S+")
+_SECRET = re.compile(
+    r"((?:password|passwd|pass|pwd|token|secret|signature|api_?key|auth)=)[^&;/\s'\"`]+", re.IGNORECASE
+)
 
 
 def table(rows: Mapping[str, str]) -> str:
@@ -21,10 +35,6 @@ def say(words: object) -> None:
 def warn(words: object) -> None:
     """Print a warning to stderr."""
     say(f"warning: {words}")
-
-
-INTERVAL = 5.0
-"""Seconds between two progress lines in a log."""
 
 
 def tqdm_options() -> dict[str, Any]:
@@ -51,12 +61,23 @@ class Lines:
         self._file.flush()
 
 
-OPENCV = (
-    "OpenCV is not installed (module cv2): pip install opencv-python-headless, or opencv-python if another package "
-    "needs its windows; install only one of them, since each overwrites the files of the other"
-)
-
-
 def with_install_hint(error: ModuleNotFoundError) -> ModuleNotFoundError:
     """Return an error with the command that installs OpenCV if that is missing, any other error unchanged."""
     return ModuleNotFoundError(OPENCV, name="cv2") if error.name == "cv2" else error
+
+
+def without_credentials(text: str) -> str:
+    """Return the text without the user, password and tokens of addresses such as rtsp://user:password@host."""
+    if ":/" not in text:
+        return text
+    return _ADDRESS.sub(lambda found: _SECRET.sub(r"\1***", found[0]), _USER.sub(r"\1", text))
+
+
+def printable(text: str) -> str:
+    """Return the text with control characters, line ends and lone surrogates escaped."""
+    return "".join(each if each.isprintable() else each.encode("unicode_escape").decode() for each in text)
+
+
+def is_unicode(text: str) -> bool:
+    """Return True without lone surrogates, which file names in other encodings have."""
+    return not any("\ud800" <= character <= "\udfff" for character in text)

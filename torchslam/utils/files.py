@@ -33,15 +33,12 @@ def check_regular(path: str | Path, limit: int, what: str) -> None:
 
 
 def read_bytes(path: str | Path, limit: int, what: str) -> bytes:
-    """Read the content of a regular file.
+    """Read the content of a regular file of at most `limit` bytes.
 
-    Args:
-        path: the file.
-        limit: maximum number of bytes.
-        what: name of this kind of file, for the message "more than the 100 bytes of a text".
+    what: name of this kind of file, for the message "more than the 100 bytes of a text"
 
     Raises:
-        OSError: for a missing file, anything but a regular file, or more bytes than `limit`.
+        OSError: for a missing file, anything but a regular file, or more bytes.
     """
     try:
         # Without O_NONBLOCK, opening a pipe waits for a writer.
@@ -137,9 +134,9 @@ def whole_folder(path: Path) -> Iterator[Path]:
     part.mkdir()
     try:
         yield part
-        for file in part.rglob("*"):
-            if file.is_file():
-                _sync_file(file)
+        for path_of_file in filter(Path.is_file, part.rglob("*")):
+            with path_of_file.open("rb+") as file:
+                os.fsync(file.fileno())
         if path.exists():
             path.rename(old)
         part.rename(path)
@@ -148,11 +145,6 @@ def whole_folder(path: Path) -> Iterator[Path]:
         raise
     _sync_folder(path.parent)
     shutil.rmtree(old, ignore_errors=True)
-
-
-def _sync_file(path: Path) -> None:
-    with path.open("rb+") as file:
-        os.fsync(file.fileno())
 
 
 def _sync_folder(folder: Path) -> None:

@@ -13,8 +13,6 @@ from typing import Any, Protocol
 
 
 class Holder(Protocol):
-    """What holds a handle."""
-
     def forget_handle(self) -> None:
         """Called in a fork: open another one before the next use; `never_release` this one."""
 

@@ -34,10 +34,7 @@ def between_rows(
     """Return the row before each value, and how far the value is from there to the next row, 0 to 1.
 
     Beyond the ends it is the first or the last interval, and the share is below 0 or above 1. Differentiable.
-
-    Args:
-        ascending: two or more distinct numbers, such as times.
-        values: to be found between them.
+    `ascending` are two or more distinct numbers, such as times.
     """
     found = torch.searchsorted(ascending.detach().contiguous(), values.detach().contiguous(), right=True)
     left = found.clamp(1, len(ascending) - 1) - 1
@@ -67,15 +64,10 @@ def is_among(ids: Int[Tensor, " N"], others: Int[Tensor, " M"]) -> Bool[Tensor, 
 def connected_parts(
     edges: Int[Tensor, "E 2"], count: int, counted: Bool[Tensor, "*batch E"] | None = None
 ) -> Int[Tensor, "*batch {count}"]:
-    """Return the lowest node of the connected component of each of `count` nodes.
+    """Return the lowest node of the connected component of each of `count` nodes, by the counted edges, or all.
 
     Every node points to one of its component with a number not above its own; edges hook these onto one another, and
     pointers are shortened, until nothing changes: about log(count) rounds.
-
-    Args:
-        edges: nodes that are joined.
-        count: number of nodes.
-        counted: edges in use; None: all.
     """
     if counted is None:
         counted = edges.new_ones(len(edges), dtype=torch.bool)

@@ -1,7 +1,8 @@
-"""Timing of the stages of a frame."""
+"""What a run costs: time of the stages of a frame, CPU time and memory of this process and its ended workers."""
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -36,3 +37,23 @@ class Stopwatch:
         """The stages since the last call, and their total."""
         taken, self.ms = self.ms, {}
         return taken | {"total": sum(taken.values())}
+
+
+def cpu_seconds() -> float | None:
+    """User and system time of this process and of its children that have ended; None where the system has no count."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    used = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in used)
+
+
+def peak_memory_mb() -> float | None:
+    """The largest resident set of this process or of any one child that has ended; None where it is not counted."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peaks = (resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return max(peaks) * (1 if sys.platform == "darwin" else 1024) / 1e6  # Linux counts in KiB, macOS in bytes

@@ -47,13 +47,9 @@ def register_pytree(
     flatten: Callable[[T], tuple[list[Any], Any]],
     unflatten: Callable[[Iterable[Any], Any], T],
 ) -> None:
-    """Make a class a pytree with one leaf.
+    """Make a class a pytree with one leaf, which is the attribute of this name.
 
-    Args:
-        kind: the class.
-        leaf: name of its attribute that is the leaf.
-        flatten: object -> ([leaf], structure).
-        unflatten: ([leaf], structure) -> object; the leaf may be anything.
+    `flatten` and `unflatten` convert an object to ([leaf], structure) and back; the leaf may be anything.
     """
 
     def flatten_with_keys(value: T) -> tuple[list[tuple[_pytree.KeyEntry, Any]], Any]:

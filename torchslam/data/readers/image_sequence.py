@@ -44,7 +44,7 @@ from torchslam.data.sequence import Reader, Sequence
 from torchslam.data.text_file import check_later
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
-from torchslam.utils.text import printable
+from torchslam.utils.console import printable
 
 DEFAULT_RATE = 30.0
 """Frame rate of images without timestamps."""

@@ -23,8 +23,8 @@ from torchslam.data.readers.capture import Capture, Retriever, open_capture, pix
 from torchslam.data.readers.video import SUFFIXES
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
+from torchslam.utils.console import without_credentials
 from torchslam.utils.forks import forget_in_forks, never_release
-from torchslam.utils.text import without_credentials
 
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
 PATIENCE = 15.0

@@ -27,10 +27,9 @@ from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to
 from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
 from torchslam.errors import FrameError, SequenceError, TorchslamError
-from torchslam.utils.console import tqdm_options
+from torchslam.utils.console import printable, tqdm_options
 from torchslam.utils.files import check_regular
 from torchslam.utils.forks import forget_in_forks, never_release
-from torchslam.utils.text import printable
 
 SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}

@@ -27,7 +27,7 @@ from torchslam.io.viewer.arrays import encoded
 from torchslam.io.viewer.ruler import of_points
 from torchslam.map.atlas import Submap
 from torchslam.types import State, Trajectory
-from torchslam.utils.text import printable
+from torchslam.utils.console import printable
 
 VIEW = "view.html"
 SCRIPTS = ("draw.js", "orbit.js", "scene.js", "ruler.js", "view.js")  # in this order, all in one script

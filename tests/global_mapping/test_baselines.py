@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -14,8 +13,7 @@ from torch import Tensor
 from tests.global_mapping.synthetic import CAMERA, Recording, arc, ball, line, rand, randn, wall
 from torchslam.evaluation import ate
 from torchslam.geometry import rigid, se3_inverse
-from torchslam.global_mapping import chained_positions as module
-from torchslam.global_mapping.chained_positions import chained_positions, pair_lengths, solve_differences
+from torchslam.global_mapping.baselines import chained_positions, pair_lengths, solve_differences
 from torchslam.global_mapping.view_graph import Relation, ViewPair
 
 WALK = Recording.of(line(10), wall(200, 2.3))
@@ -82,50 +80,6 @@ def test_images_without_pairs_have_finite_positions() -> None:
     assert error(cut, pairs) < 1e-4
 
 
-def test_baselines_are_weighted_by_their_lengths(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A direction is off by an angle: with it a baseline is by a share of its length, a ratio by three percent more."""
-    calls: list[tuple[Tensor, Tensor, Tensor, int]] = []
-    solve = module.solve_differences
-
-    def spy(edges: Tensor, differences: Tensor, stds: Tensor, nodes: int) -> Tensor:
-        calls.append((edges, differences, stds, nodes))
-        return solve(edges, differences, stds, nodes)
-
-    monkeypatch.setattr(module, "solve_differences", spy)
-    pairs = TURN.pairs(1, 3)
-    chained_positions(pairs, TURN.T_cw[:, :3, :3], TURN.views, CAMERA)
-    (_, logs, spreads, count), (ends, baselines_w, stds, images) = calls
-    assert (count, images) == (len(pairs), 12)
-    torch.testing.assert_close(spreads, torch.full_like(spreads, 0.03), atol=1e-6, rtol=0)
-    assert logs.shape == (len(spreads), 1)
-    assert ends.tolist() == [[pair.first, pair.second] for pair in pairs]
-    torch.testing.assert_close(stds, 0.05 * baselines_w.norm(dim=-1))
-    centers = se3_inverse(TURN.T_cw)[:, :3, 3]
-    steps = centers[ends[:, 1]] - centers[ends[:, 0]]
-    cosines = torch.nn.functional.cosine_similarity(steps, baselines_w)
-    torch.testing.assert_close(cosines, torch.ones_like(cosines))
-
-
-def test_uncertain_ratios_count_less(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their own error comes on top of that of the poses."""
-    stds: list[Tensor] = []
-    monkeypatch.setattr(
-        module,
-        "solve_differences",
-        lambda edges, logs, spreads, nodes: stds.append(spreads) or torch.zeros(nodes, 1).double(),  # type: ignore[func-returns-value]
-    )
-    noisy = Recording.of(line(3), wall(40, 0.5), noise_px=2.0)
-    pair_lengths(noisy.pairs(1, 2), noisy.views, CAMERA)
-    one, other = noisy.pairs(1)
-    rays = module.ViewRays.by(CAMERA, noisy.views)
-    depths = [module.PairDepths.of(pair.T_21, rays, pair) for pair in (one, other)]
-    ratio = module.depth_ratio(depths[0], 1, depths[1], 0)
-    assert ratio is not None
-    assert ratio.std > 0.01
-    assert any(std == pytest.approx(math.hypot(ratio.std, 0.03)) for std in stds[0].tolist())
-    assert float(stds[0].min()) > 0.03
-
-
 # --- lengths ---------------------------------------------------------------------------------------------------
 
 
@@ -135,15 +89,6 @@ def test_lengths_of_pairs_are_those_of_their_baselines(recording: Recording) -> 
     pairs = recording.pairs(1, 2, 3)
     ratio = pair_lengths(pairs, recording.views, CAMERA) / baselines(recording, pairs)
     torch.testing.assert_close(ratio, ratio.mean().expand_as(ratio), rtol=1e-5, atol=0)
-
-
-@pytest.mark.parametrize("ends", [((0, 1), (0, 3)), ((0, 3), (1, 3)), ((0, 1), (1, 3)), ((1, 3), (0, 1))])
-def test_two_pairs_that_share_an_image_have_comparable_lengths(ends: tuple[tuple[int, int], ...]) -> None:
-    """It may be the first or the second of either."""
-    pairs = [WALK.pair(*both) for both in ends]
-    one, other = pair_lengths(pairs, WALK.views, CAMERA).tolist()
-    true = baselines(WALK, pairs)
-    assert one / other == pytest.approx(float(true[0] / true[1]), rel=1e-4)
 
 
 def test_pairs_that_nothing_ties_to_others_have_the_length_one() -> None:
@@ -179,16 +124,6 @@ def test_differences_are_weighted_by_their_errors() -> None:
     found = solve_differences(edges, differences, stds, 2)
     assert float(found[1] - found[0]) == pytest.approx(0.8, rel=1e-3)
     assert float(found.sum()) == pytest.approx(0, abs=1e-9)
-
-
-def test_wrong_differences_lose_their_weight() -> None:
-    """Three say one, two say that it is ten or minus ten: a thousandth of the step is left of these."""
-    edges = torch.tensor([[0, 1], [1, 0], [0, 1], [0, 1], [0, 1], [1, 2]])
-    differences = torch.tensor([1.0, -1, 1, 10, 10, 5], dtype=torch.float64)[:, None]
-    stds = torch.full((6,), 0.01, dtype=torch.float64)
-    found = solve_differences(edges, differences, stds, 3)[:, 0]
-    assert float(found[1] - found[0]) == pytest.approx(1, abs=1e-3)
-    assert float(found[2] - found[1]) == pytest.approx(5, abs=1e-3)
 
 
 @pytest.mark.parametrize("columns", [1, 2])

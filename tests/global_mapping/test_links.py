@@ -13,9 +13,7 @@ from torch import Tensor
 from tests.global_mapping.synthetic import CAMERA, Recording, disturbed, line, wall
 from torchslam.config import Config
 from torchslam.geometry import se3_inverse
-from torchslam.global_mapping.mapper import SIFT_DISTANCE, SIFT_RATIO, mapping_config
-from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
-from torchslam.global_mapping.weak_links import (
+from torchslam.global_mapping.links import (
     ACROSS,
     match_guided,
     near_epipolar_line,
@@ -23,6 +21,8 @@ from torchslam.global_mapping.weak_links import (
     strengthen,
     weak_links,
 )
+from torchslam.global_mapping.mapper import mapping_config
+from torchslam.global_mapping.view_graph import PairMatcher, ViewPair
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import FrameFeatures, Matches, MatchPrior
 
@@ -174,9 +174,3 @@ def test_other_matchers_receive_the_pose() -> None:
     assert prior.T_21 is T_21
     assert prior.camera is CAMERA
     assert prior.epipolar_px == 12
-
-
-def test_descriptors_of_a_pair_are_those_of_sift() -> None:
-    """The constants of guided matching are factors on those of the mapper."""
-    matching = mapping_config(Config()).matching
-    assert (matching.max_ratio, matching.max_cosine_distance) == (SIFT_RATIO, SIFT_DISTANCE)

@@ -1,8 +1,9 @@
-"""Positions of cameras from the baselines of pairs, whose lengths two-view geometry does not determine.
+"""Baselines of image pairs: ratios of scales of pairs that share an image, lengths, and the positions of cameras.
 
-Two pairs that share an image determine the ratio of their lengths, by the depths of keypoints of the shared image that
-both see. The logarithms of all lengths are the least squares of these ratios, and the positions that of the baselines.
-Unlike positions from rays alone, of which parts collapse where few tracks cross, neighbors keep their scale.
+A relative pose determines the depths of the matches of a pair in units of its baseline. Two pairs that share an image
+determine the ratio of their lengths, by the depths of keypoints of that image that both see. The logarithms of all
+lengths are the least squares of these ratios, and the positions that of the baselines. Unlike positions from rays
+alone, of which parts collapse where few tracks cross, neighbors keep their scale.
 
 Both are differences of unknowns of nodes along edges, solved by iteratively reweighted least squares (Holland and
 Welsch, "Robust regression using iteratively reweighted least-squares", 1977).
@@ -12,20 +13,29 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from itertools import combinations
+from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
+from numpy.typing import NDArray
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_inverse
-from torchslam.geometry.robust import robustify
-from torchslam.global_mapping.depth_ratios import DepthRatio, PairDepths, ViewRays, depth_ratio
+from torchslam.geometry.robust import median_with_error, robustify
 from torchslam.global_mapping.view_graph import Relation, ViewPair
 from torchslam.optim.pose_graph._problem import Groups
 from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, factorize_sparse
 from torchslam.types import FrameFeatures
 
+MIN_PARALLAX_SIGMAS = 5.0
+"""Parallax of a keypoint that takes part in a ratio, in units of its noise: below, inverse depths are biased."""
+SIGMA_PX = 0.7
+"""Noise of a parallax: that of a keypoint in either image."""
+MIN_POINTS = 12
+"""Least number of keypoints for a ratio of depths."""
 SYSTEMATIC_STD = 0.03
 """Standard deviation of the logarithm of a ratio beyond its own: relative poses are off by fractions of a degree."""
 DIRECTION_STD = 0.05
@@ -36,6 +46,69 @@ STEPS = 10
 """Steps of reweighting with each width. Tried at this value only."""
 ZERO_PRIOR_WEIGHT = 1e-6
 """Relative weight that ties every node to zero: parts that nothing connects stay solvable."""
+
+Array = NDArray[np.float64]
+
+
+class ViewRays:
+    """Unit directions of all keypoints of images, computed once: an image is in many pairs. `focal` in pixels."""
+
+    def __init__(self, camera: Camera, views: Sequence[FrameFeatures]) -> None:
+        self.views: list[Float[Tensor, "_ 3"]] = [camera.unproject(view.keypoints) for view in views]
+        self.focal = float(camera.focal)
+
+    def of(self, pair: ViewPair) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 3"]]:
+        """The directions of the matches of a pair, in either camera."""
+        return self.views[pair.first][pair.keypoints_1], self.views[pair.second][pair.keypoints_2]
+
+
+@dataclass(frozen=True)
+class PairDepths:
+    """Inverse depths of a pair in either image, per keypoint, NaN for those without a match, and their noise."""
+
+    inverse: tuple[Array, Array]
+    sigma: tuple[Array, Array]
+
+    @classmethod
+    def of(cls, T_21: Float[Tensor, "4 4"], rays: ViewRays, pair: ViewPair) -> PairDepths:
+        """The depths by a relative pose, in its unit."""
+        x_1, x_2 = rays.of(pair)
+        sigma = SIGMA_PX / rays.focal
+        tables = []
+        for T, own, other, keypoints, count in (
+            (T_21, x_1, x_2, pair.keypoints_1, len(rays.views[pair.first])),
+            (se3_inverse(T_21), x_2, x_1, pair.keypoints_2, len(rays.views[pair.second])),
+        ):
+            # other x (R own + inverse t) = 0, by least squares.
+            along = torch.linalg.cross(other, own @ T[:3, :3].mT)
+            across = torch.linalg.cross(other, T[:3, 3].expand_as(other))
+            reach = across.norm(dim=-1)
+            table = torch.full((2, count), torch.nan, dtype=own.dtype, device=own.device)
+            table[0, keypoints] = -(along * across).sum(-1) / reach.square().clamp(min=1e-30)
+            table[1, keypoints] = sigma / reach.clamp(min=1e-15)
+            tables.append(table.cpu().numpy())
+        return cls((tables[0][0], tables[1][0]), (tables[0][1], tables[1][1]))
+
+
+class DepthRatio(NamedTuple):
+    """Logarithm of the median ratio of the inverse depths of one pair to those of another, and its standard error."""
+
+    log_ratio: float
+    std: float
+
+
+def depth_ratio(one: PairDepths, at_one: int, other: PairDepths, at_other: int) -> DepthRatio | None:
+    """Compare the inverse depths of the keypoints of a shared image by two pairs; None if too few can be compared.
+
+    `at_one` and `at_other`: which image of either pair is shared, 0 or 1. Depths of the other are divided by the first.
+    """
+    a, b = one.inverse[at_one], other.inverse[at_other]
+    # Comparisons with NaN are false: a keypoint that one pair does not match takes no part.
+    good = (a > MIN_PARALLAX_SIGMAS * one.sigma[at_one]) & (b > MIN_PARALLAX_SIGMAS * other.sigma[at_other])
+    if np.count_nonzero(good) < MIN_POINTS:
+        return None
+    center, _, error = median_with_error(np.log(b[good] / a[good]))
+    return DepthRatio(center, error)
 
 
 def chained_positions(
@@ -66,7 +139,7 @@ def pair_lengths(
     pairs: Sequence[ViewPair], views: Sequence[FrameFeatures], camera: Camera
 ) -> Float[Tensor, " P"]:
     """The lengths of the baselines of pairs, in a common unit; 1 for pairs that share no image with others."""
-    rays = ViewRays.by(camera, views)
+    rays = ViewRays(camera, views)
     depths = [PairDepths.of(pair.T_21, rays, pair) for pair in pairs]
     around: dict[int, list[tuple[int, int]]] = {}
     for row, pair in enumerate(pairs):
