@@ -34,17 +34,9 @@ def _moment_weights(device: torch.device) -> Int[Tensor, "2 S"]:
 def orientations(
     pixels: UInt8[Tensor, " A"], positions: Int[Tensor, " N"], stride: int
 ) -> Float[Tensor, " N"]:
-    """Compute the angle from each keypoint to the intensity centroid of the disk around it.
+    """Compute the angle from each keypoint in flattened pixels to the intensity centroid of the disk around it.
 
-    The moments are whole numbers below 2^24, hence exact.
-
-    Args:
-        pixels: flattened packed pyramids.
-        positions: of the keypoints in the pixels.
-        stride: length of a row of pixels.
-
-    Returns:
-        Radians in [-pi, pi], from x towards y; 0 on a uniform patch.
+    Radians in [-pi, pi], from x towards y; 0 on a uniform patch. The moments are whole numbers below 2^24, hence exact.
     """
     patches = gather_patches(pixels, positions, stride, RADIUS).flatten(1)
     # As int8: subtracting a constant changes no moment. The other order of factors is slower.

@@ -7,7 +7,6 @@ Rabaud, Konolige, Bradski: ORB, an efficient alternative to SIFT or SURF (ICCV 2
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -39,44 +38,11 @@ from torchslam.features.selection import Grid, best_per_cell, plan_grid, prefilt
 from torchslam.types import Features
 
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
-HARRIS_RADIUS = 4  # of the patch that a Harris response needs
-FAST_RADIUS = 3  # of the circle
-SOFT_RADIUS = 1  # of the soft arg-max
+PATCH_RADIUS = 4  # 3 of the circle of FAST and 1 of the soft arg-max; just what a Harris response needs
 MAX_SCORE = 255  # a score that no corner exceeds
 WEAK_TEXTURE_RATIO = 0.5  # of the keypoints that may be chosen: an image that offers fewer has weak texture
-FAINT_THRESHOLD = (
-    4  # gray values: corners of an image of the weakest texture, above the noise of a good camera
-)
+FAINT_THRESHOLD = 4  # gray values: corners of an image of the weakest texture, above a good camera's noise
 KEYPOINTS_PER_CELL = 8  # keypoints of a cell if they were spread evenly
-
-
-@dataclass(frozen=True)
-class Corners:
-    """The chosen corners of a batch of images, N in all, and the pyramid in which they were detected.
-
-    Attributes:
-        levels: from `build_levels`.
-        pixels: the flattened packed pyramids.
-        pyramid: their layout.
-        positions: of the corners in the pixels.
-        slots: rows in the flattened (B, num_keypoints) table.
-        strengths: by which the corners were ranked.
-        fast: FAST scores around each corner.
-        image: of each corner.
-        level: of each corner.
-        xy: pixels of the level.
-    """
-
-    levels: list[Float[Tensor, "B 1 _ _"]]
-    pixels: UInt8[Tensor, " A"]
-    pyramid: PackedPyramid
-    positions: Int[Tensor, " N"]
-    slots: Int[Tensor, " N"]
-    strengths: Float[Tensor, " N"]
-    fast: UInt8[Tensor, "N 3 3"]
-    image: Int[Tensor, " N"]
-    level: Int[Tensor, " N"]
-    xy: Int[Tensor, "N 2"]
 
 
 class ORB(nn.Module):
@@ -136,69 +102,56 @@ class ORB(nn.Module):
             ValueError: The images or the mask have another shape or type.
             FrameError: The images are not in [0, 1].
         """
-        corners = self.detect(images, mask)
-        stride, dtype = corners.pyramid.stride, images.dtype
-        angles = orientations(corners.pixels, corners.positions, stride)
-        descriptors = describe(blur(corners.pixels, stride), corners.positions, angles, stride)
-        offsets, scores = self._refine(corners)
-        scale_xy = torch.tensor(corners.pyramid.scales, dtype=dtype, device=images.device)[corners.level]
-        keypoints = (corners.xy + offsets.to(dtype) + 0.5) * scale_xy - 0.5
-        scales = self.scale_factor ** corners.level.to(dtype)
-
-        def table(values: Tensor, fill: int = 0) -> Tensor:
-            empty = values.new_full((len(images) * self.num_keypoints, *values.shape[1:]), fill)
-            return empty.index_copy(0, corners.slots, values).unflatten(0, (len(images), -1))
-
-        return Features(
-            table(keypoints),
-            table(scores.to(dtype)),
-            table(scales, fill=1),
-            table(angles.to(dtype)),
-            table(descriptors),
-            table(torch.ones_like(corners.slots, dtype=torch.bool)),
-        )
-
-    def detect(
-        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
-    ) -> Corners:
-        """Choose the corners of a batch of images, without sub-pixel positions and descriptors.
-
-        Args:
-            images: gray, in [0, 1].
-            mask: where corners may lie, which get the whole budget; None: everywhere.
-        """
         check_images(images, mask)
         pyramid = plan_pyramid(*images.shape[-2:], self.scale_factor, self.num_levels)
         grid = plan_grid(
             pyramid, self.num_keypoints, KEYPOINTS_PER_CELL, BORDER, self.low_threshold, images.device
         )
+        stride, dtype = pyramid.stride, images.dtype
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
             levels = build_levels(images, pyramid)
         with torch.no_grad():
             pixels = pack_levels(levels, pyramid).flatten()
-            # Peaks lie in cells, and the scores next to them are needed as well.
-            scores = fast_scores(pixels, pyramid.stride, _bands(grid, pyramid, len(images), margin=1))
+            # Peaks lie in cells, and the FAST scores next to them are needed as well.
+            fast = fast_scores(pixels, stride, _bands(grid, pyramid, len(images), margin=1))
             floor = grid.floor.expand(len(images), -1).reshape(-1)
             if mask is not None:
                 floor = torch.where(_packed_mask(mask, pyramid), floor, MAX_SCORE)
-            bands = _bands(grid, pyramid, len(images))
-            positions = self._peaks(scores, floor, len(images), pyramid.stride, bands)
-            positions, slots, strengths = self._choose(pixels, scores, positions, grid, pyramid.stride)
-            fast = gather_patches(scores, positions, pyramid.stride, 1)
+            positions = self._peaks(fast, floor, len(images), stride, _bands(grid, pyramid, len(images)))
+            positions, slots, strengths = self._choose(pixels, fast, positions, grid, stride)
             area = grid.table.shape[0]
             image, inside = positions // area, positions % area
             level = grid.levels[grid.table[inside].to(torch.int64)]
             top, left = torch.tensor(pyramid.corners, device=images.device)[level].unbind(-1)
-            xy = torch.stack([inside % pyramid.stride - left, inside // pyramid.stride - top], dim=-1)
-        return Corners(levels, pixels, pyramid, positions, slots, strengths, fast, image, level, xy)
+            xy = torch.stack([inside % stride - left, inside // stride - top], dim=-1)
+            angles = orientations(pixels, positions, stride)
+            descriptors = describe(blur(pixels, stride), positions, angles, stride)
+        # Corners are where the FAST score peaks; the maximum of the Harris response lies further inside the corner and
+        # repeats less precisely.
+        if self.differentiable:
+            offsets, strengths = self._soft_peaks(
+                gather_level_patches(levels, image, level, xy, PATCH_RADIUS)
+            )
+        else:
+            offsets = quadratic_peak(gather_patches(fast, positions, stride, 1).to(torch.float32))
+        scale_xy = torch.tensor(pyramid.scales, dtype=dtype, device=images.device)[level]
+        keypoints = (xy + offsets.to(dtype) + 0.5) * scale_xy - 0.5
+
+        def table(values: Tensor, fill: int = 0) -> Tensor:
+            empty = values.new_full((len(images) * self.num_keypoints, *values.shape[1:]), fill)
+            return empty.index_copy(0, slots, values).unflatten(0, (len(images), -1))
+
+        return Features(
+            table(keypoints),
+            table(strengths.to(dtype)),
+            table(self.scale_factor ** level.to(dtype), fill=1),
+            table(angles.to(dtype)),
+            table(descriptors),
+            table(torch.ones_like(slots, dtype=torch.bool)),
+        )
 
     def _peaks(
-        self,
-        scores: UInt8[Tensor, " A"],
-        floor: UInt8[Tensor, " A"],
-        batch: int,
-        stride: int,
-        bands: Bands,
+        self, scores: UInt8[Tensor, " A"], floor: UInt8[Tensor, " A"], batch: int, stride: int, bands: Bands
     ) -> Int[Tensor, " R"]:
         """Positions of corners: peaks of the scores above a floor, which is lower in images with few of them."""
         positions = find_peaks(scores, floor, stride, bands)
@@ -235,33 +188,26 @@ class ORB(nn.Module):
         strong = fast > self.threshold
         best = best_per_cell(image * num_cells + cell, fast, batch * num_cells)
         strong |= self._are_few(strong | best, image, batch).index_select(0, image)
+        competing = best | strong
         if self.ranking == "fast":  # the whole part of what they compete by
-            needed = best | (
-                strong
-                & prefilter_candidates(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
+            count = self.num_keypoints
+            competing = best | (
+                strong & prefilter_candidates(fast, competing, cell, image, grid, batch, count)
             )
-        else:
-            needed = best | strong
-        kept = needed.nonzero().squeeze(1)
+        kept = competing.nonzero().squeeze(1)
         positions, image, cell, strong = (x.index_select(0, kept) for x in (positions, image, cell, strong))
         if self.ranking == "harris":
-            patches = gather_patches(pixels, positions, stride, HARRIS_RADIUS)
+            patches = gather_patches(pixels, positions, stride, PATCH_RADIUS)
             strengths = harris_responses(patches.to(torch.float32)).flatten()
         else:
             strengths = _contrast_score(gather_patches(scores, positions, stride, 1).to(torch.float32))
         rows, places = select_evenly(strengths, strong, cell, image, grid, batch, self.num_keypoints)
         return positions[rows], image[rows] * self.num_keypoints + places, strengths[rows]
 
-    def _refine(self, corners: Corners) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
-        """Sub-pixel offsets in pixels of the level, and scores.
-
-        Corners are where the FAST score peaks; the maximum of the Harris response lies further inside the corner and
-        repeats less precisely.
-        """
-        if not self.differentiable:
-            return quadratic_peak(corners.fast.to(torch.float32)), corners.strengths
-        radius = FAST_RADIUS + SOFT_RADIUS  # just what the Harris response of the center needs
-        patches = gather_level_patches(corners.levels, corners.image, corners.level, corners.xy, radius)
+    def _soft_peaks(
+        self, patches: Float[Tensor, "N 9 9"]
+    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
+        """Differentiable sub-pixel offsets of corners in pixels of the level, and their scores."""
         fast = patch_scores(patches)
         if self.ranking == "harris":
             return soft_peak(fast), harris_responses(patches).flatten()
@@ -270,14 +216,9 @@ class ORB(nn.Module):
 
 def _bands(grid: Grid, pyramid: PackedPyramid, batch: int, margin: int = 0) -> Bands:
     """Runs of pixels of `batch` flattened pyramids in whose rows there are cells, with `margin` rows around them."""
-    return tuple(
-        (
-            (image * pyramid.rows + first - margin) * pyramid.stride,
-            (image * pyramid.rows + last + margin) * pyramid.stride,
-        )
-        for image in range(batch)
-        for first, last in grid.rows
-    )
+    tops = [image * pyramid.rows for image in range(batch)]
+    runs = [(top + first - margin, top + last + margin) for top in tops for first, last in grid.rows]
+    return tuple((first * pyramid.stride, last * pyramid.stride) for first, last in runs)
 
 
 def _images_of(positions: Int[Tensor, " N"], pixels: int, batch: int) -> Int[Tensor, " N"]:

@@ -43,9 +43,6 @@ RUN_NOISE = 2.0
 By the median residuals of runs over shelf_bin, fr2_desk_20, redkitchen, machine_hall and kitti07, the noise is 0.2 to
 0.5 px up to size 8, and 0.03 to 0.06 of the size beyond. With 1.0, gates are so narrow that shelf_bin is soon lost."""
 
-DESCRIPTOR_FLOATS = 128
-"""Numbers of a descriptor: 4 x 4 cells of 8 directions (Lowe, 2004)."""
-
 Array = NDArray[Any]
 
 
@@ -95,19 +92,11 @@ class SIFT(nn.Module):
         """
         # OpenCV takes the strongest before it applies the mask, so with one it must return all.
         limit = self.num_keypoints if mask is None else 0
-        sift = cv2.SIFT.create(
-            limit,
-            OCTAVE_LAYERS,
-            CONTRAST_THRESHOLD,
-            EDGE_THRESHOLD,
-            FIRST_SIGMA,
-            enable_precise_upscale=True,  # otherwise all keypoints are off by 0.25 px
-        )
+        # Without the precise upscale all keypoints are off by 0.25 px.
+        options = OCTAVE_LAYERS, CONTRAST_THRESHOLD, EDGE_THRESHOLD, FIRST_SIGMA
+        sift = cv2.SIFT.create(limit, *options, enable_precise_upscale=True)
         points, described = sift.detectAndCompute(image, mask)
-        rows, descriptors = (
-            np.zeros((self.num_keypoints, 5)),
-            np.zeros((self.num_keypoints, DESCRIPTOR_FLOATS)),
-        )
+        rows, descriptors = np.zeros((self.num_keypoints, 5)), np.zeros((self.num_keypoints, 128))
         if len(points):
             found = np.array(
                 [(*each.pt, each.size, np.radians(each.angle), each.response) for each in points]

@@ -47,17 +47,9 @@ def pairs_within_radius(
     keypoints: Float[Tensor, "B N 2"],
     keypoint_mask: Bool[Tensor, "B N"],
 ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
-    """Find all pairs of a predicted pixel and a keypoint within its radius.
+    """Find all pairs of a predicted pixel of the mask, finite, and a keypoint within its radius, pixels.
 
-    Args:
-        pixels: finite predicted pixels, at least one.
-        radius: pixels.
-        mask: predictions in use.
-        keypoints: pixels.
-        keypoint_mask: keypoints in use.
-
-    Returns:
-        Flat rows b * M + i, ascending, and flat columns b * N + j; the columns of a row are in no particular order.
+    Returns flat rows b * M + i, ascending, and flat columns b * N + j; the columns of a row are in no particular order.
     """
     if keypoints.is_cpu:
         inputs = pixels.double(), radius.double(), mask, keypoints.double(), keypoint_mask
@@ -90,15 +82,7 @@ def pairs_within_radius(
 def expand_runs(
     starts: Int[Tensor, " N"], ends: Int[Tensor, " N"]
 ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
-    """Expand the runs starts[k], ..., ends[k] - 1 into one list.
-
-    Args:
-        starts: first numbers.
-        ends: numbers after the last ones.
-
-    Returns:
-        The run of each number, ascending, and the numbers.
-    """
+    """Expand the runs starts[k], ..., ends[k] - 1 into one list: the run of each number, ascending, and the numbers."""
     if starts.is_cpu:
         found = _expand_runs_numpy(starts.numpy(), ends.numpy())
         return torch.from_numpy(found[0]), torch.from_numpy(found[1])
@@ -189,19 +173,8 @@ def nearest_of_pairs(
 ) -> tuple[Array, Array, Array]:
     """Choose one column for each row among candidate pairs by whole distances, each column at most once.
 
-    As `best_per_row` and `one_to_one`, in a fraction of the time on the CPU.
-
-    Args:
-        row: rows of the pairs, ascending.
-        column: columns of the pairs.
-        distance: of the pairs.
-        rows: number of rows.
-        scales: of the columns.
-        ratio: the nearest must be closer than `ratio` times the nearest other column of its scale; None: no test.
-        limit: largest distance.
-
-    Returns:
-        The column and the distance of each row, 0 where there is none, and whether there is one.
+    As `best_per_row` and `one_to_one`, in a fraction of the time on the CPU. Rows are ascending, `limit` is the largest
+    distance. Returns the column and the distance of each row, 0 where there is none, and whether there is one.
     """
     best_column, best_distance = np.zeros(rows, np.int64), np.zeros(rows, np.float32)
     mask = np.zeros(rows, bool)
