@@ -22,10 +22,9 @@ from torchslam.system.front_end import Simulated
 from torchslam.system.slam import SLAM
 from torchslam.tracking import tracker as tracker_module
 from torchslam.tracking.data_association import match_points
-from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.initialization import Initializer
 from torchslam.tracking.localizer import match_projected_points, project_points
-from torchslam.tracking.matcher import DescriptorMatcher
+from torchslam.tracking.matcher import DescriptorMatcher, FreeKeypoints, match_along_epipolar_lines
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, Rejection, TwoViewMap
 

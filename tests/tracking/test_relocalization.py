@@ -9,11 +9,10 @@ from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config, load_config
 from torchslam.geometry import SharedCamera
 from torchslam.map.atlas import Submap
-from torchslam.tracking import localizer, pose_validation, relocalization
+from torchslam.tracking import localizer, pose_validation, tracker
 from torchslam.tracking.data_association import match_keyframe, match_points
 from torchslam.tracking.matcher import max_distance
-from torchslam.tracking.relocalization import Relocalizer
-from torchslam.tracking.tracker import Tracker
+from torchslam.tracking.tracker import Relocalizer, Tracker
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
@@ -60,10 +59,10 @@ def test_the_number_of_candidates_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
     candidates = [(other, 0) for other in others]
     assert found(ANYWHERE, [*candidates, (right, 0)]) is None
     assert found(ANYWHERE, [*candidates[:2], (right, 0)]) is right
-    monkeypatch.setattr(relocalization, "MAX_CANDIDATES", 4)
+    monkeypatch.setattr(tracker, "MAX_CANDIDATES", 4)
     assert found(ANYWHERE, [*candidates, (right, 0)]) is right
     # neighbors of a failed candidate are not tried and do not count
-    monkeypatch.setattr(relocalization, "MAX_CANDIDATES", 2)
+    monkeypatch.setattr(tracker, "MAX_CANDIDATES", 2)
     assert found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)]) is right
 
 

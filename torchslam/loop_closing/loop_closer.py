@@ -22,7 +22,7 @@ from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
 from torchslam.mapping.new_points import match_in_keyframes, merge_points
 from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
-from torchslam.tracking.relocalization import MAX_CANDIDATES, Candidate
+from torchslam.tracking.tracker import MAX_CANDIDATES, Candidate
 from torchslam.types import FrameFeatures, Matcher
 
 MIN_ESSENTIAL_WEIGHT = 100

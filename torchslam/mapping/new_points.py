@@ -28,8 +28,13 @@ from torchslam.geometry import (
 from torchslam.map.map import NO_POINT, Map
 from torchslam.map.observation_index import first_of_each
 from torchslam.tracking.data_association import predict_observations
-from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
-from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
+from torchslam.tracking.matcher import (
+    DescriptorMatcher,
+    FreeKeypoints,
+    match_along_epipolar_lines,
+    max_distance,
+    run_matcher,
+)
 from torchslam.types import FrameFeatures, Matcher, MatchPrior
 
 MIN_BASELINE = 0.01

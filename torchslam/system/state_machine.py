@@ -23,7 +23,7 @@ from torchslam.system.savepoint import Savepoint
 from torchslam.system.session import SystemContext
 from torchslam.tracking.non_static import NO_MOVEMENT, FilteredView
 from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, SURE_INLIERS, Certainty, Verdict
-from torchslam.tracking.relocalization import Relocalizer
+from torchslam.tracking.tracker import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason
 
 FRAMES_BEFORE_NEW_SUBMAP = 20

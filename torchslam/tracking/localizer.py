@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -63,7 +63,7 @@ class Localizer:
         self,
         slam_map: Map,
         view: FrameFeatures,
-        candidates: Iterator[MatchIndices],
+        candidates: Iterable[MatchIndices],
         local_points: Int[Tensor, " N"],
         expected_T_cw: Float[Tensor, "4 4"] | None = None,
     ) -> PoseEstimate | None:
