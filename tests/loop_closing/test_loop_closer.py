@@ -13,7 +13,6 @@ from tests.scene import CAMERA, Scene, camera_center, moved, pose, rows_of, side
 from torchslam.config import Config, load_config
 from torchslam.geometry import SharedCamera, se3_inverse, sim3_inverse
 from torchslam.geometry.similarity import umeyama
-from torchslam.loop_closing import loop_closer
 from torchslam.loop_closing.loop_closer import (
     LoopCloser,
     close_loop,
@@ -28,6 +27,7 @@ from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.loop_closing.relative_sim3 import RelativeSim3, RelativeSim3Estimator
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
+from torchslam.mapping import new_points
 from torchslam.tracking.tracker import Tracker
 
 CONFIG = Config()
@@ -215,13 +215,13 @@ def test_only_points_of_the_other_side_are_searched(S_21: Tensor, monkeypatch: p
     submap = two_visits(S_21, tied=0, between=False)
     here, there = torch.arange(VISIT + 1, 2 * VISIT), torch.arange(VISIT - 1)
     searched: list[Tensor] = []
-    match_in_keyframes = loop_closer.match_in_keyframes
+    match_in_keyframes = new_points.match_in_keyframes
 
     def spy(slam_map: Map, keyframes: Tensor, points: Tensor, *rest: Any) -> Any:
         searched.append(points)
         return match_in_keyframes(slam_map, keyframes, points, *rest)
 
-    monkeypatch.setattr(loop_closer, "match_in_keyframes", spy)
+    monkeypatch.setattr(new_points, "match_in_keyframes", spy)
     expected = submap.map.observed_points(there)
     fuse_landmarks(submap.map, here, there, CAMERA, CONFIG)
     assert torch.equal(searched[0], expected)

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.loop_closing.ring import END, KEYFRAMES, ring_submap
+from tests.loop_closing.ring import END, KEYFRAMES, ring_submap, scaling_sim3
 from tests.scene import CAMERA, Scene, camera_center, pose, sideways, submap_of_scene
 from torchslam.config import Config
 from torchslam.geometry import SharedCamera, sim3_inverse
@@ -22,7 +22,7 @@ from torchslam.loop_closing.loop_detector import (
     is_plausible_drift,
     two_hop_covisible,
 )
-from torchslam.loop_closing.relative_sim3 import RelativeSim3, scaling_sim3
+from torchslam.loop_closing.relative_sim3 import RelativeSim3
 from torchslam.map.atlas import Atlas, Submap
 
 SCENE = Scene.of(300)
@@ -38,7 +38,7 @@ def loop_detector(*held: Submap) -> LoopDetector:
         for keyframe in range(submap.map.num_keyframes):
             view = submap.map.frame_features(keyframe)
             database.add(submap.map.key(keyframe), view.descriptors, view.mask)
-    return LoopDetector(SharedCamera(CAMERA), Config(), atlas, database)
+    return LoopDetector(SharedCamera(CAMERA), Config(), atlas, database, None)
 
 
 def two_submaps(S_21: Tensor) -> tuple[Submap, Submap]:
@@ -164,7 +164,7 @@ def test_rotation_drift_is_bounded() -> None:
 @pytest.mark.parametrize(("scale", "may"), [(4.99, True), (5.01, False), (1 / 4.99, True), (1 / 5.01, False)])
 def test_scale_drift_is_bounded(scale: float, may: bool) -> None:
     here = camera_center(way().map.T_cw[10])
-    grown = scaling_sim3(torch.tensor(scale).double())
+    grown = scaling_sim3(scale)
     grown = pose(*here.tolist()) @ grown @ pose(*(-here).tolist())
     assert drifts(grown) is may
     turned = pose(0, 0, 0, 0, 0, math.radians(15.0))  # the scale is no rotation, nor the other way round
@@ -193,7 +193,7 @@ def test_candidates_with_nearly_equal_similarities_agree() -> None:
     for near, far in (
         (pose(0, 0.38), pose(0, 0.5)),  # a tenth of the depth, which is four
         (pose(0, 0, 0, 4.9 * degree), pose(0, 0, 0, 5.1 * degree)),
-        (scaling_sim3(torch.tensor(1.19).double()), scaling_sim3(torch.tensor(1.21).double())),
+        (scaling_sim3(1.19), scaling_sim3(1.21)),
     ):
         assert answers(about(near), pose())
         assert answers(pose(), about(near))

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.loop_closing.ring import scaling_sim3
 from tests.scene import CAMERA, Scene, moved, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config
 from torchslam.geometry import SharedCamera, estimate_similarity, se3_inverse, sim3_inverse, transform
@@ -17,7 +18,6 @@ from torchslam.loop_closing.relative_sim3 import (
     RelativeSim3,
     RelativeSim3Estimator,
     neighborhood,
-    scaling_sim3,
     transfer_pose,
 )
 from torchslam.map.map import Map
@@ -169,7 +169,7 @@ def test_a_neighbor_verifies_a_similarity_that_predicts_its_points(S_21: Tensor)
     for wrong in (
         pose(0.5) @ S_21,
         pose(0, 0, 0, 0, 0.1) @ S_21,
-        scaling_sim3(torch.tensor(1.3).double()) @ S_21,
+        scaling_sim3(1.3) @ S_21,
     ):
         assert not ESTIMATOR.verify(RelativeSim3(wrong, 0, 0, 0), map_1, 3, map_2, near)
     thinned(map_2, in_both(map_1, map_2)[:20])
@@ -212,5 +212,5 @@ def test_a_camera_pose_is_expressed_in_the_other_map(S_21: Tensor) -> None:
     torch.testing.assert_close(transfer_pose(moved(ONE[1], S_21), S_21), ONE[1])
     torch.testing.assert_close(transfer_pose(ONE[1], sim3_inverse(S_21)), moved(ONE[1], S_21))
     points = SCENE.points_w[:5]
-    twice = transform(scaling_sim3(torch.tensor(2.0).double()), points)
+    twice = transform(scaling_sim3(2.0), points)
     torch.testing.assert_close(twice, 2 * points)

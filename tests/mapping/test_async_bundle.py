@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -19,7 +20,6 @@ from torchslam.mapping import local_bundle
 from torchslam.mapping.local_bundle import (
     AsyncBundleAdjustment,
     adjust_all,
-    solve_here,
     solve_local,
     solve_whole,
     squared_errors,
@@ -94,7 +94,7 @@ def test_a_request_is_started_once() -> None:
 
     def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         started.append(function)
-        return solve_here(function, *arguments)
+        return partial(function, *arguments)
 
     adjusting.solver = solver
     adjusting.start()  # nothing was requested
@@ -168,7 +168,7 @@ def test_a_whole_map_is_adjusted_by_another_camera_later() -> None:
 
     def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
         started.append(function)
-        return solve_here(function, *arguments)
+        return partial(function, *arguments)
 
     adjusting.solver = solver
     adjusting.request_whole(slam_map, other, due=12, on_applied=lambda: used.append(slam_map.T_cw.clone()))
@@ -203,7 +203,7 @@ def test_a_solver_is_used_within_its_context() -> None:
     adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA))
 
     def elsewhere(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        return solve_here(function, *arguments)
+        return partial(function, *arguments)
 
     def fail() -> None:
         with adjusting.solved_by(elsewhere):
@@ -212,7 +212,7 @@ def test_a_solver_is_used_within_its_context() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         fail()
-    assert adjusting.solver is solve_here
+    assert adjusting.solver is partial
 
 
 @pytest.fixture(scope="module")

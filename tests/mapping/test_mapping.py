@@ -180,7 +180,8 @@ def test_a_duplicated_point_is_fused(slam: SLAM) -> None:
     )
     slam.map.add_observations(keyframe, seen, doubles)
     slam.map.update_appearance(torch.tensor([keyframe]))
-    fuse(slam.map, keyframe, slam.map.covisible_keyframes(keyframe, 5, min_shared=5), slam.camera, CONFIG)
+    near = slam.map.covisible_keyframes(keyframe, 5, min_shared=5)
+    fuse(slam.map, near, torch.tensor([keyframe]), slam.camera, CONFIG)
     assert torch.equal(slam.map.follow_merges(doubles), slam.map.follow_merges(originals))
 
 

@@ -20,7 +20,7 @@ from torchslam.loop_closing.relative_sim3 import neighborhood
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
-from torchslam.mapping.new_points import match_in_keyframes, merge_points
+from torchslam.mapping.new_points import fuse
 from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
 from torchslam.tracking.tracker import MAX_CANDIDATES, Candidate
 from torchslam.types import FrameFeatures, Matcher
@@ -196,9 +196,7 @@ def fuse_landmarks(
     slam_map: Map, here: Int[Tensor, " K"], there: Int[Tensor, " L"], camera: Camera, config: Config
 ) -> None:
     """Match the points of two sets of keyframes in each other, and merge duplicates."""
-    for keyframes, others in ((here, there), (there, here)):
-        points = slam_map.observed_points(others)
-        merge_points(slam_map, *match_in_keyframes(slam_map, keyframes, points, camera, config))
+    fuse(slam_map, here, there, camera, config)
     slam_map.update_appearance(torch.unique(torch.cat([here, there])))
 
 

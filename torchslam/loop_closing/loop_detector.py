@@ -13,11 +13,7 @@ from torchslam.config import Config
 from torchslam.geometry import SharedCamera, se3_inverse, sim3_scale
 from torchslam.geometry.transforms import rotation_angle
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
-from torchslam.loop_closing.relative_sim3 import (
-    RelativeSim3,
-    RelativeSim3Estimator,
-    neighborhood,
-)
+from torchslam.loop_closing.relative_sim3 import RelativeSim3, RelativeSim3Estimator, neighborhood
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.types import Matcher
@@ -38,14 +34,9 @@ scene. Wide: lookalike places differ by meters and tens of degrees. Tried at the
 
 @dataclass(frozen=True)
 class LoopCandidate:
-    """A verified match of a keyframe with another keyframe of the same place.
+    """A verified match of a new keyframe with a recognized one of the same place, in the same submap or another.
 
-    Attributes:
-        submap: of the new keyframe.
-        keyframe: row of the new keyframe.
-        matched_submap: of the recognized keyframe; the same or another.
-        matched_keyframe: row of the recognized keyframe.
-        relation: Sim(3) from the submap, at the keyframe, to the matched submap.
+    The relation is the Sim(3) from the submap, at the keyframe, to the matched submap.
     """
 
     submap: Submap
@@ -69,14 +60,7 @@ class LoopCandidate:
 
 @dataclass(frozen=True)
 class LoopClosureRecord:
-    """Record of a loop closure or map merge.
-
-    Attributes:
-        frame: index of the frame of the new keyframe.
-        matched_frame: index of the frame of the recognized keyframe.
-        submap: number of the submap of the new keyframe.
-        matched_submap: number of the submap of the recognized keyframe.
-    """
+    """Record of a loop closure or map merge: frames of the new and the recognized keyframe, and their submaps."""
 
     frame: int
     matched_frame: int
@@ -92,11 +76,11 @@ class LoopDetector:
         camera: SharedCamera,
         config: Config,
         atlas: Atlas,
-        keyframe_database: KeyframeDatabase,
-        matcher: Matcher | None = None,
+        database: KeyframeDatabase,
+        matcher: Matcher | None,
     ) -> None:
         self.atlas = atlas
-        self.keyframe_database = keyframe_database
+        self.keyframe_database = database
         self.estimator = RelativeSim3Estimator(camera, config, matcher)
 
     def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:

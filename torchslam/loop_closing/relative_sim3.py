@@ -54,19 +54,12 @@ _GATE_WIDENING = 2.0
 
 @dataclass(frozen=True)
 class RelativeSim3:
-    """Sim(3) between two maps, estimated from a keyframe of each.
+    """Sim(3) between two maps, estimated from a keyframe of each."""
 
-    Attributes:
-        S_21: from the frame of map 1 to that of map 2.
-        inliers_1: number of points of map 2 that keyframe 1 observes where the Sim(3) predicts them.
-        inliers_2: number of points of map 1 that keyframe 2 observes where the Sim(3) predicts them.
-        shared_points: number of points that keyframe 1 observes and that both maps have: they give the scale.
-    """
-
-    S_21: Float[Tensor, "4 4"]
-    inliers_1: int
-    inliers_2: int
-    shared_points: int
+    S_21: Float[Tensor, "4 4"]  # from the frame of map 1 to that of map 2
+    inliers_1: int  # points of map 2 that keyframe 1 observes where the Sim(3) predicts them
+    inliers_2: int  # points of map 1 that keyframe 2 observes where the Sim(3) predicts them
+    shared_points: int  # that keyframe 1 observes and that both maps have: they give the scale
 
 
 class RelativeSim3Estimator:
@@ -98,7 +91,9 @@ class RelativeSim3Estimator:
         T_11 = map_1.T_cw[keyframe_1]
         depth_1 = transform(T_11, map_1.positions_w[own[is_shared]])[:, 2]
         depth_2 = transform(T_12, map_2.positions_w[ids[is_shared]])[:, 2]
-        S_21 = se3_inverse(T_12) @ scaling_sim3((depth_2 / depth_1).median()) @ T_11
+        S_2c = se3_inverse(T_12)
+        S_2c[:, :3] *= (depth_2 / depth_1).median()
+        S_21 = S_2c @ T_11
         points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
         T_21 = transfer_pose(map_2.T_cw[keyframe_2], S_21)
         back, _ = self.match_inliers(map_1, points_1, T_21, map_2, keyframe_2)
@@ -181,9 +176,8 @@ class RelativeSim3Estimator:
         )
         if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
             return None
-        return transfer_pose(
-            torch.eye(4, dtype=T_1.dtype, device=T_1.device), sim3_inverse(found.S_21[0]) @ T_2
-        )
+        eye = torch.eye(4, dtype=T_1.dtype, device=T_1.device)
+        return transfer_pose(eye, sim3_inverse(found.S_21[0]) @ T_2)
 
     def _refined(
         self,
@@ -216,12 +210,6 @@ def neighborhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Int[Tens
     """Return a keyframe and the `count` most covisible ones."""
     near = slam_map.covisible_keyframes(keyframe, count)
     return torch.cat([near.new_tensor([keyframe]), near])
-
-
-def scaling_sim3(scale: Float[Tensor, ""]) -> Float[Tensor, "4 4"]:
-    """Return the Sim(3) that only scales."""
-    eye = torch.eye(3, dtype=scale.dtype, device=scale.device)
-    return rigid(scale * eye, eye.new_zeros(3))
 
 
 def transfer_pose(T_cw: Float[Tensor, "4 4"], S_wv: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:

@@ -49,11 +49,7 @@ class Mapper:
     """Inserts keyframes into a map."""
 
     def __init__(
-        self,
-        camera: SharedCamera,
-        config: Config,
-        clock: Stopwatch,
-        matcher: Matcher | None = None,
+        self, camera: SharedCamera, config: Config, clock: Stopwatch, matcher: Matcher | None = None
     ) -> None:
         self.camera = camera
         self.config = config
@@ -85,14 +81,7 @@ class Mapper:
     ) -> int:
         """Insert a tracked frame as a keyframe: observe, cull points, triangulate, fuse, request local adjustment.
 
-        Args:
-            slam_map: The map.
-            view: The frame.
-            estimate: Its pose and inlier matches.
-            apply_at: When the local bundle adjustment is applied; until then the map must not change.
-
-        Returns:
-            The row of the keyframe.
+        Until the adjustment is applied (`apply_at`), the map must not change. Returns the row of the keyframe.
         """
         is_plain = self.config.paper.last_keyframe
         with self.clock("mapping"):
@@ -110,7 +99,8 @@ class Mapper:
             )
             slam_map.update_appearance(slam_map.index_tensor(keyframe))
             if not is_plain:
-                fuse(slam_map, keyframe, neighbors, self.camera.current, self.config)
+                here = slam_map.index_tensor(keyframe)
+                fuse(slam_map, neighbors, here, self.camera.current, self.config)
         if not self.config.paper.unrefined:
             is_delayed = apply_at is ApplyAt.AFTER_DELAY
             with self.clock("bundle"):
@@ -133,9 +123,8 @@ class Mapper:
         Renumbers rows, see `Map.version`.
         """
         with self.clock("mapping"):
-            culled = (
-                None if self.config.paper.last_keyframe else cull_keyframes(submap, self.config.keyframes)
-            )
+            is_plain = self.config.paper.last_keyframe
+            culled = None if is_plain else cull_keyframes(submap, self.config.keyframes)
             compacted = compact(submap)
         if culled is None or compacted is None:
             return culled or compacted
@@ -149,18 +138,15 @@ class Mapper:
         age = keyframe - points["first_keyframe"][recent]
         visible = points["times_visible"][recent].float()
         is_rarely_found = points["times_found"][recent] < MIN_FOUND_RATIO * visible
-        is_unconfirmed = (
-            (age >= 2) & (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
-        )
+        is_seldom_observed = (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
+        is_unconfirmed = (age >= 2) & is_seldom_observed
         slam_map.remove_points(recent[is_rarely_found | is_unconfirmed])
 
 
 def initial_scale(start: TwoViewMap, kind: str) -> float:
     """Return the factor from the unit baseline of a two-view map to the map unit.
 
-    Args:
-        start: The two-view map.
-        kind: "unit": the median depth in the first camera is one; "groundtruth": the baseline has its true length.
+    With "unit" the median depth in the first camera is one, with "groundtruth" the baseline has its true length.
 
     Raises:
         ConfigError: If the true poses are needed and not known.

@@ -104,13 +104,10 @@ class Tracker:
         prior_T_cw: Float[Tensor, "4 4"] | None = None,
         is_sure: bool = True,
     ) -> PoseEstimate | None:
-        """Estimate the pose of the next frame; None if it cannot be found. Nothing is changed.
+        """Estimate the pose of the next frame, see `at_middle_row`; None if it cannot be found. Nothing is changed.
 
-        Args:
-            submap: The submap with the tracking state.
-            view: The frame, see `at_middle_row`.
-            prior_T_cw: The pose around which matches are searched for; the predicted one if None.
-            is_sure: True if the last poses are certain: a pose near the predicted one is tried first.
+        Matches are searched for around `prior_T_cw`, the predicted pose if None. If the last poses are certain
+        (`is_sure`), a pose near it is tried first.
         """
         prior_T_cw = self.predict(submap) if prior_T_cw is None else prior_T_cw
         candidates = self._candidates(submap, view, prior_T_cw)
