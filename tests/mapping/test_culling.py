@@ -131,14 +131,6 @@ def test_a_mapper_culls_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) ->
     assert Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).cull_and_compact(submap) is None
 
 
-def test_keyframes_are_culled_without_renumbering_points() -> None:
-    submap = world_of(standing(30))
-    went = Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).cull_and_compact(submap)
-    assert went is not None
-    assert went.points.tolist() == list(range(POINTS))
-    assert submap.map.num_keyframes == NUM_NEWEST_KEPT + 1
-
-
 def test_culling_waits_for_several_new_keyframes() -> None:
     assert cull_keyframes(world_of(standing(7)), SETTINGS) is None
     submap = world_of(standing(20))

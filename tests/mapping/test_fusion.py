@@ -104,14 +104,6 @@ def test_a_projection_must_match_within_the_keypoint_scale(offset: float, agrees
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not agrees
 
 
-def test_different_descriptors_are_not_fused() -> None:
-    here = submap()
-    points, at = free(here.map, 2, 6)
-    here.map.points["descriptors"][points] ^= 255
-    match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, Config())
-    assert (here.map.keyframes["point_ids"][2, at] == NO_POINT).all()
-
-
 @pytest.mark.parametrize(("factor", "found"), [(1.4, True), (1.6, False), (0.72, True), (0.6, False)])
 def test_a_keypoint_must_have_the_expected_scale(factor: float, found: bool) -> None:
     here = submap()

@@ -131,7 +131,7 @@ def weights_file(weights: str | Path) -> Path:
 
 def joined(extractor: bytes, matcher: bytes) -> bytes:
     """One safetensors file of the .pt files of an extractor and its matcher."""
-    tensors = {}
+    tensors: dict[str, Tensor] = {}
     for prefix, part in ((EXTRACTOR, extractor), (MATCHER, matcher)):
         loaded = torch.load(io.BytesIO(part), map_location="cpu", weights_only=True)
         tensors |= {prefix + name: tensor for name, tensor in loaded.items()}
