@@ -6,13 +6,8 @@ import torch
 from tests.loop_closing.ring import END, ring_submap, scaling_sim3
 from tests.scene import Scene, pose
 from torchslam.geometry import sim3_scale
-from torchslam.loop_closing.loop_closer import (
-    MIN_ESSENTIAL_WEIGHT,
-    essential_edges,
-    essential_graph_solution,
-)
-from torchslam.loop_closing.loop_detector import LoopCandidate
-from torchslam.loop_closing.relative_sim3 import RelativeSim3
+from torchslam.loop_closing.loop_closer import MIN_ESSENTIAL_WEIGHT, essential_edges, essential_graph_solution
+from torchslam.loop_closing.loop_detector import LoopCandidate, RelativeSim3
 from torchslam.map.map import Map
 
 

@@ -12,8 +12,7 @@ from torchslam.geometry import SharedCamera, se3_exp, se3_inverse
 from torchslam.map import compaction
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.mapping.culling import NUM_NEWEST_KEPT, cull_keyframes, is_covered, redundant_keyframes
-from torchslam.mapping.mapper import Mapper
+from torchslam.mapping.mapper import NUM_NEWEST_KEPT, Mapper, cull_keyframes, is_covered, redundant_keyframes
 from torchslam.types import FrameFeatures
 from torchslam.utils.timing import Stopwatch
 

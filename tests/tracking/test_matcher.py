@@ -77,7 +77,7 @@ class Counting(Wrapped):
     def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         stack = traceback.extract_stack()
         callers = {f"{Path(frame.filename).stem}.{frame.name}" for frame in stack}
-        stages = (CONTRADICTION, "relative_sim3", "initialization", "new_points", RELOCALIZATION, "tracker")
+        stages = (CONTRADICTION, "loop_detector", "initialization", "new_points", RELOCALIZATION, "tracker")
         self.calls_by[next(stage for stage in stages if any(stage in each for each in callers))] += 1
         return super().__call__(view_1, view_2, prior)
 
@@ -97,7 +97,7 @@ def test_a_matcher_is_called_in_all_stages(monkeypatch: pytest.MonkeyPatch) -> N
     assert len(run.submaps) == 1
     calls = matcher.calls_by
     stages = {CONTRADICTION, "initialization", "tracker", "new_points", RELOCALIZATION}
-    assert set(calls) - {"relative_sim3"} == stages  # whether a loop is looked for depends on the walk
+    assert set(calls) - {"loop_detector"} == stages  # whether a loop is looked for depends on the walk
     assert calls["tracker"] >= 20  # near the prediction, in every tracked frame
     assert calls["new_points"] >= run.map.num_keyframes - 2  # of every keyframe after the first map
 

@@ -137,3 +137,19 @@ def apply_mask(features: Features, mask: Bool[Tensor, "B 1 H W"]) -> Features:
     x, y = features.keypoints.detach().round().to(torch.int64).unbind(-1)
     inside = mask[:, 0].flatten(1).gather(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1))
     return replace(features, mask=features.mask & inside)
+
+
+def check_images(images: Tensor, mask: Tensor | None = None) -> None:
+    """Check the input of an extractor.
+
+    Raises:
+        ValueError: The images are not (B, 1, H, W) floats, or the mask is not (B, 1, H, W) bool.
+        FrameError: The images are not in [0, 1].
+    """
+    if mask is not None and (mask.shape != images.shape or mask.dtype != torch.bool):
+        raise ValueError(f"a mask must be bool {tuple(images.shape)}, got {mask.dtype} {tuple(mask.shape)}")
+    if images.dim() != 4 or images.shape[1] != 1 or 0 in images.shape:
+        raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
+    if images.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"images must be float32 or float64, in [0, 1], got {images.dtype}")
+    check_gray(images, "images")

@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.features.contract import apply_mask
+from torchslam.features.contract import apply_mask, check_images
 from torchslam.features.corners import soft_peak
-from torchslam.features.orb import check_images
 from torchslam.features.weights import EXTRACTOR, MATCHER, read_weights
 from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features

@@ -15,8 +15,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, SharedCamera, se3_inverse, sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
-from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector
-from torchslam.loop_closing.relative_sim3 import neighborhood
+from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector, neighborhood
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
@@ -149,11 +148,7 @@ def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Su
 
 
 def fuse_and_adjust(
-    submap: Submap,
-    keyframe: int,
-    matched_keyframe: int,
-    camera: Camera,
-    config: Config,
+    submap: Submap, keyframe: int, matched_keyframe: int, camera: Camera, config: Config
 ) -> None:
     """Fuse landmarks between the neighborhoods of two keyframes, and adjust the whole map, twice.
 

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from torchslam.map.atlas import Submap
-from torchslam.mapping.culling import remove_masked_observations
 from torchslam.mapping.local_bundle import LOCAL_WINDOW, ApplyAt
+from torchslam.mapping.mapper import remove_masked_observations
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, hold, locate
 from torchslam.system.maintenance import Maintenance
 from torchslam.system.map_start import MapStart

@@ -75,9 +75,7 @@ class Verdict:
 
 
 def check_pose(
-    estimate: PoseEstimate,
-    predicted_T_cw: Float[Tensor, "4 4"] | None,
-    averages: TrackingState,
+    estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"] | None, averages: TrackingState
 ) -> Verdict:
     """Validate a pose by itself, and by the agreement of the recent images with the map.
 

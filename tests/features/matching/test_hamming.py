@@ -7,12 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchslam.features.matching import hamming as bits
-from torchslam.features.matching.hamming import (
-    hamming,
-    hamming_between,
-    pack_bits,
-    unpack_bits,
-)
+from torchslam.features.matching.hamming import hamming, hamming_between, pack_bits, unpack_bits
 
 
 def random_descriptors(*shape: int, seed: int = 0) -> torch.Tensor:
