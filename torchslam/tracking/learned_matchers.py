@@ -16,7 +16,7 @@ from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
 from torchslam.features.kornia_modules import BLOB_RADIUS
-from torchslam.features.matching.brute_force import best_of_each, empty_matches
+from torchslam.features.matching.brute_force import empty_matches, one_to_one
 from torchslam.features.matching.hamming import spread_bits
 from torchslam.features.weights import MATCHER, read_weights
 from torchslam.types import FrameFeatures, Matches, MatchPrior
@@ -195,11 +195,12 @@ class KorniaMatcher(nn.Module):
         first, second = pairs.unbind(-1)
         found = found[:, 0].float()
         distances = 1 - found if self.weighs else found
-        mask = best_of_each(second, distances, len(rows[1]))
+        all_of_them = torch.ones_like(second, dtype=torch.bool)[None]
+        mask = one_to_one(second[None], distances[None], all_of_them, len(rows[1]))
         matched = rows[0][first][None], rows[1][second][None], distances[None]
         if not self.weighs:
-            return Matches(*matched, mask[None])
-        return Matches(*matched, (mask & (found > 0))[None], weights=found.double()[None])
+            return Matches(*matched, mask)
+        return Matches(*matched, mask & (found > 0)[None], weights=found.double()[None])
 
 
 def _floats(descriptors: Shaped[Tensor, "N D"]) -> Float[Tensor, "N _"]:

@@ -16,7 +16,7 @@ from torchslam.config import MatchingConfig
 from torchslam.errors import ConfigError
 from torchslam.features import expand_runs, match, match_by_projection, match_pairs
 from torchslam.features.kornia_modules import is_kornia_module
-from torchslam.features.matching.brute_force import best_of_each
+from torchslam.features.matching.brute_force import one_to_one
 from torchslam.features.weights import MATCHER_OF
 from torchslam.geometry import Camera, KeypointNoise
 from torchslam.map.map import NO_POINT, Map
@@ -180,7 +180,7 @@ def nearest_keypoints(
     """
     distances = torch.cdist(pixels.to(view.keypoints), view.keypoints).masked_fill(~view.mask, torch.inf)
     nearest, column = distances.min(1)
-    mask = (nearest <= radius_px) & best_of_each(column, nearest, len(view.mask))
+    mask = one_to_one(column[None], nearest[None], (nearest <= radius_px)[None], len(view.mask))[0]
     first, second, apart = (torch.where(mask, values, 0)[None] for values in (rows, column, nearest))
     return Matches(first, second, apart.float(), mask[None])
 

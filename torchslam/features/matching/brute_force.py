@@ -125,13 +125,6 @@ def select_rows(values: Shaped[Tensor, "N *batch"], rows: Int[Tensor, " M"]) -> 
     return values.index_select(0, rows)
 
 
-def best_of_each(rows: Int[Tensor, " M"], distances: Float[Tensor, " M"], count: int) -> Bool[Tensor, " M"]:
-    """Which matches are the nearest of those with the same row, of `count` rows; the first one of equal ones."""
-    rank = torch.argsort(torch.argsort(distances, stable=True))
-    first = torch.full((count,), len(rows), dtype=torch.int64, device=rows.device)
-    return first.scatter_reduce(0, rows, rank, "amin")[rows] == rank
-
-
 def masked_rows(mask: Bool[Tensor, " N"], *columns: Shaped[Tensor, " N"]) -> list[Shaped[Tensor, " R"]]:
     """Select the masked rows of columns."""
     rows = true_indices(mask)

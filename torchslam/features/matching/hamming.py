@@ -156,21 +156,13 @@ def _fast_int8(device: torch.device) -> bool:
 
 
 class NearestNeighbors(NamedTuple):
-    """Nearest columns of N1 rows.
-
-    Attributes:
-        column: the nearest column.
-        distance: distance to it.
-        found: whether any column may match.
-        mutual: whether no other row is nearer to that column.
-        second: distance of the second nearest column; None if not requested.
-    """
+    """Nearest columns of N1 rows."""
 
     column: Int[Tensor, "B N1"]
     distance: Float[Tensor, "B N1"]
-    found: Bool[Tensor, "B N1"]
-    mutual: Bool[Tensor, "B N1"]
-    second: Float[Tensor, "B N1"] | None
+    found: Bool[Tensor, "B N1"]  # whether any column may match
+    mutual: Bool[Tensor, "B N1"]  # whether no other row is nearer to that column
+    second: Float[Tensor, "B N1"] | None  # distance of the second nearest column; None if not requested
 
 
 _ROWS_AT_ONCE = 512
