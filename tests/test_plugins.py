@@ -19,7 +19,7 @@ from torchslam import ORB, SLAM, ClipSLAM, Config, Features, load_config, open_s
 from torchslam.cli.main import main
 from torchslam.errors import ConfigError
 from torchslam.system.front_end import image_extractor
-from torchslam.tracking.lightglue import LightGlue
+from torchslam.tracking.learned_matchers import LightGlue
 from torchslam.tracking.matcher import make_matcher
 from torchslam.types import Frame, FrameFeatures
 

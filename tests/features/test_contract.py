@@ -23,7 +23,7 @@ def image() -> torch.Tensor:
     return open_sequence("synthetic:room?frames=2").image(0)
 
 
-@pytest.mark.parametrize("kind", ["orb", "opencv-orb"])
+@pytest.mark.parametrize("kind", ["orb", "opencv-orb", "sift"])
 def test_masked_areas_have_no_keypoints_and_the_budget_goes_elsewhere(image: torch.Tensor, kind: str) -> None:
     extract, mask = extractor(kind, 300), LEFT.expand(image.shape)
     free, masked = extract(image), extract(image, mask)

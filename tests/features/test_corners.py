@@ -9,7 +9,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from torchslam.features import brief, corners
+from torchslam.features import corners, orb
 from torchslam.features.corners import (
     FAST_CIRCLE,
     fast_scores,
@@ -42,25 +42,24 @@ def test_scores_are_the_best_arc_of_nine(height: int, width: int, seed: int) -> 
 def test_chunking_does_not_change_the_scores(monkeypatch: pytest.MonkeyPatch) -> None:
     pixels = torch.from_numpy(noise(40, 50, 3)).flatten()
     floor = torch.full_like(pixels, 10)
-    scores, blurred = fast_scores(pixels, 50), brief.blur(pixels, 50)
+    scores, blurred = fast_scores(pixels, 50), orb.blur(pixels, 50)
     peaks = find_peaks(scores, floor, 50)
     assert 10 < len(peaks) < 500
     monkeypatch.setattr(corners, "CHUNK_PIXELS", 333)
     assert torch.equal(fast_scores(pixels, 50), scores)
     assert torch.equal(find_peaks(scores, floor, 50), peaks)
-    assert torch.equal(brief.blur(pixels, 50), blurred)
+    assert torch.equal(orb.blur(pixels, 50), blurred)
 
 
 @pytest.mark.parametrize("height", [12, 40])
 def test_the_numpy_backend_gives_the_same_scores(monkeypatch: pytest.MonkeyPatch, height: int) -> None:
     pixels, floor = torch.from_numpy(noise(height, 50, 4)).flatten(), torch.full((50 * height,), 10).byte()
     scores = fast_scores(pixels, 50)
-    found = scores, find_peaks(scores, floor, 50), brief.blur(pixels, 50)
-    for module in (corners, brief):
+    found = scores, find_peaks(scores, floor, 50), orb.blur(pixels, 50)
+    for module in (corners, orb):
         monkeypatch.setattr(module, "to_numpy", lambda values: values)  # as on a GPU
-    for expected, by_torch in zip(
-        found, (fast_scores(pixels, 50), find_peaks(scores, floor, 50), brief.blur(pixels, 50)), strict=True
-    ):
+    elsewhere = fast_scores(pixels, 50), find_peaks(scores, floor, 50), orb.blur(pixels, 50)
+    for expected, by_torch in zip(found, elsewhere, strict=True):
         assert expected.dtype == by_torch.dtype
         assert torch.equal(expected, by_torch)
 
@@ -126,13 +125,6 @@ def test_peaks_exceed_their_neighbors(seed: int) -> None:
             assert bool(peaks[y, x]) == best
 
 
-def test_peaks_exceed_the_floor() -> None:
-    scores = torch.zeros(9, 9, dtype=torch.uint8)
-    scores[2, 2], scores[6, 6] = 10, 20
-    peaks = find_peaks(scores.flatten(), torch.full((81,), 10, dtype=torch.uint8), 9)
-    assert peaks.tolist() == [6 * 9 + 6]
-
-
 @given(st.integers(0, 50), st.integers(0, 2000), st.integers(1, 400))
 @settings(max_examples=50, deadline=None)
 def test_chunks_cover_the_image(start: int, count: int, most: int) -> None:
@@ -144,10 +136,6 @@ def test_chunks_cover_the_image(start: int, count: int, most: int) -> None:
     )
     assert all(0 < length <= most for _, length in parts)
     assert len(parts) == -(-count // most)
-
-
-def test_accelerators_use_one_chunk() -> None:
-    assert corners.chunks(torch.zeros(0), 3, 10**6) == [(3, 10**6 - 3)]
 
 
 def paraboloid(x: float, y: float, side: int = 3) -> torch.Tensor:

@@ -14,8 +14,7 @@ from torchslam.features.weights import read_weights
 
 WEIGHTS_DIR = Path(os.environ.get("TORCHSLAM_WEIGHTS", Path(__file__).parents[3] / "shared" / "weights"))
 NETWORKS = pytest.mark.parametrize(
-    ("name", "file", "width"),
-    [("xfeat", "xfeat.safetensors", 64), ("aliked", "aliked-t16.safetensors", 64)],
+    ("name", "file", "width"), [("xfeat", "xfeat.safetensors", 64), ("aliked", "aliked-t16.safetensors", 64)]
 )
 
 
@@ -90,12 +89,6 @@ def test_unusable_weights_are_rejected_by_name(kind: type, tmp_path: Path) -> No
     save_file({name: torch.tensor(1.0) for name in names}, tmp_path / "numbers.safetensors")
     with pytest.raises(ConfigError, match="numbers"):
         kind(tmp_path / "numbers.safetensors")
-
-
-@pytest.mark.parametrize("name", ["xfeat", "aliked"])
-def test_learned_features_need_weights(name: str) -> None:
-    with pytest.raises(ConfigError, match="weights"):
-        extractor(name)
 
 
 @NETWORKS

@@ -11,12 +11,13 @@ import torch
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.features import ORB, OpenCVORB, extractor, match
+from torchslam.features import ORB, SIFT, OpenCVORB, extractor, match
 from torchslam.features import orb as orb_module
-from torchslam.features.brief import PATTERN, blur, describe
+from torchslam.features.orb import blur, describe, pattern
 from torchslam.types import Features
 
-EXTRACTORS = pytest.mark.parametrize("kind", [ORB, OpenCVORB])
+BINARY = pytest.mark.parametrize("kind", [ORB, OpenCVORB])
+EXTRACTORS = pytest.mark.parametrize("kind", [ORB, OpenCVORB, SIFT])
 
 
 def scene(height: int, width: int, seed: int = 0) -> Tensor:
@@ -53,7 +54,7 @@ def element(features: Features, index: int) -> Features:
     return Features(**{name: None if x is None else x[index : index + 1] for name, x in columns.items()})
 
 
-@EXTRACTORS
+@BINARY
 def test_fields_have_the_documented_shapes(kind: type[nn.Module], dtype: torch.dtype) -> None:
     features = kind(num_keypoints=150)(scene(200, 260).to(dtype).expand(2, 1, -1, -1))
     assert features.keypoints.shape == (2, 150, 2)
@@ -104,7 +105,7 @@ def test_any_image_size_is_accepted(kind: type[nn.Module], size: tuple[int, int]
 def test_noise_and_blank_images(kind: type[nn.Module]) -> None:
     extract = kind(num_keypoints=200)
     noise = torch.rand(1, 1, 200, 200, generator=torch.Generator().manual_seed(0))
-    assert extract(noise).mask.sum() > 150
+    assert extract(noise).mask.sum() > 120
     assert not extract(torch.full((1, 1, 200, 200), 0.5)).mask.any()
 
 
@@ -119,22 +120,22 @@ def test_unsupported_images_are_refused(kind: type[nn.Module], images: Tensor) -
 
 
 @pytest.mark.parametrize(
-    "options",
-    [
-        {"num_keypoints": 0},
-        {"num_levels": 0},
-        {"scale_factor": 1.0},
-        {"threshold": 5},
-        {"low_threshold": 0},
-        {"ranking": "best"},
-    ],
+    ("option", "value"),
+    {
+        "num_keypoints": 0,
+        "num_levels": 0,
+        "scale_factor": 1.0,
+        "threshold": 5,
+        "low_threshold": 0,
+        "ranking": "best",
+    }.items(),
 )
-def test_invalid_options_are_refused(options: dict) -> None:
+def test_invalid_options_are_refused(option: str, value: float | str) -> None:
     with pytest.raises(ValueError, match=r"ORB needs|ranking"):
-        ORB(**options)
+        ORB(**{option: value})
 
 
-@EXTRACTORS
+@BINARY
 @pytest.mark.parametrize("scale", [1.0, 1.44, 2.0])
 def test_corners_of_a_square_are_detected_at_their_positions(kind: type[nn.Module], scale: float) -> None:
     """The square's corners, drawn with exact coverage of pixels, at every level that sees them."""
@@ -233,9 +234,7 @@ def test_weak_corners_are_used_where_there_are_hardly_others() -> None:
     nothing = (bright - 0.5) * 0.01 + 0.5
     assert not orb(nothing).mask.any()
     fainter = (bright - 0.5) * 0.05 + 0.5
-    assert (
-        int(ORB(num_keypoints=300, low_threshold=3)(fainter).mask.sum()) == 300
-    )  # a lower threshold finds them
+    assert int(ORB(num_keypoints=300, low_threshold=3)(fainter).mask.sum()) == 300
     assert int(orb(fainter).mask.sum()) < 150
 
 
@@ -271,18 +270,16 @@ def test_the_batch_leaves_no_gradient_by_default() -> None:
 def test_keypoints_and_scores_pass_gradcheck(ranking: str) -> None:
     image = scene(80, 90, 6).double()
     extract = ORB(num_keypoints=8, num_levels=2, ranking=ranking, differentiable=True)
-    image = image + 1e-3 * torch.rand(
-        image.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64
-    )
+    generator = torch.Generator().manual_seed(0)
+    image = image + 1e-3 * torch.rand(image.shape, generator=generator, dtype=torch.float64)
     direction = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
 
     def along(step: Tensor) -> tuple[Tensor, Tensor]:
         features = extract(image + step * direction)
         return features.keypoints, features.scores / 1e3
 
-    assert torch.autograd.gradcheck(
-        along, (torch.zeros((), dtype=torch.float64, requires_grad=True),), eps=1e-7
-    )
+    start = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(along, (start,), eps=1e-7)
 
 
 def test_differentiable_keypoints_are_near_the_plain_ones() -> None:
@@ -323,9 +320,9 @@ def test_the_opencv_extractor_equals_opencv() -> None:
 
 
 def test_pattern_is_256_different_tests_within_its_disk() -> None:
-    tests = np.array(PATTERN)
+    tests = pattern().numpy()
     assert tests.shape == (256, 4)
-    assert len({frozenset([(a, b), (c, d)]) for a, b, c, d in PATTERN}) == 256
+    assert len({frozenset([(a, b), (c, d)]) for a, b, c, d in pattern().tolist()}) == 256
     assert (np.linalg.norm(tests.reshape(-1, 2), axis=1) <= 14.5).all()
 
 
@@ -339,11 +336,11 @@ def test_descriptor_compares_the_pattern_on_the_blurred_image() -> None:
     described = describe(
         blur(torch.from_numpy(image).flatten(), 70), torch.tensor([y * 70 + x]), torch.zeros(1), 70
     )[0].numpy()
-    bits = [smooth[y + b, x + a] < smooth[y + d, x + c] for a, b, c, d in PATTERN]
+    bits = [smooth[y + b, x + a] < smooth[y + d, x + c] for a, b, c, d in pattern().tolist()]
     assert np.unpackbits(described, bitorder="little").astype(bool).tolist() == bits
 
 
-@pytest.mark.parametrize(("name", "kind"), [("orb", ORB), ("opencv-orb", OpenCVORB)])
+@pytest.mark.parametrize(("name", "kind"), [("orb", ORB), ("opencv-orb", OpenCVORB), ("sift", SIFT)])
 def test_an_extractor_is_created_by_name(name: str, kind: Callable) -> None:
     module = extractor(name, 77)
     assert isinstance(module, kind)

@@ -55,7 +55,7 @@ from torchslam.system.checkpoint import read_checkpoint
 from torchslam.system.front_end import Simulated
 from torchslam.system.online_run import OnlineRun
 from torchslam.system.session import Session
-from torchslam.tracking.lightglue import LightGlue
+from torchslam.tracking.learned_matchers import LightGlue
 
 CAMERA = "60,61,31.5,23.5"
 IMAGES = ("png", "jpg", "bmp", "tif", "webp", "pgm", "ppm", "color.png", "color.jpg", "1.png", "16.png")

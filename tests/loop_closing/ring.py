@@ -74,3 +74,8 @@ def drifted(T_cw: Tensor, scale: float, twist: float) -> Tensor:
     for before, after in itertools.pairwise(T_cw):
         S_cw.append(step @ after @ se3_inverse(before) @ S_cw[-1])
     return torch.stack(S_cw)
+
+
+def scaling_sim3(scale: float) -> Tensor:
+    """The Sim(3) that only scales."""
+    return torch.diag(torch.tensor([scale, scale, scale, 1], dtype=torch.float64))

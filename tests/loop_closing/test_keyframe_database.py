@@ -111,13 +111,6 @@ def test_scores_have_known_values() -> None:
     assert scores.tolist() == pytest.approx([1.0, common / (rare + common)], rel=1e-5)
 
 
-def test_an_image_is_similar_to_itself_and_not_to_noise() -> None:
-    keys, scores = places_of(5, 3, 9).query(*image(3))
-    assert int(keys[0]) == 3
-    assert float(scores[0]) == pytest.approx(1.0)
-    assert float(scores[1]) < 0.1
-
-
 def test_masked_keypoints_are_ignored() -> None:
     descriptors, mask = image(1)
     mask[20:] = False

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import pytest
 import torch
 from torch import Tensor
@@ -13,7 +11,6 @@ from tests.scene import CAMERA, Scene, camera_center, moved, pose, rows_of, side
 from torchslam.config import Config, load_config
 from torchslam.geometry import SharedCamera, se3_inverse, sim3_inverse
 from torchslam.geometry.similarity import umeyama
-from torchslam.loop_closing import loop_closer
 from torchslam.loop_closing.loop_closer import (
     LoopCloser,
     close_loop,
@@ -24,10 +21,8 @@ from torchslam.loop_closing.loop_closer import (
     fuse_with_earlier_visits,
     merge_maps,
 )
-from torchslam.loop_closing.loop_detector import LoopCandidate
-from torchslam.loop_closing.relative_sim3 import RelativeSim3, RelativeSim3Estimator
+from torchslam.loop_closing.loop_detector import LoopCandidate, RelativeSim3, RelativeSim3Estimator
 from torchslam.map.atlas import Atlas, Submap
-from torchslam.map.map import Map
 from torchslam.tracking.tracker import Tracker
 
 CONFIG = Config()
@@ -124,16 +119,6 @@ def test_two_submaps_are_merged(S_21: Tensor, query: str) -> None:
     assert int(shared[6]) > 100
 
 
-def test_a_closure_fuses_landmarks_around_both_keyframes(S_21: Tensor) -> None:
-    submap = submap_of_scene(SCENE, sideways(4))
-    submap.merge(submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100), sim3_inverse(S_21))
-    count = submap.map.num_points
-    fuse_and_adjust(submap, 5, 1, CAMERA, CONFIG)
-    assert submap.map.num_points < 0.6 * count
-    looks = {tuple(row) for row in submap.map.points["descriptors"][submap.map.valid_points()].tolist()}
-    assert len(looks) == submap.map.num_points
-
-
 # --- two visits -------------------------------------------------------------------------------------------------
 
 VISIT = 4  # keyframes
@@ -209,23 +194,6 @@ def test_landmarks_are_fused_from_both_sides(S_21: Tensor) -> None:
     fuse_landmarks(submap.map, here, there, CAMERA, CONFIG)
     assert int(submap.map.count_observed(submap.map.observed_points(here))[1]) > 100
     assert int(submap.map.count_observed(submap.map.observed_points(there))[VISIT + 2]) > 100
-
-
-def test_only_points_of_the_other_side_are_searched(S_21: Tensor, monkeypatch: pytest.MonkeyPatch) -> None:
-    submap = two_visits(S_21, tied=0, between=False)
-    here, there = torch.arange(VISIT + 1, 2 * VISIT), torch.arange(VISIT - 1)
-    searched: list[Tensor] = []
-    match_in_keyframes = loop_closer.match_in_keyframes
-
-    def spy(slam_map: Map, keyframes: Tensor, points: Tensor, *rest: Any) -> Any:
-        searched.append(points)
-        return match_in_keyframes(slam_map, keyframes, points, *rest)
-
-    monkeypatch.setattr(loop_closer, "match_in_keyframes", spy)
-    expected = submap.map.observed_points(there)
-    fuse_landmarks(submap.map, here, there, CAMERA, CONFIG)
-    assert torch.equal(searched[0], expected)
-    assert len(expected) < submap.map.num_points
 
 
 def test_duplicates_found_after_the_adjustment_are_merged_too(S_21: Tensor) -> None:

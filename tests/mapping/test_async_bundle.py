@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import pytest
@@ -19,7 +20,6 @@ from torchslam.mapping import local_bundle
 from torchslam.mapping.local_bundle import (
     AsyncBundleAdjustment,
     adjust_all,
-    solve_here,
     solve_local,
     solve_whole,
     squared_errors,
@@ -71,6 +71,18 @@ def mean_error(slam_map: Map, camera: Camera) -> float:
     return float(squared_errors(slam_map, slam_map.observations(), camera).mean())
 
 
+def recorded(adjusting: AsyncBundleAdjustment) -> list[Any]:
+    """The functions that are started from here on."""
+    started: list[Any] = []
+
+    def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
+        started.append(function)
+        return partial(function, *arguments)
+
+    adjusting.solver = solver
+    return started
+
+
 def test_the_map_does_not_change_before_the_result_is_applied() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     assert not adjusting.is_pending
@@ -90,13 +102,7 @@ def test_the_map_does_not_change_before_the_result_is_applied() -> None:
 
 def test_a_request_is_started_once() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
-    started: list[Any] = []
-
-    def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        started.append(function)
-        return solve_here(function, *arguments)
-
-    adjusting.solver = solver
+    started = recorded(adjusting)
     adjusting.start()  # nothing was requested
     adjusting.request(slam_map, 4, due=12)
     assert not started
@@ -119,24 +125,18 @@ def test_a_request_is_started_once() -> None:
     assert all(torch.equal(a, b) for a, b in zip(columns(slam_map), before, strict=True))
 
 
-def test_a_request_can_be_hurried_or_dropped() -> None:
+def test_a_request_can_be_hurried_or_dropped_or_due_before_the_next_frame() -> None:
     adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
     adjusting.set_deadline(3)
     assert not adjusting.is_pending
+    assert not adjusting.is_due_before_next_frame
     adjusting.request(slam_map, 4, due=12)
+    assert not adjusting.is_due_before_next_frame
     adjusting.set_deadline(9)
     assert adjusting.due == 9
     adjusting.drop()
     adjusting.apply(slam_map)
     assert_same(slam_map, perturbed_map())
-
-
-def test_a_request_may_be_due_before_the_next_frame() -> None:
-    adjusting, slam_map = AsyncBundleAdjustment(SharedCamera(CAMERA)), perturbed_map()
-    assert not adjusting.is_due_before_next_frame
-    adjusting.request(slam_map, 4, due=12)
-    assert not adjusting.is_due_before_next_frame
-    adjusting.drop()
     adjusting.request(slam_map, 4, due=None)
     assert adjusting.is_pending
     assert adjusting.is_due_before_next_frame
@@ -164,13 +164,7 @@ def test_a_whole_map_is_adjusted_by_another_camera_later() -> None:
     shared = SharedCamera(CAMERA)
     other = CAMERA.with_params(CAMERA.params * CAMERA.params.new_tensor([1.02, 1.02, 1, 1]))
     adjusting, slam_map, used = AsyncBundleAdjustment(shared), perturbed_map(), list[Any]()
-    started: list[Any] = []
-
-    def solver(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        started.append(function)
-        return solve_here(function, *arguments)
-
-    adjusting.solver = solver
+    started = recorded(adjusting)
     adjusting.request_whole(slam_map, other, due=12, on_applied=lambda: used.append(slam_map.T_cw.clone()))
     assert started == [solve_whole]  # at once, since the camera was estimated for this map
     assert adjusting.is_whole
@@ -203,7 +197,7 @@ def test_a_solver_is_used_within_its_context() -> None:
     adjusting = AsyncBundleAdjustment(SharedCamera(CAMERA))
 
     def elsewhere(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        return solve_here(function, *arguments)
+        return partial(function, *arguments)
 
     def fail() -> None:
         with adjusting.solved_by(elsewhere):
@@ -212,7 +206,7 @@ def test_a_solver_is_used_within_its_context() -> None:
 
     with pytest.raises(KeyboardInterrupt):
         fail()
-    assert adjusting.solver is solve_here
+    assert adjusting.solver is partial
 
 
 @pytest.fixture(scope="module")

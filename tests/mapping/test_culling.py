@@ -12,8 +12,7 @@ from torchslam.geometry import SharedCamera, se3_exp, se3_inverse
 from torchslam.map import compaction
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
-from torchslam.mapping.culling import NUM_NEWEST_KEPT, cull_keyframes, is_covered, redundant_keyframes
-from torchslam.mapping.mapper import Mapper
+from torchslam.mapping.mapper import NUM_NEWEST_KEPT, Mapper, cull_keyframes, is_covered, redundant_keyframes
 from torchslam.types import FrameFeatures
 from torchslam.utils.timing import Stopwatch
 
@@ -129,14 +128,6 @@ def test_a_mapper_culls_keyframes_and_points(monkeypatch: pytest.MonkeyPatch) ->
     assert int(went.replacement.min()) >= 0
     assert submap.map.num_keyframes < 30
     assert Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).cull_and_compact(submap) is None
-
-
-def test_keyframes_are_culled_without_renumbering_points() -> None:
-    submap = world_of(standing(30))
-    went = Mapper(SharedCamera(CAMERA), Config(), Stopwatch()).cull_and_compact(submap)
-    assert went is not None
-    assert went.points.tolist() == list(range(POINTS))
-    assert submap.map.num_keyframes == NUM_NEWEST_KEPT + 1
 
 
 def test_culling_waits_for_several_new_keyframes() -> None:

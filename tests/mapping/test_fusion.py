@@ -104,14 +104,6 @@ def test_a_projection_must_match_within_the_keypoint_scale(offset: float, agrees
     assert bool((here.map.keyframes["point_ids"][2, at] == NO_POINT).all()) is not agrees
 
 
-def test_different_descriptors_are_not_fused() -> None:
-    here = submap()
-    points, at = free(here.map, 2, 6)
-    here.map.points["descriptors"][points] ^= 255
-    match_in_keyframes(here.map, torch.tensor([2]), points, CAMERA, Config())
-    assert (here.map.keyframes["point_ids"][2, at] == NO_POINT).all()
-
-
 @pytest.mark.parametrize(("factor", "found"), [(1.4, True), (1.6, False), (0.72, True), (0.6, False)])
 def test_a_keypoint_must_have_the_expected_scale(factor: float, found: bool) -> None:
     here = submap()
@@ -131,7 +123,7 @@ def test_duplicates_are_found_from_either_keyframe(keyframe_row: int) -> None:
     here = submap()
     points, doubles = double(here.map, 2, 10)
     others = torch.tensor([keyframe for keyframe in range(3) if keyframe != keyframe_row])
-    fuse(here.map, keyframe_row, others, CAMERA, Config())
+    fuse(here.map, others, here.map.index_tensor(keyframe_row), CAMERA, Config())
     assert torch.equal(here.map.follow_merges(doubles), points)
     assert not here.map.points["is_valid"][doubles].any()
     assert (here.map.points["times_observed"][points] == 3).all()
@@ -141,7 +133,7 @@ def test_free_keypoints_of_both_keyframes_gain_observations() -> None:
     for keyframe in (0, 1):
         here = submap()
         points, at = free(here.map, 1, 10)
-        fuse(here.map, keyframe, torch.tensor([1 - keyframe]), CAMERA, Config())
+        fuse(here.map, torch.tensor([1 - keyframe]), torch.tensor([keyframe]), CAMERA, Config())
         assert torch.equal(here.map.keyframes["point_ids"][1, at], points)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+
 import pytest
 import torch
 from torch import Tensor
@@ -162,6 +164,23 @@ def test_global_adjustment_fixes_the_first_keyframe(monkeypatch: pytest.MonkeyPa
     scale = float(slam_map.T_cw[4, 0, 3] / truth[4, 0, 3])
     torch.testing.assert_close(slam_map.T_cw[:, :3, 3], scale * truth[:, :3, 3], atol=1e-6, rtol=0)
     assert (slam_map.keyframes["covariances"] == 0).all()
+
+
+def test_an_interrupted_adjustment_leaves_the_map_unchanged() -> None:
+    slam_map = row(sideways(4))
+    perturb(slam_map, [1, 2, 3], size=0.03)
+    before = copy.deepcopy(slam_map)
+
+    def interrupt(iteration: int, iterations: int) -> None:
+        assert iterations == local_bundle.GLOBAL_ITERATIONS
+        if iteration == 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adjust_all(slam_map, CAMERA, interrupt)
+    for table, old in ((slam_map.points, before.points), (slam_map.keyframes, before.keyframes)):
+        for name, column in table.columns().items():
+            assert torch.equal(column, old[name]), name
 
 
 def test_an_empty_window_changes_nothing() -> None:

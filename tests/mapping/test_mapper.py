@@ -125,11 +125,7 @@ def test_new_points_come_from_the_configured_neighbors() -> None:
     for override in ("paper.last_keyframe=true", "paper.last_keyframe=false"):
         submap = submap_of_half_the_points(3)
         before = len(submap.map.points)
-        inserted(
-            mapper("paper.unrefined=true", override),
-            submap,
-            sideways(1, start=1.2)[0],
-        )
+        inserted(mapper("paper.unrefined=true", override), submap, sideways(1, start=1.2)[0])
         made.append(len(submap.map.points) - before)
     assert 0 < made[0] < made[1]
 

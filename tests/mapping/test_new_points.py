@@ -15,8 +15,12 @@ from torchslam.geometry import KeypointNoise, se3_inverse, so3_exp, transform, t
 from torchslam.map.map import Map
 from torchslam.mapping import new_points
 from torchslam.mapping.new_points import has_baseline, has_consistent_scale, triangulate_against
-from torchslam.tracking.epipolar import FreeKeypoints, angle_around_axis, match_along_epipolar_lines
-from torchslam.tracking.matcher import max_distance
+from torchslam.tracking.matcher import (
+    FreeKeypoints,
+    angle_around_axis,
+    match_along_epipolar_lines,
+    max_distance,
+)
 from torchslam.types import FrameFeatures
 
 SCENE = Scene.of(300)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -10,7 +11,6 @@ from torchslam import load_config, open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.features import OpenCVORB
 from torchslam.geometry import Camera
-from torchslam.mapping.local_bundle import solve_here
 from torchslam.parallel.prefetch import FeaturePrefetcher, LivePrefetcher
 from torchslam.parallel.workers import (
     WORTH,
@@ -46,7 +46,7 @@ def who(sequence: Sequence, slam: SLAM, processes: int | None, start: int = 0) -
         is_beside = isinstance(adjusting, SolverWorker)
         assert isinstance(estimating, SolverWorker) == is_beside
         assert not is_beside or adjusting is not estimating  # an adjustment would wait for an estimate
-    assert slam.mapper.adjustment.solver is slam.online_camera.solver is solve_here
+    assert slam.mapper.adjustment.solver is slam.online_camera.solver is partial
     return type(frames).__name__, is_beside
 
 

@@ -12,8 +12,7 @@ from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
 from tests.system.judging import Drive
 from tests.walks import Walk, arc
 from torchslam import SLAM, Config
-from torchslam.loop_closing.loop_detector import LoopCandidate
-from torchslam.loop_closing.relative_sim3 import RelativeSim3
+from torchslam.loop_closing.loop_detector import LoopCandidate, RelativeSim3
 from torchslam.map.atlas import Submap
 from torchslam.map.compaction import RowRemap
 from torchslam.map.map import Map

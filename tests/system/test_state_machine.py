@@ -13,7 +13,7 @@ from torchslam.config import load_config
 from torchslam.data import open_sequence
 from torchslam.system.online_run import no_map_message
 from torchslam.system.slam import SLAM
-from torchslam.tracking.relocalization import Relocalizer
+from torchslam.tracking.tracker import Relocalizer
 from torchslam.types import Explanation, Reason, Rejection, State, StepResult
 
 

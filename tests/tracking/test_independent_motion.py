@@ -131,8 +131,7 @@ def test_outliers_without_common_motion_are_no_object() -> None:
         view = frame(index)
         jumps = 40 * torch.randn(len(view.mask), 2, generator=torch.Generator().manual_seed(index)).double()
         view = replace(
-            view,
-            keypoints=torch.where(is_thing(view)[:, None], view.keypoints + jumps, view.keypoints),
+            view, keypoints=torch.where(is_thing(view)[:, None], view.keypoints + jumps, view.keypoints)
         )
         by.mask_out(view)
         assert not by.observe(view, estimate(view, camera_at(index), torch.arange(50))).note

@@ -63,13 +63,8 @@ def test_an_initialization_has_motion_and_points_in_units_of_its_baseline() -> N
 def test_the_first_frame_is_the_reference_until_it_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(initialization, "MAX_REFERENCE_AGE", 3)
     initializer = Initializer(SharedCamera(CAMERA), DEFAULT)
-    for index, reason in (
-        (0, "took"),
-        (1, "the camera stands"),
-        (2, "the camera stands"),
-        (3, "took"),
-        (4, "the"),
-    ):
+    reasons = "took", "the camera stands", "the camera stands", "took", "the"
+    for index, reason in enumerate(reasons):
         assert step(initializer, SCENE.view(index, pose()))[1].startswith(reason)
     assert initializer.reference.index == 3
     assert initializer.num_views == 2
@@ -131,15 +126,20 @@ def test_a_scene_behind_a_static_overlay_initializes_a_map() -> None:
 ROLLED = pose(-0.6, 0.3, 0.1, 0.02, -0.02, 0.05)  # what stays in place is on no epipolar line
 
 
-@pytest.mark.parametrize("share", [0.15, 0.4])
-def test_static_image_points_are_excluded_from_initialization(share: float) -> None:
-    """Most of the image moves with the scene, but some of it stays."""
-    views = [SCENE.view(0, pose()), SCENE.view(1, ROLLED)]
+def with_static(T_cw: Tensor, share: float, noise: float = 0.0) -> tuple[Initializer, TwoViewMap | None]:
+    """An initializer that has seen two views, the second at T_cw with a share of points where the first has them."""
+    views = [SCENE.view(index, T, noise=noise) for index, T in enumerate(pair(T_cw))]
     some = static(views[1], share, SCENE.shows(1), views[0], SCENE.shows(0))
     initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60"]))
     step(initializer, views[0])
-    start, reason = step(initializer, some)
-    assert start is not None, reason
+    return initializer, step(initializer, some)[0]
+
+
+@pytest.mark.parametrize("share", [0.15, 0.4])
+def test_static_image_points_are_excluded_from_initialization(share: float) -> None:
+    """Most of the image moves with the scene, but some of it stays."""
+    _, start = with_static(ROLLED, share)
+    assert start is not None
     moving = SCENE.shows(1)[start.keypoints_2] >= round(share * len(SCENE))
     assert moving.double().mean() > 0.98
     wanted = ROLLED[:3, 3] / ROLLED[:3, 3].norm()
@@ -149,12 +149,8 @@ def test_static_image_points_are_excluded_from_initialization(share: float) -> N
 @pytest.mark.parametrize("T_cw", [pose(-0.5, 0.0, 0.0, 0.0, -0.03, 0.0), SIDE])
 def test_points_behind_the_camera_are_excluded(T_cw: Tensor) -> None:
     """Sideways, what stays in place is near its epipolar line; the turn says that it would be behind the camera."""
-    views = [SCENE.view(0, pose(), noise=0.2), SCENE.view(1, T_cw, noise=0.2)]
-    some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
-    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60"]))
-    step(initializer, views[0])
-    start, reason = step(initializer, some)
-    assert start is not None, reason
+    initializer, start = with_static(T_cw, 0.3, noise=0.2)
+    assert start is not None
     assert len(initializer.static_pixels) > 80
     wanted = T_cw[:3, 3] / T_cw[:3, 3].norm()
     torch.testing.assert_close(start.T_cw[:3, 3], wanted, atol=0.02, rtol=0)
@@ -163,11 +159,7 @@ def test_points_behind_the_camera_are_excluded(T_cw: Tensor) -> None:
 @pytest.mark.parametrize(("turn", "left_out"), [(-0.003, False), (-0.012, True)])
 def test_points_at_infinity_within_noise_are_inliers(turn: float, left_out: bool) -> None:
     """A turn of 0.003 moves the image of infinity by 0.6 pixels, less than the threshold of 1.5."""
-    views = [SCENE.view(0, pose()), SCENE.view(1, pose(-0.5, 0.0, 0.0, 0.0, turn, 0.0))]
-    some = static(views[1], 0.3, SCENE.shows(1), views[0], SCENE.shows(0))
-    initializer = Initializer(SharedCamera(CAMERA), load_config(None, ["initialization.min_matches=60"]))
-    step(initializer, views[0])
-    step(initializer, some)
+    initializer, _ = with_static(pose(-0.5, 0.0, 0.0, 0.0, turn, 0.0), 0.3)
     assert (len(initializer.static_pixels) > 80) is left_out
 
 
@@ -217,11 +209,7 @@ def test_planes_seen_with_an_earlier_reference_do_not_count(monkeypatch: pytest.
     poses = torch.stack([pose(), *[TURNED] * 3, pose(), TURNED])
     monkeypatch.setattr(initialization, "MAX_REFERENCE_AGE", 4)
     start, reason = tried(
-        poses,
-        "initialization.min_planar_frames=4",
-        "initialization.min_matches=50",
-        scene=WALL,
-        noise=0.2,
+        poses, "initialization.min_planar_frames=4", "initialization.min_matches=50", scene=WALL, noise=0.2
     )
     assert start is None
     assert "looks planar" in reason
@@ -241,16 +229,8 @@ def re_any(text: str, *parts: str) -> bool:
 
 def seen(angles: list[float], errors: float = 0.0, mask: bool = True) -> Triangulation:
     angle = torch.tensor(angles, dtype=torch.float64)
-    zero = torch.zeros_like(angle)
-    return Triangulation(
-        torch.zeros(len(angles), 3, dtype=torch.float64),
-        angle,
-        zero,
-        zero,
-        zero,
-        zero + errors,
-        zero == 0 if mask else zero > 0,
-    )
+    zero, points = torch.zeros_like(angle), torch.zeros(len(angles), 3, dtype=torch.float64)
+    return Triangulation(points, angle, zero, zero, zero, zero + errors, (zero == 0) & mask)
 
 
 def good(

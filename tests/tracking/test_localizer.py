@@ -6,12 +6,14 @@ import math
 
 import pytest
 import torch
+from torch import Tensor
 
 from tests.map.simulated import estimate_at
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config
 from torchslam.geometry import KeypointNoise, SharedCamera, UndistortedKeypoints, transform
 from torchslam.map.atlas import Submap
+from torchslam.optim.pose.frame_pose import FramePose
 from torchslam.tracking import localizer as localizer_module
 from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.tracker import Tracker
@@ -76,65 +78,62 @@ def test_a_pose_elsewhere_in_the_map_uses_the_local_map_there(monkeypatch: pytes
     assert estimate.inliers > 60
 
 
+def refined(
+    scales: Tensor | float, *offsets: Tensor, T_cw: Tensor | None = None
+) -> tuple[FramePose, Tensor, Tensor]:
+    """Refinement at a keyframe's pose of what it sees, with keypoints off by (n, 2)."""
+    here, seen, pixels = keyframe_0()
+    scales = torch.as_tensor(scales, dtype=torch.float64).expand(len(seen))
+    for offset in offsets:
+        pixels = pixels + offset
+    noise, undistorted = KeypointNoise.of(scales, None), UndistortedKeypoints.of(pixels, CAMERA)
+    return localizer()._refine(
+        here.map, here.map.T_cw[0] if T_cw is None else T_cw, seen, pixels, undistorted, noise
+    )
+
+
+def keyframe_0() -> tuple[Submap, Tensor, Tensor]:
+    """A submap, the points of its first keyframe, and where this sees them."""
+    here = submap()
+    seen = here.map.observed_points(torch.tensor([0]))
+    return here, seen, CAMERA.project(transform(here.map.T_cw[0], here.map.positions_w[seen]))[0]
+
+
 @pytest.mark.parametrize(("offset", "agrees"), [(2.40, True), (2.50, False)])
 @pytest.mark.parametrize("scale", [0.5, 3.0])
 def test_the_gate_is_that_of_two_degrees_of_freedom_in_units_of_the_scale(
     offset: float, agrees: bool, scale: float
 ) -> None:
-    here = submap()
-    seen = here.map.observed_points(torch.tensor([0]))
-    T_cw = here.map.T_cw[0]
-    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
-    off = torch.zeros(len(seen), dtype=torch.float64)
+    off = torch.zeros(len(keyframe_0()[1]), dtype=torch.float64)
     off[::40] = offset * scale
     off[::80] *= -1
-    shifted = pixels + off[:, None] * torch.tensor([0.6, -0.8], dtype=torch.float64)
-    noise = KeypointNoise.of(torch.full((len(seen),), scale, dtype=torch.float64), None)
-    by = localizer()
-    undistorted = UndistortedKeypoints.of(shifted, CAMERA)
-    _, _, inliers = by._refine(here.map, T_cw, seen, shifted, undistorted, noise)
+    _, _, inliers = refined(scale, off[:, None] * torch.tensor([0.6, -0.8], dtype=torch.float64))
     assert torch.equal(inliers, (off == 0) | agrees)
 
 
 def test_points_behind_the_camera_are_no_inliers() -> None:
-    here = submap()
-    seen = here.map.observed_points(torch.tensor([0]))
-    T_cw = pose(0, 0, 0, 0, math.pi)
-    middle = torch.tensor([159.5, 119.5], dtype=torch.float64).expand(len(seen), 2)
-    noise = KeypointNoise.of(torch.ones(len(seen), dtype=torch.float64), None)
-    undistorted = UndistortedKeypoints.of(middle, CAMERA)
-    _, _, inliers = localizer()._refine(here.map, T_cw, seen, middle, undistorted, noise)
-    assert not inliers.any()
+    middle = torch.tensor([159.5, 119.5], dtype=torch.float64) - keyframe_0()[2]
+    assert not refined(1.0, middle, T_cw=pose(0, 0, 0, 0, math.pi))[2].any()
 
 
 def test_a_keypoint_is_weighted_by_its_inverse_variance() -> None:
     """Half of the points are four times as coarse and three pixels to the right: the others move by 3 / 17 of that."""
-    here = submap()
-    T_cw = here.map.T_cw[0]
-    seen = here.map.observed_points(torch.tensor([0]))
-    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
+    here, seen, pixels = keyframe_0()
     coarse = torch.arange(len(seen)) % 2 == 1
     scales = torch.where(coarse, 4.0, 1.0).double()
-    shifted = pixels + torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-    noise, undistorted = KeypointNoise.of(scales, None), UndistortedKeypoints.of(shifted, CAMERA)
-    refined, errors, agrees = localizer()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
+    off = torch.where(coarse, 3.0, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
+    found, errors, agrees = refined(scales, off)
     assert agrees.all()
-    fitted = CAMERA.project(transform(refined.T_cw, here.map.positions_w[seen]))[0]
+    fitted = CAMERA.project(transform(found.T_cw, here.map.positions_w[seen]))[0]
     assert float((fitted - pixels)[:, 0].mean()) == pytest.approx(3 / 17, rel=0.1)
-    wanted = ((fitted - shifted) ** 2).sum(-1) / scales**2
-    torch.testing.assert_close(errors, wanted)
+    torch.testing.assert_close(errors, ((fitted - pixels - off) ** 2).sum(-1) / scales**2)
 
 
 def test_outliers_do_not_affect_the_refinement() -> None:
-    here = submap()
-    T_cw = here.map.T_cw[0]
-    seen = here.map.observed_points(torch.tensor([0]))
-    pixels = CAMERA.project(transform(T_cw, here.map.positions_w[seen]))[0]
-    scales = torch.ones(len(seen), dtype=torch.float64)
+    here, seen, pixels = keyframe_0()
     wrong = torch.arange(len(seen)) < len(seen) // 4
-    for off, exact in ((6.0, 1e-9), (4.0, 1e-9)):
-        shifted = pixels + torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
-        noise, undistorted = KeypointNoise.of(scales, None), UndistortedKeypoints.of(shifted, CAMERA)
-        refined, _, agrees = localizer()._refine(here.map, T_cw, seen, shifted, undistorted, noise)
+    for off in (6.0, 4.0):
+        offsets = torch.where(wrong, off, 0.0).double()[:, None] * pixels.new_tensor([1.0, 0.0])
+        found, _, agrees = refined(1.0, offsets)
         assert torch.equal(agrees, ~wrong)
-        torch.testing.assert_close(refined.T_cw, T_cw, atol=exact, rtol=0)
+        torch.testing.assert_close(found.T_cw, here.map.T_cw[0], atol=1e-9, rtol=0)

@@ -64,6 +64,7 @@ def test_the_default_matcher_as_a_plugin_gives_the_same_bytes() -> None:
 
 
 CONTRADICTION = "contradicting_initialization"  # of provisional maps
+RELOCALIZATION = "tracker.locate"
 
 
 class Counting(Wrapped):
@@ -75,16 +76,8 @@ class Counting(Wrapped):
 
     def __call__(self, view_1: FrameFeatures, view_2: FrameFeatures, prior: MatchPrior | None) -> Matches:
         stack = traceback.extract_stack()
-        callers = {Path(frame.filename).stem for frame in stack} | {frame.name for frame in stack}
-        # The relocalizer matches through the tracker.
-        stages = (
-            CONTRADICTION,
-            "relative_sim3",
-            "initialization",
-            "new_points",
-            "relocalization",
-            "tracker",
-        )
+        callers = {f"{Path(frame.filename).stem}.{frame.name}" for frame in stack}
+        stages = (CONTRADICTION, "loop_detector", "initialization", "new_points", RELOCALIZATION, "tracker")
         self.calls_by[next(stage for stage in stages if any(stage in each for each in callers))] += 1
         return super().__call__(view_1, view_2, prior)
 
@@ -103,8 +96,8 @@ def test_a_matcher_is_called_in_all_stages(monkeypatch: pytest.MonkeyPatch) -> N
     assert states[-1] is State.TRACKING
     assert len(run.submaps) == 1
     calls = matcher.calls_by
-    stages = {CONTRADICTION, "initialization", "tracker", "new_points", "relocalization"}
-    assert set(calls) - {"relative_sim3"} == stages  # whether a loop is looked for depends on the walk
+    stages = {CONTRADICTION, "initialization", "tracker", "new_points", RELOCALIZATION}
+    assert set(calls) - {"loop_detector"} == stages  # whether a loop is looked for depends on the walk
     assert calls["tracker"] >= 20  # near the prediction, in every tracked frame
     assert calls["new_points"] >= run.map.num_keyframes - 2  # of every keyframe after the first map
 

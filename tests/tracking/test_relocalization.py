@@ -6,14 +6,12 @@ import torch
 from torch import Tensor
 
 from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
-from torchslam.config import Config, load_config
+from torchslam.config import Config
 from torchslam.geometry import SharedCamera
 from torchslam.map.atlas import Submap
-from torchslam.tracking import localizer, pose_validation, relocalization
+from torchslam.tracking import pose_validation, tracker
 from torchslam.tracking.data_association import match_keyframe, match_points
-from torchslam.tracking.matcher import max_distance
-from torchslam.tracking.relocalization import Relocalizer
-from torchslam.tracking.tracker import Tracker
+from torchslam.tracking.tracker import Relocalizer, Tracker
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
@@ -60,22 +58,16 @@ def test_the_number_of_candidates_is_bounded(monkeypatch: pytest.MonkeyPatch) ->
     candidates = [(other, 0) for other in others]
     assert found(ANYWHERE, [*candidates, (right, 0)]) is None
     assert found(ANYWHERE, [*candidates[:2], (right, 0)]) is right
-    monkeypatch.setattr(relocalization, "MAX_CANDIDATES", 4)
+    monkeypatch.setattr(tracker, "MAX_CANDIDATES", 4)
     assert found(ANYWHERE, [*candidates, (right, 0)]) is right
     # neighbors of a failed candidate are not tried and do not count
-    monkeypatch.setattr(relocalization, "MAX_CANDIDATES", 2)
+    monkeypatch.setattr(tracker, "MAX_CANDIDATES", 2)
     assert found(ANYWHERE, [(wrong, row) for row in range(6)] + [(right, 0)]) is right
 
 
 def test_neighbors_of_a_candidate_that_failed_in_another_submap_are_tried() -> None:
     right, wrong = submaps()
     assert found(ANYWHERE, [(wrong, 3), (right, 3)]) is right
-
-
-def test_candidate_neighborhoods_have_the_size_of_the_local_map(monkeypatch: pytest.MonkeyPatch) -> None:
-    right, _ = submaps()
-    monkeypatch.setattr(localizer, "LOCAL_KEYFRAMES", 2)
-    assert relocalizer().tracker.localizer.local_keyframes(right.map, 5).tolist() == [5, 4, 3]
 
 
 def test_an_uncertain_pose_does_not_relocalize(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -110,12 +102,3 @@ def test_points_match_by_descriptor_at_any_position() -> None:
     assert len(points) > 150
     assert torch.equal(ROWS[SCENE.shows(50)[keypoints]], points)
     assert len(match_points(right.map, ids[:0], view, relocalizer().tracker.matching).first) == 0
-
-
-def test_thresholds_of_binary_and_float_descriptors() -> None:
-    bits, floats = torch.zeros(2, 32, dtype=torch.uint8), torch.zeros(2, 2)
-    settings = load_config(
-        None, ["matching.max_hamming_distance=50", "matching.max_cosine_distance=0.3"]
-    ).matching
-    assert max_distance(bits, settings) == 50
-    assert max_distance(floats, settings) == 0.3

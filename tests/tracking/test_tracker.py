@@ -319,14 +319,6 @@ def test_without_a_prediction_matching_is_by_descriptor() -> None:
     torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
 
 
-def test_invalid_points_are_not_matched() -> None:
-    here = submap(3)
-    dead = here.tracking.last_inlier_points[:20]
-    here.map.remove_points(dead)
-    estimate = followed(here, SCENE.view(50, sideways(1, start=0.2)[0]))
-    assert not torch.isin(estimate.point_ids, dead).any()
-
-
 # --- the parts --------------------------------------------------------------------------------------------------
 
 
@@ -488,9 +480,7 @@ def test_tracking_does_not_depend_on_the_map_frame() -> None:
     torch.testing.assert_close(two.covariance, units[:, None] * one.covariance * units, rtol=1e-3, atol=1e-12)
 
 
-def test_after_uncertain_frames_the_pose_search_starts_from_scratch(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_after_uncertain_frames_the_pose_search_starts_from_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[bool] = []
     follower, here, view = tracker(), submap(), SCENE.view(50, sideways(1, start=0.7)[0])
     monkeypatch.setattr(

@@ -11,8 +11,8 @@ from torchslam.features.learned import ALIKED, XFeat
 from torchslam.features.matching.brute_force import match, match_pairs
 from torchslam.features.matching.by_projection import expand_runs, match_by_projection
 from torchslam.features.matching.hamming import hamming, pack_bits, unpack_bits
-from torchslam.features.orb import ORB, OpenCVORB
-from torchslam.features.sift import SIFT
+from torchslam.features.opencv import SIFT, OpenCVORB
+from torchslam.features.orb import ORB
 from torchslam.features.simulated import SimulatedFeatures
 
 __all__ = [

@@ -15,14 +15,6 @@ from torchslam.geometry.gating import is_definite
 from torchslam.types import Features
 from torchslam.utils.torch_internals import in_transform
 
-COLUMNS: dict[str, tuple[int, ...]] = {
-    "keypoints": (2,),
-    "scores": (),
-    "scales": (),
-    "angles": (),
-    "mask": (),
-}
-"""Shape of a keypoint's row in each column."""
 BINARY_BYTES = 32
 """Bytes of a binary descriptor, 256 bits."""
 
@@ -48,11 +40,7 @@ _OVER = 1e-3  # beyond black and white, of what resizing or training adds
 
 
 def check_gray(images: Shaped[Tensor, "*batch"], name: str) -> None:
-    """Check that images are floats in [0, 1].
-
-    Args:
-        images: of any shape.
-        name: of the images, for messages.
+    """Check that images of any shape are floats in [0, 1]; `name`: of them, for messages.
 
     Raises:
         FrameError: They are of another kind, or have other values or NaN.
@@ -75,12 +63,7 @@ def are_unit_or_zero(descriptors: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*b
 
 
 def check_features(found: object, images: Shaped[Tensor, "B 1 H W"], name: str) -> None:
-    """Check that what a feature extractor returned for a batch of images keeps the contract of `Features`.
-
-    Args:
-        found: what the feature extractor returned.
-        images: its input.
-        name: of the feature extractor, for messages.
+    """Check that what the feature extractor `name` returned for a batch of images keeps the contract of `Features`.
 
     Raises:
         ConfigError: A field has a wrong shape, type or value.
@@ -95,10 +78,11 @@ def check_features(found: object, images: Shaped[Tensor, "B 1 H W"], name: str) 
     if not isinstance(found.keypoints, Tensor) or found.keypoints.ndim != 3:
         refuse(f"keypoints must be ({len(images)}, N, 2), not {_described(found.keypoints)}")
     rows = (len(images), found.keypoints.shape[1])
-    for column, shape in COLUMNS.items():
+    for column in ("keypoints", "scores", "scales", "angles", "mask"):
         values = getattr(found, column)
-        if not isinstance(values, Tensor) or tuple(values.shape) != (*rows, *shape):
-            refuse(f"{column} must be {(*rows, *shape)}, not {_described(values)}")
+        shape = (*rows, 2) if column == "keypoints" else rows
+        if not isinstance(values, Tensor) or tuple(values.shape) != shape:
+            refuse(f"{column} must be {shape}, not {_described(values)}")
         if not (values.dtype == torch.bool if column == "mask" else values.is_floating_point()):
             refuse(f"{column} must be {'bool' if column == 'mask' else 'floats'}, not {values.dtype}")
     described = found.descriptors
@@ -106,12 +90,15 @@ def check_features(found: object, images: Shaped[Tensor, "B 1 H W"], name: str) 
         refuse(f"descriptors must be {rows} + (D,), not {_described(described)}")
     if described.dtype != torch.uint8 and not described.is_floating_point():
         refuse(f"descriptors must be uint8, bits, or floats, not {described.dtype}")
-    if described.dtype == torch.uint8 and described.shape[-1] != BINARY_BYTES:
+    wanted = (*rows, BINARY_BYTES)
+    if described.dtype == torch.uint8 and tuple(described.shape) != wanted:
+        refuse(f"descriptors of bits must be {wanted}, {8 * BINARY_BYTES} bits, not {_described(described)}")
+    if described.is_floating_point() and bool((wrong := ~are_unit_or_zero(described)).any()):
+        lengths = described.detach().float().norm(dim=-1)[wrong]
         refuse(
-            f"descriptors of bits must be {(*rows, BINARY_BYTES)}, {8 * BINARY_BYTES} bits, not {_described(described)}"
+            "descriptors of floats are compared by their cosine and must have length one, or zero where there is no "
+            f"keypoint, not {float(lengths.min()):.3g} to {float(lengths.max()):.3g}; {NORMALIZE}"
         )
-    if described.is_floating_point():
-        _check_lengths(described, refuse)
     for column in ("keypoints", "scales"):
         if not bool(getattr(found, column).isfinite().all()):
             refuse(f"{column} must be finite, also where mask is False")
@@ -119,17 +106,6 @@ def check_features(found: object, images: Shaped[Tensor, "B 1 H W"], name: str) 
         refuse("scales must be positive")
     if found.information is not None:
         _check_information(found.information, found.mask, rows, refuse)
-
-
-def _check_lengths(descriptors: Float[Tensor, "B N D"], refuse: Callable[[str], None]) -> None:
-    """Check that float descriptors have unit length."""
-    wrong = ~are_unit_or_zero(descriptors)
-    if bool(wrong.any()):
-        lengths = descriptors.detach().float().norm(dim=-1)[wrong]
-        refuse(
-            "descriptors of floats are compared by their cosine and must have length one, or zero where there is no "
-            f"keypoint, not {float(lengths.min()):.3g} to {float(lengths.max()):.3g}; {NORMALIZE}"
-        )
 
 
 def _check_information(
@@ -161,3 +137,19 @@ def apply_mask(features: Features, mask: Bool[Tensor, "B 1 H W"]) -> Features:
     x, y = features.keypoints.detach().round().to(torch.int64).unbind(-1)
     inside = mask[:, 0].flatten(1).gather(1, y.clamp(0, height - 1) * width + x.clamp(0, width - 1))
     return replace(features, mask=features.mask & inside)
+
+
+def check_images(images: Tensor, mask: Tensor | None = None) -> None:
+    """Check the input of an extractor.
+
+    Raises:
+        ValueError: The images are not (B, 1, H, W) floats, or the mask is not (B, 1, H, W) bool.
+        FrameError: The images are not in [0, 1].
+    """
+    if mask is not None and (mask.shape != images.shape or mask.dtype != torch.bool):
+        raise ValueError(f"a mask must be bool {tuple(images.shape)}, got {mask.dtype} {tuple(mask.shape)}")
+    if images.dim() != 4 or images.shape[1] != 1 or 0 in images.shape:
+        raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
+    if images.dtype not in (torch.float32, torch.float64):
+        raise ValueError(f"images must be float32 or float64, in [0, 1], got {images.dtype}")
+    check_gray(images, "images")

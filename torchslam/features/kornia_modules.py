@@ -18,21 +18,14 @@ from torchslam.errors import ConfigError
 from torchslam.features.weights import read_weights
 from torchslam.types import Features
 
-PACKAGE = "kornia"
-_PRETRAINED = "from_pretrained"
-_DIVISOR = 16
-"""Images are padded to a multiple of it, which the networks need."""
 BLOB_RADIUS = 6.0 * 1.6
 """Radius of a region, pixels, at the finest level of kornia's detectors: 6 (`mr_size`) times a sigma of 1.6 pixels."""
-_SCALE = 1.0
-"""Scale of keypoints without regions, pixels."""
-_NEEDED = "keypoints", "descriptors"
 
 
 def is_kornia_module(part: object) -> bool:
     """Whether a feature extractor is a module, or the class of a module, that kornia defines."""
     kind = part if isinstance(part, type) else type(part)
-    return issubclass(kind, nn.Module) and kind.__module__.partition(".")[0] == PACKAGE
+    return issubclass(kind, nn.Module) and kind.__module__.partition(".")[0] == "kornia"
 
 
 def make_kornia_extractor(kind: type[nn.Module], num_keypoints: int, weights: str | None) -> KorniaFeatures:
@@ -41,8 +34,8 @@ def make_kornia_extractor(kind: type[nn.Module], num_keypoints: int, weights: st
     Raises:
         ConfigError: The weights do not fit.
     """
-    if weights is None and hasattr(kind, _PRETRAINED):
-        return KorniaFeatures(getattr(kind, _PRETRAINED)(), num_keypoints)
+    if weights is None and (pretrained := getattr(kind, "from_pretrained", None)):
+        return KorniaFeatures(pretrained(), num_keypoints)
     options = {"num_features": num_keypoints} if "num_features" in signature(kind).parameters else {}
     module = kind(**options)
     if weights is not None:
@@ -85,7 +78,7 @@ class KorniaFeatures(nn.Module):
 
     def _found(self, images: Tensor) -> list[Any]:
         height, width = images.shape[-2:]
-        padded = F.pad(images, (0, -width % _DIVISOR, 0, -height % _DIVISOR), mode="replicate")
+        padded = F.pad(images, (0, -width % 16, 0, -height % 16), mode="replicate")  # as the networks need
         found = self.module(padded.expand(-1, 3, -1, -1))
         name = type(self.module).__name__
         if not isinstance(found, list | tuple) or len(found) != len(images):
@@ -93,8 +86,7 @@ class KorniaFeatures(nn.Module):
                 f"feature extractor {name}: must return one object per image, not {type(found).__name__}"
             )
         for each in found:
-            missing = [field for field in _NEEDED if not hasattr(each, field)]
-            if missing or _scores(each) is None:
+            if not (hasattr(each, "keypoints") and hasattr(each, "descriptors")) or _scores(each) is None:
                 raise ConfigError(
                     f"feature extractor {name}: returns {type(each).__name__} without keypoints, descriptors and scores"
                 )
@@ -110,7 +102,7 @@ class KorniaFeatures(nn.Module):
         return {
             "keypoints": keypoints,
             "scores": scores,
-            "scales": torch.full_like(scores, _SCALE),
+            "scales": torch.ones_like(scores),
             "angles": torch.zeros_like(scores),
             "descriptors": found.descriptors[is_inside],
         }
@@ -133,10 +125,8 @@ class KorniaFeatures(nn.Module):
 
 def _scores(found: Any) -> Tensor | None:
     """The scores of keypoints, which kornia's classes name differently."""
-    names = ("detection_scores", "keypoint_scores", "scores")
-    return next(
-        (getattr(found, name) for name in names if isinstance(getattr(found, name, None), Tensor)), None
-    )
+    given = (getattr(found, name, None) for name in ("detection_scores", "keypoint_scores", "scores"))
+    return next((scores for scores in given if isinstance(scores, Tensor)), None)
 
 
 def _padded(images: list[dict[str, Tensor]], count: int) -> Features:

@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor, nn
 
 from torchslam.errors import ConfigError
-from torchslam.features.contract import apply_mask
+from torchslam.features.contract import apply_mask, check_images
 from torchslam.features.corners import soft_peak
-from torchslam.features.orb import check_images
 from torchslam.features.weights import EXTRACTOR, MATCHER, read_weights
 from torchslam.geometry.precision import without_autocast
 from torchslam.types import Features
@@ -79,14 +78,9 @@ class XFeat(nn.Module):
     def read(
         self, images: Float[Tensor, "B 1 H W"], keypoints: Float[Tensor, "B N 2"], mask: Bool[Tensor, "B N"]
     ) -> Features:
-        """Describe keypoints found before, in the same rows, whatever their scores are now.
+        """Describe keypoints found before in these images, in the same rows, whatever their scores are now.
 
-        Every keypoint is located anew around the peak that is at most one pixel of the network's input away.
-
-        Args:
-            images: gray, in [0, 1].
-            keypoints: of these images.
-            mask: the rows that are keypoints.
+        Each keypoint of the mask is located anew around the peak that is at most one pixel of the network's input away.
         """
         check_images(images)
         coarse, heat, scores = self._maps(images)
@@ -114,11 +108,7 @@ class XFeat(nn.Module):
         # Pixels from 0 to W - 1 span the coarse map from edge to edge: so the network was trained.
         grid = 2 * positions / positions.new_tensor([heat.shape[2] - 1, heat.shape[1] - 1]) - 1
         sampled = F.grid_sample(
-            F.normalize(coarse, dim=1),
-            grid[:, None],
-            mode="bicubic",
-            padding_mode="zeros",
-            align_corners=False,
+            F.normalize(coarse, dim=1), grid[:, None], mode="bicubic", align_corners=False
         )
         descriptors = F.normalize(sampled[:, :, 0].mT, dim=-1)
         keypoints = (positions + 0.5) * _ratio(images, heat) - 0.5
@@ -146,12 +136,8 @@ class ALIKED(nn.Module):
         state = {name.removeprefix(EXTRACTOR): tensor for name, tensor in read_weights(weights).items()}
         state = {name: tensor for name, tensor in state.items() if not name.startswith(MATCHER)}
         variants = {(8, 16): "aliked-t16", (16, 16): "aliked-n16", (16, 32): "aliked-n32"}
-        sizes = [
-            state[name].shape[:1]
-            for name in ("block1.conv1.weight", "desc_head.agg_weights")
-            if name in state
-        ]
-        shape = tuple(length for size in sizes for length in size)
+        names = ("block1.conv1.weight", "desc_head.agg_weights")
+        shape = tuple(len(state[name]) for name in names if name in state and state[name].ndim)
         if shape not in variants:
             raise ConfigError(f"{weights}: not the weights of an ALIKED network")
         # Without a threshold the network gives its strongest maxima.
@@ -171,17 +157,17 @@ class ALIKED(nn.Module):
         check_images(images, mask)
         with images.device:  # kornia makes tensors on the default device
             found = self.network(images.float())
-        rows = [
-            _features(
+        rows = []
+        for one in found:
+            keypoints, scores, descriptors = (
                 one.keypoints[None],
                 one.keypoint_scores[None],
-                one.descriptors[None].float(),
-                torch.ones_like(one.keypoint_scores[None], dtype=torch.bool),
-                self.num_keypoints,
-                ALIKED_NOISE,
+                one.descriptors[None],
             )
-            for one in found
-        ]
+            mask_1 = torch.ones_like(scores, dtype=torch.bool)
+            rows.append(
+                _features(keypoints, scores, descriptors.float(), mask_1, self.num_keypoints, ALIKED_NOISE)
+            )
         features = Features.cat(rows)
         return features if mask is None else apply_mask(features, mask)
 
@@ -223,17 +209,13 @@ class _FullPrecision(nn.Sequential):
     forward = without_autocast(nn.Sequential.forward)
 
 
-_RADIUS = 2  # of the window around a peak that locates a keypoint
-
-
 def _image_index(places: Int[Tensor, "B N 2"]) -> Int[Tensor, "B N"]:
     return torch.arange(len(places), device=places.device)[:, None].expand(places.shape[:2])
 
 
 def _windows(heat: Float[Tensor, "B H W"], places: Int[Tensor, "B N 2"]) -> Float[Tensor, "B N 5 5"]:
     """The map around places (x, y), zero beyond its edge."""
-    side = 2 * _RADIUS + 1
-    windows = F.pad(heat, (_RADIUS,) * 4).unfold(1, side, 1).unfold(2, side, 1)
+    windows = F.pad(heat, (2,) * 4).unfold(1, 5, 1).unfold(2, 5, 1)
     return windows[_image_index(places), places[..., 1], places[..., 0]]
 
 

@@ -1,4 +1,4 @@
-"""ORB in tensor operations, and the one of OpenCV.
+"""ORB in tensor operations.
 
 FAST corners on a pyramid are ranked, spread over the image, oriented, and described by rotated BRIEF, as in Rublee,
 Rabaud, Konolige, Bradski: ORB, an efficient alternative to SIFT or SURF (ICCV 2011).
@@ -7,19 +7,20 @@ Rabaud, Konolige, Bradski: ORB, an efficient alternative to SIFT or SURF (ICCV 2
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 
-import cv2
-import numpy as np
 import torch
 import torch.nn.functional as F
 from jaxtyping import Bool, Float, Int, UInt8
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
-from torchslam.features.brief import blur, describe, orientations
-from torchslam.features.contract import check_gray
+from torchslam.features.contract import check_images
 from torchslam.features.corners import (
     Bands,
+    array_module,
+    chunks,
     fast_scores,
     find_peaks,
     gather_patches,
@@ -27,7 +28,9 @@ from torchslam.features.corners import (
     patch_scores,
     quadratic_peak,
     soft_peak,
+    to_numpy,
 )
+from torchslam.features.matching.hamming import int8_product, pack_bits
 from torchslam.features.pyramid import (
     PackedPyramid,
     build_levels,
@@ -38,45 +41,18 @@ from torchslam.features.pyramid import (
 from torchslam.features.selection import Grid, best_per_cell, plan_grid, prefilter_candidates, select_evenly
 from torchslam.types import Features
 
+RADIUS = 15
+"""Of the disk for the orientation, and of the sampling pattern, pixels (Rublee et al.: ORB, 2011)."""
+BLUR_RADIUS = 3
+"""Of the Gaussian filter before the tests, pixels: 7 x 7 as in the ORB of OpenCV."""
+_PATTERN_FILE = Path(__file__).with_name("brief.safetensors")
+ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle stays below 0.2 px
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
-HARRIS_RADIUS = 4  # of the patch that a Harris response needs
-FAST_RADIUS = 3  # of the circle
-SOFT_RADIUS = 1  # of the soft arg-max
+PATCH_RADIUS = 4  # 3 of the circle of FAST and 1 of the soft arg-max; just what a Harris response needs
 MAX_SCORE = 255  # a score that no corner exceeds
 WEAK_TEXTURE_RATIO = 0.5  # of the keypoints that may be chosen: an image that offers fewer has weak texture
-FAINT_THRESHOLD = (
-    4  # gray values: corners of an image of the weakest texture, above the noise of a good camera
-)
+FAINT_THRESHOLD = 4  # gray values: corners of an image of the weakest texture, above a good camera's noise
 KEYPOINTS_PER_CELL = 8  # keypoints of a cell if they were spread evenly
-
-
-@dataclass(frozen=True)
-class Corners:
-    """The chosen corners of a batch of images, N in all, and the pyramid in which they were detected.
-
-    Attributes:
-        levels: from `build_levels`.
-        pixels: the flattened packed pyramids.
-        pyramid: their layout.
-        positions: of the corners in the pixels.
-        slots: rows in the flattened (B, num_keypoints) table.
-        strengths: by which the corners were ranked.
-        fast: FAST scores around each corner.
-        image: of each corner.
-        level: of each corner.
-        xy: pixels of the level.
-    """
-
-    levels: list[Float[Tensor, "B 1 _ _"]]
-    pixels: UInt8[Tensor, " A"]
-    pyramid: PackedPyramid
-    positions: Int[Tensor, " N"]
-    slots: Int[Tensor, " N"]
-    strengths: Float[Tensor, " N"]
-    fast: UInt8[Tensor, "N 3 3"]
-    image: Int[Tensor, " N"]
-    level: Int[Tensor, " N"]
-    xy: Int[Tensor, "N 2"]
 
 
 class ORB(nn.Module):
@@ -136,69 +112,56 @@ class ORB(nn.Module):
             ValueError: The images or the mask have another shape or type.
             FrameError: The images are not in [0, 1].
         """
-        corners = self.detect(images, mask)
-        stride, dtype = corners.pyramid.stride, images.dtype
-        angles = orientations(corners.pixels, corners.positions, stride)
-        descriptors = describe(blur(corners.pixels, stride), corners.positions, angles, stride)
-        offsets, scores = self._refine(corners)
-        scale_xy = torch.tensor(corners.pyramid.scales, dtype=dtype, device=images.device)[corners.level]
-        keypoints = (corners.xy + offsets.to(dtype) + 0.5) * scale_xy - 0.5
-        scales = self.scale_factor ** corners.level.to(dtype)
-
-        def table(values: Tensor, fill: int = 0) -> Tensor:
-            empty = values.new_full((len(images) * self.num_keypoints, *values.shape[1:]), fill)
-            return empty.index_copy(0, corners.slots, values).unflatten(0, (len(images), -1))
-
-        return Features(
-            table(keypoints),
-            table(scores.to(dtype)),
-            table(scales, fill=1),
-            table(angles.to(dtype)),
-            table(descriptors),
-            table(torch.ones_like(corners.slots, dtype=torch.bool)),
-        )
-
-    def detect(
-        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
-    ) -> Corners:
-        """Choose the corners of a batch of images, without sub-pixel positions and descriptors.
-
-        Args:
-            images: gray, in [0, 1].
-            mask: where corners may lie, which get the whole budget; None: everywhere.
-        """
         check_images(images, mask)
         pyramid = plan_pyramid(*images.shape[-2:], self.scale_factor, self.num_levels)
         grid = plan_grid(
             pyramid, self.num_keypoints, KEYPOINTS_PER_CELL, BORDER, self.low_threshold, images.device
         )
+        stride, dtype = pyramid.stride, images.dtype
         with torch.set_grad_enabled(self.differentiable and torch.is_grad_enabled()):
             levels = build_levels(images, pyramid)
         with torch.no_grad():
             pixels = pack_levels(levels, pyramid).flatten()
-            # Peaks lie in cells, and the scores next to them are needed as well.
-            scores = fast_scores(pixels, pyramid.stride, _bands(grid, pyramid, len(images), margin=1))
+            # Peaks lie in cells, and the FAST scores next to them are needed as well.
+            fast = fast_scores(pixels, stride, _bands(grid, pyramid, len(images), margin=1))
             floor = grid.floor.expand(len(images), -1).reshape(-1)
             if mask is not None:
                 floor = torch.where(_packed_mask(mask, pyramid), floor, MAX_SCORE)
-            bands = _bands(grid, pyramid, len(images))
-            positions = self._peaks(scores, floor, len(images), pyramid.stride, bands)
-            positions, slots, strengths = self._choose(pixels, scores, positions, grid, pyramid.stride)
-            fast = gather_patches(scores, positions, pyramid.stride, 1)
+            positions = self._peaks(fast, floor, len(images), stride, _bands(grid, pyramid, len(images)))
+            positions, slots, strengths = self._choose(pixels, fast, positions, grid, stride)
             area = grid.table.shape[0]
             image, inside = positions // area, positions % area
             level = grid.levels[grid.table[inside].to(torch.int64)]
             top, left = torch.tensor(pyramid.corners, device=images.device)[level].unbind(-1)
-            xy = torch.stack([inside % pyramid.stride - left, inside // pyramid.stride - top], dim=-1)
-        return Corners(levels, pixels, pyramid, positions, slots, strengths, fast, image, level, xy)
+            xy = torch.stack([inside % stride - left, inside // stride - top], dim=-1)
+            angles = orientations(pixels, positions, stride)
+            descriptors = describe(blur(pixels, stride), positions, angles, stride)
+        # Corners are where the FAST score peaks; the maximum of the Harris response lies further inside the corner and
+        # repeats less precisely.
+        if self.differentiable:
+            offsets, strengths = self._soft_peaks(
+                gather_level_patches(levels, image, level, xy, PATCH_RADIUS)
+            )
+        else:
+            offsets = quadratic_peak(gather_patches(fast, positions, stride, 1).to(torch.float32))
+        scale_xy = torch.tensor(pyramid.scales, dtype=dtype, device=images.device)[level]
+        keypoints = (xy + offsets.to(dtype) + 0.5) * scale_xy - 0.5
+
+        def table(values: Tensor, fill: int = 0) -> Tensor:
+            empty = values.new_full((len(images) * self.num_keypoints, *values.shape[1:]), fill)
+            return empty.index_copy(0, slots, values).unflatten(0, (len(images), -1))
+
+        return Features(
+            table(keypoints),
+            table(strengths.to(dtype)),
+            table(self.scale_factor ** level.to(dtype), fill=1),
+            table(angles.to(dtype)),
+            table(descriptors),
+            table(torch.ones_like(slots, dtype=torch.bool)),
+        )
 
     def _peaks(
-        self,
-        scores: UInt8[Tensor, " A"],
-        floor: UInt8[Tensor, " A"],
-        batch: int,
-        stride: int,
-        bands: Bands,
+        self, scores: UInt8[Tensor, " A"], floor: UInt8[Tensor, " A"], batch: int, stride: int, bands: Bands
     ) -> Int[Tensor, " R"]:
         """Positions of corners: peaks of the scores above a floor, which is lower in images with few of them."""
         positions = find_peaks(scores, floor, stride, bands)
@@ -235,33 +198,26 @@ class ORB(nn.Module):
         strong = fast > self.threshold
         best = best_per_cell(image * num_cells + cell, fast, batch * num_cells)
         strong |= self._are_few(strong | best, image, batch).index_select(0, image)
+        competing = best | strong
         if self.ranking == "fast":  # the whole part of what they compete by
-            needed = best | (
-                strong
-                & prefilter_candidates(fast, strong | best, cell, image, grid, batch, self.num_keypoints)
+            count = self.num_keypoints
+            competing = best | (
+                strong & prefilter_candidates(fast, competing, cell, image, grid, batch, count)
             )
-        else:
-            needed = best | strong
-        kept = needed.nonzero().squeeze(1)
+        kept = competing.nonzero().squeeze(1)
         positions, image, cell, strong = (x.index_select(0, kept) for x in (positions, image, cell, strong))
         if self.ranking == "harris":
-            patches = gather_patches(pixels, positions, stride, HARRIS_RADIUS)
+            patches = gather_patches(pixels, positions, stride, PATCH_RADIUS)
             strengths = harris_responses(patches.to(torch.float32)).flatten()
         else:
             strengths = _contrast_score(gather_patches(scores, positions, stride, 1).to(torch.float32))
         rows, places = select_evenly(strengths, strong, cell, image, grid, batch, self.num_keypoints)
         return positions[rows], image[rows] * self.num_keypoints + places, strengths[rows]
 
-    def _refine(self, corners: Corners) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
-        """Sub-pixel offsets in pixels of the level, and scores.
-
-        Corners are where the FAST score peaks; the maximum of the Harris response lies further inside the corner and
-        repeats less precisely.
-        """
-        if not self.differentiable:
-            return quadratic_peak(corners.fast.to(torch.float32)), corners.strengths
-        radius = FAST_RADIUS + SOFT_RADIUS  # just what the Harris response of the center needs
-        patches = gather_level_patches(corners.levels, corners.image, corners.level, corners.xy, radius)
+    def _soft_peaks(
+        self, patches: Float[Tensor, "N 9 9"]
+    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
+        """Differentiable sub-pixel offsets of corners in pixels of the level, and their scores."""
         fast = patch_scores(patches)
         if self.ranking == "harris":
             return soft_peak(fast), harris_responses(patches).flatten()
@@ -270,14 +226,9 @@ class ORB(nn.Module):
 
 def _bands(grid: Grid, pyramid: PackedPyramid, batch: int, margin: int = 0) -> Bands:
     """Runs of pixels of `batch` flattened pyramids in whose rows there are cells, with `margin` rows around them."""
-    return tuple(
-        (
-            (image * pyramid.rows + first - margin) * pyramid.stride,
-            (image * pyramid.rows + last + margin) * pyramid.stride,
-        )
-        for image in range(batch)
-        for first, last in grid.rows
-    )
+    tops = [image * pyramid.rows for image in range(batch)]
+    runs = [(top + first - margin, top + last + margin) for top in tops for first, last in grid.rows]
+    return tuple((first * pyramid.stride, last * pyramid.stride) for first, last in runs)
 
 
 def _images_of(positions: Int[Tensor, " N"], pixels: int, batch: int) -> Int[Tensor, " N"]:
@@ -296,82 +247,79 @@ def _packed_mask(mask: Bool[Tensor, "B 1 H W"], pyramid: PackedPyramid) -> Bool[
     return pack_levels(levels, pyramid).flatten() > 0
 
 
-def check_images(images: Tensor, mask: Tensor | None = None) -> None:
-    """Check the input of an extractor.
+@lru_cache(maxsize=8)
+def _moment_weights(device: torch.device) -> Int[Tensor, "2 S"]:
+    """x and y (int8) of each pixel of the flattened patch within the disk of RADIUS, else 0; they sum to 0."""
+    axis = torch.arange(-RADIUS, RADIUS + 1, dtype=torch.float32, device="cpu")
+    y, x = torch.meshgrid(axis, axis, indexing="ij")
+    disk = (x * x + y * y <= (RADIUS + 0.5) ** 2).float()
+    return torch.stack([x * disk, y * disk]).flatten(1).to(device, torch.int8)
 
-    Raises:
-        ValueError: The images are not (B, 1, H, W) floats, or the mask is not (B, 1, H, W) bool.
-        FrameError: The images are not in [0, 1].
+
+def orientations(
+    pixels: UInt8[Tensor, " A"], positions: Int[Tensor, " N"], stride: int
+) -> Float[Tensor, " N"]:
+    """Compute the angle from each keypoint in flattened pixels to the intensity centroid of the disk around it.
+
+    Radians in [-pi, pi], from x towards y; 0 on a uniform patch. The moments are whole numbers below 2^24, hence exact.
     """
-    if mask is not None and (mask.shape != images.shape or mask.dtype != torch.bool):
-        raise ValueError(f"a mask must be bool {tuple(images.shape)}, got {mask.dtype} {tuple(mask.shape)}")
-    if images.dim() != 4 or images.shape[1] != 1 or 0 in images.shape:
-        raise ValueError(f"images must be (B, 1, H, W), got {tuple(images.shape)}")
-    if images.dtype not in (torch.float32, torch.float64):
-        raise ValueError(f"images must be float32 or float64, in [0, 1], got {images.dtype}")
-    check_gray(images, "images")
+    patches = gather_patches(pixels, positions, stride, RADIUS).flatten(1)
+    # As int8: subtracting a constant changes no moment. The other order of factors is slower.
+    x, y = int8_product(_moment_weights(pixels.device), (patches ^ 128).view(torch.int8).mT)
+    # In float64, as vectorized float32 may differ in the last bit from one position in memory to another.
+    return torch.atan2(y.double(), x.double()).float()
 
 
-def gray_bytes(images: Float[Tensor, "B 1 H W"]) -> UInt8[Tensor, "B H W"]:
-    """Images as OpenCV takes them, on the CPU."""
-    return images.detach().mul(255).add(0.5).clamp(0, 255).to(torch.uint8)[:, 0].cpu()
+def blur(pixels: UInt8[Tensor, " A"], stride: int) -> Int[Tensor, " R"]:
+    """Smooth a flattened image by a 7x7 near-Gaussian of sigma 1.6 px, in whole numbers.
+
+    Per direction two boxes of width 4, each the sum of two shifted sums.
+
+    Returns:
+        int16, 256 times the blurred value less 2^15, without the first and the last BLUR_RADIUS * (stride + 1) pixels.
+    """
+    margin = 2 * BLUR_RADIUS * (stride + 1)
+    blurred = pixels.new_empty(max(0, pixels.shape[0] - margin), dtype=torch.int16)
+    whole = to_numpy(blurred)
+    *shifts, last = (1, 1, 2, 2, stride, stride, 2 * stride, 2 * stride)
+    for start, count in chunks(whole, 0, len(blurred)):
+        # Subtracting 128 first makes the sum of weights, 256, fit int16 without rounding.
+        smooth = to_numpy((pixels.narrow(0, start, count + margin) ^ 128).view(torch.int8).to(torch.int16))
+        for shift in shifts:
+            smooth = smooth[shift:] + smooth[:-shift]
+        array_module(whole).add(smooth[last:], smooth[:-last], out=whole[start : start + count])
+    return blurred
 
 
-class OpenCVORB(nn.Module):
-    """OpenCV's ORB behind the interface of `ORB`. Not differentiable; results are on the images' device.
+@lru_cache(maxsize=1)
+def pattern() -> Int[Tensor, "256 4"]:
+    """The tests of a descriptor: x and y of the first and of the second pixel, whose brightness is compared."""
+    return load_file(_PATTERN_FILE)["pattern"]
+
+
+@lru_cache(maxsize=16)
+def _rotated_offsets(stride: int, device: torch.device) -> Int[Tensor, "256 512"]:
+    """Flat offsets of the first and then the second pixels of all tests, rotated by every angle and rounded."""
+    angles = torch.arange(ANGLE_BINS, dtype=torch.float64, device="cpu") * (2 * math.pi / ANGLE_BINS)
+    cos, sin = angles.cos()[:, None], angles.sin()[:, None]
+    x, y = pattern().double().view(256, 2, 2).permute(2, 1, 0).flatten(1)
+    offsets = (x * sin + y * cos).round() * stride + (x * cos - y * sin).round()
+    return offsets.to(device=device, dtype=torch.int32)
+
+
+def describe(
+    blurred: Int[Tensor, " R"], positions: Int[Tensor, " N"], angles: Float[Tensor, " N"], stride: int
+) -> UInt8[Tensor, "N 32"]:
+    """Describe keypoints by 256 brightness comparisons, rotated by their angles.
 
     Args:
-        num_keypoints: largest number of keypoints per image; rows beyond what OpenCV finds are masked.
-        scale_factor: ratio of the sizes of neighboring pyramid levels.
-        num_levels: of the pyramid.
-        threshold: of FAST, gray values of 0 to 255.
+        blurred: from `blur`.
+        positions: of the keypoints in the image before blurring, RADIUS + BLUR_RADIUS inside their level.
+        angles: radians.
+        stride: length of a row of pixels.
     """
-
-    def __init__(
-        self, num_keypoints: int = 1000, scale_factor: float = 1.2, num_levels: int = 8, threshold: int = 20
-    ) -> None:
-        super().__init__()
-        self.num_keypoints = num_keypoints
-        self.scale_factor = scale_factor
-        self._orb = cv2.ORB.create(
-            nfeatures=num_keypoints, scaleFactor=scale_factor, nlevels=num_levels, fastThreshold=threshold
-        )
-
-    def forward(
-        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
-    ) -> Features:
-        """Detect and describe keypoints; arguments, result and errors as for `ORB.forward`."""
-        check_images(images, mask)
-        masks = [None] * len(images) if mask is None else list(mask[:, 0].to(torch.uint8).cpu().numpy())
-        batch = [self._extract(*each, images.dtype) for each in zip(gray_bytes(images), masks, strict=True)]
-        fields = (torch.stack(column) for column in zip(*batch, strict=True))
-        return Features(*fields).to(images.device)
-
-    def _extract(self, image: Tensor, mask: np.ndarray | None, dtype: torch.dtype) -> tuple[Tensor, ...]:
-        """The fields of `Features` of one (H, W) uint8 image, where `mask` is not 0."""
-        # cv2 fails on images that leave no room for a keypoint instead of finding none.
-        roomy = min(image.shape) > 2 * self._orb.getEdgeThreshold()
-        found, described = self._orb.detectAndCompute(image.numpy(), mask) if roomy else ((), None)
-        # cv2 may return a few more than asked for when responses tie.
-        rows = sorted(range(len(found)), key=lambda row: -found[row].response)[: self.num_keypoints]
-        values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype, device="cpu").repeat(self.num_keypoints, 1)
-        descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8, device="cpu")
-        found_mask = torch.arange(self.num_keypoints, device="cpu") < len(rows)
-        if described is not None:
-            points = [found[row] for row in rows]
-            values[: len(rows)] = torch.tensor(
-                [self._row(point) for point in points], dtype=dtype, device="cpu"
-            )
-            descriptors[: len(rows)] = torch.from_numpy(described[rows])
-        return values[:, :2], values[:, 2], values[:, 3], values[:, 4], descriptors, found_mask
-
-    def _row(self, point: cv2.KeyPoint) -> tuple[float, float, float, float, float]:
-        """x, y, score, scale, angle of a keypoint.
-
-        cv2 scales pixels of a level about the center of the first one, but resizes images about their corner; the
-        difference is half a pixel of the level less half a pixel of the image.
-        """
-        scale = self.scale_factor**point.octave
-        shift = (scale - 1) / 2
-        angle = math.remainder(math.radians(point.angle), 2 * math.pi)
-        return point.pt[0] + shift, point.pt[1] + shift, point.response, scale, angle
+    bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
+    origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)
+    samples = _rotated_offsets(stride, blurred.device).index_select(0, bins).add_(origins[:, None])
+    first, second = blurred.index_select(0, samples.view(-1)).view(samples.shape).chunk(2, dim=1)
+    return pack_bits(first < second)

@@ -91,14 +91,9 @@ def gather_level_patches(
     xy: Int[Tensor, "N 2"],
     radius: int,
 ) -> Float[Tensor, "N S S"]:
-    """Gather patches around keypoints on their own levels, with gradients to the levels.
+    """Gather patches around keypoints on their own levels of `build_levels`, with gradients to these.
 
-    Args:
-        levels: from `build_levels`.
-        images: the image of each keypoint.
-        level: the level of each keypoint.
-        xy: pixels of the level, at least `radius` inside.
-        radius: of the patches; their side is 2 radius + 1 pixels.
+    The keypoints lie `radius` pixels of their level inside; the side of a patch is 2 radius + 1 pixels.
     """
     device = xy.device
     heights, widths = (torch.tensor([lv.shape[d] for lv in levels], device=device) for d in (-2, -1))

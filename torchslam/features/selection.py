@@ -43,15 +43,9 @@ def plan_grid(
     threshold: int,
     device: torch.device,
 ) -> Grid:
-    """Divide the levels into square cells, and the keypoints between the levels.
+    """Divide the levels into square cells of about `per_cell` keypoints, and the keypoints between the levels.
 
-    Args:
-        pyramid: layout of the levels.
-        num_keypoints: budget of all levels.
-        per_cell: approximate number of keypoints in a cell.
-        border: pixels at the edges of every level without keypoints.
-        threshold: the FAST score that a corner must exceed.
-        device: of the grid.
+    No keypoint lies in the `border`, in pixels, of a level; `threshold` is the FAST score that a corner must exceed.
     """
     table = torch.full((pyramid.rows, pyramid.stride), -1, dtype=torch.int32, device="cpu")
     budgets = _level_budgets(num_keypoints, pyramid, border)
@@ -67,20 +61,14 @@ def plan_grid(
         cells = row[:, None] * across + column + len(levels)
         table[top + border : top + h - border, left + border : left + w - border] = cells.to(torch.int32)
         levels += [level] * (down * across)
-    as_tensor = torch.tensor
+    edges = F.pad((table >= 0).any(1).to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
     return Grid(
         table.flatten().to(device),
         torch.where(table.flatten() >= 0, threshold, 255).to(device=device, dtype=torch.uint8),
-        _runs((table >= 0).any(1)),
-        as_tensor(levels, dtype=torch.int64, device=device),
-        as_tensor(budgets, dtype=torch.int64, device=device),
+        tuple(zip(edges[::2], edges[1::2], strict=True)),
+        torch.tensor(levels, dtype=torch.int64, device=device),
+        torch.tensor(budgets, dtype=torch.int64, device=device),
     )
-
-
-def _runs(flags: Bool[Tensor, " N"]) -> tuple[tuple[int, int], ...]:
-    """(start, stop) of all runs of true flags."""
-    edges = F.pad(flags.to(torch.int8), (1, 1)).diff().nonzero()[:, 0].tolist()
-    return tuple(zip(edges[::2], edges[1::2], strict=True))
 
 
 def _level_budgets(num_keypoints: int, pyramid: PackedPyramid, border: int) -> list[int]:
@@ -127,11 +115,7 @@ def prefilter_candidates(
     """Find corners that `select_evenly` may choose besides the best of the cells: far fewer than all, without a sort.
 
     A level takes at most its budget and all that other levels leave: a corner with as many stronger ones on its level
-    is never chosen. Arguments as for `select_evenly`, and:
-
-    Args:
-        scores: whole parts of the scores of `select_evenly`.
-        candidates: rows that compete.
+    is never chosen. Arguments as for `select_evenly`; scores are whole parts of the scores there.
     """
     num_levels = grid.budgets.shape[0]
     group = images * num_levels + grid.levels.index_select(0, cells)
@@ -165,7 +149,7 @@ def select_evenly(
         cells: of the corners, within their images.
         images: of the corners.
         grid: cells and budgets.
-        num_images: number of images.
+        num_images: in the batch.
         count: largest number of corners per image.
 
     Returns:
@@ -174,7 +158,9 @@ def select_evenly(
     num_cells, num_levels = grid.levels.shape[0], grid.budgets.shape[0]
     rows = _falling(scores)  # every rank below follows this order
     cells, images, strong = (values.index_select(0, rows) for values in (cells, images, strong))
-    extra = ~_is_first(images * num_cells + cells, num_images * num_cells)
+    groups, numbers = images * num_cells + cells, torch.arange(len(rows), device=rows.device)
+    first = numbers.new_full((num_images * num_cells,), len(rows)).scatter_reduce(0, groups, numbers, "amin")
+    extra = numbers != first.index_select(0, groups)  # not the best of its cell
 
     kept = (strong | ~extra).nonzero().squeeze(1)
     rows, extra, images, cells = (values.index_select(0, kept) for values in (rows, extra, images, cells))
@@ -193,13 +179,6 @@ def _falling(scores: Float[Tensor, " N"]) -> Int[Tensor, " N"]:
     # The bits of floats are in the order of whole numbers, which are sorted several times as fast.
     bits = (scores + 0.0).view(torch.int32)  # -0 as 0
     return torch.argsort(~torch.where(bits < 0, bits ^ 0x7FFFFFFF, bits), stable=True)
-
-
-def _is_first(groups: Int[Tensor, " N"], num_groups: int) -> Bool[Tensor, " N"]:
-    """Test whether a row is the first of its group."""
-    rows = torch.arange(groups.shape[0], device=groups.device)
-    first = rows.new_full((num_groups,), groups.shape[0]).scatter_reduce(0, groups, rows, "amin")
-    return rows == first.index_select(0, groups)
 
 
 def _ranks_in_turn(groups: Tensor, second: Tensor, num_groups: int) -> Tensor:

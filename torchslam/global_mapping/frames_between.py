@@ -15,8 +15,7 @@ from torchslam.map.atlas import Submap
 from torchslam.map.map import Map
 from torchslam.tracking.data_association import match_keyframe
 from torchslam.tracking.pose_validation import check_pose
-from torchslam.tracking.relocalization import single_frame_state
-from torchslam.tracking.tracker import Tracker
+from torchslam.tracking.tracker import Tracker, single_frame_state
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, State, StepResult
 
 NUM_NEAREST = 3  # keyframes in time for the relocalization of a lost frame

@@ -15,8 +15,9 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped, UInt8
 from safetensors.torch import load_file
 from torch import Tensor
+from torch.nn.functional import pad
 
-from torchslam.features.matching.hamming import pack_bits, sign_products, spread_bits
+from torchslam.features.matching.hamming import count_bits, pack_bits, sign_products, spread_bits
 
 BITS = 256
 """Bits of a descriptor: ORB's, and of the random projections of floats."""
@@ -98,8 +99,8 @@ def code_similarity(
     codes_1: Int[Tensor, "*#batch"], codes_2: Int[Tensor, "*#batch"]
 ) -> Float[Tensor, "*#batch"]:
     """Similarity of codes of the same word, 0 to 1."""
-    distance = _count_bits(codes_1 ^ codes_2)
-    return _kernel(codes_1.device).index_select(0, distance.view(-1)).view(distance.shape)
+    distance = count_bits(codes_1 ^ codes_2)
+    return _kernel(codes_1.device).index_select(0, distance.view(-1).int()).view(distance.shape)
 
 
 @lru_cache(maxsize=4)
@@ -110,25 +111,12 @@ def _kernel(device: torch.device) -> Float[Tensor, "65"]:
     return values.float().to(device)
 
 
-def _count_bits(words: Int[Tensor, "*batch"]) -> Int[Tensor, "*batch"]:
-    """Number of set bits of each word (Warren: Hacker's Delight, 2002). Overwrites the words."""
-    part = (words >> 1).bitwise_and_(0x5555555555555555)
-    words -= part
-    torch.bitwise_right_shift(words, 2, out=part)
-    words.bitwise_and_(0x3333333333333333).add_(part.bitwise_and_(0x3333333333333333))
-    words += torch.bitwise_right_shift(words, 4, out=part)
-    words.bitwise_and_(0x0F0F0F0F0F0F0F0F).mul_(0x0101010101010101)
-    return words.bitwise_right_shift_(56)  # at most 64, so the sign bit stays clear
-
-
 MAX_DESCRIPTORS = 400
 """Descriptors of an image, the strongest: nearly as good as all of them, at less than half the cost."""
 NO_KEY = -1
 """Key of an empty slot; keys of keyframes are not negative."""
 _CHUNK = 1 << 17
 """Pairs of codes that are compared at once: what a processor's cache holds."""
-_FIRST_CAPACITY = 64
-"""Images for which a new database has room; it grows by a quarter."""
 _MIN_FLOAT_WORDS = 64
 """Descriptors below which an image is too empty to give the words of a float feature extractor. Tried at this value
 only."""
@@ -192,7 +180,7 @@ class KeyframeDatabase:
         Raises:
             KeyError: A key is missing; nothing was removed.
         """
-        keys = _as_list(keys)
+        keys = [int(key) for key in keys]
         slots = [self._slots[key] for key in keys]
         self._keys[slots] = NO_KEY
         self._used[:, slots] = 0.0
@@ -249,30 +237,13 @@ class KeyframeDatabase:
     def _free_slot(self, device: torch.device) -> int:
         """The lowest slot that no keyframe has, with nothing in it."""
         if len(self) == len(self._keys):
-            self._reserve(len(self) + 1, device)
+            # Room for a quarter more, so that adding a keyframe costs the same on average.
+            more = 0, max(64 - len(self), len(self) // 4)
+            self._keys = pad(self._keys.to(device), more, value=NO_KEY)
+            self._codes, self._used = (pad(each.to(device), more) for each in (self._codes, self._used))
         return int(torch.nonzero(self._keys == NO_KEY)[0, 0])
-
-    def _reserve(self, size: int, device: torch.device) -> None:
-        """Room for `size` keyframes; it grows by a quarter at least, so that adding one costs the same on average."""
-        capacity = max(_FIRST_CAPACITY, size, len(self._keys) * 5 // 4)
-        self._keys = _widened(self._keys, capacity, NO_KEY, device)
-        self._codes = _widened(self._codes, capacity, 0, device)
-        self._used = _widened(self._used, capacity, 0, device)
 
 
 def _strongest(descriptors: Shaped[Tensor, "N D"], mask: Bool[Tensor, " N"]) -> UInt8[Tensor, "R 32"]:
     """The first MAX_DESCRIPTORS descriptors of the mask, as bits."""
     return binarize(descriptors[torch.nonzero(mask)[:MAX_DESCRIPTORS, 0]])
-
-
-def _widened(
-    columns: Shaped[Tensor, "*batch K"], capacity: int, fill: int, device: torch.device
-) -> Shaped[Tensor, "*batch {capacity}"]:
-    """The tensor with `capacity` columns, the new ones filled."""
-    new = torch.full((*columns.shape[:-1], capacity), fill, dtype=columns.dtype, device=device)
-    new[..., : columns.shape[-1]] = columns
-    return new
-
-
-def _as_list(keys: Int[Tensor, " K"] | Iterable[int]) -> list[int]:
-    return [int(key) for key in (keys.tolist() if isinstance(keys, Tensor) else keys)]

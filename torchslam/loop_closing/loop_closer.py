@@ -15,14 +15,13 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, SharedCamera, se3_inverse, sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
-from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector
-from torchslam.loop_closing.relative_sim3 import neighborhood
+from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector, neighborhood
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
-from torchslam.mapping.new_points import match_in_keyframes, merge_points
+from torchslam.mapping.new_points import fuse
 from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
-from torchslam.tracking.relocalization import MAX_CANDIDATES, Candidate
+from torchslam.tracking.tracker import MAX_CANDIDATES, Candidate
 from torchslam.types import FrameFeatures, Matcher
 
 MIN_ESSENTIAL_WEIGHT = 100
@@ -149,11 +148,7 @@ def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Su
 
 
 def fuse_and_adjust(
-    submap: Submap,
-    keyframe: int,
-    matched_keyframe: int,
-    camera: Camera,
-    config: Config,
+    submap: Submap, keyframe: int, matched_keyframe: int, camera: Camera, config: Config
 ) -> None:
     """Fuse landmarks between the neighborhoods of two keyframes, and adjust the whole map, twice.
 
@@ -196,9 +191,7 @@ def fuse_landmarks(
     slam_map: Map, here: Int[Tensor, " K"], there: Int[Tensor, " L"], camera: Camera, config: Config
 ) -> None:
     """Match the points of two sets of keyframes in each other, and merge duplicates."""
-    for keyframes, others in ((here, there), (there, here)):
-        points = slam_map.observed_points(others)
-        merge_points(slam_map, *match_in_keyframes(slam_map, keyframes, points, camera, config))
+    fuse(slam_map, here, there, camera, config)
     slam_map.update_appearance(torch.unique(torch.cat([here, there])))
 
 

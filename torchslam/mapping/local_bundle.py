@@ -24,7 +24,7 @@ from torchslam.geometry.robust import middle_variance
 from torchslam.geometry.similarity import in_place_of
 from torchslam.map.map import Map
 from torchslam.map.observation_index import top_rows
-from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, BundleSolution, Progress, solve_bundle
+from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, Progress, solve_bundle
 from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
 from torchslam.optim.run_graph import camera_prior
 from torchslam.types import Observations
@@ -49,14 +49,7 @@ MAP_OPTIONS = BUNDLE_OPTIONS.replace(kernel="huber", scale=HUBER, backward="deta
 
 @dataclass(frozen=True)
 class BundleWindow:
-    """A part of the map that is adjusted at once.
-
-    Attributes:
-        keyframes: rows, ascending.
-        point_ids: rows, ascending.
-        seen: observations of the points by the keyframes.
-        problem: the same, as a bundle adjustment problem.
-    """
+    """A part of the map that is adjusted at once: ascending rows of keyframes and points, and their observations."""
 
     keyframes: Int[Tensor, " K"]
     point_ids: Int[Tensor, " N"]
@@ -95,15 +88,9 @@ def solve_whole(problem: BundleProblem, iterations: int) -> Solution:
 
     With it go the frames in between, and the poses that follow.
     """
-    found = solve_bundle(
-        problem, check=False, options=MAP_OPTIONS.replace(iterations=iterations, tolerance=WHOLE_TOLERANCE)
-    )
+    options = MAP_OPTIONS.replace(iterations=iterations, tolerance=WHOLE_TOLERANCE)
+    found = solve_bundle(problem, check=False, options=options)
     return in_place_of(problem.T_cw, found.T_cw, found.points_w)
-
-
-def solve_here(function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-    """Call in this process, when the result is requested."""
-    return partial(function, *arguments)
 
 
 def adjust_all(
@@ -113,7 +100,7 @@ def adjust_all(
     calibration: CameraMeasurement | None = None,
     tolerance: float = BUNDLE_OPTIONS.tolerance,
 ) -> Camera:
-    """Run a global bundle adjustment with the first keyframe fixed.
+    """Run a global bundle adjustment with the first keyframe fixed; return the camera of the adjusted map.
 
     Args:
         slam_map: The map.
@@ -121,44 +108,28 @@ def adjust_all(
         progress: Called before each iteration; if it raises, the map stays as it was.
         calibration: The given camera with its error: the camera is adjusted as well; None: it is exact.
         tolerance: Predicted relative reduction of the cost that ends it.
-
-    Returns:
-        The camera of the adjusted map.
     """
-    everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
-    window = build_window(slam_map, everyone[1:], everyone[:1], camera)
+    window = whole_window(slam_map, camera)
     if window is None:
         return camera
-    solution = solve_window(window.problem, progress, calibration, tolerance)
+    problem, free = window.problem, False if calibration is None else calibration.directions
+    if calibration is not None:
+        problem = replace(problem, camera_prior=camera_prior(calibration))
+    options = MAP_OPTIONS.replace(iterations=GLOBAL_ITERATIONS, tolerance=tolerance)
+    solution = solve_bundle(problem, free_camera=free, progress=progress, check=False, options=options)
     camera = camera if calibration is None else solution.camera
     apply_solution(slam_map, window, solution.T_cw, solution.points_w, camera)
     return camera
 
 
-def solve_window(
-    problem: BundleProblem,
-    progress: Progress | None = None,
-    calibration: CameraMeasurement | None = None,
-    tolerance: float = BUNDLE_OPTIONS.tolerance,
-) -> BundleSolution:
-    """Solve the problem of a window; arguments as for `adjust_all`."""
-    free: bool | Tensor = False
-    if calibration is not None:
-        problem, free = replace(problem, camera_prior=camera_prior(calibration)), calibration.directions
-    return solve_bundle(
-        problem,
-        free_camera=free,
-        progress=progress,
-        check=False,
-        options=MAP_OPTIONS.replace(iterations=GLOBAL_ITERATIONS, tolerance=tolerance),
-    )
+def whole_window(slam_map: Map, camera: Camera) -> BundleWindow | None:
+    """The problem of all keyframes, with the first one fixed; None if nothing is observed."""
+    everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
+    return build_window(slam_map, everyone[1:], everyone[:1], camera)
 
 
 def build_window(
-    slam_map: Map,
-    free: Int[Tensor, " K"],
-    fixed: Int[Tensor, " R"],
-    camera: Camera,
+    slam_map: Map, free: Int[Tensor, " K"], fixed: Int[Tensor, " R"], camera: Camera
 ) -> BundleWindow | None:
     """Build the problem of free keyframes, their points and the fixed keyframes; None if nothing is observed."""
     keyframes = torch.sort(torch.cat([free, fixed])).values
@@ -241,37 +212,23 @@ class ApplyAt(Enum):
 
 @dataclass
 class _Adjustment:
-    """A requested adjustment.
+    """A requested adjustment; `on_applied` is called once the map is adjusted."""
 
-    Attributes:
-        due: the frame after which it is applied; None: before the next frame.
-        slam_map: the map.
-        keyframe: row of the keyframe around which to adjust; None: the whole map.
-        camera: of the adjusted keyframes.
-        version: `Map.version` at the time of the request.
-        on_applied: called once the map is adjusted.
-        window: what is adjusted, once it was started; None as well if there is nothing to adjust.
-        solution: of the window.
-    """
-
-    due: int | None
+    due: int | None  # the frame after which it is applied; None: before the next frame
     slam_map: Map
-    keyframe: int | None
+    keyframe: int | None  # around which to adjust; None: the whole map
     camera: Camera
-    version: int
+    version: int  # of the map at the time of the request
     on_applied: Callable[[], None] = lambda: None
-    window: BundleWindow | None = None
+    window: BundleWindow | None = None  # once it was started; None as well if there is nothing to adjust
     solution: Callable[[], Solution] | None = None
 
 
 class SolvedElsewhere:
-    """What starts computations now and uses their results later.
+    """What starts computations now and uses their results later."""
 
-    Attributes:
-        solver: where they are computed; default: in this process.
-    """
-
-    solver: Solver = staticmethod(solve_here)
+    solver: Solver = staticmethod(partial)
+    """Where they are computed; default: in this process, when the result is requested."""
 
     @contextmanager
     def solved_by(self, solver: Solver) -> Iterator[None]:
@@ -344,8 +301,7 @@ class AsyncBundleAdjustment(SolvedElsewhere):
             window = select_window(slam_map, pending.keyframe, camera)
             solve, iterations = solve_local, LOCAL_ITERATIONS
         else:
-            everyone = torch.arange(slam_map.num_keyframes, device=slam_map.T_cw.device)
-            window = build_window(slam_map, everyone[1:], everyone[:1], camera)
+            window = whole_window(slam_map, camera)
             solve, iterations = solve_whole, GLOBAL_ITERATIONS
         if window is not None:
             pending.window = window

@@ -6,16 +6,19 @@ adjustment. `MapInitializer` builds the first map of a submap from two views.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
+from jaxtyping import Bool, Float, Int
+from torch import Tensor
 
 from torchslam.config import Config, KeyframesConfig
 from torchslam.errors import ConfigError
-from torchslam.geometry import SharedCamera, se3_inverse, triangulation_covariance
+from torchslam.geometry import SharedCamera, se3_inverse, transform, triangulation_covariance
 from torchslam.geometry.transforms import pose_distance
 from torchslam.map.atlas import Submap
-from torchslam.map.compaction import RowRemap, compact
+from torchslam.map.compaction import RowRemap, compact, remove_keyframes
 from torchslam.map.map import Map
-from torchslam.mapping.culling import cull_keyframes
 from torchslam.mapping.local_bundle import ApplyAt, AsyncBundleAdjustment
 from torchslam.mapping.new_points import fuse, triangulate_against
 from torchslam.tracking.tracker import Tracker
@@ -44,16 +47,25 @@ for an adjustment of the whole map.
 
 Half of the default `min_overlap`, so that tracking stays safe."""
 
+MIN_COVERED_RATIO = 0.9
+"""Ratio of a keyframe's points that other keyframes must observe."""
+MIN_OBSERVERS = 3
+"""Number of other keyframes that must observe each of these points."""
+MAX_SCALE_RATIO = 1.25
+"""Ratio of scales up to which an observation counts: one pyramid level (a factor of 1.2) coarser is accepted."""
+NUM_NEWEST_KEPT = 8
+"""Newest keyframes, which are never culled: their points are recent, and tracking continues from them."""
+NUM_COVISIBLE = 20
+"""Keyframes that are checked around each new one."""
+_LEAST_BATCH, _BATCH_SHARE = 8, 16
+"""Culling runs after this many new keyframes, or this part of the map: copying rows then costs O(1) per keyframe."""
+
 
 class Mapper:
     """Inserts keyframes into a map."""
 
     def __init__(
-        self,
-        camera: SharedCamera,
-        config: Config,
-        clock: Stopwatch,
-        matcher: Matcher | None = None,
+        self, camera: SharedCamera, config: Config, clock: Stopwatch, matcher: Matcher | None = None
     ) -> None:
         self.camera = camera
         self.config = config
@@ -85,14 +97,7 @@ class Mapper:
     ) -> int:
         """Insert a tracked frame as a keyframe: observe, cull points, triangulate, fuse, request local adjustment.
 
-        Args:
-            slam_map: The map.
-            view: The frame.
-            estimate: Its pose and inlier matches.
-            apply_at: When the local bundle adjustment is applied; until then the map must not change.
-
-        Returns:
-            The row of the keyframe.
+        Until the adjustment is applied (`apply_at`), the map must not change. Returns the row of the keyframe.
         """
         is_plain = self.config.paper.last_keyframe
         with self.clock("mapping"):
@@ -110,7 +115,8 @@ class Mapper:
             )
             slam_map.update_appearance(slam_map.index_tensor(keyframe))
             if not is_plain:
-                fuse(slam_map, keyframe, neighbors, self.camera.current, self.config)
+                here = slam_map.index_tensor(keyframe)
+                fuse(slam_map, neighbors, here, self.camera.current, self.config)
         if not self.config.paper.unrefined:
             is_delayed = apply_at is ApplyAt.AFTER_DELAY
             with self.clock("bundle"):
@@ -133,9 +139,8 @@ class Mapper:
         Renumbers rows, see `Map.version`.
         """
         with self.clock("mapping"):
-            culled = (
-                None if self.config.paper.last_keyframe else cull_keyframes(submap, self.config.keyframes)
-            )
+            is_plain = self.config.paper.last_keyframe
+            culled = None if is_plain else cull_keyframes(submap, self.config.keyframes)
             compacted = compact(submap)
         if culled is None or compacted is None:
             return culled or compacted
@@ -149,18 +154,86 @@ class Mapper:
         age = keyframe - points["first_keyframe"][recent]
         visible = points["times_visible"][recent].float()
         is_rarely_found = points["times_found"][recent] < MIN_FOUND_RATIO * visible
-        is_unconfirmed = (
-            (age >= 2) & (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
-        )
+        is_seldom_observed = (points["times_observed"][recent] < 3) & ~points["from_initialization"][recent]
+        is_unconfirmed = (age >= 2) & is_seldom_observed
         slam_map.remove_points(recent[is_rarely_found | is_unconfirmed])
+
+
+def cull_keyframes(submap: Submap, settings: KeyframesConfig) -> RowRemap | None:
+    """Remove redundant keyframes, a batch at a time; return where rows went, or None if nothing was removed.
+
+    The first keyframe, the newest ones and the reference keyframe of tracking always stay.
+    """
+    count = submap.map.num_keyframes
+    if count - submap.num_cull_checked < max(_LEAST_BATCH, count // _BATCH_SHARE):
+        return None
+    removed = redundant_keyframes(submap, cull_candidates(submap), settings)
+    renumbering = remove_keyframes(submap, torch.nonzero(removed)[:, 0]) if bool(removed.any()) else None
+    submap.num_cull_checked = submap.map.num_keyframes
+    return renumbering
+
+
+def cull_candidates(submap: Submap) -> Int[Tensor, " R"]:
+    """Return keyframes covisible with those inserted since the last culling, the newest first."""
+    slam_map = submap.map
+    candidates = slam_map.covisibility_union(
+        slam_map.index_tensor(*range(submap.num_cull_checked, slam_map.num_keyframes)), NUM_COVISIBLE
+    )
+    may_go = (candidates > 0) & (candidates < slam_map.num_keyframes - NUM_NEWEST_KEPT)
+    return candidates[may_go & (candidates != submap.tracking.reference)].flip(0)
+
+
+def redundant_keyframes(
+    submap: Submap, candidates: Int[Tensor, " R"], settings: KeyframesConfig
+) -> Bool[Tensor, " K"]:
+    """Return which keyframes, of the candidates, are redundant, decided one after the other."""
+    removed = torch.zeros(submap.map.num_keyframes, dtype=torch.bool, device=candidates.device)
+    for keyframe in candidates.tolist():
+        removed[keyframe] = is_covered(submap.map, keyframe, removed) and has_keyframe_nearby(
+            submap.map, keyframe, removed, settings
+        )
+    return removed
+
+
+def is_covered(slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"]) -> bool:
+    """Whether enough remaining keyframes observe the points of a keyframe at a similar or finer scale."""
+    seen = slam_map.observations(slam_map.index_tensor(keyframe))
+    observers, scales = slam_map.observers_and_scales(seen.point_index)
+    counts = (
+        (observers >= 0)
+        & (observers != keyframe)
+        & ~removed[observers]
+        & (scales <= MAX_SCALE_RATIO * seen.scales[:, None])
+    )
+    return float((counts.sum(1) >= MIN_OBSERVERS).double().mean()) >= MIN_COVERED_RATIO if len(seen) else True
+
+
+def has_keyframe_nearby(
+    slam_map: Map, keyframe: int, removed: Bool[Tensor, " K"], settings: KeyframesConfig
+) -> bool:
+    """Whether a remaining keyframe is so close that a frame at this pose would not become a keyframe."""
+    covisible = slam_map.covisible_keyframes(keyframe, NUM_COVISIBLE)
+    covisible = covisible[~removed[covisible]]
+    T_cw = slam_map.T_cw[keyframe]
+    seen = slam_map.observed_points(slam_map.index_tensor(keyframe))
+    depth = transform(T_cw, slam_map.positions_w[seen])[:, 2].median()
+    translation, rotation = pose_distance(T_cw, slam_map.T_cw[covisible], depth)
+    return bool(((translation <= settings.max_translation) & (rotation <= settings.max_rotation_deg)).any())
+
+
+def remove_masked_observations(
+    submap: Submap, is_masked: Callable[[Float[Tensor, "N 2"]], Bool[Tensor, " N"]]
+) -> None:
+    """Remove observations of the local keyframes at pixels for which `is_masked` is true."""
+    slam_map = submap.map
+    seen = slam_map.observations(torch.sort(submap.tracking.local_keyframes).values, as_detected=True)
+    slam_map.remove_masked_observations(seen, is_masked(seen.pixels))
 
 
 def initial_scale(start: TwoViewMap, kind: str) -> float:
     """Return the factor from the unit baseline of a two-view map to the map unit.
 
-    Args:
-        start: The two-view map.
-        kind: "unit": the median depth in the first camera is one; "groundtruth": the baseline has its true length.
+    With "unit" the median depth in the first camera is one, with "groundtruth" the baseline has its true length.
 
     Raises:
         ConfigError: If the true poses are needed and not known.

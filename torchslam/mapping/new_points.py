@@ -28,8 +28,13 @@ from torchslam.geometry import (
 from torchslam.map.map import NO_POINT, Map
 from torchslam.map.observation_index import first_of_each
 from torchslam.tracking.data_association import predict_observations
-from torchslam.tracking.epipolar import FreeKeypoints, match_along_epipolar_lines
-from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
+from torchslam.tracking.matcher import (
+    DescriptorMatcher,
+    FreeKeypoints,
+    match_along_epipolar_lines,
+    max_distance,
+    run_matcher,
+)
 from torchslam.types import FrameFeatures, Matcher, MatchPrior
 
 MIN_BASELINE = 0.01
@@ -53,16 +58,8 @@ def triangulate_against(
 ) -> None:
     """Add new points that a keyframe and its neighbors observe with enough parallax.
 
-    If a keypoint makes points with several neighbors, the first one counts.
-
-    Args:
-        slam_map: The map.
-        keyframe: Row of the new keyframe.
-        neighbors: Rows of the keyframes to triangulate against.
-        camera: The camera of all keyframes.
-        config: The configuration.
-        matcher: A custom matcher; by default descriptors along epipolar lines.
-        normalize: A faster equivalent of `camera.normalize`.
+    If a keypoint makes points with several neighbors, the first one counts. Without a custom matcher, descriptors are
+    matched along epipolar lines. `normalize` is a faster equivalent of `camera.normalize`.
     """
     neighbors = neighbors[has_baseline(slam_map, keyframe, neighbors, MIN_BASELINE)]
     if len(neighbors) == 0:
@@ -74,13 +71,12 @@ def triangulate_against(
     T_21 = slam_map.T_cw[neighbors] @ se3_inverse(slam_map.T_cw[keyframe])
     if matcher is None or isinstance(matcher, DescriptorMatcher):
         limit = max_distance(here.features.descriptors, config.matching)
-        found = NewPointMatches(
-            *match_along_epipolar_lines(here, there, T_21, camera, MAX_EPIPOLAR_PX, limit), None
-        )
+        matches = match_along_epipolar_lines(here, there, T_21, camera, MAX_EPIPOLAR_PX, limit)
+        found = NewPointMatches(*matches, None)
     else:
         views = [free_view(slam_map, row) for row in (keyframe, *neighbors.tolist())]
         priors = [MatchPrior(T_21=each, camera=camera, epipolar_px=MAX_EPIPOLAR_PX) for each in T_21]
-        found = NewPointMatches(*match_each(matcher, views, here, there, priors))
+        found = match_each(matcher, views, here, there, priors)
     _triangulate(slam_map, keyframe, neighbors, here, there, found, camera)
 
 
@@ -125,33 +121,17 @@ def _triangulate(
     keep = torch.nonzero(good)[:, 0]
     keep = keep[first_of_each(found.at_1[keep])]
     points_w = seen.points_w[keep]
-    covariances_w = triangulation_covariance(
-        T_1w,
-        T_2w[keep],
-        points_w,
-        noise_1[keep].sigma_or_covariance,
-        noise_2[keep].sigma_or_covariance,
-        camera,
-        camera,
-    )
+    spread_1, spread_2 = (noise[keep].sigma_or_covariance for noise in (noise_1, noise_2))
+    covariances_w = triangulation_covariance(T_1w, T_2w[keep], points_w, spread_1, spread_2, camera, camera)
     found = found.select(keep)
     descriptors = here.features.descriptors[0, found.at_1]
     ids = slam_map.add_points(points_w[:, 0], descriptors, keyframe, covariances_w[:, 0])
-    _observe(slam_map, keyframe, here.rows[0, found.at_1], ids, found.weights)
-    _observe(slam_map, neighbors[found.which], there.rows[found.which, found.at_2], ids, found.weights)
-
-
-def _observe(
-    slam_map: Map,
-    keyframes: int | Int[Tensor, " N"],
-    rows: Int[Tensor, " N"],
-    ids: Int[Tensor, " N"],
-    weights: Float[Tensor, " N"] | None,
-) -> None:
-    """Add observations of points by keypoints of one keyframe or of one each, with optional weights."""
-    slam_map.add_observations(keyframes, rows, ids)
-    if weights is not None:
-        slam_map.scale_information(keyframes, rows, weights)
+    observing: tuple[int | Tensor, Tensor] = keyframe, neighbors[found.which]
+    seen_rows = here.rows[0, found.at_1], there.rows[found.which, found.at_2]
+    for keyframes, rows in zip(observing, seen_rows, strict=True):
+        slam_map.add_observations(keyframes, rows, ids)
+        if found.weights is not None:
+            slam_map.scale_information(keyframes, rows, found.weights)
 
 
 def free_view(slam_map: Map, keyframe: int) -> FrameFeatures:
@@ -166,8 +146,8 @@ def match_each(
     here: FreeKeypoints,
     there: FreeKeypoints,
     priors: list[MatchPrior],
-) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"], Int[Tensor, " M"], Float[Tensor, " M"] | None]:
-    """Match the first view with each of the others, like `match_along_epipolar_lines`; return weights as well."""
+) -> NewPointMatches:
+    """Match the first view with each of the others, like `match_along_epipolar_lines`."""
     parts, weights = [], []
     for row, (view, prior) in enumerate(zip(views[1:], priors, strict=True)):
         pairs = run_matcher(matcher, views[0], view, prior)
@@ -176,7 +156,7 @@ def match_each(
         parts.append(torch.stack([torch.full_like(at_1, row), at_1, at_2])[:, order])
         weights += [] if pairs.weights is None else [pairs.weights[order]]
     which, at_1, at_2 = torch.cat(parts, dim=1)
-    return which, at_1, at_2, torch.cat(weights) if len(weights) == len(parts) else None
+    return NewPointMatches(which, at_1, at_2, torch.cat(weights) if len(weights) == len(parts) else None)
 
 
 def slots_among(rows: Int[Tensor, " N"]) -> Int[Tensor, " R"]:
@@ -206,16 +186,9 @@ def has_consistent_scale(
     scale_range: tuple[Float[Tensor, "*#batch #N"], ...],
     factor: float = 1.8,
 ) -> Bool[Tensor, "*#batch N"]:
-    """Return whether the scales in two images agree with the distances of the point.
+    """Return whether the scales in two images agree with the distances of the points, up to a factor.
 
-    Args:
-        points_w: points.
-        T_1w: pose of the first image.
-        T_2w: pose of the second image.
-        scale_1: scale of the keypoint in the first image, pixels.
-        scale_2: scale of the keypoint in the second image, pixels.
-        scale_range: the finest and the coarsest scale of the second image.
-        factor: by which the scales may differ from the expected ratio.
+    Scales are in pixels; `scale_range` is the finest and the coarsest one of the second image.
     """
     distance_1 = torch.linalg.vector_norm(transform(T_1w, points_w), dim=-1)
     distance_2 = torch.linalg.vector_norm(transform(T_2w, points_w), dim=-1)
@@ -223,22 +196,17 @@ def has_consistent_scale(
     return (scale_2 < factor * expected) & (scale_2 * factor > expected)
 
 
-def fuse(slam_map: Map, keyframe: int, neighbors: Int[Tensor, " K"], camera: Camera, config: Config) -> None:
-    """Match the points of a keyframe in its covisible keyframes and theirs in it, and merge duplicates."""
-    here = slam_map.index_tensor(keyframe)
-    own = slam_map.observed_points(here)
-    merge_points(slam_map, *match_in_keyframes(slam_map, neighbors, own, camera, config))
-    merge_points(
-        slam_map, *match_in_keyframes(slam_map, here, slam_map.observed_points(neighbors), camera, config)
-    )
+def fuse(
+    slam_map: Map, here: Int[Tensor, " K"], there: Int[Tensor, " L"], camera: Camera, config: Config
+) -> None:
+    """Match the points of two sets of keyframes in each other, and merge duplicates."""
+    for keyframes, others in ((here, there), (there, here)):
+        points = slam_map.observed_points(others)
+        merge_points(slam_map, *match_in_keyframes(slam_map, keyframes, points, camera, config))
 
 
 def match_in_keyframes(
-    slam_map: Map,
-    keyframes: Int[Tensor, " K"],
-    point_ids: Int[Tensor, " N"],
-    camera: Camera,
-    config: Config,
+    slam_map: Map, keyframes: Int[Tensor, " K"], point_ids: Int[Tensor, " N"], camera: Camera, config: Config
 ) -> tuple[Int[Tensor, " M"], Int[Tensor, " M"]]:
     """Match points by projection into keyframes that do not observe them yet.
 

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 from torchslam.map.atlas import Submap
-from torchslam.mapping.culling import remove_masked_observations
 from torchslam.mapping.local_bundle import LOCAL_WINDOW, ApplyAt
+from torchslam.mapping.mapper import remove_masked_observations
 from torchslam.system.local_mapping import BackwardTracking, LocalMapping, locate
 from torchslam.system.maintenance import Maintenance
 from torchslam.system.map_start import MapStart
@@ -23,7 +23,7 @@ from torchslam.system.savepoint import Savepoint
 from torchslam.system.session import SystemContext
 from torchslam.tracking.non_static import NO_MOVEMENT, FilteredView
 from torchslam.tracking.pose_validation import NUM_CONFIRMING_FRAMES, SURE_INLIERS, Certainty, Verdict
-from torchslam.tracking.relocalization import Relocalizer
+from torchslam.tracking.tracker import Relocalizer
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason
 
 FRAMES_BEFORE_NEW_SUBMAP = 20

@@ -15,6 +15,7 @@ from torch import Tensor
 from torchslam.config import MatchingConfig
 from torchslam.features import match
 from torchslam.features.matching.by_projection import PROJECTION_RATIO
+from torchslam.features.selection import ranks_within
 from torchslam.geometry import Camera, transform
 from torchslam.map.map import Map
 from torchslam.tracking.matcher import DescriptorMatcher, max_distance, run_matcher
@@ -42,14 +43,7 @@ it has passed the culling of recent points. Tried at this value only."""
 
 @dataclass(frozen=True)
 class Projected:
-    """Map points predicted to be visible.
-
-    Attributes:
-        ids: rows of the points.
-        pixels: predicted projections.
-        scales: predicted scales, pixels.
-        angles: angles in the last observation, radians.
-    """
+    """Map points predicted to be visible: their rows, predicted pixels and scales, and their last angles, radians."""
 
     ids: Int[Tensor, " N"]
     pixels: Float[Tensor, "N 2"]
@@ -103,11 +97,7 @@ def predict_observations(
 
 
 def match_projected_points(
-    slam_map: Map,
-    projected: Projected,
-    view: FrameFeatures,
-    radius_px: float,
-    matcher: Matcher,
+    slam_map: Map, projected: Projected, view: FrameFeatures, radius_px: float, matcher: Matcher
 ) -> MatchIndices:
     """Point ids and keypoints that match within a radius around the projection, one to one.
 
@@ -115,14 +105,7 @@ def match_projected_points(
     """
     if len(projected.ids) == 0:
         return MatchIndices(projected.ids, projected.ids)
-    expected = expected_view(slam_map, projected, view)
-    pairs = run_matcher(matcher, expected, view, MatchPrior(radius_px * projected.scales, PROJECTION_RATIO))
-    return replace(pairs, first=projected.ids[pairs.first])
-
-
-def expected_view(slam_map: Map, projected: Projected, view: FrameFeatures) -> FrameFeatures:
-    """Projected map points as a view, with their predicted pixels and scales and their last descriptors."""
-    return FrameFeatures(
+    expected = FrameFeatures(
         view.index,
         view.timestamp,
         keypoints=projected.pixels,
@@ -132,6 +115,8 @@ def expected_view(slam_map: Map, projected: Projected, view: FrameFeatures) -> F
         mask=torch.ones_like(projected.ids, dtype=torch.bool),
         session=view.session,
     )
+    pairs = run_matcher(matcher, expected, view, MatchPrior(radius_px * projected.scales, PROJECTION_RATIO))
+    return replace(pairs, first=projected.ids[pairs.first])
 
 
 def match_points(
@@ -140,13 +125,8 @@ def match_points(
     """Point ids and keypoints that match by descriptor alone, in the whole image."""
     if len(ids) == 0:
         return MatchIndices(ids, ids)
-    matches = match(
-        slam_map.point_features(ids),
-        view.features,
-        ratio=settings.max_ratio,
-        mutual=True,
-        max_distance=max_distance(view.descriptors, settings),
-    )
+    limit = max_distance(view.descriptors, settings)
+    matches = match(slam_map.point_features(ids), view.features, settings.max_ratio, max_distance=limit)
     found = matches.mask[0]
     return MatchIndices(ids[matches.indices_1[0][found]], matches.indices_2[0][found])
 
@@ -165,12 +145,9 @@ def image_cells(
     grid: tuple[int, int] = GRID,
     shape: tuple[int, int] | None = None,
 ) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
-    """Columns and rows of the image cells that contain pixels.
+    """Columns and rows of the image cells that contain pixels: `size` is divided into `grid` columns and rows.
 
-    Args:
-        pixels: in the image.
-        size: width and height that are divided into `grid` columns and rows of cells.
-        shape: columns and rows to which the result is clamped; those of `grid` if None.
+    They are clamped to `shape`, that of the grid if None.
     """
     column, row = (
         (at / extent * count).clamp_(0, limit - 1).long()
@@ -185,6 +162,10 @@ def cell_numbers(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Int[Ten
     return row * GRID[0] + column
 
 
+def _count_in_cells(cells: Int[Tensor, " N"]) -> Int[Tensor, " C"]:
+    return torch.bincount(cells, minlength=GRID[0] * GRID[1])
+
+
 def select_mature(times_found: Int[Tensor, " N"], least: int) -> Int[Tensor, " M"]:
     """Rows of the matches with mature points; all rows if these are fewer than `least`."""
     old = torch.nonzero(times_found >= MATURE_OBSERVATIONS)[:, 0]
@@ -193,26 +174,20 @@ def select_mature(times_found: Int[Tensor, " N"], least: int) -> Int[Tensor, " M
 
 def subsample_per_cell(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Int[Tensor, " M"]:
     """Ascending rows of pixels, at most `MAX_MATCHES_PER_CELL` of each image cell."""
-    cell = cell_numbers(pixels, size)
-    order = torch.argsort(cell, stable=True)
-    ordered = cell[order]
-    counts = torch.bincount(ordered, minlength=GRID[0] * GRID[1])
-    rank = torch.arange(len(ordered), device=cell.device) - (counts.cumsum(0) - counts)[ordered]
-    return torch.sort(order[rank < MAX_MATCHES_PER_CELL]).values
+    ranks = ranks_within(cell_numbers(pixels, size), GRID[0] * GRID[1])
+    return torch.nonzero(ranks < MAX_MATCHES_PER_CELL)[:, 0]
 
 
 def grid_weights(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Float[Tensor, " N"]:
     """Weights of matches that limit the total weight of a crowded image cell."""
     cell = cell_numbers(pixels, size)
-    crowd = torch.bincount(cell, minlength=GRID[0] * GRID[1])[cell]
-    return (MAX_CELL_WEIGHT / crowd.float()).clamp(max=1.0)
+    return (MAX_CELL_WEIGHT / _count_in_cells(cell)[cell].float()).clamp(max=1.0)
 
 
 def explained_ratio(view: FrameFeatures, keypoints: Int[Tensor, " M"], size: tuple[int, int]) -> float:
     """Ratio of the image cells with several keypoints that contain at least one of `keypoints`, the inliers."""
-    count = GRID[0] * GRID[1]
-    occupied = torch.bincount(cell_numbers(view.keypoints[view.mask], size), minlength=count) >= 2
-    used = torch.bincount(cell_numbers(view.keypoints[keypoints], size), minlength=count) > 0
+    occupied = _count_in_cells(cell_numbers(view.keypoints[view.mask], size)) >= 2
+    used = _count_in_cells(cell_numbers(view.keypoints[keypoints], size)) > 0
     return float(used[occupied].double().mean()) if bool(occupied.any()) else 1.0
 
 
@@ -221,20 +196,11 @@ def coverage_ratio(
 ) -> float:
     """Ratio of the image cells with several expected mature points in which at least a fifth of them are inliers.
 
-    Args:
-        slam_map: the map.
-        expected: points predicted to be in the image.
-        seen: ids of the inliers.
-        size: width and height of the image.
-
-    Returns:
-        The ratio; 1 if there are fewer than `MIN_COVERAGE_CELLS` such cells.
+    It is 1 if there are fewer than `MIN_COVERAGE_CELLS` such cells; `seen` are the ids of the inliers.
     """
     old = slam_map.points["times_found"][expected.ids] >= MATURE_OBSERVATIONS
     cell = cell_numbers(expected.pixels[old], size)
-    count = GRID[0] * GRID[1]
-    predicted = torch.bincount(cell, minlength=count)
-    found = torch.bincount(cell[is_among(expected.ids[old], seen)], minlength=count)
+    predicted, found = _count_in_cells(cell), _count_in_cells(cell[is_among(expected.ids[old], seen)])
     counted = predicted >= 2
     if int(counted.sum()) < MIN_COVERAGE_CELLS:
         return 1.0

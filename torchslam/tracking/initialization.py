@@ -81,14 +81,7 @@ On 46 cuts of real sequences it is 0.83 or more for correct maps; for deliberate
 
 @dataclass(frozen=True)
 class ViewMatches:
-    """Matches of the reference with a view.
-
-    Attributes:
-        view: the view.
-        first: keypoints of the reference.
-        second: keypoints of the view that match them.
-        pixels: where both are.
-    """
+    """Matches of the reference with a view: rows of keypoints of both, and where these are."""
 
     view: FrameFeatures
     first: Int[Tensor, " M"]
@@ -183,10 +176,8 @@ class Initializer:
     def _relate_moving(self, matches: ViewMatches, scene_only: bool) -> TwoViewMap | Rejection:
         """Initialize from matches that moved.
 
-        Args:
-            matches: the matches.
-            scene_only: True if the other matches stayed in place, so that these may be an object that moves in front
-                of a standing camera: only an essential matrix, which needs depth, is accepted.
+        With `scene_only` the other matches stayed in place, so that these may be an object that moves in front of a
+        standing camera: only an essential matrix, which needs depth, is accepted.
         """
         relative = self._relative_pose(matches)
         result = self._relate_by_threshold(matches, relative, scene_only)
@@ -222,11 +213,7 @@ class Initializer:
         """Initialize with a view that the camera turns away from, if the matches show more than a turn.
 
         What parallax there is has to exceed the noise that the matches show, instead of the threshold. Keypoints are
-        those of the middle rows where the shutter rolls.
-
-        Args:
-            matches: the matches.
-            rough: the relative pose by the threshold.
+        those of the middle rows where the shutter rolls. `rough` is the relative pose by the threshold.
         """
         near = self._offsets(rough.T_21_essential[0], matches) < 2 * self.threshold_px
         turned, turns = self.turning.fit(*matches.pixels, near)
@@ -268,18 +255,15 @@ class Initializer:
         """
         everything = torch.ones_like(motion, dtype=torch.bool)
         still = motion < self.max_static_px
-        if (
-            int(still.sum()) < MIN_STATIC_RATIO * len(motion)
-            or int((~still).sum()) < self.config.initialization.min_matches
-        ):
+        count = int(still.sum())
+        least = self.config.initialization.min_matches
+        if count < MIN_STATIC_RATIO * len(motion) or len(motion) - count < least:
             return everything
         others = self._relative_pose(matches.of(~still))
         if others.model[0] != "essential":
             return None if self._relative_pose(matches).model[0] == "essential" else everything
-        static = matches.of(still)
-        across, along = epipolar_offsets(
-            others.T_21_essential[0], *static.pixels, self.camera.current, self.camera.current
-        )
+        static, camera = matches.of(still), self.camera.current
+        across, along = epipolar_offsets(others.T_21_essential[0], *static.pixels, camera, camera)
         explained = (across.abs() < self.threshold_px) & (along > -self.threshold_px)
         if float(explained.double().mean()) >= MIN_EXPLAINED_RATIO:
             return everything
@@ -288,10 +272,10 @@ class Initializer:
 
     def _relative_pose(self, matches: ViewMatches, kernel: Kernel = "truncated") -> RelativePose:
         """The relative pose of the view from matches with the reference."""
-        pixels_1, pixels_2 = matches.pixels
+        pixels_1, pixels_2 = (pixels[None] for pixels in matches.pixels)
         return estimate_relative_pose(
-            pixels_1[None],
-            pixels_2[None],
+            pixels_1,
+            pixels_2,
             camera_1=self.camera.current,
             camera_2=self.camera.current,
             threshold=self.threshold_px,
@@ -305,37 +289,25 @@ class Initializer:
     ) -> TwoViewMap | Rejection:
         """Triangulate, refine pose and points together, and check that enough points are accurate.
 
-        Args:
-            matches: the matches.
-            T_cw: pose of the view.
-            min_good_ratio: least ratio of the matches whose depth is known.
-            noise_level: of the keypoints, in units of what is assumed.
+        The depth of a ratio of the matches must be known; `noise_level`: of the keypoints, in units of what is assumed.
         """
         T_1w = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
-        view, first, second = matches.view, matches.first, matches.second
+        view, first, second, camera = matches.view, matches.first, matches.second, self.camera.current
         pixels_1, pixels_2 = matches.pixels
-        noise = view.noise[second]
-        known = self.reference.noise[first]
-        noise = (known.with_explicit_information() if noise.information.shape[-1] else known).pairwise_max(
-            noise
-        )
-        seen = triangulate(
-            pixels_1,
-            pixels_2,
-            T_1w=T_1w,
-            T_2w=T_cw,
-            camera_1=self.camera.current,
-            camera_2=self.camera.current,
-        )
+        noise, known = view.noise[second], self.reference.noise[first]
+        known = known.with_explicit_information() if noise.information.shape[-1] else known
+        noise = known.pairwise_max(noise)
+        seen = triangulate(pixels_1, pixels_2, T_1w=T_1w, T_2w=T_cw, camera_1=camera, camera_2=camera)
         points_c = transform(torch.stack([T_1w, T_cw]), seen.points_w)
-        errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), self.camera.current)
-        good = is_good(seen, errors.amax(0), noise_level * noise.gate_sigma, self.camera.current, self.config)
+        errors = noise.squared_reprojection(points_c, torch.stack([pixels_1, pixels_2]), camera)
+        good = is_good(seen, errors.amax(0), noise_level * noise.gate_sigma, camera, self.config)
         rejection = check_two_view_map(good, seen, len(first), self.config, min_good_ratio)
         if rejection:
             return rejection
         keep = torch.nonzero(good)[:, 0]
+        pixels_1, pixels_2 = pixels_1[keep], pixels_2[keep]
         poses, points_w, accurate = refine_pair(
-            T_cw, seen.points_w[keep], pixels_1[keep], pixels_2[keep], noise[keep], self.camera.current
+            T_cw, seen.points_w[keep], pixels_1, pixels_2, noise[keep], camera
         )
         if (count := int(accurate.sum())) < (least := min_points(self.config)):
             return Rejection.of(Reason.FEW_REFINED_POINTS, count=count, needed=least)
@@ -345,9 +317,9 @@ class Initializer:
 
 def min_points(config: Config) -> int:
     """The number of points that an initial map needs."""
-    return (
-        PAPER_POINTS if config.paper.parallax else round(MIN_POINTS_RATIO * config.initialization.min_matches)
-    )
+    if config.paper.parallax:
+        return PAPER_POINTS
+    return round(MIN_POINTS_RATIO * config.initialization.min_matches)
 
 
 def is_good(
@@ -361,13 +333,7 @@ def is_good(
 
     The standard deviation of a depth z seen under the parallax a is about z sigma / (f a) for a keypoint known to sigma
     pixels, so a point counts when sigma / (f a) is small. With `paper.parallax`: when the angle is large enough.
-
-    Args:
-        seen: the triangulated points.
-        errors: the larger of the two squared errors, in units of the noise.
-        sigmas: standard deviations of the keypoints, pixels.
-        camera: of both views.
-        config: the criterion.
+    `errors` are the larger of the two squared errors, in units of the noise.
     """
     is_close = passes_gate(errors, TRIANGULATION_GATE_SIGMA**2)
     if config.paper.parallax:
@@ -377,11 +343,7 @@ def is_good(
 
 
 def check_two_view_map(
-    good: Bool[Tensor, " M"],
-    seen: Triangulation,
-    matches: int,
-    config: Config,
-    min_good_ratio: float,
+    good: Bool[Tensor, " M"], seen: Triangulation, matches: int, config: Config, min_good_ratio: float
 ) -> Rejection | None:
     """Why triangulated points are not enough for a map; None if they are."""
     count = int(good.sum())
@@ -412,20 +374,20 @@ def refine_pair(
         The second pose with the length of the baseline unchanged, the points, and which of them are inliers of both
         views.
     """
-    n = len(points_w)
-    device = points_w.device
+    n, device = len(points_w), points_w.device
     T = torch.stack([torch.eye(4, dtype=T_cw.dtype, device=device), T_cw])
-    frame_index = torch.arange(2, device=device).repeat_interleave(n)
-    point_index = torch.arange(n, device=device).repeat(2)
-    pixels = torch.cat([pixels_1, pixels_2])
-    weights = torch.cat([noise.weights] * 2)
-    fixed = torch.tensor([True, False], device=device)
     problem = BundleProblem(
-        T, points_w, frame_index, point_index, pixels, camera, weights=weights, fixed_frames=fixed
+        T,
+        points_w,
+        torch.arange(2, device=device).repeat_interleave(n),
+        torch.arange(n, device=device).repeat(2),
+        torch.cat([pixels_1, pixels_2]),
+        camera,
+        weights=torch.cat([noise.weights] * 2),
+        fixed_frames=torch.tensor([True, False], device=device),
     )
-    solution = solve_bundle(
-        problem, options=BUNDLE_OPTIONS.replace(kernel="huber", scale=2.0, iterations=10, backward="detached")
-    )
+    options = BUNDLE_OPTIONS.replace(kernel="huber", scale=2.0, iterations=10, backward="detached")
+    solution = solve_bundle(problem, options=options)
     factor = torch.linalg.vector_norm(T_cw[:3, 3]) / torch.linalg.vector_norm(solution.T_cw[1, :3, 3])
     refined = solution.T_cw[1].clone()
     refined[:3, 3] *= factor
@@ -443,18 +405,10 @@ def contradicting_initialization(
     config: Config,
     matcher: Matcher | None = None,
 ) -> TwoViewMap | None:
-    """Initialize from the first and the last frame alone; return the result if it contradicts the map.
+    """Initialize from the first and last frame posed in a submap alone; return the result if it contradicts the map.
 
     The map's own observations agree with it by construction, so the two frames are matched again. The result
     contradicts the map if the motion in the map explains its matches much worse.
-
-    Args:
-        submap: The submap, in which `last` is the last tracked frame.
-        first: The first frame that was posed in it.
-        last: The last one.
-        camera: The camera of both.
-        config: The configuration.
-        matcher: The matcher; the configured one if None.
     """
     threshold_px = THRESHOLD_PX * config.features.reduction(camera.size)
     T_1w, T_2w = submap.posed_frames.T_cw(submap.map)[0], submap.T_cw

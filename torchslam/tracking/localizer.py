@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -63,21 +63,14 @@ class Localizer:
         self,
         slam_map: Map,
         view: FrameFeatures,
-        candidates: Iterator[MatchIndices],
+        candidates: Iterable[MatchIndices],
         local_points: Int[Tensor, " N"],
         expected_T_cw: Float[Tensor, "4 4"] | None = None,
     ) -> PoseEstimate | None:
-        """Estimate the pose of a frame by PnP, then refine it against the local points.
+        """Estimate the pose of a frame by PnP, then refine it against the local points; None without a pose.
 
-        Args:
-            slam_map: the map.
-            view: the frame.
-            candidates: sets of matches, tried in turn until enough of their matches are inliers.
-            local_points: ids, ascending.
-            expected_T_cw: predicted pose, tried before RANSAC; None without a prediction.
-
-        Returns:
-            The estimate with the most inliers; None if no set gives a pose.
+        Sets of matches are tried in turn until enough of their matches are inliers; the estimate with the most inliers
+        is returned. Local points are ids, ascending. An expected pose is tried before RANSAC.
         """
         best: PoseEstimate | None = None
         for pairs in candidates:
@@ -104,7 +97,12 @@ class Localizer:
         chosen = chosen[subsample_per_cell(view.keypoints[keypoints[chosen]], self.camera.current.size)]
         undistorted = self.camera.undistortion(view.keypoints)
         points_w = slam_map.positions_w[point_ids[chosen]]
-        T_cw = self._start(points_w, undistorted[keypoints[chosen]], expected_T_cw)
+        seen, size = undistorted[keypoints[chosen]], self.camera.current.size
+        T_cw = None
+        if expected_T_cw is not None:
+            T_cw = nearby_pose(expected_T_cw, points_w, seen, self.threshold_px)
+        if T_cw is None:
+            T_cw = start_pose(points_w, seen, size, self.threshold_px, self.seed)
         if T_cw is None:
             return None
         candidates = self._local_points_with(slam_map, point_ids, local_points)
@@ -120,31 +118,19 @@ class Localizer:
         )
         if int(inliers.sum()) < MIN_INLIERS:
             return None
-        T_cw, seen = refined.T_cw, ids[inliers]
+        seen_ids = ids[inliers]
         return PoseEstimate(
-            T_cw,
-            seen,
+            refined.T_cw,
+            seen_ids,
             at[inliers],
             matches=len(ids),
             covariance=refined.covariance(),
             depth=float(refined.linearization.depths[inliers].median()),
             error=float(errors.median()) / slam_map.noise_variance,
-            coverage_ratio=coverage_ratio(slam_map, near, seen, self.camera.current.size),
-            explained_ratio=explained_ratio(view, at[inliers], self.camera.current.size),
+            coverage_ratio=coverage_ratio(slam_map, near, seen_ids, size),
+            explained_ratio=explained_ratio(view, at[inliers], size),
             weights=None if weights is None else weights[inliers],
             expected=near.ids,
-        )
-
-    def _start(
-        self, points_w: Tensor, seen: UndistortedKeypoints, expected_T_cw: Tensor | None
-    ) -> Float[Tensor, "4 4"] | None:
-        """Initial pose: the one near the expected pose, or else by RANSAC."""
-        threshold = self.threshold_px
-        T_cw = None if expected_T_cw is None else nearby_pose(expected_T_cw, points_w, seen, threshold)
-        return (
-            start_pose(points_w, seen, self.camera.current.size, threshold, self.seed)
-            if T_cw is None
-            else T_cw
         )
 
     def project(
@@ -181,10 +167,7 @@ class Localizer:
         """
         problem = FrameProblem(slam_map.positions_w[ids], undistorted.xy, undistorted.whitened(noise))
         linearization = problem.linearize(T_cw)
-        mask = passes_gate(
-            linearization.squared / noise.gate_factor**2,
-            OUTLIER_GATE_FACTOR * CHI_SQUARE_95,
-        )
+        mask = passes_gate(linearization.squared / noise.gate_factor**2, OUTLIER_GATE_FACTOR * CHI_SQUARE_95)
         old = mask & (slam_map.points["times_found"][ids] >= MATURE_OBSERVATIONS)
         if int(old.sum()) >= MIN_MATCHES:
             mask = old

@@ -16,10 +16,10 @@ from torch import Tensor
 
 from torchslam.config import Config
 from torchslam.features import match_by_projection
-from torchslam.geometry import SharedCamera, estimate_relative_pose, se3_inverse, transform
+from torchslam.geometry import SharedCamera, estimate_relative_pose, se3_inverse
 from torchslam.tracking.data_association import cell_numbers, match_views
 from torchslam.tracking.matcher import max_distance
-from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_segments
+from torchslam.tracking.static_overlay import StaticOverlayDetector, distances_to_views, points_at_depths
 from torchslam.types import Explanation, FrameFeatures, PoseEstimate, Reason, Rejection
 
 FRAME_INTERVAL = 5
@@ -58,42 +58,25 @@ Tried at this value only."""
 
 @dataclass(frozen=True)
 class _Observation:
-    """A frame to compare later ones with.
-
-    Attributes:
-        view: the frame.
-        T_cw: its pose; None if it has none.
-        depth: median depth of the scene.
-        patience: comparisons for which a keypoint still belongs to the moving object.
-        world: of the pose, see `Submap.world`.
-    """
+    """A frame to compare later ones with: its pose, if any, in which `Submap.world`, and the median depth."""
 
     view: FrameFeatures
     T_cw: Float[Tensor, "4 4"] | None
     depth: float
-    patience: Int[Tensor, " N"]
+    patience: Int[Tensor, " N"]  # comparisons for which a keypoint still belongs to the moving object
     world: tuple[int, int]
 
 
 @dataclass(frozen=True)
 class _Mover:
-    """The moving object in the last frame.
-
-    Attributes:
-        belongs: which of the frame's keypoints are on the object.
-        pixels: of these keypoints.
-        descriptors: of these keypoints.
-        scales: of these keypoints.
-        rest: pixels of the other keypoints.
-        motion: of the object, pixels a frame.
-    """
+    """The moving object in the last frame: the keypoints on it, and the pixels of the others (`rest`)."""
 
     belongs: Bool[Tensor, " N"]
     pixels: Float[Tensor, "M 2"]
     descriptors: Shaped[Tensor, "M D"]
     scales: Float[Tensor, " M"]
     rest: Float[Tensor, "R 2"]
-    motion: Float[Tensor, " 2"]
+    motion: Float[Tensor, " 2"]  # of the object, pixels a frame
 
     @classmethod
     def of(cls, view: FrameFeatures, belongs: Bool[Tensor, " N"], motion: Float[Tensor, " 2"]) -> _Mover:
@@ -104,12 +87,7 @@ class _Mover:
 
 @dataclass(frozen=True)
 class Movement:
-    """Independent motion in a frame.
-
-    Attributes:
-        rejection: why it makes the frame's pose uncertain; None if it does not.
-        note: number of keypoints that are masked out; None if there are none.
-    """
+    """Independent motion in a frame: why it makes the pose uncertain, and how many keypoints are masked out, if any."""
 
     rejection: Rejection | None = None
     note: Explanation | None = None
@@ -218,16 +196,10 @@ class IndependentMotion:
         strays: Bool[Tensor, " N"],
         known: Bool[Tensor, " N"],
     ) -> bool:
-        """Whether the pose may follow the moving object, so that the group is the static scene.
+        """Whether the pose may follow the moving object, so that the group of moving matches is the static scene.
 
-        So it is if what was known to move agrees with the map now, or else if the group covers more of the image than
-        what agrees.
-
-        Args:
-            pixels: of all matches.
-            group: rows of the matches that move.
-            strays: matches that disagree with the map.
-            known: matches of the known object.
+        So it is if what was known to move agrees with the map now (strays do not), or else if the group covers more of
+        the image than what agrees.
         """
         if bool(known[group].double().mean() >= 0.5):
             return False
@@ -249,12 +221,9 @@ class IndependentMotion:
         seen, view = last.view, look.view
         if last.T_cw is None or look.T_cw is None:
             return seen.keypoints.new_zeros(len(first))
-        rays = self.camera.current.unproject(seen.keypoints[first])
-        depths = last.depth * rays.new_tensor(_DEPTHS)
-        points_c = rays / rays[:, 2:] * depths[:, None, None]
-        pixels, valid = self.camera.current.project(transform(look.T_cw @ se3_inverse(last.T_cw), points_c))
-        distances = distances_to_segments(view.keypoints[second], pixels[:-1], pixels[1:])
-        errors = distances.where(valid[:-1] & valid[1:], torch.inf).amin(0)
+        camera, T_21 = self.camera.current, look.T_cw @ se3_inverse(last.T_cw)
+        points_c = points_at_depths(camera, seen.keypoints[first], last.depth, _DEPTHS)
+        errors = distances_to_views(camera, T_21, points_c, view.keypoints[second])
         return errors / torch.maximum(seen.noise.gate_sigma[first], view.noise.gate_sigma[second])
 
     def _rigid_group(
@@ -269,14 +238,10 @@ class IndependentMotion:
         rows = torch.nonzero(among)[:, 0]
         if len(rows) < MIN_MATCHES:
             return rows[:0]
+        pixels = earlier.keypoints[first[rows]][None], view.keypoints[second[rows]][None]
+        camera, threshold = self.camera.current, THRESHOLD_PX * self.reduction
         motion = estimate_relative_pose(
-            earlier.keypoints[first[rows]][None],
-            view.keypoints[second[rows]][None],
-            camera_1=self.camera.current,
-            camera_2=self.camera.current,
-            threshold=THRESHOLD_PX * self.reduction,
-            kernel="truncated",
-            min_samples=64,
+            *pixels, camera_1=camera, camera_2=camera, threshold=threshold, kernel="truncated", min_samples=64
         )
         group = rows[motion.inliers[0]]
         enough = max(MIN_MATCHES, MIN_OUTLIER_RATIO * len(rows))
@@ -293,20 +258,19 @@ class IndependentMotion:
         k = min(_NUM_NEIGHBORS, len(both))
         distances, nearest = torch.cdist(pixels, both).topk(k, largest=False)
         is_group = nearest < len(group)
-        reach = (
-            distances.where(is_group, torch.inf).amin(-1) < _MAX_DISTANCE_RATIO * self.camera.current.width
-        )
+        most = _MAX_DISTANCE_RATIO * self.camera.current.width
+        reach = distances.where(is_group, torch.inf).amin(-1) < most
         return reach & (2 * is_group.sum(-1) > k)
 
 
 @dataclass(frozen=True)
 class FilteredView:
-    """A frame, and what of it belongs to the static scene.
+    """A frame without keypoints that are known not to belong to the scene, and with more of them.
 
     Attributes:
-        view: The frame without keypoints that are known not to belong to the scene.
-        without_overlays: The frame without those of static overlays only.
-        whole: The frame with all its keypoints.
+        view: without overlays and moving objects.
+        without_overlays: without static overlays only.
+        whole: with all keypoints.
     """
 
     view: FrameFeatures

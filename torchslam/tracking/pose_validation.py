@@ -57,11 +57,7 @@ _WRONG = {
 
 @dataclass(frozen=True)
 class Verdict:
-    """The result of a validation.
-
-    Attributes:
-        rejection: Why the pose is not certain; None if it is.
-    """
+    """The result of a validation: why the pose is not certain; None if it is."""
 
     rejection: Rejection | None = None
 
@@ -79,16 +75,12 @@ class Verdict:
 
 
 def check_pose(
-    estimate: PoseEstimate,
-    predicted_T_cw: Float[Tensor, "4 4"] | None,
-    averages: TrackingState,
+    estimate: PoseEstimate, predicted_T_cw: Float[Tensor, "4 4"] | None, averages: TrackingState
 ) -> Verdict:
     """Validate a pose by itself, and by the agreement of the recent images with the map.
 
-    Args:
-        estimate: The pose.
-        predicted_T_cw: The pose that the motion model predicts; None without a prediction.
-        averages: A tracking state with the averages over the frames up to this one, see `TrackingState.averaged_with`.
+    `predicted_T_cw` is the pose that the motion model predicts; `averages` a tracking state with the averages over the
+    frames up to this one, see `TrackingState.averaged_with`.
     """
     quality = check_pose_quality(estimate, predicted_T_cw)
     return Verdict(quality or check_map_agreement(estimate, averages))

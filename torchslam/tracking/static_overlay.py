@@ -46,15 +46,7 @@ _PAUSE = 4
 
 @dataclass(frozen=True)
 class _Reference:
-    """A posed frame to compare later ones with.
-
-    Attributes:
-        view: the frame, with all its keypoints.
-        T_wc: its pose.
-        pixels: of its keypoints.
-        points_c: their points at the possible depths.
-        world: of the pose, see `Submap.world`.
-    """
+    """A posed frame, with all its keypoints, to compare later ones with, and their points at the possible depths."""
 
     view: FrameFeatures
     T_wc: Float[Tensor, "4 4"]
@@ -72,9 +64,7 @@ class _Reference:
         camera: Camera,
     ) -> _Reference:
         pixels = view.keypoints[view.mask]
-        rays = camera.unproject(pixels)
-        depths = depth * rays.new_tensor(_DEPTHS)
-        return cls(view, se3_inverse(T_cw), pixels, rays / rays[:, 2:] * depths[:, None, None], world)
+        return cls(view, se3_inverse(T_cw), pixels, points_at_depths(camera, pixels, depth, _DEPTHS), world)
 
 
 class StaticOverlayDetector:
@@ -105,10 +95,10 @@ class StaticOverlayDetector:
     def observe(
         self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float, world: tuple[int, int] = (0, 0)
     ) -> int:
-        """Compare a posed frame with an earlier one.
+        """Compare a posed frame, with all its keypoints, with an earlier one.
 
         Args:
-            view: the frame, with all its keypoints.
+            view: the frame.
             T_cw: its pose.
             depth: median depth of the scene.
             world: of the pose, see `Submap.world`.
@@ -149,9 +139,9 @@ class StaticOverlayDetector:
 
     def _must_move(self, last: _Reference, T_cw: Float[Tensor, "4 4"], step: int = 1) -> Bool[Tensor, " N"]:
         """Whether every `step`-th keypoint had to move if it belongs to the scene, whatever its depth."""
-        moved, valid = self.camera.current.project(transform(T_cw @ last.T_wc, last.points_c[:, ::step]))
-        distance = distances_to_segments(last.pixels[::step], moved[:-1], moved[1:])
-        return distance.where(valid[:-1] & valid[1:], torch.inf).amin(0) > MIN_MOTION_PX * self.reduction
+        points_c, pixels = last.points_c[:, ::step], last.pixels[::step]
+        distances = distances_to_views(self.camera.current, T_cw @ last.T_wc, points_c, pixels)
+        return distances > MIN_MOTION_PX * self.reduction
 
     def _is_far(self, must_move: Bool[Tensor, " N"]) -> bool:
         """Whether the camera moved far enough for a comparison: enough of the keypoints had to move."""
@@ -162,12 +152,13 @@ class StaticOverlayDetector:
     ) -> Float[Tensor, "M 2"]:
         """Pixels in `view` of candidates, keypoints of an earlier view matched at their old pixel."""
         rows = torch.nonzero(candidates)[:, 0]
+        there = earlier.features.rows(rows)
         matches = match_by_projection(
-            earlier.descriptors[rows][None],
-            earlier.keypoints[rows][None],
+            there.descriptors,
+            there.keypoints,
             RADIUS_PX * self.reduction,
             view.features,
-            scales=earlier.scales[rows][None],
+            scales=there.scales,
             max_distance=MAX_DISTANCE_RATIO * max_distance(view.descriptors, self.matching),
             ratio=None,
         )
@@ -188,6 +179,23 @@ class StaticOverlayDetector:
         size = (self.cell_px, self.cell_px)
         column, row = image_cells(pixels, size, grid=(1, 1), shape=(columns, rows))
         return row, column
+
+
+def points_at_depths(
+    camera: Camera, pixels: Float[Tensor, "N 2"], depth: float, ratios: tuple[float, ...]
+) -> Float[Tensor, "D N 3"]:
+    """The points of pixels at depths relative to the one of the scene."""
+    rays = camera.unproject(pixels)
+    return rays / rays[:, 2:] * (depth * rays.new_tensor(ratios))[:, None, None]
+
+
+def distances_to_views(
+    camera: Camera, T_21: Float[Tensor, "4 4"], points_c: Float[Tensor, "D N 3"], pixels: Float[Tensor, "N 2"]
+) -> Float[Tensor, " N"]:
+    """Distances of pixels of another view from where it sees points between depths."""
+    seen, valid = camera.project(transform(T_21, points_c))
+    distances = distances_to_segments(pixels, seen[:-1], seen[1:])
+    return distances.where(valid[:-1] & valid[1:], torch.inf).amin(0)
 
 
 def distances_to_segments(

@@ -1,9 +1,12 @@
-"""Frame-to-map tracking: predict the pose, match the local map, estimate the pose; `commit` updates the state."""
+"""Frame-to-map tracking: predict the pose, match the local map, estimate the pose; `commit` updates the state.
+
+Relocalization: PnP by matches with the keyframes that place recognition proposes.
+"""
 
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import torch
@@ -19,6 +22,7 @@ from torchslam.map.map import Map
 from torchslam.tracking.data_association import match_keyframe, match_points
 from torchslam.tracking.localizer import Localizer, match_projected_points
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher
+from torchslam.tracking.pose_validation import check_pose
 from torchslam.types import FrameFeatures, Matcher, MatchIndices, PoseEstimate
 
 SEARCH_RADIUS_PX, WIDE_RADIUS_PX = 12.0, 36.0
@@ -60,24 +64,12 @@ class Tracker:
         T_cw = submap.map.T_cw[keyframe]
         seen = submap.map.keyframes["point_ids"][keyframe]
         tracking = replace(submap.tracking, last_inlier_points=seen[seen >= 0])
-        submap.tracking = self._moved_to(submap, keyframe, T_cw, tracking)
+        submap.tracking = self._moved_to(submap.map, keyframe, T_cw, tracking)
 
     def _moved_to(
-        self, submap: Submap, keyframe: int, T_cw: Float[Tensor, "4 4"], tracking: TrackingState
+        self, slam_map: Map, keyframe: int, T_cw: Float[Tensor, "4 4"], tracking: TrackingState
     ) -> TrackingState:
-        """The same state with another reference keyframe, and its local map."""
-        return replace(
-            self._at_keyframe(submap.map, keyframe, T_cw),
-            velocity=tracking.velocity,
-            last_inlier_points=tracking.last_inlier_points,
-            error=tracking.error,
-            explained_ratio=tracking.explained_ratio,
-            timestamp=tracking.timestamp,
-            interval=tracking.interval,
-        )
-
-    def _at_keyframe(self, slam_map: Map, keyframe: int, T_cw: Float[Tensor, "4 4"]) -> TrackingState:
-        """The tracking state of a frame with this pose and reference keyframe, and its local map."""
+        """The same state at a pose with another reference keyframe, and its local map."""
         local_keyframes = self.localizer.local_keyframes(slam_map, keyframe)
         if self.brute_force and self.counts:
             last_seen = slam_map.points["last_seen_frame"]
@@ -86,12 +78,11 @@ class Tracker:
             )[:, 0]
         else:
             local_points = slam_map.observed_points(local_keyframes)
-        return TrackingState(
+        return replace(
+            tracking,
             T_cr=T_cw @ se3_inverse(slam_map.T_cw[keyframe]),
             reference=keyframe,
             reference_size=well_observed(slam_map, keyframe, local_keyframes),
-            velocity=None,
-            last_inlier_points=local_points[:0],
             local_keyframes=local_keyframes,
             local_points=local_points,
         )
@@ -113,13 +104,10 @@ class Tracker:
         prior_T_cw: Float[Tensor, "4 4"] | None = None,
         is_sure: bool = True,
     ) -> PoseEstimate | None:
-        """Estimate the pose of the next frame; None if it cannot be found. Nothing is changed.
+        """Estimate the pose of the next frame, see `at_middle_row`; None if it cannot be found. Nothing is changed.
 
-        Args:
-            submap: The submap with the tracking state.
-            view: The frame, see `at_middle_row`.
-            prior_T_cw: The pose around which matches are searched for; the predicted one if None.
-            is_sure: True if the last poses are certain: a pose near the predicted one is tried first.
+        Matches are searched for around `prior_T_cw`, the predicted pose if None. If the last poses are certain
+        (`is_sure`), a pose near it is tried first.
         """
         prior_T_cw = self.predict(submap) if prior_T_cw is None else prior_T_cw
         candidates = self._candidates(submap, view, prior_T_cw)
@@ -183,19 +171,19 @@ class Tracker:
         if best == tracking.reference:
             submap.tracking = replace(tracking, T_cr=estimate.T_cw @ se3_inverse(slam_map.T_cw[best]))
         else:
-            submap.tracking = self._moved_to(submap, best, estimate.T_cw, tracking)
+            submap.tracking = self._moved_to(slam_map, best, estimate.T_cw, tracking)
 
     def start_at_estimate(self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate) -> None:
         """Start the tracking state at a frame that was posed without one."""
         best = int(submap.map.count_observed(estimate.point_ids).argmax())
         self._update_last_seen(submap.map, view, estimate)
         submap.epoch += 1
-        submap.tracking = replace(
-            self._at_keyframe(submap.map, best, estimate.T_cw),
-            velocity=None,
+        tracking = replace(
+            TrackingState.empty(estimate.T_cw),
             last_inlier_points=estimate.point_ids,
             timestamp=view.timestamp,
         )
+        submap.tracking = self._moved_to(submap.map, best, estimate.T_cw, tracking)
 
     def count_visible(self, slam_map: Map, estimate: PoseEstimate) -> None:
         """Increment `times_visible` of the points that a frame with a certain pose should observe."""
@@ -212,6 +200,49 @@ class Tracker:
         """Set `last_seen_frame` of the points that a frame observes."""
         if self.counts:
             slam_map.points["last_seen_frame"][estimate.point_ids] = view.index
+
+
+MAX_CANDIDATES = 3
+"""Places that are tried for a frame, the most similar first. Tried at this value only."""
+
+Candidate = tuple[Submap, int]
+"""A keyframe that may show the same place: its submap and row."""
+
+
+class Relocalizer:
+    """Poses a frame in a known map without a predicted pose."""
+
+    def __init__(self, tracker: Tracker) -> None:
+        self.tracker = tracker
+
+    def locate(
+        self, view: FrameFeatures, candidates: Iterable[Candidate]
+    ) -> tuple[Submap, PoseEstimate] | None:
+        """The first candidate's submap in which the frame has a valid pose, and that pose.
+
+        Candidates that are covisible with one that failed are skipped.
+        """
+        tried: list[tuple[Submap, Tensor]] = []
+        for submap, keyframe in candidates:
+            if len(tried) == MAX_CANDIDATES:
+                return None
+            if any(submap is other and bool((near == keyframe).any()) for other, near in tried):
+                continue
+            near = self.tracker.localizer.local_keyframes(submap.map, keyframe)
+            pairs = match_keyframe(submap.map, keyframe, view, self.tracker.matcher)
+            points = submap.map.observed_points(near)
+            estimate = self.tracker.localizer.locate(submap.map, view, [pairs], points)
+            if estimate is not None:
+                state = single_frame_state(submap.tracking, estimate)
+                if check_pose(estimate, None, state).rejection is None:
+                    return submap, estimate
+            tried.append((submap, near))
+        return None
+
+
+def single_frame_state(tracking: TrackingState, estimate: PoseEstimate) -> TrackingState:
+    """A tracking state whose averages are those of one frame, to validate its pose without the frames before it."""
+    return replace(tracking, error=estimate.error, explained_ratio=estimate.explained_ratio)
 
 
 def well_observed(slam_map: Map, keyframe: int, local_keyframes: Int[Tensor, " K"]) -> int:

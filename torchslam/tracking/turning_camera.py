@@ -13,7 +13,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.config import CameraConfig, Config
+from torchslam.config import Config
 from torchslam.geometry import SharedCamera
 from torchslam.geometry.lie import so3_log
 from torchslam.geometry.rolling_shutter import at_middle_row
@@ -50,7 +50,9 @@ class TurningCamera:
         self.camera, self.matcher = camera, matcher
         self.threshold_px = THRESHOLD_PX * config.features.reduction(camera.current.size)
         self.min_matches = config.initialization.min_matches
-        self.std = relative_focal_std(config.camera)
+        most = MAX_LOG_FOCAL / MAX_FOCAL_SIGMAS
+        # Standard deviation of the logarithm of a focal length; zero if it is exact.
+        self.std = most if config.camera.guessed else min(config.camera.std, most)
         self.seeks_readout = config.camera.readout_std > 0
         self._first: list[FrameFeatures] = []
         self._last: list[FrameFeatures] = []
@@ -80,15 +82,8 @@ class TurningCamera:
             turns = float(known.seconds) / self._interval * turns
             pixels_1, pixels_2 = self.at_middle_rows((pixels_1, pixels_2), turns)
         is_sought = known is None and self.seeks_readout
-        found = fit_rotating_camera(
-            pixels_1[None],
-            pixels_2[None],
-            self.camera.current,
-            self.std,
-            self.threshold_px,
-            mask[None],
-            turns[None] if is_sought else None,
-        )
+        options = self.std, self.threshold_px, mask[None], turns[None] if is_sought else None
+        found = fit_rotating_camera(pixels_1[None], pixels_2[None], self.camera.current, *options)
         if not is_sought:
             return found, turns if known is not None else torch.zeros_like(turns)
         readout = float(found.readout)
@@ -130,22 +125,14 @@ class TurningCamera:
         return self._last[-1].timestamp - self._last[-2].timestamp
 
     def _rates(self, views: list[FrameFeatures]) -> list[Float[Tensor, "3"]]:
-        return [self._rate(*pair) for pair in pairwise(views)]
-
-    def _rate(self, view_1: FrameFeatures, view_2: FrameFeatures) -> Float[Tensor, "3"]:
-        """Angular velocity between a view and the next one, radians per second; zero if too few matches tell it."""
-        pairs = run_matcher(self.matcher, view_1, view_2)
-        if len(pairs.first) < self.min_matches:
-            return self.camera.current.params.new_zeros(3)
-        pixels_1, pixels_2 = view_1.keypoints[pairs.first], view_2.keypoints[pairs.second]
-        R_21 = rotation_between(pixels_1[None], pixels_2[None], self.camera.current, self.threshold_px)
-        return so3_log(R_21[0]) / (view_2.timestamp - view_1.timestamp)
-
-
-def relative_focal_std(camera: CameraConfig) -> float:
-    """Standard deviation of the logarithm of a focal length; zero if it is exact."""
-    return (
-        MAX_LOG_FOCAL / MAX_FOCAL_SIGMAS
-        if camera.guessed
-        else min(camera.std, MAX_LOG_FOCAL / MAX_FOCAL_SIGMAS)
-    )
+        """Angular velocities between each view and the next, radians per second; zero if too few matches tell it."""
+        rates = []
+        for view_1, view_2 in pairwise(views):
+            pairs = run_matcher(self.matcher, view_1, view_2)
+            if len(pairs.first) < self.min_matches:
+                rates.append(self.camera.current.params.new_zeros(3))
+                continue
+            pixels_1, pixels_2 = view_1.keypoints[pairs.first], view_2.keypoints[pairs.second]
+            R_21 = rotation_between(pixels_1[None], pixels_2[None], self.camera.current, self.threshold_px)
+            rates.append(so3_log(R_21[0]) / (view_2.timestamp - view_1.timestamp))
+        return rates

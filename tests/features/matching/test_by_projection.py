@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from torch import Tensor
 
@@ -52,9 +52,9 @@ def naive_projected(
 @pytest.mark.parametrize("floats", [None, 16])
 @pytest.mark.parametrize("guided", [True, False])
 @given(seed=st.integers(0, 1000), size=st.sampled_from([5.0, 40.0, 400.0]))
-@settings(max_examples=10, deadline=None)
+@settings(max_examples=10, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_match_by_projection_equals_the_loop(
-    floats: int | None, guided: bool, seed: int, size: float
+    device: torch.device, floats: int | None, guided: bool, seed: int, size: float
 ) -> None:
     query = features(2, 25, seed, floats)
     second = disturbed(query, seed + 1)
@@ -63,18 +63,10 @@ def test_match_by_projection_equals_the_loop(
     pixels[0, 0], pixels[1, 0], pixels[1, 1] = -1e4, 1e30, math.nan
     radius = size * torch.rand(2, 25, generator=g)
     limit = 60 if floats is None else 0.3
-    extras = {"scales": query.scales, "angles": query.angles} if guided else {}
+    extras = {"scales": query.scales.to(device), "angles": query.angles.to(device)} if guided else {}
+    given = (tensor.to(device) for tensor in (query.descriptors, pixels, radius, second, query.mask))
     matches = match_by_projection(
-        query.descriptors,
-        pixels,
-        radius,
-        second,
-        query.mask,
-        ratio=0.9,
-        max_distance=limit,
-        scale_tolerance=1.3,
-        angle_tolerance=0.5,
-        **extras,
+        *given, ratio=0.9, max_distance=limit, scale_tolerance=1.3, angle_tolerance=0.5, **extras
     )
     for row in range(2):
         assert pairs(matches, row) == naive_projected(query, pixels, radius, second, row, 0.9, limit, guided)

@@ -7,13 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchslam.features.matching import hamming as bits
-from torchslam.features.matching.hamming import (
-    hamming,
-    hamming_between,
-    hamming_pairs,
-    pack_bits,
-    unpack_bits,
-)
+from torchslam.features.matching.hamming import hamming, hamming_between, pack_bits, unpack_bits
 
 
 def random_descriptors(*shape: int, seed: int = 0) -> torch.Tensor:
@@ -54,14 +48,6 @@ def test_hamming_equals_counting_bits(fast: bool, monkeypatch: pytest.MonkeyPatc
     assert distances.dtype == torch.int32
     assert np.array_equal(distances.numpy(), expected)
     assert torch.equal(hamming(first[0], second[0]), distances[0])
-
-
-@pytest.mark.parametrize("size", [8, 32, 248])
-def test_hamming_distances_of_given_pairs(size: int) -> None:
-    first, second = random_descriptors(20, size), random_descriptors(20, size, seed=1)
-    first[0], second[0] = 0, 255
-    first[1], second[1] = 255, 255
-    assert torch.equal(hamming_pairs(first, second), hamming(first, second).diagonal().long())
 
 
 @pytest.mark.parametrize("by_numpy", [True, False])

@@ -100,8 +100,8 @@ def match_pairs(
     Args:
         descriptors_1: 32 uint8 or unit-length floats.
         descriptors_2: as `descriptors_1`.
-        rows: rows of the pairs that may match.
-        columns: columns of the pairs that may match.
+        rows: of the pairs that may match.
+        columns: of these pairs.
         max_distance: Hamming bits, or 1 - cosine for floats.
 
     Returns:
@@ -112,12 +112,7 @@ def match_pairs(
     """
     check_descriptors(descriptors_1[None], descriptors_2[None])
     distances = pair_distances(descriptors_1, rows, descriptors_2, columns)
-    near = torch.nonzero(distances <= max_distance).squeeze(1)
-    rows, columns, distances = (
-        select_rows(rows, near),
-        select_rows(columns, near),
-        select_rows(distances, near),
-    )
+    rows, columns, distances = masked_rows(distances <= max_distance, rows, columns, distances)
     column, found, _ = best_per_row(rows, columns, distances, None, len(descriptors_1), None)
     row, _, _ = best_per_row(columns, rows, distances, None, len(descriptors_2), None)
     kept = torch.nonzero(found).squeeze(1)
@@ -130,19 +125,10 @@ def select_rows(values: Shaped[Tensor, "N *batch"], rows: Int[Tensor, " M"]) -> 
     return values.index_select(0, rows)
 
 
-def best_of_each(rows: Int[Tensor, " M"], distances: Float[Tensor, " M"], count: int) -> Bool[Tensor, " M"]:
-    """Which matches are the nearest of those with the same row, of `count` rows; the first one of equal ones."""
-    rank = torch.argsort(torch.argsort(distances, stable=True))
-    first = torch.full((count,), len(rows), dtype=torch.int64, device=rows.device)
-    return first.scatter_reduce(0, rows, rank, "amin")[rows] == rank
-
-
-def masked_rows(
-    mask: Bool[Tensor, " N"], first: Shaped[Tensor, " N"], second: Shaped[Tensor, " N"]
-) -> tuple[Shaped[Tensor, " R"], Shaped[Tensor, " R"]]:
-    """Select the masked rows of two columns."""
+def masked_rows(mask: Bool[Tensor, " N"], *columns: Shaped[Tensor, " N"]) -> list[Shaped[Tensor, " R"]]:
+    """Select the masked rows of columns."""
     rows = true_indices(mask)
-    return select_rows(first, rows), select_rows(second, rows)
+    return [select_rows(values, rows) for values in columns]
 
 
 def pair_distances(
@@ -165,27 +151,18 @@ def best_per_row(
     rows: int,
     ratio: float | None,
 ) -> tuple[Int[Tensor, "{rows}"], Bool[Tensor, "{rows}"], Float[Tensor, "{rows}"]]:
-    """Find the nearest column of each row among candidate pairs.
+    """Find the nearest column of each of `rows` rows among candidate pairs.
 
-    Args:
-        row: rows of the pairs.
-        column: columns of the pairs.
-        distances: of the pairs.
-        scales: of the columns, with `ratio`.
-        rows: number of rows.
-        ratio: the nearest must be closer than `ratio` times the nearest other column of its scale; None: no test.
-
-    Returns:
-        The column of each row, whether it passes the ratio test, and its distance (with its graph). Rows without pairs
-        get column 0, not accepted.
+    Returns the column of each row, whether it is accepted, and its distance (with its graph). Rows without pairs get
+    column 0, not accepted. With `ratio`, the nearest must be closer than that times the nearest other column of its
+    scale; `scales` are those of the columns.
     """
     values = distances.detach()
     nearest = _lowest(row, values, rows)
     pair = torch.arange(row.shape[0], device=row.device)
-    winner = values == select_rows(nearest, row)
     # Lowest column among equals, then the pair that holds it.
     unset = torch.iinfo(torch.int64).max
-    winner_row, winner_column = masked_rows(winner, row, column)
+    winner_row, winner_column = masked_rows(values == select_rows(nearest, row), row, column)
     best = row.new_full((rows,), unset).scatter_reduce(0, winner_row, winner_column, "amin")
     chosen = column == select_rows(best, row)
     best_pair = row.new_zeros(rows).scatter(0, row[chosen], pair[chosen])
@@ -232,14 +209,8 @@ def to_matches(
 ) -> Matches:
     """Build matches of row i with column[i] where the mask is set; index and distance are 0 elsewhere."""
     row = torch.arange(column.shape[1], device=column.device).expand_as(column)
-    zero = torch.zeros_like(distances)
-    return Matches(
-        torch.where(mask, row, 0),
-        torch.where(mask, column, 0),
-        torch.where(mask, distances, zero),
-        mask,
-        weights,
-    )
+    row, column = torch.where(mask, row, 0), torch.where(mask, column, 0)
+    return Matches(row, column, torch.where(mask, distances, torch.zeros_like(distances)), mask, weights)
 
 
 def empty_matches(batch: int, rows: int, device: torch.device) -> Matches:
@@ -249,18 +220,10 @@ def empty_matches(batch: int, rows: int, device: torch.device) -> Matches:
 
 
 def check_descriptors(descriptors_1: Tensor, descriptors_2: Tensor) -> None:
-    """Check that descriptors are two (B, N, D) of one type.
-
-    Raises:
-        ValueError: The descriptors differ in type or length, or are not of unit length.
-    """
-    same = descriptors_1.dtype == descriptors_2.dtype and descriptors_1.shape[-1] == descriptors_2.shape[-1]
-    if (
-        descriptors_1.dim() != 3
-        or descriptors_2.dim() != 3
-        or len(descriptors_1) != len(descriptors_2)
-        or not same
-    ):
+    """Raise a ValueError unless descriptors are two (B, N, D) of one type, floats of unit length."""
+    is_same = descriptors_1.dtype == descriptors_2.dtype
+    is_same &= descriptors_1.shape[::2] == descriptors_2.shape[::2]  # batch and length
+    if not (descriptors_1.dim() == descriptors_2.dim() == 3 and is_same):
         raise ValueError(
             f"descriptors must be two (B, N, D) of one type, got {tuple(descriptors_1.shape)} {descriptors_1.dtype} "
             f"and {tuple(descriptors_2.shape)} {descriptors_2.dtype}"

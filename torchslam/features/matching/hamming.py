@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Int, Num, Shaped, UInt8
+from jaxtyping import Bool, Float, Int, Integer, Num, Shaped, UInt8
 from torch import Tensor
+from torch.nn.functional import pad
 
 from torchslam.geometry.precision import without_autocast
 from torchslam.utils.indexing import true_indices
@@ -59,21 +61,13 @@ def spread_bits(descriptors: UInt8[Tensor, "*batch D"], amplitude: int) -> Int[T
     return rows.view(torch.int8).view(*descriptors.shape[:-1], 8 * descriptors.shape[-1])
 
 
-def hamming_pairs(
-    descriptors_1: UInt8[Tensor, "*batch D"], descriptors_2: UInt8[Tensor, "*batch D"]
-) -> Int[Tensor, "*batch"]:
-    """Compute Hamming distances row by row; D must be a multiple of 8 up to 248.
-
-    Counts set bits by summing neighboring bit fields of whole words (Warren: Hacker's Delight, 2002).
-    """
-    words_1 = descriptors_1.contiguous().view(torch.int64)
-    words_2 = descriptors_2.contiguous().view(torch.int64)
-    words = words_1 ^ words_2
+def count_bits(words: Int[Tensor, "*batch"]) -> Integer[Tensor, "*batch"]:
+    """Count the set bits of words of 64 bits (Warren: Hacker's Delight, 2002), on the CPU by NumPy from version 2."""
+    if words.is_cpu and hasattr(np, "bitwise_count"):
+        return torch.from_numpy(np.bitwise_count(words.numpy().view(np.uint64)))
     words = words - ((words >> 1) & 0x5555555555555555)
     words = (words & 0x3333333333333333) + ((words >> 2) & 0x3333333333333333)
-    in_bytes = ((words + (words >> 4)) & 0x0F0F0F0F0F0F0F0F).sum(-1)
-    in_pairs = (in_bytes & 0x00FF00FF00FF00FF) + ((in_bytes >> 8) & 0x00FF00FF00FF00FF)
-    return ((in_pairs * 0x0001000100010001) >> 48) & 0xFFFF
+    return (((words + (words >> 4)) & 0x0F0F0F0F0F0F0F0F) * 0x0101010101010101) >> 56
 
 
 def hamming_between(
@@ -82,21 +76,19 @@ def hamming_between(
     descriptors_2: UInt8[Tensor, "N2 D"],
     columns: Int[Tensor, " M"],
 ) -> Int[Tensor, " M"]:
-    """Compute Hamming distances of pairs of rows of two tables, D as for `hamming_pairs`.
+    """Compute Hamming distances of pairs of rows of two tables; D must be a multiple of 8.
 
-    On the CPU by NumPy, which gathers words and counts bits several times as fast, in versions from 2 on.
+    On the CPU words are gathered and summed by NumPy, several times as fast.
     """
     if len(rows) > _CHUNK:
         chunks = zip(rows.split(_CHUNK), columns.split(_CHUNK), strict=True)
         return torch.cat([hamming_between(descriptors_1, r, descriptors_2, c) for r, c in chunks])
+    words_1, words_2 = (each.contiguous().view(torch.int64) for each in (descriptors_1, descriptors_2))
     if not (rows.is_cpu and hasattr(np, "bitwise_count")):
-        return hamming_pairs(descriptors_1.index_select(0, rows), descriptors_2.index_select(0, columns))
-    words_1, words_2 = (
-        descriptors.contiguous().numpy().view(np.uint64).take(which.numpy(), axis=0)
-        for descriptors, which in ((descriptors_1, rows), (descriptors_2, columns))
-    )
-    words_1 ^= words_2
-    return torch.from_numpy(_sum_of_bytes(np.bitwise_count(words_1)))
+        return count_bits(words_1.index_select(0, rows) ^ words_2.index_select(0, columns)).sum(-1)
+    differing = words_1.numpy().view(np.uint64).take(rows.numpy(), axis=0)
+    differing ^= words_2.numpy().view(np.uint64).take(columns.numpy(), axis=0)
+    return torch.from_numpy(_sum_of_bytes(np.bitwise_count(differing)))
 
 
 def _sum_of_bytes(counts: Any) -> Any:
@@ -156,36 +148,97 @@ def int8_product(
 def _fast_int8(device: torch.device) -> bool:
     """Test whether int8 matrix products beat float32: on x86 processors with AVX-512, through oneDNN."""
     return (
-        device.type == "cpu"
+        int8_matmul is not None
+        and device.type == "cpu"
         and torch.backends.mkldnn.is_available()
         and torch.backends.cpu.get_cpu_capability().startswith("AVX512")
     )
 
 
 class NearestNeighbors(NamedTuple):
-    """Nearest columns of N1 rows.
-
-    Attributes:
-        column: the nearest column.
-        distance: distance to it.
-        found: whether any column may match.
-        mutual: whether no other row is nearer to that column.
-        second: distance of the second nearest column; None if not requested.
-    """
+    """Nearest columns of N1 rows."""
 
     column: Int[Tensor, "B N1"]
     distance: Float[Tensor, "B N1"]
-    found: Bool[Tensor, "B N1"]
-    mutual: Bool[Tensor, "B N1"]
-    second: Float[Tensor, "B N1"] | None
+    found: Bool[Tensor, "B N1"]  # whether any column may match
+    mutual: Bool[Tensor, "B N1"]  # whether no other row is nearer to that column
+    second: Float[Tensor, "B N1"] | None  # distance of the second nearest column; None if not requested
 
 
-def _possible(
-    mask_1: Bool[Tensor, "B N1"], mask_2: Bool[Tensor, "B N2"], allowed: Bool[Tensor, "B N1 N2"] | None
-) -> Bool[Tensor, "B N1 N2"]:
-    """The pairs that may match."""
-    possible = mask_1[:, :, None] & mask_2[:, None, :]
-    return possible if allowed is None else possible & allowed
+_ROWS_AT_ONCE = 512
+"""Rows whose similarities are computed at once: they stay in the cache. 256 to 1024 are equally fast, all 2000 of an
+image take twice as long."""
+_BYTES_FROM = 1 << 20
+"""Pairs of descriptors from which on columns are chosen by bytes: 3000 and 3000 of SIFT take a third of the time. With
+fewer than 1000 and 1000 there is little to gain."""
+_BYTE_ROWS_AT_ONCE = 256
+"""As `_ROWS_AT_ONCE`: 128 is as fast, 512 takes 1.4 times as long."""
+_STEPS = 360.0
+"""Steps of one number of a unit descriptor: products then leave room for `_INDEX_BITS`, as 360^2 < 2^17. The largest
+number of SIFT's root-normalized descriptors is 0.36."""
+
+
+class _Candidates(NamedTuple):
+    """The pairs that may match: of the first `rows` and `columns` of both sets, beyond which none is used."""
+
+    mask_1: Bool[Tensor, "B N1"]
+    mask_2: Bool[Tensor, "B N2"]
+    allowed: Bool[Tensor, "B N1 N2"] | None
+    rows: int
+    columns: int
+
+    def best(
+        self,
+        keys_of: Callable[[slice], Tensor],
+        lowest: float,
+        at_once: int,
+        index_bits: int,
+        with_second: bool,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """The highest key of each row, its column, the second highest key, and the highest one of that column.
+
+        Args:
+            keys_of: the keys of some rows, (B, R, columns), which are overwritten.
+            lowest: key of the pairs that may not match.
+            at_once: rows whose keys are computed at once.
+            index_bits: lowest bits of a key, which hold its column, see `_column_of`; 0: they do not.
+            with_second: False: the highest key is returned in place of the second.
+        """
+        parts, of_columns = [], []
+        for start in range(0, self.rows, at_once):
+            chunk = slice(start, min(start + at_once, self.rows))
+            keys = keys_of(chunk)
+            masks = zip(self.mask_1[:, chunk], self.mask_2[:, : self.columns], strict=True)
+            for element, (own, other) in zip(keys, masks, strict=True):
+                element.index_fill_(0, true_indices(~own), lowest)
+                element.index_fill_(1, true_indices(~other), lowest)
+            if self.allowed is not None:
+                keys.masked_fill_(~self.allowed[:, chunk, : self.columns], lowest)
+            of_columns.append(keys.amax(1))
+            if index_bits:
+                best = keys.amax(2)
+                column = _column_of(best, lowest, index_bits)
+            else:
+                best, column = keys.max(2)
+            second = keys.scatter_(2, column[..., None], lowest).amax(2) if with_second else best
+            parts.append((best, column, second))
+        best, column, second = (torch.cat(each, 1) for each in zip(*parts, strict=True))
+        return best, column, second, torch.stack(of_columns).amax(0).gather(1, column)
+
+    def neighbors(
+        self, column: Tensor, distance: Tensor, found: Tensor, mutual: Tensor, second: Tensor | None
+    ) -> NearestNeighbors:
+        """The neighbors of all N1 rows, from those of the first `rows`."""
+        tail = 0, self.mask_1.shape[1] - self.rows
+        column, found, mutual = (pad(values, tail) for values in (column, found, mutual))
+        second = None if second is None else pad(second, tail, value=1.0)
+        return NearestNeighbors(column, pad(distance, tail, value=1.0), found, mutual, second)
+
+
+def _column_of(keys: Tensor, lowest: float, index_bits: int) -> Tensor:
+    """The columns that keys hold, counted from the last one, so that of equal keys the first column has the highest."""
+    highest = (1 << index_bits) - 1
+    return torch.where(keys > lowest, highest - (keys.to(torch.int64) & highest), 0)
 
 
 def nearest_by_hamming(
@@ -199,44 +252,22 @@ def nearest_by_hamming(
     """Find exact nearest neighbors by Hamming distance, by two maxima over the matrix and one more for the second."""
     keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
     bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
-    columns = keys.shape[2]
+    rows, columns = keys.shape[1:]
     if columns > 1 << _INDEX_BITS:  # more columns than the free bits can number: wider keys
         index_bits = columns.bit_length()
         keys = keys.to(torch.int64) << (index_bits - _INDEX_BITS)
-    highest = (1 << index_bits) - 1
-    masked = _MASKED << (index_bits - _INDEX_BITS)
-    if allowed is not None:
-        keys.masked_fill_(~allowed, masked)
-    numbers = highest - torch.arange(columns, device=keys.device) + masked * ~mask_2
-    keys += numbers.to(keys.dtype)[:, None, :]
-    keys += (masked * ~mask_1).to(keys.dtype)[:, :, None]
+    lowest = _MASKED << (index_bits - _INDEX_BITS)
+    keys += ((1 << index_bits) - 1 - torch.arange(columns, device=keys.device)).to(keys.dtype)
 
     def distance(key: Tensor) -> Tensor:
-        return (bits // 2 - (key.to(torch.int64) >> index_bits)).float()
+        return torch.where(key > lowest, (bits // 2 - (key.to(torch.int64) >> index_bits)).float(), torch.inf)
 
-    best, column_best = keys.amax(2), keys.amax(1)
-    column, nearest, second = highest - (best.to(torch.int64) & highest), distance(best), None
-    if with_second:
-        keys.scatter_(2, column[..., None], 2 * masked)
-        second = distance(keys.amax(2))
-        second = torch.where(second > bits, torch.inf, second)
-    mutual = nearest <= distance(column_best).gather(1, column)
-    return NearestNeighbors(column, nearest, nearest <= bits, mutual, second)
-
-
-_ROWS_AT_ONCE = 512
-"""Rows whose similarities are computed at once: they stay in the cache. 256 to 1024 are equally fast, all 2000 of an
-image take twice as long."""
-
-
-_BYTES_FROM = 1 << 20
-"""Pairs of descriptors from which on columns are chosen by bytes: 3000 and 3000 of SIFT take a third of the time. With
-fewer than 1000 and 1000 there is little to gain."""
-_BYTE_ROWS_AT_ONCE = 256
-"""As `_ROWS_AT_ONCE`: 128 is as fast, 512 takes 1.4 times as long."""
-_STEPS = 360.0
-"""Steps of one number of a unit descriptor: products then leave room for `_INDEX_BITS`, as 360^2 < 2^17. The largest
-number of SIFT's root-normalized descriptors is 0.36."""
+    pairs = _Candidates(mask_1, mask_2, allowed, rows, columns)
+    best, column, second, of_column = pairs.best(lambda _: keys, lowest, rows, index_bits, with_second)
+    mutual = distance(best) <= distance(of_column)
+    return pairs.neighbors(
+        column, distance(best), best > lowest, mutual, distance(second) if with_second else None
+    )
 
 
 def nearest_by_cosine(
@@ -252,105 +283,53 @@ def nearest_by_cosine(
     Where there are many, a second one is wanted, and the processor multiplies bytes quickly, columns are chosen by
     descriptors rounded to bytes; see `_nearest_by_bytes`.
     """
-    batch, rows, count = len(mask_2), _used(mask_1), _used(mask_2)
+    pairs = _Candidates(mask_1, mask_2, allowed, _used(mask_1), _used(mask_2))
+    used_1, used_2 = descriptors_1[:, : pairs.rows], descriptors_2[:, : pairs.columns]
     with_gradient = torch.is_grad_enabled() and (descriptors_1.requires_grad or descriptors_2.requires_grad)
-    if (
-        with_second
-        and not with_gradient
-        and rows * count >= _BYTES_FROM
-        and count <= 1 << _INDEX_BITS
-        and int8_matmul is not None
-        and _fast_int8(descriptors_1.device)
-    ):
-        return _nearest_by_bytes(descriptors_1, descriptors_2, mask_1, mask_2, allowed)
-    descriptors_2, mask_2 = descriptors_2[:, :count], mask_2[:, :count]
-    best_of_column = descriptors_2.new_full((batch, count), -torch.inf)
-    parts = []
-    room = descriptors_2.new_empty(
-        batch, min(_ROWS_AT_ONCE, rows), count
-    )  # once: new pages cost as much as products
-    for start in range(0, rows, _ROWS_AT_ONCE):
-        chunk = slice(start, min(start + _ROWS_AT_ONCE, rows))
-        out = None if with_gradient else room[:, : chunk.stop - start]
-        similarity = torch.matmul(descriptors_1[:, chunk], descriptors_2.mT, out=out)
-        values = similarity.detach().clone() if with_gradient else similarity  # changed in place
-        for element, (own, other) in zip(values, zip(mask_1[:, chunk], mask_2, strict=True), strict=True):
-            element.index_fill_(0, true_indices(~own), -torch.inf)
-            element.index_fill_(1, true_indices(~other), -torch.inf)
-        if allowed is not None:
-            values.masked_fill_(~allowed[:, chunk, :count], -torch.inf)
-        best, column = values.max(2)
-        best_of_column = torch.maximum(best_of_column, values.amax(1))
-        nearest = 1 - similarity.gather(2, column[..., None])[..., 0]
-        nearest = torch.where(best > -torch.inf, nearest, 1.0)
-        second = None
-        if with_second:
-            second = 1 - values.scatter_(2, column[..., None], -torch.inf).amax(2)
-        parts.append((column, nearest, best, best if second is None else second))
-    column, nearest, most, seconds = (torch.cat(each, 1) for each in zip(*parts, strict=True))
-    tail = 0, mask_1.shape[1] - rows
-    return NearestNeighbors(
-        torch.nn.functional.pad(column, tail),
-        torch.nn.functional.pad(nearest, tail, value=1.0),
-        torch.nn.functional.pad(most > -torch.inf, tail),
-        torch.nn.functional.pad(most >= best_of_column.gather(1, column), tail),
-        torch.nn.functional.pad(seconds, tail, value=1.0) if with_second else None,
-    )
+    is_large = pairs.rows * pairs.columns >= _BYTES_FROM and pairs.columns <= 1 << _INDEX_BITS
+    if with_second and not with_gradient and is_large and _fast_int8(used_1.device):
+        return _nearest_by_bytes(used_1, used_2, pairs)
+    if with_gradient:
+        similarity = used_1 @ used_2.mT
+    else:  # room for it once: new pages cost as much as products
+        similarity = used_2.new_empty(len(mask_2), min(_ROWS_AT_ONCE, pairs.rows), pairs.columns)
+
+    def keys_of(chunk: slice) -> Tensor:
+        if with_gradient:
+            return similarity.detach()[:, chunk].clone()
+        return torch.matmul(used_1[:, chunk], used_2.mT, out=similarity[:, : chunk.stop - chunk.start])
+
+    best, column, second, of_column = pairs.best(keys_of, -torch.inf, _ROWS_AT_ONCE, 0, with_second)
+    found = best > -torch.inf
+    nearest = 1 - (similarity.gather(2, column[..., None])[..., 0] if with_gradient else best)
+    nearest = torch.where(found, nearest, 1.0)
+    return pairs.neighbors(column, nearest, found, best >= of_column, 1 - second if with_second else None)
 
 
 def _nearest_by_bytes(
-    descriptors_1: Float[Tensor, "B N1 D"],
-    descriptors_2: Float[Tensor, "B N2 D"],
-    mask_1: Bool[Tensor, "B N1"],
-    mask_2: Bool[Tensor, "B N2"],
-    allowed: Bool[Tensor, "B N1 N2"] | None,
+    descriptors_1: Float[Tensor, "B N1 D"], descriptors_2: Float[Tensor, "B N2 D"], pairs: _Candidates
 ) -> NearestNeighbors:
     """`nearest_by_cosine` with columns chosen by descriptors rounded to bytes; the distances to these are exact.
 
     The similarities by which columns are chosen have an error of 0.001, its standard deviation. So the nearest may be
     another column only where two are as close as that, where no ratio test passes.
     """
-    batch, rows, count = len(mask_2), _used(mask_1), _used(mask_2)
-    descriptors_2, mask_2 = descriptors_2[:, :count], mask_2[:, :count]
-    bytes_1, bytes_2 = _rounded(descriptors_1[:, :rows]), _rounded(descriptors_2)
-    lowest, highest = torch.iinfo(torch.int32).min, (1 << _INDEX_BITS) - 1
-    numbers = highest - torch.arange(count, dtype=torch.int32, device=mask_2.device)
+    bytes_1, bytes_2 = _rounded(descriptors_1), _rounded(descriptors_2)
+    lowest = torch.iinfo(torch.int32).min
+    numbers = torch.arange(pairs.columns, dtype=torch.int32, device=bytes_2.device)
+    numbers = (1 << _INDEX_BITS) - 1 - numbers
 
-    def column(keys: Tensor) -> Tensor:
-        return torch.where(keys > lowest, highest - (keys & highest), 0).long()
-
-    best_of_column = numbers.new_full((batch, count), lowest)
-    parts = []
-    for start in range(0, rows, _BYTE_ROWS_AT_ONCE):
-        chunk = slice(start, min(start + _BYTE_ROWS_AT_ONCE, rows))
-        keys = int8_product(bytes_1[:, chunk], bytes_2.mT).mul_(1 << _INDEX_BITS).add_(numbers)
-        for element, (own, other) in zip(keys, zip(mask_1[:, chunk], mask_2, strict=True), strict=True):
-            element.index_fill_(0, true_indices(~own), lowest)
-            element.index_fill_(1, true_indices(~other), lowest)
-        if allowed is not None:
-            keys.masked_fill_(~allowed[:, chunk, :count], lowest)
-        best_of_column = torch.maximum(best_of_column, keys.amax(1))
-        best = keys.amax(2)
-        keys.scatter_(2, column(best)[..., None], lowest)
-        parts.append((best, keys.amax(2)))
-    best, second = (torch.cat(each, 1) for each in zip(*parts, strict=True))
-    tail = 0, mask_1.shape[1] - rows
+    def keys_of(chunk: slice) -> Tensor:
+        return int8_product(bytes_1[:, chunk], bytes_2.mT).mul_(1 << _INDEX_BITS).add_(numbers)
 
     def distance(keys: Tensor, otherwise: float) -> Tensor:
-        chosen = torch.stack(
-            [own.index_select(0, each) for own, each in zip(descriptors_2, column(keys), strict=True)]
-        )
-        exact = 1 - (descriptors_1[:, :rows] * chosen).sum(-1)
-        return torch.nn.functional.pad(torch.where(keys > lowest, exact, otherwise), tail, value=1.0)
+        columns = zip(descriptors_2, _column_of(keys, lowest, _INDEX_BITS), strict=True)
+        chosen = torch.stack([own.index_select(0, at) for own, at in columns])
+        return torch.where(keys > lowest, 1 - (descriptors_1 * chosen).sum(-1), otherwise)
 
-    mutual = best >> _INDEX_BITS >= best_of_column.gather(1, column(best)) >> _INDEX_BITS
-    return NearestNeighbors(
-        torch.nn.functional.pad(column(best), tail),
-        distance(best, 1.0),
-        torch.nn.functional.pad(best > lowest, tail),
-        torch.nn.functional.pad(mutual, tail),
-        distance(second, torch.inf),
-    )
+    best, column, second, of_column = pairs.best(keys_of, lowest, _BYTE_ROWS_AT_ONCE, _INDEX_BITS, True)
+    mutual = best >> _INDEX_BITS >= of_column >> _INDEX_BITS
+    return pairs.neighbors(column, distance(best, 1.0), best > lowest, mutual, distance(second, torch.inf))
 
 
 def _rounded(descriptors: Float[Tensor, "B N D"]) -> Int[Tensor, "B N D"]:
@@ -376,6 +355,7 @@ def dual_softmax(
 ) -> Float[Tensor, "B N1"]:
     """Compute the product of the softmax over columns and over rows at (row, column[row])."""
     low = torch.finfo(logits.dtype).min / 2
-    logits = logits.masked_fill(~_possible(mask_1, mask_2, allowed), low)
+    possible = mask_1[:, :, None] & mask_2[:, None, :]
+    logits = logits.masked_fill(~(possible if allowed is None else possible & allowed), low)
     both = logits.softmax(2) * logits.softmax(1)
     return both.gather(2, column[..., None])[..., 0]

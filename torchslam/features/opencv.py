@@ -1,21 +1,22 @@
-"""SIFT of OpenCV behind the interface of `ORB`: a feature extractor with descriptors of floats that needs no weights.
+"""ORB and SIFT of OpenCV behind the interface of `ORB`; both need no weights.
 
-Lowe: Distinctive image features from scale-invariant keypoints (IJCV 2004). Descriptors are root-normalized:
+Lowe: Distinctive image features from scale-invariant keypoints (IJCV 2004). Descriptors of SIFT are root-normalized:
 Arandjelovic and Zisserman: Three things everyone should know to improve object retrieval (CVPR 2012).
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from torchslam.features.orb import check_images, gray_bytes
+from torchslam.features.contract import check_images
 from torchslam.types import Features
 
 OCTAVE_LAYERS, EDGE_THRESHOLD = 3, 10.0  # as Lowe has them
@@ -43,10 +44,72 @@ RUN_NOISE = 2.0
 By the median residuals of runs over shelf_bin, fr2_desk_20, redkitchen, machine_hall and kitti07, the noise is 0.2 to
 0.5 px up to size 8, and 0.03 to 0.06 of the size beyond. With 1.0, gates are so narrow that shelf_bin is soon lost."""
 
-DESCRIPTOR_FLOATS = 128
-"""Numbers of a descriptor: 4 x 4 cells of 8 directions (Lowe, 2004)."""
-
 Array = NDArray[Any]
+
+
+def gray_bytes(images: Float[Tensor, "B 1 H W"]) -> UInt8[Tensor, "B H W"]:
+    """Images as OpenCV takes them, on the CPU."""
+    return images.detach().mul(255).add(0.5).clamp(0, 255).to(torch.uint8)[:, 0].cpu()
+
+
+class OpenCVORB(nn.Module):
+    """OpenCV's ORB behind the interface of `ORB`. Not differentiable; results are on the images' device.
+
+    Args:
+        num_keypoints: largest number of keypoints per image; rows beyond what OpenCV finds are masked.
+        scale_factor: ratio of the sizes of neighboring pyramid levels.
+        num_levels: of the pyramid.
+        threshold: of FAST, gray values of 0 to 255.
+    """
+
+    def __init__(
+        self, num_keypoints: int = 1000, scale_factor: float = 1.2, num_levels: int = 8, threshold: int = 20
+    ) -> None:
+        super().__init__()
+        self.num_keypoints = num_keypoints
+        self.scale_factor = scale_factor
+        self._orb = cv2.ORB.create(
+            nfeatures=num_keypoints, scaleFactor=scale_factor, nlevels=num_levels, fastThreshold=threshold
+        )
+
+    def forward(
+        self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
+    ) -> Features:
+        """Detect and describe keypoints; arguments, result and errors as for `ORB.forward`."""
+        check_images(images, mask)
+        masks = [None] * len(images) if mask is None else list(mask[:, 0].to(torch.uint8).cpu().numpy())
+        batch = [self._extract(*each, images.dtype) for each in zip(gray_bytes(images), masks, strict=True)]
+        fields = (torch.stack(column) for column in zip(*batch, strict=True))
+        return Features(*fields).to(images.device)
+
+    def _extract(self, image: Tensor, mask: np.ndarray | None, dtype: torch.dtype) -> tuple[Tensor, ...]:
+        """The fields of `Features` of one (H, W) uint8 image, where `mask` is not 0."""
+        # cv2 fails on images that leave no room for a keypoint instead of finding none.
+        roomy = min(image.shape) > 2 * self._orb.getEdgeThreshold()
+        found, described = self._orb.detectAndCompute(image.numpy(), mask) if roomy else ((), None)
+        # cv2 may return a few more than asked for when responses tie.
+        rows = sorted(range(len(found)), key=lambda row: -found[row].response)[: self.num_keypoints]
+        values = torch.tensor([0, 0, 0, 1, 0], dtype=dtype, device="cpu").repeat(self.num_keypoints, 1)
+        descriptors = torch.zeros(self.num_keypoints, 32, dtype=torch.uint8, device="cpu")
+        found_mask = torch.arange(self.num_keypoints, device="cpu") < len(rows)
+        if described is not None:
+            points = [found[row] for row in rows]
+            values[: len(rows)] = torch.tensor(
+                [self._row(point) for point in points], dtype=dtype, device="cpu"
+            )
+            descriptors[: len(rows)] = torch.from_numpy(described[rows])
+        return values[:, :2], values[:, 2], values[:, 3], values[:, 4], descriptors, found_mask
+
+    def _row(self, point: cv2.KeyPoint) -> tuple[float, float, float, float, float]:
+        """x, y, score, scale, angle of a keypoint.
+
+        cv2 scales pixels of a level about the center of the first one, but resizes images about their corner; the
+        difference is half a pixel of the level less half a pixel of the image.
+        """
+        scale = self.scale_factor**point.octave
+        shift = (scale - 1) / 2
+        angle = math.remainder(math.radians(point.angle), 2 * math.pi)
+        return point.pt[0] + shift, point.pt[1] + shift, point.response, scale, angle
 
 
 class SIFT(nn.Module):
@@ -95,19 +158,11 @@ class SIFT(nn.Module):
         """
         # OpenCV takes the strongest before it applies the mask, so with one it must return all.
         limit = self.num_keypoints if mask is None else 0
-        sift = cv2.SIFT.create(
-            limit,
-            OCTAVE_LAYERS,
-            CONTRAST_THRESHOLD,
-            EDGE_THRESHOLD,
-            FIRST_SIGMA,
-            enable_precise_upscale=True,  # otherwise all keypoints are off by 0.25 px
-        )
+        # Without the precise upscale all keypoints are off by 0.25 px.
+        options = OCTAVE_LAYERS, CONTRAST_THRESHOLD, EDGE_THRESHOLD, FIRST_SIGMA
+        sift = cv2.SIFT.create(limit, *options, enable_precise_upscale=True)
         points, described = sift.detectAndCompute(image, mask)
-        rows, descriptors = (
-            np.zeros((self.num_keypoints, 5)),
-            np.zeros((self.num_keypoints, DESCRIPTOR_FLOATS)),
-        )
+        rows, descriptors = np.zeros((self.num_keypoints, 5)), np.zeros((self.num_keypoints, 128))
         if len(points):
             found = np.array(
                 [(*each.pt, each.size, np.radians(each.angle), each.response) for each in points]

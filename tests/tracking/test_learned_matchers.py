@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from torchslam import load_config, match
 from torchslam.errors import ConfigError
 from torchslam.features import pack_bits
-from torchslam.tracking.kornia_matchers import KorniaMatcher
+from torchslam.tracking.learned_matchers import KorniaMatcher
 from torchslam.tracking.matcher import make_matcher, run_matcher
 from torchslam.types import FrameFeatures
 
