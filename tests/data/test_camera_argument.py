@@ -13,7 +13,7 @@ from PIL import Image
 
 from torchslam.data import Calibrated, open_sequence, parse_camera, read_calibration
 from torchslam.data.calibration import PRESETS, size_text
-from torchslam.data.camera_argument import EXIF_BLOCK, FOCAL_LENGTH_35MM
+from torchslam.data.formats.calibration_files import EXIF_BLOCK, FOCAL_LENGTH_35MM
 from torchslam.errors import CalibrationError
 
 VGA = (640, 480)

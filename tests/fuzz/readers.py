@@ -32,8 +32,8 @@ from torchslam.data.formats.depth_images import find_depth_images, read_depth
 from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_color, read_gray
-from torchslam.data.formats.imu_files import read_imu, read_inertial_calibration
-from torchslam.data.formats.speed_file import read_speeds
+from torchslam.data.inertial import read_imu, read_inertial_calibration
+from torchslam.data.formats.vehicle_files import read_speeds
 from torchslam.data.inertial import InertialSamples
 from torchslam.data.sequence import Sequence
 from torchslam.dense import DepthMaps

@@ -12,17 +12,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 from torchslam.data.calibration import GivenCamera
-from torchslam.data.camera_argument import parse_calibration
 from torchslam.data.download import unpack
+from torchslam.data.formats.calibration_files import parse_calibration
 from torchslam.data.formats.frame_names import FOLDERS, folder_kind, is_pattern, other_kind, subfolder
 from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
 from torchslam.data.readers import bag, video
 from torchslam.data.readers.bag import BAG
-from torchslam.data.readers.euroc import EUROC
+from torchslam.data.readers.datasets import EUROC, ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
 from torchslam.data.readers.image_sequence import FOLDER
 from torchslam.data.readers.kitti import KITTI, KITTI_RAW
 from torchslam.data.readers.live import LIVE, is_address, is_live
-from torchslam.data.readers.rgbd import ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
 from torchslam.data.readers.video import VIDEO
 from torchslam.data.sequence import Need, Reader, Sequence, exhaust
 from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic

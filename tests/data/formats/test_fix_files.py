@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image
 
-from torchslam.data.formats.csv_tables import utc_from_gps
+from torchslam.data.text_file import utc_from_gps
 from torchslam.data.formats.fix_files import Fixes, read_fixes
 from torchslam.errors import MeasurementError, TorchslamError
 

@@ -16,7 +16,7 @@ from tests.data.mp4 import write_mp4
 from torchslam import SLAM
 from torchslam.config import load_config
 from torchslam.data import EndOfSequence, open_sequence
-from torchslam.data.camera_argument import parse_calibration
+from torchslam.data.formats.calibration_files import parse_calibration
 from torchslam.data.readers import live
 from torchslam.data.readers.live import CaptureClock, LiveSequence
 from torchslam.data.transforms import Resized, cut, reduce_rate

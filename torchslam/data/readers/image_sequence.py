@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import statistics
 from collections import Counter
 from collections.abc import Iterable
 from collections.abc import Sequence as Listed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import CALIBRATION, FROM_EXIF, Calibration, GivenCamera, size_text
-from torchslam.data.camera_argument import read_focal
-from torchslam.data.formats.calibration_files import read_calibration
+from torchslam.data.formats.calibration_files import read_calibration, read_focal
 from torchslam.data.formats.frame_names import (
     FOLDERS,
     Found,
@@ -41,7 +38,7 @@ from torchslam.data.formats.image_file import (
     read_pixels,
 )
 from torchslam.data.sequence import Reader, Sequence
-from torchslam.data.text_file import check_later
+from torchslam.data.text_file import check_rising, float64
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 from torchslam.utils.text import printable
@@ -88,7 +85,16 @@ class ImageSequence(Sequence):
     ) -> None:
         """Raises SequenceError without images, for timestamps out of order or doubled, or where none of the
         first images can be read; CalibrationError for a camera of another image size."""
-        _check_order(name, entries)
+        if not entries:
+            raise SequenceError(f"{name}: no images")
+        times = [entry.timestamp for entry in entries]
+        check_rising(times, [entry.where for entry in entries], SequenceError)
+        interval = statistics.median(np.diff(times)) if len(times) > 1 else 1.0
+        if not SHORTEST < interval < LONGEST:
+            raise SequenceError(
+                f"{entries[-1].where}: the images are {interval:.3g} s apart: their times seem to have another unit "
+                "than the seconds that are expected (EuRoC's data.csv: nanoseconds)"
+            )
         as_stored = isinstance(camera, Calibration) and camera.as_stored
         size, self._bits = _examine(entries, as_stored)
         notes = [*notes, f"{self._bits} of 16 bits are used"] if self._bits > 8 else notes
@@ -98,7 +104,7 @@ class ImageSequence(Sequence):
             name,
             kind,
             read_focal(entries[0].path) if camera == FROM_EXIF else camera,
-            torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64, device="cpu"),
+            float64(times),
             groundtruth,
             size=size,
             notes=notes,
@@ -137,20 +143,6 @@ class ImageSequence(Sequence):
             raise FrameError(
                 f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
             )
-
-
-def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
-    if not entries:
-        raise SequenceError(f"{name}: no images")
-    for before, entry in itertools.pairwise(entries):
-        check_later(entry.timestamp, before.timestamp, entry.where, SequenceError)
-    intervals = [after.timestamp - before.timestamp for before, after in itertools.pairwise(entries)]
-    interval = statistics.median(intervals) if intervals else 1.0
-    if not SHORTEST < interval < LONGEST:
-        raise SequenceError(
-            f"{entries[-1].where}: the images are {interval:.3g} s apart: their times seem to have another unit than "
-            "the seconds that are expected (EuRoC's data.csv: nanoseconds)"
-        )
 
 
 def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, int], int]:
@@ -216,12 +208,9 @@ def _open_folder(path: str, camera: GivenCamera | None, rate: float | None) -> I
     found, folder = _find(path, base)
     camera = camera if camera is not None else find_calibration(folder) or find_calibration(base)
     times, notes = times_in_names(found.frames), found.notes
-    if times is None:
-        entries = at_rate(found.frames, rate or DEFAULT_RATE)
-    else:
-        entries = [
-            ImageEntry(time, image, str(image)) for time, image in zip(times, found.frames, strict=True)
-        ]
+    entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    if times is not None:
+        entries = [replace(entry, timestamp=time) for entry, time in zip(entries, times, strict=True)]
         notes = [*notes, "the names of the images are their times"]
     sequence = ImageSequence(base.resolve().name, "image folder", entries, camera, None, notes)
     if times is None:
