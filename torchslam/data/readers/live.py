@@ -19,8 +19,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
-from torchslam.data.readers.capture import Capture, Retriever, open_capture, pixel_aspect
-from torchslam.data.readers.video import SUFFIXES
+from torchslam.data.readers.video import SUFFIXES, Capture, Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.forks import forget_in_forks, never_release
@@ -59,8 +58,7 @@ class LiveSequence(Sequence):
     ) -> None:
         """Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit."""
         self._capture = capture
-        command = f'ffmpeg -i "{name}" -vf bwdif=send_frame -crf 16 recording.mp4'
-        self._retriever = Retriever(capture, command)
+        self._retriever = Retriever(capture, name, "recording.mp4")
         self._refusal: FrameError | None = None  # of a frame that cannot be converted
         self._patience = patience
         self._clock = CaptureClock()
