@@ -28,7 +28,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.cli.main import console
-from torchslam.data.synthetic.paths import poses
+from torchslam.data.synthetic.sequence import poses
 from torchslam.data.synthetic.scene import (
     BUILDING_TEXEL,
     FLOOR,

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from torchslam.data import open_sequence
-from torchslam.data.synthetic.paths import OUTWARD
+from torchslam.data.synthetic.sequence import OUTWARD
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import MIP_LEVELS, QUARTER_TURN, Rectangle, corridors, rooms, wall
 from torchslam.errors import SequenceError

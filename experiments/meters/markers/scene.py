@@ -11,7 +11,7 @@ import math
 import cv2
 import numpy as np
 
-from torchslam.data.synthetic.paths import loop
+from torchslam.data.synthetic.sequence import loop
 from torchslam.data.synthetic.scene import Rectangle, Vector, room
 from torchslam.data.synthetic.sequence import SCENES, Scene
 
