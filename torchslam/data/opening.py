@@ -25,7 +25,7 @@ from torchslam.data.readers.live import LIVE, is_address, is_live
 from torchslam.data.readers.video import VIDEO
 from torchslam.data.sequence import Need, Reader, Sequence, exhaust
 from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
-from torchslam.data.transforms import Masked, cut, need, reduce_rate, resize
+from torchslam.data.transforms import Masked, Selection, resize
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
 from torchslam.utils.text import without_credentials
 
@@ -68,21 +68,18 @@ def open_sequence(
     """
     if fps is not None and not 0 < fps < math.inf:
         raise SequenceError(f"{path}: frames per second must be positive, not {fps:g}")
+    selection = Selection(start, stop, fps, limit, stride)
     given = parse_calibration(str(camera)) if isinstance(camera, str | Path) else camera
     try:
-        most = None if limit is None else limit * stride
         # A folder of masks may be matched by the number of all frames.
         is_whole = mask is not None and Path(mask).is_dir()
-        sequence = _open(str(path), given, fps, exhaust if is_whole else need(start, stop, fps, most))
+        need: Need = exhaust if is_whole else lambda times: exhaust(selection.indices(times))
+        sequence = _open(str(path), given, fps, need)
         if mask is not None:
             sequence = Masked(sequence, mask)
     except OSError as cause:  # an unreadable folder, or a name that is too long
         raise SequenceError(f"{cause.filename or path}: cannot be read: {cause.strerror or cause}") from cause
-    sequence = cut(sequence, start, stop)
-    if fps is not None:
-        sequence = reduce_rate(sequence, fps)
-    if limit is not None or stride != 1:
-        sequence = sequence.part(stop=None if limit is None else limit * stride, stride=stride)
+    sequence = selection.of(sequence)
     return sequence if resize_to is None else resize(sequence, resize_to)
 
 
