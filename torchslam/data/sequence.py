@@ -89,7 +89,7 @@ class Sequence(ABC):
         """
         self.name = printable(without_credentials(name))
         self.kind = printable(kind)
-        known = camera.size if size is None and camera is not None else size
+        known = size or (None if camera is None else camera.size)
         if known is None:
             raise ValueError("a sequence without a camera needs the size of its images")
         self.size = known
@@ -334,16 +334,17 @@ class Transformed(Sequence):
         notes: Iterable[str] = (),
         groundtruth: Trajectory | None = None,
     ) -> None:
+        width, height = size or whole.size
         super().__init__(
             whole.name,
             whole.kind,
             whole._camera if camera is None else camera,
             whole.timestamps if indices is None else whole.timestamps[list(indices)],
             whole.groundtruth if groundtruth is None else groundtruth,
-            size=size or whole.size,
+            size=(width, height),
             guessed=whole.calibrated is Calibrated.GUESSED,
             notes=(*whole.notes, *notes),
-            pixel_aspect=_resized_aspect(whole, size),
+            pixel_aspect=whole.pixel_aspect * (whole.size[0] / width) / (whole.size[1] / height),
         )
         self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
         self.counted_until, self.measurements = whole.counted_until, whole.measurements
@@ -402,12 +403,6 @@ class Transformed(Sequence):
 
     def _at(self, index: int) -> int:
         return index if self._indices is None else self._indices[index]
-
-
-def _resized_aspect(whole: Sequence, size: tuple[int, int] | None) -> float:
-    """Width to height of a pixel after images are resized."""
-    width, height = size or whole.size
-    return whole.pixel_aspect * (whole.size[0] / width) / (whole.size[1] / height)
 
 
 def aspect_text(aspect: float) -> str:
