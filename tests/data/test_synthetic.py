@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from torchslam.data import open_sequence
-from torchslam.data.synthetic.sequence import OUTWARD
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import MIP_LEVELS, QUARTER_TURN, Rectangle, corridors, rooms, wall
+from torchslam.data.synthetic.sequence import OUTWARD
 from torchslam.errors import SequenceError
 
 Build = Callable[[int], list[Rectangle]]
