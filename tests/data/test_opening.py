@@ -220,6 +220,9 @@ def test_zip_of_a_mac(tmp_path: Path, tum_folder: Callable[..., Path]) -> None:
 
 
 def test_zips_without_one_sequence(tmp_path: Path) -> None:
+    (tmp_path / "wrong.zip").write_bytes(b"PK\x03\x04 not a zip")
+    with pytest.raises(SequenceError, match=r"wrong\.zip: not a zip archive"):
+        open_sequence(tmp_path / "wrong.zip")
     write_mp4(tmp_path / "clip.mp4", [np.full((48, 64, 3), 40 * index, np.uint8) for index in range(3)])
     video = (tmp_path / "clip.mp4").read_bytes()
     for files, message in (
@@ -239,12 +242,6 @@ def test_zips_without_one_sequence(tmp_path: Path) -> None:
             open_sequence(pack(tmp_path / "a.zip", files), CAMERA)
         assert "did you mean" not in str(caught.value)
         assert "torchslam-" not in str(caught.value)
-
-
-def test_a_wrong_archive(tmp_path: Path) -> None:
-    (tmp_path / "a.zip").write_bytes(b"PK\x03\x04 not a zip")
-    with pytest.raises(SequenceError, match=r"a\.zip: not a zip archive"):
-        open_sequence(tmp_path / "a.zip")
 
 
 @pytest.mark.parametrize(("bits", "white"), [(10, 1023), (12, 4095), (14, 16383), (16, 65535)])

@@ -16,7 +16,6 @@ from PIL import Image
 from tests.data.formats.test_fix_files import GPX, MAVIC_3, MAVIC_PRO, MINI_2, NMEA, with_sums
 from tests.data.mp4 import write_mp4
 from tests.data.readers.test_bag import STAMPS, Recording
-from tests.data.readers.test_euroc import SENSOR
 from tests.data.test_camera_argument import (
     COLMAP,
     KALIBR,
@@ -33,6 +32,29 @@ from tests.data.test_datasets import CAM_TO_CAM
 from tests.fuzz.mutators import Files
 from torchslam.config import Config, to_toml
 
+SENSOR = """\
+%YAML:1.0
+# Default camera sensor yaml file
+sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+
+# Sensor extrinsics wrt. the body-frame.
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, 0.1,
+         1.0, 0.0, 0.0, 0.2,
+        0.0, 0.0, 1.0, 0.3,
+         0.0, 0.0, 0.0, 1.0]
+
+# Camera specific definitions.
+rate_hz: 20
+resolution: [64, 48]
+camera_model: pinhole
+intrinsics: [58.6, 57.2, 31.2, 23.3] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
 SIZE = (64, 48)
 VGA = (640, 480)
 
@@ -49,6 +71,15 @@ def encoded(image: np.ndarray, suffix: str = ".png") -> bytes:
 
 def pictures(names: list[str], size: tuple[int, int] = SIZE) -> Files:
     return {name: encoded(picture(index, size), Path(name).suffix) for index, name in enumerate(names)}
+
+
+def place(folder: Path, files: Files) -> Path:
+    """Write files below a folder, and return it."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return folder
 
 
 def content_of(folder: Path) -> Files:
@@ -107,7 +138,7 @@ def imu() -> Files:
 def kitti() -> Files:
     return pictures([f"image_0/{index:06d}.png" for index in range(3)]) | {
         "times.txt": b"0.000000e+00\n1.037430e-01\n2.074860e-01\n",
-        "calib.txt": b"P0: 70 0 31 0 0 71 23 0 0 0 1 0\nP1: 70 0 31 -8 0 71 23 0 0 0 1 0\n",
+        "calib.txt": b"P0: 70 0 31 0 0 71 23 0 0 0 1 0\nP2: 70 0 31 4.2 0 71 23 0 0 0 1 0\n",
         "poses.txt": b"1 0 0 0 0 1 0 0 0 0 1 0\n0 0 1 5 0 1 0 0 -1 0 0 0\n1 0 0 0 0 1 0 0 0 0 1 2\n",
     }
 

@@ -15,7 +15,6 @@ import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
-from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, TypeVar, get_type_hints
 
@@ -187,7 +186,6 @@ def to_toml(config: Settings, commented: bool = False) -> str:
     return "\n".join(lines + inner) + "\n"
 
 
-@cache
 def _declared(kind: type[Settings]) -> dict[str, tuple[type, Allowed]]:
     """Return type and constraint of each setting, by name."""
     hints = get_type_hints(kind)

@@ -129,10 +129,7 @@ class Calibration:
         )
 
 
-AUTO = "auto"
-EXIF = "exif"
-
-UNKNOWN = Calibration.guess(0.85, "w", AUTO)
+UNKNOWN = Calibration.guess(0.85, "w", "auto")
 """An unknown camera; the focal lengths of phones and webcams are 0.7 to 1 image widths."""
 FROM_EXIF = Calibration("pinhole", (), "--camera exif", guessed=True)
 """The focal length is in the EXIF block of the first image."""
@@ -200,7 +197,6 @@ def _published(size: Size, *numbers: float) -> Calibration:
     return Calibration.from_numbers(list(numbers), "preset", size=size)
 
 
-_EUROC_DISTORTION = (-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05)
 _CAMERAS: dict[str, tuple[Calibration, ...]] = {
     # https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats, calibration of the color cameras;
     # the images of fr3 are undistorted already.
@@ -208,7 +204,12 @@ _CAMERAS: dict[str, tuple[Calibration, ...]] = {
     "tum-fr2": (_published(VGA, 520.9, 521.0, 325.1, 249.7, 0.2312, -0.7849, -0.0033, -0.0001, 0.9172),),
     "tum-fr3": (_published(VGA, 535.4, 539.2, 320.1, 247.6),),
     # sensor.yaml of cam0 in every sequence of https://projects.asl.ethz.ch/datasets/doku.php?id=kmavvisualinertialdatasets
-    "euroc": (_published((752, 480), 458.654, 457.296, 367.215, 248.375, *_EUROC_DISTORTION),),
+    "euroc": (
+        _published(
+            (752, 480),
+            *(458.654, 457.296, 367.215, 248.375, -0.28340811, 0.07395907, 0.00019359, 1.76187114e-05),
+        ),
+    ),
     # P0 in calib.txt of the odometry benchmark, by the size of its images: sequences 00-02 (and 13-21), 03, 04-12.
     "kitti": (
         _published((1241, 376), 718.856, 718.856, 607.1928, 185.2157),
@@ -252,13 +253,9 @@ def check_replaceable(path: Path) -> None:
 
 
 def write_calibration(path: Path, camera: Camera, remarks: list[str], std: float | None = None) -> None:
-    """Write an estimated camera as a calibration file, with remarks as comments.
+    """Write an estimated camera as a calibration file, with remarks as comments, one line each.
 
-    Args:
-        path: the file.
-        camera: the camera.
-        remarks: comments, one line each.
-        std: relative standard deviation of the focal length, if known.
+    `std` is the relative standard deviation of the focal length, if known.
     """
     stated = [*remarks, f"{IMAGE_SIZE}: {size_text(camera.size)}"]
     stated += [] if std is None else [f"{FOCAL_STD}: {std:.2g}"]

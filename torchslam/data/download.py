@@ -32,17 +32,12 @@ from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular, write_whole
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
-CHUNK = 1 << 20
-"""Bytes that are read at once: progress is shown, and the memory stays small."""
 TIMEOUT = 60.0
 """Seconds without a byte before a transfer is given up."""
 ATTEMPTS = 5
 """Maximum number of attempts of an interrupted transfer; each one must get further than the last."""
 MAX_BYTES = 1 << 34
 """An archive above this size is not fetched or opened: the largest of ETH3D have 3 GB."""
-UNPACKING, CONTENT = ".unpacking", "content"
-OF_THE_DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM)
-"""Errors that are not caused by the archive."""
 SLOWEST = 4096
 """Bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up."""
 MARGIN = 1 << 30
@@ -149,21 +144,22 @@ def unpack(archive: Path, target: Path) -> None:
     that is larger unpacked than images are, and entries without a name, that are absolute, climb out of the folder or
     are links; NoRoomError for one that does not fit on the disk.
     """
-    staging = Path(tempfile.mkdtemp(prefix=".torchslam-", suffix=UNPACKING, dir=target.parent))
+    staging = Path(tempfile.mkdtemp(prefix=".torchslam-", suffix=".unpacking", dir=target.parent))
     try:
         check_regular(archive, MAX_BYTES, "an archive that is read")
         with zipfile.ZipFile(archive) as contents:
             _check_size(archive, contents.infolist(), target)
             for entry in contents.infolist():
                 _check_entry(archive, entry)
-            contents.extractall(staging / CONTENT)
-        entries = list((staging / CONTENT).iterdir())
+            contents.extractall(staging / "content")
+        entries = list((staging / "content").iterdir())
         single = len(entries) == 1 and entries[0].is_dir()
-        (entries[0] if single else staging / CONTENT).rename(target)
+        (entries[0] if single else staging / "content").rename(target)
     except DownloadError:
         raise
     except Exception as cause:  # zipfile and the decompressors below it have no common error
-        if isinstance(cause, OSError) and cause.errno in OF_THE_DISK:
+        of_the_disk = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM)
+        if isinstance(cause, OSError) and cause.errno in of_the_disk:
             raise NoRoomError(f"{archive}: cannot be unpacked into {target}: {cause.strerror}") from cause
         why = str(cause).replace(str(staging), "") or type(cause).__name__
         raise DownloadError(f"{archive}: not a zip archive, or a damaged one: {why}") from cause
@@ -253,7 +249,7 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
         )
         with bar, part.open("ab" if resumed else "wb") as file:
             since, waited = 0, time.monotonic()
-            while chunk := response.read1(CHUNK):
+            while chunk := response.read1(1 << 20):
                 file.write(chunk)
                 bar.update(len(chunk))
                 since += len(chunk)

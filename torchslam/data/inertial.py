@@ -23,7 +23,6 @@ from torchslam.data.trajectories import ORTHOGONAL, orthogonality_error
 from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.geometry.lie import rigid, se3_inverse
 
-TIMES = ("timestamp", "time", "t", "secondselapsed", "elapsed", "seconds")
 AXES = ("x", "y", "z")
 GYROSCOPES = ("wrss", "gyro", "gyroscope", "gyr", "g", "w", "omega", "angularvelocity", "rotationrate")
 ACCELEROMETERS = ("arss", "acc", "accel", "accelerometer", "acceleration", "a", "linearacceleration")
@@ -42,7 +41,7 @@ FORCE_UNITS = {
 }
 """Units by their letters and digits, in m/s^2."""
 COLUMNS = {
-    "time": Column(TIMES, TIME_UNITS),
+    "time": Column(("timestamp", "time", "t", "secondselapsed", "elapsed", "seconds"), TIME_UNITS),
     **{f"gyro_{axis}": Column(tuple(word + axis for word in GYROSCOPES), RATE_UNITS) for axis in AXES},
     **{f"acc_{axis}": Column(tuple(word + axis for word in ACCELEROMETERS), FORCE_UNITS) for axis in AXES},
 }
@@ -62,7 +61,6 @@ DENSITIES = {
     "gyroscope_density": ("gyroscopenoisedensity", "imunoisegyro", "gyrn"),
     "accelerometer_density": ("accelerometernoisedensity", "imunoiseacc", "accn"),
 }
-TIME_SHIFT = ("timeshiftcamimu", "td")
 
 
 @dataclass(frozen=True)
@@ -181,7 +179,7 @@ def read_inertial_calibration(path: str | Path | None, imu: str | Path | None = 
         if path is not None:
             keys = list(read_keys(Path(path)))
             T_bc = _mounting(keys, Path(path))
-            offset = _first_number(keys, TIME_SHIFT) or 0.0
+            offset = _first_number(keys, ("timeshiftcamimu", "td")) or 0.0
             densities = _densities(keys)
         if imu is not None and not densities:
             folder = Path(imu) if Path(imu).is_dir() else Path(imu).parent

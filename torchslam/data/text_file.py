@@ -22,8 +22,6 @@ from torchslam.utils import files
 
 MAX_BYTES = 1 << 27
 """Size limit of text files; a million poses are smaller."""
-MAX_DIGITS = 19
-"""Maximum number of digits of an integer; nanoseconds since 1970 have 19."""
 UNIX_UNITS = {13: 10**3, 16: 10**6, 19: 10**9}
 """Parts of a second that a number with this many digits counts since 1970, from 2001 to 2286."""
 MAX_SECONDS = 1e11
@@ -31,8 +29,6 @@ MAX_SECONDS = 1e11
 MAX_LINE = 1 << 16
 """Maximum length of a line of numbers."""
 
-GPS_EPOCH = 315964800
-"""Seconds from 1970 to the beginning of GPS time, 1980-01-06 (IS-GPS-200)."""
 LEAP_SECONDS = (
     (1999, 1, 13), (2006, 1, 14), (2009, 1, 15), (2012, 7, 16), (2015, 7, 17), (2017, 1, 18),
 )  # fmt: skip
@@ -105,8 +101,8 @@ def are_numbers(words: Iterable[str]) -> bool:
 
 
 def parse_count(text: str) -> int | None:
-    """Parse a non-negative integer of at most 19 digits; None for anything else."""
-    return int(text) if text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS else None
+    """Parse a non-negative integer of at most 19 digits, as nanoseconds since 1970; None for anything else."""
+    return int(text) if text.isascii() and text.isdecimal() and len(text) <= 19 else None
 
 
 def number_rows(
@@ -167,7 +163,7 @@ def check_rising(times: Sequence[float], places: Sequence[str], error: type[Torc
 
 def utc_from_gps(seconds: float) -> float:
     """Seconds since 1970, UTC, of seconds of GPS time since 1980."""
-    unix = seconds + GPS_EPOCH
+    unix = seconds + 315964800  # the beginning of GPS time, 1980-01-06 (IS-GPS-200)
     starts = ((datetime.datetime(y, m, 1, tzinfo=datetime.UTC).timestamp(), s) for y, m, s in LEAP_SECONDS)
     return unix - max((leap for start, leap in starts if unix - leap >= start), default=0)
 
@@ -273,14 +269,8 @@ def read_table(
 ) -> Iterator[Row]:
     """Yield the rows of a table whose first line names its columns; other columns than the known ones are left out.
 
-    Args:
-        path: the file.
-        columns: kinds of columns.
-        error: what is raised.
-        needed: columns that must be there.
-        are_unique: whether two columns of one kind are an error; otherwise the first one counts.
-
-    Raises `error` for no header, an unknown one, two columns of one kind, or another number of cells.
+    Raises `error` for no header, an unknown one, one without the `needed` columns, another number of cells, and two
+    columns of one kind, unless not `are_unique`: then the first one counts.
     """
     lines = read_cells(path, error)
     where, headings = next(lines, (f"{path}:1", []))
@@ -312,15 +302,9 @@ def read_cells(
 ) -> Iterator[tuple[str, list[str]]]:
     """Yield the place and the cells of each line of a table, those of its header first.
 
-    Empty lines and comments, which begin with `#`, are left out.
-
-    Args:
-        path: the file.
-        error: what is raised.
-        limit: maximum number of bytes; None: that of `read_text`.
-        delimiter: between cells; empty: the comma, semicolon or tab of the first line, or white space.
-
-    Raises `error` for anything but a text, a quote that does not end, or another number of cells than in the header.
+    Empty lines and comments, which begin with `#`, are left out. Without `delimiter` it is the comma, semicolon or tab
+    of the first line, or white space. Raises `error` for anything but a text of at most `limit` bytes, a quote that
+    does not end, or another number of cells than in the header.
     """
     text = read_text(path, error, limit)
     first = text.lstrip().split("\n", 1)[0]

@@ -126,9 +126,6 @@ def _next(timestamps: Float[Tensor, " N"], reference: Float[Tensor, " M"]) -> In
     return torch.searchsorted(reference.contiguous(), timestamps.contiguous()).clamp(max=len(reference) - 1)
 
 
-POSES, TIMES = "poses.txt", "times.txt"
-
-
 def write_kitti(folder: Path, trajectory: Trajectory) -> None:
     """Write poses.txt and times.txt in KITTI odometry format: camera to world, one line per posed frame.
 
@@ -138,5 +135,5 @@ def write_kitti(folder: Path, trajectory: Trajectory) -> None:
     rows = trajectory.T_wc[:, :3].flatten(1).tolist()
     poses = [" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows]
     times = [f"{time!r}\n" for time in trajectory.timestamps.tolist()]
-    (folder / POSES).write_text("".join(poses), encoding="utf-8")
-    (folder / TIMES).write_text("".join(times), encoding="utf-8")
+    (folder / "poses.txt").write_text("".join(poses), encoding="utf-8")
+    (folder / "times.txt").write_text("".join(times), encoding="utf-8")

@@ -18,9 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from torchslam.data.calibration import (
-    AUTO,
     COUNTS,
-    EXIF,
     FROM_EXIF,
     PRESETS,
     UNKNOWN,
@@ -41,7 +39,6 @@ EXIF_BLOCK = 0x8769
 """Tag of the block of camera data (EXIF 2.32)."""
 FOCAL_LENGTH_35MM = 0xA405
 """Tag of the focal length of a 35 mm film camera with the same diagonal field of view, mm (EXIF 2.32)."""
-FILM_DIAGONAL = math.hypot(36.0, 24.0)  # millimeters
 
 
 def read_focal(path: Path) -> Calibration:
@@ -57,7 +54,8 @@ def read_focal(path: Path) -> Calibration:
         raise CalibrationError(
             f"{path}: no 35 mm focal length in its EXIF block; give --camera f=0.8w or fov=65 instead"
         )
-    return Calibration.guess(found / FILM_DIAGONAL, "diagonal", f"EXIF of {path.name}, {found:g} mm")
+    diagonal = math.hypot(36.0, 24.0)  # of the film, millimeters
+    return Calibration.guess(found / diagonal, "diagonal", f"EXIF of {path.name}, {found:g} mm")
 
 
 def parse_camera(text: str, size: Size, example: Path | None = None) -> Camera:
@@ -81,7 +79,7 @@ def parse_calibration(text: str, source: str = "--camera") -> Calibration:
 
     Raises CalibrationError naming `source`.
     """
-    known = {**PRESETS, EXIF: FROM_EXIF, AUTO: UNKNOWN}
+    known = {**PRESETS, "exif": FROM_EXIF, "auto": UNKNOWN}
     word = text.strip()
     if word.lower() in known:
         return known[word.lower()]
@@ -190,11 +188,7 @@ def checked(
 ) -> Calibration:
     """A calibration with a distortion model by one of its many names.
 
-    Args:
-        intrinsics: fx fy cx cy.
-
-    Raises:
-        CalibrationError: for models and coefficients that torchslam does not have.
+    `intrinsics` are fx fy cx cy. Raises CalibrationError for models and coefficients that torchslam does not have.
     """
     if _is_fisheye(distortion, "distortion", source):
         if len(coefficients) < 4 or any(coefficients[4:]):
@@ -295,10 +289,7 @@ def _with_distortion(
 ) -> Calibration:
     """A camera with the size, the model and the coefficients that its keys name.
 
-    Args:
-        intrinsics: fx fy cx cy.
-        prefix: of the keys of single coefficients.
-        model_keys: further keys of the camera's model.
+    `intrinsics` are fx fy cx cy, `prefix` is that of keys of single coefficients, `model_keys` may name the model, too.
     """
     # All keys are looked at, and are used then.
     flags = [keys.flag(key) for key in IS_FISHEYE]

@@ -31,8 +31,6 @@ SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm"})
 SEVEN_SCENES_DEPTH = "frame-*.depth.png"
 FIVE_THOUSANDTHS, MILLIMETERS = 5000.0, 1000.0
 """Units per meter, of TUM and ICL-NUIM, and of most others."""
-FAR = 65535
-"""The largest value; like 0, it marks pixels without a measurement."""
 BOUNDS_M = 0.05, 200.0
 """Meters that the middle depth of an image may have; beyond, its unit is another one. Sensors see .2 to 20 m, rendered
 scenes more."""
@@ -140,7 +138,8 @@ def read_depth(path: Path, units_per_meter: float) -> Float[np.ndarray, "H W"]:
     values = read_pixels(path, str(path), as_stored=True)
     if values.dtype != np.uint16 or values.ndim != 2:
         raise MeasurementError(f"{path}: not of 16 bits: no depth image with numbers per meter")
-    depth = np.where(values == FAR, 0, values).astype(np.float32) / np.float32(units_per_meter)
+    # Like 0, the largest value marks pixels without a measurement.
+    depth = np.where(values == 65535, 0, values).astype(np.float32) / np.float32(units_per_meter)
     known = depth[depth > 0]
     if known.size and not BOUNDS_M[0] < (middle := float(np.median(known))) < BOUNDS_M[1]:
         raise MeasurementError(

@@ -31,12 +31,8 @@ from torchslam.data.text_file import (
 )
 from torchslam.errors import FrameError, MeasurementError
 
-GPS_BLOCK = 0x8825
-"""Tag of the block of the position (EXIF 2.32)."""
 LATITUDE, LONGITUDE, ALTITUDE = 2, 4, 6
 """Tags in that block; the hemisphere, or whether it is below the sea, is the tag before each."""
-HORIZONTAL_ERROR = 31
-"""Tag of the horizontal error, meters."""
 XML_BYTES = 1 << 26
 """Size limit of GPX files; half a million points, of which the parser makes objects of ten times the size."""
 DEGREES, METERS = {"deg": 1.0, "degrees": 1.0, "°": 1.0}, {"m": 1.0, "meters": 1.0}
@@ -55,7 +51,6 @@ MAX_FIXES = 1_000_000
 """Maximum number of positions of a file: more than a day at 10 Hz."""
 MAX_ALTITUDE = 1e5
 """Meters: the farthest from the ground that a position may be; balloons and rockets of amateurs stay below."""
-OXTS_ACCURACY = 23  # the place of `pos_accuracy` in a packet (dataformat.txt)
 
 
 class Fix(NamedTuple):
@@ -393,7 +388,7 @@ def read_image_fixes(folder: Path) -> Fixes:
 
 def _image_fix(path: Path) -> Fix | None:
     try:
-        block = exif_block(path, GPS_BLOCK)
+        block = exif_block(path, 0x8825)  # of the position, EXIF 2.32
         if LATITUDE not in block or LONGITUDE not in block:
             return None
         latitude, longitude = (
@@ -401,7 +396,7 @@ def _image_fix(path: Path) -> Fix | None:
         )
         below = block.get(ALTITUDE - 1, 0) in (1, b"\x01")
         altitude = float(block.get(ALTITUDE, math.nan)) * (-1 if below else 1)
-        error = float(block.get(HORIZONTAL_ERROR, math.nan))
+        error = float(block.get(31, math.nan))  # horizontal, meters
     except FrameError as cause:
         raise MeasurementError(str(cause)) from cause
     except Exception as cause:  # values of a damaged block have any type
@@ -422,7 +417,9 @@ def _exif_degrees(parts: tuple[float, ...], hemisphere: str) -> float:
 def _oxts_rows(folder: Path) -> Iterator[Fix]:
     """On the clock of KITTI's raw images, with the accuracy that the receiver states."""
     for packet in read_oxts(folder):
-        accuracy = packet.numbers[OXTS_ACCURACY] if len(packet.numbers) > OXTS_ACCURACY else math.nan
+        accuracy = (
+            packet.numbers[23] if len(packet.numbers) > 23 else math.nan
+        )  # `pos_accuracy` (dataformat.txt)
         std = accuracy if accuracy > 0 else math.nan
         latitude, longitude, altitude = packet.numbers[:3]
         yield Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std))

@@ -27,21 +27,22 @@ from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
 TRANSFORMS = "transforms.json"
-# COLMAP, src/colmap/sensor/models.h: the numbers of the models in binary files.
-MODEL_NAMES = {
-    0: "SIMPLE_PINHOLE",
-    1: "PINHOLE",
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    5: "OPENCV_FISHEYE",
-    6: "FULL_OPENCV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-}
+MODEL_NAMES = (
+    *(
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FULL_OPENCV",
+        "FOV",
+    ),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+)
+"""By their numbers in binary files: COLMAP, src/colmap/sensor/models.h."""
 _MAX_BYTES = 1 << 30
 """Largest model that is read; a frame with 10,000 keypoints takes 240 kB of it."""
-_POINT_BYTES = 24  # of an observation in images.bin
 _ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 
 
@@ -203,7 +204,7 @@ def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
             end = data.index(b"\0", at + 64)
             (points,) = struct.unpack_from("<Q", data, end + 1)
             images.append((data[at + 64 : end].decode(), numbers))
-            at = end + 9 + _POINT_BYTES * points
+            at = end + 9 + 24 * points
     except (OSError, struct.error, ValueError, OverflowError) as cause:
         raise TrajectoryError(f"{path}: not COLMAP's images: {cause}") from cause
     return images
@@ -217,7 +218,7 @@ def _binary_camera(path: Path) -> Calibration:
         if count != 1:
             raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
         number, model, width, height = struct.unpack_from("<IiQQ", data, 8)
-        name = MODEL_NAMES.get(model, str(model))
+        name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else str(model)
         keys = COLMAP_MODELS.get(name, "").split()
         params = struct.unpack_from(f"<{len(keys)}d", data, 32)
     except (OSError, struct.error) as cause:

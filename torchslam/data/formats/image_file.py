@@ -30,7 +30,6 @@ FOREIGN = frozenset(
 )
 """Suffixes of images that are not read."""
 WIDTH, HEIGHT = 256, 257  # tags of a TIFF
-ORIENTATION = 0x0112  # tag of EXIF
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
 MAX_BYTES = 1 << 29
@@ -117,7 +116,7 @@ def is_turned(path: Path, as_stored: bool) -> bool:
                     return False
                 # Pillow would decode a PNG in search of a block after the pixels.
                 is_searched = image.format != "PNG" or "exif" in image.info
-                return is_searched and image.getexif().get(ORIENTATION, 1) != 1
+                return is_searched and image.getexif().get(0x0112, 1) != 1  # the orientation
     except Exception as cause:  # a damaged block fails in any way
         raise FrameError(f"{path}: its EXIF block cannot be read: {cause}") from cause
 
@@ -147,6 +146,10 @@ def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
     except (cv2.error, MemoryError):  # a header that promises more pixels than OpenCV takes
         return None
     return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
+
+
+SAMPLES = 20
+"""Number of images in which the brightest pixel of a 16-bit sequence is searched."""
 
 
 def bit_depth(images: Iterable[np.ndarray]) -> int:
@@ -276,10 +279,6 @@ def image_tensor(
 
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_HEADER_BYTES = (13).to_bytes(4, "big")
-"""Length of the first chunk of a PNG file, IHDR, as it stands in the file."""
-PNG_CHUNK_FRAME = 12
-"""Bytes of a chunk around its content: length, name, sum."""
 PNG_MAX_CHUNKS = 1 << 17
 """Largest number of chunks of a file: libpng writes one for 8 kB of pixels, which are at most 1 GB."""
 PNG_PLAIN_CHUNKS = frozenset({b"IHDR", b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME"})
@@ -299,7 +298,7 @@ def decode_png_gray(data: bytes) -> Shaped[np.ndarray, "H W"] | None:
     """
     header, sum_ = data[12:29], data[29:33]
     is_sound = (
-        data.startswith(PNG_SIGNATURE + PNG_HEADER_BYTES + b"IHDR")
+        data.startswith(PNG_SIGNATURE + b"\0\0\0\rIHDR")  # of 13 bytes
         and zlib.crc32(header).to_bytes(4, "big") == sum_
         and any(data[16:20])
         and any(data[20:24])
@@ -326,8 +325,8 @@ def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
     end = len(PNG_SIGNATURE)
     for _ in range(PNG_MAX_CHUNKS):
         name = data[end + 4 : end + 8]
-        end += PNG_CHUNK_FRAME + int.from_bytes(data[end : end + 4], "big")
-        yield name, end
+        end += 12 + int.from_bytes(data[end : end + 4], "big")
+        yield name, end  # around its content are its length, its name and a sum
         if name == b"IEND" or end > len(data):
             return
 

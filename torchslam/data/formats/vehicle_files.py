@@ -30,11 +30,9 @@ from torchslam.errors import MeasurementError, TorchslamError, TrajectoryError
 
 MAX_SPEED = 1000.0
 """Meters per second that a speed may be at most: airplanes fly at 250."""
-KM_H = 1 / 3.6
-"""Meters per second of a kilometer per hour."""
 COLUMNS = {
     **TIMES,
-    "speed": Column(("speed", "velocity"), {"ms": 1.0, "mps": 1.0, "kmh": KM_H, "kph": KM_H}),
+    "speed": Column(("speed", "velocity"), {"ms": 1.0, "mps": 1.0, "kmh": 1 / 3.6, "kph": 1 / 3.6}),
 }
 """Kinds of columns."""
 

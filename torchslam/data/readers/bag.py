@@ -21,7 +21,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.calibration_files import checked
-from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, gray_to_tensor
+from torchslam.data.formats.image_file import MAX_BYTES, SAMPLES, bit_depth, decode_pixels, gray_to_tensor
 from torchslam.data.sequence import Reader, Sequence
 from torchslam.data.text_file import float64
 from torchslam.errors import FrameError, SequenceError
@@ -33,15 +33,8 @@ if TYPE_CHECKING:
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 MAX_MESSAGES = 2_000_000
 """Largest number of images: more than a day at 20 Hz."""
-MAX_RECORDING, MAX_METADATA = 1 << 44, 1 << 22
-"""Bytes of a recording, and of the text that describes it."""
-MAX_FILES = 10_000
-"""Files of a recording that are looked at: six days, one each minute."""
-SAMPLES = 20
-"""Number of 16-bit images that are searched for the brightest pixel."""
 
 # https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them gray.
 GRAY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}
@@ -126,8 +119,7 @@ class BagSequence(Sequence):
             gray = self._read(self._messages[index])
         except SequenceError as error:
             raise FrameError(str(error)) from error
-        if (gray.shape[1], gray.shape[0]) != self.size:
-            raise FrameError(f"{self.image_name(index)}: has another size than the first image")
+        self._check_size(gray.shape, self.image_name(index))
         return gray_to_tensor(gray, self._bits)
 
     def image_name(self, index: int) -> str:
@@ -240,9 +232,10 @@ def _open_reader(path: Path) -> Recording:
     except ImportError:
         raise SequenceError(f"{path}: ROS bags need `pip install torchslam[bags]`") from None
     with _errors(str(path)):
-        for file in itertools.islice(path.iterdir(), MAX_FILES) if path.is_dir() else (path,):
+        # A file each minute for six days.
+        for file in itertools.islice(path.iterdir(), 10_000) if path.is_dir() else (path,):
             if not file.is_dir():
-                limit = MAX_METADATA if file.name == "metadata.yaml" else MAX_RECORDING
+                limit = 1 << 22 if file.name == "metadata.yaml" else 1 << 44
                 check_regular(file, limit, "a file of a recording")
         return Recording(path)  # a single ROS 2 file is part of a recording folder or a complete recording
 
@@ -300,7 +293,11 @@ def _open_bag(path: str, camera: GivenCamera | None, rate: float | None) -> BagS
 def _read_calibration(reader: Recording, path: str, topic: str) -> Calibration | None:
     """Read the first camera_info beside an image topic; None without one."""
     info_topic = topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-    infos = [each for each in reader.connections if each.msgtype == CAMERA_INFO and each.topic == info_topic]
+    infos = [
+        each
+        for each in reader.connections
+        if each.msgtype == "sensor_msgs/msg/CameraInfo" and each.topic == info_topic
+    ]
     is_rectified = "rect" in topic.rpartition("/")[2] or "_rect" in topic
     with _errors(path):
         for info in infos[:1]:

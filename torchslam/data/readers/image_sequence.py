@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from torchslam.data.calibration import CALIBRATION, FROM_EXIF, Calibration, GivenCamera, size_text
+from torchslam.data.calibration import CALIBRATION, FROM_EXIF, Calibration, GivenCamera
 from torchslam.data.formats.calibration_files import read_calibration, read_focal
 from torchslam.data.formats.frame_names import (
     FOLDERS,
@@ -30,6 +30,7 @@ from torchslam.data.formats.frame_names import (
 )
 from torchslam.data.formats.image_file import (
     AS_COLOR,
+    SAMPLES,
     bit_depth,
     has_transparency,
     is_turned,
@@ -45,13 +46,9 @@ from torchslam.utils.text import printable
 
 DEFAULT_RATE = 30.0
 """Frame rate of images without timestamps."""
-CALIBRATION_FILES = (CALIBRATION, "calib.txt")
 SHORTEST, LONGEST = 2e-4, 1e4
 """Seconds from image to image, beyond which times are taken to have another unit: microseconds read as nanoseconds, or
 nanoseconds since the system was started as seconds."""
-SAMPLES = 20
-"""Number of images in which the brightest pixel of a 16-bit sequence is searched."""
-WITH_ALPHA = frozenset({".png", ".webp", ".tif", ".tiff"})
 ATTEMPTS = 20
 """Number of unreadable images after which opening a sequence fails."""
 
@@ -115,13 +112,13 @@ class ImageSequence(Sequence):
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         entry = self._entries[index]
         image = read_gray(entry.path, entry.where, self._bits, self.as_stored)
-        self._check_size(entry, (image.shape[-1], image.shape[-2]))
+        self._check_size(image.shape[2:], f"{entry.where}: {entry.path}")
         return image
 
     def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         entry = self._entries[index]
         image = read_color(entry.path, entry.where, self._bits, self.as_stored)
-        self._check_size(entry, (image.shape[1], image.shape[0]))
+        self._check_size(image.shape, f"{entry.where}: {entry.path}")
         return image
 
     def image_name(self, index: int) -> str:
@@ -137,12 +134,6 @@ class ImageSequence(Sequence):
     def _root(self) -> str:
         """The folder of all images, also where it was unpacked: results must not depend on that place."""
         return os.path.commonpath({os.path.abspath(entry.path.parent) for entry in self._entries})
-
-    def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
-        if size != self.size:
-            raise FrameError(
-                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
-            )
 
 
 def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, int], int]:
@@ -174,7 +165,7 @@ def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, i
 def _are_transparent(entries: Listed[ImageEntry]) -> bool:
     """Return whether the first image that can be read has transparent pixels."""
     for entry in entries[:ATTEMPTS]:
-        if entry.path.suffix.lower() not in WITH_ALPHA:
+        if entry.path.suffix.lower() not in (".png", ".webp", ".tif", ".tiff"):
             return False
         with contextlib.suppress(FrameError):  # said when the frame is read
             return has_transparency(entry.path)
@@ -183,7 +174,7 @@ def _are_transparent(entries: Listed[ImageEntry]) -> bool:
 
 def find_calibration(path: Path) -> Calibration | None:
     """The calibration file of a folder, if it has one."""
-    for name in CALIBRATION_FILES:
+    for name in (CALIBRATION, "calib.txt"):
         if (path / name).is_file():
             return read_calibration(path / name)
     return None

@@ -27,7 +27,6 @@ from torchslam.types import Trajectory
 
 RAW_CAMERAS = ("image_00", "image_02")
 """The left cameras, gray and color; those of the odometry benchmark have one digit."""
-POSE_COLUMNS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
 EARTH_RADIUS = 6378137.0  # meters
 
 
@@ -83,7 +82,8 @@ def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     poses = next((candidate for candidate in candidates if candidate.is_file()), None)
     groundtruth = None
     if poses is not None:
-        T_w0 = float64([row for _, row in number_rows(poses, POSE_COLUMNS, TrajectoryError)]).view(-1, 3, 4)
+        columns = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
+        T_w0 = float64([row for _, row in number_rows(poses, columns, TrajectoryError)]).view(-1, 3, 4)
         if len(T_w0) != len(entries):
             raise TrajectoryError(f"{poses}: {len(T_w0)} poses for {len(entries)} times")
         times = float64([entry.timestamp for entry in entries])

@@ -133,8 +133,7 @@ class LiveSequence(Sequence):
             self._dropped += self._replaced  # what comes after the last frame that is asked for is not missed
             self._replaced = 0
         self._given = index + 1
-        if (frame.shape[1], frame.shape[0]) != self.size:
-            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
+        self._check_size(frame.shape, self.image_name(index))
         return gray_to_tensor(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
 
     def image_name(self, index: int) -> str:
@@ -142,15 +141,6 @@ class LiveSequence(Sequence):
 
     def timestamp(self, index: int) -> float:
         return self._time
-
-    def describe(self) -> dict[str, str]:
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "frames": "as they come",
-            "size": self._describe_size(),
-            "camera": self._describe_camera(),
-        }
 
     def forget_handle(self) -> None:
         never_release(self._capture)

@@ -39,8 +39,6 @@ SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
 )
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
-MAX_BYTES = 1 << 40
-"""Largest file that is read."""
 MAX_FRAMES = 2_000_000
 """Maximum number of frames: 18 hours at 30 frames per second."""
 QUIET = 2.0
@@ -51,8 +49,6 @@ MAX_ASPECT_ERROR = 0.02
 """Relative error of fy / fx of a given camera before a note reports that the file contradicts it."""
 
 
-STDERR = 2
-"""File descriptor to which FFmpeg writes its log."""
 SAMPLED = 16
 """Step of the rows that are compared with the previous frame."""
 FAILURE = re.compile(rb"(Cannot convert interlaced)|: fmt:\S+ csp:")
@@ -150,17 +146,18 @@ class Retriever:
 
 def _retrieve_with_log(capture: Capture) -> tuple[bool, np.ndarray, re.Match[bytes] | None]:
     """Retrieve a frame; also the log of a failure. Other lines go on to the error stream."""
+    stderr = 2
     with _LOCK, tempfile.TemporaryFile() as log:
         try:
-            kept = os.dup(STDERR)
+            kept = os.dup(stderr)
         except OSError:  # it is closed
             kept = os.open(os.devnull, os.O_WRONLY)
         try:
-            os.dup2(log.fileno(), STDERR)
+            os.dup2(log.fileno(), stderr)
             try:
                 decoded, image = capture.retrieve()
             finally:
-                os.dup2(kept, STDERR)
+                os.dup2(kept, stderr)
             log.seek(0)
             written = log.read()
             failure = FAILURE.search(written)
@@ -302,8 +299,7 @@ class VideoSequence(Sequence):
         frame = self._read(self._frames[index], self.image_name(index))
         if frame is None:
             raise FrameError(f"{self.image_name(index)}: cannot be decoded")
-        if (frame.shape[1], frame.shape[0]) != self.size:
-            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
+        self._check_size(frame.shape, self.image_name(index))
         return frame
 
     def _read(self, frame: int, where: str) -> np.ndarray | None:
@@ -322,11 +318,6 @@ class VideoSequence(Sequence):
         return self._retrieve(where, FrameError) if self._capture.grab() else None
 
 
-def _is_video(path: str) -> bool:
-    """Return True for a file with a video suffix."""
-    return Path(path).suffix.lower() in SUFFIXES and Path(path).is_file()
-
-
 def _open_video(
     path: str, camera: GivenCamera | None, rate: float | None, need: Need = exhaust
 ) -> VideoSequence:
@@ -341,7 +332,7 @@ def _check(path: Path) -> None:
     except UnicodeEncodeError:
         raise SequenceError(f"{path}: its name is not UTF-8, which OpenCV cannot open; rename it") from None
     try:
-        check_regular(path, MAX_BYTES, "a video that is read")
+        check_regular(path, 1 << 40, "a video that is read")
         claimed = claimed_samples(path) if path.suffix.lower() in MP4 else 0
         size = path.stat().st_size
     except OSError as cause:
@@ -364,9 +355,6 @@ def _rising(times: Iterable[float]) -> Iterator[int]:
 CONTAINERS = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 HEADER, LARGE_HEADER = 8, 16
 """Bytes of the header of a box, with a size of 32 and of 64 bits (ISO/IEC 14496-12, 4.2)."""
-DEPTH = 8  # moov, trak, mdia, minf, stbl are five
-MAX_BOXES = 1_000_000
-"""Boxes that are looked at, which bounds the time for a damaged file."""
 RUNS_AT_ONCE = 1 << 16
 """Runs of equal durations that are read at once, 8 bytes each."""
 
@@ -375,7 +363,9 @@ def claimed_samples(path: Path) -> int:
     """The most samples that a table in the file speaks of; 0 where there is none. Raises OSError."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
-        return max((_samples(file, *box) for box in _boxes(file, 0, size, [MAX_BOXES], DEPTH)), default=0)
+        # The number of boxes bounds the time for a damaged file; moov, trak, mdia, minf, stbl are five levels.
+        boxes = _boxes(file, 0, size, left=[1_000_000], depth=8)
+        return max((_samples(file, *box) for box in boxes), default=0)
 
 
 def _boxes(
@@ -383,9 +373,7 @@ def _boxes(
 ) -> Iterator[tuple[bytes, int, int]]:
     """Name, and where the content begins and ends, of every box; those in containers too.
 
-    Args:
-        left: one counter: number of boxes that may still be read
-        depth: maximum depth of nesting
+    `left` has one counter: the number of boxes that may still be read; `depth` is the maximum depth of nesting.
     """
     while start + HEADER <= end and left[0] > 0:
         left[0] -= 1
@@ -420,4 +408,9 @@ def _samples(file: BinaryIO, kind: bytes, start: int, end: int) -> int:
     return samples
 
 
-VIDEO = Reader(f"a video ({', '.join(sorted(SUFFIXES))})", _is_video, _open_video, _open_video)
+VIDEO = Reader(
+    f"a video ({', '.join(sorted(SUFFIXES))})",
+    lambda path: Path(path).suffix.lower() in SUFFIXES and Path(path).is_file(),
+    _open_video,
+    _open_video,
+)
