@@ -28,7 +28,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.cli.main import console
-from torchslam.data.synthetic.paths import poses
 from torchslam.data.synthetic.scene import (
     BUILDING_TEXEL,
     FLOOR,
@@ -41,7 +40,7 @@ from torchslam.data.synthetic.scene import (
     Y,
     Z,
 )
-from torchslam.data.synthetic.sequence import SCENES, Scene
+from torchslam.data.synthetic.sequence import SCENES, Scene, poses
 
 TOP = np.array((0.0, -HEIGHT / 2, 0.0))
 STOREY_OUTER = (6.0, 5.0)

@@ -57,7 +57,7 @@ def _settings() -> str:
 
 
 def _sections(settings: Any, prefix: str) -> Iterator[str]:
-    from torchslam.config.schema import Settings
+    from torchslam.config.schema import Allowed, Settings, descriptions
 
     rows, inner = [], []
     for each in fields(settings):
@@ -72,11 +72,10 @@ def _sections(settings: Any, prefix: str) -> Iterator[str]:
                 if value in (True, False)
                 else value
             )
-            about = each.metadata.get("about", "")
-            allowed = "true or false" if isinstance(value, bool) else str(each.metadata["allowed"])
-            allowed = (
-                "any text" if isinstance(value, str) and not each.metadata["allowed"].choices else allowed
-            )
+            about = descriptions(type(settings))[each.name]
+            limits = each.metadata.get("allowed", Allowed())
+            allowed = "true or false" if isinstance(value, bool) else str(limits)
+            allowed = "any text" if isinstance(value, str) and not limits.choices else allowed
             rows.append(f"| `{each.name}` | {about} | `{shown}` | {allowed} |")
     if rows:
         title = f"## `[{prefix}]`" if prefix else "## Outside of sections"

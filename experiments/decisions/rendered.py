@@ -14,9 +14,9 @@ from torch import Tensor
 
 from torchslam.data import Sequence
 from torchslam.data.formats.image_file import gray_to_tensor
-from torchslam.data.synthetic.paths import poses
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Painter, Rectangle, room, wall
+from torchslam.data.synthetic.sequence import poses
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.types import Trajectory
 

@@ -21,7 +21,7 @@ from torchslam.config import (
     load_config,
     to_toml,
 )
-from torchslam.config.schema import MAX_BYTES, Allowed, Settings, setting
+from torchslam.config.schema import MAX_BYTES, Allowed, Settings, descriptions, setting
 from torchslam.errors import ConfigError
 
 SECTIONS = {
@@ -53,10 +53,6 @@ def test_overrides_take_precedence_over_the_file(tmp_path: Path) -> None:
     assert (config.features.num_keypoints, config.features.kind) == (750, "opencv-orb")
 
 
-def test_an_integer_is_accepted_as_a_float() -> None:
-    assert load_config(None, ["keyframes.max_rotation_deg=20"]).keyframes.max_rotation_deg == 20.0
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [
@@ -69,20 +65,12 @@ def test_an_integer_is_accepted_as_a_float() -> None:
         ("matching.max_ratio=nan", "matching.max_ratio must be above 0 and at most 1, not nan"),
         ("matching.max_ratio=-0.5", "matching.max_ratio must be above 0 and at most 1, not -0.5"),
         (
-            "simulated.noise_px=inf",
-            "simulated.noise_px must be at least 0 and at most 10000, not inf",
-        ),
-        (
             "global_mapping.max_images=0",
             "--set global_mapping.max_images=0: global_mapping.max_images must be at least 3 and at most 1000000, "
             "not 0",
         ),
-        ("features.num_keypoints=0", "features.num_keypoints must be at least 1 and at most 8192, not 0"),
         ("features.max_image_pixels=1", "features.max_image_pixels must be 0 or at least 1024 and at most"),
-        ("simulated.depth_near=1e300", "simulated.depth_near must be above 0 and at most 1000000"),
-        ("features.num_keypoints=100000", "features.num_keypoints must be at least 1 and at most 8192"),
         ("seed=18446744073709551616", "seed must be at least 0 and at most 9223372036854775807"),
-        ("matching.max_ratio=0", "matching.max_ratio must be above 0 and at most 1, not 0"),
         pytest.param("a" + 20_000 * ".a" + "=1", "40003 characters, more than the 4096", id="too many dots"),
         pytest.param("seed=" + 3000 * "[" + 3000 * "]", "6005 characters", id="too deep"),
         pytest.param("seed=" + 1500 * "[" + 1500 * "]", "seed must be of type int", id="deep"),
@@ -127,12 +115,6 @@ def test_default_toml_is_the_default() -> None:
     assert load_config(Path(__file__).parents[2] / "configs" / "default.toml") == Config()
 
 
-def test_every_section_is_written_out() -> None:
-    text = to_toml(Config())
-    for section in fields(Config):
-        assert section.name in text
-
-
 def test_the_commented_toml_reads_back(tmp_path: Path) -> None:
     config = load_config(None, ["seed=7", "features.max_image_pixels=0", "matching.max_ratio=0.7"])
     text = to_toml(config, commented=True)
@@ -157,7 +139,7 @@ def test_every_setting_has_a_description_and_a_range(kind: type[Settings]) -> No
             assert declared.metadata["allowed"].high < math.inf, declared.name
             assert declared.default in declared.metadata["allowed"]
         if declared.type in ("int", "float", "bool", "str"):
-            assert declared.metadata["about"], declared.name
+            assert descriptions(kind)[declared.name], declared.name
 
 
 def test_a_slow_or_large_file_is_refused(tmp_path: Path) -> None:
@@ -195,10 +177,6 @@ def test_the_choices_of_settings() -> None:
     [
         (lambda: Config(scale="metric"), "^scale must be one of unit, groundtruth, not 'metric'"),
         (
-            lambda: replace(Config().global_mapping, max_images=2),
-            "^global_mapping.max_images must be at least 3",
-        ),
-        (
             lambda: replace(Config(), seed=-1),
             "^seed must be at least 0 and at most 9223372036854775807, not -1",
         ),
@@ -228,32 +206,25 @@ def test_an_invalid_value_in_python_is_rejected_by_name(build: Any, message: str
     [
         ("seed", 2**63 - 1, 2**63),
         ("features.num_keypoints", 1, 0),
-        ("simulated.points_per_view", 1, 0),
         ("simulated.depth_near", 1e-9, 0),
         ("simulated.noise_px", 0, -1e-9),
-        ("simulated.outlier_ratio", 1, 1.001),
-        ("matching.max_hamming_distance", 1e-9, 0),
         ("matching.max_cosine_distance", 2, 2.001),
-        ("matching.max_ratio", 1, 1.001),
-        ("matching.max_ratio", 1e-9, 0),
-        ("initialization.min_matches", 1, 0),
-        ("initialization.min_planar_frames", 0, -1),
-        ("keyframes.max_translation", 0, -1e-9),
-        ("keyframes.min_overlap", 1, 1.001),
         ("keyframes.max_rotation_deg", 180, 180.1),
         ("global_mapping.max_images", 3, 2),
     ],
 )
-def test_range_limits_are_inclusive_or_exclusive_as_documented(
-    key: str, accepted: float, refused: float
-) -> None:
+def test_limits_are_inclusive_or_exclusive_as_declared(key: str, accepted: float, refused: float) -> None:
     load_config(None, [f"{key}={accepted}"])
     with pytest.raises(ConfigError, match=f"{key} must be "):
         load_config(None, [f"{key}={refused}"])
 
 
-def test_an_integer_becomes_a_float_in_python_too() -> None:
-    assert repr(KeyframesConfig(max_rotation_deg=20).max_rotation_deg) == "20.0"
+def test_an_integer_becomes_a_float() -> None:
+    for keyframes in (
+        KeyframesConfig(max_rotation_deg=20),
+        load_config(None, ["keyframes.max_rotation_deg=20"]).keyframes,
+    ):
+        assert repr(keyframes.max_rotation_deg) == "20.0"
 
 
 def _valid(default: Any, allowed: Allowed) -> st.SearchStrategy[Any]:

@@ -142,12 +142,8 @@ def test_a_written_calibration_states_its_size(tmp_path: Path) -> None:
         found.camera((320, 240))
 
 
-def test_missing_file(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"nothing\.txt: cannot be read"):
-        read_calibration(tmp_path / "nothing.txt")
-
-
-def test_binary_file(tmp_path: Path) -> None:
-    (tmp_path / "calibration.txt").write_bytes(b"\x89PNG\xff\xfe\x00")
-    with pytest.raises(CalibrationError, match="cannot be read"):
-        read_calibration(tmp_path / "calibration.txt")
+def test_unreadable_files(tmp_path: Path) -> None:
+    (tmp_path / "binary.txt").write_bytes(b"\x89PNG\xff\xfe\x00")
+    for name in ("nothing.txt", "binary.txt"):
+        with pytest.raises(CalibrationError, match=rf"{name}: cannot be read"):
+            read_calibration(tmp_path / name)

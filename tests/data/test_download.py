@@ -144,24 +144,14 @@ def test_a_broken_transfer_resumes_in_the_next_call(server: Server, archive: byt
     assert server.requests[-1] == "bytes=2500-"
 
 
-def test_a_server_without_ranges_restarts_the_transfer(
-    server: Server, archive: bytes, tmp_path: Path
+@pytest.mark.parametrize("left", ["a part, of a server without ranges", "all of it", "more than the file"])
+def test_leftovers_are_resumed_used_or_discarded(
+    server: Server, archive: bytes, tmp_path: Path, left: str
 ) -> None:
     server.files["/plant_1_mono.zip"] = archive
-    server.ranges = False
-    (tmp_path / "plant_1_mono.zip.part").write_bytes(archive[:700])
-    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
-
-
-def test_a_complete_transfer_is_not_repeated(server: Server, archive: bytes, tmp_path: Path) -> None:
-    server.files["/plant_1_mono.zip"] = archive
-    (tmp_path / "plant_1_mono.zip.part").write_bytes(archive)
-    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
-
-
-def test_leftovers_longer_than_the_file_are_discarded(server: Server, archive: bytes, tmp_path: Path) -> None:
-    server.files["/plant_1_mono.zip"] = archive
-    (tmp_path / "plant_1_mono.zip.part").write_bytes(archive + b"more")
+    server.ranges = not left.startswith("a part")
+    part = {"a": archive[:700], "all": archive, "more": archive + b"more"}[left.split()[0]]
+    (tmp_path / "plant_1_mono.zip.part").write_bytes(part)
     assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
 
 
@@ -246,14 +236,11 @@ def test_archive_entries_without_a_name_are_refused(tmp_path: Path) -> None:
 def test_unknown_names(server: Server, tmp_path: Path) -> None:
     with pytest.raises(DownloadError, match="404"):
         download("eth3d/nothing", tmp_path, server.url, progress=False)
+    with pytest.raises(DownloadError, match="run the same command again"):
+        download("eth3d/plant_1", tmp_path, "http://127.0.0.1:9", progress=False)  # no server
     for name in ("plant_1", "tum/desk", "eth3d/../up", "eth3d/"):
         with pytest.raises(DownloadError, match="unknown name"):
             download(name, tmp_path, server.url, progress=False)
-
-
-def test_no_server(tmp_path: Path) -> None:
-    with pytest.raises(DownloadError, match="run the same command again"):
-        download("eth3d/plant_1", tmp_path, "http://127.0.0.1:9", progress=False)
 
 
 def test_damaged_archive_leaves_nothing(server: Server, archive: bytes, tmp_path: Path) -> None:

@@ -67,10 +67,8 @@ class Meant:
 def example(rng: random.Random) -> Files:
     """A calibration file, and what it means."""
     meant = Meant(rng)
-    write = rng.choice(
-        (_opencv, _opencv_xml, _lists, _kalibr, _orb_slam, _vins, _colmap, _transforms, _numbers)
-    )
-    name, text = write(meant)
+    programs = (_opencv, _opencv_xml, _lists, _kalibr, _orb_slam, _vins, _colmap, _transforms, _numbers)
+    name, text = rng.choice(programs)(meant)
     truth = {
         # Another size is known by the one that is stated, or by the principal point.
         "verdict": "refused" if meant.is_strange or meant.scale != 1.0 else "read",
@@ -153,10 +151,7 @@ def _lists(meant: Meant) -> tuple[str, str]:
     text = ""
     for key, value in tree.items():
         if isinstance(value, list) and meant.rng.random() < 0.5:
-            rows = [
-                "".join(f"{'- -' if i == 0 else '  -'} {number}\n" for i, number in enumerate(row))
-                for row in value
-            ]
+            rows = ["- - " + "\n  - ".join(map(str, row)) + "\n" for row in value]
             text += f"{key}:\n" + "".join(rows)
         else:
             text += f"{key}: {json.dumps(value)}\n"
@@ -203,11 +198,8 @@ def _vins(meant: Meant) -> tuple[str, str]:
     if meant.is_fisheye:
         meant.model, meant.coefficients = "pinhole", []
     model = meant.rng.choice(STRANGE_MODELS) if meant.is_strange else "PINHOLE"
-    lines = [
-        f"model_type: {model}",
-        f"image_width: {meant.made_for[0]}",
-        f"image_height: {meant.made_for[1]}",
-    ]
+    width, height = meant.made_for
+    lines = [f"model_type: {model}", f"image_width: {width}", f"image_height: {height}"]
     if meant.coefficients:
         lines += ["distortion_parameters:", *(f"   {key}: {value}" for key, value in meant.singles().items())]
     names = zip(("fx", "fy", "cx", "cy"), meant.intrinsics, strict=True)

@@ -38,34 +38,9 @@ WORDS = [
     *(b"nan", b"inf", b"-inf", b"0", b"-1", b"1", b"2", b"1e300", b"-1e300", b"1e-320", b"1e999", b"0x10"),
     *(b"1_0", b"2147483648", b"9223372036854775808", b"18446744073709551616", b"9" * 5000, b"1" + b"0" * 400),
     *("٣".encode(), "²".encode(), b"", b"\0", b"\xff\xfe", b"\xed\xb2\x80", b"\x1b[31m", b"/dev/zero"),
-    *(
-        b"..",
-        b"../../../etc/passwd",
-        b"x" * 300,
-        b"x/" * 3000,
-        b"[",
-        b"]",
-        b"{",
-        b"}",
-        b"#",
-        b",",
-        b":",
-        b"true",
-    ),
-    *(
-        b"null",
-        b'""',
-        b"[]",
-        b"[[]]",
-        b"{}",
-        b"!!binary",
-        b"&a *a",
-        b"<a>",
-        b"NaN",
-        b"\r",
-        b"\x85",
-        b"\xc2\x85",
-    ),
+    *(b"..", b"../../../etc/passwd", b"x" * 300, b"x/" * 3000, b"[", b"]", b"{", b"}", b"#", b",", b":"),
+    *(b"true", b"null", b'""', b"[]", b"[[]]", b"{}", b"!!binary", b"&a *a", b"<a>", b"NaN", b"\r", b"\x85"),
+    b"\xc2\x85",
     *("\u2028".encode(), "\u202e".encode(), b"a\0b.png", b"fisheye", b"-0.0", b"1e15", b"0.5", b"[" * 3000),
 ]
 """What may stand where a number or a name stood."""
@@ -148,11 +123,8 @@ def _change_entry(files: Mutated, name: str, rng: random.Random) -> None:
     content = files[name] if kind == "copy" else files.pop(name)
     folder, slash, last = name.rpartition("/")
     stem, dot, suffix = last.rpartition(".")
-    new = rng.choice(
-        (f"{stem}\udcff", "x" * 200, f"{stem}\n", f"\x1b[1m{stem}", f"{stem}²", f".{stem}", f"{stem}٣")
-    )
-    if f"{folder}{slash}{new}{dot}{suffix}" not in files:
-        files[f"{folder}{slash}{new}{dot}{suffix}"] = content
+    names = (f"{stem}\udcff", "x" * 200, f"{stem}\n", f"\x1b[1m{stem}", f"{stem}²", f".{stem}", f"{stem}٣")
+    files.setdefault(f"{folder}{slash}{rng.choice(names)}{dot}{suffix}", content)
 
 
 # --- bytes ---------------------------------------------------------------------------------------------------
@@ -256,32 +228,19 @@ def _change_marks(content: bytes, rng: random.Random) -> bytes:
     if not marks:
         return content
     at = rng.choice(marks)
-    return (
-        content[:at]
-        + rng.choice((b"", b",", b" ", b"\t", b":", b"]", b"[", b'"', b"\n", b"="))
-        + content[at + 1 :]
-    )
+    mark = rng.choice((b"", b",", b" ", b"\t", b":", b"]", b"[", b'"', b"\n", b"="))
+    return content[:at] + mark + content[at + 1 :]
 
 
 def _nest(content: bytes, rng: random.Random) -> bytes:
     at = rng.randrange(len(content) + 1)
     depth = rng.choice((50, 3000, 30000))
-    start, end = rng.choice(
-        ((b"[", b"]"), (b"{", b"}"), (b'{"a":', b"}"), (b"<a>", b"</a>"), (b"a.", b"a"), (b"- ", b""))
-    )
+    pairs = ((b"[", b"]"), (b"{", b"}"), (b'{"a":', b"}"), (b"<a>", b"</a>"), (b"a.", b"a"), (b"- ", b""))
+    start, end = rng.choice(pairs)
     return content[:at] + start * depth + rng.choice((b"", b"1")) + end * depth + content[at:]
 
 
-_TEXTS: list[Change] = [
-    _change_word,
-    _change_word,
-    _change_word,
-    _copy_word,
-    _change_lines,
-    _change_lines,
-    _change_marks,
-]
-_TEXTS += [_nest]
+_TEXTS: list[Change] = [*[_change_word] * 3, _copy_word, _change_lines, _change_lines, _change_marks, _nest]
 
 
 def change_json(content: bytes, rng: random.Random) -> bytes:
@@ -380,22 +339,8 @@ def change_zip(content: bytes, rng: random.Random) -> bytes:
     except Exception:  # was changed before
         return _flip(content, rng)
     kind = rng.randrange(4)
-    names = (
-        "",
-        "/",
-        "a/",
-        ".",
-        "..",
-        "../a",
-        "/a",
-        "a\\..\\b",
-        "C:a",
-        "\udcff.png",
-        "x" * 300,
-        "a//b",
-        "con\0.png",
-        "\n",
-    )
+    names = ("", "/", "a/", ".", "..", "../a", "/a", "a\\..\\b", "C:a", "a//b", "con\0.png", "\n")
+    names = (*names, "\udcff.png", "x" * 300)
     if kind == 0:
         at = rng.randrange(len(entries))
         entries[at] = (rng.choice((*names, entries[at][0] + "/a", entries[0][0])), entries[at][1])
@@ -406,9 +351,7 @@ def change_zip(content: bytes, rng: random.Random) -> bytes:
     if kind == 2:
         return _flip(packed, rng)
     if kind == 3:
-        starts = [
-            at for at in range(len(packed) - 4) if packed[at : at + 4] in (b"PK\1\2", b"PK\3\4", b"PK\5\6")
-        ]
+        starts = [found.start() for found in re.finditer(rb"PK(\x01\x02|\x03\x04|\x05\x06)", packed)]
         at = min(rng.choice(starts) + rng.randrange(4, 30), len(packed) - 2)
         return packed[:at] + struct.pack("<H", rng.choice(INTEGERS) & 0xFFFF) + packed[at + 2 :]
     return packed
@@ -488,35 +431,25 @@ def _change_column(tensors: dict[str, Any], rng: random.Random) -> None:
     elif kind == 2:
         tensors[name] = values[: rng.randrange(len(values) + 1)].clone() if values.ndim else values[None]
     elif kind == 3:
-        tensors[name] = values.to(
-            rng.choice((torch.float16, torch.float32, torch.int32, torch.int64, torch.bool))
-        )
+        types = (torch.float16, torch.float32, torch.int32, torch.int64, torch.bool)
+        tensors[name] = values.to(rng.choice(types))
     elif kind == 4:
-        tensors[name] = rng.choice(
-            (values[..., None], values.reshape(-1), values[None], values.new_zeros(0))
-        ).clone()
+        shapes = (values[..., None], values.reshape(-1), values[None], values.new_zeros(0))
+        tensors[name] = rng.choice(shapes).clone()
     elif kind == 5 and values.ndim:
         tensors[name] = torch.cat([values, values])
-    elif values.is_floating_point():
+    elif values.numel() and (
+        values.is_floating_point() or values.dtype in (torch.int64, torch.uint8, torch.bool)
+    ):
+        numbers: list[float] = [0, 1]
+        if values.dtype == torch.int64:
+            numbers = [-1, 0, 1, 2**31, 2**62, -(2**63), len(values) if values.ndim else 1]
+        elif values.dtype == torch.float64:
+            numbers = [float("nan"), float("inf"), -1.0, 0.0, 1e30, -1e30, 1e-30, 1e160, 1e300]
+        elif values.dtype == torch.float32:
+            numbers = [float("nan"), -1.0, 0.0, 1e30]
         values = values.clone()
-        whole = rng.random() < 0.4
-        target = (
-            values.view(-1)
-            if whole or not values.numel()
-            else values.view(-1)[rng.randrange(values.numel()) :][:1]
-        )
-        target.fill_(
-            rng.choice((float("nan"), float("inf"), -1.0, 0.0, 1e30, -1e30, 1e-30, 1e160, 1e300))
-            if values.dtype.itemsize > 4
-            else rng.choice((float("nan"), -1.0, 0.0, 1e30))
-            if values.dtype.itemsize > 2
-            else 0
-        )
-        tensors[name] = values
-    elif values.dtype in (torch.int64, torch.uint8, torch.bool) and values.numel():
-        values = values.clone()
-        numbers = [-1, 0, 1, 2**31, 2**62, -(2**63), len(values)] if values.dtype == torch.int64 else [0, 1]
-        whole = rng.random() < 0.3
-        target = values.view(-1) if whole else values.view(-1)[rng.randrange(values.numel()) :][:1]
+        target = values.view(-1)
+        target = target if rng.random() < 0.4 else target[rng.randrange(values.numel()) :][:1]
         target.fill_(rng.choice(numbers))
         tensors[name] = values

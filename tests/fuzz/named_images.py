@@ -52,14 +52,9 @@ def picture(seed: int) -> np.ndarray:
 
 def _counted(rng: random.Random, count: int) -> Naming:
     """A counter, with or without leading zeros, from anywhere, with steps."""
-    start, step, digits = (
-        rng.choice((0, 1, 7, 95, 998)),
-        rng.choice((1, 1, 2, 5, 10)),
-        rng.choice((1, 1, 4, 6)),
-    )
-    before = rng.choice(
-        ("", "img", "IMG_", "frame-", "left.", "cam0_", "Bild ä ", "2024-05-01_", "shot1.", "v1.2.")
-    )
+    start, step, digits = map(rng.choice, ((0, 1, 7, 95, 998), (1, 1, 2, 5, 10), (1, 1, 4, 6)))
+    starts = ("", "img", "IMG_", "frame-", "left.", "cam0_", "Bild ä ", "2024-05-01_", "shot1.", "v1.2.")
+    before = rng.choice(starts)
     after = rng.choice(("", "", "_left", "-rgb"))
     return Naming([f"{before}{start + step * index:0{digits}d}{after}" for index in range(count)])
 

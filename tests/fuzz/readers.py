@@ -32,9 +32,8 @@ from torchslam.data.formats.depth_images import find_depth_images, read_depth
 from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.formats.image_file import read_color, read_gray
-from torchslam.data.formats.imu_files import read_imu, read_inertial_calibration
-from torchslam.data.formats.speed_file import read_speeds
-from torchslam.data.inertial import InertialSamples
+from torchslam.data.formats.vehicle_files import read_speeds
+from torchslam.data.inertial import InertialSamples, read_imu, read_inertial_calibration
 from torchslam.data.sequence import Sequence
 from torchslam.dense import DepthMaps
 from torchslam.errors import CalibrationError, ConfigError, FrameError, InitializationError, ResultsError
@@ -424,7 +423,7 @@ def _image(root: Path) -> None:
 def _calibration(root: Path) -> None:
     named = [path for path in sorted(root.iterdir()) if path.name.startswith("c.")]
     calibration = read_calibration(next(iter(named), root / "c.txt"))
-    camera = calibration.camera(calibration.size or (64, 48))
+    camera = calibration.camera(calibration.size or (640, 480))
     assert bool(camera.params.isfinite().all())
     assert bool((camera.params[:2] > 0).all())
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import random
 import tempfile
 import zipfile
@@ -17,11 +16,45 @@ from PIL import Image
 from tests.data.formats.test_fix_files import GPX, MAVIC_3, MAVIC_PRO, MINI_2, NMEA, with_sums
 from tests.data.mp4 import write_mp4
 from tests.data.readers.test_bag import STAMPS, Recording
-from tests.data.readers.test_euroc import SENSOR
+from tests.data.test_camera_argument import (
+    COLMAP,
+    KALIBR,
+    LISTED,
+    NERFSTUDIO,
+    OPENCV,
+    ORB_SLAM,
+    PYYAML,
+    ROS,
+    STELLA,
+    VINS,
+)
 from tests.data.test_datasets import CAM_TO_CAM
 from tests.fuzz.mutators import Files
 from torchslam.config import Config, to_toml
 
+SENSOR = """\
+%YAML:1.0
+# Default camera sensor yaml file
+sensor_type: camera
+comment: VI-Sensor cam0 (MT9M034)
+
+# Sensor extrinsics wrt. the body-frame.
+T_BS:
+  cols: 4
+  rows: 4
+  data: [0.0, -1.0, 0.0, 0.1,
+         1.0, 0.0, 0.0, 0.2,
+        0.0, 0.0, 1.0, 0.3,
+         0.0, 0.0, 0.0, 1.0]
+
+# Camera specific definitions.
+rate_hz: 20
+resolution: [64, 48]
+camera_model: pinhole
+intrinsics: [58.6, 57.2, 31.2, 23.3] #fu, fv, cu, cv
+distortion_model: radial-tangential
+distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
+"""
 SIZE = (64, 48)
 VGA = (640, 480)
 
@@ -40,27 +73,28 @@ def pictures(names: list[str], size: tuple[int, int] = SIZE) -> Files:
     return {name: encoded(picture(index, size), Path(name).suffix) for index, name in enumerate(names)}
 
 
+def place(folder: Path, files: Files) -> Path:
+    """Write files below a folder, and return it."""
+    for name, content in files.items():
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(content)
+    return folder
+
+
 def content_of(folder: Path) -> Files:
     """The files below a folder."""
-    return {
-        str(path.relative_to(folder)): path.read_bytes()
-        for path in sorted(folder.rglob("*"))
-        if path.is_file()
-    }
+    files = (path for path in sorted(folder.rglob("*")) if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in files}
 
 
 @cache
 def images() -> dict[str, Files]:
     """An image of every kind that is read."""
     color = np.stack([picture(index) for index in range(3)], axis=-1)
-    found = {
-        suffix: encoded(picture(1), f".{suffix}") for suffix in ("png", "jpg", "bmp", "tif", "webp", "pgm")
-    }
-    found |= {
-        "ppm": encoded(color, ".ppm"),
-        "color.png": encoded(color),
-        "color.jpg": encoded(color, ".jpg"),
-    }
+    kinds = ("png", "jpg", "bmp", "tif", "webp", "pgm")
+    found = {suffix: encoded(picture(1), f".{suffix}") for suffix in kinds}
+    found |= {kind: encoded(color, "." + kind.split(".")[-1]) for kind in ("ppm", "color.png", "color.jpg")}
     found["1.png"] = bytes(cv2.imencode(".png", picture(1) // 128 * 255, [cv2.IMWRITE_PNG_BILEVEL, 1])[1])
     found["16.png"] = encoded(picture(1).astype(np.uint16) * 100)
     return {kind: {f"a.{kind}": content} for kind, content in found.items()}
@@ -83,10 +117,9 @@ def trajectory_text(poses: int) -> str:
 def euroc() -> Files:
     times = [1403636579763555584 + 50_000_000 * index for index in range(3)]
     rows = [f"{time + 1000},{index},0,0,1,0,0,0,9,9,9,9,9,9,9,9,9\n" for index, time in enumerate(times)]
+    listing = "#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\r\n" for t in times)
     return pictures([f"mav0/cam0/data/{time}.png" for time in times]) | {
-        "mav0/cam0/data.csv": (
-            "#timestamp [ns],filename\n" + "".join(f"{t},{t}.png\n" for t in times)
-        ).encode(),
+        "mav0/cam0/data.csv": listing.encode(),
         "mav0/cam0/sensor.yaml": SENSOR.encode(),
         "mav0/state_groundtruth_estimate0/data.csv": ("#timestamp\n" + "".join(rows)).encode(),
     }
@@ -105,7 +138,7 @@ def imu() -> Files:
 def kitti() -> Files:
     return pictures([f"image_0/{index:06d}.png" for index in range(3)]) | {
         "times.txt": b"0.000000e+00\n1.037430e-01\n2.074860e-01\n",
-        "calib.txt": b"P0: 70 0 31 0 0 71 23 0 0 0 1 0\nP1: 70 0 31 -8 0 71 23 0 0 0 1 0\n",
+        "calib.txt": b"P0: 70 0 31 0 0 71 23 0 0 0 1 0\nP2: 70 0 31 4.2 0 71 23 0 0 0 1 0\n",
         "poses.txt": b"1 0 0 0 0 1 0 0 0 0 1 0\n0 0 1 5 0 1 0 0 -1 0 0 0\n1 0 0 0 0 1 0 0 0 0 1 2\n",
     }
 
@@ -116,8 +149,9 @@ def kitti_raw() -> Files:
         f"drive_sync/oxts/data/{index:010d}.txt": f"{49 + index * 1e-5} 8.4 100 0.1 0 1.57 0 0 0\n".encode()
         for index in range(3)
     }
+    images = pictures([f"drive_sync/image_00/data/{index:010d}.png" for index in range(3)])
     return (
-        pictures([f"drive_sync/image_00/data/{index:010d}.png" for index in range(3)])
+        images
         | packets
         | {
             "drive_sync/image_00/timestamps.txt": times,
@@ -188,20 +222,20 @@ def masked() -> Files:
     return masks | {name: frames[name] for name in frames}
 
 
-def zipped() -> Files:
+def packed(files: Files) -> bytes:
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, content in tum().items():
-            archive.writestr(f"desk/{name}", content)
-    return {"desk.zip": buffer.getvalue()}
+        for name, content in files.items():
+            archive.writestr(name, content)
+    return buffer.getvalue()
+
+
+def zipped() -> Files:
+    return {"desk.zip": packed({f"desk/{name}": content for name, content in tum().items()})}
 
 
 def zipped_video() -> Files:
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("v.mp4", videos()["mp4"]["v.mp4"])
-        archive.writestr("__MACOSX/._v.mp4", b"x")
-    return {"v.zip": buffer.getvalue()}
+    return {"v.zip": packed({"v.mp4": videos()["mp4"]["v.mp4"], "__MACOSX/._v.mp4": b"x"})}
 
 
 @cache
@@ -236,12 +270,7 @@ def bags() -> dict[str, Files]:
 
 
 CALIBRATIONS: dict[str, Files] = {
-    "opencv.yaml": {
-        "c.yaml": b"%YAML:1.0\n---\nimage_width: 64\nimage_height: 48\ncamera_matrix: !!opencv-matrix\n   rows: 3\n"
-        b"   cols: 3\n   dt: d\n   data: [ 60., 0., 31.5, 0., 61., 23.5, 0., 0., 1. ]\n"
-        b"distortion_coefficients: !!opencv-matrix\n   rows: 1\n   cols: 5\n   dt: d\n"
-        b"   data: [ -0.1, 0.01, 0., 0., 0. ]\n"
-    },
+    "opencv.yaml": {"c.yaml": OPENCV.encode()},
     "opencv.xml": {
         "c.xml": b'<?xml version="1.0"?>\n<opencv_storage>\n<image_width>64</image_width>\n'
         b'<image_height>48</image_height>\n<camera_matrix type_id="opencv-matrix">\n<rows>3</rows>\n<cols>3</cols>\n'
@@ -249,57 +278,21 @@ CALIBRATIONS: dict[str, Files] = {
         b'<distortion_coefficients type_id="opencv-matrix"><data>-0.1 0.01 0. 0. 0.</data></distortion_coefficients>\n'
         b"</opencv_storage>\n"
     },
-    "ros.yaml": {
-        "c.yaml": b"image_width: 64\nimage_height: 48\ncamera_name: left\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
-        b"  data: [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]\ndistortion_model: plumb_bob\ndistortion_coefficients:\n"
-        b"  rows: 1\n  cols: 5\n  data: [-0.1, 0.01, 0.001, 0.002, 0]\n"
-    },
-    "kalibr.yaml": {
-        "c.yaml": b"cam0:\n  camera_model: pinhole\n  distortion_coeffs: [-0.1, 0.01, 0.001, 0.002]\n"
-        b"  distortion_model: equidistant\n  intrinsics: [60, 61, 31.5, 23.5]\n  resolution: [64, 48]\n"
-    },
+    "ros.yaml": {"c.yaml": ROS.encode()},
+    "kalibr.yaml": {"c.yaml": KALIBR.replace("radtan", "equidistant").encode()},
     "euroc.yaml": {"c.yaml": SENSOR.encode()},
-    "orb.yaml": {
-        "c.yaml": b'%YAML:1.0\nCamera.type: "KannalaBrandt8"\nCamera1.fx: 60.0\nCamera1.fy: 61.0\nCamera1.cx: 31.5\n'
-        b"Camera1.cy: 23.5\nCamera1.k1: 0.01\nCamera1.k2: 0.0\nCamera1.k3: 0\nCamera1.k4: 0\nCamera.width: 64\n"
-        b"Camera.height: 48\nCamera.fps: 20\n"
+    "orb.yaml": {"c.yaml": ORB_SLAM.replace("PinHole", "KannalaBrandt8").replace("p1", "k3").encode()},
+    "pyyaml.yaml": {"c.yaml": PYYAML.encode()},
+    "stella.yaml": {"c.yaml": STELLA.encode()},
+    "vins.yaml": {"c.yaml": VINS.encode()},
+    "lists.json": {"c.json": LISTED.encode()},
+    "colmap.txt": {"c.txt": COLMAP.encode()},
+    "transforms.json": {"c.json": NERFSTUDIO.encode()},
+    "numbers": {
+        "c.txt": b"# fx fy cx cy\n600 610 319.5 239.5\n",
+        "distortion.txt": b"-0.1 0.01 0.001 0.002\n",
     },
-    "pyyaml.yaml": {
-        "c.yaml": b"K:\n- - 60.0\n  - 0.0\n  - 31.5\n- - 0.0\n  - 61.0\n  - 23.5\n- - 0.0\n  - 0.0\n  - 1.0\n"
-        b"dist_coeff:\n- - -0.1\n  - 0.01\n  - 0.0\n  - 0.0\n  - 0.0\n"
-    },
-    "stella.yaml": {
-        "c.yaml": b'Camera:\n  model: "fisheye"\n  fx: 60.0\n  fy: 61.0\n  cx: 31.5\n  cy: 23.5\n  k1: 0.01\n'
-        b"  k2: 0.0\n  k3: 0\n  k4: 0\n  cols: 64\n  rows: 48\n"
-    },
-    "vins.yaml": {
-        "c.yaml": b"%YAML:1.0\n---\nmodel_type: PINHOLE\nimage_width: 64\nimage_height: 48\ndistortion_parameters:\n"
-        b"   k1: -0.1\n   k2: 0.01\nprojection_parameters:\n   fx: 60.0\n   fy: 61.0\n   cx: 31.5\n   cy: 23.5\n"
-    },
-    "lists.json": {
-        "c.json": b'{"camera_matrix": [[60, 0, 31.5], [0, 61, 23.5], [0, 0, 1]], "dist": [-0.1, 0.01, 0, 0]}'
-    },
-    "colmap.txt": {"c.txt": b"# Camera list\n1 OPENCV 64 48 60 61 32 24 -0.1 0.01 0.001 0.002\n"},
-    "transforms.json": {
-        "c.json": json.dumps(
-            {
-                "camera_model": "OPENCV",
-                "fl_x": 60.0,
-                "fl_y": 61.0,
-                "cx": 32.0,
-                "cy": 24.0,
-                "w": 64,
-                "h": 48,
-                "k1": -0.1,
-                "k2": 0.01,
-                "p1": 0.0,
-                "p2": 0.0,
-                "camera_angle_x": 0.9,
-            }
-        ).encode()
-    },
-    "numbers": {"c.txt": b"# fx fy cx cy\n60 61 31.5 23.5\n", "distortion.txt": b"-0.1 0.01 0.001 0.002\n"},
-    "fisheye": {"c.txt": b"fisheye 60 61 31.5 23.5 0.01 0 0 0\n"},
+    "fisheye": {"c.txt": b"fisheye 600 610 319.5 239.5 0.01 0 0 0\n"},
 }
 """Calibration files of every program whose files are read; the first of each is what is opened."""
 
@@ -331,13 +324,9 @@ FRAME_ARGUMENTS = [
     "limit=2",
 ]
 OVERRIDES = [
-    "features.num_keypoints=2000",
-    "keyframes.max_rotation_deg=12.5",
-    "seed=7",
+    *("features.num_keypoints=2000", "keyframes.max_rotation_deg=12.5", "seed=7"),
     'features.weights="a.safetensors"',
 ]
-
-
 ABSURD = [0, 1, 2, -1, 1e-300, 1e-9, 1e-3, 0.5, 1e3, 1e4, 1e6, 1e12, 1e300]
 
 
@@ -350,6 +339,4 @@ def extreme_setting(rng: random.Random) -> str:
             section = line.strip("[]") + "."
         elif line.partition(" = ")[2][0] in "0123456789":
             names.append(section + line.partition(" = ")[0])
-    name = rng.choice(names)
-    value = rng.choice(ABSURD)
-    return f"{name}={value!r}"
+    return f"{rng.choice(names)}={rng.choice(ABSURD)!r}"

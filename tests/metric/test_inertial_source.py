@@ -15,8 +15,7 @@ from torch import Tensor
 
 from tests.metric.simulated_imu import simulate
 from torchslam import SLAM, Config, open_sequence
-from torchslam.data.formats.imu_files import read_imu, read_inertial_calibration
-from torchslam.data.inertial import InertialCalibration, InertialSamples
+from torchslam.data.inertial import InertialCalibration, InertialSamples, read_imu, read_inertial_calibration
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_inverse, so3_exp, so3_log, umeyama

@@ -10,6 +10,7 @@ import pytest
 
 from torchslam.cli import arguments
 from torchslam.config import Config, MetricConfig, load_config
+from torchslam.config.schema import descriptions
 from torchslam.errors import ConfigError, MeasurementError
 from torchslam.metric import options as kinds
 from torchslam.metric.options import KINDS, Option, SourceKind, given_options, sources_of
@@ -59,8 +60,7 @@ def test_a_file_of_settings_gives_them_too(tmp_path: Path) -> None:
 
 def test_every_option_is_a_setting_with_a_description() -> None:
     for option in (option for kind in KINDS for option in kind.options):
-        field = MetricConfig.__dataclass_fields__[option.name]
-        assert field.metadata["about"]
+        assert descriptions(MetricConfig)[option.name]
 
 
 def test_a_wrong_number_of_words_is_named() -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.metric.drives import METERS_PER_UNIT, RATE, drive, sensor_odometry, view_of
-from torchslam.data.formats.speed_file import Speeds, read_speeds
+from torchslam.data.formats.vehicle_files import Speeds, read_speeds
 from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import MeasurementError, TorchslamError
 from torchslam.geometry import rigid, se3_exp, se3_inverse

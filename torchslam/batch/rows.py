@@ -12,9 +12,8 @@ from typing import Any
 
 from torchslam.config import Config
 from torchslam.config.schema import check_override_in_file
-from torchslam.data.formats.csv_tables import read_cells
 from torchslam.data.synthetic import is_synthetic
-from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, parse_number
+from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, parse_number, read_cells
 from torchslam.errors import ConfigError, SequenceError
 from torchslam.utils.console import without_credentials
 
@@ -130,8 +129,8 @@ def _free(name: str, taken: set[str]) -> str:
 
 
 def _lines(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    for number, line in numbered_lines(path, SequenceError):
-        yield f"{path}:{number}", {"sequence": line}
+    for where, line in numbered_lines(path, SequenceError):
+        yield where, {"sequence": line}
 
 
 def _cells(path: Path) -> Iterator[tuple[str, dict[str, str]]]:

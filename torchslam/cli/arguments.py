@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torchslam.config import CHOICES, Config, MetricConfig, builtin_names, load_config
+from torchslam.config.schema import descriptions
 from torchslam.errors import ConfigError
 from torchslam.metric.options import KINDS, given_options, setting_of, sources_of
 from torchslam.utils.console import say
@@ -205,7 +206,7 @@ def overrides(options: argparse.Namespace) -> list[str]:
 def add_metric(parser: argparse.ArgumentParser) -> None:
     """Add the options that give the map meters: those of `metric.options.KINDS`."""
     group = parser.add_argument_group("meters", "measurements that determine the scale; each can be repeated")
-    about = {each.name: each.metadata["about"] for each in fields(MetricConfig)}
+    about = descriptions(MetricConfig)
     for option in (option for kind in KINDS for option in kind.options):
         words = about[option.name].replace("%", "%%")
         group.add_argument(

@@ -50,19 +50,14 @@ class Config(Settings):
 
     Frozen, like its sections; `dataclasses.replace` returns a changed copy. Every way of building it raises ConfigError
     for a value that is not allowed.
+
+    Attributes:
+        seed: Seed of the random number generators; other seeds show how much results vary.
+        scale: Length unit of the map; unit: the median depth of the initial map is 1.
     """
 
-    seed: int = setting(
-        0,
-        "Seed of the random number generators; other seeds show how much results vary.",
-        low=0,
-        high=2**63 - 1,
-    )
-    scale: str = setting(
-        "unit",
-        "Length unit of the map; unit: the median depth of the initial map is 1.",
-        choices=("unit", "groundtruth"),
-    )
+    seed: int = setting(0, high=2**63 - 1)
+    scale: str = setting("unit", choices=("unit", "groundtruth"))
     camera: CameraConfig = field(default_factory=CameraConfig)
     features: FeaturesConfig = field(default_factory=FeaturesConfig)
     simulated: SimulatedConfig = field(default_factory=SimulatedConfig)

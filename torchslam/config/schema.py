@@ -1,14 +1,17 @@
 """Self-validating configuration dataclasses, read from and written to TOML.
 
-A setting declares its type, default and allowed values. Constructors, `dataclasses.replace`, TOML files and overrides
-all run the same validation. An unknown key is an error that suggests the most similar known one.
+A setting declares its type, default and allowed values; the docstring of its class describes it. Constructors,
+`dataclasses.replace`, TOML files and overrides all run the same validation. An unknown key is an error that suggests
+the most similar known one.
 """
 
 from __future__ import annotations
 
 import difflib
+import inspect
 import json
 import math
+import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
@@ -37,8 +40,8 @@ class Allowed:
     Attributes:
         low, high: inclusive range of a number.
         above: exclusive lower bound of a number.
-        also: special value outside of the range.
         choices: allowed strings; empty for any.
+        also: special value outside of the range.
         group: entry-point group whose names are allowed as well, like PACKAGE:NAME.
     """
 
@@ -69,24 +72,9 @@ class Allowed:
         return f"{also}{start} and {'finite' if self.high == math.inf else f'at most {self.high}'}"
 
 
-def setting(
-    default: Value,
-    about: str = "",
-    *,
-    low: float = 0,
-    high: float = math.inf,
-    above: float = -math.inf,
-    choices: tuple[str, ...] = (),
-    also: float | None = None,
-    group: str = "",
-) -> Value:
-    """Declare a field of a Settings class with its allowed values, see `Allowed`; non-negative without `low`.
-
-    Args:
-        about: description, for `to_toml` and the documentation.
-    """
-    allowed = Allowed(low, high, above, choices, also, group)
-    return field(default=default, metadata={"allowed": allowed, "about": about})
+def setting(default: Value, **allowed: Any) -> Value:
+    """Declare a field of a Settings class with the attributes of `Allowed`; numbers are non-negative without `low`."""
+    return field(default=default, metadata={"allowed": Allowed(**allowed)})
 
 
 @dataclass(frozen=True)
@@ -109,6 +97,13 @@ class Settings:
             object.__setattr__(self, name, value)
 
 
+def descriptions(kind: type[Settings]) -> dict[str, str]:
+    """Return the description of each setting of a section by name, from the docstring of its class."""
+    _, _, listed = inspect.cleandoc(kind.__doc__ or "").partition("Attributes:\n")
+    found = re.findall(r"^    (\w+): (.*(?:\n     .*)*)", listed, re.MULTILINE)
+    return {name: re.sub(r"\n +", " ", words) for name, words in found}
+
+
 def choices(kind: type[Settings]) -> dict[str, tuple[str, ...]]:
     """Return the allowed strings of every setting that has a fixed set of them, by full name."""
     return {name: allowed.choices for name, allowed in _everything(kind) if allowed.choices}
@@ -126,8 +121,7 @@ def merge_settings(config: Section, path: Path | str | None = None, overrides: I
     if path is not None:
         values = _read_toml(Path(path))
         config = _merge(config, values, str(path), type(config))
-        given = {name for change, _ in changes for name, _ in _leaves(change)}
-        _refuse_code(type(config), values, str(path), given)
+        _refuse_code(type(config), values, str(path), [change for change, _ in changes])
     for change, source in changes:
         config = _merge(config, change, source, type(config))
     return config
@@ -142,14 +136,18 @@ def check_override_in_file(kind: type[Settings], override: str, where: str) -> N
         values = _parse_override(override)
     except ConfigError:
         return
-    _refuse_code(kind, values, where, set())
+    _refuse_code(kind, values, where)
 
 
-def _refuse_code(kind: type[Settings], values: Mapping[str, Any], where: str, given: set[str]) -> None:
-    groups = {name: allowed.group for name, allowed in _everything(kind) if allowed.group}
-    for name, value in _leaves(values):
-        group = groups.get(name)
-        if group and name not in given and isinstance(value, str) and is_code_of_others(group, value):
+def _refuse_code(
+    kind: type[Settings], values: Mapping[str, Any], where: str, changes: Iterable[Mapping[str, Any]] = ()
+) -> None:
+    """Raise ConfigError for a value that imports code, unless one of the later changes replaces it."""
+    for name, allowed in _everything(kind):
+        value = _value(values, name)
+        if not allowed.group or not isinstance(value, str) or not is_code_of_others(allowed.group, value):
+            continue
+        if all(_value(change, name) is None for change in changes):
             package = value.partition(":")[0]
             raise ConfigError(
                 f"{where}: {name} = {_shown(value)} imports code, which a file may not do unasked: "
@@ -158,34 +156,31 @@ def _refuse_code(kind: type[Settings], values: Mapping[str, Any], where: str, gi
             )
 
 
-def _leaves(values: Mapping[str, Any]) -> Iterator[tuple[str, Any]]:
-    """Yield full name and value of each setting in tables of tables, however deep."""
-    pending = [("", values)]
-    while pending:
-        prefix, table = pending.pop()
-        for key, value in table.items():
-            if isinstance(value, Mapping):
-                pending.append((f"{prefix}{key}.", value))
-            else:
-                yield prefix + key, value
+def _value(values: Mapping[str, Any], name: str) -> Any:
+    """Return the value of `section.key` in a table of tables; None without one."""
+    found: Any = values
+    for part in name.split("."):
+        found = found.get(part) if isinstance(found, Mapping) else None
+    return found
 
 
 def to_toml(config: Settings, commented: bool = False) -> str:
     """Return the configuration as TOML with all values; `commented`: with description, range and default of each."""
     lines, inner = list[str](), list[str]()
+    about = descriptions(type(config)) if commented else {}
     for declared in fields(config):
         value = getattr(config, declared.name)
         if isinstance(value, Settings):
             words = (type(value).__doc__ or "").strip().splitlines()[:1] if commented else []
             # A dataclass without a docstring has its signature in place of one.
-            about = [f"# {line.strip()}" for line in words if "(" not in line]
-            inner += ["", *about, f"[{declared.name}]", to_toml(value, commented).rstrip("\n")]
+            title = [f"# {line.strip()}" for line in words if "(" not in line]
+            inner += ["", *title, f"[{declared.name}]", to_toml(value, commented).rstrip("\n")]
             continue
         if commented:
             allowed = declared.metadata.get("allowed", Allowed())
             is_free = isinstance(value, bool) or (isinstance(value, str) and not allowed.choices)
             limits = "" if is_free else f"{allowed}; "
-            lines.append(f"# {declared.metadata.get('about', '')}")
+            lines.append(f"# {about.get(declared.name, '')}")
             lines.append(f"#   {limits}default {_toml_value(declared.default)}")
         lines.append(f"{declared.name} = {_toml_value(value)}")
     return "\n".join(lines + inner) + "\n"
@@ -234,22 +229,14 @@ def _short(text: str) -> str:
 
 
 def _toml_value(value: object) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, str):
-        # JSON leaves this character as it is, TOML forbids it.
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    return repr(value)
+    # JSON leaves this character as it is, TOML forbids it.
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
         text = read_text(path, MAX_BYTES, "a configuration")
-        longest = max(map(len, text.splitlines()), default=0)
-        if longest > MAX_LINE:
-            raise ConfigError(
-                f"{path}: a line of {longest} characters, more than the {MAX_LINE} that are read"
-            )
+        _check_lines(text, str(path), "a line of ")
         return tomllib.loads(text)
     except FileNotFoundError:
         raise ConfigError(f"configuration file {path} does not exist") from None
@@ -259,16 +246,19 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise ConfigError(f"{path} is not valid TOML: {error}") from None
 
 
+def _check_lines(text: str, where: str, what: str = "") -> None:
+    longest = max(map(len, text.splitlines()), default=0)
+    if longest > MAX_LINE:
+        raise ConfigError(f"{where}: {what}{longest} characters, more than the {MAX_LINE} that are read")
+
+
 def _parse_override(text: str) -> dict[str, Any]:
     key, separator, value = text.partition("=")
     if not separator or not key.strip():
         raise ConfigError(
             f"--set {_shown(text)}: write it as section.key=value, for example --set features.num_keypoints=2000"
         )
-    if len(text) > MAX_LINE:
-        raise ConfigError(
-            f"--set {_short(text)}: {len(text)} characters, more than the {MAX_LINE} that are read"
-        )
+    _check_lines(text, f"--set {_short(text)}")
     parsed: Any
     try:
         parsed = tomllib.loads(f"value = {value}")["value"]
@@ -299,8 +289,6 @@ def _merge(config: Section, values: Mapping[str, Any], source: str, root: type[S
 
 def _suggestion(name: str, root: type[Settings]) -> str:
     known = [known for known, _ in _everything(root)]
-    nearest = (
-        difflib.get_close_matches(name, known, n=1, cutoff=0.5)
-        or [k for k in known if k.endswith("." + name)][:1]
-    )
+    ending = [each for each in known if each.endswith(f".{name}")]
+    nearest = difflib.get_close_matches(name, known, n=1, cutoff=0.5) or ending
     return f"; did you mean {nearest[0]!r}?" if nearest else f"; known are {', '.join(known)}"

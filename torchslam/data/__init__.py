@@ -1,8 +1,7 @@
 """Sequences in: folders of datasets and of images, videos, recordings, live cameras, rendered scenes."""
 
 from torchslam.data.calibration import Calibration
-from torchslam.data.camera_argument import parse_camera
-from torchslam.data.formats.calibration_files import read_calibration
+from torchslam.data.formats.calibration_files import parse_camera, read_calibration
 from torchslam.data.opening import open_sequence
 from torchslam.data.sequence import Calibrated, EndOfSequence, Sequence
 from torchslam.data.trajectories import read_trajectory, write_trajectory

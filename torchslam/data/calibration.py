@@ -7,9 +7,7 @@ import re
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import torch
-
-from torchslam.data.text_file import numbered_lines, parse_floats
+from torchslam.data.text_file import float64, numbered_lines, parse_floats
 from torchslam.errors import CalibrationError, ResultsError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.distortion import MODELS
@@ -18,9 +16,7 @@ from torchslam.utils.files import write_whole
 COUNTS = {"pinhole": (4,), "radial_tangential": (8, 9), "rational": (12,), "fisheye": (8,)}
 """Numbers of parameters that a text may have, by camera model."""
 NUMBERS = "fx fy cx cy [k1 k2 p1 p2 [k3 [k4 k5 k6]]], or `fisheye` and fx fy cx cy k1 k2 k3 k4"
-
 Size = tuple[int, int]
-
 MAX_OFF_CENTER = 0.08
 """Largest distance of the principal point from the middle, in longer sides of the image, without a stated size.
 
@@ -113,7 +109,7 @@ class Calibration:
             self._check_center(size)
         for each in (self, *self.others):
             if each.size in (None, size):
-                return Camera(each.model, torch.tensor(each.params, dtype=torch.float64, device="cpu"), size)
+                return Camera(each.model, float64(each.params), size)
         sizes = " or ".join(size_text(each.size) for each in (self, *self.others) if each.size)
         raise CalibrationError(
             f"{self.source}: the camera is for images of {sizes}, these are {size_text(size)}"
@@ -133,10 +129,7 @@ class Calibration:
         )
 
 
-AUTO = "auto"
-EXIF = "exif"
-
-UNKNOWN = Calibration.guess(0.85, "w", AUTO)
+UNKNOWN = Calibration.guess(0.85, "w", "auto")
 """An unknown camera; the focal lengths of phones and webcams are 0.7 to 1 image widths."""
 FROM_EXIF = Calibration("pinhole", (), "--camera exif", guessed=True)
 """The focal length is in the EXIF block of the first image."""
@@ -168,14 +161,21 @@ def read_numbers(path: Path) -> Calibration:
 
     Raises CalibrationError naming file and line.
     """
-    number, line = _first_line(path)
-    size, std = _stated(path)
-    calibration = replace(parse_numbers(line, f"{path}:{number}"), size=size, std=std)
+    where, line = _first_line(path)
+    calibration = parse_numbers(line, where)
+    if is_found(path):  # with what `write_calibration` states
+        text = path.read_text(encoding="utf-8")
+        size = re.search(rf"^# {IMAGE_SIZE}: (\d{{1,9}})x(\d{{1,9}})$", text, re.MULTILINE)
+        std = re.search(rf"^# {FOCAL_STD}: ([0-9.e+-]+)$", text, re.MULTILINE)
+        calibration = replace(
+            calibration,
+            size=None if size is None else (int(size[1]), int(size[2])),
+            std=None if std is None else float(std[1]),
+        )
     distortion = path.with_name("distortion.txt")
     if len(calibration.params) > 4 or path == distortion or not distortion.is_file():
         return calibration
-    number, line = _first_line(distortion)
-    where = f"{distortion}:{number}"
+    where, line = _first_line(distortion)
     numbers = parse_floats(line, where, CalibrationError)
     if len(numbers) not in (4, 5, 8):
         raise CalibrationError(f"{where}: expected k1 k2 p1 p2 [k3 [k4 k5 k6]], got {len(numbers)} numbers")
@@ -183,19 +183,9 @@ def read_numbers(path: Path) -> Calibration:
     return replace(whole, size=calibration.size, std=calibration.std)
 
 
-def _stated(path: Path) -> tuple[Size | None, float | None]:
-    """The image size and the relative standard deviation that `write_calibration` wrote; None without."""
-    if not is_found(path):
-        return None, None
-    text = path.read_text(encoding="utf-8")
-    size = re.search(rf"^# {IMAGE_SIZE}: (\d{{1,9}})x(\d{{1,9}})$", text, re.MULTILINE)
-    std = re.search(rf"^# {FOCAL_STD}: ([0-9.e+-]+)$", text, re.MULTILINE)
-    return None if size is None else (int(size[1]), int(size[2])), None if std is None else float(std[1])
-
-
-def _first_line(path: Path) -> tuple[int, str]:
-    for number, line in numbered_lines(path, CalibrationError):
-        return number, line
+def _first_line(path: Path) -> tuple[str, str]:
+    for where, line in numbered_lines(path, CalibrationError):
+        return where, line
     raise CalibrationError(f"{path}: no numbers; expected {NUMBERS}")
 
 
@@ -263,22 +253,14 @@ def check_replaceable(path: Path) -> None:
 
 
 def write_calibration(path: Path, camera: Camera, remarks: list[str], std: float | None = None) -> None:
-    """Write an estimated camera as a calibration file, with remarks as comments.
+    """Write an estimated camera as a calibration file, with remarks as comments, one line each.
 
-    Args:
-        path: the file.
-        camera: the camera.
-        remarks: comments, one line each.
-        std: relative standard deviation of the focal length, if known.
+    `std` is the relative standard deviation of the focal length, if known.
     """
-    stated = [f"{IMAGE_SIZE}: {size_text(camera.size)}"]
+    stated = [*remarks, f"{IMAGE_SIZE}: {size_text(camera.size)}"]
     stated += [] if std is None else [f"{FOCAL_STD}: {std:.2g}"]
-    model = "" if camera.model != "fisheye" else "fisheye "
-    numbers = " ".join(f"{number:.9g}" for number in camera.params.tolist())
-    lines = [
-        ESTIMATED_HEADER,
-        *(f"# {remark}" for remark in (*remarks, *stated)),
-        " ".join(("# fx fy cx cy", *MODELS[camera.model].coefficients)),
-        model + numbers,
-    ]
+    stated += [" ".join(("fx fy cx cy", *MODELS[camera.model].coefficients))]
+    model = ["fisheye"] if camera.model == "fisheye" else []
+    numbers = " ".join([*model, *(f"{number:.9g}" for number in camera.params.tolist())])
+    lines = [ESTIMATED_HEADER, *(f"# {remark}" for remark in stated), numbers]
     write_whole(path, ("\n".join(lines) + "\n").encode())

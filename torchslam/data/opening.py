@@ -12,21 +12,20 @@ from collections.abc import Callable
 from pathlib import Path
 
 from torchslam.data.calibration import GivenCamera
-from torchslam.data.camera_argument import parse_calibration
 from torchslam.data.download import unpack
+from torchslam.data.formats.calibration_files import parse_calibration
 from torchslam.data.formats.frame_names import FOLDERS, folder_kind, is_pattern, other_kind, subfolder
 from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
 from torchslam.data.readers import bag, video
 from torchslam.data.readers.bag import BAG
-from torchslam.data.readers.euroc import EUROC
+from torchslam.data.readers.datasets import EUROC, ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
 from torchslam.data.readers.image_sequence import FOLDER
 from torchslam.data.readers.kitti import KITTI, KITTI_RAW
 from torchslam.data.readers.live import LIVE, is_address, is_live
-from torchslam.data.readers.rgbd import ICL_NUIM, SEVEN_SCENES, TARTANAIR, TUM
 from torchslam.data.readers.video import VIDEO
 from torchslam.data.sequence import Need, Reader, Sequence, exhaust
 from torchslam.data.synthetic.sequence import SYNTHETIC, is_synthetic
-from torchslam.data.transforms import Masked, cut, need, reduce_rate, resize
+from torchslam.data.transforms import Masked, Selection, resize
 from torchslam.errors import DownloadError, SequenceError, TorchslamError
 from torchslam.utils.console import without_credentials
 
@@ -69,21 +68,18 @@ def open_sequence(
     """
     if fps is not None and not 0 < fps < math.inf:
         raise SequenceError(f"{path}: frames per second must be positive, not {fps:g}")
+    selection = Selection(start, stop, fps, limit, stride)
     given = parse_calibration(str(camera)) if isinstance(camera, str | Path) else camera
     try:
-        most = None if limit is None else limit * stride
         # A folder of masks may be matched by the number of all frames.
         is_whole = mask is not None and Path(mask).is_dir()
-        sequence = _open(str(path), given, fps, exhaust if is_whole else need(start, stop, fps, most))
+        need: Need = exhaust if is_whole else lambda times: exhaust(selection.indices(times))
+        sequence = _open(str(path), given, fps, need)
         if mask is not None:
             sequence = Masked(sequence, mask)
     except OSError as cause:  # an unreadable folder, or a name that is too long
         raise SequenceError(f"{cause.filename or path}: cannot be read: {cause.strerror or cause}") from cause
-    sequence = cut(sequence, start, stop)
-    if fps is not None:
-        sequence = reduce_rate(sequence, fps)
-    if limit is not None or stride != 1:
-        sequence = sequence.part(stop=None if limit is None else limit * stride, stride=stride)
+    sequence = selection.of(sequence)
     return sequence if resize_to is None else resize(sequence, resize_to)
 
 
@@ -111,15 +107,12 @@ def _open(path: str, camera: GivenCamera | None, rate: float | None, needed: Nee
     return reader.open(path, camera, rate)
 
 
-OpenFolder = Callable[[str], Sequence]
-
-
 def _is_archive(path: str) -> bool:
     """True for a file with the suffix of a zip archive."""
     return Path(path).suffix.lower() == ".zip" and Path(path).is_file()
 
 
-def _open_archive(path: str, open_folder: OpenFolder) -> Sequence:
+def _open_archive(path: str, open_folder: Callable[[str], Sequence]) -> Sequence:
     """Open the sequence in an archive with `open_folder`.
 
     Raises SequenceError for an archive that is damaged, unsafe or too large for the disk.
@@ -154,19 +147,16 @@ def _only_sequence(archive: Path, folder: Path) -> str:
     found = [entry for entry in inside if find_reader(str(entry))]
     if len(found) == 1:
         return str(found[0])
+    packed = [entry for entry in inside if entry.suffix.lower() == ".zip"]
+    names = ", ".join([entry.name for entry in found or packed][:SHOWN])
     if found:
-        names = ", ".join(entry.name for entry in found[:SHOWN])
-        raise SequenceError(
-            f"{archive}: holds {len(found)} sequences ({names}{', ...' * (len(found) > SHOWN)}); "
-            "unpack it and open one of them"
-        )
-    packed = [entry.name for entry in inside if entry.suffix.lower() == ".zip"]
-    if packed:
-        raise SequenceError(
-            f"{archive}: holds archives ({', '.join(packed[:SHOWN])}); unpack it and open one"
-        )
-    suffixes = ", ".join(sorted(SUFFIXES))
-    raise SequenceError(f"{archive}: no images ({suffixes}), no video and no other sequence in it")
+        more = ", ..." * (len(found) > SHOWN)
+        what = f"holds {len(found)} sequences ({names}{more}); unpack it and open one of them"
+    elif packed:
+        what = f"holds archives ({names}); unpack it and open one"
+    else:
+        what = f"no images ({', '.join(sorted(SUFFIXES))}), no video and no other sequence in it"
+    raise SequenceError(f"{archive}: {what}")
 
 
 MAX_ENTRIES = 10_000
@@ -191,9 +181,8 @@ def _not_found_message(path: str) -> str:
     if foreign and (target.exists() or is_pattern(path)):
         return f"{path}: {foreign}"
     if not target.exists():
-        near = difflib.get_close_matches(
-            target.name, [each.name for each in _entries(target.parent)], n=1, cutoff=0.6
-        )
+        names = [each.name for each in _entries(target.parent)]
+        near = difflib.get_close_matches(target.name, names, n=1, cutoff=0.6)
         return f"{path}: does not exist" + _meant([target.parent / name for name in near])
     suffixes = ", ".join(sorted(video.SUFFIXES | bag.SUFFIXES | {".zip"}))
     return f"{path}: a file that is neither a video nor a recording ({suffixes})" + _meant(_around(target))
@@ -201,52 +190,40 @@ def _not_found_message(path: str) -> str:
 
 def _why_no_folder(folder: Path) -> str:
     entries = _entries(folder)
-    kinds = Counter(
-        other_kind(entry) or folder_kind(folder) or "images"
-        for entry in entries
-        if entry.is_file() and entry.suffix.lower() in SUFFIXES | FOREIGN
-    )
-    inner = [entry for entry in entries if entry.is_dir() and not entry.name.startswith(".")][:MAX_FOLDERS]
-    below = [entry for entry in inner if find_reader(str(entry))]
-    files = [entry for entry in entries if entry.is_file() and find_reader(str(entry))]
-    files += [entry for entry in entries if _is_archive(str(entry))]
-    unread = Counter(
-        other_kind(entry)
-        for name in FOLDERS
-        for entry in _entries(folder / name)
-        if entry.suffix.lower() in FOREIGN
-    )
-    kinds = kinds or Counter({f"{kind} below": count for kind, count in unread.items()})
-    looked = "; ".join(reader.looks_for for reader in READERS[2:])
+    files = [entry for entry in entries if entry.is_file()]
+    folders = [entry for entry in entries if entry.is_dir() and not entry.name.startswith(".")][:MAX_FOLDERS]
+    images = [file for file in files if file.suffix.lower() in SUFFIXES | FOREIGN]
+    below = [entry for entry in folders if find_reader(str(entry))]
+    readable = [file for file in files if find_reader(str(file)) or _is_archive(str(file))]
+    kinds = Counter(other_kind(file) or folder_kind(folder) or "images" for file in images)
+    inner = [file for name in FOLDERS for file in _entries(folder / name) if file.suffix.lower() in FOREIGN]
+    kinds = kinds or Counter(f"{other_kind(file)} below" for file in inner)
     if kinds:
-        wrong = (
-            f"there are no frames, only {' and '.join(f'{count} {kind}' for kind, count in kinds.items())}"
-        )
+        counts = " and ".join(f"{count} {kind}" for kind, count in kinds.items())
+        wrong = f"there are no frames, only {counts}"
     elif below:
         wrong = f"no sequence, but {len(below)} folder{'s' if len(below) > 1 else ''} with one"
     elif not entries:
         wrong = "no images: the folder is empty"
     else:
+        looked = "; ".join(reader.looks_for for reader in READERS[2:])
         wrong = f"no images ({', '.join(sorted(SUFFIXES))}) and no other sequence; looked for {looked}"
-    frames_beside = [] if below or files or not kinds else _around(folder)
-    return f"{folder}: {wrong}" + _meant(below or files or frames_beside)
+    return f"{folder}: {wrong}" + _meant(below or readable or (_around(folder) if kinds else []))
 
 
 def _around(path: Path) -> list[Path]:
     """Return the sequence to which a file or a part of a dataset belongs."""
-    sibling = subfolder(path.parent)
     if find_reader(str(path.parent)):
         return [path.parent]
-    return [sibling] if sibling is not None else []
+    sibling = subfolder(path.parent)
+    return [] if sibling is None else [sibling]
 
 
 def _meant(proposals: list[Path]) -> str:
     """Return `; did you mean A?`, `; which of A, B or C?` or an empty string."""
     shown = [str(proposal) for proposal in sorted(proposals)[:SHOWN]]
-    if not shown:
-        return ""
-    if len(shown) == 1:
-        return f"; did you mean {shown[0]}?"
+    if len(shown) < 2:
+        return f"; did you mean {shown[0]}?" if shown else ""
     more = f" ... ({len(proposals)} in all)" if len(proposals) > SHOWN else ""
     return f"; which of {', '.join(shown[:-1])} or {shown[-1]}{more}?"
 

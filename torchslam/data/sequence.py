@@ -15,14 +15,12 @@ from torch import Tensor
 
 from torchslam.data.calibration import UNKNOWN, Calibration, GivenCamera, size_text
 from torchslam.data.trajectories import interpolate_poses
-from torchslam.errors import CalibrationError, SequenceError
+from torchslam.errors import CalibrationError, FrameError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.types import Features, Frame, Trajectory
 from torchslam.utils.console import printable, without_credentials
 
-MAX_ASPECT_TERM = 100
-"""Largest number in the ratio of the sides of a pixel, as it is shown."""
 Need = Callable[[Iterable[float]], None]
 """Takes the times of frames as they are found, as far as they are needed."""
 
@@ -89,7 +87,7 @@ class Sequence(ABC):
         """
         self.name = printable(without_credentials(name))
         self.kind = printable(kind)
-        known = camera.size if size is None and camera is not None else size
+        known = size or (None if camera is None else camera.size)
         if known is None:
             raise ValueError("a sequence without a camera needs the size of its images")
         self.size = known
@@ -134,6 +132,12 @@ class Sequence(ABC):
     def camera(self, camera: Camera) -> None:
         """Another camera, or an estimated one. Raises CalibrationError for another size than the images have."""
         self._camera, self.calibrated, self.camera_std = self._checked(camera), Calibrated.GIVEN, None
+
+    def _check_size(self, shape: tuple[int, ...], where: str) -> None:
+        """Raise FrameError for an image of the shape (H, W, ...) that has another size than the others."""
+        if shape[1::-1] != self.size:
+            sizes = f"{size_text((shape[1], shape[0]))}, the others are {size_text(self.size)}"
+            raise FrameError(f"{where} is {sizes}")
 
     def _checked(self, camera: Camera) -> Camera:
         if camera.size != self.size:
@@ -275,21 +279,19 @@ class Sequence(ABC):
 
     def describe(self) -> dict[str, str]:
         """Return the rows that `torchslam info` prints."""
+        about = {"name": self.name, "kind": self.kind}
+        seen = {"size": self._describe_size(), "camera": self._describe_camera()}
+        if self.is_live:
+            return about | {"frames": "as they come"} | seen
         duration = float(self.timestamps[-1] - self.timestamps[0])
         truth = "none"
         if self.groundtruth is not None:
             length = float(self.groundtruth.positions_w.diff(dim=0).norm(dim=-1).sum())
             with_pose = int(self._has_pose.sum())
             truth = f"{len(self.groundtruth)} poses, {length:.2f} m, for {with_pose} of {len(self)} frames"
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "frames": str(len(self)),
-            "size": self._describe_size(),
-            "rate": f"{self.frame_rate:.2f} Hz over {duration:.2f} s",
-            "camera": self._describe_camera(),
-            "ground truth": truth,
-        }
+        rate = f"{self.frame_rate:.2f} Hz over {duration:.2f} s"
+        frames = {"frames": str(len(self)), "size": seen["size"], "rate": rate}
+        return about | frames | seen | {"ground truth": truth}
 
     def _describe_size(self) -> str:
         aspect = aspect_text(self.pixel_aspect)
@@ -317,8 +319,7 @@ class Transformed(Sequence):
     """Base class of transformed sequences: passes everything on that a subclass does not override.
 
     Args:
-        whole: the original sequence.
-        indices: its selected frames; None: all.
+        indices: the selected frames of the whole; None: all.
         camera, size: for images of another size; `size` alone if there is no camera.
         notes: additional notes.
         groundtruth: replacement of the ground truth; subclasses then override `pose`.
@@ -334,16 +335,17 @@ class Transformed(Sequence):
         notes: Iterable[str] = (),
         groundtruth: Trajectory | None = None,
     ) -> None:
+        width, height = size or whole.size
         super().__init__(
             whole.name,
             whole.kind,
             whole._camera if camera is None else camera,
             whole.timestamps if indices is None else whole.timestamps[list(indices)],
             whole.groundtruth if groundtruth is None else groundtruth,
-            size=size or whole.size,
+            size=(width, height),
             guessed=whole.calibrated is Calibrated.GUESSED,
             notes=(*whole.notes, *notes),
-            pixel_aspect=_resized_aspect(whole, size),
+            pixel_aspect=whole.pixel_aspect * (whole.size[0] / width) / (whole.size[1] / height),
         )
         self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
         self.counted_until, self.measurements = whole.counted_until, whole.measurements
@@ -397,22 +399,13 @@ class Transformed(Sequence):
     def pose(self, index: int) -> Float[Tensor, "4 4"] | None:
         return self._whole.pose(self._at(index))
 
-    def describe(self) -> dict[str, str]:
-        return super().describe() if len(self.timestamps) else self._whole.describe()
-
     def _at(self, index: int) -> int:
         return index if self._indices is None else self._indices[index]
 
 
-def _resized_aspect(whole: Sequence, size: tuple[int, int] | None) -> float:
-    """Width to height of a pixel after images are resized."""
-    width, height = size or whole.size
-    return whole.pixel_aspect * (whole.size[0] / width) / (whole.size[1] / height)
-
-
 def aspect_text(aspect: float) -> str:
     """`16:15`, for pixels that are a little wider than high."""
-    ratio = Fraction(aspect).limit_denominator(MAX_ASPECT_TERM)
+    ratio = Fraction(aspect).limit_denominator(100)
     return f"{ratio.numerator}:{ratio.denominator}"
 
 

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.data.text_file import check_later, in_seconds, number_rows
+from torchslam.data.text_file import check_rising, float64, in_seconds, number_rows
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matrix, rigid, se3_interpolate
 from torchslam.types import Trajectory
@@ -29,45 +29,41 @@ def read_trajectory(path: str | Path) -> Trajectory:
     Raises TrajectoryError naming file and line: a missing or empty file, not eight finite numbers, a
     quaternion far from unit length, timestamps out of order or doubled.
     """
-    places: list[str] = []
-    rows: list[list[float]] = []
-    for where, row in number_rows(path, COLUMNS, TrajectoryError):
-        row[0] = in_seconds(row[0], where, TrajectoryError)
-        if rows:
-            check_later(row[0], rows[-1][0], where, TrajectoryError)
-        places.append(where)
-        rows.append(row)
-    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
-    return Trajectory(table[:, 0].contiguous(), poses_from_rows(table[:, 1:], places))
+    places, rows = zip(*number_rows(path, COLUMNS, TrajectoryError), strict=True)
+    times = [in_seconds(row[0], where, TrajectoryError) for where, row in zip(places, rows, strict=True)]
+    check_rising(times, places, TrajectoryError)
+    return Trajectory(float64(times), poses_from_rows(float64(rows)[:, 1:], places))
 
 
 def poses_from_rows(rows: Float[Tensor, "N 7"], places: Sequence[str]) -> Float[Tensor, "N 4 4"]:
     """Convert rows `tx ty tz qx qy qz qw` to poses.
 
-    Raises TrajectoryError, at the place of the row, for a quaternion far from unit length or a position beyond
-    `FARTHEST`.
+    Raises TrajectoryError, at the place of the row, for a quaternion far from unit length, and as `checked_poses`.
     """
     lengths = rows[:, 3:].norm(dim=-1, keepdim=True)
-    wrong = torch.nonzero(~((lengths[:, 0] - 1).abs() <= UNIT_LENGTH))[:, 0].tolist()
-    if wrong:
-        raise TrajectoryError(
-            f"{places[wrong[0]]}: the quaternion {rows[wrong[0], 3:].tolist()} does not have unit length"
-        )
+    _check((lengths[:, 0] - 1).abs() <= UNIT_LENGTH, places, "a quaternion does not have unit length")
     return checked_poses(rigid(matrix_from_quaternion(rows[:, 3:] / lengths), rows[:, :3]), places)
 
 
 def checked_poses(T_wc: Float[Tensor, "N 4 4"], places: Path | Sequence[str]) -> Float[Tensor, "N 4 4"]:
     """Return poses unchanged. Raises TrajectoryError for an invalid rotation or position, at its place or its file."""
-    R, positions_w = T_wc[:, :3, :3], T_wc[:, :3, 3]
-    error = (R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs().flatten(1).amax(1)
-    for is_right, what in (
-        (error < ORTHOGONAL, "a pose is not a rigid transformation"),
-        (positions_w.abs().amax(1) < FARTHEST, f"a position is farther away than {FARTHEST:g}"),
-    ):
-        wrong = torch.nonzero(~is_right)[:, 0].tolist()  # NaN is neither
-        if wrong:
-            raise TrajectoryError(f"{places if isinstance(places, Path) else places[wrong[0]]}: {what}")
+    is_rigid = orthogonality_error(T_wc[:, :3, :3]) < ORTHOGONAL
+    _check(is_rigid, places, "a pose is not a rigid transformation")
+    is_near = T_wc[:, :3, 3].abs().amax(1) < FARTHEST
+    _check(is_near, places, f"a position is farther away than {FARTHEST:g}")
     return T_wc
+
+
+def _check(is_right: Bool[Tensor, " N"], places: Path | Sequence[str], what: str) -> None:
+    """Raise TrajectoryError for the first row that is not right; NaN never is."""
+    if not is_right.all():
+        first = int(torch.nonzero(~is_right)[0])
+        raise TrajectoryError(f"{places if isinstance(places, Path) else places[first]}: {what}")
+
+
+def orthogonality_error(R: Float[Tensor, "... 3 3"]) -> Float[Tensor, " ..."]:
+    """Return the largest deviation of an element of R R^T from the identity."""
+    return (R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs().flatten(-2).amax(-1)
 
 
 def write_trajectory(path: str | Path, trajectory: Trajectory) -> None:
@@ -130,9 +126,6 @@ def _next(timestamps: Float[Tensor, " N"], reference: Float[Tensor, " M"]) -> In
     return torch.searchsorted(reference.contiguous(), timestamps.contiguous()).clamp(max=len(reference) - 1)
 
 
-POSES, TIMES = "poses.txt", "times.txt"
-
-
 def write_kitti(folder: Path, trajectory: Trajectory) -> None:
     """Write poses.txt and times.txt in KITTI odometry format: camera to world, one line per posed frame.
 
@@ -142,5 +135,5 @@ def write_kitti(folder: Path, trajectory: Trajectory) -> None:
     rows = trajectory.T_wc[:, :3].flatten(1).tolist()
     poses = [" ".join(f"{value:.9e}" for value in row) + "\n" for row in rows]
     times = [f"{time!r}\n" for time in trajectory.timestamps.tolist()]
-    (folder / POSES).write_text("".join(poses), encoding="utf-8")
-    (folder / TIMES).write_text("".join(times), encoding="utf-8")
+    (folder / "poses.txt").write_text("".join(poses), encoding="utf-8")
+    (folder / "times.txt").write_text("".join(times), encoding="utf-8")

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import torch
@@ -17,7 +18,7 @@ from torch import Tensor
 from torchslam.data.calibration import size_text
 from torchslam.data.formats.frame_names import in_order
 from torchslam.data.formats.image_file import MAX_PIXELS, SUFFIXES, has_transparency, read_gray
-from torchslam.data.sequence import Need, Sequence, Transformed
+from torchslam.data.sequence import Sequence, Transformed
 from torchslam.errors import FrameError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.types import Trajectory
@@ -33,64 +34,95 @@ SMALLEST = 32
 """Minimum width and height in pixels."""
 
 
-def cut(sequence: Sequence, start: str | int = 0, stop: str | int | None = None) -> Sequence:
-    """Return the frames of [start, stop), given as numbers or as times such as `12.5s` or `1:30`.
+class Selection(NamedTuple):
+    """Which frames of a sequence are used.
 
-    Raises SequenceError if none are left.
+    Attributes:
+        start, stop: first frame and end of the range, as numbers or as times such as `12.5s` and `1:30`.
+        rate: maximum number of frames per second, by their timestamps.
+        limit: maximum number of frames.
+        stride: use every `stride`-th frame.
     """
-    first = _frame_at(sequence, start, "start")
-    last = None if stop is None else _frame_at(sequence, stop, "stop")
-    return sequence if first == 0 and last is None else sequence.part(first, last)
+
+    start: str | int = 0
+    stop: str | int | None = None
+    rate: float | None = None
+    limit: int | None = None
+    stride: int = 1
+
+    def indices(self, times: Iterable[float]) -> Iterator[int]:
+        """Yield the indices of the selected frames among all; no more times are taken than are needed."""
+        begin, end = _place(self.start, "start"), math.inf if self.stop is None else _place(self.stop, "stop")
+        frames = _between(times, begin, end)
+        if self.rate is not None:
+            frames = _thinned(frames, self.rate)
+        most = None if self.limit is None else self.limit * self.stride
+        return itertools.islice((index for index, _ in frames), 0, most, self.stride)
+
+    def of(self, sequence: Sequence) -> Sequence:
+        """Return the selected frames of a sequence. Raises SequenceError if none are left."""
+        if self.stride < 1:
+            raise SequenceError(f"{sequence.name}: the stride must be positive, not {self.stride}")
+        if sequence.is_live:
+            return self._of_live(sequence)
+        indices = list(self.indices(sequence.timestamps.tolist()))
+        if not indices:
+            raise SequenceError(f"{sequence.name}: no frames left of {len(sequence)}")
+        return sequence if len(indices) == len(sequence) else Transformed(sequence, indices)
+
+    def _of_live(self, sequence: Sequence) -> Sequence:
+        first, last = _place(self.start, "start"), None if self.stop is None else _place(self.stop, "stop")
+        for place, what in ((first, "--start as a time"), (last, "--stop as a time"), (self.rate, "--fps")):
+            if isinstance(place, float):
+                raise SequenceError(
+                    f"{sequence.name}: {what} needs timestamps known in advance, which a live source does not have"
+                )
+        last = last if self.limit is None else self.limit * self.stride
+        is_whole = (first, last, self.stride) == (0, None, 1)
+        return (
+            sequence
+            if is_whole
+            else sequence.part(int(first), None if last is None else int(last), self.stride)
+        )
 
 
-def reduce_rate(sequence: Sequence, rate: float) -> Sequence:
-    """Select at most `rate` frames per second by their timestamps."""
-    _check_known(sequence, "--fps")
-    chosen = list(_thinned(sequence.timestamps.tolist(), rate))
-    return sequence if len(chosen) == len(sequence) else Transformed(sequence, chosen)
-
-
-def need(
-    start: str | int = 0, stop: str | int | None = None, rate: float | None = None, most: int | None = None
-) -> Need:
-    """Say how far the times of a recording are needed by `cut`, `reduce_rate` and the first `most` frames of these."""
-    begin, end = _place(start, "start"), math.inf if stop is None else _place(stop, "stop")
-
-    def take(times: Iterable[float]) -> None:
-        kept: Iterable[object] = (inside := _between(times, begin, end))
-        if rate is not None:
-            kept = _thinned(inside, rate)
-        for _ in itertools.islice(kept, most):
-            pass
-
-    return take
-
-
-def _between(times: Iterable[float], begin: int | float, end: int | float) -> Iterator[float]:
-    """Yield the times of the frames of [begin, end), which are numbers of frames, or seconds if they are floats."""
+def _between(times: Iterable[float], begin: int | float, end: int | float) -> Iterator[tuple[int, float]]:
+    """Yield the frames of [begin, end), which are numbers of frames, or seconds if they are floats, and their times."""
     first: float | None = None
     for index, time in enumerate(times):
         first = time if first is None else first
-        if _is_reached(end, index, time - first):
+        begun, ended = (
+            time - first >= place - ROUNDING if isinstance(place, float) else index >= place
+            for place in (begin, end)
+        )
+        if ended:
             return
-        if _is_reached(begin, index, time - first):
-            yield time
+        if begun:
+            yield index, time
 
 
-def _is_reached(place: int | float, index: int, elapsed: float) -> bool:
-    return elapsed >= place - ROUNDING if isinstance(place, float) else index >= place
-
-
-def _thinned(times: Iterable[float], rate: float) -> Iterator[int]:
-    """Yield the indices of the times to keep for at most `rate` a second."""
+def _thinned(frames: Iterable[tuple[int, float]], rate: float) -> Iterator[tuple[int, float]]:
+    """Yield the frames to keep for at most `rate` a second."""
     first: float | None = None
     last = -1
-    for index, time in enumerate(times):
+    for index, time in frames:
         first = time if first is None else first
         slot = math.floor((time - first) * rate + TOLERANCE)
         if slot > last:
-            yield index
+            yield index, time
             last = slot
+
+
+def _place(text: str | int, which: str) -> int | float:
+    """Return a number of a frame as int, a time in seconds as float. Raises SequenceError for anything else."""
+    if isinstance(text, int) or re.fullmatch(r"\d{1,12}", text):
+        if int(text) < 0:
+            raise SequenceError(f"--{which} must be at least 0, not {text}")
+        return int(text)
+    found = re.fullmatch(r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d+)?)s?", text)
+    if found is None:
+        raise SequenceError(f"--{which}: expected a frame, as 120, or a time, as 12.5s or 1:30, got `{text}`")
+    return 3600.0 * int(found[1] or 0) + 60.0 * int(found[2] or 0) + float(found[3])
 
 
 def resize(sequence: Sequence, text: str) -> Sequence:
@@ -153,36 +185,6 @@ def _new_size(size: tuple[int, int], text: str) -> tuple[int, int]:
     return new
 
 
-def _place(text: str | int, which: str) -> int | float:
-    """Return a number of a frame as int, a time in seconds as float. Raises SequenceError for other text."""
-    if isinstance(text, int) or re.fullmatch(r"\d{1,12}", text):
-        return int(text)
-    found = re.fullmatch(r"(?:(?:(\d{1,4}):)?(\d{1,4}):)?(\d{1,9}(?:\.\d+)?)s?", text)
-    if found is None:
-        raise SequenceError(f"--{which}: expected a frame, as 120, or a time, as 12.5s or 1:30, got `{text}`")
-    return 3600.0 * int(found[1] or 0) + 60.0 * int(found[2] or 0) + float(found[3])
-
-
-def _frame_at(sequence: Sequence, text: str | int, which: str) -> int:
-    """Return the index of the first frame at or after `text`."""
-    place = _place(text, which)
-    if isinstance(place, int):
-        if place < 0:
-            raise SequenceError(f"{sequence.name}: --{which} must be at least 0, not {text}")
-        return place
-    _check_known(sequence, f"--{which} as a time")
-    elapsed = sequence.timestamps - sequence.timestamps[:1]
-    return int(torch.searchsorted(elapsed, place - ROUNDING))
-
-
-def _check_known(sequence: Sequence, what: str) -> None:
-    """Raise SequenceError if the timestamps are not known in advance."""
-    if sequence.is_live:
-        raise SequenceError(
-            f"{sequence.name}: {what} needs timestamps known in advance, which a live source does not have"
-        )
-
-
 class Masked(Transformed):
     """Sequence with masks: no features are used where a mask is black, such as on a car's hood or a logo.
 
@@ -197,17 +199,12 @@ class Masked(Transformed):
 
     def __init__(self, whole: Sequence, path: str | Path) -> None:
         path = Path(path)
-        self._mask: Tensor | None = None
-        self._files: dict[int, Path] = {}
-        if path.is_dir():
-            self._files = _by_frame(path, whole)
-            with_mask = len(self._files)
-            notes = [f"masks for {with_mask} of {len(whole)} frames"] if with_mask < len(whole) else []
-            super().__init__(whole, notes=notes)
-            self._read(next(iter(self._files.values())))
-        else:
-            super().__init__(whole)
-            self._mask = self._read(path)
+        self._files = _by_frame(path, whole) if path.is_dir() else {}
+        count = len(self._files)
+        notes = [f"masks for {count} of {len(whole)} frames"] if 0 < count < len(whole) else []
+        super().__init__(whole, notes=notes)
+        first = self._read(next(iter(self._files.values()), path))
+        self._mask = None if self._files else first
 
     def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
         """Return the mask of a frame. Raises FrameError if it cannot be read."""
@@ -254,16 +251,13 @@ def _by_frame(folder: Path, sequence: Sequence) -> dict[int, Path]:
     )
     by_name = {file.stem: file for file in files}
     names = [Path(sequence.image_name(index)) for index in range(len(sequence))]
-    found = {
-        index: by_name.get(name.name, by_name.get(name.stem))
-        for index, name in enumerate(names)
-        if name.name in by_name or name.stem in by_name
-    }
+    named = {index: by_name.get(name.name) or by_name.get(name.stem) for index, name in enumerate(names)}
+    found = {index: file for index, file in named.items() if file is not None}
     if not found and len(files) == len(sequence):
         return dict(enumerate(files))
     if not found:
         raise SequenceError(f"{folder}: none of its {len(files)} images is the mask of a frame by its name")
-    return {index: file for index, file in found.items() if file is not None}
+    return found
 
 
 class WithGroundTruth(Transformed):

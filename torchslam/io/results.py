@@ -16,11 +16,10 @@ from torch import Tensor
 
 from torchslam.config import to_toml
 from torchslam.data.calibration import CALIBRATION, write_calibration
-from torchslam.data.formats.csv_tables import read_cells
 from torchslam.data.formats.image_file import read_gray, write_image
 from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
-from torchslam.data.text_file import read_object
+from torchslam.data.text_file import read_cells, read_object
 from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import FrameError, ResultsError

@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.data.formats.csv_tables import parse_moment, utc_from_gps
+from torchslam.data.text_file import parse_moment, utc_from_gps
 from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_interpolate, se3_inverse
 from torchslam.metric.options import Given

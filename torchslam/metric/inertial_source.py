@@ -6,8 +6,7 @@ import math
 
 import torch
 
-from torchslam.data.formats.imu_files import read_imu, read_inertial_calibration
-from torchslam.data.inertial import InertialCalibration, InertialSamples
+from torchslam.data.inertial import InertialCalibration, InertialSamples, read_imu, read_inertial_calibration
 from torchslam.errors import MeasurementError
 from torchslam.metric.inertial import InertialAlignment, InertialReason, align_inertial
 from torchslam.metric.options import Given

@@ -16,7 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.data.camera_argument import parse_calibration
+from torchslam.data.formats.calibration_files import parse_calibration
 from torchslam.data.formats.depth_images import DepthImages, find_depth_images, parse_depth_folder, read_depth
 from torchslam.data.trajectories import nearest
 from torchslam.data.transforms import scale_camera

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.data.formats.speed_file import Speeds, read_speeds
+from torchslam.data.formats.vehicle_files import Speeds, read_speeds
 from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, on_clock_of_images
 from torchslam.metric.options import Given
 from torchslam.metric.path_lengths import (

@@ -10,8 +10,7 @@ from torch import Tensor
 
 from experiments.common import DATA_DIR, parser_of, publish, sequences, table
 from torchslam import SLAM, Config
-from torchslam.data.formats.imu_files import read_imu, read_inertial_calibration
-from torchslam.data.inertial import InertialCalibration, InertialSamples
+from torchslam.data.inertial import InertialCalibration, InertialSamples, read_imu, read_inertial_calibration
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import se3_inverse, so3_exp, so3_log, umeyama
 from torchslam.metric.inertial import InertialAlignment, align_inertial

@@ -11,9 +11,8 @@ import math
 import cv2
 import numpy as np
 
-from torchslam.data.synthetic.paths import loop
 from torchslam.data.synthetic.scene import Rectangle, Vector, room
-from torchslam.data.synthetic.sequence import SCENES, Scene
+from torchslam.data.synthetic.sequence import SCENES, Scene, loop
 
 WHITE, BLACK = 225, 25
 CELL = 32

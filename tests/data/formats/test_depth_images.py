@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from tests.fuzz import valid_inputs
+from tests.fuzz.valid_inputs import place
 from torchslam.data import open_sequence
 from torchslam.data.formats.depth_images import find_depth_images, parse_depth_folder, read_depth
 from torchslam.errors import MeasurementError
@@ -18,14 +19,6 @@ def write(path: Path, values: np.ndarray) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(path), values)
     return path
-
-
-def place(folder: Path, files: dict[str, bytes]) -> Path:
-    for name, content in files.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
-    return folder
 
 
 def test_values_without_depth_are_zero(tmp_path: Path) -> None:
@@ -106,7 +99,6 @@ def test_wrong_lists_are_named(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_nothing_there(tmp_path: Path) -> None:
-    with pytest.raises(MeasurementError, match="no such folder"):
-        find_depth_images(tmp_path / "none")
-    with pytest.raises(MeasurementError, match="no depth images"):
-        find_depth_images(tmp_path)
+    for path, message in ((tmp_path / "none", "no such folder"), (tmp_path, "no depth images")):
+        with pytest.raises(MeasurementError, match=message):
+            find_depth_images(path)

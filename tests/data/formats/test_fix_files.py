@@ -11,8 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from torchslam.data.formats.csv_tables import utc_from_gps
 from torchslam.data.formats.fix_files import Fixes, read_fixes
+from torchslam.data.text_file import utc_from_gps
 from torchslam.errors import MeasurementError, TorchslamError
 
 MAVIC_3 = """1

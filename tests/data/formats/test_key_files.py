@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
+from pathlib import Path
 from typing import Any
 
 import hypothesis.strategies as st
@@ -79,10 +80,17 @@ def test_wrong_yaml(text: str, message: str) -> None:
         parse_yaml(text)
 
 
-def test_xml_and_json() -> None:
-    assert read_tree("<r><a> 1 2\n3 </a><b><c>4</c></b></r>", ".xml") == {"a": "1 2\n3", "b": {"c": "4"}}
-    assert read_tree('{"a": [1]}', ".txt") == {"a": [1]}
-    assert read_tree("1 2 3 4", ".txt") is None
+@pytest.mark.parametrize(
+    ("text", "tree"),
+    [
+        ("<r><a> 1 2\n3 </a><b><c>4</c></b></r>", {"a": "1 2\n3", "b": {"c": "4"}}),
+        ('{"a": [1]}', {"a": [1]}),
+        ("1 2 3 4", None),
+    ],
+)
+def test_files_by_their_content(tmp_path: Path, text: str, tree: dict[str, Any] | None) -> None:
+    (tmp_path / "keys.txt").write_text(text)
+    assert read_tree(tmp_path / "keys.txt") == tree
 
 
 @pytest.mark.parametrize(

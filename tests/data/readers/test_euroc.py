@@ -2,58 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.fuzz.valid_inputs import SENSOR, euroc, place
 from torchslam.config import MetricConfig
 from torchslam.data import Calibrated, open_sequence
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.metric.inertial_source import InertialSource
 from torchslam.metric.options import given_options, sources_of
 
-SENSOR = """\
-%YAML:1.0
-# Default camera sensor yaml file
-sensor_type: camera
-comment: VI-Sensor cam0 (MT9M034)
-
-# Sensor extrinsics wrt. the body-frame.
-T_BS:
-  cols: 4
-  rows: 4
-  data: [0.0, -1.0, 0.0, 0.1,
-         1.0, 0.0, 0.0, 0.2,
-        0.0, 0.0, 1.0, 0.3,
-         0.0, 0.0, 0.0, 1.0]
-
-# Camera specific definitions.
-rate_hz: 20
-resolution: [64, 48]
-camera_model: pinhole
-intrinsics: [58.6, 57.2, 31.2, 23.3] #fu, fv, cu, cv
-distortion_model: radial-tangential
-distortion_coefficients: [-0.28340811, 0.07395907, 0.00019359, 1.76187114e-05]
-"""
-
 
 @pytest.fixture
-def folder(tmp_path: Path, write_picture: Callable) -> Path:
-    folder = tmp_path / "MH_01_easy"
-    cam0, truth = folder / "mav0" / "cam0", folder / "mav0" / "state_groundtruth_estimate0"
-    times = [1403636579763555584 + 50_000_000 * index for index in range(3)]
-    for index, time in enumerate(times):
-        write_picture(cam0 / "data" / f"{time}.png", index)
-    (cam0 / "data.csv").write_text(
-        "#timestamp [ns],filename\n" + "".join(f"{time},{time}.png\r\n" for time in times)
-    )
-    (cam0 / "sensor.yaml").write_text(SENSOR)
-    truth.mkdir()
-    rows = [f"{time + 1000},{index},0,0,1,0,0,0,9,9,9,9,9,9,9,9,9\n" for index, time in enumerate(times)]
-    (truth / "data.csv").write_text("#timestamp, p_RS_R_x [m], ...\n" + "".join(rows))
-    return folder
+def folder(tmp_path: Path) -> Path:
+    return place(tmp_path / "MH_01_easy", euroc())
 
 
 def test_brings_its_inertial_sensor_along(folder: Path) -> None:

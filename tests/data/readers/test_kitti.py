@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import torch
 
+from tests.fuzz import valid_inputs
+from tests.fuzz.valid_inputs import place
 from torchslam.data import open_sequence
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 
 P0 = "P0: 70 0 31 0 0 71 23 0 0 0 1 0"
-P2 = "P2: 70 0 31 4.2 0 71 23 0 0 0 1 0"
 
 
 @pytest.fixture
-def folder(tmp_path: Path, write_picture: Callable) -> Path:
-    """dataset/sequences/03 with three gray images, and dataset/poses/03.txt."""
-    folder = tmp_path / "dataset" / "sequences" / "03"
-    for index in range(3):
-        write_picture(folder / "image_0" / f"{index:06d}.png", index)
-    (folder / "times.txt").write_text("0.000000e+00\n1.037430e-01\n2.074860e-01\n")
-    (folder / "calib.txt").write_text(f"{P0}\n{P2}\n")
+def folder(tmp_path: Path) -> Path:
+    """dataset/sequences/03 with three gray images, and dataset/poses/03.txt, with a turn to the right by 90 degrees."""
+    folder = place(tmp_path / "dataset" / "sequences" / "03", valid_inputs.kitti())
     poses = tmp_path / "dataset" / "poses"
     poses.mkdir()
-    # The second camera has turned right by 90 degrees.
-    lines = ["1 0 0 0 0 1 0 0 0 0 1 0", "0 0 1 5 0 1 0 0 -1 0 0 0", "1 0 0 0 0 1 0 0 0 0 1 2"]
-    (poses / "03.txt").write_text("\n".join(lines))
+    (folder / "poses.txt").rename(poses / "03.txt")
     return folder
 
 
@@ -78,13 +72,13 @@ def test_relative_paths_find_the_poses(folder: Path, monkeypatch: pytest.MonkeyP
         ("times.txt", "0\n0.1\n0.1\n", SequenceError, r"times\.txt:3: timestamp 0.1 repeats"),
         ("times.txt", "0\nabc\n0.2\n", SequenceError, r"times\.txt:2: `abc` is not a number"),
         ("times.txt", "", SequenceError, r"times\.txt: is empty"),
-        ("calib.txt", "P1: 1 2 3\n", CalibrationError, r"calib\.txt: no line `P0: \.\.\.`"),
-        ("calib.txt", "P0: 70 0 31\n", CalibrationError, r"calib\.txt:1: .*got 3"),
+        ("calib.txt", "P1: 1 2 3\n", CalibrationError, r"calib\.txt: expected a line `P0:` of 12 numbers"),
+        ("calib.txt", "P0: 70 0 31\n", CalibrationError, r"calib\.txt: expected a line `P0:` of 12 numbers"),
         (
             "calib.txt",
             P0.replace("70", "-70"),
             CalibrationError,
-            r"calib\.txt:1: focal lengths must be positive",
+            r"calib\.txt: focal lengths must be positive",
         ),
         ("calib.txt", P0.replace("70", "nan"), CalibrationError, r"calib\.txt:1: `nan`"),
         ("poses.txt", "1 0 0 7 0 1 0 0 0 0 1 0\n", TrajectoryError, r"poses\.txt: 1 poses for 3 times"),

@@ -17,9 +17,9 @@ import torch
 from tests.data.interlaced import set_interlaced, set_wide, write_mpeg2
 from tests.data.mp4 import write_mp4
 from torchslam.data import Calibrated, Sequence, open_sequence
-from torchslam.data.camera_argument import parse_calibration
-from torchslam.data.readers.capture import pixel_aspect
+from torchslam.data.formats.calibration_files import parse_calibration
 from torchslam.data.readers.live import LIVE
+from torchslam.data.readers.video import pixel_aspect
 from torchslam.errors import FrameError, SequenceError
 
 COUNT = 6

@@ -14,7 +14,7 @@ from tests.data.mp4 import set_durations, set_rotation, write_mp4
 from torchslam.data import Calibrated, open_sequence
 from torchslam.data.readers import video
 from torchslam.data.readers.video import VideoSequence, _rising
-from torchslam.data.transforms import cut, reduce_rate
+from torchslam.data.transforms import Selection
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
 
@@ -116,15 +116,11 @@ def test_times_are_read_as_far_as_they_are_needed(
         with pytest.raises(SequenceError, match="no frames left of 8"):
             open_sequence(clip, CAMERA, **options)
     else:
-        chosen = cut(whole, options.get("start", 0), options.get("stop"))
-        chosen = reduce_rate(chosen, options["fps"]) if "fps" in options else chosen
-        stride, limit = options.get("stride", 1), options.get("limit")
-        chosen = chosen.part(stop=None if limit is None else limit * stride, stride=stride)
         sequence = open_sequence(clip, CAMERA, **options)
+        chosen = Selection(rate=options.pop("fps", None), **options).of(whole)
         assert sequence.timestamps.tolist() == chosen.timestamps.tolist()
-        assert [sequence.image_name(i) for i in range(len(sequence))] == [
-            chosen.image_name(i) for i in range(len(chosen))
-        ]
+        names, expected = ([each.image_name(i) for i in range(len(each))] for each in (sequence, chosen))
+        assert names == expected
         assert sequence.notes == ()
     assert counts == [grabbed]
 

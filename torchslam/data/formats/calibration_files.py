@@ -1,31 +1,116 @@
-"""Calibration files of other programs: OpenCV, ROS, Kalibr, EuRoC, ORB-SLAM3, VINS, COLMAP, nerfstudio.
+"""Cameras as users give them: the `--camera` argument and calibration files of other programs.
 
-Pixel (0, 0) is the center of the top left pixel, as in OpenCV, ROS, Kalibr and ORB-SLAM3. COLMAP and nerfstudio use its
-corner, so their principal points are larger by half a pixel.
+Files are of OpenCV, ROS, Kalibr, EuRoC, ORB-SLAM3, VINS, COLMAP and nerfstudio. Pixel (0, 0) is the center of the top
+left pixel, as in OpenCV, ROS, Kalibr and ORB-SLAM3. COLMAP and nerfstudio use its corner, so their principal points are
+larger by half a pixel.
 
 A key that names a model or a distortion, and is not understood, is an error: without it, the camera is a wrong one.
 """
 
 from __future__ import annotations
 
+import difflib
 import math
+import os
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from torchslam.data.calibration import Calibration, Size, read_numbers
-from torchslam.data.formats.key_files import MAX_DEPTH, Tree, merged, read_tree
-from torchslam.data.text_file import numbered_lines, parse_floats, read_text
-from torchslam.errors import CalibrationError
+from torchslam.data.calibration import (
+    COUNTS,
+    FROM_EXIF,
+    PRESETS,
+    UNKNOWN,
+    Calibration,
+    Size,
+    parse_numbers,
+    read_numbers,
+)
+from torchslam.data.formats.image_file import exif_block
+from torchslam.data.formats.key_files import Keys, Tree, mappings, normal, read_tree
+from torchslam.data.text_file import are_numbers, numbered_lines, parse_floats
+from torchslam.errors import CalibrationError, FrameError
+from torchslam.geometry.camera import Camera
 from torchslam.geometry.distortion import MODELS
 from torchslam.geometry.transforms import HALF_PIXEL
-from torchslam.utils.files import JSON_BYTES
 
-MAX_BYTES = 1 << 18
-"""Largest file that is read; those of calibration programs have kilobytes."""
-LARGEST = 1e12  # JSON numbers may have any number of digits
+EXIF_BLOCK = 0x8769
+"""Tag of the block of camera data (EXIF 2.32)."""
+FOCAL_LENGTH_35MM = 0xA405
+"""Tag of the focal length of a 35 mm film camera with the same diagonal field of view, mm (EXIF 2.32)."""
+
+
+def read_focal(path: Path) -> Calibration:
+    """Read the 35 mm equivalent focal length of an image file (EXIF 2.32, tag 0xA405), relative to the diagonal.
+
+    Raises CalibrationError for a file without one.
+    """
+    try:
+        found = exif_block(path, EXIF_BLOCK).get(FOCAL_LENGTH_35MM)
+    except FrameError as cause:
+        raise CalibrationError(str(cause)) from cause
+    if not isinstance(found, int | float) or not 0 < found < math.inf:
+        raise CalibrationError(
+            f"{path}: no 35 mm focal length in its EXIF block; give --camera f=0.8w or fov=65 instead"
+        )
+    diagonal = math.hypot(36.0, 24.0)  # of the film, millimeters
+    return Calibration.guess(found / diagonal, "diagonal", f"EXIF of {path.name}, {found:g} mm")
+
+
+def parse_camera(text: str, size: Size, example: Path | None = None) -> Camera:
+    """Parse a `--camera` argument for images of `size` (width, height).
+
+    Args:
+        text: `fx,fy,cx,cy[,k1,k2,p1,p2[,k3[,k4,k5,k6]]]`, `fisheye,fx,fy,cx,cy,k1,k2,k3,k4`, a focal length as `f=0.8w`
+            (widths of the image) or `f=500` (pixels), `fov=65` (horizontal, degrees), a preset such as
+            `tum-fr1`, `exif`, `auto` (unknown), or a file (`read_calibration`)
+        example: an image file, for `exif`
+
+    Raises:
+        CalibrationError: if the text or the file is invalid
+    """
+    given = parse_calibration(text)
+    return (read_focal(example) if given == FROM_EXIF and example is not None else given).camera(size)
+
+
+def parse_calibration(text: str, source: str = "--camera") -> Calibration:
+    """Parse a `--camera` argument before the image size is known; see `parse_camera`.
+
+    Raises CalibrationError naming `source`.
+    """
+    known = {**PRESETS, "exif": FROM_EXIF, "auto": UNKNOWN}
+    word = text.strip()
+    if word.lower() in known:
+        return known[word.lower()]
+    if os.path.isfile(word):  # Path.is_file raises for a name that is too long
+        return read_calibration(word)
+    if word.lower().startswith(("f=", "fov=")):
+        return _parse_focal(word.lower(), source)
+    if re.fullmatch(r"[^\s,]+", word) and not are_numbers([word]) and word not in COUNTS:
+        near = difflib.get_close_matches(word.lower(), known, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"presets are {', '.join(PRESETS)}"
+        raise CalibrationError(f"{source}: `{word}` is not a number, a file or a known camera; {hint}")
+    return parse_numbers(text, source)
+
+
+def _parse_focal(word: str, source: str) -> Calibration:
+    """`f=0.8w`, `f=500`, `f=500px` or `fov=65`."""
+    angle = re.fullmatch(r"fov=([^,\s]+)", word)
+    focal = re.fullmatch(r"f=([^wpx,\s]+)(w|px)?", word)
+    if angle is not None:
+        (degrees,) = parse_floats(angle[1], source, CalibrationError)
+        if not 0 < degrees < 180:
+            raise CalibrationError(f"{source}: fov={degrees:g} is no angle between 0 and 180 degrees")
+        return Calibration.guess(0.5 / math.tan(math.radians(degrees) / 2), "w", word)
+    if focal is None:
+        raise CalibrationError(f"{source}: expected f=0.8w, f=500 or fov=65, got `{word}`")
+    (length,) = parse_floats(focal[1], source, CalibrationError)
+    if length <= 0:
+        raise CalibrationError(f"{source}: the focal length must be positive, got {length:g}")
+    return Calibration.guess(length, focal[2] or "px", word)
+
+
 FISHEYES = (
     *("equidistant", "fisheye", "opencv_fisheye"),
     *("kannala", "kannala_brandt", "kannalabrandt", "kannalabrandt8"),
@@ -47,18 +132,16 @@ DISTORTION = (
     *("distcoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "dist", "coeffs", "d"),
 )
 WIDTH, HEIGHT = ("imagewidth", "width", "w", "cols"), ("imageheight", "height", "h", "rows")
-SIZE = ("resolution", "imagesize")
 DISTORTION_MODEL = ("distortionmodel", "distortiontype")
 CAMERA_MODEL = ("cameramodel", "modeltype", "cameratype", "projectionmodel")
 IS_FISHEYE = ("fisheyemodel", "isfisheye", "usefisheye", "fisheye")
-FX, FY, CX, CY = ("fx", "fu"), ("fy", "fv"), ("cx", "cu", "ppx"), ("cy", "cv", "ppy")
+INTRINSICS = (("fx", "fu"), ("fy", "fv"), ("cx", "cu", "ppx"), ("cy", "cv", "ppy"))
 OF_A_CAMERA = (
     *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye"),
 )
 """Keys of a transforms.json that a frame may have, too."""
 LOOKS_LIKE_DISTORTION = re.compile(r"dist(?!an)|coef|fisheye|^(camera1?)?(k[1-9]|p[1-9])$|^xi$")
 """Of keys that were not used."""
-NOTHING = ("", "none", "null", "~")
 
 # COLMAP, src/colmap/sensor/models.h: where each parameter goes among fx fy cx cy and the distortion, of a fisheye where
 # the name ends so.
@@ -87,139 +170,13 @@ def read_calibration(path: str | Path) -> Calibration:
     Raises CalibrationError naming the file.
     """
     path = Path(path)
-    # A transforms.json has all frames in it.
-    text = read_text(path, CalibrationError, JSON_BYTES if path.suffix.lower() == ".json" else MAX_BYTES)
-    tree = _tree(path, text)
+    tree = read_tree(path)
     if tree is not None:
         return _from_tree(path, tree)
     lines = [line for _, line in numbered_lines(path, CalibrationError)]
     if lines and COLMAP_LINE.match(lines[0]):
         return from_colmap(path, lines)
     return read_numbers(path)
-
-
-def read_matrix(path: Path, key: str, count: int) -> list[float]:
-    """Read the numbers of a matrix in a file of keys. Raises CalibrationError for another number of them."""
-    keys = Keys(_tree(path, read_text(path, CalibrationError, MAX_BYTES)) or {}, str(path))
-    numbers = keys.numbers(_normal(key)) or []
-    if len(numbers) != count:
-        raise CalibrationError(f"{path}: {key}: expected {count} numbers, got {len(numbers)}")
-    return numbers
-
-
-def read_keys(path: Path) -> Iterator[Keys]:
-    """The keys of each mapping in a file, from the outermost one inward. Raises CalibrationError if there are none."""
-    tree = _tree(path, read_text(path, CalibrationError, MAX_BYTES))
-    if not tree:
-        raise CalibrationError(f"{path}: no keys in it; a YAML, XML or JSON file is needed")
-    for chain in _mappings(tree):
-        yield Keys(chain[-1], str(path))
-
-
-def _tree(path: Path, text: str) -> Tree | None:
-    try:
-        return read_tree(text, path.suffix)
-    except ValueError as cause:
-        raise CalibrationError(
-            f"{path}: {'not valid JSON: ' * text.lstrip().startswith('{')}{cause}"
-        ) from cause
-
-
-class Keys:
-    """The keys of one camera, which are found in any case and with any punctuation."""
-
-    def __init__(self, tree: Tree, source: str) -> None:
-        self._values: dict[str, tuple[str, Any]] = {}
-        for key, value in tree.items():
-            self._values.setdefault(_normal(key), (key, value))
-        self._source = source
-        self._used: set[str] = set()
-
-    def __contains__(self, keys: tuple[str, ...]) -> bool:
-        return any(key in self._values for key in keys)
-
-    def value(self, *keys: str) -> tuple[str, Any] | None:
-        """The first of the keys that is there, as it is written, with its value."""
-        for key in keys:
-            if key in self._values:
-                self._used.add(key)
-                return self._values[key]
-        return None
-
-    def words(self, keys: tuple[str, ...]) -> Iterator[tuple[str, str]]:
-        """Those of the keys whose value is text, with that in lower case."""
-        for key in keys:
-            found = self.value(key)
-            if found is not None and isinstance(found[1], str):
-                yield found[0], found[1].strip().lower()
-
-    def numbers(self, *keys: str) -> list[float] | None:
-        """The numbers of the first of the keys that is there. Raises CalibrationError for anything else."""
-        found = self.value(*keys)
-        return None if found is None else _numbers(found[1], f"{self._source}: {found[0]}")
-
-    def number(self, *keys: str) -> float | None:
-        """The one number of a key. Raises CalibrationError for anything else."""
-        numbers = self.numbers(*keys)
-        return numbers[0] if numbers else None
-
-    def size(self, *prefixes: str) -> Size | None:
-        """The size of the images, if it is there; zeros stand for an unknown one, as in ROS.
-
-        Raises CalibrationError if only one side is there, or not positive.
-        """
-        both = self.numbers(*SIZE) or []
-        sides = [
-            self.number(*(prefix + key for prefix in prefixes or ("",) for key in keys))
-            for keys in (WIDTH, HEIGHT)
-        ]
-        width, height = both if len(both) == 2 else (side or 0.0 for side in sides)
-        if width == height == 0:
-            return None
-        if min(width, height) < 1:
-            raise CalibrationError(
-                f"{self._source}: the size of the images must be positive, got {width:g}x{height:g}"
-            )
-        return int(width), int(height)
-
-    def check_unused(self) -> None:
-        """Raise CalibrationError for a key that looks like distortion and was not used."""
-        for key, (written, value) in self._values.items():
-            if key in self._used or not LOOKS_LIKE_DISTORTION.search(key) or _is_nothing(value):
-                continue
-            raise CalibrationError(
-                f"{self._source}: `{written}` looks like a distortion, but is not understood; "
-                "call it distortion_coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6]], or remove it"
-            )
-
-
-def _normal(key: str) -> str:
-    return re.sub(r"[^a-z0-9]", "", str(key).lower())
-
-
-def _is_nothing(value: Any) -> bool:
-    """True for no value, and for zeros."""
-    try:
-        return not any(_numbers(value, ""))
-    except CalibrationError:
-        return False
-
-
-def _numbers(value: Any, where: str, depth: int = 0) -> list[float]:
-    """The numbers of text, of lists in lists, or of a matrix's `data`."""
-    if isinstance(value, dict) and "data" in value:
-        value = value["data"]
-    if isinstance(value, list) and depth < MAX_DEPTH:
-        return [number for item in value for number in _numbers(item, where, depth + 1)]
-    if value is None or (isinstance(value, str) and value.lower() in NOTHING):
-        return []
-    if isinstance(value, bool | dict | list):
-        raise CalibrationError(f"{where}: expected numbers, got {str(value)[:40]}")
-    if isinstance(value, int | float):
-        if not abs(value) < LARGEST:  # not so NaN either
-            raise CalibrationError(f"{where}: {str(value)[:40]} is not finite")
-        return [float(value)]
-    return parse_floats(value, where, CalibrationError)
 
 
 def checked(
@@ -231,11 +188,7 @@ def checked(
 ) -> Calibration:
     """A calibration with a distortion model by one of its many names.
 
-    Args:
-        intrinsics: fx fy cx cy.
-
-    Raises:
-        CalibrationError: for models and coefficients that torchslam does not have.
+    `intrinsics` are fx fy cx cy. Raises CalibrationError for models and coefficients that torchslam does not have.
     """
     if _is_fisheye(distortion, "distortion", source):
         if len(coefficients) < 4 or any(coefficients[4:]):
@@ -260,123 +213,105 @@ def _is_fisheye(name: str, of: str, source: str) -> bool:
     """
     word = re.sub(r"\s+", "_", name.strip().lower())
     known = BROWN if of == "distortion" else (*PINHOLES, *BROWN)
-    if word in FISHEYES:
-        return True
-    if word not in known:
+    if word not in (*known, *FISHEYES):
         shown = ", ".join(word for word in (*known, *FISHEYES) if word)
         raise CalibrationError(f"{source}: {of} model `{name}` is not known; there are {shown}")
-    return False
+    return word in FISHEYES
 
 
 def _from_tree(path: Path, tree: Tree) -> Calibration:
     """The first camera of a file of keys; keys above it hold for it, too."""
-    source = str(path)
-    for chain in _mappings({**tree, **_nested_camera(tree)}):
-        keys = Keys({key: value for each in reversed(chain) for key, value in each.items()}, source)
-        here = Keys(chain[-1], source)
-        for prefix in ("camera1", "camera"):
-            if (f"{prefix}fx",) in here:
-                return _finished(keys, _from_orb_slam(keys, prefix, source))
-        if ("flx", "cameraanglex") in here:
-            return _finished(keys, _from_transforms(keys, source))
-        if ("intrinsics",) in here:
-            return _finished(keys, _from_intrinsics(keys, source))
-        if MATRIX in here and len(here.numbers(*MATRIX) or []) != 1:
-            return _finished(keys, _from_matrix(keys, source))
-        if all(names in here for names in (FX, FY, CX, CY)):
-            intrinsics = [keys.number(*names) or 0.0 for names in (FX, FY, CX, CY)]
-            return _finished(keys, _with_distortion(keys, intrinsics, source, ("model",)))
-    for _, name in Keys(tree, source).words(CAMERA_MODEL):
-        _is_fisheye(name, "camera", source)
+    # stella_vslam writes `Camera:` with keys below, ORB-SLAM3 `Camera.fx`.
+    nested = {
+        f"{name}.{key}": value
+        for name in ("Camera", "Camera1")
+        if isinstance(tree.get(name), dict)
+        for key, value in tree[name].items()
+    }
+    for chain in mappings({**tree, **nested}):
+        keys = Keys({key: value for each in reversed(chain) for key, value in each.items()}, str(path))
+        here = Keys(chain[-1], str(path))
+        prefix = next((each for each in ("camera1", "camera") if (f"{each}fx",) in here), "")
+        if prefix:
+            found = _from_single_keys(keys, prefix)
+        elif ("flx", "cameraanglex") in here:
+            found = _from_transforms(keys)
+        elif ("intrinsics",) in here:
+            found = _from_intrinsics(keys)
+        elif MATRIX in here and len(here.numbers(*MATRIX)) != 1:
+            found = _from_matrix(keys)
+        elif all(names in here for names in INTRINSICS):
+            found = _from_single_keys(keys, "", ("model",))
+        else:
+            continue
+        if unused := keys.unused(LOOKS_LIKE_DISTORTION):
+            raise _not_understood(keys, unused)
+        return found
+    _has_fisheye_model(Keys(tree, str(path)), "camera", CAMERA_MODEL)
     raise CalibrationError(
         f"{path}: no camera in it; looked for camera_matrix (OpenCV, ROS), intrinsics (Kalibr, EuRoC), "
         "Camera.fx (ORB-SLAM3), fl_x for all frames (nerfstudio), and fx fy cx cy"
     )
 
 
-def _finished(keys: Keys, calibration: Calibration) -> Calibration:
-    keys.check_unused()
-    return calibration
+def _not_understood(keys: Keys, name: str) -> CalibrationError:
+    return CalibrationError(
+        f"{keys.source}: `{name}` looks like a distortion, but is not understood; "
+        "call it distortion_coefficients, k1 k2 p1 p2 [k3 [k4 k5 k6]], or remove it"
+    )
 
 
-def _nested_camera(tree: Tree) -> Tree:
-    """The keys below `Camera:`, as stella_vslam writes them, as `Camera.fx`, as ORB-SLAM3 does."""
-    found: Tree = {}
-    for name in ("Camera", "Camera1"):
-        inner = tree.get(name)
-        if isinstance(inner, dict):
-            found |= {f"{name}.{key}": value for key, value in inner.items()}
-    return found
+def _size(keys: Keys, prefixes: tuple[str, ...]) -> Size | None:
+    """The size of the images, if it is there; zeros stand for an unknown one, as in ROS.
+
+    Raises CalibrationError if only one side is there, or not positive.
+    """
+    sides = keys.numbers("resolution", "imagesize")
+    if len(sides) != 2:
+        names = ([prefix + key for prefix in prefixes for key in side] for side in (WIDTH, HEIGHT))
+        sides = [keys.number(*side) or 0.0 for side in names]
+    if not any(sides):
+        return None
+    if min(sides) < 1:
+        raise CalibrationError(
+            f"{keys.source}: the size of the images must be positive, got {sides[0]:g}x{sides[1]:g}"
+        )
+    return int(sides[0]), int(sides[1])
 
 
-def _mappings(tree: Tree, above: tuple[Tree, ...] = ()) -> Iterator[tuple[Tree, ...]]:
-    """Every mapping, with those that it is in, in the order of the file."""
-    chain = (*above, tree)
-    yield chain
-    for value in tree.values():
-        if isinstance(value, dict) and len(chain) < MAX_DEPTH:
-            yield from _mappings(value, chain)
+def _has_fisheye_model(keys: Keys, of: str, names: tuple[str, ...]) -> bool:
+    words = [keys.text(name) for name in names]
+    return True in [_is_fisheye(word, of, keys.source) for word in words if word]
 
 
 def _with_distortion(
-    keys: Keys,
-    intrinsics: list[float],
-    source: str,
-    model_keys: tuple[str, ...] = (),
-    prefix: str = "",
-    size: Size | None = None,
+    keys: Keys, intrinsics: list[float], prefix: str = "", model_keys: tuple[str, ...] = ()
 ) -> Calibration:
-    """A camera with the model and the coefficients that its keys name.
+    """A camera with the size, the model and the coefficients that its keys name.
 
-    Args:
-        intrinsics: fx fy cx cy.
-        model_keys: further keys of the camera's model.
-        prefix: of the keys of single coefficients.
-        size: of the images; None: as the keys say.
+    `intrinsics` are fx fy cx cy, `prefix` is that of keys of single coefficients, `model_keys` may name the model, too.
     """
-    flags = [_flag(keys, key) for key in IS_FISHEYE]  # all of them, which are used then
-    fisheye = any(flags)
-    for of, names in (("camera", (*CAMERA_MODEL, *model_keys)), ("distortion", DISTORTION_MODEL)):
-        for _, name in keys.words(names):
-            fisheye |= _is_fisheye(name, of, source)
+    # All keys are looked at, and are used then.
+    flags = [keys.flag(key) for key in IS_FISHEYE]
+    flags.append(_has_fisheye_model(keys, "camera", (*CAMERA_MODEL, *model_keys)))
+    flags.append(_has_fisheye_model(keys, "distortion", DISTORTION_MODEL))
     if keys.number("xi"):
-        raise CalibrationError(f"{source}: camera model `omnidirectional` (xi) is not known")
-    coefficients = _coefficients(keys, fisheye, prefix, source)
-    return checked(intrinsics, coefficients, source, "fisheye" if fisheye else "", size or keys.size())
-
-
-def _flag(keys: Keys, key: str) -> bool:
-    """A key that is true or a number other than 0."""
-    found = keys.value(key)
-    if found is None:
-        return False
-    return str(found[1]).strip().lower() not in (*NOTHING, "0", "0.0", "0.", "false", "no", "off")
-
-
-def _coefficients(keys: Keys, fisheye: bool, prefix: str, source: str) -> list[float]:
-    """In OpenCV's order: of one list, or of keys of their own."""
-    found = keys.value(*DISTORTION)
-    names = MODELS["fisheye" if fisheye else "rational"].coefficients
-    if found is None:
-        return _single_coefficients(keys, names, prefix)
-    name, value = found[0], _value(keys, *DISTORTION)
-    if isinstance(value, dict) and "data" not in value:
-        inner = Keys(value, f"{source}: {name}")
+        raise CalibrationError(f"{keys.source}: camera model `omnidirectional` (xi) is not known")
+    kind = "fisheye" if any(flags) else ""
+    names = MODELS[kind or "rational"].coefficients
+    inner = keys.inner(*DISTORTION)
+    if inner is not None:
         coefficients = _single_coefficients(inner, names, "")
         if not coefficients:
-            raise CalibrationError(
-                f"{source}: {name}: expected k1 k2 p1 p2 [k3], got {', '.join(value)[:80]}"
-            )
-        inner.check_unused()
-        return coefficients
-    return _numbers(value, f"{source}: {name}")
-
-
-def _value(keys: Keys, *names: str) -> Any:
-    """A value; a list of mappings as one of them."""
-    found = keys.value(*names)
-    value = None if found is None else found[1]
-    return merged(value) if isinstance(value, list) else value
+            raise CalibrationError(f"{inner.source}: expected k1 k2 p1 p2 [k3]")
+        if unused := inner.unused(LOOKS_LIKE_DISTORTION):
+            raise _not_understood(inner, unused)
+    elif DISTORTION in keys:
+        coefficients = keys.numbers(*DISTORTION)
+    else:
+        coefficients = _single_coefficients(keys, names, prefix)
+    size = (_size(keys, ("camera", prefix)) if prefix else None) or _size(keys, ("",))
+    return checked(intrinsics, coefficients, keys.source, kind, size)
 
 
 def _single_coefficients(keys: Keys, names: tuple[str, ...], prefix: str) -> list[float]:
@@ -384,43 +319,40 @@ def _single_coefficients(keys: Keys, names: tuple[str, ...], prefix: str) -> lis
     return [] if all(value is None for value in values) else [value or 0.0 for value in values]
 
 
-def _from_matrix(keys: Keys, source: str) -> Calibration:
-    matrix = keys.numbers(*MATRIX) or []
+def _from_matrix(keys: Keys) -> Calibration:
+    matrix = keys.numbers(*MATRIX)
     if len(matrix) != 9:
-        raise CalibrationError(f"{source}: a camera matrix has 9 numbers, not {len(matrix)}")
+        raise CalibrationError(f"{keys.source}: a camera matrix has 9 numbers, not {len(matrix)}")
     fx, skew, cx, zero, fy, cy, *last = matrix
     if [zero, *last] != [0, 0, 0, 1]:
-        raise CalibrationError(f"{source}: a camera matrix is fx 0 cx, 0 fy cy, 0 0 1, not {matrix}")
+        raise CalibrationError(f"{keys.source}: a camera matrix is fx 0 cx, 0 fy cy, 0 0 1, not {matrix}")
     if skew:
-        raise CalibrationError(f"{source}: a skew of {skew:g} is not modeled; calibrate without it")
-    return _with_distortion(keys, [fx, fy, cx, cy], source)
+        raise CalibrationError(f"{keys.source}: a skew of {skew:g} is not modeled; calibrate without it")
+    return _with_distortion(keys, [fx, fy, cx, cy])
 
 
-def _from_intrinsics(keys: Keys, source: str) -> Calibration:
+def _from_intrinsics(keys: Keys) -> Calibration:
     """The first camera of Kalibr's camchain, or EuRoC's sensor.yaml."""
-    value = _value(keys, "intrinsics")
-    for _, name in keys.words(CAMERA_MODEL):
-        _is_fisheye(name, "camera", source)
-    if isinstance(value, dict) and "data" not in value:
-        inner = Keys(value, f"{source}: intrinsics")
-        numbers = [number for names in (FX, FY, CX, CY) if (number := inner.number(*names)) is not None]
+    _has_fisheye_model(keys, "camera", CAMERA_MODEL)  # of another model, there may be other numbers
+    inner = keys.inner("intrinsics")
+    if inner is not None:
+        numbers = [number for names in INTRINSICS if (number := inner.number(*names)) is not None]
     else:
-        numbers = _numbers(value, f"{source}: intrinsics")
+        numbers = keys.numbers("intrinsics")
     if len(numbers) != 4:
         raise CalibrationError(
-            f"{source}: expected `intrinsics: [fx, fy, cx, cy]`, got {len(numbers)} numbers"
+            f"{keys.source}: expected `intrinsics: [fx, fy, cx, cy]`, got {len(numbers)} numbers"
         )
-    return _with_distortion(keys, numbers, source)
+    return _with_distortion(keys, numbers)
 
 
-def _from_orb_slam(keys: Keys, prefix: str, source: str) -> Calibration:
-    """ORB-SLAM2's, ORB-SLAM3's and stella_vslam's settings."""
-    values = [keys.number(prefix + key) for key in ("fx", "fy", "cx", "cy")]
+def _from_single_keys(keys: Keys, prefix: str, model_keys: tuple[str, ...] = ()) -> Calibration:
+    """Keys fx, fy, cx and cy, as in the settings of ORB-SLAM2, ORB-SLAM3 and stella_vslam, where they have a prefix."""
+    values = [keys.number(*(prefix + name for name in names)) for names in INTRINSICS]
     intrinsics = [value for value in values if value is not None]
     if len(intrinsics) != 4:
-        raise CalibrationError(f"{source}: {prefix}.fx, fy, cx and cy are needed")
-    size = keys.size("camera", prefix)
-    return _with_distortion(keys, intrinsics, source, prefix=prefix, size=size)
+        raise CalibrationError(f"{keys.source}: {prefix}.fx, fy, cx and cy are needed")
+    return _with_distortion(keys, intrinsics, prefix, model_keys)
 
 
 def from_colmap(path: Path, lines: list[str]) -> Calibration:
@@ -432,11 +364,11 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
         raise CalibrationError(
             f"{path}: camera model {model} is not known; there are {', '.join(COLMAP_MODELS)}"
         )
-    keys = COLMAP_MODELS[model].split()
+    names = COLMAP_MODELS[model]
     numbers = parse_floats(" ".join(words), str(path), CalibrationError)
-    if len(numbers) != len(keys):
-        raise CalibrationError(f"{path}: {model} has the parameters {' '.join(keys)}, got {len(numbers)}")
-    values = dict(zip(keys, numbers, strict=True))
+    if len(numbers) != len(names.split()):
+        raise CalibrationError(f"{path}: {model} has the parameters {names}, got {len(numbers)}")
+    values = dict(zip(names.split(), numbers, strict=True))
     fx, fy = (values.get(key, values.get("f", 0.0)) for key in ("fx", "fy"))
     kind = "fisheye" if model.endswith("FISHEYE") else ""
     coefficients = [values.get(key, 0.0) for key in MODELS[kind or "rational"].coefficients]
@@ -445,10 +377,11 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
     return replace(found, as_stored=True)
 
 
-def _from_transforms(keys: Keys, source: str) -> Calibration:
+def _from_transforms(keys: Keys) -> Calibration:
     """The camera that all frames of a transforms.json share; its pixels count from the corner of the top left one."""
-    _check_shared(keys, source)
-    size = keys.size()
+    source = keys.source
+    _check_shared(keys)
+    size = _size(keys, ("",))
     focal, angle = keys.number("flx"), keys.number("cameraanglex")
     if focal is None and size is not None and angle is not None:
         focal = 0.5 * size[0] / math.tan(0.5 * angle) if angle > 0 else 0.0
@@ -460,7 +393,7 @@ def _from_transforms(keys: Keys, source: str) -> Calibration:
         if center is None and extent is None:
             raise CalibrationError(f"{source}: no {key} in it, nor the size of the images")
         intrinsics.append((extent or 0.0) / 2 - HALF_PIXEL if center is None else center - HALF_PIXEL)
-    found = _with_distortion(keys, intrinsics, source, size=size)
+    found = _with_distortion(keys, intrinsics)
     if found.model == "rational":
         raise CalibrationError(
             f"{source}: k4 is not modeled as nerfstudio means it, the fourth term of a polynomial"
@@ -468,16 +401,13 @@ def _from_transforms(keys: Keys, source: str) -> Calibration:
     return replace(found, as_stored=True)
 
 
-def _check_shared(keys: Keys, source: str) -> None:
+def _check_shared(keys: Keys) -> None:
     """Raise CalibrationError for a frame with a camera of its own."""
-    found = keys.value("frames")
-    for frame in found[1] if found is not None and isinstance(found[1], list) else ():
+    frames: Any = keys.value("frames")
+    for frame in frames if isinstance(frames, list) else ():
         for key in OF_A_CAMERA if isinstance(frame, dict) else ():
-            if key not in frame:
-                continue
-            shared = keys.value(_normal(key))
-            if frame[key] != (0 if shared is None else shared[1]):
+            if key in frame and frame[key] != (keys.value(normal(key)) if (normal(key),) in keys else 0):
                 raise CalibrationError(
-                    f"{source}: frame {str(frame.get('file_path', ''))[:80]} has a {key} of its own; "
+                    f"{keys.source}: frame {str(frame.get('file_path', ''))[:80]} has a {key} of its own; "
                     "only one camera for all frames is read"
                 )

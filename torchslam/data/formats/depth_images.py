@@ -17,13 +17,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.formats.frame_names import MAX_FILES, in_order, times_in_names
 from torchslam.data.formats.image_file import read_pixels
-from torchslam.data.text_file import check_later, listed_files
+from torchslam.data.text_file import check_rising, float64, listed_files
 from torchslam.errors import MeasurementError, SequenceError
 
 DEPTH_LIST = "depth.txt"
@@ -32,8 +31,6 @@ SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm"})
 SEVEN_SCENES_DEPTH = "frame-*.depth.png"
 FIVE_THOUSANDTHS, MILLIMETERS = 5000.0, 1000.0
 """Units per meter, of TUM and ICL-NUIM, and of most others."""
-FAR = 65535
-"""The largest value; like 0, it marks pixels without a measurement."""
 BOUNDS_M = 0.05, 200.0
 """Meters that the middle depth of an image may have; beyond, its unit is another one. Sensors see .2 to 20 m, rendered
 scenes more."""
@@ -89,25 +86,27 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
         MeasurementError: there are none, or a list is wrong, naming file and line.
     """
     path = Path(path)
-    if path.is_dir():
-        for listed in (path / DEPTH_LIST, path.parent / DEPTH_LIST):
-            if listed.is_file() and (listed.parent == path or path.name == "depth"):
-                return _read_list(listed, units_per_meter)
-        files = _files(path)
-        if not files and (path / "depth").is_dir():
-            path = path / "depth"
-            files = _files(path)
-        if not files:
-            raise MeasurementError(f"{path}: no depth images: no {DEPTH_LIST} and no .png, .tif or .pgm")
-        is_icl = next(path.parent.glob("*.gt.freiburg"), None) is not None
-        is_known = is_icl or files[0].match(SEVEN_SCENES_DEPTH)
-        units = units_per_meter or (FIVE_THOUSANDTHS if is_icl else MILLIMETERS)
-        return DepthImages(
-            path, tuple(files), _times_of(files), units, is_known or units_per_meter is not None
-        )
     if not path.exists():
         raise MeasurementError(f"{path}: no such folder of depth images")
-    return _read_list(path, units_per_meter)
+    listed = [path / DEPTH_LIST, *([path.parent / DEPTH_LIST] if path.name == "depth" else [])]
+    found = next((each for each in listed if each.is_file()), None if path.is_dir() else path)
+    if found is not None:
+        places, seconds, paths = zip(*listed_files(found, MeasurementError), strict=True)
+        _check_number(len(paths), found)
+        check_rising(seconds, places, MeasurementError)
+        return DepthImages(found, paths, float64(seconds), units_per_meter or FIVE_THOUSANDTHS)
+    files = _files(path)
+    if not files and (path / "depth").is_dir():
+        path = path / "depth"
+        files = _files(path)
+    if not files:
+        raise MeasurementError(f"{path}: no depth images: no {DEPTH_LIST} and no .png, .tif or .pgm")
+    is_icl = next(path.parent.glob("*.gt.freiburg"), None) is not None
+    is_known = is_icl or files[0].match(SEVEN_SCENES_DEPTH) or units_per_meter is not None
+    units = units_per_meter or (FIVE_THOUSANDTHS if is_icl else MILLIMETERS)
+    times = times_in_names(files)
+    rising = times is not None and all(after > before for before, after in itertools.pairwise(times))
+    return DepthImages(path, tuple(files), float64(times) if rising else None, units, is_known)
 
 
 def _files(folder: Path) -> list[Path]:
@@ -116,8 +115,7 @@ def _files(folder: Path) -> list[Path]:
     for file in folder.iterdir():
         if file.suffix.lower() in SUFFIXES and not file.name.startswith("."):
             found.append(file)
-        if len(found) > MAX_FILES:
-            raise MeasurementError(f"{folder}: more than {MAX_FILES} depth images")
+            _check_number(len(found), folder)
     beside = [file for file in found if file.match(SEVEN_SCENES_DEPTH)]
     try:
         return in_order(beside or found)
@@ -125,26 +123,9 @@ def _files(folder: Path) -> list[Path]:
         raise MeasurementError(str(error)) from None
 
 
-def _times_of(files: list[Path]) -> Float[Tensor, " N"] | None:
-    times = times_in_names(files)
-    if times is None or any(after <= before for before, after in itertools.pairwise(times)):
-        return None
-    return torch.tensor(times, dtype=torch.float64, device="cpu")
-
-
-def _read_list(path: Path, units_per_meter: float | None) -> DepthImages:
-    """The lines `timestamp file` of TUM's list."""
-    times: list[float] = []
-    files: list[Path] = []
-    for where, time, file in listed_files(path, MeasurementError):
-        if times:
-            check_later(time, times[-1], where, MeasurementError)
-        times.append(time)
-        files.append(file)
-        if len(files) > MAX_FILES:
-            raise MeasurementError(f"{path}: more than {MAX_FILES} depth images")
-    table = torch.tensor(times, dtype=torch.float64, device="cpu")
-    return DepthImages(path, tuple(files), table, units_per_meter or FIVE_THOUSANDTHS)
+def _check_number(count: int, where: Path) -> None:
+    if count > MAX_FILES:
+        raise MeasurementError(f"{where}: more than {MAX_FILES} depth images")
 
 
 def read_depth(path: Path, units_per_meter: float) -> Float[np.ndarray, "H W"]:
@@ -157,10 +138,10 @@ def read_depth(path: Path, units_per_meter: float) -> Float[np.ndarray, "H W"]:
     values = read_pixels(path, str(path), as_stored=True)
     if values.dtype != np.uint16 or values.ndim != 2:
         raise MeasurementError(f"{path}: not of 16 bits: no depth image with numbers per meter")
-    depth = np.where(values == FAR, 0, values).astype(np.float32) / np.float32(units_per_meter)
+    # Like 0, the largest value marks pixels without a measurement.
+    depth = np.where(values == 65535, 0, values).astype(np.float32) / np.float32(units_per_meter)
     known = depth[depth > 0]
-    middle = float(np.median(known)) if known.size else math.nan
-    if known.size and not BOUNDS_M[0] < middle < BOUNDS_M[1]:
+    if known.size and not BOUNDS_M[0] < (middle := float(np.median(known))) < BOUNDS_M[1]:
         raise MeasurementError(
             f"{path}: its middle depth is {middle:.3g} m with {units_per_meter:g} units per meter: give the right "
             "number, as in --depth FOLDER:1000"

@@ -2,35 +2,37 @@
 
 from __future__ import annotations
 
-import io
 import math
+import operator
 import os
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import reduce
 from pathlib import Path
 from typing import NamedTuple
 from xml.etree import ElementTree
 
-import torch
 from jaxtyping import Float
-from PIL import Image
 from torch import Tensor
 
-from torchslam.data.formats.csv_tables import TIMES, Column, parse_moment, read_table
 from torchslam.data.formats.frame_names import find_frames
-from torchslam.data.formats.image_file import MAX_BYTES, SUFFIXES
-from torchslam.data.formats.oxts import is_oxts, read_oxts
-from torchslam.data.text_file import MAX_LINE, parse_number, read_text
-from torchslam.errors import MeasurementError
-from torchslam.utils.files import read_bytes
+from torchslam.data.formats.image_file import SUFFIXES, exif_block
+from torchslam.data.formats.vehicle_files import oxts_folder, read_oxts
+from torchslam.data.text_file import (
+    MAX_LINE,
+    TIMES,
+    Column,
+    float64,
+    parse_moment,
+    parse_number,
+    read_table,
+    read_text,
+)
+from torchslam.errors import FrameError, MeasurementError
 
-GPS_BLOCK = 0x8825
-"""Tag of the block of the position (EXIF 2.32)."""
 LATITUDE, LONGITUDE, ALTITUDE = 2, 4, 6
 """Tags in that block; the hemisphere, or whether it is below the sea, is the tag before each."""
-HORIZONTAL_ERROR = 31
-"""Tag of the horizontal error, meters."""
 XML_BYTES = 1 << 26
 """Size limit of GPX files; half a million points, of which the parser makes objects of ten times the size."""
 DEGREES, METERS = {"deg": 1.0, "degrees": 1.0, "°": 1.0}, {"m": 1.0, "meters": 1.0}
@@ -49,7 +51,6 @@ MAX_FIXES = 1_000_000
 """Maximum number of positions of a file: more than a day at 10 Hz."""
 MAX_ALTITUDE = 1e5
 """Meters: the farthest from the ground that a position may be; balloons and rockets of amateurs stay below."""
-OXTS_ACCURACY = 23  # the place of `pos_accuracy` in a packet (dataformat.txt)
 
 
 class Fix(NamedTuple):
@@ -114,12 +115,13 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
             empty += 1
             continue
         _check(row)
-        if row.time is not None and kept and kept[-1].time is not None and row.time <= kept[-1].time:
-            if row.time < kept[-1].time:
-                raise MeasurementError(
-                    f"{row.where}: the time {row.time!r} is earlier than the one before, {kept[-1].time!r}: "
-                    "sort the file by its times"
-                )
+        before = kept[-1].time if kept else None
+        if row.time is not None and before is not None and row.time < before:
+            raise MeasurementError(
+                f"{row.where}: the time {row.time!r} is earlier than the one before, {before!r}: "
+                "sort the file by its times"
+            )
+        if row.time is not None and row.time == before:
             doubled += 1
             continue
         kept.append(row)
@@ -133,9 +135,9 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
     times = [row.time for row in kept if row.time is not None]
     return Fixes(
         Path(path),
-        torch.tensor([row[1:4] for row in kept], dtype=torch.float64, device="cpu"),
-        torch.tensor([row.std for row in kept], dtype=torch.float64, device="cpu"),
-        torch.tensor(times, dtype=torch.float64, device="cpu") if times else None,
+        float64([row[1:4] for row in kept]),
+        float64([row.std for row in kept]),
+        float64(times) if times else None,
         () if times else tuple(row.name for row in kept),
         tuple(said),
     )
@@ -143,20 +145,19 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
 
 def _check(row: Fix) -> None:
     """Raise MeasurementError for a position that is none of the Earth's, or an error that is none."""
+    what = ""
     if not abs(row.latitude) <= 90:
         hint = ": are latitude and longitude swapped?" if abs(row.longitude) <= 90 else ""
-        raise MeasurementError(
-            f"{row.where}: a latitude of {row.latitude:g} degrees is beyond the poles{hint}"
-        )
-    if not abs(row.longitude) <= 360:
-        raise MeasurementError(f"{row.where}: a longitude of {row.longitude:g} degrees is beyond 180")
-    if not (math.isnan(row.altitude) or abs(row.altitude) <= MAX_ALTITUDE):
-        raise MeasurementError(
-            f"{row.where}: an altitude of {row.altitude:g} is no altitude in meters above the ground of the Earth"
-        )
+        what = f"a latitude of {row.latitude:g} degrees is beyond the poles{hint}"
+    elif not abs(row.longitude) <= 360:
+        what = f"a longitude of {row.longitude:g} degrees is beyond 180"
+    elif abs(row.altitude) > MAX_ALTITUDE:  # NaN is not
+        what = f"an altitude of {row.altitude:g} is no altitude in meters above the ground of the Earth"
     for std in row.std:
         if not (math.isnan(std) or 0 < std < math.inf):
-            raise MeasurementError(f"{row.where}: a standard deviation of {std:g} m is not above zero")
+            what = what or f"a standard deviation of {std:g} m is not above zero"
+    if what:
+        raise MeasurementError(f"{row.where}: {what}")
 
 
 def read_fixes(path: str | Path) -> Fixes:
@@ -166,7 +167,8 @@ def read_fixes(path: str | Path) -> Fixes:
     """
     path = Path(path)
     if os.path.isdir(path):  # Path.is_dir raises for a name that is too long
-        return _read_oxts(path) if is_oxts(path) else read_image_fixes(path)
+        oxts = oxts_folder(path)
+        return read_image_fixes(path) if oxts is None else checked_fixes(path, _oxts_rows(oxts))
     suffix = path.suffix.lower()
     if suffix == ".srt":
         return checked_fixes(path, _srt_rows(path))
@@ -184,7 +186,8 @@ def read_fixes(path: str | Path) -> Fixes:
 
 def _csv_rows(path: Path) -> Iterator[Fix]:
     for row in read_table(path, COLUMNS, MeasurementError):
-        if not row.has_time and "name" not in row.cells:
+        moment = row.time()
+        if moment is None and "name" not in row.cells:
             raise MeasurementError(f"{row.where}: neither a `time` nor the `name` of an image")
         if "latitude" not in row.cells and "longitude" not in row.cells and "altitude" in row.cells:
             raise MeasurementError(f"{row.where}: no `latitude` and `longitude`, in degrees")
@@ -193,7 +196,7 @@ def _csv_rows(path: Path) -> Iterator[Fix]:
             row.number("latitude"),
             row.number("longitude"),
             row.number("altitude"),
-            row.time() if row.has_time else None,
+            moment,
             row.cells.get("name", ""),
             (row.number("std_horizontal"), row.number("std_vertical")),
         )
@@ -285,14 +288,14 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         root = ElementTree.fromstring(text)
     except (ElementTree.ParseError, ValueError) as cause:
         raise MeasurementError(f"{path}: not GPX: {cause}") from cause
-    points = [element for element in root.iter() if _tag(element) == "trkpt"]
+    points = list(root.iterfind(".//{*}trkpt"))
     if not points:
         raise MeasurementError(
             f"{path}: no points of a track (trkpt) in it; routes and waypoints have no times"
         )
     for number, point in enumerate(points, start=1):
         where = f"{path}: point {number}"
-        children = {_tag(child): (child.text or "").strip() for child in point}
+        children = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in point}
         time = parse_moment(children.get("time", ""))
         if time is None:
             raise MeasurementError(f"{where}: no time; a planned route cannot be used")
@@ -303,11 +306,6 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         yield Fix(where, latitude, longitude, altitude, time=time)
 
 
-def _tag(element: ElementTree.Element) -> str:
-    """The name of an element without its namespace."""
-    return element.tag.rpartition("}")[2]
-
-
 # --- NMEA ----------------------------------------------------------------------------------------------------
 
 
@@ -316,32 +314,25 @@ def _read_nmea(path: Path, text: str) -> Fixes:
 
     Without RMC the times are seconds since midnight, UTC. Lines with a wrong checksum are skipped, with a note.
     """
-    rows: list[tuple[str, list[str]]] = []
+    rows: dict[str, list[tuple[str, list[str]]]] = {"GGA": [], "RMC": []}
     damaged = 0
     for number, line in enumerate(text.split("\n"), start=1):
         line = line.strip()
-        if not line.startswith("$") or line[3:6] not in ("GGA", "RMC"):
+        if not line.startswith("$") or line[3:6] not in rows:
             continue
         body, star, given = line[1:].partition("*")
-        total = 0
-        for byte in body.encode():
-            total ^= byte
-        if star and given[:2].upper() != f"{total:02X}":
+        if star and given[:2].upper() != f"{reduce(operator.xor, body.encode()):02X}":
             damaged += 1
             continue
-        rows.append((f"{path}:{number}", body.split(",")))
+        rows[line[3:6]].append((f"{path}:{number}", body.split(",")))
     notes = [f"{path}: skipped {damaged} lines with a wrong checksum"] if damaged else []
-    return checked_fixes(path, _nmea_rows(rows), notes)
+    dates = {fields[1]: fields[9] for _, fields in rows["RMC"] if len(fields) > 9}
+    return checked_fixes(path, _nmea_rows(rows["GGA"] or rows["RMC"], dates), notes)
 
 
-def _nmea_rows(rows: list[tuple[str, list[str]]]) -> Iterator[Fix]:
-    has_altitudes = any(fields[0].endswith("GGA") for _, fields in rows)
-    dates = {fields[1]: fields[9] for _, fields in rows if fields[0].endswith("RMC") and len(fields) > 9}
+def _nmea_rows(rows: list[tuple[str, list[str]]], dates: dict[str, str]) -> Iterator[Fix]:
     midnight, last = 0.0, -math.inf
     for where, fields in rows:
-        is_gga = fields[0].endswith("GGA")
-        if is_gga != has_altitudes:
-            continue
         if len(fields) < 10 or not re.fullmatch(r"\d{6}(\.\d{1,9})?", fields[1]):
             continue  # no fix yet, without a time
         clock = int(fields[1][:2]) * 3600 + int(fields[1][2:4]) * 60 + float(fields[1][4:])
@@ -353,16 +344,16 @@ def _nmea_rows(rows: list[tuple[str, list[str]]]) -> Iterator[Fix]:
             midnight = moment
         elif midnight + clock < last:  # past midnight
             midnight += 86400.0
-        has_fix = fields[6] not in ("", "0") if is_gga else fields[2] == "A"
-        at = 2 if is_gga else 3
         last = midnight + clock
-        yield Fix(
-            where,
-            _degrees(fields[at], fields[at + 1], "NS", where) if has_fix else math.nan,
-            _degrees(fields[at + 2], fields[at + 3], "EW", where) if has_fix else math.nan,
-            parse_number(fields[9], where, MeasurementError) if is_gga and fields[9] else math.nan,
-            time=last,
-        )
+        is_gga = fields[0].endswith("GGA")
+        latitude = longitude = altitude = math.nan
+        if fields[6] not in ("", "0") if is_gga else fields[2] == "A":
+            at = 2 if is_gga else 3
+            latitude = _degrees(fields[at], fields[at + 1], "NS", where)
+            longitude = _degrees(fields[at + 2], fields[at + 3], "EW", where)
+        if is_gga and fields[9]:
+            altitude = parse_number(fields[9], where, MeasurementError)
+        yield Fix(where, latitude, longitude, altitude, time=last)
 
 
 def _degrees(text: str, hemisphere: str, expected: str, where: str) -> float:
@@ -397,18 +388,18 @@ def read_image_fixes(folder: Path) -> Fixes:
 
 def _image_fix(path: Path) -> Fix | None:
     try:
-        content = read_bytes(path, MAX_BYTES, "an image that is read")
-        with Image.open(io.BytesIO(content)) as image:
-            block = image.getexif().get_ifd(GPS_BLOCK)
+        block = exif_block(path, 0x8825)  # of the position, EXIF 2.32
         if LATITUDE not in block or LONGITUDE not in block:
             return None
         latitude, longitude = (
             _exif_degrees(block[tag], block.get(tag - 1, "")) for tag in (LATITUDE, LONGITUDE)
         )
         below = block.get(ALTITUDE - 1, 0) in (1, b"\x01")
-        altitude = float(block[ALTITUDE]) * (-1 if below else 1) if ALTITUDE in block else math.nan
-        error = float(block[HORIZONTAL_ERROR]) if HORIZONTAL_ERROR in block else math.nan
-    except Exception as cause:  # a damaged block fails in any way
+        altitude = float(block.get(ALTITUDE, math.nan)) * (-1 if below else 1)
+        error = float(block.get(31, math.nan))  # horizontal, meters
+    except FrameError as cause:
+        raise MeasurementError(str(cause)) from cause
+    except Exception as cause:  # values of a damaged block have any type
         raise MeasurementError(f"{path}: its EXIF block cannot be read: {cause}") from cause
     std = error if error > 0 else math.nan, math.nan
     return Fix(str(path), latitude, longitude, altitude, name=path.name, std=std)
@@ -423,12 +414,12 @@ def _exif_degrees(parts: tuple[float, ...], hemisphere: str) -> float:
 # --- KITTI ---------------------------------------------------------------------------------------------------
 
 
-def _read_oxts(folder: Path) -> Fixes:
+def _oxts_rows(folder: Path) -> Iterator[Fix]:
     """On the clock of KITTI's raw images, with the accuracy that the receiver states."""
-    rows = []
     for packet in read_oxts(folder):
-        accuracy = packet.numbers[OXTS_ACCURACY] if len(packet.numbers) > OXTS_ACCURACY else math.nan
+        accuracy = (
+            packet.numbers[23] if len(packet.numbers) > 23 else math.nan
+        )  # `pos_accuracy` (dataformat.txt)
         std = accuracy if accuracy > 0 else math.nan
         latitude, longitude, altitude = packet.numbers[:3]
-        rows.append(Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std)))
-    return checked_fixes(folder, rows)
+        yield Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import os
 import struct
 from collections import Counter
@@ -19,8 +18,8 @@ from torch import Tensor
 from torchslam.data.calibration import Calibration
 from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
-from torchslam.data.text_file import parse_floats, read_text
-from torchslam.data.trajectories import nearest, poses_from_rows, read_trajectory
+from torchslam.data.text_file import are_numbers, float64, parse_floats, read_text
+from torchslam.data.trajectories import nearest, orthogonality_error, poses_from_rows, read_trajectory
 from torchslam.errors import CalibrationError, FrameError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse
 from torchslam.geometry.transforms import opengl
@@ -28,21 +27,22 @@ from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
 TRANSFORMS = "transforms.json"
-# COLMAP, src/colmap/sensor/models.h: the numbers of the models in binary files.
-MODEL_NAMES = {
-    0: "SIMPLE_PINHOLE",
-    1: "PINHOLE",
-    2: "SIMPLE_RADIAL",
-    3: "RADIAL",
-    4: "OPENCV",
-    5: "OPENCV_FISHEYE",
-    6: "FULL_OPENCV",
-    8: "SIMPLE_RADIAL_FISHEYE",
-    9: "RADIAL_FISHEYE",
-}
+MODEL_NAMES = (
+    *(
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "FULL_OPENCV",
+        "FOV",
+    ),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
+)
+"""By their numbers in binary files: COLMAP, src/colmap/sensor/models.h."""
 _MAX_BYTES = 1 << 30
 """Largest model that is read; a frame with 10,000 keypoints takes 240 kB of it."""
-_POINT_BYTES = 24  # of an observation in images.bin
 _ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 
 
@@ -81,38 +81,37 @@ class GivenPoses:
         Raises TrajectoryError where no frame has one, for poses that are left over where the times of images are
         counted, and for images that are turned by their EXIF orientation where the poses are of the stored images.
         """
-        if self.timestamps is None:
+        times = self.timestamps
+        if times is None:
             found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
             how = f"no image has one of its names, such as {self.names[0]}"
         else:
-            found = _by_time(self.timestamps, sequence.timestamps)
-            until = sequence.counted_until
-            without_image = 0 if until is None else int((self.timestamps > until).sum())
-            if without_image and bool((found >= 0).any()):
+            found = _by_time(times, sequence.timestamps)
+            own, others = (
+                f"from {each[0]} to {each[-1]} s" for each in (times.tolist(), sequence.timestamps.tolist())
+            )
+            how = f"its times, {own}, are not those of the images, {others}"
+        frames = torch.nonzero(found >= 0)[:, 0].tolist()
+        if not frames:
+            raise TrajectoryError(f"{self.path}: no pose is that of an image of {sequence.name}: {how}")
+        if times is not None and sequence.counted_until is not None:
+            without_image = int((times > sequence.counted_until).sum())
+            if without_image:
                 raise TrajectoryError(
                     f"{self.path}: {without_image} of {len(self)} poses are of no image of {sequence.name}, whose "
                     "times are counted: with one image more or less, the others have wrong poses; name the images "
                     "by their times, or list them in rgb.txt"
                 )
-            how = (
-                f"its times, from {float(self.timestamps[0])} to {float(self.timestamps[-1])} s, are not those of the "
-                f"images, from {float(sequence.timestamps[0])} to {float(sequence.timestamps[-1])} s"
-            )
-        if not bool((found >= 0).any()):
-            raise TrajectoryError(f"{self.path}: no pose is that of an image of {sequence.name}: {how}")
-        if self.timestamps is None:
-            self._check_orientation(sequence, torch.nonzero(found >= 0)[:, 0].tolist())
-        return found
-
-    def _check_orientation(self, sequence: Sequence, frames: list[int]) -> None:
-        """Raise TrajectoryError for an image in another orientation than COLMAP, or what builds on it, saw it in."""
-        for frame in frames:
+        for frame in (
+            frames if times is None else ()
+        ):  # COLMAP, and what builds on it, sees images as they are stored
             with contextlib.suppress(FrameError):  # said when the frame is read
                 if sequence.is_turned(frame):
                     raise TrajectoryError(
                         f"{sequence.image_name(frame)}: its EXIF orientation turns it, which {self.path} ignores: open "
                         "the sequence with the camera in there (without --camera), or remove the tag from the images"
                     )
+        return found
 
 
 def read_poses(path: str | Path) -> GivenPoses:
@@ -121,22 +120,18 @@ def read_poses(path: str | Path) -> GivenPoses:
     Raises TrajectoryError or CalibrationError naming the file.
     """
     path = Path(path)
+    models = ("images.bin", "images.txt")
     if os.path.isdir(path):  # Path.is_dir raises for a name that is too long
-        if (path / TRANSFORMS).is_file():
-            return _read_transforms(path / TRANSFORMS)
-        for name in ("images.bin", "images.txt"):
-            if (path / name).is_file():
-                return _read_colmap(path, binary=name.endswith("bin"))
-        raise TrajectoryError(f"{path}: neither images.bin or images.txt of COLMAP nor {TRANSFORMS} in it")
-    if path.name in ("images.bin", "images.txt"):
+        inside = next((name for name in (TRANSFORMS, *models) if (path / name).is_file()), None)
+        if inside is None:
+            raise TrajectoryError(f"{path}: neither {' or '.join(models)} of COLMAP nor {TRANSFORMS} in it")
+        path = path / inside
+    if path.name in models:
         return _read_colmap(path.parent, binary=path.suffix == ".bin")
     if path.suffix.lower() == ".json":
         return _read_transforms(path)
     trajectory = read_trajectory(path)
     return GivenPoses(TUM, path, se3_inverse(trajectory.T_wc), trajectory.timestamps)
-
-
-# --- which pose is whose -------------------------------------------------------------------------------------
 
 
 def _by_time(times: Float[Tensor, " N"], frames: Float[Tensor, " F"]) -> Int[Tensor, " F"]:
@@ -153,17 +148,14 @@ def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
     Without a suffix as well (the first transforms.json had none); a name that two images have is that of none.
     """
     for key in (lambda name: PurePath(name).parts, lambda name: PurePath(name).with_suffix("").parts):
-        depth = max(len(key(name)) for name in names)
-        for length in range(depth, 0, -1):
+        for length in range(max(len(key(name)) for name in names), 0, -1):
             ends = [key(name)[-length:] for name in names]
             image_ends = [key(image)[-length:] for image in images]
             single, own = Counter(ends), Counter(image_ends)
             rows = {end: row for row, end in enumerate(ends) if single[end] == 1}
-            found = torch.tensor(
-                [rows.get(end, -1) if own[end] == 1 else -1 for end in image_ends], device="cpu"
-            )
-            if bool((found >= 0).any()):
-                return found
+            found = [rows.get(end, -1) if own[end] == 1 else -1 for end in image_ends]
+            if max(found, default=-1) >= 0:
+                return torch.tensor(found, device="cpu")
     return torch.full((len(images),), -1, device="cpu")
 
 
@@ -176,11 +168,10 @@ def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
     images = sorted(read(folder / f"images.{'bin' if binary else 'txt'}"))
     if not images:
         raise TrajectoryError(f"{folder}: no images in the model")
-    table = torch.tensor([numbers for _, numbers in images], dtype=torch.float64, device="cpu")
-    names = tuple(name for name, _ in images)
-    T_cw = poses_from_rows(table[:, [4, 5, 6, 1, 2, 3, 0]], [f"{folder}: {name}" for name in names])
-    text = folder / "cameras.txt"
-    calibration = _binary_camera(folder / "cameras.bin") if binary else read_calibration(text)
+    names, rows = zip(*images, strict=True)
+    T_cw = poses_from_rows(float64(rows)[:, [4, 5, 6, 1, 2, 3, 0]], [f"{folder}: {name}" for name in names])
+    read_camera = _binary_camera if binary else read_calibration
+    calibration = read_camera(folder / f"cameras.{'bin' if binary else 'txt'}")
     return GivenPoses(COLMAP, folder, T_cw, None, names, calibration)
 
 
@@ -192,7 +183,7 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
             continue
         words = line.split(maxsplit=9)
         numbers = line.split()  # observations in threes; ten words are an image whose name is a number
-        if not words or (is_points and len(numbers) != 10 and _are_numbers(numbers)):
+        if not words or (is_points and len(numbers) != 10 and are_numbers(numbers)):
             is_points = False
             continue
         if len(words) != 10:
@@ -200,13 +191,6 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
         images.append((words[9].strip(), parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)))
         is_points = True
     return images
-
-
-def _are_numbers(words: list[str]) -> bool:
-    try:
-        return all(map(math.isfinite, map(float, words)))
-    except ValueError:
-        return False
 
 
 def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
@@ -220,7 +204,7 @@ def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
             end = data.index(b"\0", at + 64)
             (points,) = struct.unpack_from("<Q", data, end + 1)
             images.append((data[at + 64 : end].decode(), numbers))
-            at = end + 9 + _POINT_BYTES * points
+            at = end + 9 + 24 * points
     except (OSError, struct.error, ValueError, OverflowError) as cause:
         raise TrajectoryError(f"{path}: not COLMAP's images: {cause}") from cause
     return images
@@ -234,7 +218,7 @@ def _binary_camera(path: Path) -> Calibration:
         if count != 1:
             raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
         number, model, width, height = struct.unpack_from("<IiQQ", data, 8)
-        name = MODEL_NAMES.get(model, str(model))
+        name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else str(model)
         keys = COLMAP_MODELS.get(name, "").split()
         params = struct.unpack_from(f"<{len(keys)}d", data, 32)
     except (OSError, struct.error) as cause:
@@ -250,16 +234,13 @@ def _read_transforms(path: Path) -> GivenPoses:
     try:
         content: Any = parse_json(read_text(path, TrajectoryError, JSON_BYTES))
         frames = [(str(frame["file_path"]), frame["transform_matrix"]) for frame in content["frames"]]
-        T_wc = torch.tensor([matrix for _, matrix in frames], dtype=torch.float64, device="cpu")
+        T_wc = float64([matrix for _, matrix in frames])
     except (ValueError, KeyError, TypeError, RuntimeError, OverflowError) as cause:
         raise TrajectoryError(f"{path}: not the frames of a transforms.json: {cause!r}") from cause
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
     R = T_wc[:, :3, :3]
-    if not bool(
-        T_wc.isfinite().all()
-        & ((R @ R.mT - torch.eye(3, dtype=R.dtype, device="cpu")).abs() < _ORTHOGONAL).all()
-    ):
+    if not bool(T_wc.isfinite().all() & (orthogonality_error(R) < _ORTHOGONAL).all()):
         raise TrajectoryError(f"{path}: a transform_matrix is not a rigid transformation")
     T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
     is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it

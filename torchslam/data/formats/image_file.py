@@ -8,9 +8,9 @@ from __future__ import annotations
 import io
 import warnings
 import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import kornia_rs
@@ -30,7 +30,6 @@ FOREIGN = frozenset(
 )
 """Suffixes of images that are not read."""
 WIDTH, HEIGHT = 256, 257  # tags of a TIFF
-ORIENTATION = 0x0112  # tag of EXIF
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
 MAX_BYTES = 1 << 29
@@ -68,14 +67,14 @@ def read_gray(
     Raises:
         FrameError: at `where` for a file that is missing, truncated, too large or not an image.
     """
-    return gray_to_tensor(_read(path, where, AS_GRAY, as_stored), bits)
+    return gray_to_tensor(read_pixels(path, where, as_stored), bits)
 
 
 def read_color(
     path: str | Path, where: str, bits: int = 8, as_stored: bool = False
 ) -> UInt8[Tensor, "H W 3"]:
     """An image file as red, green, blue; arguments and errors are those of `read_gray`."""
-    image = _read(path, where, AS_COLOR, as_stored)
+    image = read_pixels(path, where, as_stored, AS_COLOR)
     if image.dtype == np.uint16:
         image = np.rint(image * np.float32(255 / _white(bits))).clip(max=255).astype(np.uint8)
     return bgr_to_tensor(image)
@@ -84,13 +83,22 @@ def read_color(
 def read_pixels(
     path: str | Path, where: str, as_stored: bool = False, flags: int = AS_GRAY
 ) -> Shaped[np.ndarray, "H W *channels"]:
-    """An image file as gray or with `AS_COLOR`, uint8 or uint16. Raises FrameError as `read_gray`."""
-    return _read(path, where, flags, as_stored)
+    """An image file as gray, or as OpenCV's flags say, uint8 or uint16. Raises FrameError as `read_gray`."""
+    try:
+        data = read_bytes(path, MAX_BYTES, "an image that is read")
+    except OSError as cause:
+        raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
+    if _is_truncated(data):
+        raise FrameError(f"{where}: {path} is truncated: its end marker is missing")
+    image = decode_pixels(data, flags | cv2.IMREAD_IGNORE_ORIENTATION if as_stored else flags)
+    if image is None:
+        raise FrameError(f"{where}: {path} is not an image, or a damaged one")
+    return image
 
 
 def has_transparency(path: Path) -> bool:
     """Return whether an image file has pixels that are not opaque. Raises FrameError as `read_gray`."""
-    image = _read(path, str(path), cv2.IMREAD_UNCHANGED, as_stored=False)
+    image = read_pixels(path, str(path), flags=cv2.IMREAD_UNCHANGED)
     return image.shape[2:] == (4,) and int(image[..., 3].min()) < np.iinfo(image.dtype).max
 
 
@@ -108,22 +116,22 @@ def is_turned(path: Path, as_stored: bool) -> bool:
                     return False
                 # Pillow would decode a PNG in search of a block after the pixels.
                 is_searched = image.format != "PNG" or "exif" in image.info
-                return is_searched and image.getexif().get(ORIENTATION, 1) != 1
+                return is_searched and image.getexif().get(0x0112, 1) != 1  # the orientation
     except Exception as cause:  # a damaged block fails in any way
         raise FrameError(f"{path}: its EXIF block cannot be read: {cause}") from cause
 
 
-def _read(path: str | Path, where: str, flags: int, as_stored: bool) -> np.ndarray:
+def exif_block(path: Path, block: int) -> dict[int, Any]:
+    """Return the values of a block of EXIF data by tag, of the block with a tag of its own.
+
+    Raises FrameError if the file cannot be read.
+    """
     try:
-        data = read_bytes(path, MAX_BYTES, "an image that is read")
-    except OSError as cause:
-        raise FrameError(f"{where}: {path} cannot be read: {cause.strerror}") from cause
-    if _is_truncated(data):
-        raise FrameError(f"{where}: {path} is truncated: its end marker is missing")
-    image = decode_pixels(data, flags | cv2.IMREAD_IGNORE_ORIENTATION if as_stored else flags)
-    if image is None:
-        raise FrameError(f"{where}: {path} is not an image, or a damaged one")
-    return image
+        content = read_bytes(path, MAX_BYTES, "an image that is read")
+        with Image.open(io.BytesIO(content)) as image:
+            return image.getexif().get_ifd(block)
+    except Exception as cause:  # a damaged block fails in any way
+        raise FrameError(f"{path}: its EXIF block cannot be read: {cause}") from cause
 
 
 def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
@@ -138,6 +146,10 @@ def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
     except (cv2.error, MemoryError):  # a header that promises more pixels than OpenCV takes
         return None
     return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
+
+
+SAMPLES = 20
+"""Number of images in which the brightest pixel of a 16-bit sequence is searched."""
 
 
 def bit_depth(images: Iterable[np.ndarray]) -> int:
@@ -267,10 +279,6 @@ def image_tensor(
 
 
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-PNG_HEADER_BYTES = (13).to_bytes(4, "big")
-"""Length of the first chunk of a PNG file, IHDR, as it stands in the file."""
-PNG_CHUNK_FRAME = 12
-"""Bytes of a chunk around its content: length, name, sum."""
 PNG_MAX_CHUNKS = 1 << 17
 """Largest number of chunks of a file: libpng writes one for 8 kB of pixels, which are at most 1 GB."""
 PNG_PLAIN_CHUNKS = frozenset({b"IHDR", b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME"})
@@ -284,49 +292,48 @@ TO_GRAY = np.array([[9797, 19234, 3737, 0.5 - 16384]], np.float32) / 32768
 def decode_png_gray(data: bytes) -> Shaped[np.ndarray, "H W"] | None:
     """Decode a plain PNG file (gray of 8 or 16 bits, color of 8) to gray, uint8 or uint16.
 
-    None for any other file, and for a damaged one: then OpenCV has to say. An image is made of the size that a sound
-    header promises, so who calls this has looked at that. Source: PNG specification, sections 5 and 11.
+    None for any other file, and for a damaged one: then OpenCV has to say. That is: without a sound header, interlaced,
+    or with chunks that change its pixels. An image is made of the size that a sound header promises, so who calls this
+    has looked at that. Source: PNG specification, sections 5 and 11.
     """
-    if not _is_plain_png(data):
+    header, sum_ = data[12:29], data[29:33]
+    is_sound = (
+        data.startswith(PNG_SIGNATURE + b"\0\0\0\rIHDR")  # of 13 bytes
+        and zlib.crc32(header).to_bytes(4, "big") == sum_
+        and any(data[16:20])
+        and any(data[20:24])
+    )
+    first = next((name for name, _ in _png_chunks(data) if name not in PNG_PLAIN_CHUNKS), b"")
+    if not is_sound or header[-1] or first != b"IDAT":  # the last byte of the header: interlaced
         return None
     size = int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
-    bits, color = data[24], data[25]
+    kind = data[24], data[25]
     try:
-        if (bits, color) == (16, PNG_GRAY):
+        if kind == (16, PNG_GRAY):
             return kornia_rs.io.decode_image_png_u16(data, size, "mono")[..., 0]
-        if (bits, color) == (8, PNG_GRAY):
+        if kind == (8, PNG_GRAY):
             return kornia_rs.io.decode_image_png_u8(data, size, "mono")[..., 0]
-        if (bits, color) == (8, PNG_COLOR):
+        if kind == (8, PNG_COLOR):
             return cv2.transform(kornia_rs.io.decode_image_png_u8(data, size, "rgb"), TO_GRAY).reshape(size)
     except Exception:  # the decoder has no exception type
         return None
     return None
 
 
+def _png_chunks(data: bytes) -> Iterator[tuple[bytes, int]]:
+    """Yield the name of each chunk of a PNG file, and where it ends, until the last one or the end of the file."""
+    end = len(PNG_SIGNATURE)
+    for _ in range(PNG_MAX_CHUNKS):
+        name = data[end + 4 : end + 8]
+        end += 12 + int.from_bytes(data[end : end + 4], "big")
+        yield name, end  # around its content are its length, its name and a sum
+        if name == b"IEND" or end > len(data):
+            return
+
+
 def _has_whole_chunks(data: bytes) -> bool:
     """Return False for a PNG file with a chunk that reaches beyond its end: OpenCV allocates what a chunk declares."""
     if not data.startswith(PNG_SIGNATURE):
         return True
-    position = len(PNG_SIGNATURE)
-    for _ in range(PNG_MAX_CHUNKS):
-        length, name = int.from_bytes(data[position : position + 4], "big"), data[position + 4 : position + 8]
-        position += PNG_CHUNK_FRAME + length
-        if name == b"IEND" or position > len(data):
-            return position <= len(data)
-    return False
-
-
-def _is_plain_png(data: bytes) -> bool:
-    """Return True for a PNG file with a sound header, not interlaced, without chunks that change its pixels."""
-    header, sum_ = data[12:29], data[29:33]
-    if (
-        not data.startswith(PNG_SIGNATURE + PNG_HEADER_BYTES + b"IHDR")
-        or zlib.crc32(header).to_bytes(4, "big") != sum_
-    ):
-        return False
-    if header[-1] or not any(data[16:20]) or not any(data[20:24]):
-        return False
-    position = len(PNG_SIGNATURE)
-    while (name := data[position + 4 : position + 8]) in PNG_PLAIN_CHUNKS:
-        position += PNG_CHUNK_FRAME + int.from_bytes(data[position : position + 4], "big")
-    return name == b"IDAT"
+    *_, (name, end) = _png_chunks(data)
+    return name == b"IEND" and end <= len(data)

@@ -10,21 +10,20 @@ import itertools
 import sys
 import weakref
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.calibration_files import checked
-from torchslam.data.formats.image_file import MAX_BYTES, bit_depth, decode_pixels, gray_to_tensor
+from torchslam.data.formats.image_file import MAX_BYTES, SAMPLES, bit_depth, decode_pixels, gray_to_tensor
 from torchslam.data.sequence import Reader, Sequence
+from torchslam.data.text_file import float64
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.files import check_regular
 from torchslam.utils.forks import forget_in_forks, never_release
@@ -34,15 +33,8 @@ if TYPE_CHECKING:
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 MAX_MESSAGES = 2_000_000
 """Largest number of images: more than a day at 20 Hz."""
-MAX_RECORDING, MAX_METADATA = 1 << 44, 1 << 22
-"""Bytes of a recording, and of the text that describes it."""
-MAX_FILES = 10_000
-"""Files of a recording that are looked at: six days, one each minute."""
-SAMPLES = 20
-"""Number of 16-bit images that are searched for the brightest pixel."""
 
 # https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them gray.
 GRAY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}
@@ -65,50 +57,46 @@ COLORS = {
 }
 
 
-@dataclass(frozen=True)
-class Topic:
-    """An image topic and its recorded calibration.
+class BagSequence(Sequence):
+    """Images of one topic, read in order; seeking backwards reads from the start again.
 
-    Attributes:
-        times: seconds since 1970: the stamps of the images, or the times of recording for images without one
+    Args:
+        path: the recording.
+        reader: of it.
+        connection: the topic.
+        times: of its messages, seconds since 1970: the stamps of the images, or when one without it was recorded.
+        camera: of the images, if known.
+
+    Raises SequenceError if no image can be read, CalibrationError for a camera of another size.
     """
 
-    connection: Connection
-    times: list[float]
-    calibration: Calibration | None
-
-
-class BagSequence(Sequence):
-    """Images of one topic, read in order; seeking backwards reads from the start again."""
-
-    def __init__(self, path: Path, reader: Recording, topic: Topic, camera: GivenCamera | None) -> None:
-        """Raises SequenceError if no image can be read, CalibrationError for a camera of another size."""
-        self._path, self._reader, self._connection = path, reader, topic.connection
+    def __init__(
+        self,
+        path: Path,
+        reader: Recording,
+        connection: Connection,
+        times: list[float],
+        camera: GivenCamera | None,
+    ) -> None:
+        self._path, self._reader, self._connection = path, reader, connection
         # Messages may be recorded late: frames come in the order in which they were taken.
-        order = sorted(range(len(topic.times)), key=lambda message: topic.times[message])
-        self._messages = [
-            message
-            for number, message in enumerate(order)
-            if number == 0 or topic.times[message] > topic.times[order[number - 1]]
-        ]
+        messages: dict[float, int] = {}
+        for message, time in enumerate(times):
+            messages.setdefault(time, message)
+        self._messages = [messages[time] for time in sorted(messages)]
         self._position, self._is_inherited = 0, False
         self._stream: Iterator[Any] = iter(())
         self._rewind()
-        self._bits, size = 8, None
-        for message in sorted(self._messages)[:SAMPLES]:
-            image = self._read(message)
-            self._bits = max(self._bits, bit_depth([image]))
-            size = size or (image.shape[1], image.shape[0])
-        assert size is not None  # a topic has images
-        left_out = len(order) - len(self._messages)
+        first, *others = sorted(self._messages)[:SAMPLES]
+        image = self._read(first)
+        self._bits = bit_depth(itertools.chain([image], map(self._read, others)))
+        left_out = len(times) - len(messages)
         super().__init__(
             path.stem,
-            f"ROS bag, {topic.connection.topic}",
-            topic.calibration if camera is None else camera,
-            torch.tensor(
-                [topic.times[message] for message in self._messages], dtype=torch.float64, device="cpu"
-            ),
-            size=size,
+            f"ROS bag, {connection.topic}",
+            camera,
+            float64(sorted(messages)),
+            size=(image.shape[1], image.shape[0]),
             notes=[f"left out {left_out} images whose time repeats"] if left_out else [],
         )
 
@@ -131,8 +119,7 @@ class BagSequence(Sequence):
             gray = self._read(self._messages[index])
         except SequenceError as error:
             raise FrameError(str(error)) from error
-        if (gray.shape[1], gray.shape[0]) != self.size:
-            raise FrameError(f"{self.image_name(index)}: has another size than the first image")
+        self._check_size(gray.shape, self.image_name(index))
         return gray_to_tensor(gray, self._bits)
 
     def image_name(self, index: int) -> str:
@@ -159,11 +146,9 @@ class BagSequence(Sequence):
             self._rewind()
         where = f"{self._path}{self._connection.topic}, message {message}"
         with _errors(where):
-            while True:
+            while self._position <= message:
                 _, _, raw = next(self._stream)
                 self._position += 1
-                if self._position > message:
-                    break
             content: Any = self._reader.deserialize(raw, self._connection.msgtype)
             if self._connection.msgtype == COMPRESSED:
                 gray = decode_pixels(content.data[:MAX_BYTES].tobytes())
@@ -196,24 +181,6 @@ def to_gray(message: Any, where: str) -> Shaped[np.ndarray, "H W"]:
         return image.astype(GRAY[encoding])
     image = image.reshape(height, width, channels) if channels > 1 else image
     return cv2.cvtColor(image, COLORS[encoding][1])
-
-
-def _is_bag(path: str) -> bool:
-    """Return True for a bag file and for the folder of a ROS 2 recording."""
-    source = Path(path.partition("?topic=")[0])
-    return (source.suffix.lower() in SUFFIXES and source.exists()) or (source / "metadata.yaml").is_file()
-
-
-def _open_bag(path: str, camera: GivenCamera | None, rate: float | None) -> BagSequence:
-    """Open the images of a recording; without `camera`, its camera_info is used.
-
-    Raises SequenceError for a damaged file, one without images, and where it must be said which of several topics.
-    """
-    name, _, query = path.partition("?")
-    wanted = dict(parse_qsl(query)).get("topic")
-    source = Path(name)
-    reader = _open_reader(source)
-    return BagSequence(source, reader, _find_topic(reader, name, wanted), camera)
 
 
 class Recording:
@@ -265,57 +232,81 @@ def _open_reader(path: Path) -> Recording:
     except ImportError:
         raise SequenceError(f"{path}: ROS bags need `pip install torchslam[bags]`") from None
     with _errors(str(path)):
-        for file in itertools.islice(path.iterdir(), MAX_FILES) if path.is_dir() else (path,):
+        # A file each minute for six days.
+        for file in itertools.islice(path.iterdir(), 10_000) if path.is_dir() else (path,):
             if not file.is_dir():
-                limit = MAX_METADATA if file.name == "metadata.yaml" else MAX_RECORDING
+                limit = 1 << 22 if file.name == "metadata.yaml" else 1 << 44
                 check_regular(file, limit, "a file of a recording")
         return Recording(path)  # a single ROS 2 file is part of a recording folder or a complete recording
 
 
+def _image_topics(reader: Recording) -> list[Connection]:
+    return [each for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)]
+
+
 def _connection(reader: Recording, topic: str) -> Connection:
     """Return the connection of an image topic."""
-    return next(
-        each for each in reader.connections if each.topic == topic and each.msgtype in (IMAGE, COMPRESSED)
-    )
+    return next(each for each in _image_topics(reader) if each.topic == topic)
 
 
-def _find_topic(reader: Recording, path: str, wanted: str | None) -> Topic:
-    """Select the image topic. Raises SequenceError if there is none, or several without a choice."""
+def _is_bag(path: str) -> bool:
+    """Return True for a bag file and for the folder of a ROS 2 recording."""
+    source = Path(path.partition("?topic=")[0])
+    return (source.suffix.lower() in SUFFIXES and source.exists()) or (source / "metadata.yaml").is_file()
+
+
+def _open_bag(path: str, camera: GivenCamera | None, rate: float | None) -> BagSequence:
+    """Open the images of a recording; without `camera`, its camera_info is used.
+
+    Raises SequenceError for a damaged file, one without images, and where it must be said which of several topics.
+    """
+    name, _, query = path.partition("?")
+    wanted = dict(parse_qsl(query)).get("topic")
+    reader = _open_reader(Path(name))
     if not all(isinstance(each.topic, str) for each in reader.connections):
-        raise SequenceError(f"{path}: cannot be read: topics without a name")
-    images = [each for each in reader.connections if each.msgtype in (IMAGE, COMPRESSED)]
-    topics = list(dict.fromkeys(each.topic for each in images if "depth" not in each.topic.lower()))
+        raise SequenceError(f"{name}: cannot be read: topics without a name")
+    images = [each.topic for each in _image_topics(reader)]
+    topics = list(dict.fromkeys(topic for topic in images if "depth" not in topic.lower()))
     if wanted is not None:
-        topics = [wanted] if any(each.topic == wanted for each in images) else []
+        topics = [wanted] if wanted in images else []
     if not topics:
-        there = ", ".join(sorted({each.topic for each in images})) or "none"
-        raise SequenceError(f"{path}: no images on {wanted or 'any topic'}; topics of images: {there}")
+        there = ", ".join(sorted(set(images))) or "none"
+        raise SequenceError(f"{name}: no images on {wanted or 'any topic'}; topics of images: {there}")
     if len(topics) > 1:
-        proposals = " or ".join(f"'{path}?topic={topic}'" for topic in topics[:6])
-        raise SequenceError(f"{path}: {len(topics)} topics of images; choose one: {proposals}")
+        proposals = " or ".join(f"'{name}?topic={topic}'" for topic in topics[:6])
+        raise SequenceError(f"{name}: {len(topics)} topics of images; choose one: {proposals}")
     connection = _connection(reader, topics[0])
-    info_topic = topics[0].removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-    infos = [each for each in reader.connections if each.msgtype == CAMERA_INFO and each.topic == info_topic]
-    calibration = None
+    calibration = _read_calibration(reader, name, connection.topic)
     times: list[float] = []
-    with _errors(path):
-        for each in (connection, *infos[:1]):
-            reader.check_definition(each)
-        for info, _, raw in reader.messages(infos) if infos else ():
-            rectified = "rect" in topics[0].rpartition("/")[2] or "_rect" in topics[0]
-            calibration = from_camera_info(
-                reader.deserialize(raw, info.msgtype), f"{path}{info_topic}", rectified
-            )
-            break
+    with _errors(name):
+        reader.check_definition(connection)
         for _, recorded, raw in reader.messages([connection]):
             if len(times) == MAX_MESSAGES:
-                raise SequenceError(f"{path}: more than {MAX_MESSAGES} images")
-            stamp: Any = reader.deserialize(raw, connection.msgtype)
-            nanoseconds = stamp.header.stamp.sec * 1_000_000_000 + stamp.header.stamp.nanosec
-            times.append((nanoseconds or recorded) / 1e9)
+                raise SequenceError(f"{name}: more than {MAX_MESSAGES} images")
+            stamp = reader.deserialize(raw, connection.msgtype).header.stamp
+            times.append((stamp.sec * 1_000_000_000 + stamp.nanosec or recorded) / 1e9)
     if not times:
-        raise SequenceError(f"{path}: no images on {topics[0]}")
-    return Topic(connection, times, calibration)
+        raise SequenceError(f"{name}: no images on {connection.topic}")
+    return BagSequence(Path(name), reader, connection, times, calibration if camera is None else camera)
+
+
+def _read_calibration(reader: Recording, path: str, topic: str) -> Calibration | None:
+    """Read the first camera_info beside an image topic; None without one."""
+    info_topic = topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
+    infos = [
+        each
+        for each in reader.connections
+        if each.msgtype == "sensor_msgs/msg/CameraInfo" and each.topic == info_topic
+    ]
+    is_rectified = "rect" in topic.rpartition("/")[2] or "_rect" in topic
+    with _errors(path):
+        for info in infos[:1]:
+            reader.check_definition(info)
+        for info, _, raw in reader.messages(infos) if infos else ():
+            return from_camera_info(
+                reader.deserialize(raw, info.msgtype), f"{path}{info_topic}", is_rectified
+            )
+    return None
 
 
 def from_camera_info(message: Any, source: str, rectified: bool) -> Calibration | None:

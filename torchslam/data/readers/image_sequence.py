@@ -3,24 +3,21 @@
 from __future__ import annotations
 
 import contextlib
-import itertools
 import os
 import statistics
 from collections import Counter
 from collections.abc import Iterable
 from collections.abc import Sequence as Listed
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
-from torchslam.data.calibration import CALIBRATION, FROM_EXIF, Calibration, GivenCamera, size_text
-from torchslam.data.camera_argument import read_focal
-from torchslam.data.formats.calibration_files import read_calibration
+from torchslam.data.calibration import CALIBRATION, FROM_EXIF, Calibration, GivenCamera
+from torchslam.data.formats.calibration_files import read_calibration, read_focal
 from torchslam.data.formats.frame_names import (
     FOLDERS,
     Found,
@@ -33,6 +30,7 @@ from torchslam.data.formats.frame_names import (
 )
 from torchslam.data.formats.image_file import (
     AS_COLOR,
+    SAMPLES,
     bit_depth,
     has_transparency,
     is_turned,
@@ -41,20 +39,16 @@ from torchslam.data.formats.image_file import (
     read_pixels,
 )
 from torchslam.data.sequence import Reader, Sequence
-from torchslam.data.text_file import check_later
+from torchslam.data.text_file import check_rising, float64
 from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 from torchslam.utils.console import printable
 
 DEFAULT_RATE = 30.0
 """Frame rate of images without timestamps."""
-CALIBRATION_FILES = (CALIBRATION, "calib.txt")
 SHORTEST, LONGEST = 2e-4, 1e4
 """Seconds from image to image, beyond which times are taken to have another unit: microseconds read as nanoseconds, or
 nanoseconds since the system was started as seconds."""
-SAMPLES = 20
-"""Number of images in which the brightest pixel of a 16-bit sequence is searched."""
-WITH_ALPHA = frozenset({".png", ".webp", ".tif", ".tiff"})
 ATTEMPTS = 20
 """Number of unreadable images after which opening a sequence fails."""
 
@@ -88,7 +82,16 @@ class ImageSequence(Sequence):
     ) -> None:
         """Raises SequenceError without images, for timestamps out of order or doubled, or where none of the
         first images can be read; CalibrationError for a camera of another image size."""
-        _check_order(name, entries)
+        if not entries:
+            raise SequenceError(f"{name}: no images")
+        times = [entry.timestamp for entry in entries]
+        check_rising(times, [entry.where for entry in entries], SequenceError)
+        interval = statistics.median(np.diff(times)) if len(times) > 1 else 1.0
+        if not SHORTEST < interval < LONGEST:
+            raise SequenceError(
+                f"{entries[-1].where}: the images are {interval:.3g} s apart: their times seem to have another unit "
+                "than the seconds that are expected (EuRoC's data.csv: nanoseconds)"
+            )
         as_stored = isinstance(camera, Calibration) and camera.as_stored
         size, self._bits = _examine(entries, as_stored)
         notes = [*notes, f"{self._bits} of 16 bits are used"] if self._bits > 8 else notes
@@ -98,7 +101,7 @@ class ImageSequence(Sequence):
             name,
             kind,
             read_focal(entries[0].path) if camera == FROM_EXIF else camera,
-            torch.tensor([entry.timestamp for entry in entries], dtype=torch.float64, device="cpu"),
+            float64(times),
             groundtruth,
             size=size,
             notes=notes,
@@ -109,13 +112,13 @@ class ImageSequence(Sequence):
     def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
         entry = self._entries[index]
         image = read_gray(entry.path, entry.where, self._bits, self.as_stored)
-        self._check_size(entry, (image.shape[-1], image.shape[-2]))
+        self._check_size(image.shape[2:], f"{entry.where}: {entry.path}")
         return image
 
     def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
         entry = self._entries[index]
         image = read_color(entry.path, entry.where, self._bits, self.as_stored)
-        self._check_size(entry, (image.shape[1], image.shape[0]))
+        self._check_size(image.shape, f"{entry.where}: {entry.path}")
         return image
 
     def image_name(self, index: int) -> str:
@@ -131,26 +134,6 @@ class ImageSequence(Sequence):
     def _root(self) -> str:
         """The folder of all images, also where it was unpacked: results must not depend on that place."""
         return os.path.commonpath({os.path.abspath(entry.path.parent) for entry in self._entries})
-
-    def _check_size(self, entry: ImageEntry, size: tuple[int, int]) -> None:
-        if size != self.size:
-            raise FrameError(
-                f"{entry.where}: {entry.path} is {size_text(size)}, the others are {size_text(self.size)}"
-            )
-
-
-def _check_order(name: str, entries: Listed[ImageEntry]) -> None:
-    if not entries:
-        raise SequenceError(f"{name}: no images")
-    for before, entry in itertools.pairwise(entries):
-        check_later(entry.timestamp, before.timestamp, entry.where, SequenceError)
-    intervals = [after.timestamp - before.timestamp for before, after in itertools.pairwise(entries)]
-    interval = statistics.median(intervals) if intervals else 1.0
-    if not SHORTEST < interval < LONGEST:
-        raise SequenceError(
-            f"{entries[-1].where}: the images are {interval:.3g} s apart: their times seem to have another unit than "
-            "the seconds that are expected (EuRoC's data.csv: nanoseconds)"
-        )
 
 
 def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, int], int]:
@@ -182,7 +165,7 @@ def _examine(entries: Listed[ImageEntry], as_stored: bool) -> tuple[tuple[int, i
 def _are_transparent(entries: Listed[ImageEntry]) -> bool:
     """Return whether the first image that can be read has transparent pixels."""
     for entry in entries[:ATTEMPTS]:
-        if entry.path.suffix.lower() not in WITH_ALPHA:
+        if entry.path.suffix.lower() not in (".png", ".webp", ".tif", ".tiff"):
             return False
         with contextlib.suppress(FrameError):  # said when the frame is read
             return has_transparency(entry.path)
@@ -191,7 +174,7 @@ def _are_transparent(entries: Listed[ImageEntry]) -> bool:
 
 def find_calibration(path: Path) -> Calibration | None:
     """The calibration file of a folder, if it has one."""
-    for name in CALIBRATION_FILES:
+    for name in (CALIBRATION, "calib.txt"):
         if (path / name).is_file():
             return read_calibration(path / name)
     return None
@@ -216,12 +199,9 @@ def _open_folder(path: str, camera: GivenCamera | None, rate: float | None) -> I
     found, folder = _find(path, base)
     camera = camera if camera is not None else find_calibration(folder) or find_calibration(base)
     times, notes = times_in_names(found.frames), found.notes
-    if times is None:
-        entries = at_rate(found.frames, rate or DEFAULT_RATE)
-    else:
-        entries = [
-            ImageEntry(time, image, str(image)) for time, image in zip(times, found.frames, strict=True)
-        ]
+    entries = at_rate(found.frames, rate or DEFAULT_RATE)
+    if times is not None:
+        entries = [replace(entry, timestamp=time) for entry, time in zip(entries, times, strict=True)]
         notes = [*notes, "the names of the images are their times"]
     sequence = ImageSequence(base.resolve().name, "image folder", entries, camera, None, notes)
     if times is None:

@@ -16,100 +16,81 @@ from torch import Tensor
 
 from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.frame_names import find_frames
-from torchslam.data.formats.oxts import Packet, read_day_times, read_oxts
+from torchslam.data.formats.vehicle_files import Packet, read_day_times, read_oxts
 from torchslam.data.readers.image_sequence import ImageEntry, ImageSequence
 from torchslam.data.sequence import Reader
-from torchslam.data.text_file import in_seconds, number_rows, numbered_lines, parse_floats, read_text
+from torchslam.data.text_file import float64, in_seconds, number_rows, numbered_lines, parse_floats, read_text
 from torchslam.data.trajectories import checked_poses
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.types import Trajectory
 
-CAMERAS = ("image_0", "image_2")
 RAW_CAMERAS = ("image_00", "image_02")
-"""The left cameras, gray and color."""
-CALIBRATION = "calib_cam_to_cam.txt"
-POSE_COLUMNS = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
+"""The left cameras, gray and color; those of the odometry benchmark have one digit."""
 EARTH_RADIUS = 6378137.0  # meters
+
+
+def _odometry_camera(base: Path) -> Path | None:
+    return next((base / name for name in ("image_0", "image_2") if (base / name).is_dir()), None)
 
 
 def _is_kitti(path: str) -> bool:
     """Return True for a sequence of the odometry benchmark, also one without times, which is then refused."""
-    base = Path(path)
-    if not any((base / name).is_dir() for name in CAMERAS):
+    base, calibration = Path(path), Path(path) / "calib.txt"
+    if _odometry_camera(base) is None:
         return False
-    return (base / "times.txt").is_file() or _is_calibrated(base / "calib.txt")
-
-
-def _is_calibrated(path: Path) -> bool:
-    """Return whether a file has projections, `P0: ...`."""
-    return path.is_file() and read_text(path, CalibrationError).lstrip().startswith("P0:")
+    is_calibrated = calibration.is_file() and read_text(calibration, CalibrationError).lstrip().startswith(
+        "P0:"
+    )
+    return is_calibrated or (base / "times.txt").is_file()
 
 
 def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
     """A KITTI odometry sequence, left gray images before left color ones; `camera` overrides `calib.txt`.
 
-    Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` next to `sequences/NN`.
+    Ground truth, if any, comes from `poses.txt` in the folder, or `poses/NN.txt` next to `sequences/NN`: the poses of
+    camera 0, shifted to the camera that took the images.
     """
     base = Path(path)
-    folder = next(base / name for name in CAMERAS if (base / name).is_dir())
-    if not (base / "times.txt").is_file():
+    folder = _odometry_camera(base) or base
+    listed = base / "times.txt"
+    if not listed.is_file():
         raise SequenceError(
             f"{path}: no times.txt, which comes with calib.txt in data_odometry_calib.zip; {folder} alone is read as "
             "images of --fps 10, with --camera"
         )
-    seconds = [
-        in_seconds(time, where, SequenceError)
-        for where, (time,) in number_rows(base / "times.txt", "time", SequenceError)
-    ]
-    times = torch.tensor(seconds, dtype=torch.float64, device="cpu")
     found = find_frames(folder)
-    images = found.frames
-    if len(images) != len(times):
+    rows = list(number_rows(listed, "time", SequenceError))
+    if len(found.frames) != len(rows):
         raise SequenceError(
-            f"{path}: times.txt has {len(times)} lines, {folder.name}/ has {len(images)} images"
+            f"{path}: times.txt has {len(rows)} lines, {folder.name}/ has {len(found.frames)} images"
         )
     entries = [
-        ImageEntry(time, image, f"{base / 'times.txt'}:{line}")
-        for line, (time, image) in enumerate(zip(times.tolist(), images, strict=True), start=1)
+        ImageEntry(in_seconds(time, where, SequenceError), image, where)
+        for (where, (time,)), image in zip(rows, found.frames, strict=True)
     ]
-    offset_x = 0.0
+    T_0c = torch.eye(4, dtype=torch.float64, device="cpu")
     if camera is None:
-        camera, offset_x = _read_projection(base / "calib.txt", f"P{folder.name[-1]}")
-    groundtruth = _read_odometry_poses(base, times, offset_x)
+        calibration = base / "calib.txt"
+        P = _row(
+            _read_rows(calibration), f"P{folder.name[-1]}", 12, calibration
+        )  # K [I | t] of a rectified camera
+        camera = Calibration.from_numbers([P[0], P[5], P[2], P[6]], str(calibration))
+        T_0c[0, 3] = -((P[3] - P[2] * P[11]) / P[0])  # meters
+    resolved = base.resolve()
+    candidates = (base / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt")
+    poses = next((candidate for candidate in candidates if candidate.is_file()), None)
+    groundtruth = None
+    if poses is not None:
+        columns = "r11 r12 r13 tx r21 r22 r23 ty r31 r32 r33 tz"
+        T_w0 = float64([row for _, row in number_rows(poses, columns, TrajectoryError)]).view(-1, 3, 4)
+        if len(T_w0) != len(entries):
+            raise TrajectoryError(f"{poses}: {len(T_w0)} poses for {len(entries)} times")
+        times = float64([entry.timestamp for entry in entries])
+        T_wc = rigid(T_w0[..., :3], T_w0[..., 3]) @ T_0c
+        groundtruth = Trajectory(times, checked_poses(T_wc, poses))
     kind = f"KITTI odometry, {folder.name}"
     return ImageSequence(base.name, kind, entries, camera, groundtruth, found.notes)
-
-
-def _read_projection(path: Path, label: str) -> tuple[Calibration, float]:
-    """The rectified camera K [I | t] of a line `P0: ...` and t_x, meters, its offset from camera 0."""
-    for number, line in numbered_lines(path, CalibrationError):
-        if not line.startswith(f"{label}:"):
-            continue
-        where = f"{path}:{number}"
-        P = parse_floats(line.split(":", 1)[1], where, CalibrationError)
-        if len(P) != 12:
-            raise CalibrationError(f"{where}: expected the 12 numbers of a 3x4 projection, got {len(P)}")
-        calibration = Calibration.from_numbers([P[0], P[5], P[2], P[6]], where)
-        return calibration, (P[3] - P[2] * P[11]) / P[0]
-    raise CalibrationError(f"{path}: no line `{label}: ...`")
-
-
-def _read_odometry_poses(path: Path, times: Float[Tensor, " N"], offset_x: float) -> Trajectory | None:
-    """The poses of camera 0, shifted to the camera that took the images."""
-    resolved = path.resolve()
-    candidates = (path / "poses.txt", resolved.parent.parent / "poses" / f"{resolved.name}.txt")
-    found = next((candidate for candidate in candidates if candidate.is_file()), None)
-    if found is None:
-        return None
-    rows = [row for _, row in number_rows(found, POSE_COLUMNS, TrajectoryError)]
-    if len(rows) != len(times):
-        raise TrajectoryError(f"{found}: {len(rows)} poses for {len(times)} times")
-    T_w0 = torch.eye(4, dtype=torch.float64, device="cpu").repeat(len(rows), 1, 1)
-    T_w0[:, :3] = torch.tensor(rows, dtype=torch.float64, device="cpu").view(-1, 3, 4)
-    T_0c = torch.eye(4, dtype=torch.float64, device="cpu")
-    T_0c[0, 3] = -offset_x
-    return Trajectory(times, checked_poses(T_w0 @ T_0c, found))
 
 
 def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -129,10 +110,18 @@ def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -
         if not 0 <= number < len(times):
             raise SequenceError(f"{file}: timestamps.txt has no line for it among its {len(times)}")
         entries.append(ImageEntry(times[number], file, f"{folder / 'timestamps.txt'}:{number + 1}"))
-    calibration = _find_file(drive, CALIBRATION)
+    calibration = _find_file(drive, "calib_cam_to_cam.txt")
+    side = folder.name[-2:]
     if camera is None and calibration is not None:
-        camera = _read_raw_camera(calibration, folder.name[-2:], drive.resolve().name.endswith("_extract"))
-    truth = _read_truth(drive, folder.name[-2:], calibration)
+        rows = _read_rows(calibration)
+        if drive.resolve().name.endswith("_extract"):
+            K, D = _row(rows, f"K_{side}", 9, calibration), _row(rows, f"D_{side}", 5, calibration)
+            numbers = [K[0], K[4], K[2], K[5], *D]
+        else:
+            P = _row(rows, f"P_rect_{side}", 12, calibration)
+            numbers = [P[0], P[5], P[2], P[6]]
+        camera = Calibration.from_numbers(numbers, str(calibration))
+    truth = _read_truth(drive, side, calibration)
     return ImageSequence(drive.name, f"KITTI raw, {folder.name}", entries, camera, truth, found.notes)
 
 
@@ -151,10 +140,10 @@ def _find_file(drive: Path, name: str) -> Path | None:
 def _read_rows(path: Path) -> dict[str, list[float]]:
     """Lines `name: numbers`; those of dates are left out."""
     rows: dict[str, list[float]] = {}
-    for number, line in numbered_lines(path, CalibrationError):
+    for where, line in numbered_lines(path, CalibrationError):
         name, _, numbers = line.partition(":")
         if name not in ("calib_time", "corner_dist"):
-            rows[name] = parse_floats(numbers, f"{path}:{number}", CalibrationError)
+            rows[name] = parse_floats(numbers, where, CalibrationError)
     return rows
 
 
@@ -164,61 +153,39 @@ def _row(rows: dict[str, list[float]], name: str, count: int, path: Path) -> lis
     return rows[name]
 
 
-def _read_raw_camera(path: Path, number: str, as_taken: bool) -> Calibration:
-    rows = _read_rows(path)
-    if as_taken:
-        K, D = _row(rows, f"K_{number}", 9, path), _row(rows, f"D_{number}", 5, path)
-        return Calibration.from_numbers([K[0], K[4], K[2], K[5], *D], str(path))
-    P = _row(rows, f"P_rect_{number}", 12, path)
-    return Calibration.from_numbers([P[0], P[5], P[2], P[6]], str(path))
-
-
-def _read_truth(drive: Path, number: str, calibration: Path | None) -> Trajectory | None:
+def _read_truth(drive: Path, side: str, calibration: Path | None) -> Trajectory | None:
     """The camera's poses from those of the GPS/INS; None where a file for it is missing."""
+    oxts = drive / "oxts"
     velo_to_cam, imu_to_velo = (
-        _find_file(drive, "calib_velo_to_cam.txt"),
-        _find_file(drive, "calib_imu_to_velo.txt"),
+        _find_file(drive, f"calib_{name}.txt") for name in ("velo_to_cam", "imu_to_velo")
     )
-    packets = drive / "oxts" / "data"
-    if calibration is None or velo_to_cam is None or imu_to_velo is None or not packets.is_dir():
+    if calibration is None or velo_to_cam is None or imu_to_velo is None or not (oxts / "data").is_dir():
         return None
     rows = _read_rows(calibration)
-    P = _row(rows, f"P_rect_{number}", 12, calibration)
-    T_rect = torch.eye(4, dtype=torch.float64, device="cpu")
-    T_rect[:3, :3] = torch.tensor(
-        _row(rows, "R_rect_00", 9, calibration), dtype=torch.float64, device="cpu"
-    ).view(3, 3)
-    T_rect[0, 3] = P[3] / P[0]  # meters from camera 0 to this one
+    P, R = _row(rows, f"P_rect_{side}", 12, calibration), _row(rows, "R_rect_00", 9, calibration)
+    T_rect = rigid(
+        float64(R).view(3, 3), float64([P[3] / P[0], 0.0, 0.0])
+    )  # meters from camera 0 to this one
     T_ci = T_rect @ _read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo)
-    oxts = read_oxts(drive / "oxts")
-    times = [packet.time for packet in oxts]
-    T_wc = checked_poses(_poses_of(oxts) @ se3_inverse(T_ci), packets)
-    return Trajectory(torch.tensor(times, dtype=torch.float64, device="cpu"), T_wc)
+    packets = read_oxts(oxts)
+    T_wc = checked_poses(_poses_of(packets) @ se3_inverse(T_ci), oxts / "data")
+    return Trajectory(float64([packet.time for packet in packets]), T_wc)
 
 
 def _read_rigid(path: Path) -> Float[Tensor, "4 4"]:
     rows = _read_rows(path)
-    R, t = (
-        torch.tensor(_row(rows, name, count, path), dtype=torch.float64, device="cpu")
-        for name, count in (("R", 9), ("T", 3))
-    )
-    return rigid(R.view(3, 3), t)
+    return rigid(float64(_row(rows, "R", 9, path)).view(3, 3), float64(_row(rows, "T", 3, path)))
 
 
 def _poses_of(packets: list[Packet]) -> Float[Tensor, "N 4 4"]:
     """T_wi of the GPS/INS: east, north, up, by a Mercator projection, from the first one."""
-    rows = [packet.numbers[:6] for packet in packets]
-    table = torch.tensor(rows, dtype=torch.float64, device="cpu")
+    table = float64([packet.numbers[:6] for packet in packets])
     latitude, longitude = table[:, 0].deg2rad(), table[:, 1].deg2rad()
     scale = EARTH_RADIUS * math.cos(latitude[0])
     north = scale * (math.pi / 4 + latitude / 2).tan().log()
     positions = torch.stack((scale * longitude, north, table[:, 2]), dim=-1)
-    roll, pitch, yaw = (
-        so3_exp(angle[:, None] * axis)
-        for angle, axis in zip(
-            table[:, 3:].unbind(-1), torch.eye(3, dtype=torch.float64, device="cpu"), strict=True
-        )
-    )
+    axes = torch.eye(3, dtype=torch.float64, device="cpu")
+    roll, pitch, yaw = (so3_exp(table[:, 3 + axis, None] * axes[axis]) for axis in range(3))
     return rigid(yaw @ pitch @ roll, positions - positions[0])
 
 

@@ -19,8 +19,7 @@ from torch import Tensor
 
 from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
-from torchslam.data.readers.capture import Capture, Retriever, open_capture, pixel_aspect
-from torchslam.data.readers.video import SUFFIXES
+from torchslam.data.readers.video import SUFFIXES, Capture, Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.console import without_credentials
@@ -59,8 +58,7 @@ class LiveSequence(Sequence):
     ) -> None:
         """Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit."""
         self._capture = capture
-        command = f'ffmpeg -i "{name}" -vf bwdif=send_frame -crf 16 recording.mp4'
-        self._retriever = Retriever(capture, command)
+        self._retriever = Retriever(capture, name, "recording.mp4")
         self._refusal: FrameError | None = None  # of a frame that cannot be converted
         self._patience = patience
         self._clock = CaptureClock()
@@ -135,8 +133,7 @@ class LiveSequence(Sequence):
             self._dropped += self._replaced  # what comes after the last frame that is asked for is not missed
             self._replaced = 0
         self._given = index + 1
-        if (frame.shape[1], frame.shape[0]) != self.size:
-            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
+        self._check_size(frame.shape, self.image_name(index))
         return gray_to_tensor(frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY))
 
     def image_name(self, index: int) -> str:
@@ -144,15 +141,6 @@ class LiveSequence(Sequence):
 
     def timestamp(self, index: int) -> float:
         return self._time
-
-    def describe(self) -> dict[str, str]:
-        return {
-            "name": self.name,
-            "kind": self.kind,
-            "frames": "as they come",
-            "size": self._describe_size(),
-            "camera": self._describe_camera(),
-        }
 
     def forget_handle(self) -> None:
         never_release(self._capture)

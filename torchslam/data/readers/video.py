@@ -1,4 +1,4 @@
-"""Video files, decoded in order; seeking backwards decodes from the start again.
+"""OpenCV's decoder of videos, and video files, decoded in order; seeking backwards decodes from the start again.
 
 FFmpeg allocates a table of all frames that the index of an MP4 declares, so that number is checked first. Source:
 ISO/IEC 14496-12: boxes of a size and a name; stsz and stz2 hold the number of samples, stts and ctts run lengths of
@@ -8,24 +8,27 @@ durations and offsets, trun the samples of a fragment. A sample takes at least o
 from __future__ import annotations
 
 import math
+import os
+import re
 import struct
 import sys
+import tempfile
+import threading
 from collections.abc import Iterable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any, BinaryIO, Protocol
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float, UInt8
 from torch import Tensor
 from tqdm import tqdm
 
 from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import MAX_PIXELS, bgr_to_tensor, gray_to_tensor
-from torchslam.data.readers.capture import Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import Need, Reader, Sequence, aspect_text, exhaust
+from torchslam.data.text_file import float64
 from torchslam.errors import FrameError, SequenceError, TorchslamError
 from torchslam.utils.console import printable, tqdm_options
 from torchslam.utils.files import check_regular
@@ -35,8 +38,6 @@ SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
 )
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
-MAX_BYTES = 1 << 40
-"""Largest file that is read."""
 MAX_FRAMES = 2_000_000
 """Maximum number of frames: 18 hours at 30 frames per second."""
 QUIET = 2.0
@@ -45,6 +46,125 @@ MANY = 100
 """Frames that are skipped with a progress bar."""
 MAX_ASPECT_ERROR = 0.02
 """Relative error of fy / fx of a given camera before a note reports that the file contradicts it."""
+
+
+SAMPLED = 16
+"""Step of the rows that are compared with the previous frame."""
+FAILURE = re.compile(rb"(Cannot convert interlaced)|: fmt:\S+ csp:")
+"""Line of FFmpeg's log about a failed conversion: from which format to which, and why."""
+
+SILENCING = ("OPENCV_FFMPEG_DEBUG", "OPENCV_FFMPEG_LOGLEVEL")
+"""Variables that send FFmpeg's log elsewhere, or silence it. OpenCV looks at them when it first opens a video."""
+
+MAX_ASPECT = 4.0
+"""Largest ratio of the sides of a pixel; anamorphic lenses have 2."""
+
+_LOCK = threading.Lock()
+
+
+class Capture(Protocol):
+    """The part of cv2.VideoCapture that is used."""
+
+    def grab(self) -> bool:
+        """Wait for the next frame; False at the end."""
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        """Decode the last frame, BGR; False if it is damaged."""
+
+    def get(self, property_id: int) -> float:
+        """Return a property, one of cv2.CAP_PROP_*; 0 if it is unknown."""
+
+    def release(self) -> None:
+        """Close the source."""
+
+
+def open_capture(source: str) -> cv2.VideoCapture:
+    """Open a video or a stream; FFmpeg's errors go to the error stream, whatever the environment variables are."""
+    hidden = {name: os.environ.pop(name) for name in SILENCING if name in os.environ}
+    try:
+        return cv2.VideoCapture(source)
+    finally:
+        os.environ.update(hidden)
+
+
+def pixel_aspect(capture: Capture, where: str) -> float:
+    """Return width to height of a pixel as it is shown, which may be turned; 1 where the source does not say.
+
+    Raises SequenceError for pixels that no camera has.
+    """
+    across, down = (capture.get(side) for side in (cv2.CAP_PROP_SAR_NUM, cv2.CAP_PROP_SAR_DEN))
+    if across <= 0 or down <= 0:
+        return 1.0
+    aspect = across / down
+    if not 1 / MAX_ASPECT <= aspect <= MAX_ASPECT:
+        raise SequenceError(
+            f"{where}: damaged: its pixels are {across:.0f}:{down:.0f}, wide to high; "
+            f"no camera has more than {MAX_ASPECT:g}:1"
+        )
+    return 1 / aspect if capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90 else aspect
+
+
+class Retriever:
+    """Retrieves the frames of one capture, and refuses those that were not converted.
+
+    OpenCV does not look whether FFmpeg has converted a frame. From FFmpeg 7.1 on (OpenCV 4.13), interlaced frames are
+    not: `retrieve` still returns True, with what lies in its buffer, which is the frame before or memory of anything
+    else. Only FFmpeg's log reports it. It is read where a frame may be such a one: the first one, and one that repeats
+    the one before.
+
+    Args:
+        capture: where frames were grabbed.
+        source: name of the video, for messages.
+        progressive: name of a video without interlaced frames that it can be converted to.
+    """
+
+    def __init__(self, capture: Capture, source: str, progressive: str) -> None:
+        self._capture = capture
+        self._command = f'ffmpeg -i "{source}" -vf bwdif=send_frame -crf 16 "{progressive}"'
+        self._before: np.ndarray | None = None
+
+    def retrieve(self) -> UInt8[np.ndarray, "H W 3"] | None:
+        """Return the frame that was grabbed last; None if it is damaged. Raises FrameError if it was not converted."""
+        failure = None
+        if self._before is None:
+            decoded, image, failure = _retrieve_with_log(self._capture)
+        else:
+            decoded, image = self._capture.retrieve()
+        if not decoded or image is None:  # both happen
+            return None
+        sample = image[::SAMPLED].copy()
+        if self._before is not None and np.array_equal(sample, self._before):
+            _, _, failure = _retrieve_with_log(self._capture)
+        if failure is not None:
+            self._before = None  # the next one is likely to be such a frame, too
+            what = "interlaced" if failure[1] else "of a format"
+            raise FrameError(f"{what}, which this OpenCV does not decode; convert it: {self._command}")
+        self._before = sample
+        return image
+
+
+def _retrieve_with_log(capture: Capture) -> tuple[bool, np.ndarray, re.Match[bytes] | None]:
+    """Retrieve a frame; also the log of a failure. Other lines go on to the error stream."""
+    stderr = 2
+    with _LOCK, tempfile.TemporaryFile() as log:
+        try:
+            kept = os.dup(stderr)
+        except OSError:  # it is closed
+            kept = os.open(os.devnull, os.O_WRONLY)
+        try:
+            os.dup2(log.fileno(), stderr)
+            try:
+                decoded, image = capture.retrieve()
+            finally:
+                os.dup2(kept, stderr)
+            log.seek(0)
+            written = log.read()
+            failure = FAILURE.search(written)
+            if failure is None and written:
+                os.write(kept, written)
+        finally:
+            os.close(kept)
+    return decoded, image, failure
 
 
 class Bar(tqdm):
@@ -95,7 +215,7 @@ class VideoSequence(Sequence):
             path.stem,
             "video",
             camera,
-            torch.tensor([times[frame] for frame in self._frames], dtype=torch.float64, device="cpu"),
+            float64([times[frame] for frame in self._frames]),
             size=size,
             notes=notes,
             pixel_aspect=aspect,
@@ -137,7 +257,9 @@ class VideoSequence(Sequence):
         # As an absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
         self._capture = open_capture(str(self._path.absolute()))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-        self._retriever = Retriever(self._capture, _conversion(self._path))
+        # It writes whole frames, at the same times.
+        progressive = f"{self._path.stem}-progressive.mp4"
+        self._retriever = Retriever(self._capture, str(self._path.absolute()), progressive)
         self._position = 0  # of the decoder, among all frames that can be decoded
 
     def _read_times(self, need: Need, promised: int) -> tuple[np.ndarray | None, list[float], bool]:
@@ -176,8 +298,7 @@ class VideoSequence(Sequence):
         frame = self._read(self._frames[index], self.image_name(index))
         if frame is None:
             raise FrameError(f"{self.image_name(index)}: cannot be decoded")
-        if (frame.shape[1], frame.shape[0]) != self.size:
-            raise FrameError(f"{self.image_name(index)}: has another size than the first frame")
+        self._check_size(frame.shape, self.image_name(index))
         return frame
 
     def _read(self, frame: int, where: str) -> np.ndarray | None:
@@ -196,11 +317,6 @@ class VideoSequence(Sequence):
         return self._retrieve(where, FrameError) if self._capture.grab() else None
 
 
-def _is_video(path: str) -> bool:
-    """Return True for a file with a video suffix."""
-    return Path(path).suffix.lower() in SUFFIXES and Path(path).is_file()
-
-
 def _open_video(
     path: str, camera: GivenCamera | None, rate: float | None, need: Need = exhaust
 ) -> VideoSequence:
@@ -215,7 +331,7 @@ def _check(path: Path) -> None:
     except UnicodeEncodeError:
         raise SequenceError(f"{path}: its name is not UTF-8, which OpenCV cannot open; rename it") from None
     try:
-        check_regular(path, MAX_BYTES, "a video that is read")
+        check_regular(path, 1 << 40, "a video that is read")
         claimed = claimed_samples(path) if path.suffix.lower() in MP4 else 0
         size = path.stat().st_size
     except OSError as cause:
@@ -224,11 +340,6 @@ def _check(path: Path) -> None:
         raise SequenceError(
             f"{path}: damaged: its index declares {claimed} frames, but the file has {size} bytes"
         )
-
-
-def _conversion(path: Path) -> str:
-    """The command that writes an interlaced video as whole frames, at the same times."""
-    return f'ffmpeg -i "{path.absolute()}" -vf bwdif=send_frame -crf 16 "{path.stem}-progressive.mp4"'
 
 
 def _rising(times: Iterable[float]) -> Iterator[int]:
@@ -243,9 +354,6 @@ def _rising(times: Iterable[float]) -> Iterator[int]:
 CONTAINERS = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 HEADER, LARGE_HEADER = 8, 16
 """Bytes of the header of a box, with a size of 32 and of 64 bits (ISO/IEC 14496-12, 4.2)."""
-DEPTH = 8  # moov, trak, mdia, minf, stbl are five
-MAX_BOXES = 1_000_000
-"""Boxes that are looked at, which bounds the time for a damaged file."""
 RUNS_AT_ONCE = 1 << 16
 """Runs of equal durations that are read at once, 8 bytes each."""
 
@@ -254,7 +362,9 @@ def claimed_samples(path: Path) -> int:
     """The most samples that a table in the file speaks of; 0 where there is none. Raises OSError."""
     with path.open("rb") as file:
         size = file.seek(0, 2)
-        return max((_samples(file, *box) for box in _boxes(file, 0, size, [MAX_BOXES], DEPTH)), default=0)
+        # The number of boxes bounds the time for a damaged file; moov, trak, mdia, minf, stbl are five levels.
+        boxes = _boxes(file, 0, size, left=[1_000_000], depth=8)
+        return max((_samples(file, *box) for box in boxes), default=0)
 
 
 def _boxes(
@@ -262,9 +372,7 @@ def _boxes(
 ) -> Iterator[tuple[bytes, int, int]]:
     """Name, and where the content begins and ends, of every box; those in containers too.
 
-    Args:
-        left: one counter: number of boxes that may still be read
-        depth: maximum depth of nesting
+    `left` has one counter: the number of boxes that may still be read; `depth` is the maximum depth of nesting.
     """
     while start + HEADER <= end and left[0] > 0:
         left[0] -= 1
@@ -299,4 +407,9 @@ def _samples(file: BinaryIO, kind: bytes, start: int, end: int) -> int:
     return samples
 
 
-VIDEO = Reader(f"a video ({', '.join(sorted(SUFFIXES))})", _is_video, _open_video, _open_video)
+VIDEO = Reader(
+    f"a video ({', '.join(sorted(SUFFIXES))})",
+    lambda path: Path(path).suffix.lower() in SUFFIXES and Path(path).is_file(),
+    _open_video,
+    _open_video,
+)

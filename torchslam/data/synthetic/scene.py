@@ -263,13 +263,9 @@ def corridors(seed: int) -> list[Rectangle]:
 
 def _quarter(painter: Painter) -> list[Rectangle]:
     """The first room: its part of the shell, the wall with the door, the furniture."""
-    return _shell(painter) + _doorway(painter) + _furniture(painter)
-
-
-def _shell(painter: Painter) -> list[Rectangle]:
     corner = np.array((-ROOMS_HALF, -FLOOR, 0.0))
     core = np.array((-ROOMS_CORE, -FLOOR, 0.0))
-    return [
+    rectangles = [
         painter.rectangle(corner, X, Z, (ROOMS_HALF, ROOMS_HALF)),  # ceiling
         painter.rectangle(corner + HEIGHT * Y, X, Z, (ROOMS_HALF, ROOMS_HALF)),  # floor
         painter.rectangle(corner, Z, Y, (ROOMS_HALF, HEIGHT)),
@@ -277,23 +273,13 @@ def _shell(painter: Painter) -> list[Rectangle]:
         painter.rectangle(core, Z, Y, (ROOMS_CORE, HEIGHT)),
         painter.rectangle(core + ROOMS_CORE * Z, X, Y, (ROOMS_CORE, HEIGHT)),
     ]
-
-
-def _doorway(painter: Painter) -> list[Rectangle]:
-    """The wall in the plane z = 0: a piece on each side of the door, one above it."""
-    rectangles = []
-    for start, end, bottom in (
+    for start, end, bottom in (  # of the wall in the plane z = 0: on each side of the door, and above it
         (-ROOMS_HALF, ROOMS_DOOR[0], FLOOR),
         (ROOMS_DOOR[1], -ROOMS_CORE, FLOOR),
         (*ROOMS_DOOR, ROOMS_DOOR_TOP),
     ):
         center = ((start + end) / 2, (bottom - FLOOR) / 2, 0.0)
         rectangles += painter.box(center, (end - start, bottom + FLOOR, PARTITION), 0.0)
-    return rectangles
-
-
-def _furniture(painter: Painter) -> list[Rectangle]:
-    rectangles = []
     for center, size, turn in ROOMS_FURNITURE:
         x, y, z = np.array(size) * painter.rng.uniform(1 - SIZE_SPREAD, 1 + SIZE_SPREAD, 3)
         turn += painter.rng.uniform(-TURN_SPREAD, TURN_SPREAD)

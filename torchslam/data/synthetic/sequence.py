@@ -1,7 +1,8 @@
-"""Rendered sequences, opened by name: `synthetic:room`, `synthetic:room?frames=240&noise=4`."""
+"""Rendered sequences, opened by name as `synthetic:room?frames=240&noise=4`, and the smooth paths of their camera."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
@@ -16,12 +17,11 @@ from torch import Tensor
 from torchslam.data.calibration import Calibration, GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.sequence import Calibrated, Reader, Sequence
-from torchslam.data.synthetic import paths
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Rectangle, corridors, room, rooms, wall
 from torchslam.errors import CalibrationError, SequenceError
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import se3_inverse
+from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.types import Trajectory
 
 FRAME_RATE = 20.0
@@ -30,6 +30,79 @@ SIZE = (640, 480)
 """Width and height of the images, pixels."""
 FOCAL = 500.0
 """Focal length, pixels: 65 degrees over the width."""
+
+
+RADIUS = 2.87
+"""Meters: the length of the walk around the core by 2 pi."""
+OUTWARD = 0.5
+"""Radians from the heading to where the camera looks."""
+HARMONICS = ((1, 0.98444), (-3, -0.04134), (5, -0.02481), (-7, -0.00111), (9, 0.00086))
+"""Fourier series of the integral of exp(i (phase - sin(4 phase) / 4)): orders 1 - 4 n,
+weights J_n(1 / 4) / (1 - 4 n)."""
+
+
+def loop(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
+    """A figure of eight through the middle of the room, one round a phase of 2 pi, held in a hand that sways.
+
+    The sway's periods do not divide the round's, so that no two rounds are the same.
+    """
+    x = 1.1 * torch.sin(phase) + 0.02 * torch.sin(7.3 * phase)
+    y = -0.1 + 0.12 * torch.sin(2.0 * phase + 0.5) + 0.015 * torch.sin(11.7 * phase)
+    z = -0.5 - 0.55 * torch.sin(2.0 * phase) + 0.02 * torch.sin(5.9 * phase + 1.0)
+    yaw = 0.45 * torch.sin(phase - 0.9) + 0.02 * torch.sin(9.1 * phase)
+    pitch = 0.08 * torch.sin(2.0 * phase + 1.3) + 0.015 * torch.sin(8.3 * phase + 0.4)
+    roll = 0.05 * torch.sin(phase + 0.7) + 0.01 * torch.sin(10.3 * phase)
+    return poses(x, y, z, yaw, pitch, roll)
+
+
+def standstill(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
+    """No motion at all."""
+    return poses(*[torch.zeros_like(phase)] * 6)
+
+
+def rotation(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
+    """A camera that turns about its own center and back."""
+    zero = torch.zeros_like(phase)
+    return poses(zero, zero, zero, 0.7 * torch.sin(phase), 0.2 * torch.sin(2 * phase), 0.1 * torch.sin(phase))
+
+
+def sideways(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
+    """A slow walk along the wall and back, turned toward it from changing angles."""
+    return poses(
+        1.2 * torch.sin(phase),
+        0.2 * torch.sin(2 * phase),
+        0.4 * torch.sin(phase + 0.5),
+        -0.25 * torch.sin(phase),
+        0.08 * torch.sin(2 * phase),
+        0.05 * torch.sin(phase),
+    )
+
+
+def round_the_core(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
+    """Around the core of the four rooms, one round a phase of 2 pi, from the door into the first room, to the right.
+
+    The heading is phase - sin(4 phase) / 4: straight on at the four doors, twice the mean rate in the four corners,
+    at constant speed. Its integral closes for the fourfold symmetry; `HARMONICS` is its Fourier series. The camera
+    looks to the left of the heading, at the outer walls, and sways in the hand.
+    """
+    z = RADIUS * sum(weight * torch.sin(order * phase) for order, weight in HARMONICS)
+    x = -RADIUS * sum(weight * torch.cos(order * phase) for order, weight in HARMONICS)
+    return poses(
+        x + 0.012 * torch.sin(29.3 * phase),
+        0.015 * torch.sin(47.3 * phase) + 0.05 * torch.sin(3.3 * phase + 0.5),
+        z + 0.012 * torch.sin(23.9 * phase + 1.0),
+        phase - 0.25 * torch.sin(4 * phase) - OUTWARD + 0.015 * torch.sin(36.4 * phase),
+        -0.03 + 0.012 * torch.sin(31.7 * phase + 0.4),
+        0.01 * torch.sin(41.2 * phase),
+    )
+
+
+def poses(x: Tensor, y: Tensor, z: Tensor, yaw: Tensor, pitch: Tensor, roll: Tensor) -> Tensor:
+    """T_wc from position, meters, and angles, radians: about y, then x, then z of the camera."""
+    zero = torch.zeros_like(x)
+    turns = ((zero, yaw, zero), (pitch, zero, zero), (zero, zero, roll))
+    about_y, about_x, about_z = (so3_exp(torch.stack(turn, dim=-1)) for turn in turns)
+    return rigid(about_y @ about_x @ about_z, torch.stack((x, y, z), dim=-1))
 
 
 @dataclass(frozen=True)
@@ -50,14 +123,14 @@ class Scene:
 
 
 SCENES = {
-    "room": Scene(room, paths.loop),
-    "planar": Scene(wall, paths.sideways),
-    "rotation": Scene(room, paths.rotation),
-    "standstill": Scene(room, paths.standstill),
+    "room": Scene(room, loop),
+    "planar": Scene(wall, sideways),
+    "rotation": Scene(room, rotation),
+    "standstill": Scene(room, standstill),
     # Once around and 50 frames on, over the start.
-    "loop": Scene(rooms, paths.round_the_core, 670, 720),
+    "loop": Scene(rooms, round_the_core, 670, 720),
     # Ends before the start comes into sight: what looks like a return is none. With 720 frames it returns.
-    "corridors": Scene(corridors, paths.round_the_core, 670, 560),
+    "corridors": Scene(corridors, round_the_core, 670, 560),
 }
 
 
@@ -92,9 +165,11 @@ class SyntheticSequence(Sequence):
     def __init__(self, scene: str, options: RenderOptions | None = None) -> None:
         self._scene = SCENES[scene]
         options = RenderOptions(self._scene.frames) if options is None else options
-        self._phases = paths.phases(options.frames, self._scene.frames_per_round) * options.pace
+        self._step = 2 * math.pi / self._scene.frames_per_round  # in the phase, of a frame
+        frames = torch.arange(options.frames, dtype=torch.float64, device="cpu")
+        self._phases = frames * self._step * options.pace
         T_wc = self._scene.path(self._phases)
-        timestamps = torch.arange(options.frames, dtype=torch.float64, device="cpu") / FRAME_RATE
+        timestamps = frames / FRAME_RATE
         center = ((SIZE[0] - 1) / 2, (SIZE[1] - 1) / 2)
         camera = Camera.pinhole(FOCAL, FOCAL, *center, size=SIZE)
         super().__init__(scene, "rendered", camera, timestamps, Trajectory(timestamps, T_wc))
@@ -118,7 +193,7 @@ class SyntheticSequence(Sequence):
         options, phase = self._options, self._phases[index : index + 1]
         if options.readout > 0:
             fractions = (torch.arange(SIZE[1], dtype=torch.float64, device="cpu") + 0.5) / SIZE[1] - 0.5
-            per_second = paths.phases(2, self._scene.frames_per_round)[1] * FRAME_RATE * options.pace
+            per_second = self._step * FRAME_RATE * options.pace
             phase = phase + per_second * 1e-3 * options.readout * fractions
         return se3_inverse(self._scene.path(phase)).numpy()
 
