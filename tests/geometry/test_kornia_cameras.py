@@ -7,7 +7,7 @@ import torch
 from kornia.geometry.liegroup import Se3
 
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.geometry.kornia_cameras import from_kornia_camera, to_kornia_camera
+from torchslam.geometry.transforms import from_kornia_camera, to_kornia_camera
 
 
 @pytest.fixture

@@ -43,7 +43,7 @@ from torchslam.geometry.ransac import (
     truncated_rows,
     valid_first,
 )
-from torchslam.geometry.undistorted import UndistortedKeypoints
+from torchslam.geometry.sensor import UndistortedKeypoints
 
 FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
 CANDIDATES = 2  # hypotheses of each round that are optimized

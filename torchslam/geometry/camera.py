@@ -62,7 +62,7 @@ class Camera:
     size: tuple[int, int]
 
     follows_data: ClassVar[bool] = True
-    """`check_arguments` lets it have another dtype, and `full_precision` converts it."""
+    """`full_precision` lets it have another dtype, and converts it."""
 
     def __post_init__(self) -> None:
         if self.model not in distortion.MODELS:

@@ -76,6 +76,11 @@ def transform(
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 
+def homogeneous(x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D+1"]:
+    """Coordinates with a one behind them."""
+    return torch.cat((x, torch.ones_like(x[..., :1])), dim=-1)
+
+
 @full_precision
 def so3_exp(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of rotation vectors in radians."""

@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry.homography import decompose_homography
 from torchslam.geometry.ransac import SUPPORT_WIDTH, best_of, is_significant, is_unlikely
 from torchslam.geometry.robust import NORMAL_MEDIAN, NORMAL_SQUARED_MEDIAN_2D
 from torchslam.geometry.two_view import (
@@ -26,6 +25,7 @@ from torchslam.geometry.two_view import (
     transfer_squared,
     twisted,
 )
+from torchslam.geometry.two_view_matrices import decompose_homography
 
 MODELS = ("essential", "homography", "rotation")
 ESSENTIAL, HOMOGRAPHY, ROTATION = range(3)
@@ -273,32 +273,34 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Bool[Tensor
 
 
 def pose_of(
-    views: TwoViews, fits: Fits, model: Int[Tensor, " B"], plane: PlaneMotions, by_noise: bool = False
+    views: TwoViews,
+    fits: Fits,
+    front: tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]],
+    model: Int[Tensor, " B"],
+    plane: PlaneMotions,
+    by_noise: bool = False,
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, "B 3"], Bool[Tensor, " B"]]:
     """R, t and the normal of the plane, and whether a plane leaves two motions.
 
     Args:
-        by_noise: also if noise may be the reason why one of them explains the matches better.
+        front: R, t of the essential matrix, with the matches in front.
+        by_noise: two motions remain also if noise may be the reason why one explains the matches better.
     """
-    R_E, t_E = in_front(views, fits.R, fits.t, views.mask & (fits.squared[ESSENTIAL] < 1))
     R_H, direction, normal, squared, possible = plane
     of_match = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0)
     support = torch.where(possible, of_match.sum(-1), -1.0)
-    (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
+    (first, second), (best, other) = (part.unbind(-1) for part in support.topk(2, dim=-1))
     ambiguous = second > _MAX_SECOND_SUPPORT * first.clamp_min(0.0)
     index = torch.arange(len(model), device=model.device)
     if by_noise:
-        deviation = (of_match[index, order[0]] - of_match[index, order[1]]).norm(dim=-1)
+        deviation = (of_match[index, best] - of_match[index, other]).norm(dim=-1)
         ambiguous |= (second >= 0) & (first - second < _TELLS_MOTIONS * deviation)
-    best = order[0]
-    flat = model == HOMOGRAPHY
-    apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > _SAME_ROTATION
-    R = torch.where(flat[:, None, None], R_H[index, best], R_E)
-    t = torch.where(flat[:, None], direction[index, best], t_E)
-    still = model == ROTATION
+    flat, still = model == HOMOGRAPHY, model == ROTATION
+    apart = (R_H[index, best] - R_H[index, other]).abs().amax((-2, -1)) > _SAME_ROTATION
+    R = torch.where(flat[:, None, None], R_H[index, best], front[0])
     R = torch.where(still[:, None, None], fits.R_only, R)
-    t = torch.where(still[:, None], 0.0, t)
-    return R, t, normal[index, best], flat & ambiguous & apart
+    t = torch.where(flat[:, None], direction[index, best], front[1])
+    return R, torch.where(still[:, None], 0.0, t), normal[index, best], flat & ambiguous & apart
 
 
 def is_spread(views: TwoViews, inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:

@@ -8,6 +8,7 @@ Every change of axes is made here:
 | COLMAP | `T_cw`, quaternion w first | the same | that of the map | (0.5, 0.5) |
 | nerfstudio | `T_wc` | OpenGL: x right, y up, z backward | z up | (0.5, 0.5) |
 | PLY | | | z up | |
+| kornia | `T_cw` | the same | that of the map | (0, 0) |
 | rerun | `T_wc` | x right, y down, z forward (RDF) | z up | (0.5, 0.5) |
 | TUM, KITTI | `T_wc` | x right, y down, z forward | that of the map | |
 """
@@ -15,6 +16,7 @@ Every change of axes is made here:
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -29,6 +31,9 @@ from torchslam.geometry.lie import (
     sim3_scale,
     transform,
 )
+
+if TYPE_CHECKING:  # kornia is slow to import
+    from kornia.geometry import PinholeCamera
 
 
 def pose_distance(
@@ -143,3 +148,42 @@ def level_rotation(up_w: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
     right = axis - (axis @ up_w) * up_w
     right = right / right.norm()
     return torch.stack((right, torch.linalg.cross(up_w, right), up_w))
+
+
+def to_kornia_camera(camera: Camera, T_cw: Float[Tensor, "B 4 4"]) -> PinholeCamera:
+    """One `kornia.geometry.PinholeCamera`, which holds K and a pose, for a batch of poses; with gradients.
+
+    Args:
+        camera: a pinhole, one for all poses or one for each.
+        T_cw: world to camera; kornia's `Se3.from_matrix` takes it as it is.
+
+    Raises:
+        ValueError: the camera has another model: kornia's has no distortion.
+    """
+    from kornia.geometry import PinholeCamera
+
+    if camera.model != "pinhole":
+        raise ValueError(
+            f"kornia's camera has no distortion, this one is of the model {camera.model!r}: undistort the images"
+        )
+    batch = len(T_cw)
+    K = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device).repeat(batch, 1, 1)
+    K[:, :3, :3] = camera.K
+    height, width = (torch.full((batch,), side, device=T_cw.device) for side in (camera.height, camera.width))
+    return PinholeCamera(K, T_cw, height, width)
+
+
+def from_kornia_camera(camera: PinholeCamera) -> tuple[Camera, Float[Tensor, "B 4 4"]]:
+    """The pinholes of a batch, and the poses, world to camera; with gradients.
+
+    Raises:
+        ValueError: the images of the batch have different sizes, or K has a skew.
+    """
+    sizes = {(int(w), int(h)) for w, h in zip(camera.width, camera.height, strict=True)}
+    if len(sizes) != 1:
+        raise ValueError(f"the images of the batch have different sizes: {sorted(sizes)}")
+    K = camera.intrinsics[:, :3, :3]
+    if bool((K[:, 0, 1] != 0).any()):
+        raise ValueError("a camera with a skew is not a pinhole here")
+    params = torch.stack((K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]), dim=-1)
+    return Camera("pinhole", params, sizes.pop()), camera.extrinsics

@@ -14,8 +14,6 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.essential import decompose_essential, essential_from_pose, five_point
-from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
 from torchslam.geometry.lie import cayley_rotation, generators, skew
 from torchslam.geometry.projections import (
     fit_projections,
@@ -36,6 +34,14 @@ from torchslam.geometry.ransac import (
     truncated_score,
 )
 from torchslam.geometry.robust import NORMAL_MEDIAN, Kernel, median_scale, robustify
+from torchslam.geometry.two_view_matrices import (
+    decompose_essential,
+    essential_from_pose,
+    five_point,
+    homography_from_matches,
+    rotation_from_matches,
+    transfer_errors,
+)
 
 # Thresholds: a two-dimensional error so large is as probable as a one-dimensional one of one.
 TRANSFER_WIDTH = 1.5
