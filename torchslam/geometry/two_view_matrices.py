@@ -1,7 +1,7 @@
 """Essential matrices and homographies: from minimal samples, into motions, and their errors.
 
-For matches x_1, x_2 in undistorted image coordinates and points_2 = R points_1 + t: x_2^T E x_1 = 0 with E = [t]x R, and
-x_2 ~ H x_1 with H = R + t n^T for points on the plane n^T points_1 = 1.
+For matches x_1, x_2 in undistorted image coordinates and points_2 = R points_1 + t: x_2^T E x_1 = 0 with E = [t]x R,
+and x_2 ~ H x_1 with H = R + t n^T for points on the plane n^T points_1 = 1.
 """
 
 from __future__ import annotations
