@@ -22,6 +22,7 @@ from torch import Tensor
 
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.fundamental import homography_share, refine_fundamental
+from torchslam.geometry.lie import homogeneous
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, robustify, weighted_median
 from torchslam.geometry.two_view import tangent_basis
@@ -36,10 +37,6 @@ _GRID = 300  # focal lengths in that range: steps of 0.9 %, below the width that
 _MODEL_NOISE = 1e-3
 _KERNEL_SCALE = 1.5  # deviations of the noise at which a pair begins to count less; 1 to 3 were tried
 
-_LARGEST = 3.03  # deviations: 99 % of the lengths of such a vector are shorter
-_LEVEL_ROUNDS = 4  # of the noise level and the best of the grid, which hardly change after the second
-_BEND_ROUNDS = 10  # of reweighting, for the grid only: Newton's method does the rest
-_NEWTON_STEPS, _HALVINGS = 20, 20  # about five steps are needed
 _ROUNDING = 1e-12  # of the cost and of its minimum: the resolution of Newton's method
 _MAX_STD = 0.1  # relative; beyond it a focal length counts as unknown
 _RISE = 9.0  # of the cost, three deviations, that any focal length further away than three times `_MAX_STD` must have
@@ -98,15 +95,11 @@ def focal_from_fundamentals(
         the noise level fixed.
     """
     check_dtypes(F_21=F_21, principal_point=principal_point, weights=weights)
-    weights = F_21.new_ones(len(F_21)) if weights is None else weights
-    to_pixels, scale = _from_scaled(principal_point.double(), size)
-    F = to_pixels.mT @ F_21.double() @ to_pixels
-    used = (weights > 0) & torch.isfinite(F).all(-1).all(-1) & (F != 0).any(-1).any(-1)
-    F = torch.where(used[:, None, None], F, _placeholder(F))
+    F, weights = _scaled(F_21, principal_point, size, weights)
     F = F / F.flatten(1).norm(dim=1)[:, None, None]
     nothing = F.new_zeros(len(F), 9)
-    graph = _Graph(F, torch.diag_embed(nothing), nothing, torch.where(used, weights.double(), 0.0))
-    return _solve(graph, 0.0, scale, F_21.dtype)
+    graph = _Graph(F, torch.diag_embed(nothing), nothing, weights)
+    return _solve(graph, 0.0, size, F_21.dtype)
 
 
 @full_precision
@@ -146,40 +139,40 @@ def focal_from_pairs(
     check_dtypes(
         F_21=F_21, pixels_1=pixels_1, pixels_2=pixels_2, principal_point=principal_point, weights=weights
     )
-    weights = F_21.new_ones(len(F_21)) if weights is None else weights
-    to_pixels, scale = _from_scaled(principal_point.double(), size)
-    finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
-    mask = mask & finite
+    mask = mask & torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     x_1, x_2 = (
-        (torch.where(mask[..., None], x.double(), 0.0) - principal_point.double()) / scale
+        (torch.where(mask[..., None], x.double(), 0.0) - principal_point.double()) / max(size)
         for x in (pixels_1, pixels_2)
     )
-    start = to_pixels.mT @ F_21.detach().double() @ to_pixels
-    used = (weights > 0) & (mask.sum(-1) >= _MIN_MATCHES) & torch.isfinite(start).all(-1).all(-1)
-    used = used & (start != 0).any(-1).any(-1)
-    start = torch.where(used[:, None, None], start, _placeholder(start))
-    refined = refine_fundamental(start, x_1, x_2, mask & used[:, None], threshold / scale)
+    weights = F_21.new_ones(len(F_21)) if weights is None else weights
+    weights = torch.where(mask.sum(-1) >= _MIN_MATCHES, weights, 0.0)
+    start, weights = _scaled(F_21.detach(), principal_point, size, weights)
+    used = weights > 0
+    refined = refine_fundamental(start, x_1, x_2, mask & used[:, None], threshold / max(size))
     if bool(used.any()):
         used = used & (homography_share(x_1, x_2, mask, refined.noise) < _MAX_HOMOGRAPHY_SHARE)
-    weights = torch.where(used, weights.double(), 0.0)
+    weights = torch.where(used, weights, 0.0)
     graph = _Graph(refined.F_21, refined.covariance, refined.bend, weights)
-    return _solve(graph, k1_std, scale, F_21.dtype)
+    return _solve(graph, k1_std, size, F_21.dtype)
 
 
-def _from_scaled(
-    principal_point: Float[Tensor, "2"], size: tuple[int, int]
-) -> tuple[Float[Tensor, "3 3"], float]:
-    """From pixels from the principal point in longer sides, to pixels; and pixels of a longer side."""
-    scale = float(max(size))
-    matrix = torch.diag(principal_point.new_tensor((scale, scale, 1.0)))
-    return torch.cat(
-        (matrix[:, :2], torch.nn.functional.pad(principal_point, (0, 1), value=1.0)[:, None]), 1
-    ), scale
+def _scaled(
+    F_21: Float[Tensor, "M 3 3"],
+    principal_point: Float[Tensor, "2"],
+    size: tuple[int, int],
+    weights: Float[Tensor, " M"] | None,
+) -> tuple[Float[Tensor, "M 3 3"], Float[Tensor, " M"]]:
+    """Matrices for pixels from the principal point in longer sides, and weights, zero of a matrix that is none.
 
-
-def _placeholder(F: Float[Tensor, "M 3 3"]) -> Float[Tensor, "3 3"]:
-    """The matrix of a shift to the side, for pairs without weight: nothing is NaN."""
-    return F.new_tensor(((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
+    That of a shift to the side takes its place, so that nothing is NaN.
+    """
+    side = principal_point.new_tensor((max(size), max(size), 1.0), dtype=torch.float64).diag()
+    to_pixels = torch.cat((side[:, :2], homogeneous(principal_point.double())[:, None]), 1)
+    F = to_pixels.mT @ F_21.double() @ to_pixels
+    weights = torch.ones_like(F[:, 0, 0]) if weights is None else weights.double()
+    used = (weights > 0) & torch.isfinite(F).all(-1).all(-1) & (F != 0).any(-1).any(-1)
+    shift = F.new_tensor(((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
+    return torch.where(used[:, None, None], F, shift), torch.where(used, weights, 0.0)
 
 
 class _Graph(NamedTuple):
@@ -259,7 +252,7 @@ def _best_bend(
     k1 = squares.constant.new_zeros(len(squares.constant))
     if k1_std == 0:
         return k1
-    for _ in range(_BEND_ROUNDS):
+    for _ in range(10):  # for the grid only: Newton's method does the rest
         scaled = squares.at(k1) / level
         weight = weights / level * robustify(scaled, "cauchy", scaled.new_tensor(_KERNEL_SCALE)).weight
         k1 = -(weight * squares.linear).sum(-1) / ((weight * squares.square).sum(-1) + k1_std**-2)
@@ -281,16 +274,13 @@ class _Profile(NamedTuple):
 
 
 def _search(graph: _Graph, k1_std: float) -> _Profile:
-    low, high = RANGE
-    log_focal = torch.linspace(
-        math.log(low), math.log(high), _GRID, dtype=graph.F.dtype, device=graph.F.device
-    )
+    low, high = (math.log(end) for end in RANGE)
+    log_focal = torch.linspace(low, high, _GRID, dtype=graph.F.dtype, device=graph.F.device)
     squares, level = _squares(graph, log_focal.exp()), 1.0
-    for _ in range(_LEVEL_ROUNDS):
+    for _ in range(4):  # level and best of the grid hardly change after the second
         k1 = _best_bend(squares, graph.weights, level, k1_std)
         at = squares.at(k1)
-        costs = _costs(at, graph.weights, level)
-        prior = _prior(k1, k1_std)
+        costs, prior = _costs(at, graph.weights, level), _prior(k1, k1_std)
         best = int((costs.sum(-1) + prior).argmin())
         before, level = level, max(1.0, weighted_median(at[best], graph.weights) / NORMAL_SQUARED_MEDIAN_2D)
         if level == before:
@@ -302,7 +292,7 @@ def _prior(k1: Tensor, k1_std: float) -> Tensor:
     return (k1 / k1_std).square() if k1_std > 0 else torch.zeros_like(k1)
 
 
-def _solve(graph: _Graph, k1_std: float, scale: float, dtype: torch.dtype) -> ViewGraphFocal:
+def _solve(graph: _Graph, k1_std: float, size: tuple[int, int], dtype: torch.dtype) -> ViewGraphFocal:
     """The minimum of the cost, how certain it is, and its gradient."""
     with torch.no_grad():
         fixed = _Graph(*(x.detach() for x in graph))
@@ -321,10 +311,10 @@ def _solve(graph: _Graph, k1_std: float, scale: float, dtype: torch.dtype) -> Vi
         at = found + implicit_step(objective, found[None])[0]  # a step of zero that has the gradient
     used = graph.weights > 0
     return ViewGraphFocal(
-        (scale * at[0].exp()).to(dtype),
+        (max(size) * at[0].exp()).to(dtype),
         std.to(dtype),
         torch.where(used, errors, torch.nan).to(dtype),
-        used & (errors < _LARGEST),
+        used & (errors < 3.03),  # 99 % of the lengths of such a vector are shorter
         torch.tensor(success, device=used.device),
         _bend_of(at, k1_std)[0].to(dtype),
     )
@@ -360,12 +350,12 @@ def _polished(graph: _Graph, profile: _Profile, k1_std: float) -> Float[Tensor, 
     start = torch.stack((log_focal[best], profile.k1[best])[: 2 if k1_std > 0 else 1])
     at, width = start, float(log_focal[1] - log_focal[0])
     cost, gradient, H = _derivatives(graph, at, profile.level, k1_std)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(20):  # about five are needed
         factor, info = torch.linalg.cholesky_ex(H)
         if int(info) != 0:
             break
         step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
-        for _ in range(_HALVINGS):
+        for _ in range(20):
             if abs(float(at[0] + step[0] - start[0])) <= 2 * width:
                 found = _derivatives(graph, at + step, profile.level, k1_std)
                 if float(found[0]) <= float(cost) + _ROUNDING * (1 + float(cost)):
