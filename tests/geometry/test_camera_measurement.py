@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
@@ -49,13 +47,6 @@ def test_a_camera_that_is_held_has_no_error() -> None:
     held = CameraMeasurement(given.camera, given.directions[:, :0])
     assert (held.focal_std, held.radial_std) == (0.0, (0.0, 0.0))
     assert not held.information.any()
-
-
-def test_departure_counts_standard_deviations_of_the_focal_length() -> None:
-    given = CameraMeasurement.of(PINHOLE, 0.02)
-    longer = PINHOLE.with_params(PINHOLE.params * torch.tensor([math.exp(0.06), math.exp(0.06), 1, 1]))
-    assert given.departure(longer) == pytest.approx(3.0)
-    assert CameraMeasurement.of(PINHOLE, 0.0).departure(longer) == 0.0
 
 
 @pytest.mark.parametrize(

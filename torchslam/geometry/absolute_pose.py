@@ -88,20 +88,15 @@ def estimate_absolute_pose(
     The same arguments and seed give the same result. Where an input requires a gradient, T_cw carries that of the final
     least squares with respect to points, pixels and camera parameters, with the set of rows it uses fixed (implicit
     function theorem, exact Hessian). Sources: Fischler and Bolles, 1981; Chum et al., "Locally optimized RANSAC", 2003;
-    for P3P see `p3p`.
+    for P3P see `p3p`. Too few points, points on a line, or pure noise give `success` False.
 
     Args:
-        points_w: points.
-        pixels: where they are seen.
         camera: one for all, or a batch of B.
         threshold: reprojection error of an inlier, pixels.
         mask: rows in use; rows with NaN are never used.
         seed: of the random samples.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples per camera.
-
-    Returns:
-        The poses; `success` is False for a camera with too few points, points on a line, or pure noise.
 
     Raises:
         ValueError: A shape or a dtype does not fit.
@@ -149,8 +144,7 @@ def start_pose(
     undistorted coordinates, in pixels at each keypoint. The same arguments and seed give the same result.
 
     Args:
-        points_w: finite points.
-        undistorted: of the N keypoints that see them.
+        undistorted: of the keypoints that see the points, which are finite.
         size: (width, height) of the image.
         threshold: reprojection error of an inlier, pixels.
         seed: of the random samples.
@@ -226,12 +220,9 @@ def _estimate(
 
 @dataclass(frozen=True)
 class _Search:
-    """The data of B searches in undistorted coordinates.
+    """The data of B searches in undistorted coordinates; points are about their mean: float32 is enough for scores.
 
-    Points are relative to their mean, so that float32 is enough for scores.
-
-    scale:     thresholds per unit of xy, of one direction or of both
-    is_single: one problem in which all rows count: samples and scores take fewer calls
+    scale: thresholds per unit of xy, of one direction or of both; is_single: one problem in which all rows count
     """
 
     points: Float[Tensor, "B N 3"]

@@ -67,13 +67,10 @@ class RelativePose:
         inliers: matches within the threshold of the chosen model.
         success: whether rotation and direction are determined: the inliers are significant, the motion is no
             pure rotation, and the plane, if any, is not ambiguous.
-        model: B strings, "essential", "homography" (a plane explains the matches) or
-            "rotation".
-        model_index: indices of these models, in this order.
+        model_index: 0 "essential", 1 "homography" (a plane explains the matches), 2 "rotation"; see `model`.
         ambiguous: whether the matches lie on a plane and two motions explain them; T_21 is the more likely one.
-        score_essential: sum over the matches of 1 - min((error / threshold)^2, 1); zero if not requested.
-        score_homography: as `score_essential`.
-        score_rotation: as `score_essential`.
+        score_essential: sum over the matches of 1 - min((error / threshold)^2, 1); zero if not requested. Those of
+            the other models, `score_homography` and `score_rotation`, are alike.
         T_21_essential: the pose of the essential matrix, whatever was chosen, without gradient: a guess
             where there is no `success`.
     """
@@ -130,10 +127,7 @@ def estimate_relative_pose(
     optimized RANSAC", 2003; Torr, "An assessment of information criteria for motion model selection", 1997.
 
     Args:
-        pixels_1: matches in the first view.
-        pixels_2: matches in the second view.
-        camera_1: of the first view, one or B.
-        camera_2: of the second view, one or B.
+        camera_1: of the first view, one or B; `camera_2`: of the second one.
         threshold: pixels, about the noise of one coordinate or somewhat more, for matches of weight one.
         mask: matches in use; those with NaN are never used.
         seed: of the random samples.
@@ -147,9 +141,6 @@ def estimate_relative_pose(
         weights: information of the matches; the threshold of a match is `threshold / sqrt(weight)`. A weight
             of zero, infinity or NaN excludes the match.
         min_samples: smallest number of samples of five matches.
-
-    Returns:
-        The relative poses.
 
     Raises:
         ValueError: A shape or a dtype does not fit, or an unknown model or kernel.

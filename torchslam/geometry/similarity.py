@@ -53,8 +53,6 @@ def umeyama(
     between two point patterns", 1991.
 
     Args:
-        source: points.
-        target: corresponding points.
         weights: weights or a boolean mask; rows without a finite weight above zero do not count and may hold anything.
         with_scale: False fixes the scale to one.
 
@@ -95,8 +93,6 @@ def align_poses(
     too. Its scale is the ratio of the spreads of the centers, one where all are at one place.
 
     Args:
-        T_ac: poses, camera to world a.
-        T_bc: poses of the same cameras, camera to world b.
         use_centers: let centers and orientations count equally in the rotation.
     """
     M = (T_bc[:, :3, :3] @ T_ac[:, :3, :3].mT).sum(0)
@@ -194,14 +190,12 @@ def estimate_similarity(
     system", 2015, section VII-B; for the minimal solution `umeyama`.
 
     Args:
-        points_1: points in the coordinates of camera 1.
-        points_2: the same points in the coordinates of camera 2.
+        points_1: points in the coordinates of camera 1; `points_2`: the same ones in those of camera 2.
         pixels_1: where camera 1 saw them.
         pixels_2: where camera 2 saw them.
         camera_1: one or B.
         camera_2: one or B.
-        sigmas_1: standard deviations of `pixels_1`, pixels; None: one.
-        sigmas_2: standard deviations of `pixels_2`, pixels; None: one.
+        sigmas_1: standard deviations of `pixels_1`, pixels; None: one. `sigmas_2`: of `pixels_2`.
         threshold: reprojection error of an inlier in standard deviations, of the points of each camera in the other
             image.
         depth_sigma: relative standard deviation of the depths in camera 2. They determine the scale where both
@@ -212,9 +206,6 @@ def estimate_similarity(
         with_scale: False fixes the scale to one.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples per pair of cameras.
-
-    Returns:
-        The similarities.
 
     Raises:
         ValueError: A shape or a dtype does not fit.
