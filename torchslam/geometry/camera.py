@@ -16,13 +16,12 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry import distortion
+from torchslam.geometry.lie import homogeneous
 from torchslam.geometry.precision import without_autocast
 from torchslam.utils.torch_internals import default_collate_fn_map, in_transform, register_pytree
 
 Scalar = float | Tensor
 Numbers = Tensor | np.ndarray | Sequence[Any]
-
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
@@ -118,11 +117,7 @@ class Camera:
 
     @staticmethod
     def from_opencv(
-        K: Numbers,
-        dist: Numbers | None,
-        size: tuple[int, int],
-        *,
-        fisheye: bool = False,
+        K: Numbers, dist: Numbers | None, size: tuple[int, int], *, fisheye: bool = False
     ) -> Camera:
         """The camera of a matrix and distortion coefficients, as `cv2.calibrateCamera` returns them.
 
@@ -287,11 +282,7 @@ class Camera:
         inverse_depth = torch.where(valid, 1 / points_c[..., 2].masked_fill(~valid, 1.0), 0.0)
         scale = focal * inverse_depth[..., None]
         slope = self._distortion.slope(normalized, coefficients) * scale[..., None]
-        (a, b), (c, d), (x, y) = (
-            slope[..., 0, :].unbind(-1),
-            slope[..., 1, :].unbind(-1),
-            normalized.unbind(-1),
-        )
+        a, b, c, d, x, y = *slope.flatten(-2).unbind(-1), *normalized.unbind(-1)
         rows = torch.stack((a, b, -(a * x + b * y), c, d, -(c * x + d * y)))
         J = rows.unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
         return self._to_pixels(distorted, valid), valid, J
@@ -337,8 +328,7 @@ class Camera:
     @_in_dtype_of_data
     def unproject(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 3"]:
         """Compute bearings of unit length of pixels."""
-        normalized = self.normalize(pixels)
-        ray = torch.cat((normalized, torch.ones_like(normalized[..., :1])), dim=-1)
+        ray = homogeneous(self.normalize(pixels))
         return ray / ray.norm(dim=-1, keepdim=True)
 
     @without_autocast

@@ -64,8 +64,6 @@ def refine_fundamental(
 
     Args:
         F_21: where to start, of any scale; without gradient.
-        x_1: matches in view 1.
-        x_2: matches in view 2.
         mask: matches in use, few of them wrong; finite.
         threshold: of the kernel, in units of the coordinates: about the noise of one coordinate or somewhat more.
     """
@@ -99,13 +97,7 @@ def homography_share(
     """Share of the matches that one homography explains: near one of a plane, and of a camera that only turned.
 
     Then a fundamental matrix follows the noise in two directions, and its covariance cannot be trusted. Not
-    differentiable by design: it serves a decision. The samples are always the same.
-
-    Args:
-        x_1: matches in view 1.
-        x_2: matches in view 2.
-        mask: matches in use.
-        noise: of a coordinate, as of `RefinedFundamental`.
+    differentiable by design: it serves a decision. The samples are always the same. noise: of `RefinedFundamental`
     """
     with torch.no_grad():
         scale = (1 / (_WIDTH * noise))[:, None].expand(mask.shape)

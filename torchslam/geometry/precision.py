@@ -85,14 +85,9 @@ def check_positive(**numbers: float | None) -> None:
 class _Form(NamedTuple):
     """One kind and shape that a tensor may have.
 
-    Attributes:
-        dtypes: that it may have; none: any.
-        kind: these in words.
-        before: dimensions in front of those of any number, each a size, a name, or None for any size.
-        variadic: name of the dimensions of any number; None: there are none.
-        after: the dimensions behind them.
-        broadcasts: whether the dimensions of any number broadcast.
-        text: the shape as messages show it.
+    dtypes: none for any; kind: these in words; before: dimensions in front of those of any number, each a size, a name,
+    or None for any size; variadic: name of the dimensions of any number, None where there are none; after: those behind
+    them; text: the shape as messages show it
     """
 
     dtypes: tuple[torch.dtype, ...]
@@ -128,15 +123,7 @@ def _dimension(token: str) -> int | str | None:
 
 
 class _Argument(NamedTuple):
-    """What one argument may be.
-
-    Attributes:
-        name: of the argument.
-        forms: of a tensor.
-        classes: of an object with tensors.
-        holds: the fields of such an object.
-        is_open: whether it may be something else as well.
-    """
+    """What one argument may be: a tensor of some form, an object with tensors, or, if open, something else as well."""
 
     name: str
     forms: tuple[_Form, ...]

@@ -45,18 +45,14 @@ def levenberg_marquardt(
     retract: Callable[[ModelState, Tensor], ModelState],
     iterations: int,
 ) -> tuple[ModelState, Float[Tensor, " B"]]:
-    """Minimize many small problems at once, each with its own damping.
+    """Minimize many small problems (B) at once, each with its own damping; return the state and its cost.
 
-    Stops once no problem can gain more than 1e-11 of its cost.
+    Stops once no problem can gain more than 1e-11 of its cost. Problems that become singular or NaN keep their last
+    good state.
 
     Args:
-        state: tensors with one leading dimension (B), the problems.
         evaluate: state -> (A, cost): A (B, D + 1, D + 1) is [J r]^T W [J r], and cost (B,) what must not grow.
         retract: state, step (B, D) -> state.
-        iterations: largest number.
-
-    Returns:
-        The state and its cost; problems that become singular or NaN keep their last good state.
     """
     A, cost = evaluate(*state)
     damping = torch.full_like(cost, 1e-4)[:, None, None]
@@ -83,8 +79,7 @@ def in_chunks(
 ) -> tuple[Tensor, ...]:
     """Call function(*tensors) for a few problems at a time, so that intermediate results stay in the cache.
 
-    Args:
-        numbers: values of the function's largest intermediate result per problem.
+    numbers: values of the function's largest intermediate result per problem
     """
     size = max(1, _MAX_VALUES_AT_ONCE // numbers)
     if len(tensors[0]) <= size:
@@ -172,8 +167,7 @@ def best_models(
 ) -> Int[Tensor, "B {count}"]:
     """Indices of the best of many models, which first have to do well on a random part of the rows.
 
-    Args:
-        score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K).
+    score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K)
     """
     few = min(mask.shape[1] // _PREVIEW_ROWS, models.shape[1] // _PREVIEW_MODELS) < 2
     if few or models.shape[0] * models.shape[1] * mask.shape[1] < _PREVIEW_FROM:
@@ -206,12 +200,9 @@ def gather_rows(
 
 
 def truncated_score(squared: Float[Tensor, "B K N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B K"]:
-    """Sum of 1 - min(r^2, 1) over the rows in use (MSAC), higher is better; `squared` is overwritten.
+    """Sum of 1 - min(r^2, 1) over the rows in use (MSAC; Torr and Zisserman, "MLESAC", 2000), higher is better.
 
-    Source: Torr and Zisserman, "MLESAC", 2000.
-
-    Args:
-        squared: squared residuals in units of the threshold; NaN counts as an outlier.
+    squared: residuals in units of the threshold, which are overwritten; NaN counts as an outlier
     """
     weights = mask.to(squared.dtype)[..., None]
     cost = squared.clamp_max_(1.0).nan_to_num_(1.0) @ weights
@@ -244,7 +235,6 @@ def search(
         size: of a minimal sample.
         confidence: probability that some sample has no outlier.
         first_round: samples of the first round; every round draws twice as many as the one before.
-        max_samples: largest number of samples per problem.
         as_needed: draw no more than the support calls for, but at least as many as in the first round.
     """
 
@@ -288,12 +278,7 @@ def is_significant(
 
     Source: Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images", 2004.
 
-    Args:
-        inliers: number of inliers.
-        available: number of rows in use.
-        size: of a minimal sample.
-        chance: probability that a wrong row fits a model.
-        solutions: models per minimal sample.
+    available: rows in use; size: of a minimal sample; chance: that a wrong row fits a model; solutions: per sample
     """
 
     def log_false_alarms(inliers: int, available: int, chance: float) -> float:

@@ -113,7 +113,7 @@ def corner_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"
 def corner_camera(camera: Camera) -> Camera:
     """The camera whose pixels are those of `corner_pixels`."""
     params = camera.params.clone()
-    params[..., 2:4] += HALF_PIXEL
+    params[..., 2:4] = corner_pixels(params[..., 2:4])
     return camera.with_params(params)
 
 

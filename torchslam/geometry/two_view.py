@@ -52,14 +52,9 @@ TRANSFER_WIDTH = 1.5
 
 @dataclass(frozen=True)
 class TwoViews:
-    """Matches of B pairs of views.
+    """Matches of B pairs of views in undistorted image coordinates, and the mask of those in use.
 
-    Attributes:
-        x_1: undistorted image coordinates in view 1.
-        x_2: undistorted image coordinates in view 2.
-        scale_1: thresholds per unit of `x_1`.
-        scale_2: thresholds per unit of `x_2`.
-        mask: matches in use.
+    scale_1, scale_2: thresholds per unit of x_1 and x_2
     """
 
     x_1: Float[Tensor, "B N 2"]
@@ -246,9 +241,8 @@ def propose_essential(
 ) -> tuple[ModelState, Tensor, Tensor]:
     """The best (R, t) of `count` samples of five matches, locally optimized, its score and its support.
 
-    Args:
-        by_noise: matches count the more the closer they are, in units of the noise that the best sample
-            shows; those that lie behind a camera count as wrong.
+    by_noise: matches count the more the closer they are, in units of the noise that the best sample shows; those that
+    lie behind a camera count as wrong
     """
     B = len(views.mask)
     sample = sample_minimal(views.mask, 5, count, generator)

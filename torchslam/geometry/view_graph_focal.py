@@ -91,8 +91,7 @@ def focal_from_fundamentals(
         weights: of the pairs, not negative, as if each were present that many times; one by default.
 
     Returns:
-        The focal length. Its gradient to F_21 and weights is that of the minimum (implicit function theorem), with
-        the noise level fixed.
+        The focal length, with the gradient to F_21 and weights of the minimum, the noise level fixed.
     """
     check_dtypes(F_21=F_21, principal_point=principal_point, weights=weights)
     F, weights = _scaled(F_21, principal_point, size, weights)
@@ -114,7 +113,7 @@ def focal_from_pairs(
     threshold: float = 1.0,
     k1_std: float = 0.03,
 ) -> ViewGraphFocal:
-    """Find the focal length of a camera from the matches of pairs of its images.
+    """Find the focal length of a camera from the matches of pairs of its images, pixels.
 
     Refines the fundamental matrices on the matches, and uses how uncertain each is and how distortion would change
     it. Pairs whose matches a homography explains, those of a plane or of a camera that only turned, are left out;
@@ -122,8 +121,6 @@ def focal_from_pairs(
 
     Args:
         F_21: in pixels, x_2^T F_21 x_1 = 0, such as from RANSAC: where the refinement starts.
-        pixels_1: matches in the first views.
-        pixels_2: matches in the second views.
         mask: inliers of F_21; a pair with fewer than 20 is left out.
         principal_point: pixels.
         size: width and height of the images, pixels; sets the range of the search.
@@ -133,8 +130,7 @@ def focal_from_pairs(
             the focal length. 0.03 (0.01 to 1 were tried) is that of a camera called undistorted; zero for none.
 
     Returns:
-        The focal length. Its gradient to the matches and weights is that of the minima (implicit function theorem),
-        with the noise fixed.
+        The focal length, with the gradient to the matches and weights of the minima, the noise fixed.
     """
     check_dtypes(
         F_21=F_21, pixels_1=pixels_1, pixels_2=pixels_2, principal_point=principal_point, weights=weights
