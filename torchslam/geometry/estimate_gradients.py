@@ -87,7 +87,7 @@ def implicit_step(
 ) -> Float[Tensor, "B D"]:
     """A step of value zero that carries the gradient of the minimizer with respect to the data.
 
-    It is -H^-1 (gradient - its value) with the exact Hessian. Where that is not positive definite, the gradient is zero.
+    It is -H^-1 (gradient - its value) with the exact Hessian; where H is not positive definite, the gradient is zero.
     It has no second derivative, see `first_order`.
 
     Args:

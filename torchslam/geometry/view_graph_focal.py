@@ -202,11 +202,9 @@ def _squares(graph: _Graph, focal: Float[Tensor, " G"]) -> _Squares:
     K = torch.stack((focal, focal, one), dim=-1)[:, None]
     null = (_null_vector(F) / K, _null_vector(F.mT) / K)  # of K F K, from the right and from the left
     B_1, B_2 = (tangent_basis(e / e.norm(dim=-1, keepdim=True)) * K[:, :, None] for e in null)
-    block = (B_2 @ F @ B_1.mT).detach()
+    a, b, c, d = (B_2 @ F @ B_1.mT).detach().flatten(-2).unbind(-1)
     # Of a reflection, one axis is turned around: then it is a rotation.
-    sign = torch.where(
-        block[..., 0, 0] * block[..., 1, 1] < block[..., 0, 1] * block[..., 1, 0], -1.0, 1.0
-    ).to(block.dtype)
+    sign = torch.where(a * d < b * c, -1.0, 1.0).to(a.dtype)
     b_1, b_2 = B_1[..., 0, :], B_1[..., 1, :] * sign[..., None]
     c_1, c_2 = B_2[..., 0, :], B_2[..., 1, :]
 
@@ -241,20 +239,6 @@ def _costs(squares: Float[Tensor, "G M"], weights: Float[Tensor, " M"], level: f
     return weights * robustify(squares / level, "cauchy", squares.new_tensor(_KERNEL_SCALE)).rho
 
 
-def _best_bend(
-    squares: _Squares, weights: Float[Tensor, " M"], level: float, k1_std: float
-) -> Float[Tensor, " G"]:
-    """k1 of least cost for each focal length, by iteratively reweighted least squares from zero."""
-    k1 = squares.constant.new_zeros(len(squares.constant))
-    if k1_std == 0:
-        return k1
-    for _ in range(10):  # for the grid only: Newton's method does the rest
-        scaled = squares.at(k1) / level
-        weight = weights / level * robustify(scaled, "cauchy", scaled.new_tensor(_KERNEL_SCALE)).weight
-        k1 = -(weight * squares.linear).sum(-1) / ((weight * squares.square).sum(-1) + k1_std**-2)
-    return k1
-
-
 class _Profile(NamedTuple):
     """The search on the grid: costs of the pairs, k1 of each focal length, the best of them, and the noise level.
 
@@ -273,10 +257,14 @@ def _search(graph: _Graph, k1_std: float) -> _Profile:
     low, high = (math.log(end) for end in RANGE)
     log_focal = torch.linspace(low, high, _GRID, dtype=graph.F.dtype, device=graph.F.device)
     squares, level = _squares(graph, log_focal.exp()), 1.0
+    scale = log_focal.new_tensor(_KERNEL_SCALE)
     for _ in range(4):  # level and best of the grid hardly change after the second
-        k1 = _best_bend(squares, graph.weights, level, k1_std)
+        k1 = torch.zeros_like(log_focal)
+        for _ in range(10):  # of reweighting, for the grid only: Newton's method does the rest
+            weight = graph.weights / level * robustify(squares.at(k1) / level, "cauchy", scale).weight
+            k1 = -(weight * squares.linear).sum(-1) / ((weight * squares.square).sum(-1) + k1_std**-2)
         at = squares.at(k1)
-        costs, prior = _costs(at, graph.weights, level), _prior(k1, k1_std)
+        costs, prior = _costs(at, graph.weights, level), (k1 / k1_std).square()
         best = int((costs.sum(-1) + prior).argmin())
         before, level = level, max(1.0, weighted_median(at[best], graph.weights) / NORMAL_SQUARED_MEDIAN_2D)
         if level == before:
@@ -284,24 +272,25 @@ def _search(graph: _Graph, k1_std: float) -> _Profile:
     return _Profile(log_focal, costs, k1, prior, best, before)
 
 
-def _prior(k1: Tensor, k1_std: float) -> Tensor:
-    return (k1 / k1_std).square() if k1_std > 0 else torch.zeros_like(k1)
-
-
 def _solve(graph: _Graph, k1_std: float, size: tuple[int, int], dtype: torch.dtype) -> ViewGraphFocal:
     """The minimum of the cost, how certain it is, and its gradient."""
+    if k1_std == 0:  # without an effect on the errors, k1 stays zero
+        graph, k1_std = graph._replace(bend=torch.zeros_like(graph.bend)), 1.0
     with torch.no_grad():
         fixed = _Graph(*(x.detach() for x in graph))
         profile = _search(fixed, k1_std)
-        found = _polished(fixed, profile, k1_std)
-        std = _standard_error(fixed, profile, found, k1_std)
-        squares = _squares(fixed, found[:1].exp()).at(_bend_of(found, k1_std))
-        errors = (squares[0] / profile.level).sqrt()
-        success = bool(std < _MAX_STD) and _is_bounded(profile, float(found[0]))
+        found, H = _polished(fixed, profile, k1_std)
+        std = _standard_error(fixed, profile, found[0], H)
+        errors = (_squares(fixed, found[:1].exp()).at(found[1:])[0] / profile.level).sqrt()
+        # All focal lengths not clearly worse are close, and inside of the range.
+        cost = profile.costs.sum(-1) + profile.prior
+        possible = cost < cost[profile.best] + _RISE
+        far = (profile.log_focal - found[0]).abs() > 3 * _MAX_STD
+        success = bool(std < _MAX_STD) and not bool((possible & far).any() | possible[0] | possible[-1])
     at = found
     if success and needs_gradient(*graph):
 
-        def objective(step: Float[Tensor, "1 D"]) -> Float[Tensor, "1"]:
+        def objective(step: Float[Tensor, "1 2"]) -> Float[Tensor, "1"]:
             return _cost(graph, found + step[0], profile.level, k1_std)[None]
 
         at = found + implicit_step(objective, found[None])[0]  # a step of zero that has the gradient
@@ -312,40 +301,36 @@ def _solve(graph: _Graph, k1_std: float, size: tuple[int, int], dtype: torch.dty
         torch.where(used, errors, torch.nan).to(dtype),
         used & (errors < 3.03),  # 99 % of the lengths of such a vector are shorter
         torch.tensor(success, device=used.device),
-        _bend_of(at, k1_std)[0].to(dtype),
+        at[1].to(dtype),
     )
 
 
-def _bend_of(at: Float[Tensor, " D"], k1_std: float) -> Float[Tensor, " 1"]:
-    """k1, where it is sought, else zero."""
-    return at[1:2] if k1_std > 0 else torch.zeros_like(at[:1])
+def _cost(graph: _Graph, at: Float[Tensor, "2"], level: float, k1_std: float) -> Float[Tensor, ""]:
+    """The cost with the logarithm of the focal length and k1."""
+    squares = _squares(graph, at[:1].exp()).at(at[1:])
+    return _costs(squares, graph.weights, level).sum() + (at[1] / k1_std).square()
 
 
-def _cost(graph: _Graph, at: Float[Tensor, " D"], level: float, k1_std: float) -> Float[Tensor, ""]:
-    """The cost with the logarithm of the focal length and, if it is sought, k1."""
-    k1 = _bend_of(at, k1_std)
-    squares = _squares(graph, at[:1].exp()).at(k1)
-    return (_costs(squares, graph.weights, level).sum(-1) + _prior(k1, k1_std))[0]
+def _polished(
+    graph: _Graph, profile: _Profile, k1_std: float
+) -> tuple[Float[Tensor, "2"], Float[Tensor, "2 2"]]:
+    """The minimum next to the best of the grid, two steps of which it may be away, and the Hessian there.
 
+    By Newton's method with halved steps.
+    """
 
-def _derivatives(
-    graph: _Graph, at: Float[Tensor, " D"], level: float, k1_std: float
-) -> tuple[Float[Tensor, ""], Float[Tensor, " D"], Float[Tensor, "D D"]]:
-    """The cost, its gradient and its Hessian."""
-    with torch.enable_grad():
-        at = at.detach().requires_grad_()
-        cost = _cost(graph, at, level, k1_std)
-        (gradient,) = torch.autograd.grad(cost, at, create_graph=True)
-        rows = [torch.autograd.grad(entry, at, retain_graph=True)[0] for entry in gradient]
-    return cost.detach(), gradient.detach(), torch.stack(rows)
+    def derivatives(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        with torch.enable_grad():
+            at = at.detach().requires_grad_()
+            cost = _cost(graph, at, profile.level, k1_std)
+            (gradient,) = torch.autograd.grad(cost, at, create_graph=True)
+            rows = [torch.autograd.grad(entry, at, retain_graph=True)[0] for entry in gradient]
+        return cost.detach(), gradient.detach(), torch.stack(rows)
 
-
-def _polished(graph: _Graph, profile: _Profile, k1_std: float) -> Float[Tensor, " D"]:
-    """The minimum next to the best of the grid, two steps of which it may be away: Newton's method, halved steps."""
     log_focal, best = profile.log_focal, profile.best
-    start = torch.stack((log_focal[best], profile.k1[best])[: 2 if k1_std > 0 else 1])
+    start = torch.stack((log_focal[best], profile.k1[best]))
     at, width = start, float(log_focal[1] - log_focal[0])
-    cost, gradient, H = _derivatives(graph, at, profile.level, k1_std)
+    cost, gradient, H = derivatives(at)
     for _ in range(20):  # about five are needed
         factor, info = torch.linalg.cholesky_ex(H)
         if int(info) != 0:
@@ -353,7 +338,7 @@ def _polished(graph: _Graph, profile: _Profile, k1_std: float) -> Float[Tensor, 
         step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
         for _ in range(20):
             if abs(float(at[0] + step[0] - start[0])) <= 2 * width:
-                found = _derivatives(graph, at + step, profile.level, k1_std)
+                found = derivatives(at + step)
                 if float(found[0]) <= float(cost) + _ROUNDING * (1 + float(cost)):
                     break
             step = 0.5 * step
@@ -362,36 +347,25 @@ def _polished(graph: _Graph, profile: _Profile, k1_std: float) -> Float[Tensor, 
         at, (cost, gradient, H) = at + step, found
         if float(step.abs().max()) < _ROUNDING:
             break
-    return at
+    return at, H
 
 
 def _standard_error(
-    graph: _Graph, profile: _Profile, at: Float[Tensor, " D"], k1_std: float
+    graph: _Graph, profile: _Profile, log_focal: Float[Tensor, ""], H: Float[Tensor, "2 2"]
 ) -> Float[Tensor, ""]:
     """The larger of the errors by the curvature of the cost and by leaving out one pair at a time (jackknife)."""
-    _, _, H = _derivatives(graph, at, profile.level, k1_std)
     factor, info = torch.linalg.cholesky_ex(0.5 * H)  # the cost is twice a negative log likelihood
     if int(info) != 0 or int((graph.weights > 0).sum()) < 2:  # nothing confirms a single pair
-        return at.new_tensor(torch.inf)
+        return H.new_tensor(torch.inf)
     variance = torch.cholesky_inverse(factor)[0, 0]
-    without = profile.costs.sum(-1, keepdim=True) - profile.costs + profile.prior[:, None]
-    shifts = (_vertices(profile.log_focal, without) - at[0])[graph.weights > 0]
-    jackknife = shifts.square().sum() * (len(shifts) - 1) / len(shifts)
-    return torch.maximum(variance, jackknife).sqrt()
-
-
-def _vertices(log_focal: Float[Tensor, " G"], costs: Float[Tensor, "G M"]) -> Float[Tensor, " M"]:
-    """The minima of columns, by a parabola through the lowest value and its neighbors."""
-    best = costs.argmin(0).clamp(1, len(log_focal) - 2)
+    costs = profile.costs.sum(-1, keepdim=True) - profile.costs + profile.prior[:, None]
+    # Their minima, by a parabola through the lowest value and its neighbors.
+    grid = profile.log_focal
+    best = costs.argmin(0).clamp(1, len(grid) - 2)
     below, middle, above = (costs.gather(0, (best + i)[None])[0] for i in (-1, 0, 1))
     bend = below - 2 * middle + above
     shift = torch.where(bend > 0, 0.5 * (below - above) / bend.clamp_min(torch.finfo(bend.dtype).tiny), 0.0)
-    return log_focal[best] + shift.clamp(-1.0, 1.0) * (log_focal[1] - log_focal[0])
-
-
-def _is_bounded(profile: _Profile, log_focal: float) -> bool:
-    """Whether all focal lengths not clearly worse are close, and inside of the range."""
-    cost = profile.costs.sum(-1) + profile.prior
-    possible = cost < cost[profile.best] + _RISE
-    far = (profile.log_focal - log_focal).abs() > 3 * _MAX_STD
-    return not bool((possible & far).any() | possible[0] | possible[-1])
+    minima = grid[best] + shift.clamp(-1.0, 1.0) * (grid[1] - grid[0])
+    shifts = (minima - log_focal)[graph.weights > 0]
+    jackknife = shifts.square().sum() * (len(shifts) - 1) / len(shifts)
+    return torch.maximum(variance, jackknife).sqrt()
