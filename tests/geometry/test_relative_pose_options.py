@@ -7,7 +7,6 @@ import poselib
 import pytest
 import torch
 from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_views
-from torch import Tensor
 
 from torchslam.geometry import RelativePose, estimate_relative_pose, so3_exp
 from torchslam.geometry.motion_models import Fits, PlaneMotions, goes_both_ways, plane_holds
@@ -323,59 +322,6 @@ def test_match_information_improves_the_pose() -> None:
         given.append(errors(estimate(noisy_scene, weights=sigmas**-2), scene)[1])
         without.append(errors(estimate(noisy_scene), scene)[1])
     assert sum(given) < 0.6 * sum(without)
-
-
-@pytest.mark.parametrize("kernel", ["cauchy", "geman_mcclure", "truncated"])
-def test_gradient_in_pixels_and_weights(kernel: Kernel) -> None:
-    """Against central differences of the whole estimator, of which the level of the noise stays the same."""
-    scene = two_views(7, count=80, outliers=0.1, noise=0.1)
-    generator = torch.Generator().manual_seed(1)
-    weights = 0.5 + torch.rand(1, 80, generator=generator, dtype=torch.float64)
-    weights[0, 20] = 0.0
-    inputs = {"pixels_1": scene.pixels_1, "weights": weights}
-    direction = {
-        name: torch.randn(x.shape, generator=generator, dtype=torch.float64) for name, x in inputs.items()
-    }
-    direction["weights"][0, 20] = 0.0
-
-    def run(pixels_1: Tensor, weights: Tensor) -> Tensor:
-        pose = estimate_relative_pose(
-            pixels_1,
-            scene.pixels_2,
-            camera_1=CAMERA,
-            camera_2=CAMERA,
-            threshold=2.0,
-            weights=weights,
-            kernel=kernel,
-        )
-        return pose.T_21[0, :3]
-
-    leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
-    factors = torch.linspace(-1, 1, 12, dtype=torch.float64).view(3, 4)
-    (run(**leaves) * factors).sum().backward()
-    for name, x in inputs.items():
-        step = 1e-3 * direction[name]
-        high, low = (run(**{**inputs, name: x + sign * step}) for sign in (1, -1))
-        expected = ((high - low) * factors).sum() / 2e-3
-        actual = (leaves[name].grad * direction[name]).sum()
-        torch.testing.assert_close(actual, expected, rtol=2e-3, atol=1e-7)
-    assert float(leaves["weights"].grad[0, 20]) == 0
-
-
-def test_a_batch_equals_a_loop_where_the_samples_do() -> None:
-    """Every problem of a batch draws its own samples: as many copies of one must agree."""
-    scene = two_views(3, noise=0.3)
-    weights = torch.linspace(0.5, 2, 200, dtype=torch.float64)[None]
-    one = estimate(scene, weights=weights)
-    three = estimate_relative_pose(
-        scene.pixels_1.repeat(3, 1, 1),
-        scene.pixels_2.repeat(3, 1, 1),
-        camera_1=CAMERA,
-        camera_2=CAMERA,
-        weights=weights.repeat(3, 1),
-    )
-    torch.testing.assert_close(three.T_21, one.T_21.expand(3, 4, 4), atol=1e-5, rtol=0)
-    assert torch.equal(three.inliers, one.inliers.expand(3, -1))
 
 
 def test_many_outliers_do_not_bias_the_pose() -> None:

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from geometry_scenes import CAMERA
+from geometry_scenes import CAMERA, FISHEYE, RADIAL
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -15,9 +15,6 @@ from torchslam.geometry import (
     triangulate_many,
     triangulation_covariance,
 )
-
-RADIAL = Camera.radial_tangential(500.0, 510.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
-FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
 
 
 def views(
