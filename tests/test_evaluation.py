@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 from torch.func import jacfwd, jacrev
 
-from torchslam.data import open_sequence
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import ate, ate_apart, evaluate, rpe
@@ -269,24 +267,6 @@ def test_agrees_with_evo(association: str, generator: torch.Generator) -> None:
         assert figures["rpe"][name] == pytest.approx(expected[name], rel=tolerance)
 
 
-@pytest.mark.data
-@pytest.mark.parametrize("name", ["redkitchen", "kitti07", "machine_hall", "fr2_desk_20", "shelf_bin"])
-def test_agrees_with_evo_on_real_trajectories(name: str, data_dir: Path, generator: torch.Generator) -> None:
-    pytest.importorskip("evo")
-    sequence = open_sequence(data_dir / name)
-    truth = sequence.groundtruth
-    assert truth is not None
-    T_wc, valid = interpolate_poses(truth, sequence.timestamps, 0.02)
-    assert valid.all()
-    estimate = Trajectory(sequence.timestamps, _noisy(T_wc, generator))
-    expected = _evo_figures(estimate, truth, interpolate=False)
-    evaluation = evaluate(estimate, truth, association="nearest", delta=2)
-    assert evaluation.ate_m == pytest.approx(expected["ate_m"], rel=1e-9)
-    assert evaluation.ate_se3_m == pytest.approx(expected["ate_se3_m"], rel=1e-9)
-    assert evaluation.rpe_translation_m == pytest.approx(expected["translation_m"], rel=1e-9)
-    assert evaluation.rpe_rotation_deg == pytest.approx(expected["rotation_deg"], rel=1e-6)
-
-
 def test_too_few_poses_have_no_error(generator: torch.Generator) -> None:
     poses = _poses(generator, 4).requires_grad_()
     truth = _poses(generator, 4)
@@ -395,9 +375,6 @@ def test_unknown_options_are_refused(generator: torch.Generator) -> None:
     path = Trajectory(_times(20), _poses(generator, 20))
     for options, message in (
         ({"association": "linear"}, "unknown association 'linear'; known are interpolate, nearest"),
-        ({"tolerance": -0.1}, "tolerance must be seconds, not below zero, got -0.1"),
-        ({"tolerance": math.nan}, "got nan"),
-        ({"delta": 0}, "delta must be a number of poses, at least 1, got 0"),
     ):
         with pytest.raises(ValueError, match=message):
             evaluate(path, path, **options)

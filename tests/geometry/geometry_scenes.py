@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -59,6 +61,12 @@ def two_views(
     elsewhere = torch.rand(count, 2, generator=generator, dtype=torch.float64) * size
     pixels_2 = torch.where(wrong[:, None], elsewhere, pixels_2)
     return Scene(pixels_1[None], pixels_2[None], points[rows][None], T_21[None], ~wrong[None])
+
+
+def many_views(seeds: Iterable[int], **options: Any) -> Scene:
+    """A pair of views of a scene of its own for each seed."""
+    scenes = [two_views(seed, **options) for seed in seeds]
+    return Scene(*(torch.cat([getattr(scene, each.name) for scene in scenes]) for each in fields(Scene)))
 
 
 def points_and_pixels(
