@@ -363,8 +363,7 @@ def test_trajectories_that_cannot_be_compared_are_refused(generator: torch.Gener
             evaluate(*pair)
     still = Trajectory(unix, T_wc[:1].expand(20, 4, 4))
     with pytest.raises(
-        TrajectoryError,
-        match="20 compared positions of the ground truth are the same, the others",
+        TrajectoryError, match="20 compared positions of the ground truth are the same, the others"
     ):
         evaluate(other, still)
     with pytest.raises(TrajectoryError, match="all 20 compared positions of the estimate are the same"):

@@ -6,11 +6,7 @@ import pytest
 import torch
 
 from torchslam.geometry import Camera
-from torchslam.geometry.camera_measurement import (
-    CameraMeasurement,
-    may_be_same,
-    with_radial_terms,
-)
+from torchslam.geometry.camera_measurement import CameraMeasurement, may_be_same, with_radial_terms
 
 PINHOLE = Camera.pinhole(500.0, 510.0, 320.0, 240.0, size=(640, 480))
 

@@ -10,12 +10,7 @@ import torch
 from geometry_scenes import CAMERA, FISHEYE, RADIAL, make_pairs, points_and_pixels, two_views
 from torch import Tensor
 
-from torchslam.geometry import (
-    Camera,
-    estimate_absolute_pose,
-    estimate_relative_pose,
-    estimate_similarity,
-)
+from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, estimate_similarity
 
 Inputs = dict[str, Tensor]
 SIMILARITY = ("points_1", "points_2", "pixels_1", "pixels_2")

@@ -109,15 +109,6 @@ def test_double_integral_of_a_rotation(angle: float) -> None:
     torch.testing.assert_close(so3_double_integral(omega), expected, atol=1e-7, rtol=0)
 
 
-def test_a_batch_is_a_loop() -> None:
-    data, bias = steps(3, 7), torch.randn(3, 6, generator=torch.Generator().manual_seed(1)).double() * 0.1
-    together = integrate(data, bias)
-    for row in range(3):
-        alone = integrate(InertialSteps(*(x[row : row + 1] for x in data)), bias[row : row + 1])
-        for part, expected in zip(together, alone, strict=True):
-            torch.testing.assert_close(part[row], expected[0], atol=1e-14, rtol=0)
-
-
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 1000))
 @settings(max_examples=20, deadline=None)
 def test_intervals_compose(first: int, second: int, seed: int) -> None:
@@ -198,16 +189,6 @@ def test_gradients_of_steps() -> None:
     start, end = torch.tensor([0.103, 0.205]).double(), torch.tensor([0.151, 0.222]).double()
     inputs = tuple(x.clone().requires_grad_() for x in (gyroscope, accelerometer, start, end))
     assert gradcheck(lambda g, a, s, e: tuple(inertial_steps(times, g, a, s, e)), inputs)
-
-
-def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
-    times, gyroscope, accelerometer = (x.to(device, dtype) for x in samples())
-    start, end = torch.tensor([0.1, 0.2]).to(device, dtype), torch.tensor([0.2, 0.3]).to(device, dtype)
-    cut = inertial_steps(times, gyroscope, accelerometer, start, end)
-    found = preintegrate(cut, torch.zeros(6).to(device, dtype), *DENSITIES)
-    for part in found:
-        assert (part.dtype, part.device.type) == (dtype, device.type)
-        assert torch.isfinite(part).all()
 
 
 def test_agrees_with_gtsam() -> None:

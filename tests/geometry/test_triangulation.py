@@ -137,17 +137,6 @@ def test_zero_baseline_or_parallel_rays_give_no_point() -> None:
     assert not one_view.mask.any()
 
 
-def test_batch_equals_loop_and_device(device: torch.device) -> None:
-    T_cw, pixels, _ = (x.to(device) for x in views(noise=0.5, extra=1))
-    camera = CAMERA.to(device)
-    batch = triangulate_many(
-        torch.stack((pixels, pixels.flip(0))), T_cw=torch.stack((T_cw, T_cw)), camera=camera
-    )
-    single = triangulate_many(pixels, T_cw=T_cw, camera=camera)
-    torch.testing.assert_close(batch.points_w[0], single.points_w)
-    torch.testing.assert_close(batch.points_w[1], single.points_w.flip(0))
-
-
 def test_covariance_is_that_of_noisy_triangulations() -> None:
     T_cw, pixels, points_w = views(RADIAL)
     sigmas = torch.full_like(points_w[:, 0], 0.3)

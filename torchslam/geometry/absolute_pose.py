@@ -19,11 +19,7 @@ from torchslam.geometry.estimate_gradients import (
 from torchslam.geometry.lie import homogeneous, rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.projections import (
-    fit_projections,
-    pose_tangent,
-    squared_projections,
-)
+from torchslam.geometry.projections import fit_projections, pose_tangent, squared_projections
 from torchslam.geometry.ransac import (
     CONFIDENCE,
     SUPPORT_WIDTH,

@@ -27,8 +27,9 @@ R = TypeVar("R")
 
 
 def _in_dtype_of_data(method: Callable[Concatenate[Camera, P], R]) -> Callable[Concatenate[Camera, P], R]:
-    """The method of the camera with parameters in the dtype of its argument."""
+    """The method, without autocast, of the camera with parameters in the dtype of its argument."""
 
+    @without_autocast
     @wraps(method)
     def following(self: Camera, *args: P.args, **kwargs: P.kwargs) -> R:
         data: Any = args[0] if args else next(iter(kwargs.values()))
@@ -251,7 +252,6 @@ class Camera:
         """Move the camera to another device or dtype; arguments as of `Tensor.to`."""
         return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
-    @without_autocast
     @_in_dtype_of_data
     def project(
         self, points_c: Float[Tensor, "*#batch N 3"]
@@ -266,7 +266,6 @@ class Camera:
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
         return self._to_pixels(distorted, valid), valid
 
-    @without_autocast
     @_in_dtype_of_data
     def project_with_point_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
@@ -287,7 +286,6 @@ class Camera:
         J = rows.unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
         return self._to_pixels(distorted, valid), valid, J
 
-    @without_autocast
     @_in_dtype_of_data
     def project_with_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
@@ -311,7 +309,6 @@ class Camera:
         J_params = torch.cat((torch.diag_embed(distorted), J_center, J_coefficients), dim=-1)
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
-    @without_autocast
     @_in_dtype_of_data
     def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Compute undistorted image coordinates x/z, y/z of pixels.
@@ -324,7 +321,6 @@ class Camera:
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
 
-    @without_autocast
     @_in_dtype_of_data
     def unproject(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 3"]:
         """Compute bearings of unit length of pixels."""
@@ -339,7 +335,6 @@ class Camera:
         low = border - 0.5
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
-    @without_autocast
     @_in_dtype_of_data
     def pixel_scale(self, normalized: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Pixels per unit of undistorted image coordinates, along x and y, locally.

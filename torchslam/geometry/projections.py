@@ -15,12 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.lie import cayley_rotation, generators
-from torchslam.geometry.ransac import (
-    ModelState,
-    in_chunks,
-    levenberg_marquardt,
-    retract_pose,
-)
+from torchslam.geometry.ransac import ModelState, in_chunks, levenberg_marquardt, retract_pose
 
 
 def squared_projections(
