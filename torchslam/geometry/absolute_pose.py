@@ -118,8 +118,14 @@ def estimate_absolute_pose(
     T_cw, success, squared, score = (result.clone() for result in results)  # fit for graphs
     mask = mask & success[:, None]
     if needs_gradient(points_w, pixels, camera.params):
-        used = (squared < FINAL_WIDTH**2) & mask
-        T_cw = _attach(T_cw, points_w, pixels, camera, used)
+        used, found = (squared < FINAL_WIDTH**2) & mask, T_cw
+
+        def objective(xi: Tensor) -> Tensor:
+            projected, valid = camera.project(transform(se3_exp(xi) @ found, points_w))
+            squared = (projected - pixels).square().sum(-1)
+            return torch.where(used & valid, squared, 0.0).sum(-1)
+
+        T_cw = se3_exp(implicit_step(objective, found[:, 0, :1].expand(-1, 6))) @ found
     return AbsolutePose(T_cw, (squared < 1) & mask, success, score)
 
 
@@ -320,20 +326,3 @@ def _is_success(
     chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
     return significant & leave_a_line(points, inliers)
-
-
-def _attach(
-    T_cw: Float[Tensor, "B 4 4"],
-    points_w: Float[Tensor, "B N 3"],
-    pixels: Float[Tensor, "B N 2"],
-    camera: Camera,
-    used: Bool[Tensor, "B N"],
-) -> Float[Tensor, "B 4 4"]:
-    """The poses, with the gradient of the minimizer of the squared error over the rows in use."""
-
-    def objective(xi: Tensor) -> Tensor:
-        projected, valid = camera.project(transform(se3_exp(xi) @ T_cw, points_w))
-        squared = (projected - pixels).square().sum(-1)
-        return torch.where(used & valid, squared, 0.0).sum(-1)
-
-    return se3_exp(implicit_step(objective, T_cw[:, 0, :1].expand(-1, 6))) @ T_cw

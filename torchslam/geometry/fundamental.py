@@ -69,8 +69,13 @@ def refine_fundamental(
     """
     x_1, x_2 = (torch.where(mask[..., None], x, 0.0) for x in (x_1, x_2))
     with torch.no_grad():
+        # The nearest matrices of rank two, of norm one; NaN where there is none.
+        finite = torch.isfinite(F_21).all(-1).all(-1)[:, None, None]
+        U, S, Vh = torch.linalg.svd(torch.where(finite, F_21, 0.0))
+        F = (U[:, :, :2] * S[:, None, :2]) @ Vh[:, :2]
+        F = F / torch.where(finite, F.flatten(1).norm(dim=1)[:, None, None], torch.nan)
         (F,), _ = levenberg_marquardt(
-            (_rank_two(F_21.detach()),),
+            (F,),
             lambda F: _normal_equations(F, x_1, x_2, mask, threshold),
             lambda state, step: (_displaced(*torch.linalg.svd(state[0].nan_to_num()), step),),
             _ITERATIONS,
@@ -110,14 +115,6 @@ def homography_share(
         (H,), _ = best_of((H,), cost)
         explained = mask & (transfer_squared(views, H[:, None])[:, 0] < 1)
         return explained.sum(-1).to(x_1.dtype) / mask.sum(-1).clamp_min(1)
-
-
-def _rank_two(F: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
-    """The nearest matrices of rank two, of norm one; NaN where there is none."""
-    finite = torch.isfinite(F).all(-1).all(-1)[:, None, None]
-    U, S, Vh = torch.linalg.svd(torch.where(finite, F, 0.0))
-    F = (U[:, :, :2] * S[:, None, :2]) @ Vh[:, :2]
-    return F / torch.where(finite, F.flatten(1).norm(dim=1)[:, None, None], torch.nan)
 
 
 def _displaced(

@@ -170,7 +170,11 @@ def estimate_relative_pose(
     chance = 2 * threshold * math.hypot(width, height) / (width * height)
     generator = torch.Generator().manual_seed(seed)
     with torch.no_grad():
-        chances = chance * _mean_width(mask, weights, pixels_1.dtype)
+        if weights is None:
+            chances = torch.full_like(pixels_1[:, 0, 0], chance)
+        else:  # by the mean of the matches' thresholds, in units of that of weight one
+            widths = torch.where(mask, torch.where(mask, weights, 1.0).rsqrt(), 0.0)
+            chances = chance * (widths.sum(-1) / mask.sum(-1).clamp_min(1))
         detached = views(*(x.detach() for x in inputs))
         motion = _fit_motion(detached, kernel, (confidence, min_samples, max_samples), generator)
         found, normal, used = _pose(detached, motion, chances, kernel, model, generator)
@@ -193,16 +197,6 @@ def _nothing(pixels: Float[Tensor, "B N 2"], given: list[Tensor]) -> RelativePos
     )
 
 
-def _mean_width(
-    mask: Bool[Tensor, "B N"], weights: Float[Tensor, "B N"] | None, dtype: torch.dtype
-) -> Float[Tensor, " B"]:
-    """The mean of the matches' thresholds, in units of that of weight one."""
-    if weights is None:
-        return torch.ones_like(mask[:, 0], dtype=dtype)
-    widths = torch.where(mask, torch.where(mask, weights, 1.0).rsqrt(), 0.0)
-    return widths.sum(-1) / mask.sum(-1).clamp_min(1)
-
-
 def _fit_motion(
     views: TwoViews, kernel: Kernel, effort: tuple[float, int, int], generator: torch.Generator
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, " B"], Bool[Tensor, "B N"]]:
@@ -214,7 +208,13 @@ def _fit_motion(
         *effort,
         as_needed=kernel != "truncated",
     )
-    R, t, one = _rotations(R)[:, None], t[:, None], R.new_ones(len(R))
+    # Where the root of E was not found exactly, R is a rotation only to 1e-4; the others keep their bits.
+    eye, rounding = torch.eye(3, dtype=R.dtype, device=R.device), torch.finfo(R.dtype).eps ** 0.6
+    good = ((R.mT @ R - eye).abs() < rounding).all(-1).all(-1)
+    if not good.all():
+        nearest = matrix_from_quaternion(quaternion_from_matrix(R))
+        R = torch.where(good[:, None, None], R, nearest)
+    R, t, one = R[:, None], t[:, None], R.new_ones(len(R))
     if kernel == "truncated":
         R, t, _ = fit_essential(views, R, t, FINAL_ITERATIONS, FINAL_WIDTH * one)
         return R[:, 0], t[:, 0], one, views.mask & (sampson_squared(views, R, t)[:, 0] < FINAL_WIDTH**2)
@@ -226,18 +226,6 @@ def _fit_motion(
     near = views.mask & (squared < (NOISE_WIDTH * noise[:, None]) ** 2)
     R, t, _ = fit_essential(replace(views, mask=near), R, t, _KERNEL_ITERATIONS, _KERNEL_WIDTH * one, kernel)
     return R[:, 0], t[:, 0], noise, near
-
-
-def _rotations(R: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
-    """The rotations closest to matrices.
-
-    Where the root of E was not found exactly, R is a rotation only to 1e-4; the others keep their bits.
-    """
-    eye, rounding = torch.eye(3, dtype=R.dtype, device=R.device), torch.finfo(R.dtype).eps ** 0.6
-    good = ((R.mT @ R - eye).abs() < rounding).all(-1).all(-1)
-    if good.all():
-        return R
-    return torch.where(good[:, None, None], R, matrix_from_quaternion(quaternion_from_matrix(R)))
 
 
 class _Chosen(NamedTuple):

@@ -307,7 +307,16 @@ class _Problem:
         )
         P, _ = self.fit(P, FINAL_ITERATIONS, FINAL_WIDTH)
         squared = self.larger_errors(P)
-        success = self.is_success((squared < 1) & self.mask)
+        # A wrong pair has to fit in both images, but the one makes the other more likely: only one is counted.
+        inliers, count = (squared < 1) & self.mask, self.mask.sum(-1)
+        areas = [
+            (view.sigmas.square() * self.mask).sum(-1) * math.pi / (view.camera.width * view.camera.height)
+            for view in (self.forward, self.backward)
+        ]
+        chance = torch.maximum(*areas).double() / count.clamp_min(1)
+        success = is_significant(inliers.sum(-1), count, 3, chance, solutions=1)
+        for view in (self.forward, self.backward):
+            success = success & leave_a_line(view.points, inliers)
         score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
         eye = torch.eye(4, dtype=P.dtype, device=P.device)
         S_21 = torch.where(success[:, None, None], rigid(P[..., :3], P[..., 3]), eye)
@@ -377,20 +386,6 @@ class _Problem:
 
         (P,), cost = levenberg_marquardt((P,), evaluate, retract_pose, iterations)
         return P, cost
-
-    def is_success(self, inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:
-        """Test whether the inliers are significant and fix the similarity: four or more, not on one line."""
-        count = self.mask.sum(-1)
-        # A wrong pair has to fit in both images, but the one makes the other more likely: only one is counted.
-        areas = [
-            (view.sigmas.square() * self.mask).sum(-1) * math.pi / (view.camera.width * view.camera.height)
-            for view in (self.forward, self.backward)
-        ]
-        chance = torch.maximum(*areas).double() / count.clamp_min(1)
-        success = is_significant(inliers.sum(-1), count, 3, chance, solutions=1)
-        for view in (self.forward, self.backward):
-            success = success & leave_a_line(view.points, inliers)
-        return success
 
 
 def _inverse(P: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 3 4"]:

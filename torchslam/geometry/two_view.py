@@ -380,8 +380,8 @@ def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return views.h_1.mT, views.x_2, views.transfer_scale[..., None], views.mask
 
 
-def score_mappings(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B K"]:
-    """Truncated scores of homographies or rotations, in float32."""
+def _best_mappings(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B 2 3 3"]:
+    """The homographies or rotations of best truncated score, in float32, which are worth a fit."""
     h_1, x_2, scale, mask = _transfer(views)
 
     def score(H: Tensor, h_1: Tensor, x_2: Tensor, scale: Tensor, mask: Tensor) -> tuple[Tensor]:
@@ -389,12 +389,7 @@ def score_mappings(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor
 
     numbers = 3 * H.shape[1] * mask.shape[1]
     (scores,) = in_chunks(score, numbers, H.float(), h_1.float(), x_2.float(), scale, mask)
-    return scores
-
-
-def _best_mappings(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B 2 3 3"]:
-    """Those of best score, which are worth a fit."""
-    best = score_mappings(views, H).topk(2, dim=1).indices
+    best = scores.topk(2, dim=1).indices
     return gather_rows(H.flatten(2), best).unflatten(-1, (3, 3))
 
 
