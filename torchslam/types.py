@@ -27,9 +27,8 @@ class Frame:
         index: position in the sequence, from 0.
         timestamp: seconds.
         image: gray, float32 in [0, 1].
-        name: name of the image in messages (its path, or `video.mp4#17`).
-        T_cw_groundtruth: float64 world to camera, if the sequence has it. Read only by simulated features, by scale
-            from ground truth and by evaluation.
+        name: in messages (its path, or `video.mp4#17`).
+        T_cw_groundtruth: float64. Read only by simulated features, by scale from ground truth and by evaluation.
         mask: True where features may be found; None: everywhere.
         features: a batch of one, if they were extracted already; then the image is not needed, and H and W may be 0.
         backlog: number of newer frames already queued (live sources only).
@@ -89,8 +88,7 @@ class Features:
         return cls(*joined)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Features:
-        columns: Any = (getattr(self, each.name) for each in fields(self))
-        changed: Any = (None if column is None else change(column) for column in columns)
+        changed: Any = (None if column is None else change(column) for column in vars(self).values())
         return Features(*changed)
 
 
@@ -99,8 +97,7 @@ class Matches:
     """A batch of matches between two sets of features. Invalid rows have index 0 and `mask` False.
 
     Attributes:
-        indices_1: rows in the first set.
-        indices_2: rows in the second set.
+        indices_1: rows in the first set; `indices_2`: in the second one.
         distances: Hamming distance in bits, or 1 - cosine.
         mask: True where the row is a match.
         weights: matching weights, if the matcher gives some.
@@ -255,16 +252,13 @@ class PoseEstimate:
     """Pose of a frame, with the inliers it was estimated from.
 
     Attributes:
-        T_cw: world to camera.
-        point_ids: map points of the inliers.
-        keypoints: their keypoints.
+        point_ids: map points of the inliers; `keypoints`: their keypoints.
         matches: number of matches from which the inliers were chosen.
         covariance: of the pose's left perturbation (translation, rotation), the points taken as exact.
         depth: median depth of the inliers.
         error: median squared error of the matches, in units of their variance; 1.39 for noise alone.
         coverage_ratio: ratio of image cells with expected points in which these are found.
         explained_ratio: ratio of image cells with keypoints in which some agree with the map.
-        weights: of the inliers, if the matcher gives some.
         expected: points predicted to be visible; None: `point_ids`.
     """
 
@@ -437,12 +431,7 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True)
 class Explanation:
-    """A reason with the values of the fields of its text; `str` gives the text.
-
-    Attributes:
-        reason: the kind.
-        values: numbers and words by the name of their field.
-    """
+    """A reason with the values of the fields of its text, by name; `str` gives the text."""
 
     reason: Reason
     values: dict[str, float | str | Explanation] = field(default_factory=dict)
@@ -521,9 +510,7 @@ class StepResult:
         T_cw: pose of the frame, world to camera; None while initializing or lost.
         submap: number of the submap the pose is in; None without a pose.
         covariance: of the pose's left perturbation (translation, rotation); None if it was not estimated.
-        is_keyframe: True if the frame became a keyframe.
-        matches: number of map points matched in this frame.
-        inliers: number of these that agree with the pose.
+        matches: number of map points matched in this frame; `inliers`: of these that agree with the pose.
         reasons: why there is no pose, or an uncertain one, or why the frame is a keyframe.
         stage_ms: milliseconds per stage.
     """

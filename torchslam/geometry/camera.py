@@ -42,12 +42,10 @@ def _in_dtype_of_data(method: Callable[Concatenate[Camera, P], R]) -> Callable[C
 class Camera:
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
 
-    Parameters given as Python numbers are float64, so that nothing is lost. Whoever takes a camera and tensors computes
-    in the dtype of the tensors, the methods as well: the camera follows the data.
-
-    Every method is differentiable with respect to points, pixels and `params`, up to the third order where it undoes a
-    distortion. A camera is a pytree with `params` as its only leaf, so that `torch.func` and
-    `torch.utils.data.default_collate` accept it.
+    Parameters given as Python numbers are float64. Whoever takes a camera and tensors computes in the dtype of the
+    tensors, the methods as well. Every method is differentiable with respect to points, pixels and `params`, up to the
+    third order where it undoes a distortion. A camera is a pytree with `params` as its only leaf, so that `torch.func`
+    and `torch.utils.data.default_collate` accept it.
 
     Attributes:
         model: "pinhole", "radial_tangential", "rational" or "fisheye".
@@ -238,11 +236,7 @@ class Camera:
 
     @staticmethod
     def stack(cameras: Sequence[Camera]) -> Camera:
-        """Stack cameras along a leading dimension.
-
-        Raises:
-            ValueError: The cameras differ in model or size.
-        """
+        """Stack cameras along a leading dimension. Raises ValueError if they differ in model or size."""
         kinds = sorted({(camera.model, tuple(camera.size)) for camera in cameras})
         if len(kinds) != 1:
             raise ValueError(f"cameras of a batch must have one model and one size, not {kinds}")
@@ -270,11 +264,7 @@ class Camera:
     def project_with_point_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"], Float[Tensor, "*#batch N 2 3"]]:
-        """Project points, with the analytic derivative with respect to the points.
-
-        Returns:
-            Pixels, valid and d pixels / d points_c, zero where invalid.
-        """
+        """Project points; also return the analytic derivatives by the points, zero where invalid."""
         normalized, valid = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2]
         distorted = self._distortion.distort(normalized, coefficients)
@@ -295,11 +285,7 @@ class Camera:
         Float[Tensor, "*#batch N 2 3"],
         Float[Tensor, "*#batch N 2 P"],
     ]:
-        """Project points, with the analytic derivatives with respect to points and parameters.
-
-        Returns:
-            Pixels, valid, d pixels / d points_c and d pixels / d params. Derivatives of invalid points are zero.
-        """
+        """Project points; also return the analytic derivatives by points and `params`, zero where invalid."""
         pixels, valid, J_points = self.project_with_point_jacobians(points_c)
         normalized, _ = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2, None]
@@ -311,10 +297,7 @@ class Camera:
 
     @_in_dtype_of_data
     def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
-        """Compute undistorted image coordinates x/z, y/z of pixels.
-
-        Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the center.
-        """
+        """Compute x/z, y/z of pixels, clamped to the edge of the monotone distortion; NaN gives the center."""
         # Replaced before the parameters see it: zero times NaN would be their gradient.
         pixels = torch.where(torch.isfinite(pixels), pixels, self.params.detach()[..., None, 2:4])
         distorted = (pixels - self.params[..., None, 2:4]) / self.params[..., None, :2]
@@ -337,10 +320,7 @@ class Camera:
 
     @_in_dtype_of_data
     def pixel_scale(self, normalized: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
-        """Pixels per unit of undistorted image coordinates, along x and y, locally.
-
-        Exact without distortion; with it, the mean over all directions.
-        """
+        """Pixels per unit of x/z and y/z, locally; with distortion, the mean over all directions."""
         scale = self.params[..., None, :2].expand(normalized.shape)
         if self.model == "pinhole":
             return scale
@@ -348,7 +328,6 @@ class Camera:
         return scale * torch.linalg.det(J).abs().sqrt()[..., None]
 
     def _to_pixels(self, distorted: Tensor, valid: Tensor) -> Tensor:
-        """Pixels of distorted image coordinates; the middle of the image, a constant, where invalid."""
         pixels = distorted * self.params[..., None, :2] + self.params[..., None, 2:4]
         middle = pixels.new_tensor((0.5 * (self.width - 1), 0.5 * (self.height - 1)))
         return torch.where(valid[..., None], pixels, middle)
@@ -367,7 +346,6 @@ class Camera:
 
 
 def _stack(*values: Scalar) -> Float[Tensor, "*batch P"]:
-    """Parameters from floats and tensors; float64 on the CPU unless tensors say otherwise."""
     tensors = [value for value in values if isinstance(value, Tensor)]
     dtype = reduce(torch.promote_types, [tensor.dtype for tensor in tensors]) if tensors else torch.float64
     device = tensors[0].device if tensors else "cpu"

@@ -306,21 +306,16 @@ def sim3_inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
 @full_precision
 def sim3_adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 7 7"]:
     """Ad with T exp(xi) = exp(Ad xi) T for similarities."""
-    sR, t = T[..., :3, :3], T[..., :3, 3:]
+    sR, t = T[..., :3, :3], T[..., :3, 3]
     R = sR / sim3_scale(T)[..., None, None]
-    zero, column = torch.zeros_like(R), torch.zeros_like(t)
-    top = torch.cat((sR, skew(t.squeeze(-1)) @ R, -t), dim=-1)
-    middle = torch.cat((zero, R, column), dim=-1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 6] = 1.0
-    return torch.cat((top, middle, bottom), dim=-2)
+    return _sim3_matrix(sR, skew(t) @ R, -t, R)
 
 
 @full_precision
 def sim3_left_jacobian(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7 7"]:
     """J with exp(xi + d) = exp(J d) exp(xi) to first order."""
     (W, Q, q), rotation = _sim3_left_jacobian_blocks(xi)
-    return _sim3_jacobian_from_blocks(W, Q, -q, rotation)
+    return _sim3_matrix(W, Q, -q, rotation)
 
 
 @full_precision
@@ -329,7 +324,7 @@ def sim3_left_jacobian_inverse(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "
     (W, Q, q), _ = _sim3_left_jacobian_blocks(xi)
     rotation = so3_left_jacobian_inverse(xi[..., 3:6])
     W = torch.linalg.inv_ex(W)[0]
-    return _sim3_jacobian_from_blocks(W, -W @ Q @ rotation, (W @ q[..., None]).squeeze(-1), rotation)
+    return _sim3_matrix(W, -W @ Q @ rotation, (W @ q[..., None]).squeeze(-1), rotation)
 
 
 def _sim3_left_jacobian_blocks(
@@ -363,7 +358,7 @@ def _sim3_left_jacobian_blocks(
     return (W, (skew(moments) @ powers).sum(-3), moments[..., 0, :]), rotation
 
 
-def _sim3_jacobian_from_blocks(
+def _sim3_matrix(
     W: Float[Tensor, "*batch 3 3"],
     Q: Float[Tensor, "*batch 3 3"],
     q: Float[Tensor, "*batch 3"],

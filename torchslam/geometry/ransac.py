@@ -127,11 +127,10 @@ def some_problems(problems: Problems, rows: Int[Tensor, " R"]) -> Problems:
 def sample_minimal(
     mask: Bool[Tensor, "B N"], size: int, count: int, generator: torch.Generator
 ) -> Int[Tensor, "B {count} {size}"]:
-    """Row numbers of random minimal samples without repeated rows, from the rows inside the mask.
+    """Row numbers of random minimal samples without repeated rows, but where the mask has fewer than `size`.
 
-    Problems with fewer than `size` rows get repeated ones. Random permutations are cut into disjoint samples, which
-    also spreads the samples over all rows. The random numbers come from the CPU, so that every device draws the same
-    ones.
+    Random permutations are cut into disjoint samples, which spreads the samples over all rows. The random numbers come
+    from the CPU, so that every device draws the same ones.
     """
     B, N = mask.shape
     available = mask.sum(-1)
@@ -181,10 +180,7 @@ def best_models(
 def samples_needed(
     inliers: Int[Tensor, " B"], available: Int[Tensor, " B"], size: int, confidence: float
 ) -> Float[Tensor, " B"]:
-    """Number of samples that contain, with the given confidence, one without outliers.
-
-    Computed on the host, where a number costs less than a call.
-    """
+    """Number of samples that contain, with the given confidence, one without outliers; computed on the host."""
     ratios = [k / max(n, 1) for k, n in zip(inliers.tolist(), available.tolist(), strict=True)]
     clean = [min(max(ratio, 1e-6), 1 - 1e-6) ** size for ratio in ratios]
     needed = [math.log(1 - confidence) / math.log1p(-min(share, 1 - 1e-6)) for share in clean]
@@ -342,10 +338,7 @@ def valid_first(valid: Bool[Tensor, "B N"]) -> Int[Tensor, "B R"]:
 def pad_groups(
     values: Float[Tensor, "R D"], group: Int[Tensor, " R"], groups: int, least: int
 ) -> tuple[Float[Tensor, "{groups} K D"], Bool[Tensor, "{groups} K"]]:
-    """Values in ascending order of their group, as rows of a padded tensor, zero where padded, with a mask.
-
-    The size of a group is that of the largest one, but at least `least`.
-    """
+    """Values in ascending order of their group as rows of a tensor, `least` or more, zero where padded; with a mask."""
     counts = torch.bincount(group, minlength=groups)
     size = max(least, int(counts.max()))
     start = counts.cumsum(0) - counts

@@ -51,7 +51,7 @@ class Readout:
 
     @classmethod
     def from_numbers(cls, numbers: Tensor) -> Self:
-        """Read the four numbers of a file, as `numbers` has them. Raises ValueError for numbers that are none."""
+        """Read the four `numbers` of a file. Raises ValueError for numbers that are none."""
         if numbers.shape != (4,) or numbers.dtype != torch.float64:
             raise ValueError(f"the readout is {tuple(numbers.shape)} of {numbers.dtype}, not four float64")
         if not bool(numbers.isfinite().all()) or bool((numbers[[0, 2]].abs() > MAX_READOUT).any()):
@@ -62,7 +62,7 @@ class Readout:
 
     @property
     def numbers(self) -> Float[Tensor, " 4"]:
-        """Seconds, standard error, prior and its standard deviation, as files have them."""
+        """As files have them."""
         numbers = float(self.seconds), self.std, self.prior, self.prior_std
         return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
@@ -73,11 +73,11 @@ class Readout:
 
     @property
     def is_sought(self) -> bool:
-        """Whether images may say that there is one, of which nothing was known."""
+        """Whether images may show one of which nothing was known."""
         return self.prior == 0 and self.prior_std > 0
 
     def updated(self, seconds: float, std: float) -> Self:
-        """The mean of the prior and of what images say, weighted by their information."""
+        """The mean of the prior and of an estimate from images, weighted by their information."""
         if not math.isfinite(std) or not self.prior_std:
             return self
         share = self.prior_std**2 / (self.prior_std**2 + std**2)
@@ -120,7 +120,7 @@ def global_shutter_pixels(
     """Where the keypoints would be if all rows were exposed with the one in the middle.
 
     A keypoint is moved by the difference between the images of its point at the pose of the frame and at that of the
-    row. A keypoint stays where it is if one of the two is invalid.
+    row, unless one of the two is invalid.
 
     Args:
         T_cw: pose of the frame of each keypoint.

@@ -59,10 +59,9 @@ class UndistortedKeypoints:
         return torch.addcmul(a * d, b, c, value=-1).abs_().sqrt_()
 
     def whitened(self, noise: KeypointNoise) -> Float[Tensor, "2 2 N"]:
-        """Slopes in units of the noise of the keypoints.
+        """Slopes in units of the noise: times an error in xy, to first order, an error of covariance one.
 
-        Times an error in xy they are, to first order, an error of covariance one. Noise whose inverse covariance is
-        not definite gives zero.
+        Noise whose inverse covariance is not definite gives zero.
         """
         if noise.information.shape[-1] < 3:
             return self.slope / noise.sigmas
@@ -153,7 +152,6 @@ class SensorModel:
         """Where a global shutter would have seen the keypoints of K frames, while their middle rows were exposed.
 
         Args:
-            detected: pixels of the detected keypoints.
             velocities: left perturbations of the poses of the frames per second, translation first.
             depths: of the points that the keypoints see, along the optical axis.
             rays: x/z and y/z of the keypoints; computed if None.
@@ -169,11 +167,9 @@ class SensorModel:
 
 
 class SharedCamera:
-    """The sensor model that the components of a running system share; it changes when the run adopts another one.
+    """The sensor model that the components of a running system share, and its undistortion.
 
-    Attributes:
-        model: The sensor model of the map as it is now.
-        undistortion: Of the keypoints of its images.
+    They change when the run adopts another one.
     """
 
     def __init__(self, camera: Camera, readout: Readout | None = None) -> None:

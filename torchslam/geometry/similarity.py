@@ -236,9 +236,9 @@ def estimate_similarity(
 
 @dataclass(frozen=True)
 class _View:
-    """One direction: points of the other camera, and where this one saw them.
+    """One direction: points of the other camera, and where this one saw them; sigmas are thresholds in pixels.
 
-    sigmas: thresholds in pixels; normalized: undistorted pixels; scale: thresholds per unit of `normalized`
+    normalized: undistorted pixels; scale: thresholds per unit of them
     """
 
     points: Float[Tensor, "B N 3"]
@@ -276,10 +276,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The data of the search: camera 1's points in camera 2, and the reverse.
-
-    depth_sigma: threshold of relative differences in depth
-    """
+    """Camera 1's points in camera 2, and the reverse. depth_sigma: threshold of relative differences in depth"""
 
     forward: _View
     backward: _View

@@ -25,8 +25,6 @@ _KEPT = ("x", "xz", "xzz", "y", "yz", "yzz", "", "z", "zz", "zzz")
 # Columns of x_2 x_1^T to solve for; the other four span the null space. Independent also for small motions.
 _SOLVED, _FREE = (0, 1, 2, 4, 5), (3, 6, 7, 8)
 _GRID = 256  # intervals in which to look for sign changes
-_NEWTON_STEPS = 5
-"""On a root within a cell of the grid: each about doubles the correct digits."""
 
 
 @full_precision
@@ -38,10 +36,6 @@ def five_point(
     Solutions closer together than 1.4 degrees of the last unknown's angle can be missed; degenerate samples may
     give none or wrong ones. Not differentiable by design: it generates hypotheses. Source: Nister, "An efficient
     solution to the five-point relative pose problem", 2004.
-
-    Args:
-        x_1: undistorted image coordinates in view 1.
-        x_2: undistorted image coordinates in view 2.
 
     Returns:
         E of norm sqrt(2), the R real solutions of all samples together, up to ten each, and the sample of each,
@@ -166,8 +160,7 @@ def _angle_grid(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tenso
 def _real_roots(polynomial: Float[Tensor, "B 11"]) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
     """Real roots of polynomials of degree ten, with the row of each.
 
-    With z = tan(angle) all of them lie in a bounded interval; sign changes on a grid bracket them, Newton's method
-    with bisection finishes.
+    z = tan(angle): sign changes on a grid of angles bracket them, Newton's method with bisection finishes.
     """
     angle, table = _angle_grid(polynomial.dtype, polynomial.device)
     negative = torch.signbit(polynomial @ table)
@@ -183,7 +176,7 @@ def _real_roots(polynomial: Float[Tensor, "B 11"]) -> tuple[Float[Tensor, " R"],
     low, high = ends(angle[cell]), ends(angle[cell + 1])
     sign = torch.where(negative[row, cell], -1.0, 1.0).to(polynomial.dtype)
     z = 0.5 * (low + high)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(5):  # each about doubles the correct digits
         value, slope = torch.addcmul(coefficients[9], coefficients[10], z), coefficients[10]
         for k in range(8, -1, -1):
             slope = torch.addcmul(value, slope, z)
@@ -331,9 +324,6 @@ def decompose_homography(
 
     Not differentiable by design. Source: Ma et al., "An invitation to 3-D vision", 2004, section 5.3.3.
 
-    Args:
-        H: of any scale and sign.
-
     Returns:
         R, t in units of the plane's distance, and unit normals n in the first camera: H ~ R + t n^T. A pure rotation
         has t = 0 and any normal.
@@ -348,10 +338,8 @@ def decompose_homography(
         # u = a v_1 + b v_3 keeps its length under H; without spread, of a pure rotation, any direction does.
         share = ((1 - low) / (high - low).clamp_min(torch.finfo(H.dtype).eps)).clamp(0.0, 1.0)[..., None]
         a, b = share.sqrt(), (1 - share).sqrt()
-        motions = [_motion(H, v_2, a * v_1 + sign * b * v_3) for sign in (1, -1)]
-        R, t, n = (
-            torch.stack(part, dim=-3 if i == 0 else -2) for i, part in enumerate(zip(*motions, strict=True))
-        )
+        R, t, n = zip(*(_motion(H, v_2, a * v_1 + sign * b * v_3) for sign in (1, -1)), strict=True)
+        R, t, n = torch.stack(R, dim=-3), torch.stack(t, dim=-2), torch.stack(n, dim=-2)
     return torch.cat((R, R), dim=-3), torch.cat((t, -t), dim=-2), torch.cat((n, -n), dim=-2)
 
 

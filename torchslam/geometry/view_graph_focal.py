@@ -116,15 +116,15 @@ def focal_from_pairs(
     """Find the focal length of a camera from the matches of pairs of its images, pixels.
 
     Refines the fundamental matrices on the matches, and uses how uncertain each is and how distortion would change
-    it. Pairs whose matches a homography explains, those of a plane or of a camera that only turned, are left out;
-    without others there is no `success`. The same motions as for `focal_from_fundamentals` have no information.
+    it. Pairs whose matches a homography explains, those of a plane or of a camera that only turned, are left out. The
+    same motions as for `focal_from_fundamentals` have no information.
 
     Args:
         F_21: in pixels, x_2^T F_21 x_1 = 0, such as from RANSAC: where the refinement starts.
         mask: inliers of F_21; a pair with fewer than 20 is left out.
         principal_point: pixels.
         size: width and height of the images, pixels; sets the range of the search.
-        weights: of the pairs, not negative, as if each were present that many times; one by default.
+        weights: as of `focal_from_fundamentals`.
         threshold: pixels, about the noise of one coordinate or somewhat more.
         k1_std: standard deviation of the camera's k1 around zero: it is estimated too, as its error would be one of
             the focal length. 0.03 (0.01 to 1 were tried) is that of a camera called undistorted; zero for none.
@@ -172,10 +172,9 @@ def _scaled(
 
 
 class _Graph(NamedTuple):
-    """Pairs in scaled coordinates: as of `RefinedFundamental`, their weights.
+    """Pairs in scaled coordinates, as of `RefinedFundamental`, and their weights.
 
-    In float64 whatever the input: what counts is a small difference of the singular values, and the covariances of good
-    and bad pairs are many powers of ten apart.
+    In float64 whatever the input: what counts is a small difference of the singular values.
     """
 
     F: Float[Tensor, "M 3 3"]
@@ -314,10 +313,7 @@ def _cost(graph: _Graph, at: Float[Tensor, "2"], level: float, k1_std: float) ->
 def _polished(
     graph: _Graph, profile: _Profile, k1_std: float
 ) -> tuple[Float[Tensor, "2"], Float[Tensor, "2 2"]]:
-    """The minimum next to the best of the grid, two steps of which it may be away, and the Hessian there.
-
-    By Newton's method with halved steps.
-    """
+    """The minimum within two steps of the best of the grid, by Newton's method, and the Hessian there."""
 
     def derivatives(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         with torch.enable_grad():
