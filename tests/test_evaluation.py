@@ -170,35 +170,6 @@ def test_gradient_on_exact_data_is_zero(generator: torch.Generator, dtype: torch
     assert T_cw.grad.isfinite().all()
 
 
-def test_masked_rows_do_not_matter(generator: torch.Generator) -> None:
-    T_cw, truth = _poses(generator, 9), _poses(generator, 9)
-    mask = torch.ones(9, dtype=torch.bool)
-    mask[-2:] = False
-    broken = T_cw.clone()
-    broken[-2:] = torch.nan
-    torch.testing.assert_close(
-        ate(T_cw=broken, T_cw_groundtruth=truth, mask=mask), ate(T_cw=T_cw[:7], T_cw_groundtruth=truth[:7])
-    )
-    torch.testing.assert_close(
-        rpe(T_cw=broken, T_cw_groundtruth=truth, delta=1, mask=mask),
-        rpe(T_cw=T_cw[:7], T_cw_groundtruth=truth[:7], delta=1),
-    )
-
-
-def test_a_batch_equals_a_loop(generator: torch.Generator, device: torch.device, dtype: torch.dtype) -> None:
-    T_cw = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
-    truth = torch.stack([_poses(generator, 12, dtype) for _ in range(3)]).to(device)
-    errors, (translation, rotation) = (
-        ate(T_cw=T_cw, T_cw_groundtruth=truth),
-        rpe(T_cw=T_cw, T_cw_groundtruth=truth),
-    )
-    assert errors.shape == translation.shape == rotation.shape == (3,)
-    assert (errors.dtype, errors.device.type) == (dtype, device.type)
-    for row in range(3):
-        torch.testing.assert_close(errors[row], ate(T_cw=T_cw[row], T_cw_groundtruth=truth[row]))
-        torch.testing.assert_close(translation[row], rpe(T_cw=T_cw[row], T_cw_groundtruth=truth[row])[0])
-
-
 def test_delta_out_of_range(generator: torch.Generator) -> None:
     T_cw = _poses(generator, 4)
     for delta in (0, 4):

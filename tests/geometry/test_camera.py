@@ -135,19 +135,6 @@ def test_first_positive_root() -> None:
     torch.testing.assert_close(first_positive_root(coefficients.double()), expected.double())
 
 
-def test_batched_cameras_equal_a_loop() -> None:
-    camera = CAMERAS["radial_tangential"]
-    params = torch.stack((camera.params, 1.1 * camera.params))
-    cloud = points()
-    both = Camera(camera.model, params, SIZE)
-    for i in range(2):
-        one = camera.with_params(params[i])
-        assert torch.equal(both.project(cloud)[0][i], one.project(cloud[i])[0])
-        torch.testing.assert_close(
-            both.unproject(cloud[..., :2] * 100 + 200)[i], one.unproject(cloud[i, :, :2] * 100 + 200)
-        )
-
-
 def test_float32_and_device(camera: Camera, device: torch.device, dtype: torch.dtype) -> None:
     camera = camera.to(device).to(dtype)
     cloud = points().to(device, dtype).requires_grad_()
@@ -315,21 +302,6 @@ def test_derivatives_of_the_inverse_up_to_the_third_order(camera: Camera) -> Non
     for lower, higher in itertools.pairwise(derivatives):
         near, far = (lower(zero + step) - lower(zero - step) for step in (h, 2 * h))
         torch.testing.assert_close(higher(zero), (8 * near - far) / (12 * h), rtol=1e-5, atol=1e-13)
-
-
-@pytest.mark.parametrize("camera", [CAMERAS[name] for name in DISTORTED], ids=DISTORTED)
-def test_hessians_and_vmap_of_undistorted_pixels_agree_with_double_backward(camera: Camera) -> None:
-    pixels = torch.tensor([[120.0, 400.0], [600.0, 30.0], [320.0, 240.0]], dtype=torch.float64)
-
-    def loss(pixels: Tensor, params: Tensor) -> Tensor:
-        return camera.with_params(params).unproject(pixels[None]).pow(3).sum()
-
-    hessians = torch.vmap(torch.func.hessian(loss), (0, None))(pixels, camera.params)
-    for pixel, hessian in zip(pixels, hessians, strict=True):
-        leaf = pixel.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad(loss(leaf, camera.params), leaf, create_graph=True)
-        rows = [torch.autograd.grad(each, leaf, retain_graph=True)[0] for each in gradient]
-        torch.testing.assert_close(hessian, torch.stack(rows), rtol=1e-8, atol=1e-12)
 
 
 @pytest.mark.parametrize("ways", ["optimizer", "data", "inference"])

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import pytest
 import torch
-from geometry_scenes import CAMERA, FISHEYE, RADIAL, make_pairs, points_and_pixels, two_views
+from geometry_scenes import CAMERA, RADIAL, make_pairs, points_and_pixels, two_views
 from torch import Tensor
 
 from torchslam.geometry import Camera, estimate_absolute_pose, estimate_relative_pose, estimate_similarity
@@ -178,12 +178,3 @@ def test_torch_func_is_refused_in_words(name: str, transform_of: Callable[..., A
     given = first[None] if transform_of is torch.func.vmap else first
     with pytest.raises(RuntimeError, match=f"estimate_{name} chooses among random samples"):
         transform_of(lambda x: getattr(estimate({key: x, **dict(others)}), estimate.pose))(given)
-
-
-@pytest.mark.parametrize("camera", [RADIAL, FISHEYE], ids=["radial_tangential", "fisheye"])
-def test_exact_data_give_the_exact_inliers(name: str, camera: Camera) -> None:
-    estimate = ESTIMATORS[name]
-    options = {"camera_1": camera, "camera_2": camera} if name == "similarity" else {"camera": camera}
-    found = estimate(estimate.inputs(0, noise=0.0, outliers=0.2, **options), camera)
-    assert found.success.all()
-    assert found.inliers[0, found.inliers.shape[1] // 5 :].all()

@@ -1,6 +1,5 @@
 """Threshold, model, kernel and weights of `estimate_relative_pose`."""
 
-import math
 from dataclasses import replace
 
 import pytest
@@ -15,7 +14,6 @@ from torchslam.geometry.two_view import (
     ahead_and_parallax,
     best_in_front,
     possible_matches,
-    sampson_squared,
     twisted,
 )
 
@@ -188,22 +186,6 @@ def test_parallax_that_no_match_shows_alone_counts(threshold: float) -> None:
         assert result.success.all()
         off.append(errors(result, scene)[1])
     assert sorted(off)[2] < 12
-
-
-@pytest.mark.parametrize(
-    ("turn", "holds"), [(0.0, True), (0.5, True), (1.0, True), (1.5, False), (2.0, False)]
-)
-def test_a_plane_holds_while_its_motion_explains_the_matches(turn: float, holds: bool) -> None:
-    """Sixty matches with half a pixel of noise tell directions that are degrees apart."""
-    scene = two_views(0, count=60, outliers=0.0, noise=0.5)
-    views = TwoViews.of(scene.pixels_1, scene.pixels_2, CAMERA, CAMERA, 0.5, scene.mask, None)
-    R, t = scene.T_21[:, :3, :3], scene.T_21[:, :3, 3] / scene.T_21[:, :3, 3].norm()
-    across = torch.linalg.cross(t, torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64))
-    turned = t @ so3_exp(math.radians(turn) * across[0] / across.norm()).mT
-    normal = 0.35 / 4 * torch.tensor([[[0.0, 0.0, 1.0]]], dtype=torch.float64)
-    squared = sampson_squared(views, R[:, None], t[:, None]).transpose(0, 1).expand(3, -1, -1)
-    fits = Fits(R, t, R + turned[:, :, None] * normal, R, squared).with_mappings(views)
-    assert bool(plane_holds(views, fits, PlaneMotions.of(views, fits))) == holds
 
 
 @pytest.mark.parametrize(("num_outside", "holds"), [(2, True), (3, False)])

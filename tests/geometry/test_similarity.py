@@ -98,19 +98,27 @@ def test_reflected_points_still_give_a_rotation() -> None:
     torch.testing.assert_close(torch.linalg.det(R), torch.ones(2, dtype=torch.float64))
 
 
+def rotation(S: Tensor) -> Tensor:
+    return S[:, :3, :3] / sim3_scale(S)[:, None, None]
+
+
 def check(S_21: Tensor, truth: Tensor, degrees: float = 0.3, length: float = 0.03) -> None:
     scales = sim3_scale(S_21), sim3_scale(truth)
     assert float((scales[0] / scales[1]).log().abs().max()) < 0.01
-    R, R_true = (S[:, :3, :3] / s[:, None, None] for S, s in zip((S_21, truth), scales, strict=True))
+    R, R_true = rotation(S_21), rotation(truth)
     assert rotation_error(R, R_true) < degrees
     assert float((S_21 - truth)[:, :3, 3].norm(dim=-1).max()) < length * float(scales[1].max())
 
 
 @pytest.mark.parametrize("camera", [CAMERA, RADIAL, FISHEYE], ids=["pinhole", "radial_tangential", "fisheye"])
-@pytest.mark.parametrize("outliers", [0.0, 0.3, 0.6])
-def test_finds_the_similarity_among_wrong_pairs(camera: Camera, outliers: float) -> None:
+@pytest.mark.parametrize(
+    "options",
+    [{"outliers": 0.0}, {"outliers": 0.6}, *({"baseline": 0.0, "log_scale": x} for x in (-1.5, 1.5))],
+)
+def test_finds_the_similarity_among_wrong_pairs(camera: Camera, options: dict[str, float]) -> None:
+    """Also its scale where both cameras are at one place, where no pixel depends on it."""
     for seed in range(4):
-        pairs = make_pairs(seed, outliers=outliers, camera_1=camera)
+        pairs = make_pairs(seed, camera_1=camera, **options)
         result = estimate_similarity(*pairs.inputs(), camera_1=camera, camera_2=CAMERA)
         assert result.success.all()
         check(result.S_21, pairs.S_21)
@@ -152,16 +160,6 @@ def test_an_inlier_agrees_in_both_images() -> None:
         torch.testing.assert_close(result.S_21, pairs.S_21, atol=1e-8, rtol=0)
 
 
-@pytest.mark.parametrize("log_scale", [-1.5, 0.0, 1.5])
-def test_scale_where_both_cameras_are_at_one_place(log_scale: float) -> None:
-    """Where no pixel depends on it."""
-    for seed in range(4):
-        pairs = make_pairs(seed, log_scale=log_scale, baseline=0.0)
-        result = estimate_similarity(*pairs.inputs(), camera_1=CAMERA, camera_2=CAMERA)
-        assert result.success.all()
-        check(result.S_21, pairs.S_21)
-
-
 def test_errors_are_whitened_by_their_standard_deviations() -> None:
     """The threshold follows sigma, in each image by itself."""
     pairs = make_pairs(3, outliers=0.0, noise=0.0)
@@ -186,10 +184,8 @@ def test_the_refinement_beats_the_alignment_of_points() -> None:
         pairs = make_pairs(seed, outliers=0.0, noise=1.0)
         result = estimate_similarity(*pairs.inputs(), camera_1=CAMERA, camera_2=CAMERA)
         _, R, _ = umeyama(pairs.points_1, pairs.points_2)
-        R_true = pairs.S_21[:, :3, :3] / sim3_scale(pairs.S_21)[:, None, None]
-        found = result.S_21[:, :3, :3] / sim3_scale(result.S_21)[:, None, None]
-        ours.append(rotation_error(found, R_true))
-        theirs.append(rotation_error(R, R_true))
+        for errors, found in ((ours, rotation(result.S_21)), (theirs, R)):
+            errors.append(rotation_error(found, rotation(pairs.S_21)))
         check(result.S_21, pairs.S_21, degrees=0.5, length=0.1)
     assert sum(ours) < sum(theirs)
 

@@ -185,8 +185,8 @@ def test_a_column_is_refused_or_right(call: Call) -> None:
                 assert_same(found, expected, exact=False)
 
 
-@pytest.mark.parametrize("name", [name for name in CALLS if name in geometry.__all__])
-def test_geometry_has_the_dtype_and_device_of_the_data(
+@pytest.mark.parametrize("name", [name for name in CALLS if name in (*geometry.__all__, "ate", "rpe")])
+def test_results_have_the_dtype_and_device_of_the_data(
     name: str, device: torch.device, dtype: torch.dtype
 ) -> None:
     def moved(tensor: Tensor) -> Tensor:
