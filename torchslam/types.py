@@ -157,11 +157,12 @@ class FrameFeatures:
         features, truth = features.to(like.device), frame.T_cw_groundtruth
         scales, information = features.scales[:1], features.information
         information = None if information is None else information[:1]
-        numbers = (features.keypoints, features.scales, features.angles)
         return cls(
             frame.index,
             frame.timestamp,
-            *(column[0].to(like.dtype) for column in numbers),
+            features.keypoints[0].to(like.dtype),
+            features.scales[0].to(like.dtype),
+            features.angles[0].to(like.dtype),
             features.descriptors[0],
             features.mask[0],
             None if truth is None else truth.to(like),
@@ -192,7 +193,8 @@ class FrameFeatures:
         """The keypoints as a batch of one, for matching."""
         scores = torch.ones_like(self.scales)
         columns = (self.keypoints, scores, self.scales, self.angles, self.descriptors, self.mask)
-        return Features(*(column[None] for column in columns), unpacked_information(self.information[None]))
+        batch: Any = (*(column[None] for column in columns), unpacked_information(self.information[None]))
+        return Features(*batch)
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from torch import Tensor
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.lie import homogeneous
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.ransac import best_of, levenberg_marquardt
+from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import median_scale, robustify
 from torchslam.geometry.two_view import TwoViews, fit_homography, propose_homography, transfer_squared
 from torchslam.geometry.two_view_matrices import sampson_errors
@@ -68,6 +68,11 @@ def refine_fundamental(
         threshold: of the kernel, in units of the coordinates: about the noise of one coordinate or somewhat more.
     """
     x_1, x_2 = (torch.where(mask[..., None], x, 0.0) for x in (x_1, x_2))
+
+    def moved(state: ModelState, step: Float[Tensor, "B 7"]) -> ModelState:
+        U, S, Vh = torch.linalg.svd(state[0].nan_to_num())
+        return (_displaced(U, S, Vh, step),)
+
     with torch.no_grad():
         # The nearest matrices of rank two, of norm one; NaN where there is none.
         finite = torch.isfinite(F_21).all(-1).all(-1)[:, None, None]
@@ -77,7 +82,7 @@ def refine_fundamental(
         (F,), _ = levenberg_marquardt(
             (F,),
             lambda F: _normal_equations(F, x_1, x_2, mask, threshold),
-            lambda state, step: (_displaced(*torch.linalg.svd(state[0].nan_to_num()), step),),
+            moved,
             _ITERATIONS,
         )
         covariance, bend, noise = _uncertainty(F, x_1, x_2, mask, threshold)

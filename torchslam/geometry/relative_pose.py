@@ -284,7 +284,9 @@ def _pose(
         significant & (model != ROTATION) & ~chosen.ambiguous,
         model,
         chosen.ambiguous & significant,
-        *scores,
+        scores[0],
+        scores[1],
+        scores[2],
         torch.where(enough, rigid(chosen.R_E, chosen.t_E), eye),
     )
     return found, chosen.normal, used & significant[:, None]

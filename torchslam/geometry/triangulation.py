@@ -200,8 +200,8 @@ def triangulate_many(
     points_c = (R_cw @ points_w[..., None, :, None]).squeeze(-1) + t_cw
     depths = points_c[..., 2]
     mask = (seen.sum(-1) >= 2) & ((depths > 0) | ~seen).all(-1)
-    flat = (x.flatten(-3, -2) for x in (points_c, pixels))
-    errors = _reprojection_error(camera, *flat, seen.flatten(-2)).unflatten(-1, seen.shape[-2:])
+    flat, flat_pixels = points_c.flatten(-3, -2), pixels.flatten(-3, -2)
+    errors = _reprojection_error(camera, flat, flat_pixels, seen.flatten(-2)).unflatten(-1, seen.shape[-2:])
     rays, pairs = points_w[..., None, :] - centers_w, seen[..., :, None] & seen[..., None, :]
     between = _angle(*torch.broadcast_tensors(rays[..., :, None, :], rays[..., None, :, :]))
     angles = torch.where(pairs, between, 0.0).amax((-2, -1))

@@ -338,8 +338,13 @@ def decompose_homography(
         # u = a v_1 + b v_3 keeps its length under H; without spread, of a pure rotation, any direction does.
         share = ((1 - low) / (high - low).clamp_min(torch.finfo(H.dtype).eps)).clamp(0.0, 1.0)[..., None]
         a, b = share.sqrt(), (1 - share).sqrt()
-        R, t, n = zip(*(_motion(H, v_2, a * v_1 + sign * b * v_3) for sign in (1, -1)), strict=True)
-        R, t, n = torch.stack(R, dim=-3), torch.stack(t, dim=-2), torch.stack(n, dim=-2)
+        R_1, t_1, n_1 = _motion(H, v_2, a * v_1 + b * v_3)
+        R_2, t_2, n_2 = _motion(H, v_2, a * v_1 - b * v_3)
+        R, t, n = (
+            torch.stack((R_1, R_2), dim=-3),
+            torch.stack((t_1, t_2), dim=-2),
+            torch.stack((n_1, n_2), dim=-2),
+        )
     return torch.cat((R, R), dim=-3), torch.cat((t, -t), dim=-2), torch.cat((n, -n), dim=-2)
 
 
