@@ -1,7 +1,4 @@
-"""First derivatives of what an estimator found, by the implicit function theorem where it is a minimizer.
-
-Those of any order, of minima of least squares: `torchslam.optim._core.implicit`.
-"""
+"""First derivatives of estimates, by the implicit function theorem; of any order: `torchslam.optim._core.implicit`."""
 
 from __future__ import annotations
 

@@ -42,11 +42,12 @@ def inverse_2x2(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
 
 def whitening(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
     """W, upper triangular, with W^T W = A; zero, with gradient zero, where A is not positive definite."""
-    xx, xy, yy = torch.where(is_definite(A)[..., None], triangle(A), A.new_tensor((1.0, 0.0, 1.0))).unbind(-1)
+    definite = is_definite(A)[..., None]
+    xx, xy, yy = torch.where(definite, triangle(A), A.new_tensor((1.0, 0.0, 1.0))).unbind(-1)
     p = xx.sqrt()
     q = xy / p
     W = torch.stack((p, q, torch.zeros_like(p), (yy - q * q).sqrt()), dim=-1).unflatten(-1, (2, 2))
-    return torch.where(is_definite(A)[..., None, None], W, 0.0)
+    return torch.where(definite[..., None], W, 0.0)
 
 
 def times(

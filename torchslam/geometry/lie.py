@@ -138,8 +138,7 @@ def so3_left_jacobian_inverse(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor,
 def quaternion_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternions (x, y, z, w) with w >= 0 of rotation matrices.
 
-    The columns of 4 q q^T are linear in R; the one with the largest diagonal is never near zero (Shepperd,
-    1978).
+    The columns of 4 q q^T are linear in R; the one with the largest diagonal is never near zero (Shepperd, 1978).
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.flatten(-2).unbind(-1)
     xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
@@ -232,10 +231,7 @@ def se3_interpolate(
     T_1: Float[Tensor, "*#batch 4 4"],
     fraction: Float[Tensor, "*#batch"] | float,
 ) -> Float[Tensor, "*#batch 4 4"]:
-    """The screw motion from T_0 (fraction 0) to T_1 (fraction 1).
-
-    Interpolating the inverses gives the inverse of the interpolation.
-    """
+    """The screw motion from T_0 (fraction 0) to T_1 (fraction 1); that of the inverses is its inverse."""
     fraction = torch.as_tensor(fraction, dtype=T_0.dtype, device=T_0.device)
     return se3_exp(fraction[..., None] * se3_log(T_1 @ se3_inverse(T_0))) @ T_0
 
@@ -257,10 +253,7 @@ _NODES, _WEIGHTS = (0.5 * (_NODES + 1)).tolist(), (0.5 * _WEIGHTS).tolist()  # f
 def _sim3_translation_matrix(
     omega: Float[Tensor, "*batch 3"], sigma: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """W = integral over s in [0, 1] of exp(s sigma) exp(s omega^).
-
-    By quadrature: no case distinctions for a small angle or scale, and smooth everywhere.
-    """
+    """W = integral over s in [0, 1] of exp(s sigma) exp(s omega^); quadrature is smooth for a small angle or scale."""
     s = torch.tensor(_NODES, dtype=omega.dtype, device=omega.device)
     weight = torch.tensor(_WEIGHTS, dtype=omega.dtype, device=omega.device) * (s * sigma[..., None]).exp()
     a, b, _, _ = _rodrigues(s * s * (omega * omega).sum(-1, keepdim=True))

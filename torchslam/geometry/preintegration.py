@@ -69,13 +69,10 @@ def inertial_steps(
     """Cut samples into steps between two times each, by the mean of the ends of a step.
 
     Args:
-        timestamps: seconds, strictly increasing, at least two.
+        timestamps: seconds, strictly increasing; fewer than two raise ValueError.
         gyroscope: rad/s; `accelerometer`: m/s^2.
         start: seconds; before the first sample and behind the last one, the line through two samples is extended.
         end: seconds, not before the start.
-
-    Raises:
-        ValueError: there are fewer than two samples.
     """
     if len(timestamps) < 2:
         raise ValueError(f"timestamps must be of two samples or more, not of {len(timestamps)}")

@@ -33,11 +33,11 @@ Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
 
 
 class Robustified(NamedTuple):
-    """A kernel and its derivatives with respect to the squared residual; all of the shape of the input.
+    """A kernel and its derivatives with respect to the squared residual.
 
     Attributes:
         rho: the cost, twice the contribution of the residual to the objective.
-        weight: rho', the weight of the residual in iteratively reweighted least squares, in [0, 1].
+        weight: rho', of the residual in iteratively reweighted least squares, in [0, 1].
         curvature: rho'', never positive.
     """
 
@@ -90,11 +90,7 @@ _KERNELS: dict[str, Callable[[Tensor, Tensor], Robustified]] = {
 def kernel_scale(
     scale: Float[Tensor, "*scale"] | float, like: Float[Tensor, "..."]
 ) -> Float[Tensor, "*scale"]:
-    """The scale of a kernel, with the dtype and on the device of another tensor.
-
-    Raises:
-        ValueError: It is not above zero.
-    """
+    """The scale of a kernel, with the dtype and on the device of a tensor. Raises ValueError if not above zero."""
     if not in_transform() and not (bool((scale > 0).all()) if isinstance(scale, Tensor) else scale > 0):
         given = scale.tolist() if isinstance(scale, Tensor) else scale
         raise ValueError(f"scale must be above zero, not {given}")
@@ -106,10 +102,8 @@ def robustify(
 ) -> Robustified:
     """Return rho, rho' and rho'' of squared whitened residuals, for a positive scale.
 
-    Differentiable in both, except on the boundary of "huber" (rho'') and "truncated".
-
-    Raises:
-        ValueError: for an unknown kernel.
+    Differentiable in both, except on the boundary of "huber" (rho'') and "truncated". Raises ValueError for an unknown
+    kernel.
     """
     if kernel not in _KERNELS:
         raise ValueError(f"unknown kernel {kernel!r}; known are {', '.join(get_args(Kernel))}")

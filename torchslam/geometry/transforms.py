@@ -55,8 +55,8 @@ def rotation_angle(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
 def reorthonormalized(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """Reorthonormalize the rotations of nearly rigid transforms, to machine precision.
 
-    If poses are predicted from earlier ones, with transposes for inverses, the deviation from a rotation grows by a
-    factor of 1 + sqrt(2) per frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
+    In poses predicted from earlier ones, with transposes for inverses, the deviation from a rotation grows by a factor
+    of 1 + sqrt(2) per frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
     """
     R = T[..., :3, :3]
     return rigid(1.5 * R - 0.5 * R @ (R.mT @ R), T[..., :3, 3])
@@ -130,8 +130,7 @@ def quaternion_wxyz(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]
 def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
     """Rotation from the world to one whose z is up and whose x is as close to the world's x as possible.
 
-    Gravity is not known: up is the mean up direction of the cameras. If that is zero (half of the cameras are
-    upside down), up is -y.
+    Up is the mean up direction of the cameras; if that is zero (half of them are upside down), it is -y.
     """
     down = T_wc[:, :3, 1].mean(dim=0) if len(T_wc) else T_wc.new_zeros(3)
     if float(down.norm()) < 1e-3:  # a unit vector in any but made-up cases
@@ -140,10 +139,7 @@ def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
 
 
 def level_rotation(up_w: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
-    """Rotation from the world to one whose z is the unit vector up_w and whose x is as close to the old x as possible.
-
-    Where up is nearly x, the world's z takes its place.
-    """
+    """As `upright_rotation`, for a unit vector up_w; where up is nearly x, the world's z takes the place of x."""
     axis = up_w.new_tensor((1.0, 0.0, 0.0) if abs(float(up_w[0])) < 0.9 else (0.0, 0.0, 1.0))
     right = axis - (axis @ up_w) * up_w
     right = right / right.norm()
