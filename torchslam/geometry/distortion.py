@@ -82,7 +82,7 @@ def _implicit_step(
 
 
 def length(xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-    """Length of vectors, not differentiable at zero; faster than `norm` where coordinates are in one piece of memory."""
+    """Length of vectors, not differentiable at zero; faster than `norm` if a coordinate is in one piece of memory."""
     x, y = xy.unbind(-1)
     return (x * x + y * y).sqrt()
 
