@@ -281,10 +281,10 @@ def _broadcast(first: tuple[int, ...], second: tuple[int, ...]) -> tuple[int, ..
         first, second = second, first
     if len(first) > len(second) > 0 and first[-1] == 1 and first[-2] == second[-1] > 1:
         return None
-    try:
-        return tuple(torch.broadcast_shapes(first, second))
-    except RuntimeError:
+    second = (1,) * (len(first) - len(second)) + second
+    if any(a != b and a != 1 and b != 1 for a, b in zip(first, second, strict=True)):
         return None
+    return tuple(b if a == 1 else a for a, b in zip(first, second, strict=True))
 
 
 def _listed(classes: tuple[type, ...]) -> str:
