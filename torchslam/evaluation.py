@@ -93,22 +93,22 @@ def evaluate(
     """Compare an estimate with the ground truth at the times of the estimate.
 
     Args:
-        estimate: to evaluate.
-        groundtruth: true poses.
         association: how to get the true pose at a time: from the two nearest ones, or the nearest as it is. Where the
             ground truth has a clock of its own, "nearest" charges the estimate with the motion in between (0.03 mm
             and 0.008 degrees a frame on TUM fr2_desk with its 300 Hz); at equal times both are the same.
         tolerance: maximum time to the nearest true pose, seconds; other estimated poses are left out.
         delta: number of poses over which relative motion is compared, fewer if there are fewer.
 
-    Returns:
-        The errors.
-
     Raises:
         TrajectoryError: Times repeat, fewer than three poses can be compared, or one of two paths is a single place.
         ValueError: An option is unknown or out of range.
     """
-    _check_options(association, tolerance, delta)
+    if association not in (known := get_args(Association)):
+        raise ValueError(f"unknown association {association!r}; known are {', '.join(known)}")
+    if not tolerance >= 0:
+        raise ValueError(f"tolerance must be seconds, not below zero, got {tolerance}")
+    if delta < 1:
+        raise ValueError(f"delta must be a number of poses, at least 1, got {delta}")
     for each in (estimate, groundtruth):
         check_ascending(each.timestamps, each.timestamps.diff() <= 0)
     device = groundtruth.T_wc.device
@@ -118,9 +118,13 @@ def evaluate(
     T_wg, valid = _associate(truth, times, association, tolerance)
     compared = int(valid.sum())
     if compared < MIN_POSES:
+        spans = ""
+        if len(times) and len(truth):
+            one, other = (f"{float(t[0]):.3f} to {float(t[-1]):.3f} s" for t in (times, truth.timestamps))
+            spans = f"; the estimate goes from {one}, the ground truth from {other}"
         raise TrajectoryError(
             f"{compared} of {len(times)} estimated poses have a true one within {tolerance:g} s, "
-            f"{MIN_POSES} are needed{_ranges(times, truth.timestamps)}"
+            f"{MIN_POSES} are needed{spans}"
         )
     matched, reference = T_we[valid], T_wg[valid]
     moves, has_moved = (bool(_has_extent(T[:, :3, 3])) for T in (matched, reference))
@@ -163,21 +167,17 @@ def ate_apart(parts: Iterable[Trajectory], groundtruth: Trajectory) -> float:
     Raises:
         TrajectoryError: No part is left.
     """
-    errors = [
-        evaluate(part, groundtruth).errors_m for part in parts if _compared(part, groundtruth) >= MIN_POSES
-    ]
+    truth = Trajectory(groundtruth.timestamps.double(), groundtruth.T_wc.detach().double())
+    errors = []
+    for part in parts:
+        times = part.timestamps.to(truth.T_wc)
+        if int(_associate(truth, times, "interpolate", TOLERANCE)[1].sum()) >= MIN_POSES:
+            errors.append(evaluate(part, groundtruth).errors_m)
     if not errors:
         raise TrajectoryError(
             f"no submap has {MIN_POSES} estimated poses with a true one within {TOLERANCE:g} s"
         )
     return float(_rms(torch.cat(errors).square()))
-
-
-def _compared(estimate: Trajectory, groundtruth: Trajectory) -> int:
-    """How many poses of the estimate have a true one."""
-    truth = Trajectory(groundtruth.timestamps.double(), groundtruth.T_wc.detach().double())
-    times = estimate.timestamps.to(truth.T_wc)
-    return int(_associate(truth, times, "interpolate", TOLERANCE)[1].sum())
 
 
 @full_precision
@@ -202,12 +202,12 @@ def ate(
         The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count, one is not finite, or all
         true centers are at one place, to which a similarity shrinks any other path.
     """
-    T_cw, T_cw_groundtruth, finite = _counted(T_cw, T_cw_groundtruth, mask)
+    T_cw, T_cw_groundtruth, known, enough = _counted(T_cw, T_cw_groundtruth, mask)
     centers, truth = _centers(T_cw), _centers(T_cw_groundtruth)
     s, R, t = umeyama(centers, truth, mask, with_scale)
     moved = s[..., None, None] * centers @ R.mT + t[..., None, :]
     error = _rms((moved - truth).square().sum(-1), mask)
-    known = finite & _enough(T_cw, mask)
+    known = known & enough
     if with_scale:
         known = known & (_has_extent(truth, mask) | ~_has_extent(centers, mask))
     return torch.where(known, error, torch.nan)
@@ -229,7 +229,6 @@ def rpe(
     Args:
         T_cw: estimated poses, world to camera; a `Trajectory` has the inverses.
         T_cw_groundtruth: true poses at the same times.
-        delta: number of rows.
         mask: rows that count.
         with_scale: scale the estimate as the alignment of `ate` does.
 
@@ -242,28 +241,21 @@ def rpe(
     """
     if not 1 <= delta < T_cw.shape[-3]:
         raise ValueError(f"delta must be between 1 and {T_cw.shape[-3] - 1}, got {delta}")
-    T_cw, T_cw_groundtruth, finite = _counted(T_cw, T_cw_groundtruth, mask)
+    T_cw, T_cw_groundtruth, known, enough = _counted(T_cw, T_cw_groundtruth, mask)
     s, _, _ = umeyama(_centers(T_cw), _centers(T_cw_groundtruth), mask, with_scale)
-    motion, true_motion = _motions(T_cw, delta), _motions(T_cw_groundtruth, delta)
+    # Each camera `delta` rows later, in the camera before.
+    motion, true_motion = (
+        T[..., :-delta, :, :] @ se3_inverse(T[..., delta:, :, :]) for T in (T_cw, T_cw_groundtruth)
+    )
     motion = rigid(motion[..., :3, :3], s[..., None, None] * motion[..., :3, 3])
     error = se3_inverse(true_motion) @ motion
     pairs = None if mask is None else mask[..., :-delta] & mask[..., delta:]
     translation = error[..., :3, 3].square().sum(-1)
     rotation = so3_log(error[..., :3, :3]).square().sum(-1)
-    known = finite if pairs is None else finite & pairs.any(-1)
-    known = known & _enough(T_cw, mask) if with_scale else known
+    known = known if pairs is None else known & pairs.any(-1)
+    known = known & enough if with_scale else known
     errors = _rms(translation, pairs), _rms(rotation, pairs)
     return torch.where(known, errors[0], torch.nan), torch.where(known, errors[1], torch.nan)
-
-
-def _check_options(association: str, tolerance: float, delta: int) -> None:
-    known = get_args(Association)
-    if association not in known:
-        raise ValueError(f"unknown association {association!r}; known are {', '.join(known)}")
-    if not tolerance >= 0:
-        raise ValueError(f"tolerance must be seconds, not below zero, got {tolerance}")
-    if delta < 1:
-        raise ValueError(f"delta must be a number of poses, at least 1, got {delta}")
 
 
 def _has_extent(
@@ -291,42 +283,22 @@ def _associate(
     return truth.T_wc[indices], distances <= tolerance
 
 
-def _ranges(times: Tensor, truth_times: Tensor) -> str:
-    """The spans of time of both, as the end of a message; empty where one has no poses."""
-    if len(times) == 0 or len(truth_times) == 0:
-        return ""
-    spans = [f"from {float(span[0]):.3f} to {float(span[-1]):.3f} s" for span in (times, truth_times)]
-    return f"; the estimate goes {spans[0]}, the ground truth {spans[1]}"
-
-
 def _counted(
     T_cw: Float[Tensor, "*batch N 4 4"],
     T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
     mask: Bool[Tensor, "*batch N"] | None,
-) -> tuple[Float[Tensor, "*batch N 4 4"], Float[Tensor, "*batch N 4 4"], Bool[Tensor, "*batch"]]:
-    """Both with the identity for rows that are not finite, and whether all rows that count are."""
+) -> tuple[Tensor, Tensor, Bool[Tensor, "*batch"], Bool[Tensor, "*batch"]]:
+    """Both with the identity for rows that are not finite; whether all rows that count are, and enough to align."""
     finite = torch.isfinite(T_cw).flatten(-2).all(-1) & torch.isfinite(T_cw_groundtruth).flatten(-2).all(-1)
     eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
     T_cw, T_cw_groundtruth = (torch.where(finite[..., None, None], T, eye) for T in (T_cw, T_cw_groundtruth))
-    return T_cw, T_cw_groundtruth, (finite if mask is None else finite | ~mask).all(-1)
-
-
-def _enough(
-    T_cw: Float[Tensor, "*batch N 4 4"], mask: Bool[Tensor, "*batch N"] | None
-) -> Bool[Tensor, "*batch"]:
-    """Test whether enough rows count for an alignment."""
-    rows = T_cw.new_ones(T_cw.shape[:-2], dtype=torch.bool) if mask is None else mask
-    return rows.sum(-1) >= MIN_POSES
+    rows = torch.ones_like(finite) if mask is None else mask
+    return T_cw, T_cw_groundtruth, (finite | ~rows).all(-1), rows.sum(-1) >= MIN_POSES
 
 
 def _centers(T_cw: Float[Tensor, "*batch N 4 4"]) -> Float[Tensor, "*batch N 3"]:
     """Camera centers in the world."""
     return se3_inverse(T_cw)[..., :3, 3]
-
-
-def _motions(T_cw: Float[Tensor, "*batch N 4 4"], delta: int) -> Float[Tensor, "*batch N-{delta} 4 4"]:
-    """Each camera `delta` rows later, in the camera before."""
-    return T_cw[..., :-delta, :, :] @ se3_inverse(T_cw[..., delta:, :, :])
 
 
 def _rms(

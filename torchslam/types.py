@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import Enum, StrEnum
-from functools import cache
+from functools import cache, partial
 from string import Formatter
 from typing import Any, Self
 
@@ -27,9 +27,8 @@ class Frame:
         index: position in the sequence, from 0.
         timestamp: seconds.
         image: gray, float32 in [0, 1].
-        name: name of the image in messages (its path, or `video.mp4#17`).
-        T_cw_groundtruth: float64 world to camera, if the sequence has it. Read only by simulated features, by scale
-            from ground truth and by evaluation.
+        name: in messages (its path, or `video.mp4#17`).
+        T_cw_groundtruth: float64. Read only by simulated features, by scale from ground truth and by evaluation.
         mask: True where features may be found; None: everywhere.
         features: a batch of one, if they were extracted already; then the image is not needed, and H and W may be 0.
         backlog: number of newer frames already queued (live sources only).
@@ -89,8 +88,7 @@ class Features:
         return cls(*joined)
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Features:
-        columns: Any = (getattr(self, each.name) for each in fields(self))
-        changed: Any = (None if column is None else change(column) for column in columns)
+        changed: Any = (None if column is None else change(column) for column in vars(self).values())
         return Features(*changed)
 
 
@@ -99,8 +97,7 @@ class Matches:
     """A batch of matches between two sets of features. Invalid rows have index 0 and `mask` False.
 
     Attributes:
-        indices_1: rows in the first set.
-        indices_2: rows in the second set.
+        indices_1: rows in the first set; `indices_2`: in the second one.
         distances: Hamming distance in bits, or 1 - cosine.
         mask: True where the row is a match.
         weights: matching weights, if the matcher gives some.
@@ -113,23 +110,21 @@ class Matches:
     weights: Float[Tensor, "B M"] | None = None
 
 
+def _empty(*shape: int) -> Tensor:
+    """What stands for a tensor that was left out."""
+    return torch.zeros(shape, dtype=torch.float32, device="cpu")
+
+
 @dataclass(frozen=True)
 class FrameFeatures:
-    """The features of one frame as the geometry uses them, unbatched.
+    """The features of one frame as the geometry uses them, unbatched; else as in `Frame` and `Features`.
 
     Attributes:
-        index: as in `Frame`.
-        timestamp: as in `Frame`.
         keypoints: pixels, in the dtype of the geometry (float64 unless configured).
         scales: pixels: the standard deviation of a keypoint grows with the size of its pyramid level.
-        angles: radians.
-        descriptors: as in `Features`.
-        mask: as in `Features`.
-        T_cw_groundtruth: as in `Frame`.
         session: number of the run over the same map, from 0.
         information: as in `KeypointNoise`, of the keypoints; (N, 0) if the feature extractor gives none.
         image: gray, if the matcher wants it.
-        backlog: as in `Frame`.
         detected: pixels at which the extractor found the keypoints. They differ from `keypoints` where a rolling
             shutter was corrected, see `torchslam.geometry.SensorModel`; `keypoints` themselves if omitted.
     """
@@ -143,23 +138,18 @@ class FrameFeatures:
     mask: Bool[Tensor, " N"]
     T_cw_groundtruth: Float[Tensor, "4 4"] | None = None
     session: int = 0
-    information: Float[Tensor, "N I"] = field(
-        default_factory=lambda: torch.zeros(0, dtype=torch.float32, device="cpu")
-    )
+    information: Float[Tensor, "N I"] = field(default_factory=partial(_empty, 0))
     image: Float[Tensor, "1 1 H W"] | None = None
     backlog: int = 0
-    detected: Float[Tensor, "_ 2"] = field(
-        default_factory=lambda: torch.zeros(0, 2, dtype=torch.float32, device="cpu")
-    )
+    detected: Float[Tensor, "_ 2"] = field(default_factory=partial(_empty, 0, 2))
 
     def __post_init__(self) -> None:
-        _fill_information(self)
+        if self.information.ndim == 1:
+            object.__setattr__(self, "information", packed_information(None, self.scales))
         if len(self.detected) == 0:
             object.__setattr__(self, "detected", self.keypoints)
-        if len(self.detected) != len(self.keypoints):
-            raise ValueError(
-                f"detected has {len(self.detected)} rows, but keypoints has {len(self.keypoints)}"
-            )
+        if (rows := len(self.detected)) != len(self.keypoints):
+            raise ValueError(f"detected has {rows} rows, but keypoints has {len(self.keypoints)}")
 
     @classmethod
     def of(cls, frame: Frame, features: Features, like: Tensor) -> FrameFeatures:
@@ -203,9 +193,8 @@ class FrameFeatures:
         """The keypoints as a batch of one, for matching."""
         scores = torch.ones_like(self.scales)
         columns = (self.keypoints, scores, self.scales, self.angles, self.descriptors, self.mask)
-        information = unpacked_information(self.information[None])
-        keypoints, scores, scales, angles, descriptors, mask = (column[None] for column in columns)
-        return Features(keypoints, scores, scales, angles, descriptors, mask, information)
+        batch: Any = (*(column[None] for column in columns), unpacked_information(self.information[None]))
+        return Features(*batch)
 
 
 @dataclass(frozen=True)
@@ -247,15 +236,9 @@ class MatchIndices:
 
 @dataclass(frozen=True)
 class TwoViewMap:
-    """A map of two views, the result of initialization.
+    """A map of two views, the result of initialization: the second view, its pose, and points with their keypoints.
 
-    Attributes:
-        reference: the first view, whose camera is the world frame.
-        view: the second view.
-        T_cw: pose of the second view.
-        points_w: points.
-        keypoints_1: their keypoints in the first view.
-        keypoints_2: their keypoints in the second view.
+    The camera of the first view, the reference, is the world frame.
     """
 
     reference: FrameFeatures
@@ -271,16 +254,13 @@ class PoseEstimate:
     """Pose of a frame, with the inliers it was estimated from.
 
     Attributes:
-        T_cw: world to camera.
-        point_ids: map points of the inliers.
-        keypoints: their keypoints.
+        point_ids: map points of the inliers; `keypoints`: their keypoints.
         matches: number of matches from which the inliers were chosen.
         covariance: of the pose's left perturbation (translation, rotation), the points taken as exact.
         depth: median depth of the inliers.
         error: median squared error of the matches, in units of their variance; 1.39 for noise alone.
         coverage_ratio: ratio of image cells with expected points in which these are found.
         explained_ratio: ratio of image cells with keypoints in which some agree with the map.
-        weights: of the inliers, if the matcher gives some.
         expected: points predicted to be visible; None: `point_ids`.
     """
 
@@ -302,12 +282,6 @@ class PoseEstimate:
         return len(self.point_ids)
 
 
-def _fill_information(features: FrameFeatures) -> None:
-    """Replace information that was left out by an empty tensor (n, 0)."""
-    if features.information.ndim == 1:
-        object.__setattr__(features, "information", packed_information(None, features.scales))
-
-
 @dataclass(frozen=True)
 class Observations:
     """Observations of points in keyframes: flat index tensors, ordered by keyframe, then keypoint.
@@ -316,9 +290,7 @@ class Observations:
         keyframe_index: rows of keyframes.
         keypoint_index: rows of keypoints in these keyframes.
         point_index: rows of points.
-        pixels: where the keypoints are.
-        scales: pixels, as in `KeypointNoise`.
-        information: as in `KeypointNoise`.
+        pixels: where the keypoints are, whose noise is that of `scales` and `information`.
     """
 
     keyframe_index: Int[Tensor, " O"]
@@ -358,16 +330,13 @@ class Trajectory:
             ("timestamps", times, (torch.float64,)),  # others cannot tell apart frames of seconds since 1970
             ("T_wc", T_wc, (torch.float32, torch.float64)),
         ):
-            if not isinstance(values, Tensor) or values.dtype not in kinds:
-                found = values.dtype if isinstance(values, Tensor) else type(values).__name__
-                raise TrajectoryError(
-                    f"{name} of a trajectory must be {' or '.join(str(kind) for kind in kinds)}, not {found}"
-                )
+            found = values.dtype if isinstance(values, Tensor) else type(values).__name__
+            if found not in kinds:
+                wanted = " or ".join(map(str, kinds))
+                raise TrajectoryError(f"{name} of a trajectory must be {wanted}, not {found}")
         if times.ndim != 1 or T_wc.shape != (len(times), 4, 4):
-            shapes = f"{tuple(times.shape)} and {tuple(T_wc.shape)}"
-            raise TrajectoryError(
-                f"timestamps and T_wc of a trajectory must be (N,) and (N, 4, 4), not {shapes}"
-            )
+            shapes = f"(N,) and (N, 4, 4), not {tuple(times.shape)} and {tuple(T_wc.shape)}"
+            raise TrajectoryError(f"timestamps and T_wc of a trajectory must be {shapes}")
         for name, finite in (("time", times.isfinite()), ("pose", T_wc.isfinite().flatten(1).all(1))):
             if not bool(finite.all()):
                 raise TrajectoryError(f"{name} {int(finite.int().argmin())} of a trajectory is not finite")
@@ -376,10 +345,8 @@ class Trajectory:
     @classmethod
     def empty(cls) -> Trajectory:
         """A trajectory without poses."""
-        return cls(
-            torch.zeros(0, dtype=torch.float64, device="cpu"),
-            torch.zeros(0, 4, 4, dtype=torch.float64, device="cpu"),
-        )
+        nothing = torch.zeros(0, 4, 4, dtype=torch.float64, device="cpu")
+        return cls(nothing[:, 0, 0], nothing)
 
     def __len__(self) -> int:
         return int(self.timestamps.shape[0])
@@ -394,9 +361,9 @@ def check_ascending(times: Float[Tensor, " N"], wrong: Bool[Tensor, " M"]) -> No
     """Raise TrajectoryError where a step from one time to the next is wrong."""
     if bool(wrong.any()):
         row = int(wrong.int().argmax()) + 1
+        late, early = float(times[row]), float(times[row - 1])
         raise TrajectoryError(
-            f"times of a trajectory must increase: {float(times[row])!r} s, row {row}, follows "
-            f"{float(times[row - 1])!r} s"
+            f"times of a trajectory must increase: {late!r} s, row {row}, follows {early!r} s"
         )
 
 
@@ -466,12 +433,7 @@ class Reason(StrEnum):
 
 @dataclass(frozen=True)
 class Explanation:
-    """A reason with the values of the fields of its text; `str` gives the text.
-
-    Attributes:
-        reason: the kind.
-        values: numbers and words by the name of their field.
-    """
+    """A reason with the values of the fields of its text, by name; `str` gives the text."""
 
     reason: Reason
     values: dict[str, float | str | Explanation] = field(default_factory=dict)
@@ -545,15 +507,12 @@ class StepResult:
     """The result of one frame.
 
     Attributes:
-        index: of the frame.
         timestamp: of the frame, seconds.
         state: after the frame.
         T_cw: pose of the frame, world to camera; None while initializing or lost.
         submap: number of the submap the pose is in; None without a pose.
         covariance: of the pose's left perturbation (translation, rotation); None if it was not estimated.
-        is_keyframe: True if the frame became a keyframe.
-        matches: number of map points matched in this frame.
-        inliers: number of these that agree with the pose.
+        matches: number of map points matched in this frame; `inliers`: of these that agree with the pose.
         reasons: why there is no pose, or an uncertain one, or why the frame is a keyframe.
         stage_ms: milliseconds per stage.
     """

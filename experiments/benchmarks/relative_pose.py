@@ -37,7 +37,7 @@ from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.features import ORB
 from torchslam.geometry import Camera, estimate_relative_pose, se3_inverse, so3_log
-from torchslam.geometry.relative_pose_search import Model
+from torchslam.geometry.relative_pose import Model
 
 HERE = Path(__file__).parent
 # Sequences with the least baseline in meters whose direction the ground truth determines to some degrees: several times

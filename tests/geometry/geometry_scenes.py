@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
 
-from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, so3_exp, transform
+from torchslam.geometry import Camera, rigid, se3_exp, se3_inverse, sim3_exp, so3_exp, transform
 
 CAMERA = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))
+RADIAL = Camera.radial_tangential(500.0, 520.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
+FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
 
 
 @dataclass(frozen=True)
@@ -58,6 +63,12 @@ def two_views(
     return Scene(pixels_1[None], pixels_2[None], points[rows][None], T_21[None], ~wrong[None])
 
 
+def many_views(seeds: Iterable[int], **options: Any) -> Scene:
+    """A pair of views of a scene of its own for each seed."""
+    scenes = [two_views(seed, **options) for seed in seeds]
+    return Scene(*(torch.cat([getattr(scene, each.name) for scene in scenes]) for each in fields(Scene)))
+
+
 def points_and_pixels(
     seed: int, count: int = 150, outliers: float = 0.3, noise: float = 0.5, camera: Camera = CAMERA
 ) -> tuple[Tensor, Tensor, Tensor]:
@@ -73,6 +84,59 @@ def points_and_pixels(
     wrong = torch.arange(count) < int(outliers * count)
     elsewhere = torch.rand(count, 2, generator=generator, dtype=torch.float64) * size
     return points_w[None], torch.where(wrong[:, None], elsewhere, pixels)[None], T_cw[None]
+
+
+@dataclass(frozen=True)
+class Pairs:
+    """The arguments of `estimate_similarity`, the answer (1, 4, 4), and the right pairs (1, N)."""
+
+    points_1: Tensor
+    points_2: Tensor
+    pixels_1: Tensor
+    pixels_2: Tensor
+    S_21: Tensor
+    right: Tensor
+
+    def inputs(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        return self.points_1, self.points_2, self.pixels_1, self.pixels_2
+
+
+def make_pairs(
+    seed: int,
+    count: int = 120,
+    outliers: float = 0.3,
+    noise: float = 0.5,
+    log_scale: float = 0.6,
+    baseline: float = 0.8,
+    camera_1: Camera = CAMERA,
+    camera_2: Camera = CAMERA,
+) -> Pairs:
+    """Points seen by two cameras whose maps differ in scale, their depths uncertain by `noise` per cent."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def normal(*shape: int) -> Tensor:
+        return torch.randn(*shape, generator=generator, dtype=torch.float64)
+
+    direction = normal(3) * torch.tensor((1.0, 1.0, 0.3))
+    translation = baseline * math.exp(0.5 * log_scale) * direction / direction.norm()
+    xi = torch.cat((translation, 0.08 * normal(3), torch.tensor((log_scale,))))
+    S_21 = sim3_exp(xi)
+    size = torch.tensor(camera_1.size, dtype=torch.float64)
+    pixels_1 = torch.rand(8 * count, 2, generator=generator, dtype=torch.float64) * size
+    rays = camera_1.unproject(pixels_1)
+    depth = 2 + 4 * torch.rand(8 * count, 1, generator=generator, dtype=torch.float64)
+    points_1 = rays / rays[:, 2:] * depth
+    points_2 = transform(S_21, points_1)
+    pixels_2, valid = camera_2.project(points_2)
+    rows = (valid & camera_2.in_image(pixels_2)).nonzero().squeeze(-1)[:count]
+    points_1, points_2, pixels_1, pixels_2 = (x[rows] for x in (points_1, points_2, pixels_1, pixels_2))
+    wrong = torch.arange(count) < int(outliers * count)
+    order = torch.cat((torch.arange(count)[wrong].roll(1), torch.arange(count)[~wrong]))
+    points_2, pixels_2 = points_2[order], pixels_2[order]
+    pixels_1, pixels_2 = pixels_1 + noise * normal(count, 2), pixels_2 + noise * normal(count, 2)
+    points_1, points_2 = (x * (1 + 0.01 * noise * normal(count, 1)) for x in (points_1, points_2))
+    tensors = (points_1, points_2, pixels_1, pixels_2, S_21, ~wrong)
+    return Pairs(*(x[None] for x in tensors))
 
 
 def rotation_error(R: Tensor, R_true: Tensor) -> float:

@@ -2,17 +2,11 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 
 from torchslam.geometry import Camera
-from torchslam.geometry.camera_measurement import (
-    CameraMeasurement,
-    may_be_same,
-    with_radial_terms,
-)
+from torchslam.geometry.camera_measurement import CameraMeasurement, may_be_same, with_radial_terms
 
 PINHOLE = Camera.pinhole(500.0, 510.0, 320.0, 240.0, size=(640, 480))
 
@@ -49,13 +43,6 @@ def test_a_camera_that_is_held_has_no_error() -> None:
     held = CameraMeasurement(given.camera, given.directions[:, :0])
     assert (held.focal_std, held.radial_std) == (0.0, (0.0, 0.0))
     assert not held.information.any()
-
-
-def test_departure_counts_standard_deviations_of_the_focal_length() -> None:
-    given = CameraMeasurement.of(PINHOLE, 0.02)
-    longer = PINHOLE.with_params(PINHOLE.params * torch.tensor([math.exp(0.06), math.exp(0.06), 1, 1]))
-    assert given.departure(longer) == pytest.approx(3.0)
-    assert CameraMeasurement.of(PINHOLE, 0.0).departure(longer) == 0.0
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 import torch
-from geometry_scenes import CAMERA, two_views
+from geometry_scenes import CAMERA, many_views
 from torch import Tensor
 
 from torchslam.geometry import essential_from_pose, sampson_errors, so3_exp
@@ -24,12 +24,9 @@ def matrix_of(T_21: Tensor, focal: float = 525.0) -> Tensor:
 
 def matches(noise: float, seeds: range, **options: float) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """x_1, x_2, the mask of right matches and the true F of a pair per seed."""
-    scenes = [two_views(seed, noise=noise, **{"outliers": 0.0, **options}) for seed in seeds]
-    x_1, x_2 = (
-        (torch.cat([getattr(scene, name) for scene in scenes]) - CENTER) / SCALE
-        for name in ("pixels_1", "pixels_2")
-    )
-    return x_1, x_2, torch.cat([s.mask for s in scenes]), matrix_of(torch.cat([s.T_21 for s in scenes]))
+    scene = many_views(seeds, noise=noise, **{"outliers": 0.0, **options})
+    x_1, x_2 = ((pixels - CENTER) / SCALE for pixels in (scene.pixels_1, scene.pixels_2))
+    return x_1, x_2, scene.mask, matrix_of(scene.T_21)
 
 
 def moved(F: Tensor, size: float, seed: int = 0) -> Tensor:
@@ -51,9 +48,8 @@ def test_exact_matches_give_the_matrix() -> None:
 def test_equal_singular_values_are_no_special_case() -> None:
     """They are, with the focal length as the unit, those of every pair."""
     x_1, x_2, mask, _ = matches(0.5, range(3))
-    scenes = [two_views(seed, noise=0.5, outliers=0.0) for seed in range(3)]
     factor = SCALE / 525.0
-    true = matrix_of(torch.cat([s.T_21 for s in scenes]), SCALE)
+    true = matrix_of(many_views(range(3)).T_21, SCALE)
     found = refine_fundamental(true, factor * x_1, factor * x_2, mask, factor * PIXEL)
     _, values, _ = torch.linalg.svd(found.covariance)
     assert (values[:, 6] > 1e-9).all()  # seven directions are uncertain

@@ -6,13 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchslam.geometry import (
-    Camera,
-    KeypointNoise,
-    innovation_covariances,
-    mahalanobis_squared,
-    passes_gate,
-)
+from torchslam.geometry import Camera, KeypointNoise, innovation_covariances, mahalanobis_squared, passes_gate
 from torchslam.geometry.gating import GATE_FACTOR, unpacked_information, whitening
 
 

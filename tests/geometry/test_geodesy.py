@@ -90,11 +90,3 @@ def test_gradients() -> None:
     far = (100 * positions_e).requires_grad_()
     assert gradcheck(lambda x: geodetic_from_enu(x, origin.detach()), (far,), eps=10.0, atol=1e-8)
     assert gradcheck(lambda o: geodetic_from_enu(far.detach(), o), (origin,), eps=1e-3, atol=1e-5)
-
-
-def test_a_batch_is_a_loop() -> None:
-    origins = places(3)
-    positions_e = torch.randn(3, 4, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
-    found = geodetic_from_enu(positions_e, origins)
-    for row in range(3):
-        torch.testing.assert_close(found[row], geodetic_from_enu(positions_e[row], origins[row]))

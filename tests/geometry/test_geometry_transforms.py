@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from kornia.geometry.liegroup import Se3
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -28,11 +29,13 @@ from torchslam.geometry.transforms import (
     corner_camera,
     corner_pixels,
     covariances_with_unit,
+    from_kornia_camera,
     opengl,
     pose_distance,
     quaternion_wxyz,
     reorthonormalized,
     rotation_angle,
+    to_kornia_camera,
     upright_rotation,
     with_unit,
     without_scale,
@@ -227,3 +230,54 @@ def test_without_an_up_direction_y_points_down() -> None:
     upright = upright_rotation(looking((0.0, 0.0, 0.0)))
     torch.testing.assert_close(upright_rotation(opposed), upright)
     torch.testing.assert_close(upright_rotation(opposed[:0]), upright)
+
+
+@pytest.fixture
+def T_cw() -> Tensor:
+    return se3_exp(0.3 * torch.randn(3, 6, dtype=torch.float64, generator=torch.Generator().manual_seed(0)))
+
+
+@pytest.fixture
+def camera() -> Camera:
+    return Camera.pinhole(500.0, 510.0, 319.5, 239.5, size=(640, 480)).to(torch.float64)
+
+
+def test_kornia_projects_to_the_same_pixels(camera: Camera, T_cw: Tensor) -> None:
+    points_w = torch.rand(3, 7, 3, dtype=torch.float64) + torch.tensor((0.0, 0.0, 4.0), dtype=torch.float64)
+    ours = camera.project(transform(T_cw, points_w))[0]
+    theirs = to_kornia_camera(camera, T_cw)
+    for row in range(7):  # theirs takes one point for each camera
+        torch.testing.assert_close(theirs.project(points_w[:, row : row + 1])[:, 0], ours[:, row])
+
+
+def test_cameras_of_kornia_there_and_back(camera: Camera, T_cw: Tensor) -> None:
+    found, poses = from_kornia_camera(to_kornia_camera(camera, T_cw))
+    torch.testing.assert_close(found.params, camera.params.expand(3, 4))
+    assert found.size == camera.size
+    torch.testing.assert_close(poses, T_cw)
+    torch.testing.assert_close(Se3.from_matrix(T_cw).matrix(), T_cw)
+
+
+def test_gradients_flow_through_cameras_of_kornia(camera: Camera, T_cw: Tensor) -> None:
+    params = camera.params.clone().requires_grad_()
+    pose = T_cw.clone().requires_grad_()
+    found, poses = from_kornia_camera(to_kornia_camera(camera.with_params(params), pose))
+    (found.params.sum() + poses.sum()).backward()
+    assert params.grad is not None
+    assert pose.grad is not None
+    torch.testing.assert_close(params.grad, torch.full((4,), 3.0, dtype=torch.float64))
+    torch.testing.assert_close(pose.grad, torch.ones_like(pose))
+
+
+def test_cameras_that_kornia_cannot_have_are_refused(camera: Camera, T_cw: Tensor) -> None:
+    bent = Camera.radial_tangential(500.0, 500.0, 319.5, 239.5, 0.1, 0.0, 0.0, 0.0, size=(640, 480))
+    with pytest.raises(ValueError, match="no distortion"):
+        to_kornia_camera(bent, T_cw)
+    theirs = to_kornia_camera(camera, T_cw)
+    theirs.intrinsics[1, 0, 1] = 2.0
+    with pytest.raises(ValueError, match="skew"):
+        from_kornia_camera(theirs)
+    theirs = to_kornia_camera(camera, T_cw)
+    theirs.width[0] = 320
+    with pytest.raises(ValueError, match="different sizes"):
+        from_kornia_camera(theirs)

@@ -136,14 +136,3 @@ def test_quaternions_agree_with_scipy_and_round_trip(q: list[float]) -> None:
     unit = quaternion / quaternion.norm()
     assert back[3] >= 0
     torch.testing.assert_close(back * torch.sign(back @ unit), unit, atol=1e-12, rtol=0)
-
-
-def test_dtype_device_and_batch(device: torch.device, dtype: torch.dtype) -> None:
-    xi = tangent(0.3, 6).to(device, dtype)
-    T = g.se3_exp(xi)
-    assert (T.dtype, T.device.type) == (dtype, device.type)
-    assert torch.equal(T[1], g.se3_exp(xi[1]))
-    points = torch.randn(4, 5, 3, dtype=torch.float64).to(device, dtype)
-    torch.testing.assert_close(
-        g.transform(g.se3_inverse(T), g.transform(T, points)), points, atol=1e-5, rtol=1e-5
-    )

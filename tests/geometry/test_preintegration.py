@@ -37,19 +37,6 @@ def integrate(steps: InertialSteps, bias: Tensor) -> Increments:
     return preintegrate(steps, bias, *DENSITIES)
 
 
-def sequential(steps: InertialSteps, bias: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Rotation, velocity and position of one interval, by a thousand steps of Euler for each of its steps."""
-    R, v, p = torch.eye(3, dtype=torch.float64), torch.zeros(3).double(), torch.zeros(3).double()
-    parts = 1000
-    for dt, rate, force in zip(*(x[0] for x in steps), strict=True):
-        h, turn = dt / parts, so3_exp((rate - bias[:3]) * dt / parts)
-        half = so3_exp((rate - bias[:3]) * dt / parts / 2)
-        for _ in range(parts):
-            a = R @ half @ (force - bias[3:])
-            p, v, R = p + v * h + 0.5 * a * h * h, v + a * h, R @ turn
-    return R, v, p
-
-
 def test_constant_acceleration() -> None:
     constant = InertialSteps(
         torch.full((1, 20), 0.05, dtype=torch.float64),
@@ -61,18 +48,6 @@ def test_constant_acceleration() -> None:
     torch.testing.assert_close(found.R_ij[0], torch.eye(3).double())
     torch.testing.assert_close(found.velocity[0], torch.tensor([1.0, -2.0, 3.0]).double())
     torch.testing.assert_close(found.position[0], torch.tensor([0.5, -1.0, 1.5]).double())
-
-
-def test_noise_of_a_body_that_feels_no_force() -> None:
-    """White noise: sigma^2 T of a velocity and a rotation, sigma^2 T^3 / 3 of a position."""
-    zero = torch.zeros(1, 20, 3).double()
-    found = integrate(
-        InertialSteps(torch.full((1, 20), 0.05, dtype=torch.float64), zero, zero), torch.zeros(6).double()
-    )
-    variance = DENSITIES[1] ** 2
-    assert float(found.covariance[0, 3, 3]) == pytest.approx(variance, rel=1e-6)
-    assert float(found.covariance[0, 0, 0]) == pytest.approx(variance / 3, rel=2e-3)
-    assert float(found.covariance[0, 6, 6]) == pytest.approx(DENSITIES[0] ** 2, rel=1e-6)
 
 
 def test_a_circle() -> None:
@@ -94,28 +69,12 @@ def test_a_circle() -> None:
     )
 
 
-def test_agrees_with_small_steps_in_order() -> None:
-    data, bias = steps(1, 5), torch.tensor([0.02, -0.01, 0.03, 0.1, -0.2, 0.05]).double()
-    found = integrate(data, bias)
-    for part, expected in zip(found[1:4], sequential(data, bias), strict=True):
-        torch.testing.assert_close(part[0], expected, atol=1e-9, rtol=0)
-
-
 @pytest.mark.parametrize("angle", [0.0, 1e-5, 0.4, 0.6, 3.0])
 def test_double_integral_of_a_rotation(angle: float) -> None:
     omega = angle * torch.tensor([0.6, 0.0, 0.8], dtype=torch.float64)
     nodes = (torch.arange(4000, dtype=torch.float64) + 0.5) / 4000
     expected = ((1 - nodes)[:, None, None] * so3_exp(nodes[:, None] * omega)).mean(0)
     torch.testing.assert_close(so3_double_integral(omega), expected, atol=1e-7, rtol=0)
-
-
-def test_a_batch_is_a_loop() -> None:
-    data, bias = steps(3, 7), torch.randn(3, 6, generator=torch.Generator().manual_seed(1)).double() * 0.1
-    together = integrate(data, bias)
-    for row in range(3):
-        alone = integrate(InertialSteps(*(x[row : row + 1] for x in data)), bias[row : row + 1])
-        for part, expected in zip(together, alone, strict=True):
-            torch.testing.assert_close(part[row], expected[0], atol=1e-14, rtol=0)
 
 
 @given(st.integers(1, 9), st.integers(1, 9), st.integers(0, 1000))
@@ -198,16 +157,6 @@ def test_gradients_of_steps() -> None:
     start, end = torch.tensor([0.103, 0.205]).double(), torch.tensor([0.151, 0.222]).double()
     inputs = tuple(x.clone().requires_grad_() for x in (gyroscope, accelerometer, start, end))
     assert gradcheck(lambda g, a, s, e: tuple(inertial_steps(times, g, a, s, e)), inputs)
-
-
-def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
-    times, gyroscope, accelerometer = (x.to(device, dtype) for x in samples())
-    start, end = torch.tensor([0.1, 0.2]).to(device, dtype), torch.tensor([0.2, 0.3]).to(device, dtype)
-    cut = inertial_steps(times, gyroscope, accelerometer, start, end)
-    found = preintegrate(cut, torch.zeros(6).to(device, dtype), *DENSITIES)
-    for part in found:
-        assert (part.dtype, part.device.type) == (dtype, device.type)
-        assert torch.isfinite(part).all()
 
 
 def test_agrees_with_gtsam() -> None:

@@ -1,12 +1,8 @@
 import math
-from collections.abc import Callable
-from typing import Any
 
 import pytest
 import torch
 
-from tests.geometry.geometry_scenes import CAMERA, points_and_pixels, two_views
-from torchslam.geometry import estimate_absolute_pose, estimate_relative_pose, estimate_similarity
 from torchslam.geometry.estimate_gradients import implicit_step
 from torchslam.geometry.lie import cayley_rotation, so3_exp
 from torchslam.geometry.ransac import (
@@ -81,12 +77,6 @@ def test_truncated_score_ignores_masked_rows_and_nan() -> None:
     squared = torch.tensor((((0.0, 0.5, 2.0, torch.nan, 0.0),),))
     mask = torch.tensor(((True, True, True, True, False),))
     assert truncated_score(squared, mask).item() == pytest.approx(1.5)
-
-
-def test_significance_grows_with_inliers_and_falls_with_chance() -> None:
-    inliers, available = torch.tensor((5, 10, 60, 60)), torch.tensor((100, 100, 100, 100))
-    chance = torch.tensor((0.005, 0.005, 0.005, 0.6))
-    assert is_significant(inliers, available, 5, chance, 10).tolist() == [False, False, True, False]
 
 
 def test_significance_is_the_published_number_of_false_alarms() -> None:
@@ -169,26 +159,3 @@ def test_false_alarms_bound_the_binomial_tail() -> None:
             assert alarms < 0.1
         elif alarms < 0.01:
             pytest.fail(f"{count} of 30 are expected {alarms:.4f} times")
-
-
-@pytest.mark.parametrize("transform_of", [torch.func.jacrev, torch.func.jacfwd, torch.func.vmap])
-def test_torch_func_is_refused_in_words(transform_of: Callable[..., Any]) -> None:
-    points_w, pixels, _ = points_and_pixels(0, count=30)
-    scene = two_views(0, count=30)
-    others = scene.points_1, scene.pixels_1, scene.pixels_2
-    for name, estimate, given in (
-        ("absolute_pose", lambda x: estimate_absolute_pose(points_w, x, camera=CAMERA).T_cw, pixels),
-        (
-            "relative_pose",
-            lambda x: estimate_relative_pose(x, scene.pixels_2, camera_1=CAMERA, camera_2=CAMERA).T_21,
-            pixels,
-        ),
-        (
-            "similarity",
-            lambda x: estimate_similarity(x, *others, camera_1=CAMERA, camera_2=CAMERA).S_21,
-            scene.points_1,
-        ),
-    ):
-        given = given[None] if transform_of is torch.func.vmap else given
-        with pytest.raises(RuntimeError, match=f"estimate_{name} chooses among random samples"):
-            transform_of(estimate)(given)

@@ -4,13 +4,10 @@ import numpy as np
 import poselib
 import pytest
 import torch
-from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_views
+from geometry_scenes import CAMERA, FISHEYE, RADIAL, Scene, direction_error, rotation_error, two_views
 from torch import Tensor
 
-from torchslam.geometry import Camera, RelativePose, estimate_relative_pose
-
-RADIAL = Camera.radial_tangential(500.0, 520.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
-FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
+from torchslam.geometry import Camera, RelativePose, estimate_relative_pose, rigid
 
 
 def estimate(scene: Scene, camera: Camera = CAMERA, **options: float) -> RelativePose:
@@ -34,22 +31,28 @@ def test_finds_the_pose_among_wrong_matches(camera: Camera, outliers: float) -> 
         )
 
 
-def test_the_pose_is_as_accurate_as_that_of_poselib() -> None:
+@pytest.mark.parametrize(
+    ("count", "outliers", "noise", "threshold", "part", "ratio"),
+    [(400, 0.4, 1.0, 1.0, "rotation", 1.1), (60, 0.5, 0.5, 2.0, "direction", 1.2)],
+)
+def test_the_pose_is_as_accurate_as_that_of_poselib(
+    count: int, outliers: float, noise: float, threshold: float, part: str, ratio: float
+) -> None:
+    """Of many matches the rotation, and of few, half of which are wrong, the direction."""
     ours, theirs = [], []
     model = {"model": "PINHOLE", "width": 640, "height": 480, "params": CAMERA.params.tolist()}
-    for seed in range(8):
-        scene = two_views(seed, count=400, outliers=0.4, noise=1.0)
-        pose, _ = poselib.estimate_relative_pose(
-            scene.pixels_1[0].numpy(),
-            scene.pixels_2[0].numpy(),
-            model,
-            model,
-            {"max_epipolar_error": 1.0},
-            {},
-        )
-        for errors, R in ((ours, estimate(scene).T_21[:, :3, :3]), (theirs, torch.from_numpy(pose.R)[None])):
-            errors.append(rotation_error(R, scene.T_21[:, :3, :3]))
-    assert np.mean(ours) <= 1.1 * np.mean(theirs)
+    for seed in range(10):
+        scene = two_views(seed, count=count, outliers=outliers, noise=noise)
+        pixels = scene.pixels_1[0].numpy(), scene.pixels_2[0].numpy()
+        pose, _ = poselib.estimate_relative_pose(*pixels, model, model, {"max_epipolar_error": threshold}, {})
+        found = estimate(scene, threshold=threshold, model="auto" if part == "rotation" else "essential").T_21
+        other = rigid(torch.from_numpy(pose.R), torch.from_numpy(pose.t))[None]
+        for errors, T_21 in ((ours, found), (theirs, other)):
+            if part == "rotation":
+                errors.append(rotation_error(T_21[:, :3, :3], scene.T_21[:, :3, :3]))
+            else:
+                errors.append(direction_error(T_21[:, :3, 3], scene.T_21[:, :3, 3]))
+    assert np.mean(ours) <= ratio * np.mean(theirs)
 
 
 def test_exact_data_give_the_exact_pose() -> None:
@@ -133,98 +136,6 @@ def test_a_batch_holds_independent_problems() -> None:
     assert not (result.inliers & ~mask).any()
     assert rotation_error(result.T_21[:3, :3, :3], scene.T_21[:, :3, :3]) < 1
     assert direction_error(result.T_21[:3, :3, 3], scene.T_21[:, :3, 3]) < 4
-
-
-@pytest.mark.parametrize(("count", "threshold"), [(100, 1.0), (20, 4.0), (60, 4.0)])
-def test_pure_noise_is_never_a_success(count: int, threshold: float) -> None:
-    generator = torch.Generator().manual_seed(0)
-    size = torch.tensor((640.0, 480.0), dtype=torch.float64)
-    pixels = torch.rand(2, 8, count, 2, generator=generator, dtype=torch.float64) * size
-    assert not estimate_relative_pose(
-        *pixels, camera_1=CAMERA, camera_2=CAMERA, threshold=threshold, max_samples=500
-    ).success.any()
-
-
-def test_same_seed_same_bytes_and_batch_agrees_with_loop() -> None:
-    scenes = [two_views(seed, outliers=0.2) for seed in range(3)]
-    pixels_1, pixels_2 = (torch.cat([getattr(s, name) for s in scenes]) for name in ("pixels_1", "pixels_2"))
-    batch, again = (
-        estimate_relative_pose(pixels_1, pixels_2, camera_1=CAMERA, camera_2=CAMERA, seed=3) for _ in range(2)
-    )
-    assert torch.equal(batch.T_21, again.T_21)
-    single = torch.cat([estimate(scene).T_21 for scene in scenes])
-    torch.testing.assert_close(
-        batch.T_21, single, atol=0.05, rtol=0
-    )  # other samples, nearly the same inliers
-
-
-@pytest.mark.parametrize("kind", ["essential", "homography", "rotation"])
-@pytest.mark.parametrize("camera", [CAMERA, RADIAL], ids=["pinhole", "radial_tangential"])
-def test_the_gradient_is_that_of_the_estimate(camera: Camera, kind: str) -> None:
-    """Against central differences of the whole estimator; the set of inliers stays the same."""
-    options = {"essential": {}, "homography": {"plane": True}, "rotation": {"baseline": 0.0}}[kind]
-    scene = two_views(7, count=80, outliers=0.1, noise=0.1, camera=camera, **options)
-    inputs = {"pixels_1": scene.pixels_1, "pixels_2": scene.pixels_2, "params": camera.params}
-    size = torch.ones_like(camera.params)
-    size[4:] = 0.01
-    direction = {
-        name: torch.randn(x.shape, generator=torch.Generator().manual_seed(1)).double()
-        for name, x in inputs.items()
-    }
-    direction["params"] = direction["params"] * size
-
-    def run(pixels_1: Tensor, pixels_2: Tensor, params: Tensor) -> Tensor:
-        one = camera.with_params(params)
-        result = estimate_relative_pose(pixels_1, pixels_2, camera_1=one, camera_2=one, threshold=2.0)
-        assert result.model == (kind,)
-        return result.T_21
-
-    leaves = {name: x.clone().requires_grad_() for name, x in inputs.items()}
-    T_21 = run(**leaves)
-    weights = torch.linspace(-1, 1, 12, dtype=torch.float64).view(3, 4)
-    (T_21[0, :3] * weights).sum().backward()
-    torch.testing.assert_close(T_21.detach(), run(**inputs))
-    for name, x in inputs.items():
-        step = 1e-3 * direction[name]
-        high, low = (run(**{**inputs, name: x + sign * step})[0, :3] for sign in (1, -1))
-        expected = ((high - low) * weights).sum() / 2e-3
-        torch.testing.assert_close(
-            (leaves[name].grad * direction[name]).sum(), expected, rtol=1e-3, atol=1e-7
-        )
-
-
-def test_gradients_are_finite_in_float32_also_of_exact_data_and_failures() -> None:
-    scene, exact = two_views(1, outliers=0.1), two_views(1, outliers=0.1, noise=0.0)
-    pixels_1 = torch.cat((scene.pixels_1, exact.pixels_1, scene.pixels_1)).float()
-    pixels_2 = torch.cat((scene.pixels_2, exact.pixels_2, scene.pixels_2)).float()
-    pixels_1[2, 3:] = torch.nan
-    pixels_1, pixels_2 = pixels_1.requires_grad_(), pixels_2.requires_grad_()
-    camera = CAMERA.to(torch.float32)
-    result = estimate_relative_pose(pixels_1, pixels_2, camera_1=camera, camera_2=camera)
-    assert result.success.tolist() == [True, True, False]
-    result.T_21.square().sum().backward()
-    assert torch.isfinite(pixels_1.grad).all()
-    assert torch.isfinite(pixels_2.grad).all()
-
-
-def test_dtype_and_device(device: torch.device, dtype: torch.dtype) -> None:
-    scene = two_views(2)
-    camera = CAMERA.to(device).to(dtype)
-    pixels_1, pixels_2 = (x.to(device, dtype) for x in (scene.pixels_1, scene.pixels_2))
-    result = estimate_relative_pose(pixels_1, pixels_2, camera_1=camera, camera_2=camera)
-    assert (result.T_21.dtype, result.T_21.device.type) == (dtype, device.type)
-    assert rotation_error(result.T_21[:, :3, :3].double().cpu(), scene.T_21[:, :3, :3]) < 1
-
-
-@pytest.mark.usefixtures("without_shape_checks")
-def test_wrong_shapes_and_empty_input() -> None:
-    with pytest.raises(ValueError, match=r"\(B, N, 2\)"):
-        estimate_relative_pose(torch.zeros(5, 2), torch.zeros(5, 2), camera_1=CAMERA, camera_2=CAMERA)
-    for shape in ((0, 10, 2), (2, 0, 2), (2, 4, 2)):
-        pixels = torch.zeros(shape, dtype=torch.float64)
-        result = estimate_relative_pose(pixels, pixels, camera_1=CAMERA, camera_2=CAMERA)
-        assert result.T_21.shape == (shape[0], 4, 4)
-        assert not result.success.any()
 
 
 def gradients(scene: Scene) -> tuple[RelativePose, Tensor]:

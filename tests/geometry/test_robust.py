@@ -37,10 +37,7 @@ def test_known_values():
         assert robustify(s, kernel, c).rho.item() == pytest.approx(value)
 
 
-@given(
-    st.sampled_from(KERNELS),
-    st.floats(1e-3, 1e3).filter(lambda s: abs(s - 4.0) > 1e-3),
-)
+@given(st.sampled_from(KERNELS), st.floats(1e-3, 1e3).filter(lambda s: abs(s - 4.0) > 1e-3))
 def test_derivatives_are_those_of_rho(kernel, value):
     s = torch.tensor(value, dtype=torch.float64, requires_grad=True)
     rho, weight, curvature = robustify(s, kernel, torch.tensor(2.0, dtype=torch.float64))

@@ -1,6 +1,6 @@
 import pytest
 import torch
-from geometry_scenes import CAMERA
+from geometry_scenes import CAMERA, FISHEYE, RADIAL
 from torch import Tensor
 from torch.autograd import gradcheck
 
@@ -15,9 +15,6 @@ from torchslam.geometry import (
     triangulate_many,
     triangulation_covariance,
 )
-
-RADIAL = Camera.radial_tangential(500.0, 510.0, 320.0, 240.0, -0.28, 0.07, 1e-3, -5e-4, 0.01, size=(640, 480))
-FISHEYE = Camera.fisheye(300.0, 305.0, 320.0, 240.0, 0.02, -0.01, 0.003, -0.001, size=(640, 480))
 
 
 def views(
@@ -138,17 +135,6 @@ def test_zero_baseline_or_parallel_rays_give_no_point() -> None:
         pixels, T_cw=T_cw, camera=CAMERA, mask=torch.tensor((True, False)).expand(len(pixels), 2)
     )
     assert not one_view.mask.any()
-
-
-def test_batch_equals_loop_and_device(device: torch.device) -> None:
-    T_cw, pixels, _ = (x.to(device) for x in views(noise=0.5, extra=1))
-    camera = CAMERA.to(device)
-    batch = triangulate_many(
-        torch.stack((pixels, pixels.flip(0))), T_cw=torch.stack((T_cw, T_cw)), camera=camera
-    )
-    single = triangulate_many(pixels, T_cw=T_cw, camera=camera)
-    torch.testing.assert_close(batch.points_w[0], single.points_w)
-    torch.testing.assert_close(batch.points_w[1], single.points_w.flip(0))
 
 
 def test_covariance_is_that_of_noisy_triangulations() -> None:

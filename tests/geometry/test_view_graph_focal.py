@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from geometry_scenes import CAMERA, two_views
+from geometry_scenes import CAMERA, many_views
 from torch import Tensor
 
 from torchslam.data import open_sequence
@@ -32,23 +32,13 @@ def matrix_of(T_21: Tensor) -> Tensor:
 
 
 def pairs(
-    count: int = 20,
-    noise: float = 0.5,
-    matches: int = 200,
-    plane: bool = False,
-    camera: Camera = CAMERA,
-    first: int = 100,
+    count: int = 20, noise: float = 0.5, matches: int = 200, plane: bool = False, camera: Camera = CAMERA
 ) -> Matches:
     """The true F, matching pixels and their mask of pairs of views of a scene of its own each."""
-    scenes = [
-        two_views(seed, matches, outliers=0.0, noise=noise, plane=plane, camera=camera)
-        for seed in range(first, first + count)
-    ]
-    pixels_1, pixels_2, T_21, mask = (
-        torch.cat([getattr(scene, name) for scene in scenes])
-        for name in ("pixels_1", "pixels_2", "T_21", "mask")
+    scene = many_views(
+        range(100, 100 + count), count=matches, outliers=0.0, noise=noise, plane=plane, camera=camera
     )
-    return matrix_of(T_21), pixels_1, pixels_2, mask
+    return matrix_of(scene.T_21), scene.pixels_1, scene.pixels_2, scene.mask
 
 
 def moving(omega: Tensor, t: Tensor, noise: float = 0.5, seed: int = 0) -> Matches:
@@ -105,11 +95,11 @@ def off(found: ViewGraphFocal) -> float:
 
 
 def test_exact_pairs_give_the_focal_length() -> None:
-    F, pixels_1, pixels_2, mask = pairs(noise=0.0)
+    matches = pairs(noise=0.0)
     for found in (
-        focal_from_fundamentals(F, CENTER, SIZE),
-        focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE),
-        focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE, k1_std=0.0),
+        focal_from_fundamentals(matches[0], CENTER, SIZE),
+        focal_from_pairs(*matches, CENTER, SIZE),
+        focal_from_pairs(*matches, CENTER, SIZE, k1_std=0.0),
     ):
         assert off(found) < 1e-6
         assert found.success
@@ -120,7 +110,7 @@ def test_exact_pairs_give_the_focal_length() -> None:
 
 @pytest.mark.parametrize("focal", [200.0, 420.0, 640.0, 2000.0])
 def test_any_focal_length_of_the_range_is_found(focal: float) -> None:
-    T_21 = torch.cat([two_views(seed).T_21 for seed in range(10)])
+    T_21 = many_views(range(10)).T_21
     inverse = torch.linalg.inv(torch.cat((K[:, :2] * focal / FOCAL, K[:, 2:]), 1))
     F = inverse.mT @ essential_from_pose(T_21[:, :3, :3], T_21[:, :3, 3]) @ inverse
     assert float(focal_from_fundamentals(F, CENTER, SIZE).focal) == pytest.approx(focal, rel=1e-6)
@@ -128,15 +118,15 @@ def test_any_focal_length_of_the_range_is_found(focal: float) -> None:
 
 @pytest.mark.parametrize("noise", [0.3, 1.0])
 def test_noise(noise: float) -> None:
-    F, pixels_1, pixels_2, mask = pairs(noise=noise)
-    found = focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE)
+    matches = pairs(noise=noise)
+    found = focal_from_pairs(*matches, CENTER, SIZE)
     assert found.success
     assert off(found) < min(0.02, 3 * float(found.std))
     assert found.inliers.sum() >= 18
-    exactly = focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE, k1_std=0.0)
+    exactly = focal_from_pairs(*matches, CENTER, SIZE, k1_std=0.0)
     assert off(exactly) < min(0.01, 3 * float(exactly.std))
     assert exactly.std < found.std  # what is given is no doubt
-    noisy = focal_from_fundamentals(disturbed(F, 2e-3 * noise), CENTER, SIZE)
+    noisy = focal_from_fundamentals(disturbed(matches[0], 2e-3 * noise), CENTER, SIZE)
     assert off(noisy) < min(0.02, 3 * float(noisy.std))
     assert noisy.success
 
@@ -168,11 +158,11 @@ def test_pairs_of_another_camera_are_no_inliers() -> None:
 
 
 def test_distortion_is_estimated_too() -> None:
-    F, pixels_1, pixels_2, mask = pairs(noise=0.3, camera=BENT)
-    found = focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE)
+    matches = pairs(noise=0.3, camera=BENT)
+    found = focal_from_pairs(*matches, CENTER, SIZE)
     assert off(found) < 0.015
     assert float(found.k1) == pytest.approx(0.04, abs=0.015)
-    straight = focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE, k1_std=0.0)
+    straight = focal_from_pairs(*matches, CENTER, SIZE, k1_std=0.0)
     assert off(straight) > 2 * off(found)
     assert straight.k1 == 0
 
@@ -263,9 +253,8 @@ def test_weights_count_pairs() -> None:
     twice = focal_from_fundamentals(torch.cat((F, F[:1])), CENTER, SIZE)
     weights = torch.ones(12, dtype=torch.float64)
     weights[0] = 2.0
-    torch.testing.assert_close(
-        focal_from_fundamentals(F, CENTER, SIZE, weights).focal, twice.focal, rtol=1e-9, atol=0
-    )
+    found = focal_from_fundamentals(F, CENTER, SIZE, weights)
+    torch.testing.assert_close(found.focal, twice.focal, rtol=1e-9, atol=0)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, 0.0])
@@ -275,27 +264,20 @@ def test_a_matrix_that_is_none_is_left_out(value: float) -> None:
     F[0] = value
     found = focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE)
     torch.testing.assert_close(found.focal, good, rtol=1e-6, atol=0)
-    torch.testing.assert_close(
-        focal_from_fundamentals(F, CENTER, SIZE).focal,
-        focal_from_fundamentals(F[1:], CENTER, SIZE).focal,
-        rtol=1e-9,
-        atol=0,
-    )
+    both = (focal_from_fundamentals(each, CENTER, SIZE).focal for each in (F, F[1:]))
+    torch.testing.assert_close(*both, rtol=1e-9, atol=0)
 
 
 def test_order_scale_and_sign_do_not_matter() -> None:
     F, pixels_1, pixels_2, mask = pairs(12)
     order = torch.randperm(12, generator=torch.Generator().manual_seed(0))
     one = focal_from_pairs(F, pixels_1, pixels_2, mask, CENTER, SIZE)
-    factors = 3 * normal(12, 1, 1)
-    other = focal_from_pairs(
-        (factors * F)[order], pixels_1[order], pixels_2[order], mask[order], CENTER, SIZE
-    )
+    scaled = 3 * normal(12, 1, 1) * F
+    other = focal_from_pairs(*(x[order] for x in (scaled, pixels_1, pixels_2, mask)), CENTER, SIZE)
     torch.testing.assert_close(one.focal, other.focal, rtol=1e-6, atol=0)
     torch.testing.assert_close(one.errors[order], other.errors, rtol=1e-4, atol=1e-6)
-    back = focal_from_pairs(
-        F.mT, pixels_2, pixels_1, mask, CENTER, SIZE
-    )  # from the second views to the first
+    # from the second views to the first
+    back = focal_from_pairs(F.mT, pixels_2, pixels_1, mask, CENTER, SIZE)
     torch.testing.assert_close(one.focal, back.focal, rtol=1e-6, atol=0)
 
 

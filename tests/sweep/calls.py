@@ -28,7 +28,6 @@ class Call(NamedTuple):
         arguments: by name.
         vmap: whether `torch.vmap` may map it over a further dimension of all its tensors of floats.
         gradient: whether results carry a gradient to arguments.
-        nan: whether rows that are not finite are left out, so that the others give what they give alone.
     """
 
     function: Callable[..., Any]
@@ -133,6 +132,9 @@ def calls() -> dict[str, Call]:
     def of(function: Callable[..., Any], **arguments: Any) -> Call:
         return Call(function, arguments)
 
+    def alone(function: Callable[..., Any], **arguments: Any) -> Call:
+        return Call(function, arguments, vmap=False)
+
     def decision(function: Callable[..., Any], **arguments: Any) -> Call:
         return Call(function, arguments, vmap=False, gradient=False)
 
@@ -140,25 +142,20 @@ def calls() -> dict[str, Call]:
     increments = g.preintegrate(steps, 0.1 * rand(B, 6), 1e-3, 2e-2)
     undistorted = g.UndistortedKeypoints.of(v["pixels_2"][0], CAMERA)
     return {
-        "inertial_steps": Call(
+        "inertial_steps": alone(
             g.inertial_steps,
-            {
-                "timestamps": torch.arange(N, dtype=F64) / 100,
-                "gyroscope": rand(N, 3),
-                "accelerometer": rand(N, 3),
-                "start": torch.tensor([0.012, 0.05], dtype=F64),
-                "end": torch.tensor([0.2, 0.31], dtype=F64),
-            },
-            vmap=False,
+            timestamps=torch.arange(N, dtype=F64) / 100,
+            gyroscope=rand(N, 3),
+            accelerometer=rand(N, 3),
+            start=torch.tensor([0.012, 0.05], dtype=F64),
+            end=torch.tensor([0.2, 0.31], dtype=F64),
         ),
-        "preintegrate": Call(
+        "preintegrate": of(
             g.preintegrate,
-            {
-                "steps": steps,
-                "bias": 0.1 * rand(B, 6),
-                "gyroscope_density": 1e-3,
-                "accelerometer_density": 2e-2,
-            },
+            steps=steps,
+            bias=0.1 * rand(B, 6),
+            gyroscope_density=1e-3,
+            accelerometer_density=2e-2,
         ),
         "compose_increments": of(g.compose_increments, first=increments, second=increments),
         "with_bias_change": of(g.with_bias_change, increments=increments, change=0.01 * rand(B, 6)),
@@ -227,14 +224,14 @@ def calls() -> dict[str, Call]:
             **both,
         ),
         "umeyama": of(g.umeyama, source=v["points_w"], target=points_c, weights=v["mask"]),
-        "estimate_absolute_pose": Call(
+        "estimate_absolute_pose": alone(
             g.estimate_absolute_pose,
-            {"points_w": v["points_w"], "pixels": v["pixels_2"], "camera": CAMERA, "mask": v["mask"]},
-            vmap=False,
+            points_w=v["points_w"],
+            pixels=v["pixels_2"],
+            camera=CAMERA,
+            mask=v["mask"],
         ),
-        "estimate_relative_pose": Call(
-            g.estimate_relative_pose, {**pair, "mask": v["mask"], "weights": ones}, vmap=False
-        ),
+        "estimate_relative_pose": alone(g.estimate_relative_pose, **pair, mask=v["mask"], weights=ones),
         "estimate_similarity": decision(
             g.estimate_similarity,
             points_1=v["points_w"],
@@ -265,17 +262,14 @@ def calls() -> dict[str, Call]:
             mask=v["mask"],
             prior=o.PosePrior(T_2, torch.eye(6, dtype=F64).repeat(B, 1, 1)),
         ),
-        "solve_bundle": Call(o.solve_bundle, {"problem": bundle()}),
+        "solve_bundle": of(o.solve_bundle, problem=bundle()),
         "solve_pose_graph": of(o.solve_pose_graph, graph=graph()),
-        "solve_rotations": Call(
+        "solve_rotations": alone(
             o.solve_rotations,
-            {
-                "edges": edges,
-                "R_ji": R_cw[edges[:, 1]] @ R_cw[edges[:, 0]].mT @ so3_exp(0.01 * rand(4, 3)),
-                "num_views": 4,
-                "weights": torch.ones(4, dtype=F64),
-            },
-            vmap=False,
+            edges=edges,
+            R_ji=R_cw[edges[:, 1]] @ R_cw[edges[:, 0]].mT @ so3_exp(0.01 * rand(4, 3)),
+            num_views=4,
+            weights=torch.ones(4, dtype=F64),
         ),
         "solve_least_squares": of(
             o.solve_least_squares,

@@ -185,6 +185,21 @@ def test_a_column_is_refused_or_right(call: Call) -> None:
                 assert_same(found, expected, exact=False)
 
 
+@pytest.mark.parametrize("name", [name for name in CALLS if name in (*geometry.__all__, "ate", "rpe")])
+def test_results_have_the_dtype_and_device_of_the_data(
+    name: str, device: torch.device, dtype: torch.dtype
+) -> None:
+    def moved(tensor: Tensor) -> Tensor:
+        return tensor.to(device, dtype if tensor.is_floating_point() else tensor.dtype)
+
+    expected = run(CALLS[name])
+    found = run(CALLS[name], mapped(CALLS[name].arguments, moved))
+    for one, other in zip(found, expected, strict=True):
+        assert one.device.type == device.type
+        assert one.dtype == (dtype if other.is_floating_point() else other.dtype)
+        assert one.shape[1:] == other.shape[1:]  # five_point has as many as it finds
+
+
 @pytest.mark.parametrize("size", [B, N], ids=["batch", "rows"])
 def test_nothing_gives_nothing_or_is_refused(call: Call, size: int) -> None:
     def emptied(tensor: Tensor) -> Tensor:

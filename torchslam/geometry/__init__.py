@@ -2,13 +2,6 @@
 
 from torchslam.geometry.absolute_pose import AbsolutePose, estimate_absolute_pose, start_pose
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.essential import (
-    decompose_essential,
-    epipolar_offsets,
-    essential_from_pose,
-    five_point,
-    sampson_errors,
-)
 from torchslam.geometry.gating import (
     CHI_SQUARE_95,
     KeypointNoise,
@@ -23,12 +16,6 @@ from torchslam.geometry.geodesy import (
     enu_from_geodetic,
     geodetic_from_ecef,
     geodetic_from_enu,
-)
-from torchslam.geometry.homography import (
-    decompose_homography,
-    homography_from_matches,
-    rotation_from_matches,
-    transfer_errors,
 )
 from torchslam.geometry.lie import (
     matrix_from_quaternion,
@@ -63,7 +50,7 @@ from torchslam.geometry.preintegration import (
     with_bias_change,
 )
 from torchslam.geometry.relative_pose import RelativePose, estimate_relative_pose
-from torchslam.geometry.sensor import SensorModel, SharedCamera
+from torchslam.geometry.sensor import SensorModel, SharedCamera, UndistortedKeypoints, Undistortion
 from torchslam.geometry.similarity import Similarity, estimate_similarity, umeyama
 from torchslam.geometry.triangulation import (
     MultiViewTriangulation,
@@ -73,7 +60,17 @@ from torchslam.geometry.triangulation import (
     triangulate_many,
     triangulation_covariance,
 )
-from torchslam.geometry.undistorted import UndistortedKeypoints, Undistortion
+from torchslam.geometry.two_view_matrices import (
+    decompose_essential,
+    decompose_homography,
+    epipolar_offsets,
+    essential_from_pose,
+    five_point,
+    homography_from_matches,
+    rotation_from_matches,
+    sampson_errors,
+    transfer_errors,
+)
 
 __all__ = [
     "CHI_SQUARE_95",

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,15 +16,10 @@ from torchslam.geometry.estimate_gradients import (
     refuse_transforms,
     with_zero_gradient,
 )
-from torchslam.geometry.lie import rigid, se3_exp, transform
+from torchslam.geometry.lie import homogeneous, rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.projections import (
-    fit_projections,
-    pose_tangent,
-    score_projections,
-    squared_projections,
-)
+from torchslam.geometry.projections import fit_projections, pose_tangent, squared_projections
 from torchslam.geometry.ransac import (
     CONFIDENCE,
     SUPPORT_WIDTH,
@@ -35,22 +29,25 @@ from torchslam.geometry.ransac import (
     check_search,
     gather_rows,
     is_significant,
+    leave_a_line,
     levenberg_marquardt,
+    pose_rows,
     retract_pose,
     sample_minimal,
     sample_minimal_of_all,
     search,
+    some_problems,
     truncated_rows,
+    truncated_score,
     valid_first,
 )
-from torchslam.geometry.undistorted import UndistortedKeypoints
+from torchslam.geometry.sensor import UndistortedKeypoints
 
 FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
 CANDIDATES = 2  # hypotheses of each round that are optimized
 LOCAL_ITERATIONS, FINAL_ITERATIONS = 1, 10
 """Of a hypothesis within the search, which only ranks it, and of the final refinement. Tried at these values only."""
 FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without this refinement more runs are lost
-_ON_A_LINE = 1e-6  # of the largest variance of the points: the second is no more than rounding
 
 
 @dataclass(frozen=True)
@@ -87,20 +84,15 @@ def estimate_absolute_pose(
     The same arguments and seed give the same result. Where an input requires a gradient, T_cw carries that of the final
     least squares with respect to points, pixels and camera parameters, with the set of rows it uses fixed (implicit
     function theorem, exact Hessian). Sources: Fischler and Bolles, 1981; Chum et al., "Locally optimized RANSAC", 2003;
-    for P3P see `p3p`.
+    for P3P see `p3p`. Too few points, points on a line, or pure noise give `success` False.
 
     Args:
-        points_w: points.
-        pixels: where they are seen.
         camera: one for all, or a batch of B.
         threshold: reprojection error of an inlier, pixels.
         mask: rows in use; rows with NaN are never used.
         seed: of the random samples.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples per camera.
-
-    Returns:
-        The poses; `success` is False for a camera with too few points, points on a line, or pure noise.
 
     Raises:
         ValueError: A shape or a dtype does not fit.
@@ -120,14 +112,20 @@ def estimate_absolute_pose(
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)
     pixels = torch.where(mask[..., None], pixels, 0.0)
+    effort = seed, confidence, max_samples
     with torch.inference_mode():  # less work per operation than without gradients only
-        problem = _Problem.of(points_w.detach(), pixels.detach(), camera, threshold, mask)
-        results = problem.solve(seed, confidence, max_samples)
+        results = _estimate(points_w.detach(), pixels.detach(), camera, threshold, mask, effort)
     T_cw, success, squared, score = (result.clone() for result in results)  # fit for graphs
     mask = mask & success[:, None]
     if needs_gradient(points_w, pixels, camera.params):
-        used = (squared < FINAL_WIDTH**2) & mask
-        T_cw = attach_absolute_pose(T_cw, points_w, pixels, camera, used)
+        used, found = (squared < FINAL_WIDTH**2) & mask, T_cw
+
+        def objective(xi: Tensor) -> Tensor:
+            projected, valid = camera.project(transform(se3_exp(xi) @ found, points_w))
+            squared = (projected - pixels).square().sum(-1)
+            return torch.where(used & valid, squared, 0.0).sum(-1)
+
+        T_cw = se3_exp(implicit_step(objective, found[:, 0, :1].expand(-1, 6))) @ found
     return AbsolutePose(T_cw, (squared < 1) & mask, success, score)
 
 
@@ -148,8 +146,7 @@ def start_pose(
     undistorted coordinates, in pixels at each keypoint. The same arguments and seed give the same result.
 
     Args:
-        points_w: finite points.
-        undistorted: of the N keypoints that see them.
+        undistorted: of the keypoints that see the points, which are finite.
         size: (width, height) of the image.
         threshold: reprojection error of an inlier, pixels.
         seed: of the random samples.
@@ -171,7 +168,7 @@ def start_pose(
     P = search_data.best_pose(seed, confidence, max_samples)
     P = search_data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
     inliers = search_data.squared_errors(P) < 1
-    if not bool(is_success(inliers, mask, search_data.points, size, threshold)):
+    if not bool(_is_success(inliers, mask, search_data.points, size, threshold)):
         return None
     P = P[0]
     T_cw = torch.eye(4, dtype=P.dtype, device=P.device)
@@ -180,14 +177,54 @@ def start_pose(
     return T_cw
 
 
+def _estimate(
+    points_w: Float[Tensor, "B N 3"],
+    pixels: Float[Tensor, "B N 2"],
+    camera: Camera,
+    threshold: float,
+    mask: Bool[Tensor, "B N"],
+    effort: tuple[int, float, int],
+) -> tuple[Float[Tensor, "B 4 4"], Bool[Tensor, " B"], Float[Tensor, "B N"], Float[Tensor, " B"]]:
+    """T_cw, success, squared errors in thresholds and score. effort: seed, confidence, largest number of samples"""
+    weights = mask[..., None].to(points_w.dtype)
+    center = (points_w * weights).sum(1) / weights.sum(1).clamp_min(1.0)
+    camera = camera.with_params(camera.params.detach().expand(len(points_w), -1))
+    xy = camera.normalize(pixels)
+    data = _Search.of(points_w - center[:, None], xy, camera.pixel_scale(xy) / threshold, mask)
+    P = data.fit(data.best_pose(*effort)[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
+    if camera.model == "pinhole":  # whose undistorted coordinates are pixels up to their scale
+        squared = data.squared_errors(P)
+    else:
+
+        def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
+            points_c = (P @ data.homogeneous).mT
+            projected, valid, J = camera.project_with_point_jacobians(points_c)
+            residual = projected - pixels
+            squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf) / threshold**2
+            used, cost = truncated_rows(squared[:, None], mask, FINAL_WIDTH)
+            rows = (
+                torch.cat((pose_rows(J, points_c), residual[..., None]), dim=-1) * used[:, 0, :, None, None]
+            )
+            rows = rows.flatten(1, 2)
+            return torch.bmm(rows.mT, rows), cost[:, 0]
+
+        (P,), _ = levenberg_marquardt((P,), evaluate, retract_pose, FINAL_ITERATIONS)
+        projected, valid = camera.project((P @ data.homogeneous).mT)
+        # Infinite also beyond the monotone part of the distortion.
+        squared = ((projected - pixels) / threshold).square().sum(-1).masked_fill(~valid, torch.inf)
+    success = _is_success((squared < 1) & mask, mask, data.points, camera.size, threshold)
+    score = torch.where(mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
+    R, t = P[..., :3], P[..., 3]
+    T_cw = rigid(R, t - (R @ center[..., None]).squeeze(-1))
+    eye = torch.eye(4, dtype=P.dtype, device=P.device)
+    return torch.where(success[:, None, None], T_cw, eye), success, squared, score
+
+
 @dataclass(frozen=True)
 class _Search:
-    """The data of B searches in undistorted coordinates.
+    """The data of B searches in undistorted coordinates; points are about their mean: float32 is enough for scores.
 
-    Points are relative to their mean, so that float32 is enough for scores.
-
-    scale:     thresholds per unit of xy, of one direction or of both
-    is_single: one problem in which all rows count: samples and scores take fewer calls
+    scale: thresholds per unit of xy, of one direction or of both; is_single: one problem in which all rows count
     """
 
     points: Float[Tensor, "B N 3"]
@@ -200,18 +237,13 @@ class _Search:
 
     @classmethod
     def of(cls, points: Tensor, xy: Tensor, scale: Tensor, mask: Tensor, is_single: bool = False) -> _Search:
-        homogeneous = torch.cat((points, torch.ones_like(points[..., :1])), dim=-1).mT
-        rays = torch.nn.functional.pad(xy, (0, 1), value=1.0)
+        rays = homogeneous(xy)
         rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-        return cls(points, rays, homogeneous, xy, scale, mask, is_single)
+        return cls(points, rays, homogeneous(points).mT, xy, scale, mask, is_single)
 
     def select(self, rows: Tensor) -> _Search:
         """Some of the problems."""
-        if len(rows) == len(self.points):
-            return self
-        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
-        return replace(self, **chosen)
+        return self if len(rows) == len(self.points) else some_problems(self, rows)
 
     def best_pose(self, seed: int, confidence: float, max_samples: int) -> Float[Tensor, "B 3 4"]:
         """The pose of each problem with most support."""
@@ -266,7 +298,7 @@ class _Search:
             homogeneous, xy, scale = (gather_rows(values, rows) for values in (homogeneous, xy, scale))
             mask = mask.gather(1, rows)
         P = P.float().unflatten(-1, (3, 4))
-        return score_projections(P, homogeneous.mT.float(), xy.float(), scale, mask)
+        return truncated_score(squared_projections(P, homogeneous.mT.float(), xy.float(), scale), mask)
 
     def fit(
         self, P: Float[Tensor, "B K 3 4"], iterations: int, width: float = 1.0
@@ -283,107 +315,14 @@ class _Search:
         return squared[:, 0].nan_to_num(torch.inf)
 
 
-@dataclass(frozen=True)
-class _Problem:
-    """Poses of B cameras, whose distortion counts.
-
-    data: the search in undistorted coordinates; center: mean of the points
-    """
-
-    data: _Search
-    pixels: Float[Tensor, "B N 2"]
-    camera: Camera
-    threshold: float
-    center: Float[Tensor, "B 3"]
-
-    @staticmethod
-    def of(points_w: Tensor, pixels: Tensor, camera: Camera, threshold: float, mask: Tensor) -> _Problem:
-        weights = mask[..., None].to(points_w.dtype)
-        center = (points_w * weights).sum(1) / weights.sum(1).clamp_min(1.0)
-        points = points_w - center[:, None]
-        camera = camera.with_params(camera.params.detach().expand(len(points), -1))
-        xy = camera.normalize(pixels)
-        data = _Search.of(points, xy, camera.pixel_scale(xy) / threshold, mask)
-        return _Problem(data, pixels, camera, threshold, center)
-
-    def solve(
-        self, seed: int, confidence: float, max_samples: int
-    ) -> tuple[Float[Tensor, "B 4 4"], Bool[Tensor, " B"], Float[Tensor, "B N"], Float[Tensor, " B"]]:
-        """T_cw, success, squared errors in thresholds and score."""
-        mask = self.data.mask
-        P = self.refine(self.data.best_pose(seed, confidence, max_samples))
-        squared = self.squared_errors(P)
-        success = is_success((squared < 1) & mask, mask, self.data.points, self.camera.size, self.threshold)
-        score = torch.where(mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
-        R = P[..., :3]
-        T_cw = rigid(R, P[..., 3] - (R @ self.center[..., None]).squeeze(-1))
-        eye = torch.eye(4, dtype=P.dtype, device=P.device)
-        return torch.where(success[:, None, None], T_cw, eye), success, squared, score
-
-    def squared_errors(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B N"]:
-        """Those of `_Search` through the distortion, and infinite also beyond its monotone part."""
-        if self.camera.model == "pinhole":
-            return self.data.squared_errors(P)
-        projected, valid = self.camera.project((P @ self.data.homogeneous).mT)
-        squared = ((projected - self.pixels) / self.threshold).square().sum(-1)
-        return squared.masked_fill(~valid, torch.inf)
-
-    def refine(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B 3 4"]:
-        """The poses of least truncated squared reprojection error."""
-        P = self.data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
-        if self.camera.model == "pinhole":
-            return P  # whose undistorted coordinates are pixels up to their scale
-
-        def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
-            points_c = (P @ self.data.homogeneous).mT
-            projected, valid, J = self.camera.project_with_point_jacobians(points_c)
-            residual = projected - self.pixels
-            squared = (residual * residual).sum(-1).masked_fill(~valid, torch.inf) / self.threshold**2
-            used, cost = truncated_rows(squared[:, None], self.data.mask, FINAL_WIDTH)
-            J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(J), J, dim=-1)
-            rows = torch.cat((J, J_rotation, residual[..., None]), dim=-1) * used[:, 0, :, None, None]
-            rows = rows.flatten(1, 2)
-            return torch.bmm(rows.mT, rows), cost[:, 0]
-
-        (P,), _ = levenberg_marquardt((P,), evaluate, retract_pose, FINAL_ITERATIONS)
-        return P
-
-
-def is_success(
+def _is_success(
     inliers: Bool[Tensor, "B N"],
     mask: Bool[Tensor, "B N"],
     points: Float[Tensor, "B N 3"],
     size: tuple[int, int],
     threshold: float,
 ) -> Bool[Tensor, " B"]:
-    """Test whether the inliers among the rows in use are significant and fix the pose: four or more, not on one line.
-
-    Args:
-        points: about their mean.
-        size: of the image.
-        threshold: of an inlier, pixels.
-    """
+    """Test whether the inliers among the rows in use are significant and fix the pose: four or more, not on a line."""
     chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
     significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
-    inliers = inliers[..., None]
-    mean = torch.where(inliers, points, 0.0).sum(1, keepdim=True) / inliers.sum(1, keepdim=True).clamp_min(1)
-    centered = torch.where(inliers, points - mean, 0.0)
-    spread = torch.linalg.eigvalsh(centered.mT @ centered)
-    return significant & (spread[:, 1] > _ON_A_LINE * spread[:, 2])
-
-
-def attach_absolute_pose(
-    T_cw: Float[Tensor, "B 4 4"],
-    points_w: Float[Tensor, "B N 3"],
-    pixels: Float[Tensor, "B N 2"],
-    camera: Camera,
-    used: Bool[Tensor, "B N"],
-) -> Float[Tensor, "B 4 4"]:
-    """Attach to the poses the gradient of the minimizer of the squared error over the rows in use."""
-
-    def objective(xi: Tensor) -> Tensor:
-        projected, valid = camera.project(transform(se3_exp(xi) @ T_cw, points_w))
-        squared = (projected - pixels).square().sum(-1)
-        return torch.where(used & valid, squared, 0.0).sum(-1)
-
-    return se3_exp(implicit_step(objective, T_cw[:, 0, :1].expand(-1, 6))) @ T_cw
+    return significant & leave_a_line(points, inliers)

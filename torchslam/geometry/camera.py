@@ -16,20 +16,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry import distortion
+from torchslam.geometry.lie import homogeneous
 from torchslam.geometry.precision import without_autocast
 from torchslam.utils.torch_internals import default_collate_fn_map, in_transform, register_pytree
 
 Scalar = float | Tensor
 Numbers = Tensor | np.ndarray | Sequence[Any]
-
-
 P = ParamSpec("P")
 R = TypeVar("R")
 
 
 def _in_dtype_of_data(method: Callable[Concatenate[Camera, P], R]) -> Callable[Concatenate[Camera, P], R]:
-    """The method of the camera with parameters in the dtype of its argument."""
+    """The method, without autocast, of the camera with parameters in the dtype of its argument."""
 
+    @without_autocast
     @wraps(method)
     def following(self: Camera, *args: P.args, **kwargs: P.kwargs) -> R:
         data: Any = args[0] if args else next(iter(kwargs.values()))
@@ -42,12 +42,10 @@ def _in_dtype_of_data(method: Callable[Concatenate[Camera, P], R]) -> Callable[C
 class Camera:
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
 
-    Parameters given as Python numbers are float64, so that nothing is lost. Whoever takes a camera and tensors computes
-    in the dtype of the tensors, the methods as well: the camera follows the data.
-
-    Every method is differentiable with respect to points, pixels and `params`, up to the third order where it undoes a
-    distortion. A camera is a pytree with `params` as its only leaf, so that `torch.func` and
-    `torch.utils.data.default_collate` accept it.
+    Parameters given as Python numbers are float64. Whoever takes a camera and tensors computes in the dtype of the
+    tensors, the methods as well. Every method is differentiable with respect to points, pixels and `params`, up to the
+    third order where it undoes a distortion. A camera is a pytree with `params` as its only leaf, so that `torch.func`
+    and `torch.utils.data.default_collate` accept it.
 
     Attributes:
         model: "pinhole", "radial_tangential", "rational" or "fisheye".
@@ -62,7 +60,7 @@ class Camera:
     size: tuple[int, int]
 
     follows_data: ClassVar[bool] = True
-    """`check_arguments` lets it have another dtype, and `full_precision` converts it."""
+    """`full_precision` lets it have another dtype, and converts it."""
 
     def __post_init__(self) -> None:
         if self.model not in distortion.MODELS:
@@ -118,11 +116,7 @@ class Camera:
 
     @staticmethod
     def from_opencv(
-        K: Numbers,
-        dist: Numbers | None,
-        size: tuple[int, int],
-        *,
-        fisheye: bool = False,
+        K: Numbers, dist: Numbers | None, size: tuple[int, int], *, fisheye: bool = False
     ) -> Camera:
         """The camera of a matrix and distortion coefficients, as `cv2.calibrateCamera` returns them.
 
@@ -242,11 +236,7 @@ class Camera:
 
     @staticmethod
     def stack(cameras: Sequence[Camera]) -> Camera:
-        """Stack cameras along a leading dimension.
-
-        Raises:
-            ValueError: The cameras differ in model or size.
-        """
+        """Stack cameras along a leading dimension. Raises ValueError if they differ in model or size."""
         kinds = sorted({(camera.model, tuple(camera.size)) for camera in cameras})
         if len(kinds) != 1:
             raise ValueError(f"cameras of a batch must have one model and one size, not {kinds}")
@@ -256,7 +246,6 @@ class Camera:
         """Move the camera to another device or dtype; arguments as of `Tensor.to`."""
         return Camera(self.model, self.params.to(*args, **kwargs), self.size)
 
-    @without_autocast
     @_in_dtype_of_data
     def project(
         self, points_c: Float[Tensor, "*#batch N 3"]
@@ -271,32 +260,22 @@ class Camera:
         distorted = self._distortion.distort(normalized, self.params[..., None, 4:])
         return self._to_pixels(distorted, valid), valid
 
-    @without_autocast
     @_in_dtype_of_data
     def project_with_point_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
     ) -> tuple[Float[Tensor, "*#batch N 2"], Bool[Tensor, "*#batch N"], Float[Tensor, "*#batch N 2 3"]]:
-        """Project points, with the analytic derivative with respect to the points.
-
-        Returns:
-            Pixels, valid and d pixels / d points_c, zero where invalid.
-        """
+        """Project points; also return the analytic derivatives by the points, zero where invalid."""
         normalized, valid = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2]
         distorted = self._distortion.distort(normalized, coefficients)
         inverse_depth = torch.where(valid, 1 / points_c[..., 2].masked_fill(~valid, 1.0), 0.0)
         scale = focal * inverse_depth[..., None]
         slope = self._distortion.slope(normalized, coefficients) * scale[..., None]
-        (a, b), (c, d), (x, y) = (
-            slope[..., 0, :].unbind(-1),
-            slope[..., 1, :].unbind(-1),
-            normalized.unbind(-1),
-        )
+        a, b, c, d, x, y = *slope.flatten(-2).unbind(-1), *normalized.unbind(-1)
         rows = torch.stack((a, b, -(a * x + b * y), c, d, -(c * x + d * y)))
         J = rows.unflatten(0, (2, 3)).movedim((0, 1), (-2, -1))
         return self._to_pixels(distorted, valid), valid, J
 
-    @without_autocast
     @_in_dtype_of_data
     def project_with_jacobians(
         self, points_c: Float[Tensor, "*#batch N 3"]
@@ -306,11 +285,7 @@ class Camera:
         Float[Tensor, "*#batch N 2 3"],
         Float[Tensor, "*#batch N 2 P"],
     ]:
-        """Project points, with the analytic derivatives with respect to points and parameters.
-
-        Returns:
-            Pixels, valid, d pixels / d points_c and d pixels / d params. Derivatives of invalid points are zero.
-        """
+        """Project points; also return the analytic derivatives by points and `params`, zero where invalid."""
         pixels, valid, J_points = self.project_with_point_jacobians(points_c)
         normalized, _ = self._normalize_points(points_c)
         coefficients, focal = self.params[..., None, 4:], self.params[..., None, :2, None]
@@ -320,25 +295,19 @@ class Camera:
         J_params = torch.cat((torch.diag_embed(distorted), J_center, J_coefficients), dim=-1)
         return pixels, valid, J_points, torch.where(valid[..., None, None], J_params, 0.0)
 
-    @without_autocast
     @_in_dtype_of_data
     def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
-        """Compute undistorted image coordinates x/z, y/z of pixels.
-
-        Beyond the monotone part of the distortion the coordinates are clamped to its edge; NaN gives the center.
-        """
+        """Compute x/z, y/z of pixels, clamped to the edge of the monotone distortion; NaN gives the center."""
         # Replaced before the parameters see it: zero times NaN would be their gradient.
         pixels = torch.where(torch.isfinite(pixels), pixels, self.params.detach()[..., None, 2:4])
         distorted = (pixels - self.params[..., None, 2:4]) / self.params[..., None, :2]
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
 
-    @without_autocast
     @_in_dtype_of_data
     def unproject(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 3"]:
         """Compute bearings of unit length of pixels."""
-        normalized = self.normalize(pixels)
-        ray = torch.cat((normalized, torch.ones_like(normalized[..., :1])), dim=-1)
+        ray = homogeneous(self.normalize(pixels))
         return ray / ray.norm(dim=-1, keepdim=True)
 
     @without_autocast
@@ -349,13 +318,9 @@ class Camera:
         low = border - 0.5
         return (x >= low) & (x <= self.width - 1 - low) & (y >= low) & (y <= self.height - 1 - low)
 
-    @without_autocast
     @_in_dtype_of_data
     def pixel_scale(self, normalized: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
-        """Pixels per unit of undistorted image coordinates, along x and y, locally.
-
-        Exact without distortion; with it, the mean over all directions.
-        """
+        """Pixels per unit of x/z and y/z, locally; with distortion, the mean over all directions."""
         scale = self.params[..., None, :2].expand(normalized.shape)
         if self.model == "pinhole":
             return scale
@@ -363,7 +328,6 @@ class Camera:
         return scale * torch.linalg.det(J).abs().sqrt()[..., None]
 
     def _to_pixels(self, distorted: Tensor, valid: Tensor) -> Tensor:
-        """Pixels of distorted image coordinates; the middle of the image, a constant, where invalid."""
         pixels = distorted * self.params[..., None, :2] + self.params[..., None, 2:4]
         middle = pixels.new_tensor((0.5 * (self.width - 1), 0.5 * (self.height - 1)))
         return torch.where(valid[..., None], pixels, middle)
@@ -382,7 +346,6 @@ class Camera:
 
 
 def _stack(*values: Scalar) -> Float[Tensor, "*batch P"]:
-    """Parameters from floats and tensors; float64 on the CPU unless tensors say otherwise."""
     tensors = [value for value in values if isinstance(value, Tensor)]
     dtype = reduce(torch.promote_types, [tensor.dtype for tensor in tensors]) if tensors else torch.float64
     device = tensors[0].device if tensors else "cpu"

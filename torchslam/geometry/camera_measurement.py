@@ -7,7 +7,6 @@ be wrong; bundle adjustments take it as a prior and move the camera along these 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass, replace
 from typing import Self
 
@@ -75,9 +74,8 @@ class CameraMeasurement:
     def with_error(self, camera: Camera, covariance: Float[Tensor, "n n"]) -> CameraMeasurement:
         """Another camera with a covariance of the steps along the directions."""
         variances, axes = torch.linalg.eigh(covariance)
-        return replace(
-            self, camera=camera, directions=self.directions @ (axes * variances.clamp_min(0.0).sqrt())
-        )
+        directions = self.directions @ (axes * variances.clamp_min(0.0).sqrt())
+        return replace(self, camera=camera, directions=directions)
 
     def nearest(self, camera: Camera) -> Camera:
         """The camera with what may be wrong as another one has it, and the rest as given."""
@@ -85,19 +83,9 @@ class CameraMeasurement:
         along = self.directions @ (torch.linalg.pinv(self.directions) @ off)
         return camera.with_params(self.camera.params + along)
 
-    def departure(self, camera: Camera) -> float:
-        """Distance of a camera's focal length from the mean, in standard deviations; 0 for an exact one."""
-        std = self.focal_std
-        off = abs(math.log(float(camera.focal) / float(self.camera.focal)))
-        return off / std if std > 0 else 0.0
-
-
-MAX_DEPARTURE = 5.0
-"""Standard deviations by which an estimated camera may differ from the given one."""
-
 
 def may_be_same(found: Camera, given: Camera, std: float) -> bool:
-    """Whether a run may have found one camera where another one was given with a relative standard deviation.
+    """Whether a run may have found one camera where another one was given: within five relative standard deviations.
 
     What a run does not adjust must be equal, to the nine digits of a calibration file.
     """
@@ -105,7 +93,7 @@ def may_be_same(found: Camera, given: Camera, std: float) -> bool:
     if one.model != other.model:
         return False
     off = one.params - other.params
-    allowed = MAX_DEPARTURE * CameraMeasurement.of(given, std).directions.norm(dim=-1)
+    allowed = 5 * CameraMeasurement.of(given, std).directions.norm(dim=-1)
     return bool((off.abs() <= allowed + 1e-8 * other.params.abs()).all())
 
 

@@ -20,10 +20,9 @@ from torch import Tensor
 from torchslam.geometry.estimate_gradients import needs_gradient
 from torchslam.utils.torch_internals import in_transform
 
-_NEWTON_STEPS = 12
-"""Of the inverse map; more are needed close to the limit of the model. Tried at this value only."""
-_GRAPH_STEPS = 2
-"""Newton steps from the solution on that gradients pass: one gives the first derivative, two give three."""
+_NEWTON_STEPS, _GRAPH_STEPS = 12, 2
+"""Of the inverse map, tried at this value only; and those from the solution on that gradients pass: one gives the first
+derivative, two give three."""
 
 
 @dataclass(frozen=True)
@@ -52,8 +51,7 @@ class Distortion:
 def first_positive_root(coefficients: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:
     """Smallest positive root of 1 + c_1 u + ... + c_K u^K, infinity where there is none.
 
-    Found as the largest real eigenvalue 1/u of the companion matrix of the reversed polynomial, which stays
-    monic whichever coefficients vanish.
+    The largest real eigenvalue 1/u of the companion matrix of the reversed polynomial, which stays monic.
     """
     degree = coefficients.shape[-1]
     first = -torch.where(torch.isfinite(coefficients), coefficients, 0.0)[..., None, :]
@@ -66,11 +64,8 @@ def first_positive_root(coefficients: Float[Tensor, "*batch D"]) -> Float[Tensor
 
 
 def _converged(step: Tensor) -> bool:
-    """Test whether the next Newton step, about the square of the largest one, would have no effect.
-
-    Under `torch.func`, where no decision may depend on values, all steps are taken.
-    """
-    if in_transform():
+    """Test whether the next Newton step, about the square of the largest one, would have no effect."""
+    if in_transform():  # where no decision may depend on values
         return False
     return step.numel() == 0 or float(step.abs().max()) < torch.finfo(step.dtype).eps ** 0.5
 
@@ -87,10 +82,7 @@ def _implicit_step(
 
 
 def length(xy: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
-    """Length of vectors, not differentiable at zero.
-
-    Many times as fast as `norm` where each coordinate is in one piece of memory.
-    """
+    """Length of vectors, not differentiable at zero; faster than `norm` if a coordinate is in one piece of memory."""
     x, y = xy.unbind(-1)
     return (x * x + y * y).sqrt()
 
@@ -124,7 +116,6 @@ def _brown(xy: Tensor, k: Tensor) -> Tensor:
 
 
 def _brown_slope(xy: Tensor, k: Tensor) -> Tensor:
-    """d distorted / d xy. (..., 2, 2)."""
     x, y = xy.unbind(-1)
     k1, k2, p1, p2, k3, *below = k.unbind(-1)
     r2 = x * x + y * y
@@ -142,7 +133,6 @@ def _brown_slope(xy: Tensor, k: Tensor) -> Tensor:
 
 
 def _brown_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
-    """d distorted / d k. (..., 2, K)."""
     x, y = xy.unbind(-1)
     xx, yy, xy2 = x * x, y * y, 2 * x * y
     r2 = xx + yy
@@ -186,7 +176,7 @@ def _invert(
 
 
 def _radial_tangential_limit(k: Tensor) -> Tensor:
-    """The radius at which r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing."""
+    """Where r (1 + k1 r^2 + k2 r^4 + k3 r^6) stops growing."""
     return first_positive_root(torch.stack((3 * k[..., 0], 5 * k[..., 1], 7 * k[..., 4]), dim=-1)).sqrt()
 
 
@@ -246,7 +236,6 @@ def _fisheye_slope(xy: Tensor, k: Tensor) -> Tensor:
 
 
 def _fisheye_coefficient_slope(xy: Tensor, k: Tensor) -> Tensor:
-    """d distorted / d k. (..., 2, 4)."""
     radius, zero = _safe_radius(xy)
     angle = torch.atan(torch.where(zero, 0.0, radius))
     u = angle * angle

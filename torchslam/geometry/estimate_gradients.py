@@ -1,7 +1,4 @@
-"""First derivatives of what an estimator found, by the implicit function theorem where it is a minimizer.
-
-Those of any order, of minima of least squares: `torchslam.optim._core.implicit`.
-"""
+"""First derivatives of estimates, by the implicit function theorem; of any order: `torchslam.optim._core.implicit`."""
 
 from __future__ import annotations
 
@@ -87,14 +84,13 @@ def implicit_step(
 ) -> Float[Tensor, "B D"]:
     """A step of value zero that carries the gradient of the minimizer with respect to the data.
 
+    It is -H^-1 (gradient - its value) with the exact Hessian; where H is not positive definite, the gradient is zero.
+    It has no second derivative, see `first_order`.
+
     Args:
         objective: (B, D) -> (B,), a function of the local parameters, zero at the minimizer, that is also a
             function of data with a graph; the problems of the batch must be independent.
         template: for shape and dtype.
-
-    Returns:
-        -H^-1 (gradient - its value) with the exact Hessian. Where the Hessian is not positive definite, the gradient
-        is zero. It has no second derivative, see `first_order`.
     """
     at = torch.zeros_like(template).requires_grad_()
     with torch.enable_grad():

@@ -7,28 +7,26 @@ image, such as pixels from the principal point over the longer side. A matrix is
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.geometry.essential import sampson_errors
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
+from torchslam.geometry.lie import homogeneous
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import median_scale, robustify
 from torchslam.geometry.two_view import TwoViews, fit_homography, propose_homography, transfer_squared
+from torchslam.geometry.two_view_matrices import sampson_errors
 
 _ITERATIONS = 15
 """Of Levenberg-Marquardt, for the matrix and for the homography. Tried at this value only."""
-_LEAST_NOISE = (
-    0.1  # thresholds: SIFT keypoints that are exact to a tenth of a pixel are an accident of few matches
-)
+# Thresholds: SIFT keypoints that are exact to a tenth of a pixel are an accident of few matches.
+_LEAST_NOISE = 0.1
 _FREEDOMS = 7
 """Degrees of freedom of a fundamental matrix: nine numbers less the scale and the rank."""
-# Added to the information, relative to its mean: of a plane or a rotating camera, two directions have none, and their
-# covariance shall be large, not infinite.
-_LEAST_INFORMATION = 1e-12
 # Of a homography: random samples of four matches, so that of matches half of which lie on the plane 98 % have a good
 # one; deviations of the noise within which it explains a match in both coordinates; and as much wider at first, since
 # four matches do not determine it as well as all.
@@ -66,17 +64,25 @@ def refine_fundamental(
 
     Args:
         F_21: where to start, of any scale; without gradient.
-        x_1: matches in view 1.
-        x_2: matches in view 2.
         mask: matches in use, few of them wrong; finite.
         threshold: of the kernel, in units of the coordinates: about the noise of one coordinate or somewhat more.
     """
     x_1, x_2 = (torch.where(mask[..., None], x, 0.0) for x in (x_1, x_2))
+
+    def moved(state: ModelState, step: Float[Tensor, "B 7"]) -> ModelState:
+        U, S, Vh = torch.linalg.svd(state[0].nan_to_num())
+        return (_displaced(U, S, Vh, step),)
+
     with torch.no_grad():
+        # The nearest matrices of rank two, of norm one; NaN where there is none.
+        finite = torch.isfinite(F_21).all(-1).all(-1)[:, None, None]
+        U, S, Vh = torch.linalg.svd(torch.where(finite, F_21, 0.0))
+        F = (U[:, :, :2] * S[:, None, :2]) @ Vh[:, :2]
+        F = F / torch.where(finite, F.flatten(1).norm(dim=1)[:, None, None], torch.nan)
         (F,), _ = levenberg_marquardt(
-            (_rank_two(F_21.detach()),),
+            (F,),
             lambda F: _normal_equations(F, x_1, x_2, mask, threshold),
-            lambda state, step: (_moved(state, step),),
+            moved,
             _ITERATIONS,
         )
         covariance, bend, noise = _uncertainty(F, x_1, x_2, mask, threshold)
@@ -101,13 +107,7 @@ def homography_share(
     """Share of the matches that one homography explains: near one of a plane, and of a camera that only turned.
 
     Then a fundamental matrix follows the noise in two directions, and its covariance cannot be trusted. Not
-    differentiable by design: it serves a decision. The samples are always the same.
-
-    Args:
-        x_1: matches in view 1.
-        x_2: matches in view 2.
-        mask: matches in use.
-        noise: of a coordinate, as of `RefinedFundamental`.
+    differentiable by design: it serves a decision. The samples are always the same. noise: of `RefinedFundamental`
     """
     with torch.no_grad():
         scale = (1 / (_WIDTH * noise))[:, None].expand(mask.shape)
@@ -120,19 +120,6 @@ def homography_share(
         (H,), _ = best_of((H,), cost)
         explained = mask & (transfer_squared(views, H[:, None])[:, 0] < 1)
         return explained.sum(-1).to(x_1.dtype) / mask.sum(-1).clamp_min(1)
-
-
-def _rank_two(F: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 3 3"]:
-    """The nearest matrices of rank two, of norm one; NaN where there is none."""
-    finite = torch.isfinite(F).all(-1).all(-1)[:, None, None]
-    U, S, Vh = torch.linalg.svd(torch.where(finite, F, 0.0))
-    F = (U[:, :, :2] * S[:, None, :2]) @ Vh[:, :2]
-    return F / torch.where(finite, F.flatten(1).norm(dim=1)[:, None, None], torch.nan)
-
-
-def _moved(state: ModelState, step: Float[Tensor, "B 7"]) -> Float[Tensor, "B 3 3"]:
-    U, S, Vh = torch.linalg.svd(state[0].nan_to_num())
-    return _displaced(U, S, Vh, step)
 
 
 def _displaced(
@@ -164,12 +151,15 @@ def _tangents(F: Float[Tensor, "B 3 3"]) -> Float[Tensor, "B 7 9"]:
     return torch.stack([*(products[:, i, j] for i, j in pairs), ratio], dim=1).flatten(2)
 
 
-def _rows(
-    F: Float[Tensor, "B 3 3"], x_1: Float[Tensor, "B N 2"], x_2: Float[Tensor, "B N 2"]
-) -> tuple[Float[Tensor, "B N"], Float[Tensor, "B 7 N"], Float[Tensor, "B N"]]:
-    """Sampson distances, and their derivatives along the tangents and by the bend of the coordinates."""
-    one = torch.ones_like(x_1[..., :1])
-    h_1, h_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
+def _linearized(
+    F: Float[Tensor, "B 3 3"],
+    x_1: Float[Tensor, "B N 2"],
+    x_2: Float[Tensor, "B N 2"],
+    mask: Bool[Tensor, "B N"],
+    threshold: float,
+) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """Sampson distances, their derivatives along the tangents (B, 7, N) and by the bend; robust weights and costs."""
+    h_1, h_2 = homogeneous(x_1), homogeneous(x_2)
     line_2, line_1 = h_1 @ F.mT, h_2 @ F
     flat = line_2.new_tensor((1.0, 1.0, 0.0))
     squared = (line_2 * flat).square().sum(-1) + (line_1 * flat).square().sum(-1)
@@ -183,22 +173,16 @@ def _rows(
     along = _tangents(F) @ (change.flatten(2) * inverse[..., None]).mT
     moves_1, moves_2 = x_1 * x_1.square().sum(-1, keepdim=True), x_2 * x_2.square().sum(-1, keepdim=True)
     bend = ((line_1[..., :2] * moves_1).sum(-1) + (line_2[..., :2] * moves_2).sum(-1)) * inverse
-    return distance, along, bend
-
-
-def _normal_equations(
-    F: Float[Tensor, "B 3 3"],
-    x_1: Float[Tensor, "B N 2"],
-    x_2: Float[Tensor, "B N 2"],
-    mask: Bool[Tensor, "B N"],
-    threshold: float,
-) -> tuple[Float[Tensor, "B 8 8"], Float[Tensor, " B"]]:
-    """[J r]^T W [J r] and the cost, as `levenberg_marquardt` wants them; lengths in thresholds."""
-    distance, along, _ = _rows(F, x_1, x_2)
-    rows = torch.cat((along, distance[:, None]), dim=1) / threshold
     robust = robustify((distance / threshold).square(), "cauchy", distance.new_tensor(1.0))
-    weight, cost = torch.where(mask, robust.weight, 0.0), torch.where(mask, robust.rho, 0.0).sum(-1)
-    return (rows * weight[:, None]) @ rows.mT, cost
+    weight, cost = (torch.where(mask, part, 0.0) for part in (robust.weight, robust.rho))
+    return distance, along, bend, weight, cost
+
+
+def _normal_equations(F: Tensor, *matches: Any) -> tuple[Float[Tensor, "B 8 8"], Float[Tensor, " B"]]:
+    """[J r]^T W [J r] and the cost, as `levenberg_marquardt` wants them; lengths in thresholds."""
+    distance, along, _, weight, cost = _linearized(F, *matches)
+    rows = torch.cat((along, distance[:, None]), dim=1) / matches[-1]
+    return (rows * weight[:, None]) @ rows.mT, cost.sum(-1)
 
 
 def _uncertainty(
@@ -209,16 +193,15 @@ def _uncertainty(
     threshold: float,
 ) -> tuple[Float[Tensor, "B 9 9"], Float[Tensor, "B 9"], Float[Tensor, " B"]]:
     """The covariance of F, its derivative by the bend, and the noise of the distances."""
-    distance, along, bend = _rows(F, x_1, x_2)
-    robust = robustify((distance / threshold).square(), "cauchy", distance.new_tensor(1.0))
-    weight = torch.where(mask, robust.weight, 0.0)
+    distance, along, bend, weight, _ = _linearized(F, x_1, x_2, mask, threshold)
     count = mask.sum(-1).to(F.dtype)
     middle = median_scale(distance.abs(), mask=mask)
     # The fit follows the noise of as many matches as it has parameters.
     noise = middle * (count / (count - _FREEDOMS).clamp_min(1.0)).sqrt()
     noise = noise.nan_to_num(threshold).clamp_min(_LEAST_NOISE * threshold)
     information = (along * weight[:, None]) @ along.mT
-    least = _LEAST_INFORMATION * information.diagonal(dim1=1, dim2=2).mean(-1).clamp_min(1.0)
+    # Of a plane or a rotating camera, two directions have none: their covariance shall be large, not infinite.
+    least = 1e-12 * information.diagonal(dim1=1, dim2=2).mean(-1).clamp_min(1.0)
     information = information + torch.diag_embed(least[:, None].expand(-1, _FREEDOMS))
     tangents = _tangents(F)
     both = torch.cat((tangents, (along * weight[:, None] @ bend[..., None])), dim=2)

@@ -1,8 +1,7 @@
 """The noise of keypoints, `KeypointNoise`, and gates on the errors of predictions.
 
 In units of that noise, the squared error of a correct match follows a chi-square distribution of two degrees of
-freedom. Everything that weights or gates a keypoint uses it: tracking, mapping, bundle adjustment, covariances, and the
-graph of a run. Symmetric 2x2 matrices are written out: faster than general ones, and fit for `torch.func`.
+freedom. Symmetric 2x2 matrices are written out: faster than general ones, and fit for `torch.func`.
 """
 
 from __future__ import annotations
@@ -43,11 +42,12 @@ def inverse_2x2(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
 
 def whitening(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
     """W, upper triangular, with W^T W = A; zero, with gradient zero, where A is not positive definite."""
-    xx, xy, yy = torch.where(is_definite(A)[..., None], triangle(A), A.new_tensor((1.0, 0.0, 1.0))).unbind(-1)
+    definite = is_definite(A)[..., None]
+    xx, xy, yy = torch.where(definite, triangle(A), A.new_tensor((1.0, 0.0, 1.0))).unbind(-1)
     p = xx.sqrt()
     q = xy / p
     W = torch.stack((p, q, torch.zeros_like(p), (yy - q * q).sqrt()), dim=-1).unflatten(-1, (2, 2))
-    return torch.where(is_definite(A)[..., None, None], W, 0.0)
+    return torch.where(definite[..., None], W, 0.0)
 
 
 def times(
@@ -59,8 +59,6 @@ def times(
 
 CHI_SQUARE_95 = 5.991
 """95 % of a chi-square distribution of two degrees of freedom."""
-
-
 GATE_FACTOR = 2.0
 """Inflation of the standard deviations that an extractor provides when a keypoint is gated against the map, which has
 errors of its own. Scales, where no information is provided, include that factor: ORB is precise to half its scale."""
@@ -142,7 +140,7 @@ class KeypointNoise:
     def squared(self, errors: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch"]:
         """Squares of errors in pixels, in units of the gate's noise, for `passes_gate`."""
         if self.information.shape[-1] < 3:
-            return self._squared(errors.square().sum(-1))
+            return errors.square().sum(-1) / self.gate_sigma**2
         return (errors[..., None, :] @ self.weights @ errors[..., None])[..., 0, 0] / GATE_FACTOR**2
 
     def squared_reprojection(
@@ -150,12 +148,9 @@ class KeypointNoise:
     ) -> Float[Tensor, "*#batch"]:
         """`squared` of the reprojections of points seen at pixels; infinite behind the camera."""
         if self.information.shape[-1] < 3:
-            return self._squared(squared_reprojection_errors(points_c, pixels, camera))
+            return squared_reprojection_errors(points_c, pixels, camera) / self.gate_sigma**2
         projected, valid = camera.project(points_c)
         return self.squared(projected - pixels).where(valid, torch.inf)
-
-    def _squared(self, squared_px: Float[Tensor, "*batch"]) -> Float[Tensor, "*batch"]:
-        return squared_px / self.gate_sigma**2
 
 
 def packed_information(
@@ -198,10 +193,8 @@ def innovation_covariances(
 ) -> Float[Tensor, "*#batch 2 2"]:
     """Covariances S = R + J Sigma J^T of measured minus predicted pixels, px^2.
 
-    Args:
-        J: derivatives of the predictions with respect to their parameters.
-        covariances: of those parameters.
-        sigmas: (...) standard deviations of the measured pixels, R = sigma^2 I, or (..., 2, 2) their covariances R.
+    J are the derivatives of the predictions by the parameters, which have the covariances; `sigmas` are (...) standard
+    deviations of the measured pixels, R = sigma^2 I, or (..., 2, 2) their covariances R.
     """
     if sigmas.ndim == J.ndim:
         return sigmas + J @ covariances @ J.mT

@@ -76,6 +76,11 @@ def transform(
     return points @ T[..., :3, :3].mT + T[..., None, :3, 3]
 
 
+def homogeneous(x: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch D+1"]:
+    """Coordinates with a one behind them."""
+    return torch.cat((x, torch.ones_like(x[..., :1])), dim=-1)
+
+
 @full_precision
 def so3_exp(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch 3 3"]:
     """Rotation matrices of rotation vectors in radians."""
@@ -133,8 +138,7 @@ def so3_left_jacobian_inverse(omega: Float[Tensor, "*batch 3"]) -> Float[Tensor,
 def quaternion_from_matrix(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:
     """Unit quaternions (x, y, z, w) with w >= 0 of rotation matrices.
 
-    The columns of 4 q q^T are linear in R; the one with the largest diagonal is never near zero (Shepperd,
-    1978).
+    The columns of 4 q q^T are linear in R; the one with the largest diagonal is never near zero (Shepperd, 1978).
     """
     r00, r01, r02, r10, r11, r12, r20, r21, r22 = R.flatten(-2).unbind(-1)
     xy, xz, yz = r01 + r10, r02 + r20, r12 + r21
@@ -227,10 +231,7 @@ def se3_interpolate(
     T_1: Float[Tensor, "*#batch 4 4"],
     fraction: Float[Tensor, "*#batch"] | float,
 ) -> Float[Tensor, "*#batch 4 4"]:
-    """The screw motion from T_0 (fraction 0) to T_1 (fraction 1).
-
-    Interpolating the inverses gives the inverse of the interpolation.
-    """
+    """The screw motion from T_0 (fraction 0) to T_1 (fraction 1); that of the inverses is its inverse."""
     fraction = torch.as_tensor(fraction, dtype=T_0.dtype, device=T_0.device)
     return se3_exp(fraction[..., None] * se3_log(T_1 @ se3_inverse(T_0))) @ T_0
 
@@ -252,10 +253,7 @@ _NODES, _WEIGHTS = (0.5 * (_NODES + 1)).tolist(), (0.5 * _WEIGHTS).tolist()  # f
 def _sim3_translation_matrix(
     omega: Float[Tensor, "*batch 3"], sigma: Float[Tensor, "*batch"]
 ) -> Float[Tensor, "*batch 3 3"]:
-    """W = integral over s in [0, 1] of exp(s sigma) exp(s omega^).
-
-    By quadrature: no case distinctions for a small angle or scale, and smooth everywhere.
-    """
+    """W = integral over s in [0, 1] of exp(s sigma) exp(s omega^); quadrature is smooth for a small angle or scale."""
     s = torch.tensor(_NODES, dtype=omega.dtype, device=omega.device)
     weight = torch.tensor(_WEIGHTS, dtype=omega.dtype, device=omega.device) * (s * sigma[..., None]).exp()
     a, b, _, _ = _rodrigues(s * s * (omega * omega).sum(-1, keepdim=True))
@@ -301,21 +299,16 @@ def sim3_inverse(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
 @full_precision
 def sim3_adjoint(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 7 7"]:
     """Ad with T exp(xi) = exp(Ad xi) T for similarities."""
-    sR, t = T[..., :3, :3], T[..., :3, 3:]
+    sR, t = T[..., :3, :3], T[..., :3, 3]
     R = sR / sim3_scale(T)[..., None, None]
-    zero, column = torch.zeros_like(R), torch.zeros_like(t)
-    top = torch.cat((sR, skew(t.squeeze(-1)) @ R, -t), dim=-1)
-    middle = torch.cat((zero, R, column), dim=-1)
-    bottom = torch.zeros_like(top[..., :1, :])
-    bottom[..., 6] = 1.0
-    return torch.cat((top, middle, bottom), dim=-2)
+    return _sim3_matrix(sR, skew(t) @ R, -t, R)
 
 
 @full_precision
 def sim3_left_jacobian(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "*batch 7 7"]:
     """J with exp(xi + d) = exp(J d) exp(xi) to first order."""
     (W, Q, q), rotation = _sim3_left_jacobian_blocks(xi)
-    return _sim3_jacobian_from_blocks(W, Q, -q, rotation)
+    return _sim3_matrix(W, Q, -q, rotation)
 
 
 @full_precision
@@ -324,7 +317,7 @@ def sim3_left_jacobian_inverse(xi: Float[Tensor, "*batch 7"]) -> Float[Tensor, "
     (W, Q, q), _ = _sim3_left_jacobian_blocks(xi)
     rotation = so3_left_jacobian_inverse(xi[..., 3:6])
     W = torch.linalg.inv_ex(W)[0]
-    return _sim3_jacobian_from_blocks(W, -W @ Q @ rotation, (W @ q[..., None]).squeeze(-1), rotation)
+    return _sim3_matrix(W, -W @ Q @ rotation, (W @ q[..., None]).squeeze(-1), rotation)
 
 
 def _sim3_left_jacobian_blocks(
@@ -358,7 +351,7 @@ def _sim3_left_jacobian_blocks(
     return (W, (skew(moments) @ powers).sum(-3), moments[..., 0, :]), rotation
 
 
-def _sim3_jacobian_from_blocks(
+def _sim3_matrix(
     W: Float[Tensor, "*batch 3 3"],
     Q: Float[Tensor, "*batch 3 3"],
     q: Float[Tensor, "*batch 3"],

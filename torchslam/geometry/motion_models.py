@@ -10,7 +10,6 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry.homography import decompose_homography
 from torchslam.geometry.ransac import SUPPORT_WIDTH, best_of, is_significant, is_unlikely
 from torchslam.geometry.robust import NORMAL_MEDIAN, NORMAL_SQUARED_MEDIAN_2D
 from torchslam.geometry.two_view import (
@@ -26,6 +25,7 @@ from torchslam.geometry.two_view import (
     transfer_squared,
     twisted,
 )
+from torchslam.geometry.two_view_matrices import decompose_homography
 
 MODELS = ("essential", "homography", "rotation")
 ESSENTIAL, HOMOGRAPHY, ROTATION = range(3)
@@ -34,9 +34,9 @@ ESSENTIAL, HOMOGRAPHY, ROTATION = range(3)
 FINAL_ITERATIONS = 12
 """Of Levenberg-Marquardt, for the model that is chosen. Tried at this value only."""
 FINAL_WIDTH = 2.0  # thresholds; the refinement uses the tail of the noise too
-_HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES = 64, 16
-"""Minimal samples of a homography and of a rotation. Tried at these values only."""
-_TRIAL_ITERATIONS = 5  # of a homography or rotation that may not be needed
+_HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES, _TRIAL_ITERATIONS = 64, 16, 5
+"""Minimal samples of a homography and a rotation, and iterations for one that may not be needed. Tried at these values
+only."""
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
@@ -49,10 +49,8 @@ _FARTHEST = 3.0  # deviations of the noise, beyond which a match counts as so fa
 # on edges has a direction of its own.
 _MIN_LEAN_SIGMAS, _MIN_LEAN = 4.0, 1 / 3
 # Squared deviations by which the five parameters of an essential matrix, fitted, beat the true one in one case of a
-# hundred (chi-square).
-_GAIN_OF_A_FIT = 15.09
-# The median square of one Gaussian, over that of the length of two.
-_PLANE_MEDIAN = NORMAL_MEDIAN**2 / NORMAL_SQUARED_MEDIAN_2D
+# hundred (chi-square); and the median square of one Gaussian, over that of the length of two.
+_GAIN_OF_A_FIT, _PLANE_MEDIAN = 15.09, NORMAL_MEDIAN**2 / NORMAL_SQUARED_MEDIAN_2D
 # Ratio of the support of the second motion before a plane to that of the first, above which either may be the right
 # one; and entries of two rotations that differ by less are those of one motion, to 0.06 degrees. Tried at these values
 # only.
@@ -65,14 +63,9 @@ _EXACT = 1 / 16  # units of the noise; only exact matches are far below, and wha
 
 @dataclass(frozen=True)
 class Fits:
-    """The best fit of each model.
+    """The best fit of each model: the pose of the essential matrix, the homography, and the pure rotation.
 
-    Attributes:
-        R: rotation of the essential matrix.
-        t: direction of translation of the essential matrix.
-        H: homography.
-        R_only: pure rotation.
-        squared: squared errors of the three models, thresholds.
+    squared: errors of the three models, thresholds
     """
 
     R: Float[Tensor, "B 3 3"]
@@ -102,8 +95,7 @@ def fit_models(
 ) -> Fits:
     """A homography and a pure rotation for matches that R, t explain.
 
-    Args:
-        by_noise: skip the fit of samples that most matches contradict, as in a scene with depth.
+    by_noise: skip the fit of samples that most matches contradict, as in a scene with depth
     """
     essential = sampson_squared(views, R[:, None], t[:, None])[:, 0]
     # The matches of a plane, or of a pure rotation, are among those that fit the essential matrix.
@@ -137,11 +129,9 @@ def choose(
 ) -> tuple[Int[Tensor, " B"], Bool[Tensor, " B"]]:
     """The index of the simplest model that no significant number of matches contradicts, and if a plane is one.
 
-    Args:
-        by_noise: also require that all matches together do not contradict it by the direction of their
-            errors. Keypoint noise has a long tail, so that many errors of a few pixels do not refute a rotation.
-            But noise has any direction, while parallax lies along the epipolar lines, in one sense. Noise
-            along image edges can lie along the lines too, but in both senses.
+    by_noise: also require that all matches together do not contradict it by the direction of their errors. Keypoint
+    noise has a long tail, so that many errors of a few pixels do not refute a rotation. But noise has any direction,
+    while parallax lies along the epipolar lines, in one sense; noise along image edges can lie so in both senses.
     """
     mask, (essential, homography, rotation) = views.mask, fits.squared
     # Noise beyond the threshold must not look like parallax: the distances from the epipolar lines, which depth
@@ -201,8 +191,7 @@ def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -
     The noise of keypoints on edges lies along lines, and where many edges are parallel, along epipolar lines: parallax
     by its size. But it puts as many matches behind the cameras as before them.
 
-    Args:
-        variance: variance of the noise, by the essential matrix.
+    variance: of the noise, by the essential matrix
     """
     variance = variance.clamp_min(_EXACT**2)[:, None]
     near = views.mask & (fits.squared[ESSENTIAL] < _FARTHEST**2 * variance)
@@ -217,14 +206,10 @@ def goes_both_ways(views: TwoViews, fits: Fits, variance: Float[Tensor, " B"]) -
 
 
 class PlaneMotions(NamedTuple):
-    """Motions in front of the plane of a homography, four for each.
+    """Motions in front of the plane of a homography, four for each: rotations, and directions of the translation.
 
-    Attributes:
-        R: rotations.
-        direction: of the translation.
-        normal: of the plane, in units of the distance that the camera moved.
-        squared: squared Sampson errors, thresholds.
-        possible: whether the plane is in front of the cameras.
+    normal: of the plane, in units of the distance that the camera moved; squared: Sampson errors, thresholds; possible:
+    whether the plane is in front of the cameras
     """
 
     R: Float[Tensor, "B 4 3 3"]
@@ -256,11 +241,8 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Bool[Tensor
     """
     # The noise as the plane has it, too: an essential matrix that accident chose shows too little.
     across, both = fits.squared[:2]
-    variance = torch.maximum(
-        noise_variance(across, views.mask),
-        _PLANE_MEDIAN * noise_variance(both * TRANSFER_WIDTH**2, views.mask),
-    )
-    variance = variance.clamp_min(_EXACT**2)[:, None]
+    of_plane = _PLANE_MEDIAN * noise_variance(both * TRANSFER_WIDTH**2, views.mask)
+    variance = torch.maximum(noise_variance(across, views.mask), of_plane).clamp_min(_EXACT**2)[:, None]
     near = (torch.minimum(*fits.squared[:2]) < _FARTHEST**2 * variance) & views.mask
 
     def cost(squared: Float[Tensor, "B K N"]) -> Float[Tensor, "B K"]:
@@ -273,32 +255,32 @@ def plane_holds(views: TwoViews, fits: Fits, plane: PlaneMotions) -> Bool[Tensor
 
 
 def pose_of(
-    views: TwoViews, fits: Fits, model: Int[Tensor, " B"], plane: PlaneMotions, by_noise: bool = False
+    views: TwoViews,
+    fits: Fits,
+    front: tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"]],
+    model: Int[Tensor, " B"],
+    plane: PlaneMotions,
+    by_noise: bool = False,
 ) -> tuple[Float[Tensor, "B 3 3"], Float[Tensor, "B 3"], Float[Tensor, "B 3"], Bool[Tensor, " B"]]:
     """R, t and the normal of the plane, and whether a plane leaves two motions.
 
-    Args:
-        by_noise: also if noise may be the reason why one of them explains the matches better.
+    front: R, t of the essential matrix; by_noise: two motions remain also if noise may be why one is better
     """
-    R_E, t_E = in_front(views, fits.R, fits.t, views.mask & (fits.squared[ESSENTIAL] < 1))
     R_H, direction, normal, squared, possible = plane
     of_match = torch.where(views.mask[:, None], (1 - squared).clamp_min(0.0), 0.0)
     support = torch.where(possible, of_match.sum(-1), -1.0)
-    (first, second), order = (part.unbind(-1) for part in support.topk(2, dim=-1))
+    (first, second), (best, other) = (part.unbind(-1) for part in support.topk(2, dim=-1))
     ambiguous = second > _MAX_SECOND_SUPPORT * first.clamp_min(0.0)
     index = torch.arange(len(model), device=model.device)
     if by_noise:
-        deviation = (of_match[index, order[0]] - of_match[index, order[1]]).norm(dim=-1)
+        deviation = (of_match[index, best] - of_match[index, other]).norm(dim=-1)
         ambiguous |= (second >= 0) & (first - second < _TELLS_MOTIONS * deviation)
-    best = order[0]
-    flat = model == HOMOGRAPHY
-    apart = (R_H[index, order[0]] - R_H[index, order[1]]).abs().amax((-2, -1)) > _SAME_ROTATION
-    R = torch.where(flat[:, None, None], R_H[index, best], R_E)
-    t = torch.where(flat[:, None], direction[index, best], t_E)
-    still = model == ROTATION
+    flat, still = model == HOMOGRAPHY, model == ROTATION
+    apart = (R_H[index, best] - R_H[index, other]).abs().amax((-2, -1)) > _SAME_ROTATION
+    R = torch.where(flat[:, None, None], R_H[index, best], front[0])
     R = torch.where(still[:, None, None], fits.R_only, R)
-    t = torch.where(still[:, None], 0.0, t)
-    return R, t, normal[index, best], flat & ambiguous & apart
+    t = torch.where(flat[:, None], direction[index, best], front[1])
+    return R, torch.where(still[:, None], 0.0, t), normal[index, best], flat & ambiguous & apart
 
 
 def is_spread(views: TwoViews, inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:
@@ -327,13 +309,7 @@ def is_no_accident(
     With `by_noise`, the range that the noise explains, often much less than the threshold, is tried as well; a
     rotation is determined by two matches, not five, and a wrong match is as near with less than the squared chance.
 
-    Args:
-        views: in units of the noise.
-        squared: errors of the chosen model in units of the noise.
-        model: index of the chosen model.
-        noise: thresholds.
-        chance: probability that a wrong match is within the threshold of an epipolar line.
-        by_noise: whether the noise is estimated.
+    views, squared errors: in units of the noise; chance: that a wrong match is within the threshold of a line
     """
     still = (model == ROTATION) & by_noise
     in_thresholds = views.in_units(1 / noise[:, None])

@@ -51,44 +51,16 @@ def _frame(corners: Tensor) -> Tensor:
     return torch.stack((x, torch.linalg.cross(z, x, dim=0), z))
 
 
-# Of a symmetric matrix the entries 00, 01, 02, 11, 22, 12 are stored. The entries of its adjugate are differences
-# of products of two of them.
-_ADJUGATE_PLUS, _ADJUGATE_MINUS = (
-    ((3, 4), (2, 5), (1, 5), (0, 4), (0, 3), (1, 2)),
-    ((5, 5), (1, 4), (2, 3), (2, 2), (1, 1), (0, 5)),
-)
-# The two conics of the pencil in multiples of the squared distance of one pair of points (12, 23, 31), and of that
-# times the cosine of the rays of a pair: (entry, pair of the distance, 0 or the pair of the cosine, factor).
-_CONICS = (
-    ((0, 2, 0, 1), (1, 2, 1, -1), (3, 2, 0, 1), (3, 1, 0, -1), (5, 1, 2, 1), (4, 1, 0, -1)),
-    ((0, 2, 0, 1), (2, 2, 3, -1), (3, 3, 0, -1), (5, 3, 2, 1), (4, 2, 0, 1), (4, 3, 0, -1)),
-)
-
-_ADJUGATE_PAIRS = [
-    entry for table in (_ADJUGATE_PLUS, _ADJUGATE_MINUS) for row in zip(*table, strict=True) for entry in row
-]
-_CONIC_TABLE = [
-    [
-        sum(float(factor) for *place, factor in terms if place == [entry, distance, cosine])
-        for distance in (1, 2, 3)
-        for cosine in range(4)
-    ]
-    for terms in _CONICS
-    for entry in range(6)
-]
-"""`_CONICS` as a table by entry: factors of the products of distance and cosine."""
+# Of a symmetric matrix the entries 00, 01, 02, 11, 22, 12 are stored. Those of its adjugate are a b - c d: all a, then
+# all b, c and d.
+_ADJUGATE = (3, 2, 1, 0, 0, 1, 4, 5, 5, 4, 3, 2, 5, 1, 2, 2, 1, 0, 5, 4, 3, 2, 1, 5)
 
 
 @lru_cache(maxsize=4)
-def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor, Tensor]:
-    """Coefficients of the conics and their adjugates.
-
-    Indices of the factors of the adjugate (24,); how often each entry is in the full matrix (6, 1); the conics as a
-    linear function of distances times one and the cosines (12, 12).
-    """
-    conics = torch.tensor(_CONIC_TABLE, dtype=dtype, device=device)
+def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
+    """`_ADJUGATE`, and how often each entry is in the full matrix (6, 1)."""
     times = torch.tensor((1, 2, 2, 1, 1, 2), dtype=dtype, device=device)
-    return torch.tensor(_ADJUGATE_PAIRS, device=device), times[:, None], conics
+    return torch.tensor(_ADJUGATE, device=device), times[:, None]
 
 
 def _depths(
@@ -100,10 +72,11 @@ def _depths(
     cosine = (rays * rays.roll(-1, 0)).sum(1)
     unit = distance.sum(0)
     distance = distance / unit
-    _, _, table = _tables(rays.dtype, rays.device)
-    products = distance[:, None] * torch.nn.functional.pad(cosine, (0, 0, 1, 0), value=1.0)
-    # depths^T D depths = 0 for both
-    D = (table @ products.flatten(0, 1)).unflatten(0, (2, 6))
+    # The two conics of the pencil, depths^T D depths = 0.
+    (d_1, d_2, d_3), zero = distance.unbind(0), torch.zeros_like(unit)
+    mixed_1, mixed_2 = d_1 * cosine[1], d_2 * cosine[::2]
+    first = torch.stack((d_2, -mixed_2[0], zero, d_2 - d_1, -d_1, mixed_1))
+    D = torch.stack((first, torch.stack((d_2, zero, -mixed_2[1], -d_3, d_2 - d_3, d_3 * cosine[1]))))
     lines, real = _line_pair(D)
     depths, on_conic = _intersections(lines, D[1])
 
@@ -120,7 +93,7 @@ def _line_pair(D: Float[Tensor, "2 6 B"]) -> tuple[Float[Tensor, "2 2 B"], Bool[
 
     Each line as p, q of depth_1 = p depth_2 + q depth_3, in the first dimension. Also, whether the lines are real.
     """
-    factors, times, _ = _tables(D.dtype, D.device)
+    factors, times = _tables(D.dtype, D.device)
     a, b, c, d = D.index_select(1, factors).unflatten(1, (4, 6)).unbind(1)
     adjugate = torch.addcmul(a * b, c, d, value=-1) * times
     # tr(adj(D_i) D_j), whose diagonal is 3 det(D_i), gives det(D_0 + g D_1)

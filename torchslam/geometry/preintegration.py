@@ -69,14 +69,10 @@ def inertial_steps(
     """Cut samples into steps between two times each, by the mean of the ends of a step.
 
     Args:
-        timestamps: seconds, strictly increasing, at least two.
-        gyroscope: rad/s.
-        accelerometer: m/s^2.
+        timestamps: seconds, strictly increasing; fewer than two raise ValueError.
+        gyroscope: rad/s; `accelerometer`: m/s^2.
         start: seconds; before the first sample and behind the last one, the line through two samples is extended.
         end: seconds, not before the start.
-
-    Raises:
-        ValueError: there are fewer than two samples.
     """
     if len(timestamps) < 2:
         raise ValueError(f"timestamps must be of two samples or more, not of {len(timestamps)}")
@@ -105,10 +101,8 @@ def preintegrate(
     """The increments over intervals of steps.
 
     Args:
-        steps: the samples.
         bias: of the gyroscope in rad/s and of the accelerometer in m/s^2, which are subtracted.
-        gyroscope_density: of its white noise, rad/s/sqrt(Hz).
-        accelerometer_density: of its white noise, m/s^2/sqrt(Hz).
+        gyroscope_density: of its white noise, rad/s/sqrt(Hz); `accelerometer_density`: m/s^2/sqrt(Hz).
     """
     durations, gyroscope, accelerometer = steps
     size = durations.shape[-1]
@@ -149,12 +143,8 @@ def _single_steps(
         torch.cat((-once, zero), dim=-1),
     )
     per_dt = torch.cat(blocks, dim=-2)
-    variances = torch.cat(
-        (
-            dt.new_ones(3) * gyroscope_density**2,
-            dt.new_ones(3) * accelerometer_density**2,
-        )
-    )
+    ones = dt.new_ones(3)
+    variances = torch.cat((ones * gyroscope_density**2, ones * accelerometer_density**2))
     return Increments(
         durations,
         so3_exp(angle),
@@ -171,14 +161,12 @@ def compose_increments(first: Increments, second: Increments) -> Increments:
     T, R = second.duration[..., None], first.R_ij
     velocity, position = ((R @ x[..., None]).squeeze(-1) for x in (second.velocity, second.position))
     eye, zero = (x.expand_as(R) for x in (torch.eye(3, dtype=R.dtype, device=R.device), torch.zeros_like(R)))
-    from_first = torch.cat(
-        (
-            torch.cat((eye, T[..., None] * eye, -skew(position)), dim=-1),
-            torch.cat((zero, eye, -skew(velocity)), dim=-1),
-            torch.cat((zero, zero, eye), dim=-1),
-        ),
-        dim=-2,
+    blocks = (
+        torch.cat((eye, T[..., None] * eye, -skew(position)), dim=-1),
+        torch.cat((zero, eye, -skew(velocity)), dim=-1),
+        torch.cat((zero, zero, eye), dim=-1),
     )
+    from_first = torch.cat(blocks, dim=-2)
 
     def turned(matrix: Tensor) -> Tensor:
         return (R[..., None, :, :] @ matrix.unflatten(-2, (3, 3))).flatten(-3, -2)

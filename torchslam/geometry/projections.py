@@ -1,4 +1,4 @@
-"""Scores and fits of what maps homogeneous points to image coordinates: poses, homographies, pure rotations.
+"""Errors and fits of what maps homogeneous points to image coordinates: poses, homographies, pure rotations.
 
 All map homogeneous points by P (3, D) to x: D = 4 for scene points, D = 3 for image points. Errors are in thresholds,
 of which `scale` go into one unit of x, in each direction or in both; rows outside `mask` do not count.
@@ -15,24 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.lie import cayley_rotation, generators
-from torchslam.geometry.ransac import (
-    ModelState,
-    in_chunks,
-    levenberg_marquardt,
-    retract_pose,
-    truncated_score,
-)
-
-
-def score_projections(
-    P: Float[Tensor, "B K 3 D"],
-    homogeneous: Float[Tensor, "B D N"],
-    x: Float[Tensor, "B N 2"],
-    scale: Float[Tensor, "B N _"],
-    mask: Bool[Tensor, "B N"],
-) -> Float[Tensor, "B K"]:
-    """Truncated scores of many mappings, in the dtype of P; a negative depth counts as an outlier."""
-    return truncated_score(squared_projections(P, homogeneous, x, scale), mask)
+from torchslam.geometry.ransac import ModelState, in_chunks, levenberg_marquardt, retract_pose
 
 
 def squared_projections(
@@ -120,43 +103,30 @@ def fit_projections(
     width: float = 1.0,
 ) -> tuple[Float[Tensor, "B K 3 D"], Float[Tensor, "B K"]]:
     """Mappings of least squared error near the given ones, truncated at `width` thresholds, and their costs."""
-    T, N = len(tangent.constant) // (3 * P.shape[-1]) - 1, x.shape[1]
+    K, D, N = P.shape[1], P.shape[-1], x.shape[1]
+    T = len(tangent.constant) // (3 * D) - 1
 
-    def fit(*part: Tensor) -> tuple[Tensor, Tensor]:
-        return _fit_part(tangent, iterations, width, *part)
+    def fit(P: Tensor, homogeneous: Tensor, x: Tensor, scale: Tensor) -> tuple[Tensor, Tensor]:
+        B = len(P)
+        x, scale = x.mT[:, None], scale.mT[:, None].contiguous()
 
-    P, cost = in_chunks(fit, P.shape[1] * 3 * (T + 1) * N, P, homogeneous, x, scale * mask[..., None])
+        def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
+            rows = torch.addmm(tangent.constant, P.view(B * K, 3 * D), tangent.linear)
+            mapped = torch.bmm(rows.view(B, K * 3 * (T + 1), D), homogeneous).view(B, K, T + 1, 3, N)
+            numerator, depth = mapped.split((2, 1), dim=3)
+            inverse = depth[:, :, -1].clamp_min(1e-9).reciprocal_()
+            image = numerator[:, :, -1] * inverse
+            # d(u / w) = (du - (u / w) dw) / w; the row of the mapping itself becomes the residual
+            rows = torch.addcmul(numerator, image[:, :, None], depth, value=-1)
+            torch.sub(image, x, out=rows[:, :, -1]).div_(inverse)
+            rows.mul_((inverse * scale)[:, :, None])
+            squared = rows[:, :, -1].square().sum(2)
+            cost = squared.clamp_max(width * width).sum(-1)
+            rows = rows.mul_((squared < width * width)[:, :, None, None]).view(B * K, T + 1, 2 * N)
+            return torch.bmm(rows, rows.mT), cost.view(-1)
+
+        (P,), cost = levenberg_marquardt((P.reshape(B * K, 3, D),), evaluate, tangent.retract, iterations)
+        return P.view(B, K, 3, D), cost.view(B, K)
+
+    P, cost = in_chunks(fit, K * 3 * (T + 1) * N, P, homogeneous, x, scale * mask[..., None])
     return P, cost
-
-
-def _fit_part(
-    tangent: Tangent,
-    iterations: int,
-    width: float,
-    P: Float[Tensor, "B K 3 D"],
-    homogeneous: Float[Tensor, "B D N"],
-    x: Float[Tensor, "B N 2"],
-    scale: Float[Tensor, "B N _"],
-) -> tuple[Float[Tensor, "B K 3 D"], Float[Tensor, "B K"]]:
-    """`fit_projections` of a few problems, with a scale of zero for rows outside the mask."""
-    B, K, _, D = P.shape
-    T, N = len(tangent.constant) // (3 * D) - 1, x.shape[1]
-    x, scale = x.mT[:, None], scale.mT[:, None].contiguous()
-
-    def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
-        rows = torch.addmm(tangent.constant, P.view(B * K, 3 * D), tangent.linear)
-        mapped = torch.bmm(rows.view(B, K * 3 * (T + 1), D), homogeneous).view(B, K, T + 1, 3, N)
-        numerator, depth = mapped.split((2, 1), dim=3)
-        inverse = depth[:, :, -1].clamp_min(1e-9).reciprocal_()
-        image = numerator[:, :, -1] * inverse
-        # d(u / w) = (du - (u / w) dw) / w; the row of the mapping itself becomes the residual
-        rows = torch.addcmul(numerator, image[:, :, None], depth, value=-1)
-        torch.sub(image, x, out=rows[:, :, -1]).div_(inverse)
-        rows.mul_((inverse * scale)[:, :, None])
-        squared = rows[:, :, -1].square().sum(2)
-        cost = squared.clamp_max(width * width).sum(-1)
-        rows = rows.mul_((squared < width * width)[:, :, None, None]).view(B * K, T + 1, 2 * N)
-        return torch.bmm(rows, rows.mT), cost.view(-1)
-
-    (P,), cost = levenberg_marquardt((P.reshape(B * K, 3, D),), evaluate, tangent.retract, iterations)
-    return P.view(B, K, 3, D), cost.view(B, K)

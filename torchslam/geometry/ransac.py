@@ -8,21 +8,28 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any, TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
+from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import cayley_rotation, identity
 from torchslam.geometry.precision import check_positive
 
 ModelState = tuple[Tensor, ...]
+Problems = TypeVar("Problems")
 
 CONFIDENCE = 0.9999
 """Default of searches: probability that some sample has no outlier. Tried at this value only."""
-_MAX_VALUES_AT_ONCE = 300_000
-"""Residuals that are in memory at once, which bounds it. Tried at this value only."""
-_MIN_ITERATIONS = 2  # before it may stop
+# Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
+SUPPORT_WIDTH = 2.0
+_MAX_VALUES_AT_ONCE, _SAMPLES_AT_ONCE = 300_000, 1024
+"""Residuals in memory, and minimal samples solved, at once: they bound the memory. Tried at these values only."""
+# From this many residuals on, models are compared on some rows first, and some models then on all.
+_PREVIEW_FROM, _PREVIEW_ROWS, _PREVIEW_MODELS = 100_000, 80, 32
 
 
 def check_search(threshold: float, confidence: float, max_samples: int, min_samples: int = 1) -> None:
@@ -38,18 +45,14 @@ def levenberg_marquardt(
     retract: Callable[[ModelState, Tensor], ModelState],
     iterations: int,
 ) -> tuple[ModelState, Float[Tensor, " B"]]:
-    """Minimize many small problems at once, each with its own damping.
+    """Minimize many small problems (B) at once, each with its own damping; return the state and its cost.
 
-    Stops once no problem can gain more than 1e-11 of its cost.
+    Stops once no problem can gain more than 1e-11 of its cost. Problems that become singular or NaN keep their last
+    good state.
 
     Args:
-        state: tensors with one leading dimension (B), the problems.
         evaluate: state -> (A, cost): A (B, D + 1, D + 1) is [J r]^T W [J r], and cost (B,) what must not grow.
         retract: state, step (B, D) -> state.
-        iterations: largest number.
-
-    Returns:
-        The state and its cost; problems that become singular or NaN keep their last good state.
     """
     A, cost = evaluate(*state)
     damping = torch.full_like(cost, 1e-4)[:, None, None]
@@ -59,7 +62,7 @@ def levenberg_marquardt(
         H, g = A[:, :-1, :-1], A[:, :-1, -1]
         step = torch.linalg.solve_ex(torch.addcmul(H, H * eye, damping), g)[0].neg_()
         moved = retract(state, step)
-        if iteration >= _MIN_ITERATIONS:
+        if iteration >= 2:
             gain = (g * step).sum(-1).abs()
             if bool((gain <= 1e-11 * cost).all()):  # too little to be worth a check
                 return _select(gain < torch.inf, moved, state), cost
@@ -76,8 +79,7 @@ def in_chunks(
 ) -> tuple[Tensor, ...]:
     """Call function(*tensors) for a few problems at a time, so that intermediate results stay in the cache.
 
-    Args:
-        numbers: values of the function's largest intermediate result per problem.
+    numbers: values of the function's largest intermediate result per problem
     """
     size = max(1, _MAX_VALUES_AT_ONCE // numbers)
     if len(tensors[0]) <= size:
@@ -100,43 +102,47 @@ def _select(condition: Bool[Tensor, " B"], new: ModelState, old: ModelState) -> 
     )
 
 
-def retract_pose(pose: ModelState, step: Float[Tensor, "B 6"]) -> ModelState:
-    """Perturb [R t], (B, 3, 4), by [rho, omega] from the left."""
-    turn = cayley_rotation(step[:, 3:])
+def retract_pose(pose: ModelState, step: Float[Tensor, "B D"]) -> ModelState:
+    """Perturb [R t], or [sR t], (B, 3, 4), by [rho, omega] or [rho, omega, sigma] from the left."""
+    turn = cayley_rotation(step[:, 3:6])
+    if step.shape[-1] == 7:
+        turn = turn * step[:, 6, None, None].exp()
     return (torch.baddbmm(torch.nn.functional.pad(step[:, :3, None], (3, 0)), turn, pose[0]),)
 
 
-# Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
-SUPPORT_WIDTH = 2.0
-_SAMPLES_AT_ONCE = 1024
-"""Minimal samples that are solved at once, which bounds the memory. Tried at this value only."""
-# From this many residuals on, models are compared on some rows first, and some models then on all.
-_PREVIEW_FROM, _PREVIEW_ROWS, _PREVIEW_MODELS = 100_000, 80, 32
+def pose_rows(
+    J: Float[Tensor, "*batch R 3"], points: Float[Tensor, "*batch 3"]
+) -> Float[Tensor, "*batch R 6"]:
+    """Derivatives by [rho, omega] from the left of what depends on moved points by J."""
+    return torch.cat((J, torch.linalg.cross(points[..., None, :].expand_as(J), J, dim=-1)), dim=-1)
+
+
+def some_problems(problems: Problems, rows: Int[Tensor, " R"]) -> Problems:
+    """Some of a dataclass of tensors and cameras with one leading dimension."""
+    values: dict[str, Any] = {each.name: getattr(problems, each.name) for each in fields(problems)}  # type: ignore[arg-type]
+    chosen = {name: x[rows] for name, x in values.items() if isinstance(x, Tensor | Camera)}
+    return replace(problems, **chosen)  # type: ignore[type-var]
 
 
 def sample_minimal(
     mask: Bool[Tensor, "B N"], size: int, count: int, generator: torch.Generator
 ) -> Int[Tensor, "B {count} {size}"]:
-    """Row numbers of random minimal samples without repeated rows, from the rows inside the mask.
+    """Row numbers of random minimal samples without repeated rows, but where the mask has fewer than `size`.
 
-    Problems with fewer than `size` rows get repeated ones. Random permutations are cut into disjoint samples, which
-    also spreads the samples over all rows. The random numbers come from the CPU, so that every device draws the same
-    ones.
+    Random permutations are cut into disjoint samples, which spreads the samples over all rows. The random numbers come
+    from the CPU, so that every device draws the same ones.
     """
     B, N = mask.shape
     available = mask.sum(-1)
     per_permutation = (available // size).clamp_min(1)
     permutations = math.ceil(count / int(per_permutation.min()))
     # Many permutations of few rows are cheap; of many rows few are needed.
-    keys = torch.rand(B, permutations, N, generator=generator, dtype=torch.float32, device="cpu").to(
-        mask.device
-    )
-    order = torch.where(mask[:, None], keys, 2.0).argsort(-1).flatten(1)
+    keys = torch.rand(B, permutations, N, generator=generator, dtype=torch.float32, device="cpu")
+    order = torch.where(mask[:, None], keys.to(mask.device), 2.0).argsort(-1).flatten(1)
     sample = torch.arange(count, device=mask.device)
     start = sample // per_permutation[:, None] * N + sample % per_permutation[:, None] * size
-    position = (
-        start[..., None] + torch.arange(size, device=mask.device) % available.clamp_min(1)[:, None, None]
-    )
+    place = torch.arange(size, device=mask.device) % available.clamp_min(1)[:, None, None]
+    position = start[..., None] + place
     return order.gather(1, position.flatten(1)).unflatten(1, (count, size))
 
 
@@ -145,9 +151,8 @@ def sample_minimal_of_all(
 ) -> Int[Tensor, "{count} {size}"]:
     """The samples of `sample_minimal` for one problem whose mask has all rows, in few calls."""
     each = rows // size
-    order = torch.rand(
-        math.ceil(count / each), rows, generator=generator, dtype=torch.float32, device="cpu"
-    ).argsort(1)
+    permutations = math.ceil(count / each)
+    order = torch.rand(permutations, rows, generator=generator, dtype=torch.float32, device="cpu").argsort(1)
     return order[:, : size * each].reshape(-1, size)[:count]
 
 
@@ -161,8 +166,7 @@ def best_models(
 ) -> Int[Tensor, "B {count}"]:
     """Indices of the best of many models, which first have to do well on a random part of the rows.
 
-    Args:
-        score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K).
+    score: (models (B, K, D), row numbers (B, n) or None for all) -> (B, K)
     """
     few = min(mask.shape[1] // _PREVIEW_ROWS, models.shape[1] // _PREVIEW_MODELS) < 2
     if few or models.shape[0] * models.shape[1] * mask.shape[1] < _PREVIEW_FROM:
@@ -176,10 +180,7 @@ def best_models(
 def samples_needed(
     inliers: Int[Tensor, " B"], available: Int[Tensor, " B"], size: int, confidence: float
 ) -> Float[Tensor, " B"]:
-    """Number of samples that contain, with the given confidence, one without outliers.
-
-    Computed on the host, where a number costs less than a call.
-    """
+    """Number of samples that contain, with the given confidence, one without outliers; computed on the host."""
     ratios = [k / max(n, 1) for k, n in zip(inliers.tolist(), available.tolist(), strict=True)]
     clean = [min(max(ratio, 1e-6), 1 - 1e-6) ** size for ratio in ratios]
     needed = [math.log(1 - confidence) / math.log1p(-min(share, 1 - 1e-6)) for share in clean]
@@ -195,12 +196,9 @@ def gather_rows(
 
 
 def truncated_score(squared: Float[Tensor, "B K N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, "B K"]:
-    """Sum of 1 - min(r^2, 1) over the rows in use (MSAC), higher is better; `squared` is overwritten.
+    """Sum of 1 - min(r^2, 1) over the rows in use (MSAC; Torr and Zisserman, "MLESAC", 2000), higher is better.
 
-    Source: Torr and Zisserman, "MLESAC", 2000.
-
-    Args:
-        squared: squared residuals in units of the threshold; NaN counts as an outlier.
+    squared: residuals in units of the threshold, which are overwritten; NaN counts as an outlier
     """
     weights = mask.to(squared.dtype)[..., None]
     cost = squared.clamp_max_(1.0).nan_to_num_(1.0) @ weights
@@ -233,7 +231,6 @@ def search(
         size: of a minimal sample.
         confidence: probability that some sample has no outlier.
         first_round: samples of the first round; every round draws twice as many as the one before.
-        max_samples: largest number of samples per problem.
         as_needed: draw no more than the support calls for, but at least as many as in the first round.
     """
 
@@ -277,27 +274,26 @@ def is_significant(
 
     Source: Moisan and Stival, "A probabilistic criterion to detect rigid point matches between two images", 2004.
 
-    Args:
-        inliers: number of inliers.
-        available: number of rows in use.
-        size: of a minimal sample.
-        chance: probability that a wrong row fits a model.
-        solutions: models per minimal sample.
+    available: rows in use; size: of a minimal sample; chance: that a wrong row fits a model; solutions: per sample
     """
-    problems = zip(inliers.tolist(), available.tolist(), chance.tolist(), strict=True)
-    logs = [_log_false_alarms(k, n, size, p, solutions) for k, n, p in problems]
-    return torch.tensor([log < math.log(1e-3) for log in logs], dtype=torch.bool, device=inliers.device)
+
+    def log_false_alarms(inliers: int, available: int, chance: float) -> float:
+        if inliers <= size:
+            return math.inf
+        # available over inliers times inliers over size, without what cancels
+        rest, others = max(available - inliers, 0), inliers - size
+        choices = math.lgamma(available + 1) - math.lgamma(rest + 1) - math.lgamma(others + 1)
+        alarms = choices - math.lgamma(size + 1) + others * math.log(min(max(chance, 1e-12), 1.0))
+        return alarms + math.log(solutions * max(available - size, 1))
+
+    return _is_below(1e-3, log_false_alarms, inliers, available, chance)
 
 
-def _log_false_alarms(inliers: int, available: int, size: int, chance: float, solutions: int) -> float:
-    """For one problem: on the host a number costs less than a call."""
-    if inliers <= size:
-        return math.inf
-    # available over inliers times inliers over size, without what cancels
-    rest, others = max(available - inliers, 0), inliers - size
-    choices = math.lgamma(available + 1) - math.lgamma(rest + 1) - math.lgamma(others + 1)
-    alarms = choices - math.lgamma(size + 1) + others * math.log(min(max(chance, 1e-12), 1.0))
-    return alarms + math.log(solutions * max(available - size, 1))
+def _is_below(limit: float, log_alarms: Callable[..., float], *of_problems: Tensor) -> Bool[Tensor, " B"]:
+    """Which problems have fewer false alarms. Computed on the host, where a number costs less than a call."""
+    problems = zip(*(x.tolist() for x in of_problems), strict=True)
+    found = [log_alarms(*each) < math.log(limit) for each in problems]
+    return torch.tensor(found, dtype=torch.bool, device=of_problems[0].device)
 
 
 def is_unlikely(
@@ -308,22 +304,29 @@ def is_unlikely(
     As `is_significant`, for chances that need not be small: the tail of the binomial distribution over the rows
     beyond a sample is bounded by Chernoff's inequality.
     """
-    problems = zip(count.tolist(), available.tolist(), chance.tolist(), strict=True)
-    logs = [_log_tail_alarms(k, n, size, p) for k, n, p in problems]
-    return torch.tensor([log < math.log(0.1) for log in logs], dtype=torch.bool, device=count.device)
+
+    def log_tail_alarms(count: int, available: int, chance: float) -> float:
+        """The number of samples, times the chance of this many inliers among the other rows."""
+        rest = available - size
+        share = (count - size) / rest if rest > 0 else 0.0
+        chance = max(chance, 1e-12)
+        if share <= chance:
+            return math.inf
+        divergence = share * math.log(share / chance)
+        if share < 1:
+            divergence += (1 - share) * math.log((1 - share) / (1 - chance))
+        return math.log(math.comb(available, size)) - rest * divergence
+
+    return _is_below(0.1, log_tail_alarms, count, available, chance)
 
 
-def _log_tail_alarms(count: int, available: int, size: int, chance: float) -> float:
-    """For one problem: the number of samples, times the chance of this many inliers among the other rows."""
-    rest = available - size
-    share = (count - size) / rest if rest > 0 else 0.0
-    chance = max(chance, 1e-12)
-    if share <= chance:
-        return math.inf
-    divergence = share * math.log(share / chance)
-    if share < 1:
-        divergence += (1 - share) * math.log((1 - share) / (1 - chance))
-    return math.log(math.comb(available, size)) - rest * divergence
+def leave_a_line(points: Float[Tensor, "B N 3"], inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:
+    """Test whether the inliers are not all on one line: their second variance is more than rounding."""
+    rows = inliers[..., None]
+    mean = torch.where(rows, points, 0.0).sum(1, keepdim=True) / rows.sum(1, keepdim=True).clamp_min(1)
+    centered = torch.where(rows, points - mean, 0.0)
+    spread = torch.linalg.eigvalsh(centered.mT @ centered)
+    return spread[:, 1] > 1e-6 * spread[:, 2]
 
 
 def valid_first(valid: Bool[Tensor, "B N"]) -> Int[Tensor, "B R"]:
@@ -335,10 +338,7 @@ def valid_first(valid: Bool[Tensor, "B N"]) -> Int[Tensor, "B R"]:
 def pad_groups(
     values: Float[Tensor, "R D"], group: Int[Tensor, " R"], groups: int, least: int
 ) -> tuple[Float[Tensor, "{groups} K D"], Bool[Tensor, "{groups} K"]]:
-    """Values in ascending order of their group, as rows of a padded tensor, zero where padded, with a mask.
-
-    The size of a group is that of the largest one, but at least `least`.
-    """
+    """Values in ascending order of their group as rows of a tensor, `least` or more, zero where padded; with a mask."""
     counts = torch.bincount(group, minlength=groups)
     size = max(least, int(counts.max()))
     start = counts.cumsum(0) - counts

@@ -33,11 +33,11 @@ Kernel = Literal["none", "huber", "cauchy", "geman_mcclure", "truncated"]
 
 
 class Robustified(NamedTuple):
-    """A kernel and its derivatives with respect to the squared residual; all of the shape of the input.
+    """A kernel and its derivatives with respect to the squared residual.
 
     Attributes:
         rho: the cost, twice the contribution of the residual to the objective.
-        weight: rho', the weight of the residual in iteratively reweighted least squares, in [0, 1].
+        weight: rho', of the residual in iteratively reweighted least squares, in [0, 1].
         curvature: rho'', never positive.
     """
 
@@ -90,31 +90,20 @@ _KERNELS: dict[str, Callable[[Tensor, Tensor], Robustified]] = {
 def kernel_scale(
     scale: Float[Tensor, "*scale"] | float, like: Float[Tensor, "..."]
 ) -> Float[Tensor, "*scale"]:
-    """The scale of a kernel, with the dtype and on the device of another tensor.
-
-    Raises:
-        ValueError: It is not above zero.
-    """
+    """The scale of a kernel, with the dtype and on the device of a tensor. Raises ValueError if not above zero."""
     if not in_transform() and not (bool((scale > 0).all()) if isinstance(scale, Tensor) else scale > 0):
-        raise ValueError(
-            f"scale must be above zero, not {scale.tolist() if isinstance(scale, Tensor) else scale}"
-        )
+        given = scale.tolist() if isinstance(scale, Tensor) else scale
+        raise ValueError(f"scale must be above zero, not {given}")
     return torch.as_tensor(scale, dtype=like.dtype, device=like.device)
 
 
 def robustify(
     squared: Float[Tensor, "*#batch"], kernel: Kernel, scale: Float[Tensor, "*#batch"]
 ) -> Robustified:
-    """Return rho, rho' and rho'' of squared whitened residuals.
+    """Return rho, rho' and rho'' of squared whitened residuals, for a positive scale.
 
-    Differentiable in both, except on the boundary of "huber" (rho'') and "truncated".
-
-    Args:
-        squared: not negative.
-        scale: positive, broadcastable to `squared`.
-
-    Raises:
-        ValueError: for an unknown kernel.
+    Differentiable in both, except on the boundary of "huber" (rho'') and "truncated". Raises ValueError for an unknown
+    kernel.
     """
     if kernel not in _KERNELS:
         raise ValueError(f"unknown kernel {kernel!r}; known are {', '.join(get_args(Kernel))}")
@@ -136,14 +125,10 @@ _MIN_VARIANCE, _MAX_VARIANCE = 1e-3, 4.0
 
 
 def middle_variance(squared: Float[Tensor, " O"], redundancy: float) -> float:
-    """The variance of the middle of whitened errors in the plane, by the median of their squares.
+    """The variance of the middle of whitened errors in the plane, by the median of their squares at a minimum.
 
-    Args:
-        squared: at a minimum, whitened by the stated noise; infinite where a point is behind the camera.
-        redundancy: share of the errors that the unknowns cannot follow.
-
-    Returns:
-        The variance in units of the stated one; that one where there is no redundancy.
+    In units of the stated one; that one where there is no redundancy, the share of the errors that the unknowns cannot
+    follow.
     """
     if len(squared) == 0 or not redundancy > 0:
         return 1.0
@@ -159,12 +144,9 @@ def median_scale(
     """The scale of normal errors by the median of their magnitudes, which up to half of them may exceed by anything.
 
     Args:
-        magnitudes: absolute values, lengths or squares of errors; NaN does not count.
+        magnitudes: absolute values or lengths of errors, for a standard deviation, or squares, for a variance; NaN does
+            not count, and where nothing counts the result is NaN.
         expected: median of these magnitudes for a standard deviation of one.
-        mask: errors that count.
-
-    Returns:
-        The standard deviation, or the variance of squares; NaN where nothing counts.
     """
     if mask is not None:
         magnitudes = magnitudes.masked_fill(~mask, torch.nan)
@@ -197,7 +179,6 @@ def fit_inliers(
     """Fit a model to the data that agree with the previous one, until these stay the same.
 
     Args:
-        model: to start with.
         find_inliers: data that agree with a model.
         fit: fits a model to these, starting from the previous one; None where they do not determine it.
         rounds: maximum number of fits.

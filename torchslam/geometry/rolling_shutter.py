@@ -18,14 +18,7 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import (
-    se3_exp,
-    se3_exp_transform,
-    se3_inverse,
-    se3_log,
-    so3_exp,
-    transform,
-)
+from torchslam.geometry.lie import se3_exp, se3_exp_transform, se3_inverse, se3_log, so3_exp, transform
 from torchslam.geometry.precision import full_precision, without_autocast
 
 MAX_GAP = 1.5
@@ -58,7 +51,7 @@ class Readout:
 
     @classmethod
     def from_numbers(cls, numbers: Tensor) -> Self:
-        """Read the four numbers of a file, as `numbers` has them. Raises ValueError for numbers that are none."""
+        """Read the four `numbers` of a file. Raises ValueError for numbers that are none."""
         if numbers.shape != (4,) or numbers.dtype != torch.float64:
             raise ValueError(f"the readout is {tuple(numbers.shape)} of {numbers.dtype}, not four float64")
         if not bool(numbers.isfinite().all()) or bool((numbers[[0, 2]].abs() > MAX_READOUT).any()):
@@ -69,7 +62,7 @@ class Readout:
 
     @property
     def numbers(self) -> Float[Tensor, " 4"]:
-        """Seconds, standard error, prior and its standard deviation, as files have them."""
+        """As files have them."""
         numbers = float(self.seconds), self.std, self.prior, self.prior_std
         return torch.tensor(numbers, dtype=torch.float64, device="cpu")
 
@@ -80,11 +73,11 @@ class Readout:
 
     @property
     def is_sought(self) -> bool:
-        """Whether images may say that there is one, of which nothing was known."""
+        """Whether images may show one of which nothing was known."""
         return self.prior == 0 and self.prior_std > 0
 
     def updated(self, seconds: float, std: float) -> Self:
-        """The mean of the prior and of what images say, weighted by their information."""
+        """The mean of the prior and of an estimate from images, weighted by their information."""
         if not math.isfinite(std) or not self.prior_std:
             return self
         share = self.prior_std**2 / (self.prior_std**2 + std**2)
@@ -108,13 +101,9 @@ def row_poses(
     fractions: Float[Tensor, "*#batch"],
     readout: Float[Tensor, "*#readout"],
 ) -> Float[Tensor, "*batch 4 4"]:
-    """The poses at rows: exp(r readout v) T_cw.
+    """The poses at rows: exp(r readout v) T_cw, of poses at the middle row and `row_fractions` r; readout in seconds.
 
-    Args:
-        T_cw: of the frames, at the middle of their images.
-        velocities: left perturbations of the poses, translation first, per second.
-        fractions: of the rows, see `row_fractions`.
-        readout: seconds.
+    Velocities are left perturbations of the poses per second, translation first.
     """
     return se3_exp((fractions * readout)[..., None] * velocities) @ T_cw
 
@@ -131,14 +120,11 @@ def global_shutter_pixels(
     """Where the keypoints would be if all rows were exposed with the one in the middle.
 
     A keypoint is moved by the difference between the images of its point at the pose of the frame and at that of the
-    row. A keypoint stays where it is if one of the two is invalid.
+    row, unless one of the two is invalid.
 
     Args:
-        pixels: detected keypoints.
         T_cw: pose of the frame of each keypoint.
         velocities: of that frame, per second, see `row_poses`.
-        points_w: the point of each keypoint.
-        camera: of all frames.
         readout: seconds; a scalar, or of any shape that broadcasts with (..., N).
     """
     fractions = row_fractions(pixels, camera.height)
@@ -154,10 +140,7 @@ def at_middle_row(
 ) -> Float[Tensor, "B N 2"]:
     """Where a camera that only turns sees points of any distance while its middle row is exposed.
 
-    Args:
-        pixels: of the points, each seen while its own row is exposed.
-        camera: of the view.
-        turns: rotation vectors from the first row to the last one.
+    turns: rotation vectors from the first row to the last one
     """
     R = so3_exp(-row_fractions(pixels, camera.height)[..., None] * turns[:, None])
     return camera.project((R @ camera.unproject(pixels)[..., None])[..., 0])[0]
@@ -176,8 +159,7 @@ def frame_velocities(
     neighbors. A frame with one neighbor has the velocity from there to it, one without any has none.
 
     Args:
-        T_cw: poses, in any order.
-        timestamps: seconds.
+        timestamps: seconds, in any order.
         recordings: frames with different numbers are no neighbors; one recording if omitted.
         frames: rows whose velocities are computed, the others are zero; all if omitted.
 

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.camera_measurement import FOCAL, K1, intrinsics_directions, with_radial_terms
-from torchslam.geometry.lie import cayley_rotation, generators, so3_exp
+from torchslam.geometry.lie import cayley_rotation, generators, homogeneous, so3_exp
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.ransac import ModelState, best_of, levenberg_marquardt
 from torchslam.geometry.robust import robustify
@@ -27,9 +27,6 @@ _STARTS = 3  # focal lengths, over twice the standard deviation to both sides; t
 _ITERATIONS = 10
 """Of Levenberg-Marquardt from each start. Tried at this value only."""
 _KERNEL_SCALE = 2.0  # thresholds at which the Huber kernel becomes linear
-_BEHIND = 1e3  # squared thresholds: the cost of a match that turns behind the camera
-_ROTATION_SAMPLES = 16
-"""Minimal samples of a rotation. Tried at this value only."""
 READOUT_STD = 0.5
 """Standard deviation of the readout time about zero, in intervals between frames; it is below one. Tried at this value
 only."""
@@ -72,8 +69,6 @@ def fit_rotating_camera(
     from several focal lengths. Not differentiable by design: it serves a decision.
 
     Args:
-        pixels_1: matches in view 1.
-        pixels_2: matches in view 2.
         camera: of both views, one.
         std: relative standard deviation of its focal length, and of k1; above zero.
         threshold: pixels, about the noise of one coordinate or somewhat more.
@@ -103,7 +98,7 @@ def fit_rotating_camera(
         """Rotations to the middle row of view 2 and on to the row of the match; the image points before and after."""
         R_1, R_2 = (so3_exp(readout[..., None] * turn) for turn in row_turns)
         R_middle = R[:, None] @ R_1.mT
-        h_1 = torch.nn.functional.pad(at.normalize(pixels_1), (0, 1), value=1.0)
+        h_1 = homogeneous(at.normalize(pixels_1))
         h_middle = _rotated(R_middle, h_1)
         return R_middle, R_2, h_1, h_middle, _rotated(R_2, h_middle)
 
@@ -112,7 +107,7 @@ def fit_rotating_camera(
     ) -> tuple[Tensor, Tensor]:
         at = changed(change)
         R_middle, R_2, h_1, h_middle, h_2 = image_points(R, at, readout)
-        along = (directions * torch.nn.functional.pad(factor(change), (0, 1), value=1.0)[:, None])[:, None]
+        along = (directions * homogeneous(factor(change))[:, None])[:, None]
         # The image points of fixed pixels move with the camera: 0 = J_point dx + J_params dparams.
         _, _, J_point, J_params = at.project_with_jacobians(h_1)
         moves = -torch.linalg.solve_ex(J_point[..., :2], J_params @ along)[0]
@@ -131,7 +126,7 @@ def fit_rotating_camera(
         prior = torch.diag_embed(departures.new_tensor((1.0, 1.0, 1 / READOUT_STD)).expand_as(departures))
         prior = torch.cat((torch.nn.functional.pad(prior, (3, 0)), departures[..., None]), dim=-1)
         rows = torch.cat((rows, prior), dim=1)
-        cost = torch.where(mask, torch.where(valid, robust.rho, _BEHIND), 0.0).sum(-1)
+        cost = torch.where(mask, torch.where(valid, robust.rho, 1e3), 0.0).sum(-1)
         return rows.mT @ rows, cost + departures.square().sum(-1)
 
     def retract(state: ModelState, step: Float[Tensor, "B 6"]) -> ModelState:
@@ -154,9 +149,8 @@ def fit_rotating_camera(
         )
         R, change, readout = found
         covariance, singular = torch.linalg.inv_ex(evaluate(*found)[0][:, :-1, :-1])
-        readout_std = (
-            torch.where(singular == 0, covariance[:, -1, -1], torch.inf).sqrt().clamp_max(READOUT_STD)
-        )
+        readout_std = torch.where(singular == 0, covariance[:, -1, -1], torch.inf).sqrt()
+        readout_std = readout_std.clamp_max(READOUT_STD)
         pixels, valid = changed(change).project(image_points(R, changed(change), readout)[-1])
         errors = torch.where(valid, (pixels - pixels_2).norm(dim=-1), torch.inf)
         each = tuple(x.unflatten(0, (B, -1)) for x in (R, change, readout[:, 0], readout_std, errors))
@@ -168,18 +162,11 @@ def fit_rotating_camera(
 def rotation_between(
     pixels_1: Float[Tensor, "B N 2"], pixels_2: Float[Tensor, "B N 2"], camera: Camera, threshold: float
 ) -> Float[Tensor, "B 3 3"]:
-    """The rotations from view 1 to view 2 that most matches support, as if the camera did not move.
-
-    Args:
-        pixels_1: matches in view 1.
-        pixels_2: matches in view 2.
-        camera: of both views, one.
-        threshold: pixels, about the noise of one coordinate or somewhat more.
-    """
+    """The rotations from view 1 to view 2 that most matches support, as if the camera did not move."""
     with torch.no_grad():
         mask = torch.ones_like(pixels_1[..., 0], dtype=torch.bool)
         views = TwoViews.of(pixels_1, pixels_2, camera, camera, threshold, mask, None)
-        R = propose_rotation(views, _ROTATION_SAMPLES, torch.Generator().manual_seed(0))
+        R = propose_rotation(views, 16, torch.Generator().manual_seed(0))
         ((R,), _) = best_of(*fit_rotation(views, R, _ITERATIONS, _KERNEL_SCALE))
         return R
 

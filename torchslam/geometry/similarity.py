@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchslam.geometry.absolute_pose import CANDIDATES, FINAL_ITERATIONS, FINAL_WIDTH, FIRST_ROUND
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.estimate_gradients import first_order, needs_gradient, refuse_transforms
-from torchslam.geometry.lie import cayley_rotation, rigid, se3_inverse, sim3_inverse, so3_exp, transform, vee
+from torchslam.geometry.lie import homogeneous, rigid, se3_inverse, sim3_inverse, so3_exp, transform, vee
 from torchslam.geometry.precision import check_positive, full_precision
 from torchslam.geometry.projections import squared_projections
 from torchslam.geometry.ransac import (
@@ -20,12 +20,17 @@ from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
     ModelState,
     best_models,
+    best_of,
     check_search,
     gather_rows,
     is_significant,
+    leave_a_line,
     levenberg_marquardt,
+    pose_rows,
+    retract_pose,
     sample_minimal,
     search,
+    some_problems,
     truncated_rows,
     truncated_score,
 )
@@ -48,8 +53,6 @@ def umeyama(
     between two point patterns", 1991.
 
     Args:
-        source: points.
-        target: corresponding points.
         weights: weights or a boolean mask; rows without a finite weight above zero do not count and may hold anything.
         with_scale: False fixes the scale to one.
 
@@ -76,12 +79,9 @@ def umeyama(
     else:
         scale = torch.ones_like(mean_source[..., 0])
     t = mean_target - scale[..., None] * (R @ mean_source[..., None]).squeeze(-1)
-    scale = torch.where(finite, scale, torch.nan)
-    return (
-        scale,
-        torch.where(finite[..., None, None], R, torch.nan),
-        torch.where(finite[..., None], t, torch.nan),
-    )
+    finite = finite[..., None, None]
+    scale, R = torch.where(finite[..., 0, 0], scale, torch.nan), torch.where(finite, R, torch.nan)
+    return scale, R, torch.where(finite[..., 0], t, torch.nan)
 
 
 def align_poses(
@@ -93,8 +93,6 @@ def align_poses(
     too. Its scale is the ratio of the spreads of the centers, one where all are at one place.
 
     Args:
-        T_ac: poses, camera to world a.
-        T_bc: poses of the same cameras, camera to world b.
         use_centers: let centers and orientations count equally in the rotation.
     """
     M = (T_bc[:, :3, :3] @ T_ac[:, :3, :3].mT).sum(0)
@@ -141,16 +139,11 @@ def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 
     return so3_exp(first_order(omega - omega.detach())) @ R
 
 
-# 99 % of two-dimensional normal errors are smaller than this many standard deviations.
-_THRESHOLD = 3.035
-_DEPTH_SIGMA = 0.1
-"""Relative standard deviation of the depth of triangulated points. Tried at this value only."""
-_SAMPLE = 3  # pairs that fix a similarity
-_FIRST_ROUND = 160  # samples
-_CANDIDATES = 2  # hypotheses of each round that are optimized
-_LOCAL_ITERATIONS, _FINAL_ITERATIONS = 2, 10
-"""Of a hypothesis within the search, which only ranks it, and of the final refinement. Tried at these values only."""
-_FINAL_WIDTH = 1.5  # thresholds; the refinement uses the tail of the noise too
+# 99 % of two-dimensional normal errors are smaller than this many standard deviations; and the relative standard
+# deviation of the depth of triangulated points, tried at this value only.
+_THRESHOLD, _DEPTH_SIGMA = 3.035, 0.1
+_LOCAL_ITERATIONS = 2
+"""Of a hypothesis within the search, which only ranks it. Tried at this value only."""
 
 
 @dataclass(frozen=True)
@@ -197,14 +190,12 @@ def estimate_similarity(
     system", 2015, section VII-B; for the minimal solution `umeyama`.
 
     Args:
-        points_1: points in the coordinates of camera 1.
-        points_2: the same points in the coordinates of camera 2.
+        points_1: points in the coordinates of camera 1; `points_2`: the same ones in those of camera 2.
         pixels_1: where camera 1 saw them.
         pixels_2: where camera 2 saw them.
         camera_1: one or B.
         camera_2: one or B.
-        sigmas_1: standard deviations of `pixels_1`, pixels; None: one.
-        sigmas_2: standard deviations of `pixels_2`, pixels; None: one.
+        sigmas_1: standard deviations of `pixels_1`, pixels; None: one. `sigmas_2`: of `pixels_2`.
         threshold: reprojection error of an inlier in standard deviations, of the points of each camera in the other
             image.
         depth_sigma: relative standard deviation of the depths in camera 2. They determine the scale where both
@@ -216,23 +207,20 @@ def estimate_similarity(
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples per pair of cameras.
 
-    Returns:
-        The similarities.
-
     Raises:
         ValueError: A shape or a dtype does not fit.
         RuntimeError: It is called within a transform of `torch.func`.
     """
-    shape, given = points_1.shape[:-1], (points_1, points_2, pixels_1, pixels_2)
     refuse_transforms("estimate_similarity")
     check_search(threshold, confidence, max_samples)
     check_positive(depth_sigma=depth_sigma)
+    given = points_1, points_2, pixels_1, pixels_2
     sigmas = tuple(torch.ones_like(points_1[..., 0]) if s is None else s for s in (sigmas_1, sigmas_2))
     positive = torch.stack((points_1[..., 2], points_2[..., 2], *sigmas), dim=-1)
     use = (positive > 0).all(-1) & torch.isfinite(torch.cat((*given, positive), dim=-1)).all(-1)
     use = use if mask is None else use & mask
-    B, N = shape
-    if B == 0 or N < _SAMPLE:
+    B, N = use.shape
+    if B == 0 or N < 3:
         S_21 = torch.eye(4, dtype=points_1.dtype, device=points_1.device).expand(B, 4, 4)
         return Similarity(S_21, torch.zeros_like(use), torch.zeros_like(S_21[:, 0, 0]) > 0, S_21[:, 0, 1])
     points_1, points_2, pixels_1, pixels_2 = (torch.where(use[..., None], x, 0.0).detach() for x in given)
@@ -248,9 +236,9 @@ def estimate_similarity(
 
 @dataclass(frozen=True)
 class _View:
-    """One direction: points of the other camera, and where this one saw them.
+    """One direction: points of the other camera, and where this one saw them; sigmas are thresholds in pixels.
 
-    sigmas: thresholds in pixels; normalized: undistorted pixels; scale: thresholds per unit of `normalized`
+    normalized: undistorted pixels; scale: thresholds per unit of them
     """
 
     points: Float[Tensor, "B N 3"]
@@ -264,15 +252,8 @@ class _View:
     def of(points: Tensor, pixels: Tensor, sigmas: Tensor, camera: Camera, threshold: float) -> _View:
         camera = camera.with_params(camera.params.detach().expand(len(points), -1))
         normalized, sigmas = camera.normalize(pixels), threshold * sigmas
-        return _View(
-            points, pixels, sigmas, camera, normalized, camera.pixel_scale(normalized) / sigmas[..., None]
-        )
-
-    def select(self, rows: Tensor) -> _View:
-        """Some of the problems."""
-        fields = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        chosen: dict[str, Any] = {name: x[rows] for name, x in fields.items() if isinstance(x, Tensor)}
-        return replace(self, camera=self.camera.with_params(self.camera.params[rows]), **chosen)
+        scale = camera.pixel_scale(normalized) / sigmas[..., None]
+        return _View(points, pixels, sigmas, camera, normalized, scale)
 
     def undistorted_errors(
         self, P: Float[Tensor, "B K 3 4"], rows: Int[Tensor, "B n"] | None = None
@@ -281,8 +262,7 @@ class _View:
         points, x, scale = self.points, self.normalized, self.scale
         if rows is not None:
             points, x, scale = (gather_rows(values, rows) for values in (points, x, scale))
-        homogeneous = torch.nn.functional.pad(points, (0, 1), value=1.0).mT
-        return squared_projections(P, homogeneous.to(P.dtype), x.to(P.dtype), scale)
+        return squared_projections(P, homogeneous(points).mT.to(P.dtype), x.to(P.dtype), scale)
 
     def residuals(
         self, P: Float[Tensor, "B 3 4"]
@@ -296,10 +276,7 @@ class _View:
 
 @dataclass(frozen=True)
 class _Problem:
-    """The data of the search: camera 1's points in camera 2, and the reverse.
-
-    depth_sigma: threshold of relative differences in depth
-    """
+    """Camera 1's points in camera 2, and the reverse. depth_sigma: threshold of relative differences in depth"""
 
     forward: _View
     backward: _View
@@ -309,7 +286,7 @@ class _Problem:
 
     def select(self, rows: Tensor) -> _Problem:
         """Some of the problems."""
-        forward, backward = self.forward.select(rows), self.backward.select(rows)
+        forward, backward = some_problems(self.forward, rows), some_problems(self.backward, rows)
         return replace(self, forward=forward, backward=backward, mask=self.mask[rows])
 
     def solve(
@@ -320,14 +297,23 @@ class _Problem:
         (P,) = search(
             lambda rows, count: self.select(rows).propose(count, generator),
             self.mask.sum(-1),
-            _SAMPLE,
+            3,
             confidence,
-            _FIRST_ROUND,
+            FIRST_ROUND,
             max_samples,
         )
-        P, _ = self.fit(P, _FINAL_ITERATIONS, _FINAL_WIDTH)
+        P, _ = self.fit(P, FINAL_ITERATIONS, FINAL_WIDTH)
         squared = self.larger_errors(P)
-        success = self.is_success((squared < 1) & self.mask)
+        # A wrong pair has to fit in both images, but the one makes the other more likely: only one is counted.
+        inliers, count = (squared < 1) & self.mask, self.mask.sum(-1)
+        areas = [
+            (view.sigmas.square() * self.mask).sum(-1) * math.pi / (view.camera.width * view.camera.height)
+            for view in (self.forward, self.backward)
+        ]
+        chance = torch.maximum(*areas).double() / count.clamp_min(1)
+        success = is_significant(inliers.sum(-1), count, 3, chance, solutions=1)
+        for view in (self.forward, self.backward):
+            success = success & leave_a_line(view.points, inliers)
         score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
         eye = torch.eye(4, dtype=P.dtype, device=P.device)
         S_21 = torch.where(success[:, None, None], rigid(P[..., :3], P[..., 3]), eye)
@@ -335,29 +321,27 @@ class _Problem:
 
     def propose(self, count: int, generator: torch.Generator) -> tuple[ModelState, Tensor, Tensor]:
         """The best similarity from `count` minimal samples, locally optimized, its score and its support."""
-        sample = sample_minimal(self.mask, _SAMPLE, count, generator)
+        sample = sample_minimal(self.mask, 3, count, generator)
         source, target = (gather_rows(view.points, sample) for view in (self.forward, self.backward))
         scale, R, t = umeyama(source, target, with_scale=self.with_scale)
         P = torch.cat((scale[..., None, None] * R, t[..., None]), dim=-1).flatten(2)
         valid = torch.isfinite(P).all(-1) & (scale > torch.finfo(P.dtype).eps)
-        best = best_models(self.score, P, valid, self.mask, _CANDIDATES, generator)
+        best = best_models(self.score, P, valid, self.mask, CANDIDATES, generator)
         # Samples of equal points have no scale; what stands in for them is finite.
         safe = torch.eye(3, 4, dtype=P.dtype, device=P.device).flatten()
         P = gather_rows(torch.where(valid[..., None], P, safe), best).flatten(0, 1).unflatten(-1, (3, 4))
-        rows = torch.arange(len(self.mask), device=P.device)
-        each = self.select(rows.repeat_interleave(_CANDIDATES))
+        each = self.select(torch.arange(len(self.mask), device=P.device).repeat_interleave(CANDIDATES))
         P, cost = each.fit(P, _LOCAL_ITERATIONS, 1.0)
-        cost, best = cost.unflatten(0, (-1, _CANDIDATES)).nan_to_num(torch.inf).min(dim=1)
-        P = P.unflatten(0, (-1, _CANDIDATES))[rows, best]
+        (P,), cost = best_of((P.unflatten(0, (-1, CANDIDATES)),), cost.unflatten(0, (-1, CANDIDATES)))
         near = (self.larger_errors(P) < SUPPORT_WIDTH**2) & self.mask
         return (P,), self.mask.sum(-1) - cost, near.sum(-1)
 
     def score(self, P: Float[Tensor, "B K 12"], rows: Int[Tensor, "B n"] | None) -> Float[Tensor, "B K"]:
         """Truncated scores of many similarities on some of the pairs, or all, in float32."""
         P = P.unflatten(-1, (3, 4))
-        mask = self.mask if rows is None else self.mask.gather(1, rows)
         there = self.forward.undistorted_errors(P.float(), rows)
         back = self.backward.undistorted_errors(_inverse(P).float(), rows)
+        mask = self.mask if rows is None else self.mask.gather(1, rows)
         return truncated_score(torch.maximum(there, back), mask)
 
     def larger_errors(self, P: Float[Tensor, "B 3 4"]) -> Float[Tensor, "B N"]:
@@ -372,75 +356,36 @@ class _Problem:
         self, P: Float[Tensor, "B 3 4"], iterations: int, width: float
     ) -> tuple[Float[Tensor, "B 3 4"], Float[Tensor, " B"]]:
         """Similarities of least truncated squared error in both images and in depth, and their costs."""
-        dims = 7 if self.with_scale else 6
+
+        def in_step(J: Tensor, points: Tensor) -> Tensor:
+            rows = pose_rows(J, points)
+            return torch.cat((rows, J @ points[..., None]), dim=-1) if self.with_scale else rows
 
         def evaluate(P: Tensor) -> tuple[Tensor, Tensor]:
             inverse = _inverse(P)
             moved, there, J, valid = self.forward.residuals(P)
             _, back, J_back, valid_back = self.backward.residuals(inverse)
-            deeper, J_deeper = self.depths(moved)
+            # Differences of the logarithms of depths in camera 2; none where a depth is not positive.
+            front = (moved[..., 2:] > 0) & (self.backward.points[..., 2:] > 0)
+            depth, known = (torch.where(front, x[..., 2:], 1.0) for x in (moved, self.backward.points))
+            deeper = (depth / known).log() / self.depth_sigma
+            slope = torch.where(front, 1 / (self.depth_sigma * depth), 0.0)
+            J = torch.cat((J, torch.nn.functional.pad(slope[..., None], (2, 0))), dim=-2)
             # Moving S from the left moves the points of camera 2 against it before the inverse maps them.
-            slopes = (
-                _chain(torch.cat((J, J_deeper), dim=-2), moved),
-                -_chain(J_back @ inverse[:, None, :, :3], self.backward.points),
-            )
+            slopes = in_step(J, moved), -in_step(J_back @ inverse[:, None, :, :3], self.backward.points)
             residual = torch.cat((there, deeper, back), dim=-1)
             squared = 0.5 * residual.square().sum(-1)  # as large as in each image, where both are alike
             squared = squared.masked_fill(~(valid & valid_back), torch.inf)
             used, cost = truncated_rows(squared[:, None], self.mask, width)
-            rows = torch.cat((torch.cat(slopes, dim=-2)[..., :dims], residual[..., None]), dim=-1)
+            rows = torch.cat((torch.cat(slopes, dim=-2), residual[..., None]), dim=-1)
             rows = torch.where(used[:, 0, :, None, None], rows, 0.0).flatten(1, 2)
             return 0.5 * torch.bmm(rows.mT, rows), cost[:, 0]
 
-        (P,), cost = levenberg_marquardt((P,), evaluate, _retract, iterations)
+        (P,), cost = levenberg_marquardt((P,), evaluate, retract_pose, iterations)
         return P, cost
-
-    def depths(
-        self, moved: Float[Tensor, "B N 3"]
-    ) -> tuple[Float[Tensor, "B N 1"], Float[Tensor, "B N 1 3"]]:
-        """Differences of the logarithms of depths in camera 2, in thresholds, and their derivatives in the points.
-
-        Both are zero where a depth is not positive.
-        """
-        front = (moved[..., 2:] > 0) & (self.backward.points[..., 2:] > 0)
-        depth, known = (torch.where(front, x[..., 2:], 1.0) for x in (moved, self.backward.points))
-        slope = torch.where(front, 1 / (self.depth_sigma * depth), 0.0)
-        return (depth / known).log() / self.depth_sigma, torch.nn.functional.pad(slope[..., None], (2, 0))
-
-    def is_success(self, inliers: Bool[Tensor, "B N"]) -> Bool[Tensor, " B"]:
-        """Test whether the inliers are significant and fix the similarity: four or more, not on one line."""
-        weights = inliers[..., None].to(self.forward.points.dtype)
-        count = self.mask.sum(-1)
-        # A wrong pair has to fit in both images, but the one makes the other more likely: only one is counted.
-        areas = [
-            (view.sigmas.square() * self.mask).sum(-1) * math.pi / (view.camera.width * view.camera.height)
-            for view in (self.forward, self.backward)
-        ]
-        chance = torch.maximum(*areas).double() / count.clamp_min(1)
-        success = is_significant(inliers.sum(-1), count, _SAMPLE, chance, solutions=1)
-        for view in (self.forward, self.backward):
-            mean = (weights * view.points).sum(1, keepdim=True) / weights.sum(1, keepdim=True).clamp_min(1.0)
-            centered = weights * (view.points - mean)
-            spread = torch.linalg.eigvalsh(centered.mT @ centered)
-            success = success & (spread[:, 1] > 1e-6 * spread[:, 2])
-        return success
 
 
 def _inverse(P: Float[Tensor, "*batch 3 4"]) -> Float[Tensor, "*batch 3 4"]:
     """Inverse of similarities [sR t]."""
     linear = P[..., :3].mT / P[..., :1, :3].square().sum(-1, keepdim=True)
     return torch.cat((linear, -linear @ P[..., 3:]), dim=-1)
-
-
-def _chain(J: Float[Tensor, "*batch R 3"], points: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch R 7"]:
-    """Derivatives in [rho, omega, sigma] of what depends on points by J."""
-    rotation = torch.linalg.cross(points[..., None, :].expand_as(J), J, dim=-1)
-    return torch.cat((J, rotation, J @ points[..., None]), dim=-1)
-
-
-def _retract(P: ModelState, step: Tensor) -> ModelState:
-    """Moves [sR t] by [rho, omega] or [rho, omega, sigma] from the left. (B, 3, 4), (B, 6 or 7)."""
-    turn = cayley_rotation(step[:, 3:6])
-    if step.shape[-1] == 7:
-        turn = turn * step[:, 6, None, None].exp()
-    return (torch.baddbmm(torch.nn.functional.pad(step[:, :3, None], (3, 0)), turn, P[0]),)

@@ -8,6 +8,7 @@ Every change of axes is made here:
 | COLMAP | `T_cw`, quaternion w first | the same | that of the map | (0.5, 0.5) |
 | nerfstudio | `T_wc` | OpenGL: x right, y up, z backward | z up | (0.5, 0.5) |
 | PLY | | | z up | |
+| kornia | `T_cw` | the same | that of the map | (0, 0) |
 | rerun | `T_wc` | x right, y down, z forward (RDF) | z up | (0.5, 0.5) |
 | TUM, KITTI | `T_wc` | x right, y down, z forward | that of the map | |
 """
@@ -15,6 +16,7 @@ Every change of axes is made here:
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import torch
 from jaxtyping import Float
@@ -29,6 +31,9 @@ from torchslam.geometry.lie import (
     sim3_scale,
     transform,
 )
+
+if TYPE_CHECKING:  # kornia is slow to import
+    from kornia.geometry import PinholeCamera
 
 
 def pose_distance(
@@ -50,8 +55,8 @@ def rotation_angle(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch"]:
 def reorthonormalized(T: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """Reorthonormalize the rotations of nearly rigid transforms, to machine precision.
 
-    If poses are predicted from earlier ones, with transposes for inverses, the deviation from a rotation grows by a
-    factor of 1 + sqrt(2) per frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
+    In poses predicted from earlier ones, with transposes for inverses, the deviation from a rotation grows by a factor
+    of 1 + sqrt(2) per frame. One step of Newton's iteration for the polar decomposition (Higham, 1986).
     """
     R = T[..., :3, :3]
     return rigid(1.5 * R - 0.5 * R @ (R.mT @ R), T[..., :3, 3])
@@ -108,7 +113,7 @@ def corner_pixels(pixels: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 2"
 def corner_camera(camera: Camera) -> Camera:
     """The camera whose pixels are those of `corner_pixels`."""
     params = camera.params.clone()
-    params[..., 2:4] += HALF_PIXEL
+    params[..., 2:4] = corner_pixels(params[..., 2:4])
     return camera.with_params(params)
 
 
@@ -125,8 +130,7 @@ def quaternion_wxyz(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]
 def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
     """Rotation from the world to one whose z is up and whose x is as close to the world's x as possible.
 
-    Gravity is not known: up is the mean up direction of the cameras. If that is zero (half of the cameras are
-    upside down), up is -y.
+    Up is the mean up direction of the cameras; if that is zero (half of them are upside down), it is -y.
     """
     down = T_wc[:, :3, 1].mean(dim=0) if len(T_wc) else T_wc.new_zeros(3)
     if float(down.norm()) < 1e-3:  # a unit vector in any but made-up cases
@@ -135,11 +139,47 @@ def upright_rotation(T_wc: Float[Tensor, "N 4 4"]) -> Float[Tensor, "3 3"]:
 
 
 def level_rotation(up_w: Float[Tensor, " 3"]) -> Float[Tensor, "3 3"]:
-    """Rotation from the world to one whose z is the unit vector up_w and whose x is as close to the old x as possible.
-
-    Where up is nearly x, the world's z takes its place.
-    """
+    """As `upright_rotation`, for a unit vector up_w; where up is nearly x, the world's z takes the place of x."""
     axis = up_w.new_tensor((1.0, 0.0, 0.0) if abs(float(up_w[0])) < 0.9 else (0.0, 0.0, 1.0))
     right = axis - (axis @ up_w) * up_w
     right = right / right.norm()
     return torch.stack((right, torch.linalg.cross(up_w, right), up_w))
+
+
+def to_kornia_camera(camera: Camera, T_cw: Float[Tensor, "B 4 4"]) -> PinholeCamera:
+    """One `kornia.geometry.PinholeCamera`, which holds K and a pose, for a batch of poses; with gradients.
+
+    Args:
+        camera: a pinhole, one for all poses or one for each.
+        T_cw: world to camera; kornia's `Se3.from_matrix` takes it as it is.
+
+    Raises:
+        ValueError: the camera has another model: kornia's has no distortion.
+    """
+    from kornia.geometry import PinholeCamera
+
+    if camera.model != "pinhole":
+        raise ValueError(
+            f"kornia's camera has no distortion, this one is of the model {camera.model!r}: undistort the images"
+        )
+    batch = len(T_cw)
+    K = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device).repeat(batch, 1, 1)
+    K[:, :3, :3] = camera.K
+    height, width = (torch.full((batch,), side, device=T_cw.device) for side in (camera.height, camera.width))
+    return PinholeCamera(K, T_cw, height, width)
+
+
+def from_kornia_camera(camera: PinholeCamera) -> tuple[Camera, Float[Tensor, "B 4 4"]]:
+    """The pinholes of a batch, and the poses, world to camera; with gradients.
+
+    Raises:
+        ValueError: the images of the batch have different sizes, or K has a skew.
+    """
+    sizes = {(int(w), int(h)) for w, h in zip(camera.width, camera.height, strict=True)}
+    if len(sizes) != 1:
+        raise ValueError(f"the images of the batch have different sizes: {sorted(sizes)}")
+    K = camera.intrinsics[:, :3, :3]
+    if bool((K[:, 0, 1] != 0).any()):
+        raise ValueError("a camera with a skew is not a pinhole here")
+    params = torch.stack((K[:, 0, 0], K[:, 1, 1], K[:, 0, 2], K[:, 1, 2]), dim=-1)
+    return Camera("pinhole", params, sizes.pop()), camera.extrinsics

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import inverse_2x2, whitening
-from torchslam.geometry.lie import se3_inverse, skew, transform
+from torchslam.geometry.lie import homogeneous, se3_inverse, skew, transform
 from torchslam.geometry.precision import full_precision
 
 
@@ -23,8 +23,7 @@ class Triangulation:
         angles: parallax between the two rays at the point, radians.
         depths_1: z in camera 1.
         depths_2: z in camera 2.
-        errors_1: reprojection error in pixels; infinite where the point does not project.
-        errors_2: reprojection error in pixels; infinite where the point does not project.
+        errors_1: reprojection error in pixels; infinite where the point does not project. `errors_2`: in view 2.
         mask: the input mask, where the rays intersect in front of both cameras.
     """
 
@@ -75,17 +74,8 @@ def triangulate(
     the noise).
 
     Args:
-        T_1w: world to camera 1.
-        T_2w: world to camera 2.
-        pixels_1: matches in view 1.
-        pixels_2: matches in view 2.
-        camera_1: of view 1.
-        camera_2: of view 2.
         mask: matches in use; rows outside it may hold anything.
         normalized: the undistorted coordinates of both pixels, if the caller has them already.
-
-    Returns:
-        The points and measures of their quality.
     """
     finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     mask = finite if mask is None else mask & finite
@@ -95,18 +85,18 @@ def triangulate(
     R_21, t_21 = T_21[..., :3, :3], T_21[..., :3, 3]
     x_1, x_2 = correct_matches(skew(t_21) @ R_21, x_1, x_2)
 
-    ray_1, ray_2 = _homogeneous(x_1) @ R_21.mT, _homogeneous(x_2)
+    h_1, ray_2 = homogeneous(x_1), homogeneous(x_2)
+    ray_1 = h_1 @ R_21.mT
     t = t_21[..., None, :].expand_as(ray_1)
     normal = torch.linalg.cross(ray_1, ray_2, dim=-1)
     normal_squared = (normal * normal).sum(-1)
     # depth_2 ray_2 = depth_1 ray_1 + t, each depth after a cross product with the other ray
     tiny = torch.finfo(x_1.dtype).eps ** 2
     intersects = normal_squared > tiny
-    depth_1 = -(torch.linalg.cross(t, ray_2, dim=-1) * normal).sum(-1) / torch.where(
-        intersects, normal_squared, 1.0
-    )
+    depth_1 = -(torch.linalg.cross(t, ray_2, dim=-1) * normal).sum(-1)
+    depth_1 = depth_1 / torch.where(intersects, normal_squared, 1.0)
     depth_1 = torch.where(intersects & (depth_1 != 0), depth_1, 1.0)
-    points_1 = depth_1[..., None] * _homogeneous(x_1)
+    points_1 = depth_1[..., None] * h_1
     points_2 = transform(T_21, points_1)
     depth_2 = points_2[..., 2]
 
@@ -130,17 +120,8 @@ def triangulation_covariance(
 ) -> Float[Tensor, "*#batch N 3 3"]:
     """Covariances (sum of J^T J / sigma^2)^-1 of points triangulated from two views with exact poses.
 
-    Args:
-        T_1w: world to camera 1.
-        T_2w: world to camera 2.
-        points_w: points.
-        sigmas_1: standard deviations of the pixels in view 1, or their covariances.
-        sigmas_2: of the pixels in view 2.
-        camera_1: of view 1.
-        camera_2: of view 2.
-
-    Returns:
-        The covariances; zero where the views do not determine a point: no parallax, or not in front of both.
+    Zero where the views do not determine a point: no parallax, or not in front of both. `sigmas_1` and `sigmas_2` are
+    standard deviations of the pixels, or their covariances.
     """
     information = torch.zeros_like(points_w[..., None] * points_w[..., None, :])
     determined = torch.ones_like(points_w[..., 0], dtype=torch.bool)
@@ -163,21 +144,12 @@ def correct_matches(
 ) -> tuple[Float[Tensor, "*#batch N 2"], Float[Tensor, "*#batch N 2"]]:
     """Move matches by the least squared distance, over both images, onto the epipolar constraint x_2^T E x_1 = 0.
 
-    Source: Lindstrom, "Triangulation made easy", 2010.
-
-    Args:
-        E: essential matrices.
-        x_1: undistorted image coordinates in view 1.
-        x_2: undistorted image coordinates in view 2.
-
-    Returns:
-        The corrected x_1 and x_2.
+    In undistorted image coordinates. Source: Lindstrom, "Triangulation made easy", 2010.
     """
     E_22 = E[..., :2, :2]
-    line_2 = _homogeneous(x_1) @ E.mT  # E x_1
-    n_2 = line_2[..., :2]
-    n_1 = (_homogeneous(x_2) @ E)[..., :2]
-    constraint = (_homogeneous(x_2) * line_2).sum(-1)
+    h_2, line_2 = homogeneous(x_2), homogeneous(x_1) @ E.mT
+    n_1, n_2 = (h_2 @ E)[..., :2], line_2[..., :2]
+    constraint = (h_2 * line_2).sum(-1)
     b = 0.5 * ((n_1 * n_1).sum(-1) + (n_2 * n_2).sum(-1))
     a = ((n_2 @ E_22) * n_1).sum(-1)
     regular = b > torch.finfo(b.dtype).tiny
@@ -207,13 +179,9 @@ def triangulate_many(
 
     Args:
         pixels: observations; entries outside the mask may hold anything.
-        T_cw: world to camera.
         camera: of all views.
         mask: which views see the point.
         iterations: of Gauss-Newton.
-
-    Returns:
-        The points and measures of their quality.
     """
     seen = torch.isfinite(pixels).all(-1)
     seen = seen if mask is None else seen & mask
@@ -231,13 +199,13 @@ def triangulate_many(
 
     points_c = (R_cw @ points_w[..., None, :, None]).squeeze(-1) + t_cw
     depths = points_c[..., 2]
-    counted = seen.sum(-1) >= 2
-    mask = counted & ((depths > 0) | ~seen).all(-1)
-    flat = points_c.flatten(-3, -2)
-    errors = _reprojection_error(camera, flat, pixels.flatten(-3, -2), seen.flatten(-2)).unflatten(
-        -1, seen.shape[-2:]
-    )
-    return MultiViewTriangulation(points_w, _largest_angle(points_w, centers_w, seen), depths, errors, mask)
+    mask = (seen.sum(-1) >= 2) & ((depths > 0) | ~seen).all(-1)
+    flat, flat_pixels = points_c.flatten(-3, -2), pixels.flatten(-3, -2)
+    errors = _reprojection_error(camera, flat, flat_pixels, seen.flatten(-2)).unflatten(-1, seen.shape[-2:])
+    rays, pairs = points_w[..., None, :] - centers_w, seen[..., :, None] & seen[..., None, :]
+    between = _angle(*torch.broadcast_tensors(rays[..., :, None, :], rays[..., None, :, :]))
+    angles = torch.where(pairs, between, 0.0).amax((-2, -1))
+    return MultiViewTriangulation(points_w, angles, depths, errors, mask)
 
 
 def _refine_points(points_w: Tensor, T_cw: Tensor, pixels: Tensor, camera: Camera, seen: Tensor) -> Tensor:
@@ -245,11 +213,9 @@ def _refine_points(points_w: Tensor, T_cw: Tensor, pixels: Tensor, camera: Camer
 
     def residuals(points_w: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         points_c = (R_cw @ points_w[..., None, :, None]).squeeze(-1) + t_cw
-        projected, valid, J, _ = camera.project_with_jacobians(points_c.flatten(-3, -2))
-        projected, J, valid = (
-            x.unflatten(index, shape) for x, index in ((projected, -2), (J, -3), (valid, -1))
-        )
-        used = seen & valid
+        projected, valid, J = camera.project_with_point_jacobians(points_c.flatten(-3, -2))
+        projected, J = projected.unflatten(-2, shape), J.unflatten(-3, shape)
+        used = seen & valid.unflatten(-1, shape)
         residual = torch.where(used[..., None], projected - pixels, 0.0)
         return residual, torch.where(used[..., None, None], J @ R_cw, 0.0), (used == seen).all(-1)
 
@@ -278,10 +244,6 @@ def _solve_3x3(A: Float[Tensor, "*batch 3 3"], b: Float[Tensor, "*batch 3"]) -> 
     return torch.where(regular[..., None], x, 0.0)
 
 
-def _homogeneous(x: Tensor) -> Tensor:
-    return torch.cat((x, torch.ones_like(x[..., :1])), dim=-1)
-
-
 def _length(v: Tensor) -> Tensor:
     """Euclidean norm with gradient zero, not NaN, at zero."""
     squared = (v * v).sum(-1)
@@ -294,14 +256,6 @@ def _angle(u: Tensor, v: Tensor) -> Tensor:
     dot = (u * v).sum(-1)
     sine = _length(torch.linalg.cross(u, v, dim=-1))
     return torch.atan2(sine, torch.where((sine == 0) & (dot == 0), 1.0, dot))
-
-
-def _largest_angle(points_w: Tensor, centers_w: Tensor, seen: Tensor) -> Tensor:
-    """The largest angle at each point between two of the cameras that see it."""
-    rays = points_w[..., None, :] - centers_w
-    pairs = seen[..., :, None] & seen[..., None, :]
-    first, second = torch.broadcast_tensors(rays[..., :, None, :], rays[..., None, :, :])
-    return torch.where(pairs, _angle(first, second), 0.0).amax((-2, -1))
 
 
 def _reprojection_error(camera: Camera, points_c: Tensor, pixels: Tensor, mask: Tensor) -> Tensor:

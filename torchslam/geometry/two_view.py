@@ -6,22 +6,22 @@ of the threshold: to first order, the distance by which the match would have to 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property, lru_cache, partial
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.essential import decompose_essential, essential_from_pose, five_point
-from torchslam.geometry.homography import homography_from_matches, rotation_from_matches, transfer_errors
-from torchslam.geometry.lie import cayley_rotation, generators, skew
+from torchslam.geometry.lie import cayley_rotation, generators, homogeneous, skew
 from torchslam.geometry.projections import (
+    Tangent,
     fit_projections,
     homography_tangent,
     rotation_tangent,
-    score_projections,
+    squared_projections,
 )
 from torchslam.geometry.ransac import (
     SUPPORT_WIDTH,
@@ -33,9 +33,18 @@ from torchslam.geometry.ransac import (
     levenberg_marquardt,
     pad_groups,
     sample_minimal,
+    some_problems,
     truncated_score,
 )
 from torchslam.geometry.robust import NORMAL_MEDIAN, Kernel, median_scale, robustify
+from torchslam.geometry.two_view_matrices import (
+    decompose_essential,
+    essential_from_pose,
+    five_point,
+    homography_from_matches,
+    rotation_from_matches,
+    transfer_errors,
+)
 
 # Thresholds: a two-dimensional error so large is as probable as a one-dimensional one of one.
 TRANSFER_WIDTH = 1.5
@@ -43,14 +52,9 @@ TRANSFER_WIDTH = 1.5
 
 @dataclass(frozen=True)
 class TwoViews:
-    """Matches of B pairs of views.
+    """Matches of B pairs of views in undistorted image coordinates, and the mask of those in use.
 
-    Attributes:
-        x_1: undistorted image coordinates in view 1.
-        x_2: undistorted image coordinates in view 2.
-        scale_1: thresholds per unit of `x_1`.
-        scale_2: thresholds per unit of `x_2`.
-        mask: matches in use.
+    scale_1, scale_2: thresholds per unit of x_1 and x_2
     """
 
     x_1: Float[Tensor, "B N 2"]
@@ -84,9 +88,7 @@ class TwoViews:
 
     def select(self, rows: Int[Tensor, " R"]) -> TwoViews:
         """Some of the problems."""
-        if len(rows) == len(self.mask):
-            return self
-        return TwoViews(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+        return self if len(rows) == len(self.mask) else some_problems(self, rows)
 
     def rows(self, rows: Int[Tensor, "B n"]) -> TwoViews:
         """Some of the matches of each problem, by row number."""
@@ -96,12 +98,12 @@ class TwoViews:
     @cached_property
     def h_1(self) -> Float[Tensor, "B N 3"]:
         """Homogeneous x_1."""
-        return torch.cat((self.x_1, torch.ones_like(self.x_1[..., :1])), dim=-1)
+        return homogeneous(self.x_1)
 
     @cached_property
     def h_2(self) -> Float[Tensor, "B N 3"]:
         """Homogeneous x_2."""
-        return torch.cat((self.x_2, torch.ones_like(self.x_2[..., :1])), dim=-1)
+        return homogeneous(self.x_2)
 
     @cached_property
     def epipolar(self) -> tuple[Float[Tensor, "B 9 N"], Float[Tensor, "B 18 N"]]:
@@ -117,26 +119,18 @@ class TwoViews:
         return constraint, torch.cat((outer_1, outer_2), dim=1).flatten(1, 2)
 
     @cached_property
-    def epipolar_float(self) -> tuple[Float[Tensor, "B 9 N"], Float[Tensor, "B 18 N"]]:
-        """`epipolar` in float32, for scores."""
-        constraint, variance = self.epipolar
-        return constraint.float(), variance.float()
-
-    @cached_property
     def transfer_scale(self) -> Float[Tensor, "B N"]:
         """Thresholds per unit of a difference H(x_1) - x_2, which has the noise of both images.
 
         Two-dimensional errors get a threshold of their own, see `TRANSFER_WIDTH`.
         """
-        return (
-            self.scale_1.square().reciprocal() + self.scale_2.square().reciprocal()
-        ).rsqrt() / TRANSFER_WIDTH
+        both = self.scale_1.square().reciprocal() + self.scale_2.square().reciprocal()
+        return both.rsqrt() / TRANSFER_WIDTH
 
 
-_CANDIDATES = 4  # essential matrices of each round that are optimized
-_MORE_CANDIDATES = 8  # if matches have to be in front of the cameras,
-_CHECKED_CANDIDATES = 24  # of so many
-_ITERATIONS = 4  # of their local optimization
+# Essential matrices of each round that are optimized; if matches have to be in front of the cameras, more, of so many;
+# and the iterations of their local optimization.
+_CANDIDATES, _MORE_CANDIDATES, _CHECKED_CANDIDATES, _ITERATIONS = 4, 8, 24, 4
 # Deviations of the noise at which a match supports a candidate half, and thresholds between which that is: a threshold
 # far from the noise still ranks the samples, but discriminates poorly between the best ones.
 _SUPPORT_DEVIATIONS, _LEAST_UNIT, _LARGEST_UNIT = 1.5, 1 / 16, 4.0
@@ -201,51 +195,39 @@ def fit_essential(
     kernel: Kernel = "truncated",
 ) -> tuple[Float[Tensor, "B K 3 3"], Float[Tensor, "B K 3"], Float[Tensor, "B K"]]:
     """Optimize poses with |t| = 1; also return their robust costs. scales: of the kernel, in thresholds."""
-
-    def fit(*part: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        return _fit_essential_part(iterations, kernel, *part)
-
-    numbers = t.shape[1] * 6 * views.mask.shape[1]
-    R, t, cost = in_chunks(fit, numbers, R, t, *views.epipolar, views.mask, scales)
-    return R, t, cost
-
-
-def _fit_essential_part(
-    iterations: int,
-    kernel: Kernel,
-    R: Float[Tensor, "B K 3 3"],
-    t: Float[Tensor, "B K 3"],
-    constraint: Float[Tensor, "B 9 N"],
-    variance: Float[Tensor, "B 18 N"],
-    mask: Bool[Tensor, "B N"],
-    scales: Float[Tensor, " B"],
-) -> tuple[Float[Tensor, "B K 3 3"], Float[Tensor, "B K 3"], Float[Tensor, "B K"]]:
-    """`fit_essential` of a few problems."""
-    B, K = t.shape[:2]
+    K, N = t.shape[1], views.mask.shape[1]
     left_table, variance_table = _essential_tables(R.dtype, R.device)
-    frame = torch.cat((t[..., None, :], tangent_basis(t)), dim=-2)
 
-    def evaluate(pose: Tensor) -> tuple[Tensor, Tensor]:
-        left = (pose[:, 1].reshape(B * K, 9) @ left_table).view(B * K, 18, 3)
-        E = torch.bmm(left, pose[:, 0]).view(B * K, 6, 9)
-        form = torch.bmm(E, (E[:, -1] @ variance_table).view(B * K, 9, 18))
-        value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, constraint.shape[-1])
-        spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, constraint.shape[-1])
-        inverse = spread[:, :, -1:].clamp_min(torch.finfo(pose.dtype).tiny).rsqrt_()
-        # r = c / s has the derivative dc / s - r (s ds) / s^2, and s ds is what `spread` holds
-        rows = value.mul_(inverse)
-        residual = rows[:, :, -1:]
-        rows[:, :, :-1].addcmul_(residual * inverse.square_(), spread[:, :, :-1], value=-1)
-        robust = robustify(residual.squeeze(2).square(), kernel, scales[:, None, None])
-        cost = torch.where(mask[:, None], robust.rho, 0.0).sum(-1)
-        weight = torch.where(mask[:, None], robust.weight, 0.0).sqrt_()
-        rows = rows.mul_(weight[:, :, None]).view(B * K, 6, constraint.shape[-1])
-        return torch.bmm(rows, rows.mT), cost.view(-1)
+    def fit(
+        R: Tensor, t: Tensor, constraint: Tensor, variance: Tensor, mask: Tensor, scales: Tensor
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        B = len(R)
 
-    start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
-    (pose,), cost = levenberg_marquardt((start,), evaluate, _retract_essential, iterations)
-    pose = pose.view(B, K, 2, 3, 3)
-    return pose[:, :, 0], pose[:, :, 1, 0], cost.view(B, K)
+        def evaluate(pose: Tensor) -> tuple[Tensor, Tensor]:
+            left = (pose[:, 1].reshape(B * K, 9) @ left_table).view(B * K, 18, 3)
+            E = torch.bmm(left, pose[:, 0]).view(B * K, 6, 9)
+            form = torch.bmm(E, (E[:, -1] @ variance_table).view(B * K, 9, 18))
+            value = torch.bmm(E.view(B, K * 6, 9), constraint).view(B, K, 6, N)
+            spread = torch.bmm(form.view(B, K * 6, 18), variance).view(B, K, 6, N)
+            inverse = spread[:, :, -1:].clamp_min(torch.finfo(pose.dtype).tiny).rsqrt_()
+            # r = c / s has the derivative dc / s - r (s ds) / s^2, and s ds is what `spread` holds
+            rows = value.mul_(inverse)
+            residual = rows[:, :, -1:]
+            rows[:, :, :-1].addcmul_(residual * inverse.square_(), spread[:, :, :-1], value=-1)
+            robust = robustify(residual.squeeze(2).square(), kernel, scales[:, None, None])
+            cost = torch.where(mask[:, None], robust.rho, 0.0).sum(-1)
+            weight = torch.where(mask[:, None], robust.weight, 0.0).sqrt_()
+            rows = rows.mul_(weight[:, :, None]).view(B * K, 6, N)
+            return torch.bmm(rows, rows.mT), cost.view(-1)
+
+        frame = torch.cat((t[..., None, :], tangent_basis(t)), dim=-2)
+        start = torch.stack((R, frame), dim=2).view(B * K, 2, 3, 3)
+        (pose,), cost = levenberg_marquardt((start,), evaluate, _retract_essential, iterations)
+        pose = pose.view(B, K, 2, 3, 3)
+        return pose[:, :, 0], pose[:, :, 1, 0], cost.view(B, K)
+
+    R, t, cost = in_chunks(fit, K * 6 * N, R, t, *views.epipolar, views.mask, scales)
+    return R, t, cost
 
 
 def noise_variance(squared: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> Float[Tensor, " B"]:
@@ -254,30 +236,13 @@ def noise_variance(squared: Float[Tensor, "B N"], mask: Bool[Tensor, "B N"]) -> 
     return median_scale(squared, NORMAL_MEDIAN**2, near).nan_to_num(NORMAL_MEDIAN**-2)
 
 
-def score_essential(views: TwoViews, E: Float[Tensor, "B K 3 3"], soft: bool = False) -> Float[Tensor, "B K"]:
-    """Scores of many essential matrices, in float32.
-
-    Args:
-        soft: the sum of 1 / (1 + r^2), by which matches beyond the threshold count too, instead of
-            `truncated_score`.
-    """
-    constraint, variance = views.epipolar_float
-    squared = (E.flatten(-2).float() @ constraint).square_()
-    spread = (_variance_form(E).float() @ variance).clamp_min_(1e-20)
-    if not soft:
-        return truncated_score(squared.div_(spread), views.mask)
-    support = spread.div_(squared.add_(spread)).nan_to_num_(0.0)
-    return (support @ views.mask.to(support.dtype)[..., None]).squeeze(-1)
-
-
 def propose_essential(
     views: TwoViews, count: int, generator: torch.Generator, by_noise: bool
 ) -> tuple[ModelState, Tensor, Tensor]:
     """The best (R, t) of `count` samples of five matches, locally optimized, its score and its support.
 
-    Args:
-        by_noise: matches count the more the closer they are, in units of the noise that the best sample
-            shows; those that lie behind a camera count as wrong.
+    by_noise: matches count the more the closer they are, in units of the noise that the best sample shows; those that
+    lie behind a camera count as wrong
     """
     B = len(views.mask)
     sample = sample_minimal(views.mask, 5, count, generator)
@@ -287,16 +252,21 @@ def propose_essential(
     E, valid = pad_groups(E.flatten(1), row // count, B, candidates)
 
     def score(E: Tensor, rows: Tensor | None) -> Tensor:
+        """In float32. By noise, matches beyond the threshold count too: the sum of 1 / (1 + r^2)."""
         some = views if rows is None else views.rows(rows)
-        return score_essential(some, E.unflatten(-1, (3, 3)), by_noise)
+        constraint, variance = (terms.float() for terms in some.epipolar)
+        squared = (E.float() @ constraint).square_()
+        spread = (_variance_form(E.unflatten(-1, (3, 3))).float() @ variance).clamp_min_(1e-20)
+        if not by_noise:
+            return truncated_score(squared.div_(spread), some.mask)
+        support = spread.div_(squared.add_(spread)).nan_to_num_(0.0)
+        return (support @ some.mask.to(support.dtype)[..., None]).squeeze(-1)
 
     best = best_models(score, E, valid, views.mask, candidates, generator)
     R, t = decompose_essential(gather_rows(E, best).unflatten(-1, (3, 3)))
     # Padding has no pose; start it from the identity.
-    R = torch.where(
-        valid.gather(1, best)[..., None, None], R[:, :, 0], torch.eye(3, dtype=R.dtype, device=R.device)
-    )
-    t = torch.where(valid.gather(1, best)[..., None], t, t.new_tensor((0.0, 0.0, 1.0)))
+    valid, eye = valid.gather(1, best)[..., None], torch.eye(3, dtype=R.dtype, device=R.device)
+    R, t = torch.where(valid[..., None], R[:, :, 0], eye), torch.where(valid, t, eye[2])
     R, t, cost = _optimized(views, R, t, by_noise)
     near = (sampson_squared(views, R[:, None], t[:, None])[:, 0] < SUPPORT_WIDTH**2) & views.mask
     return (R, t), views.mask.sum(-1) - cost, near.sum(-1)
@@ -381,31 +351,28 @@ def possible_matches(
     return (ahead | far[:, :, :, None]).flatten(2, 3)
 
 
-_MAPPING_CANDIDATES = 2  # of all samples, that are worth a fit
-
-
 def transfer_squared(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B K N"]:
     """Squared transfer errors in thresholds of homographies or rotations."""
     difference = transfer_errors(H, views.x_1[:, None], views.x_2[:, None])
     return difference.square().sum(-1) * views.transfer_scale[:, None].square()
 
 
-def fit_homography(
-    views: TwoViews, H: Float[Tensor, "B K 3 3"], iterations: int, width: float = 1.0
+def fit_mappings(
+    tangent: Callable[[torch.dtype, torch.device], Tangent],
+    views: TwoViews,
+    H: Float[Tensor, "B K 3 3"],
+    iterations: int,
+    width: float = 1.0,
 ) -> tuple[ModelState, Float[Tensor, "B K"]]:
-    """Optimize homographies with H_33 = 1; also return their truncated costs."""
-    tangent = homography_tangent(H.dtype, H.device)
-    H, cost = fit_projections(H, tangent, *_transfer(views), iterations, width)
+    """Optimize homographies with H_33 = 1, or rotations, by their tangent; also return their truncated costs."""
+    H, cost = fit_projections(H, tangent(H.dtype, H.device), *_transfer(views), iterations, width)
     return (H,), cost
 
 
-def fit_rotation(
-    views: TwoViews, R: Float[Tensor, "B K 3 3"], iterations: int, width: float = 1.0
-) -> tuple[ModelState, Float[Tensor, "B K"]]:
-    """Optimize pure rotations; also return their truncated costs."""
-    tangent = rotation_tangent(R.dtype, R.device)
-    R, cost = fit_projections(R, tangent, *_transfer(views), iterations, width)
-    return (R,), cost
+fit_homography, fit_rotation = (
+    partial(fit_mappings, homography_tangent),
+    partial(fit_mappings, rotation_tangent),
+)
 
 
 def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -413,25 +380,24 @@ def _transfer(views: TwoViews) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return views.h_1.mT, views.x_2, views.transfer_scale[..., None], views.mask
 
 
-def score_mappings(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B K"]:
-    """Truncated scores of homographies or rotations, in float32."""
+def _best_mappings(views: TwoViews, H: Float[Tensor, "B K 3 3"]) -> Float[Tensor, "B 2 3 3"]:
+    """The homographies or rotations of best truncated score, in float32, which are worth a fit."""
     h_1, x_2, scale, mask = _transfer(views)
 
-    def score(*part: Tensor) -> tuple[Tensor]:
-        return (score_projections(*part),)
+    def score(H: Tensor, h_1: Tensor, x_2: Tensor, scale: Tensor, mask: Tensor) -> tuple[Tensor]:
+        return (truncated_score(squared_projections(H, h_1, x_2, scale), mask),)
 
-    (scores,) = in_chunks(
-        score, 3 * H.shape[1] * mask.shape[1], H.float(), h_1.float(), x_2.float(), scale, mask
-    )
-    return scores
+    numbers = 3 * H.shape[1] * mask.shape[1]
+    (scores,) = in_chunks(score, numbers, H.float(), h_1.float(), x_2.float(), scale, mask)
+    best = scores.topk(2, dim=1).indices
+    return gather_rows(H.flatten(2), best).unflatten(-1, (3, 3))
 
 
 def propose_homography(views: TwoViews, count: int, generator: torch.Generator) -> Float[Tensor, "B K 3 3"]:
     """The best homographies of `count` samples of four matches."""
     sample = sample_minimal(views.mask, 4, count, generator)
     H = homography_from_matches(gather_rows(views.x_1, sample), gather_rows(views.x_2, sample))
-    best = score_mappings(views, H).topk(_MAPPING_CANDIDATES, dim=1).indices
-    return gather_rows(H.flatten(2), best).unflatten(-1, (3, 3))
+    return _best_mappings(views, H)
 
 
 def propose_rotation(views: TwoViews, count: int, generator: torch.Generator) -> Float[Tensor, "B K 3 3"]:
@@ -439,6 +405,4 @@ def propose_rotation(views: TwoViews, count: int, generator: torch.Generator) ->
     sample = sample_minimal(views.mask, 2, count, generator)
     R = rotation_from_matches(gather_rows(views.h_1, sample), gather_rows(views.h_2, sample))
     regular = torch.isfinite(R).all((-2, -1))[..., None, None]
-    R = torch.where(regular, R, torch.eye(3, dtype=R.dtype, device=R.device))
-    best = score_mappings(views, R).topk(_MAPPING_CANDIDATES, dim=1).indices
-    return gather_rows(R.flatten(2), best).unflatten(-1, (3, 3))
+    return _best_mappings(views, torch.where(regular, R, torch.eye(3, dtype=R.dtype, device=R.device)))

@@ -22,6 +22,7 @@ from torch import Tensor
 
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.fundamental import homography_share, refine_fundamental
+from torchslam.geometry.lie import homogeneous
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, robustify, weighted_median
 from torchslam.geometry.two_view import tangent_basis
@@ -36,10 +37,6 @@ _GRID = 300  # focal lengths in that range: steps of 0.9 %, below the width that
 _MODEL_NOISE = 1e-3
 _KERNEL_SCALE = 1.5  # deviations of the noise at which a pair begins to count less; 1 to 3 were tried
 
-_LARGEST = 3.03  # deviations: 99 % of the lengths of such a vector are shorter
-_LEVEL_ROUNDS = 4  # of the noise level and the best of the grid, which hardly change after the second
-_BEND_ROUNDS = 10  # of reweighting, for the grid only: Newton's method does the rest
-_NEWTON_STEPS, _HALVINGS = 20, 20  # about five steps are needed
 _ROUNDING = 1e-12  # of the cost and of its minimum: the resolution of Newton's method
 _MAX_STD = 0.1  # relative; beyond it a focal length counts as unknown
 _RISE = 9.0  # of the cost, three deviations, that any focal length further away than three times `_MAX_STD` must have
@@ -94,19 +91,14 @@ def focal_from_fundamentals(
         weights: of the pairs, not negative, as if each were present that many times; one by default.
 
     Returns:
-        The focal length. Its gradient to F_21 and weights is that of the minimum (implicit function theorem), with
-        the noise level fixed.
+        The focal length, with the gradient to F_21 and weights of the minimum, the noise level fixed.
     """
     check_dtypes(F_21=F_21, principal_point=principal_point, weights=weights)
-    weights = F_21.new_ones(len(F_21)) if weights is None else weights
-    to_pixels, scale = _from_scaled(principal_point.double(), size)
-    F = to_pixels.mT @ F_21.double() @ to_pixels
-    used = (weights > 0) & torch.isfinite(F).all(-1).all(-1) & (F != 0).any(-1).any(-1)
-    F = torch.where(used[:, None, None], F, _placeholder(F))
+    F, weights = _scaled(F_21, principal_point, size, weights)
     F = F / F.flatten(1).norm(dim=1)[:, None, None]
     nothing = F.new_zeros(len(F), 9)
-    graph = _Graph(F, torch.diag_embed(nothing), nothing, torch.where(used, weights.double(), 0.0))
-    return _solve(graph, 0.0, scale, F_21.dtype)
+    graph = _Graph(F, torch.diag_embed(nothing), nothing, weights)
+    return _solve(graph, 0.0, size, F_21.dtype)
 
 
 @full_precision
@@ -121,72 +113,68 @@ def focal_from_pairs(
     threshold: float = 1.0,
     k1_std: float = 0.03,
 ) -> ViewGraphFocal:
-    """Find the focal length of a camera from the matches of pairs of its images.
+    """Find the focal length of a camera from the matches of pairs of its images, pixels.
 
     Refines the fundamental matrices on the matches, and uses how uncertain each is and how distortion would change
-    it. Pairs whose matches a homography explains, those of a plane or of a camera that only turned, are left out;
-    without others there is no `success`. The same motions as for `focal_from_fundamentals` have no information.
+    it. Pairs whose matches a homography explains, those of a plane or of a camera that only turned, are left out. The
+    same motions as for `focal_from_fundamentals` have no information.
 
     Args:
         F_21: in pixels, x_2^T F_21 x_1 = 0, such as from RANSAC: where the refinement starts.
-        pixels_1: matches in the first views.
-        pixels_2: matches in the second views.
         mask: inliers of F_21; a pair with fewer than 20 is left out.
         principal_point: pixels.
         size: width and height of the images, pixels; sets the range of the search.
-        weights: of the pairs, not negative, as if each were present that many times; one by default.
+        weights: as of `focal_from_fundamentals`.
         threshold: pixels, about the noise of one coordinate or somewhat more.
         k1_std: standard deviation of the camera's k1 around zero: it is estimated too, as its error would be one of
             the focal length. 0.03 (0.01 to 1 were tried) is that of a camera called undistorted; zero for none.
 
     Returns:
-        The focal length. Its gradient to the matches and weights is that of the minima (implicit function theorem),
-        with the noise fixed.
+        The focal length, with the gradient to the matches and weights of the minima, the noise fixed.
     """
     check_dtypes(
         F_21=F_21, pixels_1=pixels_1, pixels_2=pixels_2, principal_point=principal_point, weights=weights
     )
-    weights = F_21.new_ones(len(F_21)) if weights is None else weights
-    to_pixels, scale = _from_scaled(principal_point.double(), size)
-    finite = torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
-    mask = mask & finite
+    mask = mask & torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     x_1, x_2 = (
-        (torch.where(mask[..., None], x.double(), 0.0) - principal_point.double()) / scale
+        (torch.where(mask[..., None], x.double(), 0.0) - principal_point.double()) / max(size)
         for x in (pixels_1, pixels_2)
     )
-    start = to_pixels.mT @ F_21.detach().double() @ to_pixels
-    used = (weights > 0) & (mask.sum(-1) >= _MIN_MATCHES) & torch.isfinite(start).all(-1).all(-1)
-    used = used & (start != 0).any(-1).any(-1)
-    start = torch.where(used[:, None, None], start, _placeholder(start))
-    refined = refine_fundamental(start, x_1, x_2, mask & used[:, None], threshold / scale)
+    weights = F_21.new_ones(len(F_21)) if weights is None else weights
+    weights = torch.where(mask.sum(-1) >= _MIN_MATCHES, weights, 0.0)
+    start, weights = _scaled(F_21.detach(), principal_point, size, weights)
+    used = weights > 0
+    refined = refine_fundamental(start, x_1, x_2, mask & used[:, None], threshold / max(size))
     if bool(used.any()):
         used = used & (homography_share(x_1, x_2, mask, refined.noise) < _MAX_HOMOGRAPHY_SHARE)
-    weights = torch.where(used, weights.double(), 0.0)
+    weights = torch.where(used, weights, 0.0)
     graph = _Graph(refined.F_21, refined.covariance, refined.bend, weights)
-    return _solve(graph, k1_std, scale, F_21.dtype)
+    return _solve(graph, k1_std, size, F_21.dtype)
 
 
-def _from_scaled(
-    principal_point: Float[Tensor, "2"], size: tuple[int, int]
-) -> tuple[Float[Tensor, "3 3"], float]:
-    """From pixels from the principal point in longer sides, to pixels; and pixels of a longer side."""
-    scale = float(max(size))
-    matrix = torch.diag(principal_point.new_tensor((scale, scale, 1.0)))
-    return torch.cat(
-        (matrix[:, :2], torch.nn.functional.pad(principal_point, (0, 1), value=1.0)[:, None]), 1
-    ), scale
+def _scaled(
+    F_21: Float[Tensor, "M 3 3"],
+    principal_point: Float[Tensor, "2"],
+    size: tuple[int, int],
+    weights: Float[Tensor, " M"] | None,
+) -> tuple[Float[Tensor, "M 3 3"], Float[Tensor, " M"]]:
+    """Matrices for pixels from the principal point in longer sides, and weights, zero of a matrix that is none.
 
-
-def _placeholder(F: Float[Tensor, "M 3 3"]) -> Float[Tensor, "3 3"]:
-    """The matrix of a shift to the side, for pairs without weight: nothing is NaN."""
-    return F.new_tensor(((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
+    That of a shift to the side takes its place, so that nothing is NaN.
+    """
+    side = principal_point.new_tensor((max(size), max(size), 1.0), dtype=torch.float64).diag()
+    to_pixels = torch.cat((side[:, :2], homogeneous(principal_point.double())[:, None]), 1)
+    F = to_pixels.mT @ F_21.double() @ to_pixels
+    weights = torch.ones_like(F[:, 0, 0]) if weights is None else weights.double()
+    used = (weights > 0) & torch.isfinite(F).all(-1).all(-1) & (F != 0).any(-1).any(-1)
+    shift = F.new_tensor(((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (0.0, 1.0, 0.0)))
+    return torch.where(used[:, None, None], F, shift), torch.where(used, weights, 0.0)
 
 
 class _Graph(NamedTuple):
-    """Pairs in scaled coordinates: as of `RefinedFundamental`, their weights.
+    """Pairs in scaled coordinates, as of `RefinedFundamental`, and their weights.
 
-    In float64 whatever the input: what counts is a small difference of the singular values, and the covariances of good
-    and bad pairs are many powers of ten apart.
+    In float64 whatever the input: what counts is a small difference of the singular values.
     """
 
     F: Float[Tensor, "M 3 3"]
@@ -213,11 +201,9 @@ def _squares(graph: _Graph, focal: Float[Tensor, " G"]) -> _Squares:
     K = torch.stack((focal, focal, one), dim=-1)[:, None]
     null = (_null_vector(F) / K, _null_vector(F.mT) / K)  # of K F K, from the right and from the left
     B_1, B_2 = (tangent_basis(e / e.norm(dim=-1, keepdim=True)) * K[:, :, None] for e in null)
-    block = (B_2 @ F @ B_1.mT).detach()
+    a, b, c, d = (B_2 @ F @ B_1.mT).detach().flatten(-2).unbind(-1)
     # Of a reflection, one axis is turned around: then it is a rotation.
-    sign = torch.where(
-        block[..., 0, 0] * block[..., 1, 1] < block[..., 0, 1] * block[..., 1, 0], -1.0, 1.0
-    ).to(block.dtype)
+    sign = torch.where(a * d < b * c, -1.0, 1.0).to(a.dtype)
     b_1, b_2 = B_1[..., 0, :], B_1[..., 1, :] * sign[..., None]
     c_1, c_2 = B_2[..., 0, :], B_2[..., 1, :]
 
@@ -252,20 +238,6 @@ def _costs(squares: Float[Tensor, "G M"], weights: Float[Tensor, " M"], level: f
     return weights * robustify(squares / level, "cauchy", squares.new_tensor(_KERNEL_SCALE)).rho
 
 
-def _best_bend(
-    squares: _Squares, weights: Float[Tensor, " M"], level: float, k1_std: float
-) -> Float[Tensor, " G"]:
-    """k1 of least cost for each focal length, by iteratively reweighted least squares from zero."""
-    k1 = squares.constant.new_zeros(len(squares.constant))
-    if k1_std == 0:
-        return k1
-    for _ in range(_BEND_ROUNDS):
-        scaled = squares.at(k1) / level
-        weight = weights / level * robustify(scaled, "cauchy", scaled.new_tensor(_KERNEL_SCALE)).weight
-        k1 = -(weight * squares.linear).sum(-1) / ((weight * squares.square).sum(-1) + k1_std**-2)
-    return k1
-
-
 class _Profile(NamedTuple):
     """The search on the grid: costs of the pairs, k1 of each focal length, the best of them, and the noise level.
 
@@ -281,16 +253,17 @@ class _Profile(NamedTuple):
 
 
 def _search(graph: _Graph, k1_std: float) -> _Profile:
-    low, high = RANGE
-    log_focal = torch.linspace(
-        math.log(low), math.log(high), _GRID, dtype=graph.F.dtype, device=graph.F.device
-    )
+    low, high = (math.log(end) for end in RANGE)
+    log_focal = torch.linspace(low, high, _GRID, dtype=graph.F.dtype, device=graph.F.device)
     squares, level = _squares(graph, log_focal.exp()), 1.0
-    for _ in range(_LEVEL_ROUNDS):
-        k1 = _best_bend(squares, graph.weights, level, k1_std)
+    scale = log_focal.new_tensor(_KERNEL_SCALE)
+    for _ in range(4):  # level and best of the grid hardly change after the second
+        k1 = torch.zeros_like(log_focal)
+        for _ in range(10):  # of reweighting, for the grid only: Newton's method does the rest
+            weight = graph.weights / level * robustify(squares.at(k1) / level, "cauchy", scale).weight
+            k1 = -(weight * squares.linear).sum(-1) / ((weight * squares.square).sum(-1) + k1_std**-2)
         at = squares.at(k1)
-        costs = _costs(at, graph.weights, level)
-        prior = _prior(k1, k1_std)
+        costs, prior = _costs(at, graph.weights, level), (k1 / k1_std).square()
         best = int((costs.sum(-1) + prior).argmin())
         before, level = level, max(1.0, weighted_median(at[best], graph.weights) / NORMAL_SQUARED_MEDIAN_2D)
         if level == before:
@@ -298,76 +271,70 @@ def _search(graph: _Graph, k1_std: float) -> _Profile:
     return _Profile(log_focal, costs, k1, prior, best, before)
 
 
-def _prior(k1: Tensor, k1_std: float) -> Tensor:
-    return (k1 / k1_std).square() if k1_std > 0 else torch.zeros_like(k1)
-
-
-def _solve(graph: _Graph, k1_std: float, scale: float, dtype: torch.dtype) -> ViewGraphFocal:
+def _solve(graph: _Graph, k1_std: float, size: tuple[int, int], dtype: torch.dtype) -> ViewGraphFocal:
     """The minimum of the cost, how certain it is, and its gradient."""
+    if k1_std == 0:  # without an effect on the errors, k1 stays zero
+        graph, k1_std = graph._replace(bend=torch.zeros_like(graph.bend)), 1.0
     with torch.no_grad():
         fixed = _Graph(*(x.detach() for x in graph))
         profile = _search(fixed, k1_std)
-        found = _polished(fixed, profile, k1_std)
-        std = _standard_error(fixed, profile, found, k1_std)
-        squares = _squares(fixed, found[:1].exp()).at(_bend_of(found, k1_std))
-        errors = (squares[0] / profile.level).sqrt()
-        success = bool(std < _MAX_STD) and _is_bounded(profile, float(found[0]))
+        found, H = _polished(fixed, profile, k1_std)
+        std = _standard_error(fixed, profile, found[0], H)
+        errors = (_squares(fixed, found[:1].exp()).at(found[1:])[0] / profile.level).sqrt()
+        # All focal lengths not clearly worse are close, and inside of the range.
+        cost = profile.costs.sum(-1) + profile.prior
+        possible = cost < cost[profile.best] + _RISE
+        far = (profile.log_focal - found[0]).abs() > 3 * _MAX_STD
+        success = bool(std < _MAX_STD) and not bool((possible & far).any() | possible[0] | possible[-1])
     at = found
     if success and needs_gradient(*graph):
 
-        def objective(step: Float[Tensor, "1 D"]) -> Float[Tensor, "1"]:
+        def objective(step: Float[Tensor, "1 2"]) -> Float[Tensor, "1"]:
             return _cost(graph, found + step[0], profile.level, k1_std)[None]
 
         at = found + implicit_step(objective, found[None])[0]  # a step of zero that has the gradient
     used = graph.weights > 0
     return ViewGraphFocal(
-        (scale * at[0].exp()).to(dtype),
+        (max(size) * at[0].exp()).to(dtype),
         std.to(dtype),
         torch.where(used, errors, torch.nan).to(dtype),
-        used & (errors < _LARGEST),
+        used & (errors < 3.03),  # 99 % of the lengths of such a vector are shorter
         torch.tensor(success, device=used.device),
-        _bend_of(at, k1_std)[0].to(dtype),
+        at[1].to(dtype),
     )
 
 
-def _bend_of(at: Float[Tensor, " D"], k1_std: float) -> Float[Tensor, " 1"]:
-    """k1, where it is sought, else zero."""
-    return at[1:2] if k1_std > 0 else torch.zeros_like(at[:1])
+def _cost(graph: _Graph, at: Float[Tensor, "2"], level: float, k1_std: float) -> Float[Tensor, ""]:
+    """The cost with the logarithm of the focal length and k1."""
+    squares = _squares(graph, at[:1].exp()).at(at[1:])
+    return _costs(squares, graph.weights, level).sum() + (at[1] / k1_std).square()
 
 
-def _cost(graph: _Graph, at: Float[Tensor, " D"], level: float, k1_std: float) -> Float[Tensor, ""]:
-    """The cost with the logarithm of the focal length and, if it is sought, k1."""
-    k1 = _bend_of(at, k1_std)
-    squares = _squares(graph, at[:1].exp()).at(k1)
-    return (_costs(squares, graph.weights, level).sum(-1) + _prior(k1, k1_std))[0]
+def _polished(
+    graph: _Graph, profile: _Profile, k1_std: float
+) -> tuple[Float[Tensor, "2"], Float[Tensor, "2 2"]]:
+    """The minimum within two steps of the best of the grid, by Newton's method, and the Hessian there."""
 
+    def derivatives(at: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        with torch.enable_grad():
+            at = at.detach().requires_grad_()
+            cost = _cost(graph, at, profile.level, k1_std)
+            (gradient,) = torch.autograd.grad(cost, at, create_graph=True)
+            rows = [torch.autograd.grad(entry, at, retain_graph=True)[0] for entry in gradient]
+        return cost.detach(), gradient.detach(), torch.stack(rows)
 
-def _derivatives(
-    graph: _Graph, at: Float[Tensor, " D"], level: float, k1_std: float
-) -> tuple[Float[Tensor, ""], Float[Tensor, " D"], Float[Tensor, "D D"]]:
-    """The cost, its gradient and its Hessian."""
-    with torch.enable_grad():
-        at = at.detach().requires_grad_()
-        cost = _cost(graph, at, level, k1_std)
-        (gradient,) = torch.autograd.grad(cost, at, create_graph=True)
-        rows = [torch.autograd.grad(entry, at, retain_graph=True)[0] for entry in gradient]
-    return cost.detach(), gradient.detach(), torch.stack(rows)
-
-
-def _polished(graph: _Graph, profile: _Profile, k1_std: float) -> Float[Tensor, " D"]:
-    """The minimum next to the best of the grid, two steps of which it may be away: Newton's method, halved steps."""
     log_focal, best = profile.log_focal, profile.best
-    start = torch.stack((log_focal[best], profile.k1[best])[: 2 if k1_std > 0 else 1])
+    start = torch.stack((log_focal[best], profile.k1[best]))
     at, width = start, float(log_focal[1] - log_focal[0])
-    cost, gradient, H = _derivatives(graph, at, profile.level, k1_std)
-    for _ in range(_NEWTON_STEPS):
+    cost, gradient, H = derivatives(at)
+    for _ in range(20):  # about five are needed
         factor, info = torch.linalg.cholesky_ex(H)
         if int(info) != 0:
             break
         step = -torch.cholesky_solve(gradient[:, None], factor)[:, 0]
-        for _ in range(_HALVINGS):
+        for _ in range(20):
             if abs(float(at[0] + step[0] - start[0])) <= 2 * width:
-                found = _derivatives(graph, at + step, profile.level, k1_std)
+                found = derivatives(at + step)
                 if float(found[0]) <= float(cost) + _ROUNDING * (1 + float(cost)):
                     break
             step = 0.5 * step
@@ -376,36 +343,25 @@ def _polished(graph: _Graph, profile: _Profile, k1_std: float) -> Float[Tensor, 
         at, (cost, gradient, H) = at + step, found
         if float(step.abs().max()) < _ROUNDING:
             break
-    return at
+    return at, H
 
 
 def _standard_error(
-    graph: _Graph, profile: _Profile, at: Float[Tensor, " D"], k1_std: float
+    graph: _Graph, profile: _Profile, log_focal: Float[Tensor, ""], H: Float[Tensor, "2 2"]
 ) -> Float[Tensor, ""]:
     """The larger of the errors by the curvature of the cost and by leaving out one pair at a time (jackknife)."""
-    _, _, H = _derivatives(graph, at, profile.level, k1_std)
     factor, info = torch.linalg.cholesky_ex(0.5 * H)  # the cost is twice a negative log likelihood
     if int(info) != 0 or int((graph.weights > 0).sum()) < 2:  # nothing confirms a single pair
-        return at.new_tensor(torch.inf)
+        return H.new_tensor(torch.inf)
     variance = torch.cholesky_inverse(factor)[0, 0]
-    without = profile.costs.sum(-1, keepdim=True) - profile.costs + profile.prior[:, None]
-    shifts = (_vertices(profile.log_focal, without) - at[0])[graph.weights > 0]
-    jackknife = shifts.square().sum() * (len(shifts) - 1) / len(shifts)
-    return torch.maximum(variance, jackknife).sqrt()
-
-
-def _vertices(log_focal: Float[Tensor, " G"], costs: Float[Tensor, "G M"]) -> Float[Tensor, " M"]:
-    """The minima of columns, by a parabola through the lowest value and its neighbors."""
-    best = costs.argmin(0).clamp(1, len(log_focal) - 2)
+    costs = profile.costs.sum(-1, keepdim=True) - profile.costs + profile.prior[:, None]
+    # Their minima, by a parabola through the lowest value and its neighbors.
+    grid = profile.log_focal
+    best = costs.argmin(0).clamp(1, len(grid) - 2)
     below, middle, above = (costs.gather(0, (best + i)[None])[0] for i in (-1, 0, 1))
     bend = below - 2 * middle + above
     shift = torch.where(bend > 0, 0.5 * (below - above) / bend.clamp_min(torch.finfo(bend.dtype).tiny), 0.0)
-    return log_focal[best] + shift.clamp(-1.0, 1.0) * (log_focal[1] - log_focal[0])
-
-
-def _is_bounded(profile: _Profile, log_focal: float) -> bool:
-    """Whether all focal lengths not clearly worse are close, and inside of the range."""
-    cost = profile.costs.sum(-1) + profile.prior
-    possible = cost < cost[profile.best] + _RISE
-    far = (profile.log_focal - log_focal).abs() > 3 * _MAX_STD
-    return not bool((possible & far).any() | possible[0] | possible[-1])
+    minima = grid[best] + shift.clamp(-1.0, 1.0) * (grid[1] - grid[0])
+    shifts = (minima - log_focal)[graph.weights > 0]
+    jackknife = shifts.square().sum() * (len(shifts) - 1) / len(shifts)
+    return torch.maximum(variance, jackknife).sqrt()

@@ -18,7 +18,7 @@ from torchslam.config import CameraConfig, Config
 from torchslam.geometry import Camera, SensorModel, SharedCamera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
-from torchslam.geometry.undistorted import Undistortion
+from torchslam.geometry.sensor import Undistortion
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import (
     GLOBAL_ITERATIONS,

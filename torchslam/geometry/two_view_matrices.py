@@ -1,6 +1,7 @@
-"""Essential matrices: from five matches, into rotation and direction, and their errors.
+"""Essential matrices and homographies: from minimal samples, into motions, and their errors.
 
-x_2^T E x_1 = 0 for matches x_1, x_2 in undistorted image coordinates; E = [t]x R for points_2 = R points_1 + t.
+For matches x_1, x_2 in undistorted image coordinates and points_2 = R points_1 + t: x_2^T E x_1 = 0 with E = [t]x R,
+and x_2 ~ H x_1 with H = R + t n^T for points on the plane n^T points_1 = 1.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import skew
+from torchslam.geometry.lie import homogeneous, skew
 from torchslam.geometry.precision import full_precision
 
 # The unknowns are x, y, z in E = x E_0 + y E_1 + z E_2 + E_3. The monomials by their powers of x, y, z: first those
@@ -24,8 +25,6 @@ _KEPT = ("x", "xz", "xzz", "y", "yz", "yzz", "", "z", "zz", "zzz")
 # Columns of x_2 x_1^T to solve for; the other four span the null space. Independent also for small motions.
 _SOLVED, _FREE = (0, 1, 2, 4, 5), (3, 6, 7, 8)
 _GRID = 256  # intervals in which to look for sign changes
-_NEWTON_STEPS = 5
-"""On a root within a cell of the grid: each about doubles the correct digits."""
 
 
 @full_precision
@@ -37,10 +36,6 @@ def five_point(
     Solutions closer together than 1.4 degrees of the last unknown's angle can be missed; degenerate samples may
     give none or wrong ones. Not differentiable by design: it generates hypotheses. Source: Nister, "An efficient
     solution to the five-point relative pose problem", 2004.
-
-    Args:
-        x_1: undistorted image coordinates in view 1.
-        x_2: undistorted image coordinates in view 2.
 
     Returns:
         E of norm sqrt(2), the R real solutions of all samples together, up to ten each, and the sample of each,
@@ -66,7 +61,7 @@ def five_point(
 
 def _null_space(x_1: Float[Tensor, "B 5 2"], x_2: Float[Tensor, "B 5 2"]) -> Float[Tensor, "B 4 9"]:
     """Four orthonormal solutions of the five epipolar equations."""
-    equations = _outer(x_2, x_1)
+    equations = (homogeneous(x_2)[..., :, None] * homogeneous(x_1)[..., None, :]).flatten(-2)
     solved = torch.linalg.solve_ex(equations[..., _SOLVED], -equations[..., _FREE])[0].nan_to_num()
     basis = solved.new_zeros(len(solved), 4, 9)
     basis[..., _SOLVED] = solved.mT
@@ -78,13 +73,6 @@ def _null_space(x_1: Float[Tensor, "B 5 2"], x_2: Float[Tensor, "B 5 2"]) -> Flo
             row = row - (row @ other.mT) * other
         rows.append(row / row.norm(dim=-1, keepdim=True))
     return torch.cat(rows, dim=1)
-
-
-def _outer(x_2: Float[Tensor, "*batch 2"], x_1: Float[Tensor, "*batch 2"]) -> Float[Tensor, "*batch 9"]:
-    """The nine coefficients of the epipolar equation."""
-    one = torch.ones_like(x_1[..., :1])
-    x_1, x_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
-    return (x_2[..., :, None] * x_1[..., None, :]).flatten(-2)
 
 
 @lru_cache(maxsize=16)
@@ -136,28 +124,21 @@ def _elimination(constraints: Float[Tensor, "B 10 20"]) -> Float[Tensor, "B 3 3 
     reduced = torch.linalg.solve_ex(constraints[..., :10], constraints[..., 10:])[0]
     # rows 4 to 9 are x^2 z, x^2, y^2 z, y^2, xyz, xy; each first minus z times the second cancels
     x, y, one = reduced[:, 4:, :3], reduced[:, 4:, 3:6], reduced[:, 4:, 6:]
-    zero = torch.zeros_like(x[..., :1])
-    padded = torch.stack(
-        (
-            torch.cat((zero, x, zero, zero), -1),
-            torch.cat((zero, y, zero, zero), -1),
-            torch.cat((zero, one, zero), -1),
-        ),
-        dim=2,
-    )
+    pad = torch.nn.functional.pad
+    padded = torch.stack((pad(x, (1, 2)), pad(y, (1, 2)), pad(one, (1, 1))), dim=2)
     return padded[:, 0::2, :, 1:] - padded[:, 1::2, :, :-1]
 
 
 @lru_cache(maxsize=16)
-def _product_table(degree_a: int, degree_b: int, dtype: torch.dtype, device: torch.device) -> Tensor:
-    """((a + 1)(b + 1), a + b + 1) which power each product of two coefficients belongs to."""
-    power = torch.arange(degree_a + 1, device="cpu")[:, None] + torch.arange(degree_b + 1, device="cpu")
+def _product_table(count_a: int, count_b: int, dtype: torch.dtype, device: torch.device) -> Tensor:
+    """(A B, A + B - 1) which power each product of two coefficients belongs to."""
+    power = torch.arange(count_a, device="cpu")[:, None] + torch.arange(count_b, device="cpu")
     return torch.nn.functional.one_hot(power.flatten()).to(dtype=dtype, device=device)
 
 
 def _product(a: Tensor, b: Tensor) -> Tensor:
     """Products of polynomials. (..., A), (..., B) -> (..., A + B - 1)."""
-    table = _product_table(a.shape[-1] - 1, b.shape[-1] - 1, a.dtype, a.device)
+    table = _product_table(a.shape[-1], b.shape[-1], a.dtype, a.device)
     return (a[..., :, None] * b[..., None, :]).flatten(-2) @ table
 
 
@@ -179,8 +160,7 @@ def _angle_grid(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tenso
 def _real_roots(polynomial: Float[Tensor, "B 11"]) -> tuple[Float[Tensor, " R"], Int[Tensor, " R"]]:
     """Real roots of polynomials of degree ten, with the row of each.
 
-    With z = tan(angle) all of them lie in a bounded interval; sign changes on a grid bracket them, Newton's method
-    with bisection finishes.
+    z = tan(angle): sign changes on a grid of angles bracket them, Newton's method with bisection finishes.
     """
     angle, table = _angle_grid(polynomial.dtype, polynomial.device)
     negative = torch.signbit(polynomial @ table)
@@ -196,7 +176,7 @@ def _real_roots(polynomial: Float[Tensor, "B 11"]) -> tuple[Float[Tensor, " R"],
     low, high = ends(angle[cell]), ends(angle[cell + 1])
     sign = torch.where(negative[row, cell], -1.0, 1.0).to(polynomial.dtype)
     z = 0.5 * (low + high)
-    for _ in range(_NEWTON_STEPS):
+    for _ in range(5):  # each about doubles the correct digits
         value, slope = torch.addcmul(coefficients[9], coefficients[10], z), coefficients[10]
         for k in range(8, -1, -1):
             slope = torch.addcmul(value, slope, z)
@@ -221,16 +201,10 @@ def essential_from_pose(
 def decompose_essential(
     E: Float[Tensor, "*batch 3 3"],
 ) -> tuple[Float[Tensor, "*batch 2 3 3"], Float[Tensor, "*batch 3"]]:
-    """Decompose essential matrices of any scale into two rotations and a direction up to sign.
+    """Decompose essential matrices of any scale into R_i and t of unit length: poses (R_i, t) and (R_i, -t).
 
     Without a singular value decomposition, so that the gradient is correct at the equal singular values. Source:
     Horn, "Recovering baseline and orientation from essential matrix", 1990.
-
-    Args:
-        E: essential matrices.
-
-    Returns:
-        R, and t of unit length: the poses are (R_i, t) and (R_i, -t).
     """
     gram = E @ E.mT
     half_trace = 0.5 * gram.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -256,20 +230,10 @@ def sampson_errors(
 ) -> Float[Tensor, "*#batch N"]:
     """Compute signed Sampson distances to the epipolar constraint, zero at both epipoles.
 
-    Source: Hartley and Zisserman, "Multiple view geometry", 2004, eq. 11.9.
-
-    Args:
-        E: essential matrices.
-        x_1: undistorted image coordinates in view 1.
-        x_2: undistorted image coordinates in view 2.
-        variance_1: variances of the coordinates in view 1.
-        variance_2: variances of the coordinates in view 2.
-
-    Returns:
-        First-order distances over both images together, in standard deviations.
+    First-order distances over both images together, in standard deviations of the coordinates, whose variances are
+    `variance_1` and `variance_2`. Source: Hartley and Zisserman, "Multiple view geometry", 2004, eq. 11.9.
     """
-    one = torch.ones_like(x_1[..., :1])
-    x_1, x_2 = torch.cat((x_1, one), dim=-1), torch.cat((x_2, one), dim=-1)
+    x_1, x_2 = homogeneous(x_1), homogeneous(x_2)
     line_2, line_1 = x_1 @ E.mT, x_2 @ E
     squared = line_2[..., :2].square().sum(-1) * variance_2 + line_1[..., :2].square().sum(-1) * variance_1
     regular = squared > torch.finfo(squared.dtype).tiny
@@ -286,13 +250,6 @@ def epipolar_offsets(
 ) -> tuple[Float[Tensor, "*#batch N"], Float[Tensor, "*#batch N"]]:
     """Compute the offsets of matches from the epipolar lines of a motion, across and along them.
 
-    Args:
-        T_21: from camera 1 to camera 2.
-        pixels_1: matches in view 1.
-        pixels_2: matches in view 2.
-        camera_1: of view 1.
-        camera_2: of view 2.
-
     Returns:
         The signed Sampson distance and the disparity to a point at infinity, in pixels at the center of camera 2.
         For a point on its line at depth z in camera 2 the disparity is |e| / z, e being the shift along the line by
@@ -302,7 +259,7 @@ def epipolar_offsets(
     x_1, x_2 = camera_1.normalize(pixels_1), camera_2.normalize(pixels_2)
     R, t = T_21[..., :3, :3], T_21[..., None, :3, 3]
     across = sampson_errors(essential_from_pose(R, T_21[..., :3, 3]), x_1, x_2)
-    far = torch.cat((x_1, torch.ones_like(x_1[..., :1])), dim=-1) @ R.mT
+    far = homogeneous(x_1) @ R.mT
     ahead = far[..., 2:] > torch.finfo(far.dtype).eps
     x_far = far[..., :2] / torch.where(ahead, far[..., 2:], 1.0)
     towards = t[..., :2] - t[..., 2:] * x_far
@@ -310,3 +267,93 @@ def epipolar_offsets(
     regular = ahead[..., 0] & (squared > torch.finfo(squared.dtype).tiny)
     along = ((x_2 - x_far) * towards).sum(-1) * torch.where(regular, squared, 1.0).rsqrt()
     return camera_2.focal * across, camera_2.focal * torch.where(regular, along, 0.0)
+
+
+@full_precision
+def homography_from_matches(
+    x_1: Float[Tensor, "*batch N 2"], x_2: Float[Tensor, "*batch N 2"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Compute homographies with H_33 = 1 of samples of four or more matches, in the algebraic least-squares sense.
+
+    For samples of more than four, coordinates should be of order one. Degenerate samples (three points on a line) give
+    zeros, or anything. Source: Hartley and Zisserman, 2004, alg. 4.1.
+    """
+    x, y = x_1.unbind(-1)
+    zero, one = torch.zeros_like(x), torch.ones_like(x)
+    u, v = x_2.unbind(-1)
+    row_u = torch.stack((x, y, one, zero, zero, zero, -u * x, -u * y), dim=-1)
+    row_v = torch.stack((zero, zero, zero, x, y, one, -v * x, -v * y), dim=-1)
+    A, b = torch.cat((row_u, row_v), dim=-2), torch.cat((u, v), dim=-1)[..., None]
+    if x_1.shape[-2] > 4:
+        A, b = A.mT @ A, A.mT @ b
+    h = torch.linalg.solve_ex(A, b)[0].squeeze(-1).nan_to_num()
+    return torch.cat((h, torch.ones_like(h[..., :1])), dim=-1).unflatten(-1, (3, 3))
+
+
+@full_precision
+def rotation_from_matches(
+    rays_1: Float[Tensor, "*batch 2 3"], rays_2: Float[Tensor, "*batch 2 3"]
+) -> Float[Tensor, "*batch 3 3"]:
+    """Compute rotations that take two rays to two rays, exact for the first."""
+
+    def frame(rays: Tensor) -> Tensor:
+        a, b = rays.unbind(-2)
+        normal = torch.linalg.cross(a, b, dim=-1)
+        x, z = a / a.norm(dim=-1, keepdim=True), normal / normal.norm(dim=-1, keepdim=True)
+        return torch.stack((x, torch.linalg.cross(z, x, dim=-1), z), dim=-1)
+
+    return frame(rays_2) @ frame(rays_1).mT
+
+
+@full_precision
+def transfer_errors(
+    H: Float[Tensor, "*#batch 3 3"], x_1: Float[Tensor, "*#batch N 2"], x_2: Float[Tensor, "*#batch N 2"]
+) -> Float[Tensor, "*#batch N 2"]:
+    """Compute differences H(x_1) - x_2, very large where H takes a point behind the camera."""
+    mapped = x_1 @ H[..., :2].mT + H[..., None, :, 2]
+    depth = mapped[..., 2:]
+    front = depth > torch.finfo(depth.dtype).eps
+    return torch.where(front, mapped[..., :2] / torch.where(front, depth, 1.0) - x_2, 1e6)
+
+
+@full_precision
+def decompose_homography(
+    H: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 4 3 3"], Float[Tensor, "*batch 4 3"], Float[Tensor, "*batch 4 3"]]:
+    """Decompose homographies into the four motions and planes that explain them, two of which have the scene in front.
+
+    Not differentiable by design. Source: Ma et al., "An invitation to 3-D vision", 2004, section 5.3.3.
+
+    Returns:
+        R, t in units of the plane's distance, and unit normals n in the first camera: H ~ R + t n^T. A pure rotation
+        has t = 0 and any normal.
+    """
+    with torch.no_grad():
+        H = torch.where(torch.linalg.det(H)[..., None, None] < 0, -H, H)
+        squares, V = torch.linalg.eigh((H.mT @ H).nan_to_num())
+        middle = squares[..., 1].clamp_min(torch.finfo(H.dtype).tiny)
+        H = H * middle.rsqrt()[..., None, None]
+        low, high = squares[..., 0] / middle, squares[..., 2] / middle
+        v_3, v_2, v_1 = V.unbind(-1)
+        # u = a v_1 + b v_3 keeps its length under H; without spread, of a pure rotation, any direction does.
+        share = ((1 - low) / (high - low).clamp_min(torch.finfo(H.dtype).eps)).clamp(0.0, 1.0)[..., None]
+        a, b = share.sqrt(), (1 - share).sqrt()
+        R_1, t_1, n_1 = _motion(H, v_2, a * v_1 + b * v_3)
+        R_2, t_2, n_2 = _motion(H, v_2, a * v_1 - b * v_3)
+        R, t, n = (
+            torch.stack((R_1, R_2), dim=-3),
+            torch.stack((t_1, t_2), dim=-2),
+            torch.stack((n_1, n_2), dim=-2),
+        )
+    return torch.cat((R, R), dim=-3), torch.cat((t, -t), dim=-2), torch.cat((n, -n), dim=-2)
+
+
+def _motion(H: Tensor, v: Tensor, u: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """R, t, n from two orthonormal vectors in the plane whose lengths H keeps."""
+
+    def frame(a: Tensor, b: Tensor) -> Tensor:
+        return torch.stack((a, b, torch.linalg.cross(a, b, dim=-1)), dim=-1)
+
+    n = torch.linalg.cross(v, u, dim=-1)
+    R = frame((H @ v[..., None]).squeeze(-1), (H @ u[..., None]).squeeze(-1)) @ frame(v, u).mT
+    return R, ((H - R) @ n[..., None]).squeeze(-1), n
