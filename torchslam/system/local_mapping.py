@@ -56,9 +56,7 @@ class LocalMapping:
                 self.adjustment.set_deadline(view.index)
             reason = None
         if reason:
-            keyframe = self.mapper.insert(submap.map, view, estimate, apply_at)
-            self.loop_closer.add(submap.map, keyframe)
-            self.tracker.reset_to_keyframe(submap, keyframe)
+            self.loop_closer.add(submap.map, self._insert(submap, view, estimate, apply_at))
         self.tracker.count_found(submap.map, estimate)
         submap.posed_frames.add(view, estimate, submap.tracking.T_cr, submap.tracking.reference)
         sensor = self.mapper.camera.model
@@ -74,13 +72,13 @@ class LocalMapping:
         Without new points a moving camera would be lost before its pose is confirmed. Tentative keyframes are not in
         the keyframe database, and their points are not culled.
         """
-        submap, mapper = savepoint.submap, self.mapper
+        submap = savepoint.submap
         if not self._keyframe_reason(submap, view, estimate):
             return
         if self.adjustment.is_pending:
-            mapper.apply_adjustment(submap.map)
+            self.mapper.apply_adjustment(submap.map)
         savepoint.save_map()
-        self.tracker.reset_to_keyframe(submap, mapper.insert(submap.map, view, estimate))
+        self._insert(submap, view, estimate)
 
     def commit(self, savepoint: Savepoint) -> list[HeldFrame]:
         """Add the frames that were held back since a savepoint, and keep its tentative keyframes; return the frames."""
@@ -94,6 +92,14 @@ class LocalMapping:
             submap.posed_frames.add(frame.view, frame.estimate, frame.T_cr, frame.reference)
         savepoint.commit()
         return frames
+
+    def _insert(
+        self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate, apply_at: ApplyAt = ApplyAt.NOW
+    ) -> int:
+        """Insert a frame as a keyframe, which tracking goes on from; return its row."""
+        keyframe = self.mapper.insert(submap.map, view, estimate, apply_at)
+        self.tracker.reset_to_keyframe(submap, keyframe)
+        return keyframe
 
     def _keyframe_reason(
         self, submap: Submap, view: FrameFeatures, estimate: PoseEstimate
