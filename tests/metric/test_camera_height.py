@@ -13,8 +13,7 @@ from tests.metric.plane_world import PlaneWorld
 from torchslam.errors import MeasurementError
 from torchslam.geometry import rigid, se3_inverse, so3_exp
 from torchslam.metric.camera_height import CameraHeight, from_options, ground_heights
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, SubmapView, Unmeasured
 
 HEIGHT = 0.8
 DOWN = torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64)

@@ -17,8 +17,7 @@ from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_inverse
 from torchslam.metric.distances import Click, Distance, Distances, parse_distance
 from torchslam.metric.image_depth import LocatedPixel, locate_pixel
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, SubmapView, Unmeasured
 
 CLICKS = Click(4, (90.0, 60.0)), Click(4, (220.0, 150.0))
 

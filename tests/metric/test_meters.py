@@ -24,8 +24,7 @@ from torchslam.geometry.transforms import level_rotation
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.unit import MetricUnit
 from torchslam.metric.meters import bring_into_meters
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.system.metric_run import run_in_meters
 from torchslam.system.run import Run
 from torchslam.types import State, StepResult

@@ -18,8 +18,7 @@ from torchslam.geometry import enu_from_geodetic, geodetic_from_enu, sim3_exp, t
 from torchslam.metric.camera_path import Clock, clocks_of, parse_clock
 from torchslam.metric.position_fit import _jacobian, position_residuals
 from torchslam.metric.positions import PositionSource, from_options
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.optim import solve_least_squares
 
 FILE = Path("track.csv")

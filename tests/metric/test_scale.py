@@ -7,7 +7,8 @@ import math
 import pytest
 
 from torchslam.errors import TorchslamError
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource, combine_scales
+from torchslam.metric.meters import combine_scales
+from torchslam.metric.source import ScaleMeasurement, ScaleSource
 
 
 def measurement(scale: float, std: float, source: ScaleSource = ScaleSource.MARKER) -> ScaleMeasurement:

@@ -20,9 +20,8 @@ from torchslam.data.formats.depth_images import find_depth_images
 from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera, transform
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.sensor_depth import SensorDepth, from_options, nearest_times
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.system.slam import SLAM
 
 METERS_PER_UNIT = 0.4

@@ -18,9 +18,8 @@ from torchslam.geometry import rigid, se3_exp, se3_inverse
 from torchslam.metric import odometry, speeds
 from torchslam.metric.camera_path import Clock
 from torchslam.metric.odometry import OdometrySource, hand_eye
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import slow_mean
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.metric.speeds import SpeedSource
 from torchslam.types import Trajectory
 

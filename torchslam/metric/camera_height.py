@@ -20,8 +20,7 @@ from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.geometry.robust import median_with_error
 from torchslam.metric.options import Given
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.metric.windows import read_gray, sample_windows
 
 FRAMES = 16

@@ -10,9 +10,9 @@ import torch
 
 from torchslam.errors import MeasurementError
 from torchslam.metric.image_depth import LocatedPixel, locate_pixel
+from torchslam.metric.meters import MAX_DISAGREEMENT, combine_scales
 from torchslam.metric.options import Given
-from torchslam.metric.scale import MAX_DISAGREEMENT, ScaleMeasurement, ScaleSource, combine_scales
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 MAX_METERS = 1e5
 """Longest known length that is believed; the moon is not measured."""

@@ -11,8 +11,7 @@ from torchslam.data.inertial import InertialCalibration, InertialSamples
 from torchslam.errors import MeasurementError
 from torchslam.metric.inertial import InertialAlignment, InertialReason, align_inertial
 from torchslam.metric.options import Given
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 
 class InertialSource:

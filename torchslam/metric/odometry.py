@@ -29,9 +29,8 @@ from torchslam.metric.path_lengths import (
     measured,
     stretch_ends,
 )
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import GATE
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.types import Trajectory
 
 LEVER_STD = 1.0

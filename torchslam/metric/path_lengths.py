@@ -12,9 +12,8 @@ from torch import Tensor
 
 from torchslam.geometry import so3_log
 from torchslam.metric.camera_path import CameraPath, found_shift
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import scale_of_series
-from torchslam.metric.source import Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, Unmeasured
 
 STRETCH = 1.0
 """Seconds of a stretch: long enough that noise of single poses does not matter, short enough to separate slips from

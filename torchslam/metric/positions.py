@@ -30,8 +30,7 @@ from torchslam.metric.position_fit import (
     fit_positions,
     start_distance,
 )
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 MIN_AGREEING = 0.5
 """Part of the positions that must agree with the path: the start is right with up to half of them wrong."""

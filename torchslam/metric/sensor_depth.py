@@ -24,9 +24,8 @@ from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, transform
 from torchslam.geometry.robust import weighted_median
 from torchslam.metric.options import Given
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import scale_of_series
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 IMAGES = 60
 """Depth images that are read at most, evenly over the recording; with 20 and with 100 redkitchen's scale is the same to

@@ -16,8 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.robust import fit_inliers, median_scale
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, Unmeasured
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviations of the slow noise, in those of the white noise; beyond the last one the white noise does not

@@ -20,8 +20,7 @@ from torchslam.metric.path_lengths import (
     measured,
     stretch_ends,
 )
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.utils.indexing import between_rows
 
 MAX_GAP = 2.5

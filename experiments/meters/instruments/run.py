@@ -18,8 +18,7 @@ from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import geodetic_from_enu, rigid, se3_exp, se3_inverse, so3_exp
 from torchslam.metric.odometry import OdometrySource
 from torchslam.metric.positions import PositionSource
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import MetricSource
+from torchslam.metric.source import MetricSource, ScaleMeasurement
 from torchslam.metric.speeds import SpeedSource
 from torchslam.types import Trajectory
 

@@ -14,8 +14,7 @@ from torchslam.metric.markers.corners import PlacedTarget
 from torchslam.metric.markers.detection import Detection
 from torchslam.metric.markers.source import Markers, log_sizes
 from torchslam.metric.markers.targets import Target, parse_target
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, SubmapView, Unmeasured
 
 SIDE = 0.5
 """Of all markers, units of the map."""

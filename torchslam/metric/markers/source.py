@@ -21,9 +21,9 @@ from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, median_scale, we
 from torchslam.metric.markers.corners import GraphWithCorners, PlacedTarget, Sighting, add_corners
 from torchslam.metric.markers.detection import Detector, detector_of
 from torchslam.metric.markers.targets import Target, TargetKind, parse_target
+from torchslam.metric.meters import MAX_DISAGREEMENT
 from torchslam.metric.options import Given
-from torchslam.metric.scale import MAX_DISAGREEMENT, ScaleMeasurement, ScaleSource
-from torchslam.metric.source import Images, SubmapView, Unmeasured
+from torchslam.metric.source import Images, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graph
 
