@@ -17,10 +17,9 @@ from torchslam.errors import MeasurementError, TorchslamError
 from torchslam.geometry import rigid, se3_exp, se3_inverse
 from torchslam.metric import odometry, speeds
 from torchslam.metric.camera_path import Clock
-from torchslam.metric.odometry import OdometrySource, hand_eye
+from torchslam.metric.odometry import OdometrySource, SpeedSource, hand_eye
 from torchslam.metric.slow_noise import slow_mean
 from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
-from torchslam.metric.speeds import SpeedSource
 from torchslam.types import Trajectory
 
 FILE = Path("speeds.csv")

@@ -84,7 +84,7 @@ KINDS: tuple[SourceKind, ...] = (
     ),
     SourceKind(
         (Option("speed", ("FILE",)), Option("speed_clock", ("CLOCK",))),
-        "torchslam.metric.speeds:from_options",
+        "torchslam.metric.odometry:speeds_from_options",
     ),
     SourceKind(
         (Option("odometry", ("FILE",)), Option("odometry_clock", ("CLOCK",))),
@@ -92,7 +92,7 @@ KINDS: tuple[SourceKind, ...] = (
     ),
     SourceKind(
         (Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))),
-        "torchslam.metric.inertial_source:from_options",
+        "torchslam.metric.inertial:from_options",
     ),
     SourceKind(
         (Option("depth", ("FOLDER[:SCALE]",)), Option("depth_camera", ("CAMERA",))),

@@ -13,14 +13,7 @@ from torchslam.data.formats.fix_files import Fixes, read_fixes
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, sim3_scale
-from torchslam.metric.camera_path import (
-    CameraPath,
-    Clock,
-    clock_notes,
-    clocks_of,
-    found_shift,
-    on_clock_of_images,
-)
+from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, found_shift
 from torchslam.metric.options import Given
 from torchslam.metric.position_fit import (
     CLOCK_STD,
@@ -107,7 +100,7 @@ class PositionSource:
 
     def _by_times(self, path: CameraPath) -> tuple[PositionPairs, PositionFit, float] | Unmeasured:
         assert self.fixes.timestamps is not None
-        times = on_clock_of_images(self.fixes.timestamps, path, self.clock, self.fixes.path, "--gps-clock")
+        times = path.on_its_clock(self.fixes.timestamps, self.clock, self.fixes.path, "--gps-clock")
         if bool((self.fixes.geodetic.nan_to_num() == self.fixes.geodetic[0].nan_to_num()).all()):
             return _unmeasured(f"all {len(self.fixes)} positions are the same")
         moved = torch.ones_like(times, dtype=torch.bool)

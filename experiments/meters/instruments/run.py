@@ -19,7 +19,7 @@ from torchslam.geometry import geodetic_from_enu, rigid, se3_exp, se3_inverse, s
 from torchslam.metric.odometry import OdometrySource
 from torchslam.metric.positions import PositionSource
 from torchslam.metric.source import MetricSource, ScaleMeasurement
-from torchslam.metric.speeds import SpeedSource
+from torchslam.metric.odometry import SpeedSource
 from torchslam.types import Trajectory
 
 ORIGIN = torch.tensor((48.98, 8.39, 112.0), dtype=torch.float64)
