@@ -15,7 +15,7 @@ from torchslam.data.formats.speed_file import Speeds, read_speeds
 from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import MeasurementError, TorchslamError
 from torchslam.geometry import rigid, se3_exp, se3_inverse
-from torchslam.metric import odometry, speeds
+from torchslam.metric import odometry
 from torchslam.metric.camera_path import Clock
 from torchslam.metric.odometry import OdometrySource, SpeedSource, hand_eye
 from torchslam.metric.slow_noise import slow_mean
@@ -191,7 +191,7 @@ def test_wrong_files_of_speeds(tmp_path: Path, content: str, message: str) -> No
 
 def test_options_read_their_files(tmp_path: Path) -> None:
     (tmp_path / "v.csv").write_text("0,1\n1,1\n", encoding="utf-8")
-    (by_speed,) = speeds.from_options({"speed": ((str(tmp_path / "v.csv"),),)})
+    (by_speed,) = odometry.speeds_from_options({"speed": ((str(tmp_path / "v.csv"),),)})
     assert isinstance(by_speed, SpeedSource)
     poses = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     write_trajectory(tmp_path / "o.txt", Trajectory(torch.tensor((0.0, 1.0), dtype=torch.float64), poses))

@@ -119,7 +119,7 @@ class Distances:
         Raises:
             MeasurementError: a click is outside of the image.
         """
-        if view.sequence is None or view.sequence.brings_features:
+        if not view.has_images:
             return Unmeasured(ScaleSource.DISTANCE, "there are no images to find the points in")
         self.check(view.camera.size)
         found: list[tuple[Distance, ScaleMeasurement]] = []

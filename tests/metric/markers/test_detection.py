@@ -8,8 +8,7 @@ import pytest
 import torch
 
 from torchslam.geometry import Camera
-from torchslam.metric.markers.detection import detector_of, side_bends
-from torchslam.metric.markers.edges import fit_corners, sides
+from torchslam.metric.markers.detection import detector_of, fit_corners, side_bends, sides
 from torchslam.metric.markers.targets import dictionary, parse_target
 
 SIZE = (320, 240)
