@@ -96,15 +96,12 @@ class PositionPairs:
         return PositionPairs(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
 
 
-def fit_positions(
-    pairs: PositionPairs, camera_up_w: Float[Tensor, " 3"], clock_std: float = CLOCK_STD
-) -> PositionFit | None:
+def fit_positions(pairs: PositionPairs, camera_up_w: Float[Tensor, " 3"]) -> PositionFit | None:
     """Fit a similarity to positions, up to half of them wrong; None where they do not determine one.
 
     Args:
         pairs: `MIN_POSITIONS` or more.
         camera_up_w: mean direction in the map that is up in the images, a unit vector.
-        clock_std: standard deviation of the difference of the clocks, seconds.
     """
 
     def residuals_of(S_ew: Tensor) -> Float[Tensor, "N 3"]:
@@ -114,7 +111,7 @@ def fit_positions(
         return ((residuals_of(model.S_ew).abs() <= GATE * model.stds) | ~_known(pairs)).all(-1)
 
     def averaged_from(model: _Model, inliers: Bool[Tensor, " N"], slow: bool) -> PositionFit | None:
-        return _average(pairs, inliers, model, camera_up_w, clock_std, slow)
+        return _average(pairs, inliers, model, camera_up_w, slow)
 
     def fitted(model: _Model, inliers: Bool[Tensor, " N"]) -> _Model | None:
         if int(inliers.sum()) < MIN_POSITIONS:
@@ -186,7 +183,6 @@ def _average(
     inliers: Bool[Tensor, " N"],
     start: _Model,
     camera_up_w: Float[Tensor, " 3"],
-    clock_std: float,
     slow: bool,
 ) -> PositionFit | None:
     """The average over all covariances, or white noise alone; None where one does not determine the similarity."""
@@ -204,16 +200,14 @@ def _average(
     correlations = slow_correlations(mean(kept.times))[slice(1, None) if slow else slice(1)]
     V = correlations[:, None] * stds.square().mean(0)[:, None, None] + torch.diag_embed(white.mT)
     L = torch.linalg.cholesky(V)
-    whitening = torch.linalg.solve_triangular(
-        L, torch.eye(len(size), dtype=L.dtype, device="cpu").expand_as(L), upper=False
-    )
+    eye = torch.eye(len(size), dtype=torch.float64, device="cpu")
+    whitening = torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False)
     B = len(correlations)
     shared = (mean(kept.positions_w), mean(kept.velocities_w), mean(kept.positions_e), camera_up_w)
-    clock = torch.full((B,), clock_std, dtype=torch.float64, device="cpu")
-    inputs = (whitening, *(x.expand(B, *x.shape) for x in shared), clock)
+    inputs = (whitening, *(x.expand(B, *x.shape) for x in shared))
     solution = solve_least_squares(
         _residuals,
-        (start.S_ew.expand(B, 4, 4), clock.new_zeros(B, 1)),
+        (start.S_ew.expand(B, 4, 4), eye.new_zeros(B, 1)),
         inputs,
         ("sim3", "euclidean"),
         options=LEAST_SQUARES_OPTIONS.replace(tolerance=TOLERANCE),
@@ -225,7 +219,7 @@ def _average(
     def moved(step: Float[Tensor, " 8"]) -> Float[Tensor, "B N"]:
         return _residuals(sim3_exp(step[:7]) @ S, offset + step[7], *inputs)
 
-    J = jacfwd(moved)(clock.new_zeros(8))  # translation, rotation, log scale, offset
+    J = jacfwd(moved)(eye.new_zeros(8))  # translation, rotation, log scale, offset
     information = J.mT @ J
     log_det = 2 * L.diagonal(dim1=-2, dim2=-1).log().sum((-1, -2))
     models = averaged(log_det, information, 2 * solution.cost, 3 * len(size) - 7)
@@ -262,11 +256,10 @@ def _residuals(
     velocities_w: Float[Tensor, "B G 3"],
     positions_e: Float[Tensor, "B G 3"],
     camera_up_w: Float[Tensor, "B 3"],
-    clock_std: Float[Tensor, " B"],
 ) -> Float[Tensor, "B N"]:
     """Whitened differences of positions, then of the clocks, then of the cameras' up; for `solve_least_squares`."""
     moved = transform(S_ew, positions_w + offset[..., None] * velocities_w)
     errors = (whitening @ (moved - positions_e).mT[..., None]).squeeze(-1)
     up = torch.nn.functional.normalize((S_ew[..., :3, :3] @ camera_up_w[..., None]).squeeze(-1), dim=-1)
     up = up - torch.tensor((0.0, 0.0, 1.0), dtype=up.dtype, device=up.device)
-    return torch.cat((errors.flatten(-2), offset / clock_std[..., None], up / CAMERA_UP_STD), dim=-1)
+    return torch.cat((errors.flatten(-2), offset / CLOCK_STD, up / CAMERA_UP_STD), dim=-1)
