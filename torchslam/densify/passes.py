@@ -24,14 +24,11 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from torchslam.data.formats.image_file import write_image
-from torchslam.dense.cloud import PointCloud
-from torchslam.dense.confidence import confidence_alone, confidence_together, kept
-from torchslam.dense.consistency import merge
+from torchslam.dense.cloud import CloudFusion, PointCloud
+from torchslam.dense.consistency import confidence_alone, confidence_together, depth_normals, kept, merge
 from torchslam.dense.depth_maps import DepthMaps, join, read_about
 from torchslam.dense.estimate import estimate_depth
-from torchslam.dense.fusion import CloudFusion
 from torchslam.dense.learned import learned_confidence
-from torchslam.dense.normals import depth_normals
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
 from torchslam.errors import ResultsError
 from torchslam.io.export.scene import Images

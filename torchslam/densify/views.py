@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.data.transforms import scale_camera
-from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
+from torchslam.dense.estimate import choose_neighbors, neighbor_scores
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.scene import ExportedScene, Images, undistorted
