@@ -109,21 +109,15 @@ def collate(clips: Several[Clip]) -> Clip:
         raise ValueError(
             f"clips of a batch must have the same number and size of frames, not {sorted(sizes)}"
         )
+    camera = stack_cameras([clip.camera for clip in clips])
+    names = ("images", "T_cw", "known", "number")
     return Clip(
-        torch.stack([clip.images for clip in clips]),
-        torch.stack([clip.T_cw for clip in clips]),
-        torch.stack([clip.known for clip in clips]),
-        stack_cameras([clip.camera for clip in clips]),
-        torch.stack([clip.number for clip in clips]),
+        camera=camera, **{name: torch.stack([getattr(clip, name) for clip in clips]) for name in names}
     )
 
 
 def stack_cameras(cameras: Several[Camera]) -> Camera:
-    """Stack B cameras of one size into one with params (B, P); parameters are padded where others have more.
-
-    Raises:
-        ValueError: Different sizes, or models that cannot be mixed.
-    """
+    """Stack B cameras into one with params (B, P). Raises ValueError for sizes or models that cannot be mixed."""
     nested = ("pinhole", "radial_tangential", "rational")  # each is the next one with zeros at the end
     if all(camera.model in nested for camera in cameras):
         model = max((camera.model for camera in cameras), key=nested.index)
@@ -188,7 +182,8 @@ class Clips(Dataset[Clip]):
                 if len(found) == per_sequence:
                     break
                 stride = seen.stride(start, frames - 1, min_parallax, max_stride)
-                if stride and not (supervised and seen.lacks_poses(start, frames, stride)):
+                clip = range(start, start + frames * stride, stride) if stride else ()
+                if clip and not (supervised and any(sequence.pose(index) is None for index in clip)):
                     found[start] = stride
             self.chosen += [(number, start, found[start]) for start in sorted(found)]
 
@@ -343,18 +338,13 @@ class _Seen:
         """The least of 1, 2, 4, ..., `most` with enough parallax to the frame `steps` strides later; 0 for none."""
         stride = 1
         while stride <= most and start + steps * stride < len(self._sequence):
-            first, second = start, start + steps * stride
-            T_1, T_2 = self._sequence.pose(first), self._sequence.pose(second)
+            second = start + steps * stride
+            T_1, T_2 = self._sequence.pose(start), self._sequence.pose(second)
             R_21 = None if T_1 is None or T_2 is None else (T_2 @ se3_inverse(T_1))[:3, :3]
-            found = parallax(self._of(first), self._of(second), self._sequence.camera, R_21)
-            if found >= least:
+            if parallax(self._of(start), self._of(second), self._sequence.camera, R_21) >= least:
                 return stride
             stride *= 2
         return 0
-
-    def lacks_poses(self, start: int, frames: int, stride: int) -> bool:
-        """Test whether a frame of a clip has no true pose."""
-        return any(self._sequence.pose(start + row * stride) is None for row in range(frames))
 
     def _of(self, index: int) -> Features:
         if index not in self._features:
