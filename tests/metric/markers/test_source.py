@@ -10,9 +10,8 @@ from torch import Tensor
 
 from tests.map.simulated import CAMERA, simulated_submap
 from torchslam.geometry import Camera, SensorModel, transform
-from torchslam.metric.markers.detection import Detection
+from torchslam.metric.markers.detection import Detection, Target, parse_target
 from torchslam.metric.markers.source import Markers, PlacedTarget, log_sizes
-from torchslam.metric.markers.targets import Target, parse_target
 from torchslam.metric.source import ScaleMeasurement, SubmapView, Unmeasured
 
 SIDE = 0.5

@@ -1,4 +1,6 @@
-"""Where an image shows targets: corners of markers and boards, to a tenth of a pixel and without bias.
+"""Printed targets of known size, and where an image shows them: corners to a tenth of a pixel and without bias.
+
+The user describes them: `apriltag-25h9:0.05`, `aruco-4x4:0.05`, `charuco-7x5:0.04:0.03`, `chessboard-7x5:0.04`.
 
 OpenCV finds markers by a threshold, which moves the edges of blurred dark squares inward, and its subpixel corners keep
 that: a marker looks 0.8 to 1.5 % too small. Its corners are only where the fit of the edges starts: the center of the
@@ -8,7 +10,9 @@ AprilTags has no such bias, but its corners are five times as far off, 0.3 px.
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol
 
 import cv2
@@ -16,9 +20,24 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int, UInt8
 
+from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera
-from torchslam.metric.markers.targets import BOARD_FAMILIES, Target, TargetKind, dictionary
 
+MAX_METERS = 100.0
+"""Longest side of a marker that is believed; a larger number is meant in millimeters."""
+MIN_METERS = 0.001
+"""Shortest side of a marker that a camera resolves."""
+MAX_SQUARES = 100
+"""Most squares along a side of a board."""
+ARUCO_COUNT = 250
+"""Markers of a family aruco-NxN without a number: more of 4x4 would let other squares look like markers."""
+
+SINGLE = re.compile(
+    r"(?P<family>apriltag-\w+|aruco-\w+(?:-\d+)?):(?P<size>[^:,]+)(?P<others>(?:,\d+=[^:,]+)*)"
+)
+BOARD = re.compile(r"(?P<kind>charuco|chessboard)-(?P<columns>\d+)x(?P<rows>\d+):(?P<lengths>[^,]+)")
+BOARD_FAMILIES = ("aruco-4x4", "aruco-5x5", "aruco-6x6", "aruco-7x7", "apriltag-36h11")
+"""Families of the markers in a ChArUco board, of which its description does not say the one."""
 MAX_SHIFT_PX = 3.0
 """Largest distance between the corners by a threshold and those by the edges: else the edges are others."""
 MIN_SIDE_PX = 12.0
@@ -47,6 +66,126 @@ MAX_SPREAD_PX = 0.5
 """Largest root mean square of edge points around their line, pixels; .1 to .2 are usual."""
 NEAR_PX = 0.1
 """Distance from the line within which an edge point always counts, pixels."""
+
+
+class TargetKind(StrEnum):
+    """Kind of a target."""
+
+    MARKER = "marker"
+    """Square markers with an id each."""
+    CHARUCO = "charuco"
+    """A chessboard with markers in its white squares."""
+    CHESSBOARD = "chessboard"
+    """A plain chessboard."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """A kind of target, as the user describes it.
+
+    Attributes:
+        text: the description.
+        kind: what it is.
+        family: of the markers, such as "apriltag-25h9"; empty for boards.
+        size: meters: side of the black square of a marker, or of a square of a board.
+        others: sizes of the markers with other ones, by id.
+        squares: columns and rows of a board.
+        marker_size: meters: side of the markers in a ChArUco board.
+    """
+
+    text: str
+    kind: TargetKind
+    family: str
+    size: float
+    others: tuple[tuple[int, float], ...] = ()
+    squares: tuple[int, int] = (0, 0)
+    marker_size: float = 0.0
+
+    def corners(self, identity: int) -> Float[np.ndarray, "C 2"]:
+        """Positions of the corners of a target in its plane, meters; those of a marker in OpenCV's order."""
+        if self.kind is TargetKind.MARKER:
+            size = dict(self.others).get(identity, self.size)
+            return size * np.array(((-0.5, -0.5), (0.5, -0.5), (0.5, 0.5), (-0.5, 0.5)))
+        columns, rows = self.squares[0] - 1, self.squares[1] - 1
+        x, y = np.meshgrid(np.arange(columns), np.arange(rows))
+        return self.size * np.stack((x, y), axis=-1).reshape(-1, 2).astype(float)
+
+    def name(self, identity: int) -> str:
+        """A target in words."""
+        return f"{self.family} {identity}" if self.kind is TargetKind.MARKER else str(self.kind)
+
+
+def parse_target(text: str) -> Target:
+    """Read the description of a target.
+
+    Raises:
+        MeasurementError: it is none, or a size is impossible.
+    """
+    if found := SINGLE.fullmatch(text):
+        dictionary(found["family"], text)
+        others = [other.split("=") for other in found["others"].split(",") if other]
+        sizes = tuple((int(identity), _length(size, text)) for identity, size in others)
+        twice = [identity for identity, _ in sizes if [other for other, _ in sizes].count(identity) > 1]
+        if twice:
+            raise MeasurementError(f"--marker {text}: marker {twice[0]} has two sizes")
+        return Target(text, TargetKind.MARKER, found["family"], _length(found["size"], text), sizes)
+    if found := BOARD.fullmatch(text):
+        squares = int(found["columns"]), int(found["rows"])
+        if not all(3 <= count <= MAX_SQUARES for count in squares):
+            raise MeasurementError(
+                f"--marker {text}: a board has 3 to {MAX_SQUARES} squares along each side; count all squares, "
+                "not the corners between them"
+            )
+        lengths = [_length(length, text) for length in found["lengths"].split(":")]
+        kind = TargetKind(found["kind"])
+        if len(lengths) != (2 if kind is TargetKind.CHARUCO else 1):
+            needed = "of a square and of a marker" if kind is TargetKind.CHARUCO else "of a square"
+            raise MeasurementError(f"--marker {text}: {kind} needs the side {needed}, in meters")
+        if kind is TargetKind.CHARUCO and lengths[1] >= lengths[0]:
+            raise MeasurementError(
+                f"--marker {text}: a marker must be smaller than the square that it lies in"
+            )
+        return Target(text, kind, "", lengths[0], (), squares, lengths[-1] if len(lengths) > 1 else 0.0)
+    raise MeasurementError(
+        f"--marker {text}: write FAMILY:METERS, such as apriltag-36h11:0.05 or aruco-4x4:0.05, with other sizes of "
+        "ids as apriltag-36h11:0.05,7=0.1; or charuco-7x5:SQUARE:MARKER or chessboard-7x5:SQUARE, with columns and "
+        "rows of squares"
+    )
+
+
+def _length(text: str, whole: str) -> float:
+    """A size in meters."""
+    try:
+        length = float(text)
+    except ValueError:
+        raise MeasurementError(f"--marker {whole}: {text!r} is no length in meters") from None
+    if not MIN_METERS <= length <= MAX_METERS:
+        raise MeasurementError(
+            f"--marker {whole}: a side of {text} m; sizes are in meters, from {MIN_METERS} to {MAX_METERS:g}"
+        )
+    return length
+
+
+def dictionary(family: str, text: str) -> cv2.aruco.Dictionary:
+    """OpenCV's dictionary of a family of markers; `text` is the description that a message names.
+
+    Raises:
+        MeasurementError: there is no such family.
+    """
+    kind, _, rest = family.partition("-")
+    name = f"DICT_APRILTAG_{rest.lower()}" if kind == "apriltag" else f"DICT_{rest.upper().replace('-', '_')}"
+    if kind == "aruco" and rest.lower() == "original":
+        name = "DICT_ARUCO_ORIGINAL"
+    elif kind == "aruco" and rest.count("-") == 0:
+        name += f"_{ARUCO_COUNT}"
+    if not hasattr(cv2.aruco, name):
+        known = [each for each in dir(cv2.aruco) if re.fullmatch(r"DICT_APRILTAG_\d+h\d+", each)]
+        tags = ", ".join(each.removeprefix("DICT_APRILTAG_") for each in known)
+        raise MeasurementError(
+            f"--marker {text}: no family {family}; there are apriltag-({tags}), aruco-(4x4, 5x5, 6x6, 7x7) with 50, "
+            f"100, 250 or 1000 markers (aruco-4x4-1000, else {ARUCO_COUNT}), and aruco-original"
+        )
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
 
 
 @dataclass(frozen=True)
@@ -131,15 +270,12 @@ class CharucoDetector:
     def __init__(self, target: Target) -> None:
         """Take the board."""
         self._target = target
-        self._boards = {family: self._board(family) for family in BOARD_FAMILIES}
+        board = (target.squares, target.size, target.marker_size)
+        self._boards = {
+            family: cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard(*board, dictionary(family, target.text)))
+            for family in BOARD_FAMILIES
+        }
         self._seen = dict.fromkeys(self._boards, 0)
-
-    def _board(self, family: str) -> cv2.aruco.CharucoDetector:
-        target = self._target
-        board = cv2.aruco.CharucoBoard(
-            target.squares, target.size, target.marker_size, dictionary(family, target.text)
-        )
-        return cv2.aruco.CharucoDetector(board)
 
     def detect(self, image: UInt8[np.ndarray, "H W"]) -> list[Detection]:
         """The board in an image, or nothing. The family is settled by the first image that shows it."""
@@ -153,18 +289,15 @@ class CharucoDetector:
             return []
         self._seen[family] += len(rows)
         pixels, rows = pixels.reshape(-1, 2).astype(np.float32), rows.ravel().astype(int)
-        side = _side_px(pixels, self._target.corners(0)[rows], self._target.size)
+        # The side of a square in the image, by the distances of all corners from the first.
+        corners = self._target.corners(0)[rows]
+        apart, apart_px = (np.linalg.norm(each[1:] - each[0], axis=1) for each in (corners, pixels))
+        side = float(np.median(apart_px / (apart / self._target.size)))
         free = (self._target.size - self._target.marker_size) / (2 * self._target.size)
         half = max(2, int(FREE_SHARE * free * side))
         stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 30, 1e-3)
         pixels = cv2.cornerSubPix(image, pixels[:, None].copy(), (half, half), (-1, -1), stop).reshape(-1, 2)
         return [Detection(0, rows, pixels.astype(float))]
-
-
-def _side_px(pixels: Float[np.ndarray, "C 2"], corners: Float[np.ndarray, "C 2"], size: float) -> float:
-    """Length of a square of a board in the image, pixels, by the distances of all corners from the first."""
-    lengths = np.linalg.norm(corners[1:] - corners[0], axis=1) / size
-    return float(np.median(np.linalg.norm(pixels[1:] - pixels[0], axis=1) / lengths))
 
 
 def detector_of(target: Target, camera: Camera) -> Detector:

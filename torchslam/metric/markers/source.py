@@ -18,8 +18,14 @@ from torch import Tensor
 from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera, SensorModel, se3_inverse, transform, triangulate_many
 from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, median_scale, weighted_median
-from torchslam.metric.markers.detection import Detection, Detector, detector_of
-from torchslam.metric.markers.targets import Target, TargetKind, parse_target
+from torchslam.metric.markers.detection import (
+    Detection,
+    Detector,
+    Target,
+    TargetKind,
+    detector_of,
+    parse_target,
+)
 from torchslam.metric.meters import MAX_DISAGREEMENT
 from torchslam.metric.options import Given
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
