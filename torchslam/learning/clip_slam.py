@@ -353,8 +353,8 @@ class ClipSLAM(nn.Module):
         seen = [each.to(camera.params.device) for each, camera in zip(seen, cameras, strict=True)]
         keypoint_weights = [self._keypoint_weights(each) for each in seen]
         graphs = tuple(
-            None if run is None else _as_seen(run, *rest)
-            for run, *rest in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
+            None if run is None else _as_seen(run, each, weights, own)
+            for run, each, weights, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
         )
         solvable = [each for each in graphs if each is not None]
         found = iter(

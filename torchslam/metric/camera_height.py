@@ -71,14 +71,15 @@ def from_options(given: Given) -> list[CameraHeight]:
     return [CameraHeight(float(given["camera_height"][0][0]))]
 
 
+@dataclass(frozen=True)
 class CameraHeight:
-    """A camera that moves over the ground at a known height, upright."""
+    """A camera that moves over the ground at a known height, upright. Raises MeasurementError for an impossible one."""
 
-    def __init__(self, meters: float) -> None:
-        """Take the height. Raises MeasurementError for an impossible one."""
-        if not 0 < meters < math.inf:
-            raise MeasurementError(f"--camera-height {meters}: no height in meters")
-        self._meters = meters
+    meters: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.meters < math.inf:
+            raise MeasurementError(f"--camera-height {self.meters}: no height in meters")
 
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """Measure the unit of a submap by the median height over its frames."""
@@ -94,7 +95,7 @@ class CameraHeight:
         middle, spread, error = median_with_error(np.log(heights))
         return ScaleMeasurement(
             ScaleSource.CAMERA_HEIGHT,
-            self._meters / math.exp(middle),
+            self.meters / math.exp(middle),
             math.hypot(error, MODEL_STD),
             len(heights),
             "frames above the ground",
@@ -189,18 +190,10 @@ class _Windows:
         top, bottom = max(cy + BELOW_HORIZON * fy, margin), camera.height - 1 - margin
         if top >= bottom:
             return None
-        y, x = np.meshgrid(
-            np.linspace(top, bottom, ROWS),
-            np.linspace(margin, camera.width - 1 - margin, COLUMNS),
-            indexing="ij",
-        )
-        v, u = np.meshgrid(
-            spacing * np.arange(-RADIUS_Y, RADIUS_Y + 1),
-            spacing * np.arange(-RADIUS_X, RADIUS_X + 1),
-            indexing="ij",
-        )
-        centers, offsets = (np.stack((a.ravel(), b.ravel()), axis=-1) for a, b in ((x, y), (u, v)))
-        pixels = torch.from_numpy(centers[:, None] + offsets)
+        columns = np.linspace(margin, camera.width - 1 - margin, COLUMNS), np.linspace(top, bottom, ROWS)
+        samples = np.arange(-RADIUS_X, RADIUS_X + 1), np.arange(-RADIUS_Y, RADIUS_Y + 1)
+        centers, offsets = (np.stack(np.meshgrid(*xy), axis=-1).reshape(-1, 2) for xy in (columns, samples))
+        pixels = torch.from_numpy(centers[:, None] + spacing * offsets)
         rays = camera.unproject(pixels)
         return cls(camera, pixels, rays / rays[..., 2:])
 

@@ -165,10 +165,9 @@ def align_inertial(
     gravity_std = math.hypot(gravity_std, float(rotation.R_std.norm()))
     scale = found[0]
     is_determined = bool(scale > 0) and relative_std < WORST
-    reason = InertialReason.MEASURED if is_determined else InertialReason.NOT_DETERMINED
     starts = timestamps[torch.tensor([each[0] for each in rows], device=timestamps.device)]
     return InertialAlignment(
-        reason,
+        InertialReason.MEASURED if is_determined else InertialReason.NOT_DETERMINED,
         scale,
         math.hypot(relative_std, SENSOR_STD),
         found[1:4],

@@ -180,16 +180,12 @@ def scale_of_series(
     """Average a series of logarithms of meters per unit, up to half of them wrong; see `slow_mean`.
 
     Args:
-        source: where they come from.
-        times: seconds, ascending.
-        logs: the logarithms.
-        stds: their standard deviations, relative to each other.
-        unit: what is counted, in the plural.
+        source, unit, notes: of the measurement.
+        times, logs, stds: as for `slow_mean`.
         name_of: the name of a row, such as "at 3.2 s".
         disagreement: message where they determine no scale, with `{}` for their relative standard deviation.
         cause: end of the message about rejected ones.
         shared_std: relative standard deviation of an error that all have in common.
-        notes: remarks.
     """
     mean = slow_mean(times, logs, stds)
     if mean.std > MAX_RELATIVE_STD or float(mean.inliers.double().mean()) < 0.5:
