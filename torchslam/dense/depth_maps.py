@@ -174,7 +174,7 @@ def _content(
     camera: Camera,
     about: dict[str, Any],
 ) -> Iterator[bytes]:
-    """The bytes of a file, in pieces: a header with the place of each tensor, and the rows of the tensors, in blocks."""
+    """The bytes of a file, in pieces: a header with the place of each tensor, then the rows of each, in blocks."""
     description = {
         "format": FORMAT,
         "camera": {"model": camera.model, "size": list(camera.size)},

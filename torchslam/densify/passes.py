@@ -164,10 +164,8 @@ class DenseJob:
 
 def _do(job: DenseJob, result: Pass, view: int) -> None:
     """Compute one view in one pass and write it."""
-    if result is Pass.ALONE:
-        _write_alone(job, view)
-    else:
-        _write_merged(job, view)
+    write = _write_alone if result is Pass.ALONE else _write_merged
+    write(job, view)
 
 
 def _write_alone(job: DenseJob, view: int) -> None:

@@ -61,13 +61,7 @@ focal length to 1 %."""
 
 
 def from_options(given: Given) -> list[CameraHeight]:
-    """The source of `--camera-height`.
-
-    Raises:
-        MeasurementError: it is given twice.
-    """
-    if len(given["camera_height"]) > 1:
-        raise MeasurementError("--camera-height is given twice: a camera has one")
+    """The source of `--camera-height`."""
     return [CameraHeight(float(given["camera_height"][0][0]))]
 
 
