@@ -112,8 +112,7 @@ def as_seen_by(
     Args:
         inverse_depth: of the view, one map for each other view.
         others: maps of the other views.
-        camera: the pinhole of all views.
-        T_sr: poses, camera of the view to those of the others.
+        camera, T_sr: pinhole of all views; poses from the camera of the view to those of the others.
 
     Returns:
         Inverse depth in the view, 0 where the other map has none.
@@ -156,8 +155,7 @@ def merge(
         inverse_depth: of the view, 1 / map units; 0 where unknown.
         confidence: of its depth alone, 0 to 1: the weight of its votes.
         others, other_confidences: of its neighbors.
-        camera: the pinhole of all views.
-        T_sr: poses, camera of the view to those of the neighbors.
+        camera, T_sr: pinhole of all views; poses from the camera of the view to those of the neighbors.
         tolerance: relative difference of depths at which one gives half a vote to another.
     """
     rendered = render(others, camera, se3_inverse(T_sr))

@@ -3,7 +3,8 @@
 Plane sweep: a hypothesis is an inverse depth, 1 / z, per pixel: constant over the image for a sweep of planes, or
 around a known surface for a refinement, whose windows then follow the surface. Everything is differentiable with
 respect to images, poses, camera and hypotheses; whether a pixel is seen, and which views are the best ones, are
-decisions without a gradient.
+decisions without a gradient. Images are gray, in [0, 1]; `camera` is the pinhole of all views, T_sr are poses from the
+reference camera to source cameras, and inverse depths are in 1 / map units.
 
 Semi-global aggregation (Hirschmüller 2008): smooth surfaces that may jump at edges of the image. A path comes to every
 pixel along each direction; its cost is the cost of the pixel and of the cheapest changes of hypothesis on the way. A
@@ -44,12 +45,6 @@ def warp(
     inverse_depth: Float[Tensor, "*batch D #H #W"],
 ) -> tuple[Float[Tensor, "*batch V D H W"], Bool[Tensor, "*batch V D H W"]]:
     """Sample the source views where the reference view's pixels are seen at given inverse depths.
-
-    Args:
-        sources: gray images.
-        camera: the pinhole of all views.
-        T_sr: poses, reference camera to source camera.
-        inverse_depth: hypotheses, 1 / map units.
 
     Returns:
         Samples, and whether the pixel is in front of the source camera and inside of its image. Samples that are not
@@ -137,10 +132,7 @@ def matching_cost(
     with 0.
 
     Args:
-        reference, sources: gray images in [0, 1].
-        camera: the pinhole of all views.
-        T_sr: poses, reference camera to source camera.
-        inverse_depth: hypotheses, 1 / map units.
+        reference, sources, camera, T_sr, inverse_depth: as in `warp`.
         radius: of the windows, pixels.
         num_best: number of views to take, for each hypothesis.
     """

@@ -59,15 +59,7 @@ class Clip:
         number: int = 0,
         supervised: bool = False,
     ) -> Clip:
-        """Read the frames `start`, `start + stride`, ... of a sequence.
-
-        Args:
-            sequence: With a camera.
-            start: First frame.
-            frames: T.
-            stride: Frames from one to the next.
-            number: Index in the data set.
-            supervised: Whether every frame must have a true pose.
+        """Read the T frames `start`, `start + stride`, ... of a sequence with a camera.
 
         Raises:
             SequenceError: The sequence is too short or, if `supervised`, lacks the true pose of one of the frames.
@@ -143,8 +135,6 @@ class Clips(Dataset[Clip]):
     `MIN_MATCHES` matches, are skipped. The same arguments give the same clips.
 
     Attributes:
-        sequences: The sequences.
-        frames: Number of frames of a clip.
         chosen: (sequence, start, stride) of each clip.
 
     Args:
@@ -302,8 +292,7 @@ def parallax(
     """Measure the median angle between the rays of matches after rotation compensation, in radians.
 
     Args:
-        first: Features of one image.
-        second: Features of another one.
+        first, second: Features of two images of a camera.
         camera: Of both.
         R_21: Rotation from the first camera to the second; estimated if None.
 
