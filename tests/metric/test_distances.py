@@ -24,9 +24,7 @@ CLICKS = Click(4, (90.0, 60.0)), Click(4, (220.0, 150.0))
 
 @pytest.fixture(scope="module")
 def world() -> PlaneWorld:
-    """A slanted wall, from four to five units ahead."""
-    normal_w = torch.nn.functional.normalize(torch.tensor([0.2, 0.1, 1.0], dtype=torch.float64), dim=0)
-    return PlaneWorld(sideways(9), normal_w, 4.5)
+    return PlaneWorld.slanted()
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,6 @@ from torch import Tensor
 from tests.map.simulated import CAMERA
 from tests.metric.drives import measure, reason
 from tests.metric.plane_world import PlaneWorld
-from tests.scene import sideways
 from torchslam.data import open_sequence
 from torchslam.data.formats.depth_images import find_depth_images
 from torchslam.errors import CalibrationError, MeasurementError
@@ -38,9 +37,7 @@ class NamedWorld(PlaneWorld):
 
 @pytest.fixture(scope="module")
 def world() -> NamedWorld:
-    """A slanted wall, from four to five units ahead."""
-    normal_w = torch.nn.functional.normalize(torch.tensor([0.2, 0.1, 1.0], dtype=torch.float64), dim=0)
-    return NamedWorld(sideways(FRAMES), normal_w, 4.5)
+    return NamedWorld.slanted(FRAMES)
 
 
 @pytest.fixture(scope="module")
