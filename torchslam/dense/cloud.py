@@ -11,10 +11,6 @@ from torch import Tensor
 from torchslam.dense.depth_maps import DepthMaps
 from torchslam.geometry import se3_inverse, transform
 
-THINNING_SEED = 0
-"""Of the choice of points, so that the same cloud is thinned to the same bytes."""
-SPACING_SAMPLE = 200  # points whose distance to their neighbors is measured
-SPACING_RANK = 3  # the neighbor at that distance: on a surface, a circle of that radius holds as many points
 MERGE_AT = 1 << 20
 """Points that are collected before equal voxels are summed."""
 MAX_CELL = 1 << 20
@@ -56,20 +52,21 @@ class PointCloud:
         """
         if len(self) <= limit:
             return self
-        generator = torch.Generator().manual_seed(THINNING_SEED)
+        generator = torch.Generator().manual_seed(0)
         rows = torch.randperm(len(self), generator=generator, device="cpu")[:limit].sort().values
         return self[rows.to(self.points_w.device)]
 
     def spacing(self) -> float:
-        """Return the median distance of points to their third neighbor; 0 for very few points."""
-        if len(self) <= SPACING_RANK:
+        """Return the median distance of points to their third neighbor, of up to 200 points; 0 for very few points.
+
+        On a surface, a circle of that radius holds as many points.
+        """
+        if len(self) <= 3:
             return 0.0
         points_w = self.points_w.float()
-        rows = torch.linspace(
-            0, len(self) - 1, min(len(self), SPACING_SAMPLE), dtype=torch.float32, device="cpu"
-        ).long()
+        rows = torch.linspace(0, len(self) - 1, min(len(self), 200), dtype=torch.float32, device="cpu").long()
         distances = torch.cdist(points_w[rows.to(points_w.device)], points_w)
-        return float(distances.topk(SPACING_RANK + 1, dim=1, largest=False).values[:, -1].median())
+        return float(distances.topk(4, dim=1, largest=False).values[:, -1].median())
 
 
 class CloudFusion:

@@ -24,9 +24,6 @@ from torchslam.utils.files import check_regular, parse_json, write_whole
 
 FORMAT = 1
 """Number of the file format."""
-MAX_BYTES = 1 << 40  # of depth maps of 170,000 keyframes of 640 x 480 pixels
-UNIT_TOLERANCE = 1e-3
-"""Largest difference of the length of a normal from 1."""
 FIELDS = {
     "frame_index": torch.int64,
     "depth": torch.float32,
@@ -110,7 +107,7 @@ class DepthMaps:
             ((self.depth < 0).any(), "depth: negative"),
             ((self.confidence < 0).any() or (self.confidence > 1).any(), "confidence: not between 0 and 1"),
             (
-                ((lengths - 1).abs().minimum(lengths) > UNIT_TOLERANCE).any(),
+                ((lengths - 1).abs().minimum(lengths) > 1e-3).any(),
                 "normal: neither of unit length nor 0",
             ),
         ):
@@ -203,7 +200,7 @@ def _opened(path: str | Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     from safetensors import SafetensorError, safe_open
 
     try:
-        check_regular(path, MAX_BYTES, "depth maps")
+        check_regular(path, 1 << 40, "depth maps")  # of 170,000 keyframes of 640 x 480 pixels
         with safe_open(str(path), framework="pt") as file:
             about = parse_json((file.metadata() or {}).get("torchslam", "null"))
             if not isinstance(about, dict) or "format" not in about:

@@ -38,8 +38,6 @@ from torchslam.utils.files import parse_json, read_text, write_whole
 
 PARTS = "parts"
 JOB = "job.json"
-MAX_JOB_BYTES = 1 << 16
-"""Largest description of a job that is read; it has a few kilobytes."""
 FORMAT = 1
 """Of the parts: those of another version are computed again."""
 
@@ -120,7 +118,7 @@ def _prepare(parts: Path, views: Views, is_learned: bool) -> None:
     """Create the folder of parts; delete those of other views, of the other aggregation or of another version."""
     job = {"format": FORMAT, "views": views.fingerprint(), "learned": is_learned}
     try:
-        is_same = parse_json(read_text(parts / JOB, MAX_JOB_BYTES, "a description of depth maps")) == job
+        is_same = parse_json(read_text(parts / JOB, 1 << 16, "a description of depth maps")) == job
     except (OSError, ValueError):
         is_same = False
     if not is_same:

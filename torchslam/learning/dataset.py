@@ -28,7 +28,6 @@ MIN_MATCHES = 50
 MIN_PARALLAX = 0.05
 """Radians, three degrees, between these frames. With it the system poses 45 of 48 clips of redkitchen, machine_hall,
 kitti07 and fr2_desk_20; with two degrees 3 of 8 of redkitchen, but a car shows no more than that."""
-_KEYPOINTS = 500  # per image when selecting clips
 
 
 @dataclass(frozen=True)
@@ -320,7 +319,7 @@ class _Seen:
 
     def __init__(self, sequence: Sequence) -> None:
         self._sequence = sequence
-        self._orb = ORB(_KEYPOINTS)
+        self._orb = ORB(500)
         self._features: dict[int, Features] = {}
 
     def stride(self, start: int, steps: int, least: float, most: int) -> int:

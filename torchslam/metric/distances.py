@@ -12,8 +12,6 @@ from torchslam.metric.meters import MAX_DISAGREEMENT, combine_scales
 from torchslam.metric.options import Given
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
-MAX_METERS = 1e5
-"""Longest known length that is believed; the moon is not measured."""
 UNIT_STD = 0.01
 """Relative standard deviation of the unit of a map from place to place, by its drift: two lengths in different places
 differ by about that much, however well their ends are found (redkitchen, against its depth images)."""
@@ -70,7 +68,7 @@ def parse_distance(words: Sequence[str]) -> Distance:
         meters = float(words[2])
     except ValueError:
         meters = math.nan
-    if not 0 < meters <= MAX_METERS:
+    if not 0 < meters <= 1e5:
         raise MeasurementError(f"{whole}: {words[2]} is no length in meters")
     if first == second:
         raise MeasurementError(f"{whole}: both points are the same")

@@ -38,10 +38,6 @@ ROBUST_SCALE = 2.0
 """Of Cauchy's kernel, in standard errors of a turn, which leaves Gaussian errors 95 % of their information."""
 ROUNDS, WIDE_ROUNDS = 6, 3
 """Steps, and those of them by reweighted least squares, which come from afar; those of Newton after them converge."""
-SMALLEST_TURN_STD = 1e-7
-"""rad: turns of exact data."""
-TURN_PRIOR = 1e3
-"""rad, of a rotation between the sensors before it is measured: without axes of turning, it stays where it was."""
 MOUNTING_STD, FOUND_MOUNTING_STD = 2e-3, 6e-3
 """rad about each axis: errors of a calibrated rotation between camera and body, where calibrations of one rig differ by
 0.1 degrees, and what is added to those of one that is found. On a drone's recording that is off by 0.7 degrees, which
@@ -207,13 +203,14 @@ def _refined(
     shift = (R_ij @ rates[1:, :, None]) - rates[:-1, :, None]
     turned = torch.eye(3, dtype=R_ij.dtype, device=R_ij.device) - turns_b
     J = torch.cat((inverse @ turned, -from_right @ found.jacobian[:, 6:, :3], -from_right @ shift), dim=-1)
-    std = median_scale(error.detach().abs().flatten()).clamp_min(SMALLEST_TURN_STD)
+    std = median_scale(error.detach().abs().flatten()).clamp_min(1e-7)  # of exact data
     std = std if turn_std is None else torch.full_like(std, turn_std)
     kernel = robustify((error / std).square().sum(-1), "cauchy", std.new_tensor(ROBUST_SCALE))
     weighted = (kernel.weight[:, None] * error / std**2)[..., None]
     if not rotation_free:
         J = torch.cat((torch.zeros_like(J[..., :3]), J[..., 3:]), dim=-1)
-    known = bias.new_tensor((*(TURN_PRIOR,) * 3, *(BIAS_STD,) * 3, OFFSET_STD)) ** -2
+    # Without axes of turning, the rotation between the sensors stays where it was.
+    known = bias.new_tensor((*(1e3,) * 3, *(BIAS_STD,) * 3, OFFSET_STD)) ** -2
     off = torch.cat((torch.zeros_like(bias), bias, (offset - prior)[None]))
     gradient = (J.mT @ weighted).sum(0).squeeze(-1) + known * off
     hessian = normal = (J.mT @ (kernel.weight[:, None, None] * J)).sum(0) / std**2 + torch.diag(known)

@@ -51,8 +51,6 @@ LEVER_STD = 1.0
 """Meters that the sensor may be from the camera, as a prior: motion without turns leaves the lever arm open."""
 ROUNDS = 30
 """Alternations between rotation with scale, and lever arm; they gain two digits in ten."""
-MIN_TURN_NOISE = math.radians(0.2)
-"""Radians: the least noise of turns over a stretch that is assumed, the rounding of files."""
 
 
 @dataclass(frozen=True)
@@ -239,7 +237,8 @@ def hand_eye(
     """
     turns, camera_turns = so3_log(motions[:, :3, :3]), so3_log(camera_motions[:, :3, :3])
     turned = (turns.norm(dim=-1) - camera_turns.norm(dim=-1)).abs()
-    alike = turned <= GATE * median_scale(turned[known]).clamp_min(MIN_TURN_NOISE)
+    least = math.radians(0.2)  # the rounding of files
+    alike = turned <= GATE * median_scale(turned[known]).clamp_min(least)
     used = known & alike
     eye = torch.eye(3, dtype=torch.float64, device="cpu")
     lever, translations_c = torch.zeros_like(eye[0]), camera_motions[:, :3, 3]

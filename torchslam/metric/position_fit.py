@@ -16,7 +16,7 @@ from torch.func import jacfwd
 
 from torchslam.geometry import rigid, sim3_exp, sim3_scale, transform, umeyama
 from torchslam.geometry.robust import NORMAL_MEDIAN_3D, fit_inliers
-from torchslam.metric.slow_noise import averaged, group_means, group_rows, slow_correlations
+from torchslam.metric.slow_noise import GATE, averaged, group_means, group_rows, slow_correlations
 from torchslam.optim import LEAST_SQUARES_OPTIONS, solve_least_squares
 
 MIN_POSITIONS = 4
@@ -24,10 +24,6 @@ MIN_POSITIONS = 4
 SAMPLES = 512
 """Similarities of three positions each, of which the best is the start. With half of the positions wrong, 64 of
 them are of right ones, and the best of many is near. Tried at 512 only."""
-SEED = 0  # of the samples
-GATE = 4.0
-"""Standard deviations of a position along one axis beyond which it is wrong: 2e-4 of right ones are.
-Tried at 4 only."""
 ROUNDS = 10
 """Fits of the start, each to the positions that the one before explains; they settle in two to four."""
 TOLERANCE = 1e-6
@@ -148,7 +144,7 @@ def _robust_start(pairs: PositionPairs) -> _Model:
 
     Source: Rousseeuw, "Least median of squares regression", 1984.
     """
-    generator = torch.Generator(device="cpu").manual_seed(SEED)
+    generator = torch.Generator(device="cpu").manual_seed(0)
     keys = torch.rand(SAMPLES, len(pairs), generator=generator, dtype=torch.float64, device="cpu")
     sample = keys.topk(3, dim=1).indices
     s, R, t = umeyama(pairs.positions_w[sample], pairs.positions_e[sample])

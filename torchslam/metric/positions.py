@@ -22,12 +22,9 @@ from torchslam.metric.position_fit import (
     fit_positions,
     start_distance,
 )
+from torchslam.metric.slow_noise import MAX_RELATIVE_STD
 from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
-MIN_AGREEING = 0.5
-"""Part of the positions that must agree with the path: the start is right with up to half of them wrong."""
-MAX_RELATIVE_STD = 0.25
-"""Relative standard error from which on a scale is no measurement: positions then hardly differ beyond their noise."""
 SWAPPED = 3.0
 """How much nearer a path must be to positions with latitude and longitude exchanged before a note is written."""
 LINE_UP_STD = math.radians(15.0)
@@ -192,7 +189,7 @@ class PositionSource:
         if not bool(pairs.positions_w.std(0).norm() > 0):
             raise _NoFit("the camera does not move")
         fit = fit_positions(pairs, path.up_w)
-        if fit is None or float(fit.inliers.double().mean()) < MIN_AGREEING:
+        if fit is None or float(fit.inliers.double().mean()) < 0.5:
             self._check_swapped(pairs)
             raise _NoFit(f"the {len(pairs)} positions do not have the shape of the camera's path")
         if fit.relative_std > MAX_RELATIVE_STD:
