@@ -25,8 +25,7 @@ from torch import Tensor
 
 from experiments.dense.rooms import samples
 from torchslam.cli.densify import LONG_SIDE, map_size
-from torchslam.dense.confidence import confidence_alone, confidence_together, kept
-from torchslam.dense.consistency import merge
+from torchslam.dense.consistency import confidence_alone, confidence_together, kept, merge
 from torchslam.dense.estimate import Estimate, estimate_depth
 from torchslam.dense.learned import HALF_INPUTS, RatingNet, net_inputs
 from torchslam.densify.views import SWEPT, ViewImages, views_of

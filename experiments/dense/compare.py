@@ -21,8 +21,7 @@ from torch import Tensor
 from experiments.common import parser_of, timed
 from experiments.dense.run import LEVELS, add_truth, estimator, opened, truth_of
 from torchslam.dense import DepthMaps
-from torchslam.dense.confidence import LEAST_KEPT, confidence_alone, confidence_together, kept
-from torchslam.dense.consistency import merge
+from torchslam.dense.consistency import LEAST_KEPT, confidence_alone, confidence_together, kept, merge
 from torchslam.dense.estimate import Estimate
 from torchslam.dense.learned import RatingNet, learned_confidence
 from torchslam.densify.views import Views

@@ -1,4 +1,4 @@
-"""Fit the constants of `torchslam.dense.confidence` to depth that is known, recordings weighted equally.
+"""Fit the constants of `torchslam.dense.consistency` to depth that is known, recordings weighted equally.
 
 python -m experiments.dense.fit RESULTS[=FOLDER] ...    with the folder of the sensor's depth; without, it is rendered
 
@@ -16,8 +16,7 @@ from torch import Tensor
 
 from experiments.dense.run import estimator, opened, truth_of
 from torchslam.dense import DepthMaps
-from torchslam.dense.confidence import alone_features, confidence_alone, together_features
-from torchslam.dense.consistency import merge
+from torchslam.dense.consistency import alone_features, confidence_alone, merge, together_features
 from torchslam.io.results import DEPTHS
 
 RIGHT = 0.05

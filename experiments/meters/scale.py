@@ -10,8 +10,7 @@ from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.io.results import MAP, read_metrics
 from torchslam.map.file import read_atlas
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import MetricSource, SubmapView
+from torchslam.metric.source import MetricSource, ScaleMeasurement, SubmapView
 from torchslam.types import Trajectory
 
 

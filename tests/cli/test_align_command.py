@@ -13,8 +13,7 @@ from torchslam.cli import align, arguments
 from torchslam.cli.main import main
 from torchslam.data import read_trajectory
 from torchslam.map.file import read_atlas
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 ROOM = "synthetic:room?frames=16"
 FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]

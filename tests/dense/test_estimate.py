@@ -9,8 +9,15 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from tests.dense.slanted_plane import FAR, NEAR, NORMAL, a_camera, depth_of, poses, scene
-from torchslam.dense.confidence import confidence_alone, confidence_together, kept
-from torchslam.dense.consistency import as_seen_by, merge, render
+from torchslam.dense.consistency import (
+    as_seen_by,
+    confidence_alone,
+    confidence_together,
+    depth_normals,
+    kept,
+    merge,
+    render,
+)
 from torchslam.dense.cost_volume import (
     STD_FACTOR,
     box_sum,
@@ -23,9 +30,7 @@ from torchslam.dense.cost_volume import (
     semi_global,
     warp,
 )
-from torchslam.dense.estimate import estimate_depth, halved, refine_depth
-from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
-from torchslam.dense.normals import depth_normals
+from torchslam.dense.estimate import choose_neighbors, estimate_depth, halved, neighbor_scores, refine_depth
 from torchslam.geometry import Camera, se3_inverse
 
 WIDTH, HEIGHT = 192, 144

@@ -7,7 +7,7 @@ from torch import Tensor
 
 from tests.dense.slanted_plane import FAR, NEAR, scene
 from torchslam.dense import learned
-from torchslam.dense.confidence import confidence_alone
+from torchslam.dense.consistency import confidence_alone
 from torchslam.dense.estimate import Estimate, estimate_depth
 from torchslam.dense.learned import RatingNet, learned_confidence, net_inputs, trained_net
 

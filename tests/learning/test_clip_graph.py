@@ -141,19 +141,6 @@ def test_missing_keypoints_are_ignored(walk: Walk) -> None:
     assert 0 < len(left.pixels) < len(seen.pixels)
 
 
-def test_a_clip_without_initialization_has_no_pose() -> None:
-    walk = Walk(still(4))
-    images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0))
-    graph = clip_slam.build_graph(images, walk.camera)
-    assert graph.runs == (None,)
-    poses = clip_slam.pose(graph, clip_slam.extract(images))
-    assert graph.reasons == poses.reasons
-    assert poses.reasons[0].startswith("no map was initialized")
-    assert poses.T_cw.shape == (4, 4, 4)
-    assert poses.T_cw.requires_grad
-
-
 def test_failing_clips_among_good_ones_keep_their_reasons(walk: Walk) -> None:
     """Together they are what each is alone: cameras of two models, one clip without a map, one that is blind now."""
     images, truth = clip_of(walk)

@@ -183,17 +183,6 @@ def test_a_failed_clip_does_not_count_as_zero_error() -> None:
         clip_loss(poses, T_cw_groundtruth=truth, on_failure="ignore")  # type: ignore[arg-type]
 
 
-def test_a_batch_equals_its_clips() -> None:
-    walk = Walk(arc(FRAMES, length=1.0))
-    images, _ = clip_of(walk)
-    clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0))
-    one, two = clip_slam(images, walk.camera), clip_slam(torch.stack([images, images]), walk.camera)
-    assert two.T_cw.shape == (2, FRAMES, 4, 4)
-    torch.testing.assert_close(two.T_cw, torch.stack([one.T_cw, one.T_cw]), atol=1e-9, rtol=0)
-    assert torch.equal(two.posed, torch.stack([one.posed, one.posed]))
-    assert len(two.graphs) == len(two.solutions) == 2
-
-
 @pytest.mark.usefixtures("without_shape_checks")
 def test_images_have_the_dimensions_of_clips() -> None:
     walk = Walk(arc(2, length=1.0))

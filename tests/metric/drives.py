@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import rigid, se3_inverse, sim3_exp, sim3_inverse, sim3_scale, so3_exp, transform
-from torchslam.metric.source import SubmapView
+from torchslam.metric.source import MetricSource, ScaleMeasurement, SubmapView, Unmeasured
 
 RATE = 10.0
 """Images a second."""
@@ -97,3 +97,22 @@ def sensor_odometry(T_ec: Tensor, drift: float = 0.01, seed: int = 0) -> Tensor:
 def true_S_ew() -> Tensor:
     """From the map to east, north, up."""
     return sim3_inverse(S_WE)
+
+
+def measure(source: MetricSource, view: SubmapView) -> ScaleMeasurement:
+    """What a source measures."""
+    found = source.measure(view)
+    assert isinstance(found, ScaleMeasurement), found
+    return found
+
+
+def reason(source: MetricSource, view: SubmapView) -> str:
+    """Why a source measures nothing."""
+    found = source.measure(view)
+    assert isinstance(found, Unmeasured), found
+    return found.reason
+
+
+def error(found: ScaleMeasurement) -> float:
+    """The logarithm of a measured scale of the drive over the true one."""
+    return math.log(found.meters_per_unit / METERS_PER_UNIT)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Self
+
 import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from tests.map.simulated import CAMERA, estimate_at, view_of
+from tests.scene import sideways
 from torchslam.geometry import se3_inverse, transform
 from torchslam.map.atlas import Submap
 from torchslam.metric.source import SubmapView
@@ -30,6 +33,12 @@ class PlaneWorld:
         self.texture = (texture - texture.min()) / (texture.max() - texture.min())
         axis = torch.tensor((1.0, 0.0, 0.0), dtype=torch.float64)
         self.axes = torch.stack((axis, torch.linalg.cross(normal_w, axis)))
+
+    @classmethod
+    def slanted(cls, frames: int = 9) -> Self:
+        """A slanted wall, from four to five units ahead."""
+        normal_w = torch.nn.functional.normalize(torch.tensor([0.2, 0.1, 1.0], dtype=torch.float64), dim=0)
+        return cls(sideways(frames), normal_w, 4.5)
 
     def points_w(self, index: int, pixels: Tensor) -> Tensor:
         """(N, 3) where the rays of pixels (N, 2) of a frame meet the plane; far behind it above the horizon."""

@@ -17,17 +17,14 @@ from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_inverse
 from torchslam.metric.distances import Click, Distance, Distances, parse_distance
 from torchslam.metric.image_depth import LocatedPixel, locate_pixel
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, SubmapView, Unmeasured
 
 CLICKS = Click(4, (90.0, 60.0)), Click(4, (220.0, 150.0))
 
 
 @pytest.fixture(scope="module")
 def world() -> PlaneWorld:
-    """A slanted wall, from four to five units ahead."""
-    normal_w = torch.nn.functional.normalize(torch.tensor([0.2, 0.1, 1.0], dtype=torch.float64), dim=0)
-    return PlaneWorld(sideways(9), normal_w, 4.5)
+    return PlaneWorld.slanted()
 
 
 @pytest.fixture(scope="module")

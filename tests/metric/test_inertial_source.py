@@ -19,10 +19,8 @@ from torchslam.data.inertial import InertialCalibration, InertialSamples, read_i
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_inverse, so3_exp, so3_log, umeyama
-from torchslam.metric.inertial import InertialReason, align_inertial
-from torchslam.metric.inertial_source import InertialSource, from_options
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.inertial import InertialReason, InertialSource, align_inertial, from_options
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.types import Trajectory
 
 

@@ -13,16 +13,15 @@ import torch
 from torch import Tensor
 
 from tests.map.simulated import CAMERA
+from tests.metric.drives import measure, reason
 from tests.metric.plane_world import PlaneWorld
-from tests.scene import sideways
 from torchslam.data import open_sequence
 from torchslam.data.formats.depth_images import find_depth_images
 from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera, transform
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.sensor_depth import SensorDepth, from_options, nearest_times
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView
 from torchslam.system.slam import SLAM
 
 METERS_PER_UNIT = 0.4
@@ -38,9 +37,7 @@ class NamedWorld(PlaneWorld):
 
 @pytest.fixture(scope="module")
 def world() -> NamedWorld:
-    """A slanted wall, from four to five units ahead."""
-    normal_w = torch.nn.functional.normalize(torch.tensor([0.2, 0.1, 1.0], dtype=torch.float64), dim=0)
-    return NamedWorld(sideways(FRAMES), normal_w, 4.5)
+    return NamedWorld.slanted(FRAMES)
 
 
 @pytest.fixture(scope="module")
@@ -68,12 +65,6 @@ def write_all(
 ) -> None:
     for index in range(FRAMES):
         write(folder / name.format(index), true_depth(world, index), units)
-
-
-def measure(source: SensorDepth, view: SubmapView) -> ScaleMeasurement:
-    found = source.measure(view)
-    assert isinstance(found, ScaleMeasurement), found
-    return found
 
 
 def error(found: ScaleMeasurement) -> float:
@@ -161,11 +152,6 @@ def test_images_that_contradict_the_others_are_named(
 
 
 def test_what_says_nothing_is_said(world: NamedWorld, view: SubmapView, tmp_path: Path) -> None:
-    def reason(source: SensorDepth, shown: SubmapView = view) -> str:
-        found = source.measure(shown)
-        assert isinstance(found, Unmeasured), found
-        return found.reason
-
     write_all(tmp_path / "a", world)
     images = find_depth_images(tmp_path / "a")
     assert "neither times nor those of the images" in reason(
@@ -175,7 +161,7 @@ def test_what_says_nothing_is_said(world: NamedWorld, view: SubmapView, tmp_path
     assert "within half a frame" in reason(SensorDepth(late), replace(view, sequence=None))
     for index in range(FRAMES):
         write(tmp_path / "b" / f"{index}.png", 0 * true_depth(world, index))
-    assert "have depth in 0 of 9 depth images" in reason(SensorDepth(find_depth_images(tmp_path / "b")))
+    assert "have depth in 0 of 9 depth images" in reason(SensorDepth(find_depth_images(tmp_path / "b")), view)
 
 
 def test_another_unit_is_an_error(world: NamedWorld, view: SubmapView, tmp_path: Path) -> None:

@@ -1,8 +1,16 @@
 """Dense depth from posed images: pure, batched functions on any device, and the two results, maps and a cloud."""
 
-from torchslam.dense.cloud import PointCloud
-from torchslam.dense.confidence import confidence_alone, confidence_together, kept
-from torchslam.dense.consistency import Merged, as_seen_by, merge, render
+from torchslam.dense.cloud import CloudFusion, PointCloud
+from torchslam.dense.consistency import (
+    Merged,
+    as_seen_by,
+    confidence_alone,
+    confidence_together,
+    depth_normals,
+    kept,
+    merge,
+    render,
+)
 from torchslam.dense.cost_volume import (
     Aggregation,
     Minimum,
@@ -13,11 +21,8 @@ from torchslam.dense.cost_volume import (
     warp,
 )
 from torchslam.dense.depth_maps import DepthMaps
-from torchslam.dense.estimate import Estimate, estimate_depth, refine_depth
-from torchslam.dense.fusion import CloudFusion
+from torchslam.dense.estimate import Estimate, choose_neighbors, estimate_depth, neighbor_scores, refine_depth
 from torchslam.dense.learned import RatingNet, learned_confidence, net_inputs
-from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
-from torchslam.dense.normals import depth_normals
 
 __all__ = [
     "Aggregation",

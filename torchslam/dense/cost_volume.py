@@ -3,7 +3,8 @@
 Plane sweep: a hypothesis is an inverse depth, 1 / z, per pixel: constant over the image for a sweep of planes, or
 around a known surface for a refinement, whose windows then follow the surface. Everything is differentiable with
 respect to images, poses, camera and hypotheses; whether a pixel is seen, and which views are the best ones, are
-decisions without a gradient.
+decisions without a gradient. Images are gray, in [0, 1]; `camera` is the pinhole of all views, T_sr are poses from the
+reference camera to source cameras, and inverse depths are in 1 / map units.
 
 Semi-global aggregation (Hirschmüller 2008): smooth surfaces that may jump at edges of the image. A path comes to every
 pixel along each direction; its cost is the cost of the pixel and of the cheapest changes of hypothesis on the way. A
@@ -44,12 +45,6 @@ def warp(
     inverse_depth: Float[Tensor, "*batch D #H #W"],
 ) -> tuple[Float[Tensor, "*batch V D H W"], Bool[Tensor, "*batch V D H W"]]:
     """Sample the source views where the reference view's pixels are seen at given inverse depths.
-
-    Args:
-        sources: gray images.
-        camera: the pinhole of all views.
-        T_sr: poses, reference camera to source camera.
-        inverse_depth: hypotheses, 1 / map units.
 
     Returns:
         Samples, and whether the pixel is in front of the source camera and inside of its image. Samples that are not
@@ -137,10 +132,7 @@ def matching_cost(
     with 0.
 
     Args:
-        reference, sources: gray images in [0, 1].
-        camera: the pinhole of all views.
-        T_sr: poses, reference camera to source camera.
-        inverse_depth: hypotheses, 1 / map units.
+        reference, sources, camera, T_sr, inverse_depth: as in `warp`.
         radius: of the windows, pixels.
         num_best: number of views to take, for each hypothesis.
     """
@@ -247,13 +239,7 @@ def semi_global(
 
 
 def _paths(cost: Tensor, image: Tensor, shifts: tuple[int, ...], small_step: float, jump: float) -> Tensor:
-    """Sum of the costs of paths from column to column, both ways, that move by each shift of rows meanwhile.
-
-    Args:
-        cost: (B, D, H, W).
-        image: (B, H, W).
-        shifts: rows from a column to the next.
-    """
+    """Sum of the costs (B, D, H, W) of paths from column to column, both ways, that move by each shift of rows."""
     # Columns first, hypotheses last; the two ways beside each other.
     columns = torch.stack((cost, cost.flip(-1))).permute(4, 0, 1, 3, 2).contiguous()  # (W, 2, B, H, D)
     pixels = torch.stack((image, image.flip(-1))).permute(3, 0, 1, 2)  # (W, 2, B, H)
@@ -263,7 +249,10 @@ def _paths(cost: Tensor, image: Tensor, shifts: tuple[int, ...], small_step: flo
         jumps = jump / (1 + (pixels - before).abs() / EDGE)[..., None]
         path, along = columns[0], [columns[0]]
         for column, penalty in zip(columns[1:], jumps[1:], strict=True):
-            path = _step(_shifted(path, shift), column, penalty, small_step)
+            if shift:  # by a row; a path that begins at the edge costs nothing so far
+                kept = path[..., :-1, :] if shift > 0 else path[..., 1:, :]
+                path = F.pad(kept, (0, 0, 1, 0) if shift > 0 else (0, 0, 0, 1))
+            path = _step(path, column, penalty, small_step)
             along.append(path)
         total = total + torch.stack(along)
     total = total.permute(1, 2, 4, 3, 0)
@@ -277,11 +266,3 @@ def _step(path: Tensor, cost: Tensor, jump: Tensor, small_step: float) -> Tensor
     best = torch.minimum(near[..., :-2], near[..., 2:])
     best = torch.minimum(torch.minimum(best, path), least + jump.clamp(min=LEAST_JUMP))
     return cost + best - least
-
-
-def _shifted(path: Tensor, shift: int) -> Tensor:
-    """Costs (..., H, D) moved by a row; a path that begins at the edge costs nothing so far."""
-    if shift == 0:
-        return path
-    pad = (0, 0, 1, 0) if shift > 0 else (0, 0, 0, 1)
-    return F.pad(path[..., :-1, :] if shift > 0 else path[..., 1:, :], pad)

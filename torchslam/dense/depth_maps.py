@@ -24,9 +24,6 @@ from torchslam.utils.files import check_regular, parse_json, write_whole
 
 FORMAT = 1
 """Number of the file format."""
-MAX_BYTES = 1 << 40  # of depth maps of 170,000 keyframes of 640 x 480 pixels
-UNIT_TOLERANCE = 1e-3
-"""Largest difference of the length of a normal from 1."""
 FIELDS = {
     "frame_index": torch.int64,
     "depth": torch.float32,
@@ -69,10 +66,9 @@ class DepthMaps:
             path: the file.
             about: what a program wants to know again (`read_about`), as JSON.
         """
-        shapes = {name: tuple(getattr(self, name).shape) for name in FIELDS}
-        write_whole(
-            path, _content(shapes, lambda name: iter([getattr(self, name)]), self.camera, about or {})
-        )
+        columns = {name: getattr(self, name) for name in FIELDS}
+        shapes = {name: tuple(rows.shape) for name, rows in columns.items()}
+        write_whole(path, _content(shapes, lambda name: iter([columns[name]]), self.camera, about or {}))
 
     @classmethod
     def load(cls, path: str | Path) -> DepthMaps:
@@ -88,13 +84,35 @@ class DepthMaps:
 
     @classmethod
     def _read(cls, path: str | Path, rows: slice) -> DepthMaps:
-        """Read some rows of a file."""
         with _opened(path) as (file, about):
             # In memory of their own: the file may be replaced.
             columns = {name: file.get_slice(name)[rows].clone() for name in FIELDS}
             maps = cls(**columns, camera=_camera(file, about))
-            _check_values(maps)
+            maps._check()
         return maps
+
+    def _check(self) -> None:
+        """Check the numbers. Raises ValueError."""
+        for name in ("depth", "normal", "confidence", "T_cw"):
+            if not bool(torch.isfinite(getattr(self, name)).all()):
+                raise ValueError(f"{name}: not finite")
+        if not bool(torch.isfinite(self.camera.params).all() and (self.camera.params[:2] > 0).all()):
+            raise ValueError(f"{CAMERA}: no focal lengths and principal point")
+        lengths = self.normal.norm(dim=1)
+        for is_wrong, what in (
+            (
+                (self.frame_index < 0).any() or (self.frame_index.diff() <= 0).any(),
+                "frame_index: not ascending from 0",
+            ),
+            ((self.depth < 0).any(), "depth: negative"),
+            ((self.confidence < 0).any() or (self.confidence > 1).any(), "confidence: not between 0 and 1"),
+            (
+                ((lengths - 1).abs().minimum(lengths) > 1e-3).any(),
+                "normal: neither of unit length nor 0",
+            ),
+        ):
+            if bool(is_wrong):
+                raise ValueError(what)
 
 
 def read_shape(path: str | Path) -> tuple[int, int, int]:
@@ -153,13 +171,7 @@ def _content(
     camera: Camera,
     about: dict[str, Any],
 ) -> Iterator[bytes]:
-    """The bytes of a file, in pieces: a header with the place of each tensor, and the tensors.
-
-    Args:
-        shapes: of the tensors.
-        rows: the rows of a tensor, in blocks.
-        camera, about: the rest of the content.
-    """
+    """The bytes of a file, in pieces: a header with the place of each tensor, then the rows of each, in blocks."""
     description = {
         "format": FORMAT,
         "camera": {"model": camera.model, "size": list(camera.size)},
@@ -188,7 +200,7 @@ def _opened(path: str | Path) -> Iterator[tuple[Any, dict[str, Any]]]:
     from safetensors import SafetensorError, safe_open
 
     try:
-        check_regular(path, MAX_BYTES, "depth maps")
+        check_regular(path, 1 << 40, "depth maps")  # of 170,000 keyframes of 640 x 480 pixels
         with safe_open(str(path), framework="pt") as file:
             about = parse_json((file.metadata() or {}).get("torchslam", "null"))
             if not isinstance(about, dict) or "format" not in about:
@@ -198,11 +210,7 @@ def _opened(path: str | Path) -> Iterator[tuple[Any, dict[str, Any]]]:
                     f"{path}: depth maps of format {about['format']}, this version reads format {FORMAT}: "
                     "run again"
                 )
-            _check_shapes(
-                {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()},  # noqa: SIM118
-                {name: file.get_slice(name).get_dtype() for name in file.keys()},  # noqa: SIM118
-                about,
-            )
+            _check_shapes(file, about)
             yield file, about
     except FileNotFoundError:
         raise ResultsError(f"{path}: no depth maps") from None
@@ -218,9 +226,9 @@ def _camera(file: Any, about: dict[str, Any]) -> Camera:
     return Camera(about["camera"]["model"], file.get_tensor(CAMERA).clone(), (width, height))
 
 
-def _check_shapes(shapes: dict[str, tuple[int, ...]], dtypes: dict[str, str], about: dict[str, Any]) -> None:
+def _check_shapes(file: Any, about: dict[str, Any]) -> None:
     """Check names, shapes and types against each other and the camera. Raises ValueError."""
-    wrong = sorted(shapes.keys() ^ {*FIELDS, CAMERA})
+    wrong = sorted(set(file.keys()) ^ {*FIELDS, CAMERA})
     if wrong:
         raise ValueError(f"missing or unknown tensors: {', '.join(wrong[:3])}")
     width, height = about["camera"]["size"]
@@ -228,34 +236,16 @@ def _check_shapes(shapes: dict[str, tuple[int, ...]], dtypes: dict[str, str], ab
         raise ValueError(f"an image of {width} x {height} pixels")
     if about["camera"]["model"] != "pinhole" or not isinstance(about["about"], dict):
         raise ValueError(f"the camera is {about['camera']['model']}, not a pinhole")
-    count = shapes["frame_index"][0] if shapes["frame_index"] else 0
-    expected: dict[str, tuple[int, ...]] = {
-        "frame_index": (count,),
-        "depth": (count, height, width),
-        "normal": (count, 3, height, width),
-        "confidence": (count, height, width),
-        "T_cw": (count, 4, 4),
-        CAMERA: (4,),
+    (count,) = file.get_slice("frame_index").get_shape()[:1] or (0,)
+    expected = {
+        "frame_index": [count],
+        "depth": [count, height, width],
+        "normal": [count, 3, height, width],
+        "confidence": [count, height, width],
+        "T_cw": [count, 4, 4],
+        CAMERA: [4],
     }
     for name, shape in expected.items():
-        dtype = _NAMES[FIELDS.get(name, torch.float64)]
-        if shapes[name] != shape or dtypes[name] != dtype:
-            raise ValueError(f"{name}: {dtypes[name]} {list(shapes[name])}, expected {dtype} {list(shape)}")
-
-
-def _check_values(maps: DepthMaps) -> None:
-    """Check the numbers of maps. Raises ValueError."""
-    for name in ("depth", "normal", "confidence", "T_cw"):
-        if not bool(torch.isfinite(getattr(maps, name)).all()):
-            raise ValueError(f"{name}: not finite")
-    if not bool(torch.isfinite(maps.camera.params).all() and (maps.camera.params[:2] > 0).all()):
-        raise ValueError(f"{CAMERA}: no focal lengths and principal point")
-    if bool((maps.frame_index < 0).any() or (maps.frame_index.diff() <= 0).any()):
-        raise ValueError("frame_index: not ascending from 0")
-    if bool((maps.depth < 0).any()):
-        raise ValueError("depth: negative")
-    if bool((maps.confidence < 0).any() or (maps.confidence > 1).any()):
-        raise ValueError("confidence: not between 0 and 1")
-    lengths = maps.normal.norm(dim=1)
-    if bool(((lengths - 1).abs().minimum(lengths) > UNIT_TOLERANCE).any()):
-        raise ValueError("normal: neither of unit length nor 0")
+        found, dtype = file.get_slice(name), _NAMES[FIELDS.get(name, torch.float64)]
+        if found.get_shape() != shape or found.get_dtype() != dtype:
+            raise ValueError(f"{name}: {found.get_dtype()} {found.get_shape()}, expected {dtype} {shape}")

@@ -96,11 +96,16 @@ def net_inputs(
             relative / 4,
             (middle - position_coarse).clamp(-LARGEST_DETAIL, LARGEST_DETAIL),
         )
+        centered = gray - gray.mean((-1, -2), keepdim=True)
+        count = box_sum(torch.ones_like(gray), 2)
+        mean = box_sum(centered, 2) / count
+        variance = box_sum(centered * centered, 2) / count - mean * mean
         detail = position - F.interpolate(middle, scale_factor=2)[:, 0]
         full = torch.stack(
             (
                 gray - 0.5,
-                _log_texture(gray),
+                # Logarithm of the standard deviation in windows of five pixels, about -1 without texture to 1.
+                (variance.clamp(min=0).sqrt() + NOISE).log() / 2 + 1.5,
                 detail.clamp(-LARGEST_DETAIL, LARGEST_DETAIL),
                 found.fine.cost,
                 found.fine.margin,
@@ -125,12 +130,3 @@ def learned_confidence(
     """
     net = trained_net(found.inverse_depth.device, found.inverse_depth.dtype) if net is None else net
     return torch.sigmoid(F.pixel_shuffle(net(net_inputs(found, gray, near, far)), 2)[:, 0])
-
-
-def _log_texture(gray: Float[Tensor, "B H W"]) -> Float[Tensor, "B H W"]:
-    """Logarithm of the standard deviation in windows of five pixels, about -1 without texture to 1."""
-    centered = gray - gray.mean((-1, -2), keepdim=True)
-    count = box_sum(torch.ones_like(gray), 2)
-    mean = box_sum(centered, 2) / count
-    variance = box_sum(centered * centered, 2) / count - mean * mean
-    return (variance.clamp(min=0).sqrt() + NOISE).log() / 2 + 1.5

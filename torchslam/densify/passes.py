@@ -24,14 +24,11 @@ from safetensors.torch import load_file, save
 from torch import Tensor
 
 from torchslam.data.formats.image_file import write_image
-from torchslam.dense.cloud import PointCloud
-from torchslam.dense.confidence import confidence_alone, confidence_together, kept
-from torchslam.dense.consistency import merge
+from torchslam.dense.cloud import CloudFusion, PointCloud
+from torchslam.dense.consistency import confidence_alone, confidence_together, depth_normals, kept, merge
 from torchslam.dense.depth_maps import DepthMaps, join, read_about
 from torchslam.dense.estimate import estimate_depth
-from torchslam.dense.fusion import CloudFusion
 from torchslam.dense.learned import learned_confidence
-from torchslam.dense.normals import depth_normals
 from torchslam.densify.views import CACHED, SWEPT, ViewImages, Views, readable
 from torchslam.errors import ResultsError
 from torchslam.io.export.scene import Images
@@ -41,8 +38,6 @@ from torchslam.utils.files import parse_json, read_text, write_whole
 
 PARTS = "parts"
 JOB = "job.json"
-MAX_JOB_BYTES = 1 << 16
-"""Largest description of a job that is read; it has a few kilobytes."""
 FORMAT = 1
 """Of the parts: those of another version are computed again."""
 
@@ -123,7 +118,7 @@ def _prepare(parts: Path, views: Views, is_learned: bool) -> None:
     """Create the folder of parts; delete those of other views, of the other aggregation or of another version."""
     job = {"format": FORMAT, "views": views.fingerprint(), "learned": is_learned}
     try:
-        is_same = parse_json(read_text(parts / JOB, MAX_JOB_BYTES, "a description of depth maps")) == job
+        is_same = parse_json(read_text(parts / JOB, 1 << 16, "a description of depth maps")) == job
     except (OSError, ValueError):
         is_same = False
     if not is_same:
@@ -167,10 +162,8 @@ class DenseJob:
 
 def _do(job: DenseJob, result: Pass, view: int) -> None:
     """Compute one view in one pass and write it."""
-    if result is Pass.ALONE:
-        _write_alone(job, view)
-    else:
-        _write_merged(job, view)
+    write = _write_alone if result is Pass.ALONE else _write_merged
+    write(job, view)
 
 
 def _write_alone(job: DenseJob, view: int) -> None:

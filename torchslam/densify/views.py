@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import cv2
@@ -12,7 +12,7 @@ from jaxtyping import Float, Int, UInt8
 from torch import Tensor
 
 from torchslam.data.transforms import scale_camera
-from torchslam.dense.neighbors import choose_neighbors, neighbor_scores
+from torchslam.dense.estimate import choose_neighbors, neighbor_scores
 from torchslam.errors import FrameError, ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.scene import ExportedScene, Images, undistorted
@@ -78,14 +78,8 @@ class Views:
             if all(enough):
                 break
             kept = [view for view, fits in zip(kept, enough, strict=True) if fits]
-        return Views(
-            self.frame_index[kept],
-            self.T_cw[kept],
-            self.camera,
-            self.near[kept],
-            self.far[kept],
-            tuple(neighbors),
-        )
+        columns = {name: getattr(self, name)[kept] for name in ("frame_index", "T_cw", "near", "far")}
+        return replace(self, **columns, neighbors=tuple(neighbors))
 
 
 def readable(views: Views, images: Images) -> tuple[Views, list[str]]:
@@ -144,12 +138,11 @@ def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = No
         ResultsError: fewer than three views are left.
     """
     scene = undistorted(scene)
-    chosen = (
-        scene.is_keyframe if every is None else torch.arange(len(scene.frame_ids), device="cpu") % every == 0
-    )
-    frames = torch.nonzero(chosen)[:, 0]
+    if every is None:
+        frames, kind = torch.nonzero(scene.is_keyframe)[:, 0], "keyframes"
+    else:
+        frames, kind = torch.arange(0, len(scene.frame_ids), every, device="cpu"), "frames"
     if len(frames) <= LEAST_NEIGHBORS:
-        kind = "keyframes" if every is None else "frames"
         raise ResultsError(
             f"dense depth needs {LEAST_NEIGHBORS + 1} views or more, and there are {len(frames)} {kind}: choose more "
             "posed frames (--every)"

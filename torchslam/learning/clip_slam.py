@@ -75,16 +75,19 @@ class ClipGraph:
         if len({graph.frames for graph in graphs}) != 1 or any(graph.batched for graph in graphs):
             raise ValueError("stack needs graphs of one clip each with the same number of frames")
 
-        def every(name: str) -> tuple[Any, ...]:
-            return tuple(getattr(graph, name)[0] for graph in graphs)
-
-        columns = {name: every(name) for name in ("runs", "cameras", "reasons", "keypoints", "masks")}
+        names = ("runs", "cameras", "reasons", "keypoints", "masks")
+        columns: dict[str, Any] = {name: tuple(getattr(graph, name)[0] for graph in graphs) for name in names}
         return ClipGraph(frames=graphs[0].frames, batched=True, **columns)
 
     def halves(self) -> tuple[ClipGraph, ClipGraph]:
         """The same clips with every other point: two problems that share no observation, for `clip_halves`."""
         even, odd = (
-            replace(self, runs=tuple(None if run is None else _every_other(run, first) for run in self.runs))
+            replace(
+                self,
+                runs=tuple(
+                    run and _with_observations(run, run.point_index % 2 == first) for run in self.runs
+                ),
+            )
             for first in (0, 1)
         )
         return even, odd
@@ -348,19 +351,10 @@ class ClipSLAM(nn.Module):
             )
         cameras = tuple(camera.to(torch.float64) for camera in cameras)
         seen = [each.to(camera.params.device) for each, camera in zip(seen, cameras, strict=True)]
-        keypoint_weights = [
-            torch.ones_like(each.scores) if self.keypoint_weight is None else self.keypoint_weight(each)
-            for each in seen
-        ]
-        for weights, each in zip(keypoint_weights, seen, strict=True):
-            if weights.shape != each.mask.shape or not weights.is_floating_point():
-                raise ValueError(
-                    f"keypoint_weight must give floats (T, N) = {tuple(each.mask.shape)}, not {weights.dtype} "
-                    f"{tuple(weights.shape)}"
-                )
+        keypoint_weights = [self._keypoint_weights(each) for each in seen]
         graphs = tuple(
-            None if run is None else _as_seen(run, each, weights_of, own)
-            for run, each, weights_of, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
+            None if run is None else _as_seen(run, each, weights, own)
+            for run, each, weights, own in zip(graph.runs, seen, keypoint_weights, cameras, strict=True)
         )
         solvable = [each for each in graphs if each is not None]
         found = iter(
@@ -377,6 +371,18 @@ class ClipSLAM(nn.Module):
         )
         row = slice(None) if graph.batched else 0
         return ClipPoses(T_cw[row], posed[row], success[row], tuple(reasons), graphs, solutions)
+
+    def _keypoint_weights(self, features: Features) -> Float[Tensor, "T N"]:
+        """Weights of the information of keypoints. Raises ValueError where they are not floats (T, N)."""
+        if self.keypoint_weight is None:
+            return torch.ones_like(features.scores)
+        weights = self.keypoint_weight(features)
+        if weights.shape != features.mask.shape or not weights.is_floating_point():
+            raise ValueError(
+                f"keypoint_weight must give floats (T, N) = {tuple(features.mask.shape)}, not {weights.dtype} "
+                f"{tuple(weights.shape)}"
+            )
+        return weights
 
     def _build_graph(self, images: Tensor, features: Features, camera: Camera) -> tuple[RunGraph | None, str]:
         """The graph of one clip, or None and the reason why no map was initialized."""
@@ -418,7 +424,7 @@ def _as_seen(
     run: RunGraph, features: Features, keypoint_weights: Shaped[Tensor, "T N"], camera: Camera
 ) -> RunGraph:
     """The graph of a clip with the current pixels of its features, weighted by keypoint_weights."""
-    run = _still_seen(run, features.mask)
+    run = _with_observations(run, features.mask[run.frame_ids[run.frame_index], run.keypoint_index])
     rows = (run.frame_ids[run.frame_index], run.keypoint_index)
     weights = run.weights
     if features.information is not None:
@@ -454,16 +460,6 @@ def _posed(
         return T_cw, posed
     T_cw = T_cw.index_copy(0, graph.frame_ids, solution.T_cw)
     return T_cw, posed.index_copy(0, graph.frame_ids, solution.success)
-
-
-def _still_seen(graph: RunGraph, mask: Bool[Tensor, "T N"]) -> RunGraph:
-    """The graph without the observations of keypoints that the mask excludes."""
-    return _with_observations(graph, mask[graph.frame_ids[graph.frame_index], graph.keypoint_index])
-
-
-def _every_other(graph: RunGraph, first: int) -> RunGraph:
-    """The graph with every other point, from the first or the second on."""
-    return _with_observations(graph, graph.point_index % 2 == first)
 
 
 def _with_observations(graph: RunGraph, kept: Bool[Tensor, " O"]) -> RunGraph:

@@ -28,7 +28,6 @@ MIN_MATCHES = 50
 MIN_PARALLAX = 0.05
 """Radians, three degrees, between these frames. With it the system poses 45 of 48 clips of redkitchen, machine_hall,
 kitti07 and fr2_desk_20; with two degrees 3 of 8 of redkitchen, but a car shows no more than that."""
-_KEYPOINTS = 500  # per image when selecting clips
 
 
 @dataclass(frozen=True)
@@ -59,15 +58,7 @@ class Clip:
         number: int = 0,
         supervised: bool = False,
     ) -> Clip:
-        """Read the frames `start`, `start + stride`, ... of a sequence.
-
-        Args:
-            sequence: With a camera.
-            start: First frame.
-            frames: T.
-            stride: Frames from one to the next.
-            number: Index in the data set.
-            supervised: Whether every frame must have a true pose.
+        """Read the T frames `start`, `start + stride`, ... of a sequence with a camera.
 
         Raises:
             SequenceError: The sequence is too short or, if `supervised`, lacks the true pose of one of the frames.
@@ -109,21 +100,15 @@ def collate(clips: Several[Clip]) -> Clip:
         raise ValueError(
             f"clips of a batch must have the same number and size of frames, not {sorted(sizes)}"
         )
+    camera = stack_cameras([clip.camera for clip in clips])
+    names = ("images", "T_cw", "known", "number")
     return Clip(
-        torch.stack([clip.images for clip in clips]),
-        torch.stack([clip.T_cw for clip in clips]),
-        torch.stack([clip.known for clip in clips]),
-        stack_cameras([clip.camera for clip in clips]),
-        torch.stack([clip.number for clip in clips]),
+        camera=camera, **{name: torch.stack([getattr(clip, name) for clip in clips]) for name in names}
     )
 
 
 def stack_cameras(cameras: Several[Camera]) -> Camera:
-    """Stack B cameras of one size into one with params (B, P); parameters are padded where others have more.
-
-    Raises:
-        ValueError: Different sizes, or models that cannot be mixed.
-    """
+    """Stack B cameras into one with params (B, P). Raises ValueError for sizes or models that cannot be mixed."""
     nested = ("pinhole", "radial_tangential", "rational")  # each is the next one with zeros at the end
     if all(camera.model in nested for camera in cameras):
         model = max((camera.model for camera in cameras), key=nested.index)
@@ -149,8 +134,6 @@ class Clips(Dataset[Clip]):
     `MIN_MATCHES` matches, are skipped. The same arguments give the same clips.
 
     Attributes:
-        sequences: The sequences.
-        frames: Number of frames of a clip.
         chosen: (sequence, start, stride) of each clip.
 
     Args:
@@ -188,7 +171,8 @@ class Clips(Dataset[Clip]):
                 if len(found) == per_sequence:
                     break
                 stride = seen.stride(start, frames - 1, min_parallax, max_stride)
-                if stride and not (supervised and seen.lacks_poses(start, frames, stride)):
+                clip = range(start, start + frames * stride, stride) if stride else ()
+                if clip and not (supervised and any(sequence.pose(index) is None for index in clip)):
                     found[start] = stride
             self.chosen += [(number, start, found[start]) for start in sorted(found)]
 
@@ -307,8 +291,7 @@ def parallax(
     """Measure the median angle between the rays of matches after rotation compensation, in radians.
 
     Args:
-        first: Features of one image.
-        second: Features of another one.
+        first, second: Features of two images of a camera.
         camera: Of both.
         R_21: Rotation from the first camera to the second; estimated if None.
 
@@ -336,25 +319,20 @@ class _Seen:
 
     def __init__(self, sequence: Sequence) -> None:
         self._sequence = sequence
-        self._orb = ORB(_KEYPOINTS)
+        self._orb = ORB(500)
         self._features: dict[int, Features] = {}
 
     def stride(self, start: int, steps: int, least: float, most: int) -> int:
         """The least of 1, 2, 4, ..., `most` with enough parallax to the frame `steps` strides later; 0 for none."""
         stride = 1
         while stride <= most and start + steps * stride < len(self._sequence):
-            first, second = start, start + steps * stride
-            T_1, T_2 = self._sequence.pose(first), self._sequence.pose(second)
+            second = start + steps * stride
+            T_1, T_2 = self._sequence.pose(start), self._sequence.pose(second)
             R_21 = None if T_1 is None or T_2 is None else (T_2 @ se3_inverse(T_1))[:3, :3]
-            found = parallax(self._of(first), self._of(second), self._sequence.camera, R_21)
-            if found >= least:
+            if parallax(self._of(start), self._of(second), self._sequence.camera, R_21) >= least:
                 return stride
             stride *= 2
         return 0
-
-    def lacks_poses(self, start: int, frames: int, stride: int) -> bool:
-        """Test whether a frame of a clip has no true pose."""
-        return any(self._sequence.pose(start + row * stride) is None for row in range(frames))
 
     def _of(self, index: int) -> Features:
         if index not in self._features:

@@ -44,12 +44,7 @@ def relative_ate(
     T_cw_groundtruth: Float[Tensor, "*batch N 4 4"],
     mask: Bool[Tensor, "*batch N"] | None = None,
 ) -> Float[Tensor, "*batch"]:
-    """Compute the ATE relative to the length of the true path, comparable between clips of any size.
-
-    Args:
-        T_cw: Estimated poses.
-        T_cw_groundtruth: True poses; all of them make up the path.
-        mask: Poses that count.
+    """Compute the ATE relative to the length of the path of all true poses, comparable between clips of any size.
 
     Returns:
         A ratio, NaN where fewer than three poses count or the true camera does not move.
@@ -108,8 +103,7 @@ def pose_nll(
     positive definite do not count.
 
     Args:
-        T_cw: Estimated poses.
-        T_cw_groundtruth: True poses in the same world and unit.
+        T_cw, T_cw_groundtruth: Estimated and true poses, in the same world and unit.
         covariance: Of the left perturbation (translation, rotation) of T_cw: of a solver (detached, so it only weights
             the errors) or predicted by a network.
         mask: Poses that count; others may have any covariance.
@@ -143,13 +137,10 @@ def epipolar_loss(
 
     Args:
         T_21: With a translation of any length but zero, which would fit everything.
-        pixels_1: Of the first images.
-        pixels_2: Matching pixels of the second images.
-        camera_1: Of the first images.
-        camera_2: Of the second images.
+        pixels_1, pixels_2: Matching pixels of the first and the second images.
+        camera_1, camera_2: Of these images.
         mask: Matches that count.
-        kernel: Robust kernel.
-        scale: Of the kernel, pixels.
+        kernel, scale: Robust kernel and its scale, pixels.
 
     Returns:
         px^2.
@@ -182,8 +173,7 @@ def reprojection_loss(
         pixels: Of the points in the views.
         camera: Of all views.
         mask: Which views see a point; a point needs two.
-        kernel: Robust kernel.
-        scale: Of the kernel on the root of a point's sum of squares, pixels.
+        kernel, scale: Robust kernel and its scale on the root of a point's sum of squares, pixels.
 
     Returns:
         px^2: mean over points of the robust sum of squares.
@@ -205,8 +195,7 @@ def clip_reprojection(
 
     Args:
         poses: Of clips.
-        kernel: Robust kernel.
-        scale: Of the kernel, pixels.
+        kernel, scale: Robust kernel and its scale, pixels.
 
     Returns:
         px^2, one per clip: mean over the observations, for `clip_mean`.

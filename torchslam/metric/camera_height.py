@@ -19,10 +19,9 @@ from torch import Tensor
 from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.geometry.robust import median_with_error
+from torchslam.metric.image_depth import correlate, sample_windows
 from torchslam.metric.options import Given
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import SubmapView, Unmeasured
-from torchslam.metric.windows import read_gray, sample_windows
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 FRAMES = 16
 """Frames, evenly spread over a submap, in which a plane is sought: the error of one is 3 to 4 %."""
@@ -62,28 +61,23 @@ focal length to 1 %."""
 
 
 def from_options(given: Given) -> list[CameraHeight]:
-    """The source of `--camera-height`.
-
-    Raises:
-        MeasurementError: it is given twice.
-    """
-    if len(given["camera_height"]) > 1:
-        raise MeasurementError("--camera-height is given twice: a camera has one")
+    """The source of `--camera-height`."""
     return [CameraHeight(float(given["camera_height"][0][0]))]
 
 
+@dataclass(frozen=True)
 class CameraHeight:
-    """A camera that moves over the ground at a known height, upright."""
+    """A camera that moves over the ground at a known height, upright. Raises MeasurementError for an impossible one."""
 
-    def __init__(self, meters: float) -> None:
-        """Take the height. Raises MeasurementError for an impossible one."""
-        if not 0 < meters < math.inf:
-            raise MeasurementError(f"--camera-height {meters}: no height in meters")
-        self._meters = meters
+    meters: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.meters < math.inf:
+            raise MeasurementError(f"--camera-height {self.meters}: no height in meters")
 
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """Measure the unit of a submap by the median height over its frames."""
-        if view.sequence is None or view.sequence.brings_features:
+        if not view.has_images:
             return Unmeasured(ScaleSource.CAMERA_HEIGHT, "there are no images to find the ground in")
         heights = ground_heights(view)
         if len(heights) < LEAST_FRAMES:
@@ -95,7 +89,7 @@ class CameraHeight:
         middle, spread, error = median_with_error(np.log(heights))
         return ScaleMeasurement(
             ScaleSource.CAMERA_HEIGHT,
-            self._meters / math.exp(middle),
+            self.meters / math.exp(middle),
             math.hypot(error, MODEL_STD),
             len(heights),
             "frames above the ground",
@@ -108,32 +102,28 @@ def ground_heights(view: SubmapView) -> Float[np.ndarray, " R"]:
     T_cw = view.T_cw.detach().cpu().double()
     centers_w = se3_inverse(T_cw)[:, :3, 3]
     windows = _Windows.of(view.camera.to("cpu"))
-    rows = sorted(
-        {
-            int(row)
-            for row in torch.linspace(0, len(T_cw) - 1, FRAMES + 2, dtype=torch.float64, device="cpu").round()
-        }
-    )
+    places = torch.linspace(0, len(T_cw) - 1, FRAMES + 2, dtype=torch.float64, device="cpu")
+    rows = places.round().long().unique().tolist()
     guess = _guess(view, T_cw[rows])
-    found = list[float]()
     if guess is None or windows is None:
-        return np.array(found)
+        return np.empty(0)
+    found = list[float]()
     for row in rows:
         around = _path(centers_w, row, guess)
-        if around is None:
+        reference = None if around is None else view.gray(int(view.frame_index[row]))
+        if around is None or reference is None:
             continue
-        direction_c = T_cw[row, :3, :3] @ around.direction_w
-        images = [read_gray(view, int(view.frame_index[each])) for each in (row, *around.others)]
-        reference, *others = images
-        kept = [each for each, image in zip(around.others, others, strict=True) if image is not None]
-        if reference is None or not kept:
+        direction_w, beside = around
+        images = {each: view.gray(int(view.frame_index[each])) for each in beside}
+        others = {each: image for each, image in images.items() if image is not None}
+        if not others:
             continue
         fit = _PlaneFit(
             windows,
             sample_windows(reference, windows.pixels),
-            [image for image in others if image is not None],
-            T_cw[kept] @ se3_inverse(T_cw[row]),
-            direction_c,
+            list(others.values()),
+            T_cw[list(others)] @ se3_inverse(T_cw[row]),
+            T_cw[row, :3, :3] @ direction_w,
         )
         height = fit.height(guess)
         if height is not None:
@@ -155,16 +145,10 @@ def _guess(view: SubmapView, T_cw: Float[Tensor, "R 4 4"]) -> float | None:
     return float(np.median(heights)) if heights else None
 
 
-@dataclass(frozen=True)
-class _Path:
-    """The path around a frame: its direction, and rows of other frames to compare with."""
-
-    direction_w: Float[Tensor, " 3"]
-    others: tuple[int, ...]
-
-
-def _path(centers_w: Float[Tensor, "K 3"], row: int, height: float) -> _Path | None:
-    """The path around a frame; None where it ends, or bends."""
+def _path(
+    centers_w: Float[Tensor, "K 3"], row: int, height: float
+) -> tuple[Float[Tensor, " 3"], list[int]] | None:
+    """The direction of the path around a frame, and rows to compare with; None where the path ends, or bends."""
     distances = (centers_w - centers_w[row]).norm(dim=-1)
 
     def nearest(rows: range, least: float) -> int | None:
@@ -180,7 +164,7 @@ def _path(centers_w: Float[Tensor, "K 3"], row: int, height: float) -> _Path | N
         return None
     others = nearest(before, LEAST_BASELINE), nearest(after, LEAST_BASELINE)
     along = centers_w[ends[1]] - centers_w[ends[0]]
-    return _Path(along / along.norm(), tuple(each for each in others if each is not None))
+    return along / along.norm(), [each for each in others if each is not None]
 
 
 @dataclass(frozen=True)
@@ -200,18 +184,10 @@ class _Windows:
         top, bottom = max(cy + BELOW_HORIZON * fy, margin), camera.height - 1 - margin
         if top >= bottom:
             return None
-        y, x = np.meshgrid(
-            np.linspace(top, bottom, ROWS),
-            np.linspace(margin, camera.width - 1 - margin, COLUMNS),
-            indexing="ij",
-        )
-        v, u = np.meshgrid(
-            spacing * np.arange(-RADIUS_Y, RADIUS_Y + 1),
-            spacing * np.arange(-RADIUS_X, RADIUS_X + 1),
-            indexing="ij",
-        )
-        centers, offsets = (np.stack((a.ravel(), b.ravel()), axis=-1) for a, b in ((x, y), (u, v)))
-        pixels = torch.from_numpy(centers[:, None] + offsets)
+        columns = np.linspace(margin, camera.width - 1 - margin, COLUMNS), np.linspace(top, bottom, ROWS)
+        samples = np.arange(-RADIUS_X, RADIUS_X + 1), np.arange(-RADIUS_Y, RADIUS_Y + 1)
+        centers, offsets = (np.stack(np.meshgrid(*xy), axis=-1).reshape(-1, 2) for xy in (columns, samples))
+        pixels = torch.from_numpy(centers[:, None] + spacing * offsets)
         rays = camera.unproject(pixels)
         return cls(camera, pixels, rays / rays[..., 2:])
 
@@ -261,9 +237,7 @@ class _PlaneFit:
         points_c = self.windows.rays / inverse_depths.clamp(min=1e-9)[..., None]
         total, count = np.zeros(len(self.own)), np.zeros(len(self.own))
         for image, T_oc in zip(self.others, self.T_oc, strict=True):
-            pixels, seen = self.windows.camera.project(transform(T_oc, points_c))
-            inside = (seen & self.windows.camera.in_image(pixels, 1.0)).all(dim=-1).numpy()
-            other = sample_windows(image, pixels, seen)
-            total += np.where(inside, (self.own * other).sum(axis=-1), 0.0)
+            alike, inside = correlate(self.own, transform(T_oc, points_c), self.windows.camera, image, 1.0)
+            total += np.where(inside, alike, 0.0)
             count += inside
         return total / np.maximum(count, 1)

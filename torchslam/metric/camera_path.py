@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -90,12 +90,45 @@ class CameraPath:
         self, times: Float[Tensor, "*shape"]
     ) -> tuple[Tensor, Float[Tensor, "*shape"], Bool[Tensor, "*shape"]]:
         """The row of the pose before, the part of the interval that has passed, and whether it is short enough."""
-        own = self.timestamps
-        left, part = between_rows(own, times)
-        interval = own.diff()
+        left, part = between_rows(self.timestamps, times)
+        interval = self.timestamps.diff()
         longest = max(MAX_GAP, GAP_INTERVALS * float(interval.median()))
         known = (part >= 0) & (part <= 1) & (interval[left] <= longest)
         return left, part.clamp(0, 1), known
+
+    def on_its_clock(
+        self, times: Float[Tensor, " N"], clock: Clock, file: Path, option: str
+    ) -> Float[Tensor, " N"]:
+        """The times of a file on the clock of the images.
+
+        Both clocks count from 1970, or both from the start of the recording; GPS time, which counts from 1980 without
+        leap seconds, is recognized where UTC does not fit and it does.
+
+        Raises MeasurementError, saying what to state, where the two have nothing in common.
+        """
+        own = self.timestamps
+        if clock.seconds is not None:
+            times = times + clock.seconds
+        elif clock.start is not None:
+            if not _is_absolute(times):
+                raise MeasurementError(
+                    f"{option}: the times of {file} are no dates, from {_span(times)}; give the seconds to add to them"
+                )
+            times = times - clock.start + self.first_image
+        elif _is_absolute(times) and _is_absolute(own) and not _overlap(times, own):
+            as_gps = times.new_tensor([utc_from_gps(time) for time in times.tolist()])
+            times = as_gps if _overlap(as_gps, own) else times
+        if _overlap(times, own):
+            return times
+        if _is_absolute(times) and not _is_absolute(own):
+            advice = f"give {option} the date and time of the first image, such as 2024-05-01T10:00:00Z"
+        elif float(times[-1] - times[0]) > 100 * self.duration > 0:
+            advice = "if they count milli- or nanoseconds, call the column time_ms or time_ns"
+        else:
+            advice = f"give {option} the seconds to add to them"
+        raise MeasurementError(
+            f"{file}: its times, from {_span(times)}, are not those of the images, from {_span(own)}; {advice}"
+        )
 
 
 @dataclass(frozen=True)
@@ -153,41 +186,6 @@ def clock_notes(file: Path, shift: float, std: float | None = None) -> list[str]
     ]
 
 
-def on_clock_of_images(
-    times: Float[Tensor, " N"], path: CameraPath, clock: Clock, file: Path, option: str
-) -> Float[Tensor, " N"]:
-    """The times of a file on the clock of the images.
-
-    Both clocks count from 1970, or both from the start of the recording; GPS time, which counts from 1980 without leap
-    seconds, is recognized where UTC does not fit and it does.
-
-    Raises MeasurementError, saying what to state, where the two have nothing in common.
-    """
-    own = path.timestamps
-    if clock.seconds is not None:
-        times = times + clock.seconds
-    elif clock.start is not None:
-        if not _is_absolute(times):
-            raise MeasurementError(
-                f"{option}: the times of {file} are no dates, from {_span(times)}; give the seconds to add to them"
-            )
-        times = times - clock.start + path.first_image
-    elif _is_absolute(times) and _is_absolute(own) and not _overlap(times, own):
-        as_gps = times.new_tensor([utc_from_gps(time) for time in times.tolist()])
-        times = as_gps if _overlap(as_gps, own) else times
-    if _overlap(times, own):
-        return times
-    if _is_absolute(times) and not _is_absolute(own):
-        advice = f"give {option} the date and time of the first image, such as 2024-05-01T10:00:00Z"
-    elif float(times[-1] - times[0]) > 100 * float(own[-1] - own[0]) > 0:
-        advice = "if they count milli- or nanoseconds, call the column time_ms or time_ns"
-    else:
-        advice = f"give {option} the seconds to add to them"
-    raise MeasurementError(
-        f"{file}: its times, from {_span(times)}, are not those of the images, from {_span(own)}; {advice}"
-    )
-
-
 def found_shift(
     cost_at: Callable[[float], float | None], duration: float, step: float, least_gain: float
 ) -> float:
@@ -212,7 +210,7 @@ def found_shift(
     return best
 
 
-def _is_absolute(times: Sequence[float] | Tensor) -> bool:
+def _is_absolute(times: Float[Tensor, " N"]) -> bool:
     return float(times[0]) >= SINCE_1970
 
 
@@ -221,5 +219,5 @@ def _overlap(times: Float[Tensor, " N"], own: Float[Tensor, " K"]) -> bool:
 
 
 def _span(times: Float[Tensor, " N"]) -> str:
-    digits = 3 if math.fabs(float(times[-1])) < SINCE_1970 else 1
+    digits = 3 if abs(float(times[-1])) < SINCE_1970 else 1
     return f"{float(times[0]):.{digits}f} to {float(times[-1]):.{digits}f} s"

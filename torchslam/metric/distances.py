@@ -6,16 +6,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-
 from torchslam.errors import MeasurementError
-from torchslam.metric.image_depth import LocatedPixel, locate_pixel
+from torchslam.metric.image_depth import locate_pixel
+from torchslam.metric.meters import MAX_DISAGREEMENT, combine_scales
 from torchslam.metric.options import Given
-from torchslam.metric.scale import MAX_DISAGREEMENT, ScaleMeasurement, ScaleSource, combine_scales
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
-MAX_METERS = 1e5
-"""Longest known length that is believed; the moon is not measured."""
 UNIT_STD = 0.01
 """Relative standard deviation of the unit of a map from place to place, by its drift: two lengths in different places
 differ by about that much, however well their ends are found (redkitchen, against its depth images)."""
@@ -72,7 +68,7 @@ def parse_distance(words: Sequence[str]) -> Distance:
         meters = float(words[2])
     except ValueError:
         meters = math.nan
-    if not 0 < meters <= MAX_METERS:
+    if not 0 < meters <= 1e5:
         raise MeasurementError(f"{whole}: {words[2]} is no length in meters")
     if first == second:
         raise MeasurementError(f"{whole}: both points are the same")
@@ -92,12 +88,11 @@ def _click(word: str, whole: str) -> Click:
     return Click(number, (x, y))
 
 
+@dataclass(frozen=True)
 class Distances:
     """Lengths between clicked points."""
 
-    def __init__(self, distances: Sequence[Distance]) -> None:
-        """Take the lengths."""
-        self._distances = tuple(distances)
+    distances: Sequence[Distance]
 
     def check(self, size: tuple[int, int]) -> None:
         """Check that all clicks are in images of (width, height).
@@ -106,7 +101,7 @@ class Distances:
             MeasurementError: a click is outside.
         """
         width, height = size
-        for click in (click for each in self._distances for click in (each.first, each.second)):
+        for click in (click for each in self.distances for click in (each.first, each.second)):
             x, y = click.pixel
             if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
                 raise MeasurementError(
@@ -119,29 +114,21 @@ class Distances:
         Raises:
             MeasurementError: a click is outside of the image.
         """
-        if view.sequence is None or view.sequence.brings_features:
+        if not view.has_images:
             return Unmeasured(ScaleSource.DISTANCE, "there are no images to find the points in")
         self.check(view.camera.size)
-        found: list[tuple[Distance, ScaleMeasurement]] = []
-        failed = []
-        for each in self._distances:
-            measured = measure_distance(view, each)
-            if isinstance(measured, str):
-                failed.append(measured)
-            else:
-                found.append((each, measured))
+        measured = [measure_distance(view, each) for each in self.distances]
+        failed = [one for one in measured if isinstance(one, str)]
+        found = [one for one in measured if not isinstance(one, str)]
         if not found:
             return Unmeasured(ScaleSource.DISTANCE, "; ".join(failed))
-        combined = combine_scales([measured for _, measured in found])
-        logs = torch.tensor(
-            [math.log(measured.meters_per_unit / combined.meters_per_unit) for _, measured in found],
-            dtype=torch.float64,
-            device="cpu",
-        )
+        combined = combine_scales(found)
+        logs = [math.log(one.meters_per_unit / combined.meters_per_unit) for one in found]
+        used = [each for each, one in zip(self.distances, measured, strict=True) if not isinstance(one, str)]
         rejected = [
-            f"the length {each} is {abs(log):.1%} ± {measured.relative_std:.1%} off the mean of all"
-            for (each, measured), log in zip(found, logs.tolist(), strict=True)
-            if len(found) > 1 and abs(log) > MAX_DISAGREEMENT * measured.relative_std
+            f"the length {each} is {abs(log):.1%} ± {one.relative_std:.1%} off the mean of all"
+            for each, one, log in zip(used, found, logs, strict=True)
+            if len(found) > 1 and abs(log) > MAX_DISAGREEMENT * one.relative_std
         ]
         return ScaleMeasurement(
             ScaleSource.DISTANCE,
@@ -150,17 +137,17 @@ class Distances:
             len(found),
             "known lengths" if len(found) > 1 else "known length",
             (*rejected, *failed),
-            apart=float(logs.square().mean().sqrt()) if len(found) > 1 else None,
+            apart=math.sqrt(sum(log**2 for log in logs) / len(logs)) if len(found) > 1 else None,
         )
 
 
 def measure_distance(view: SubmapView, distance: Distance) -> ScaleMeasurement | str:
     """The unit of a submap by one length, or the reason why it has none."""
     first = locate_pixel(view, distance.first.frame, distance.first.pixel)
-    if not isinstance(first, LocatedPixel):
+    if isinstance(first, str):
         return first
     second = locate_pixel(view, distance.second.frame, distance.second.pixel)
-    if not isinstance(second, LocatedPixel):
+    if isinstance(second, str):
         return second
     between_w = second.point_w - first.point_w
     length = float(between_w.norm())

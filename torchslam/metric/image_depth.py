@@ -9,15 +9,17 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.geometry import se3_inverse, transform
+from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.metric.source import SubmapView
-from torchslam.metric.windows import read_gray, sample_windows
 
+CONTRAST = 2.0 / 255
+"""Minimum standard deviation of the gray levels of a window; flatter ones count as noise."""
 NEAREST = 30
 """Observed points nearest to the pixel, whose depths bound the search."""
 NEARER, FARTHER = 0.5, 2.0
@@ -56,6 +58,48 @@ CLICK_STD_PX = 1.0
 """Standard deviation of a click, pixels."""
 
 
+def sample_windows(
+    image: Float[np.ndarray, "H W"], pixels: Float[Tensor, "W P 2"]
+) -> Float[np.ndarray, "W P"]:
+    """Sample windows of P pixels, normalized to mean zero and unit length; flat ones are nearly zero.
+
+    Beyond the image are the gray levels of its border.
+    """
+    x, y = pixels.numpy().astype(np.float32).transpose(2, 0, 1)
+    window = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    window -= window.mean(axis=-1, keepdims=True)
+    least = CONTRAST * math.sqrt(window.shape[-1])
+    normalized: Float[np.ndarray, "W P"] = window / np.maximum(
+        np.linalg.norm(window, axis=-1, keepdims=True), least
+    )
+    return normalized
+
+
+def correlate(
+    own: Float[np.ndarray, "#W P"],
+    points_o: Float[Tensor, "W P 3"],
+    camera: Camera,
+    image: Float[np.ndarray, "H W2"],
+    border: float = 0.0,
+) -> tuple[Float[np.ndarray, " W"], Bool[np.ndarray, " W"]]:
+    """Correlate sampled windows with those of another image that shows their points.
+
+    Args:
+        own: the sampled windows.
+        points_o: their points in the camera of the other image.
+        camera: of that image.
+        image: its gray levels.
+        border: within which an image does not count, pixels.
+
+    Returns:
+        Correlations, and whether all points of a window are in the image.
+    """
+    pixels, seen = camera.project(points_o)
+    inside = (seen & camera.in_image(pixels, border)).all(dim=-1).numpy()
+    other = sample_windows(image, torch.where(seen[..., None], pixels, 0.0))
+    return (own * other).sum(axis=-1), inside
+
+
 @dataclass(frozen=True)
 class LocatedPixel:
     """A pixel in the world.
@@ -90,16 +134,27 @@ def locate_pixel(view: SubmapView, frame_index: int, pixel: tuple[float, float])
     if sweep is None:
         return f"no other frames show {where} from a place {ANGLES_DEG[0]:g} degrees away"
     low, high = 1 / (FARTHER * float(depths.max())), 1 / (NEARER * float(depths.min()))
-    found: LocatedPixel | str = ""
+    found: tuple[float, float] | str = ""
     for radius in RADII:
         found = _search(replace(sweep, radius=radius), low, high, where)
-        if isinstance(found, LocatedPixel):
+        if not isinstance(found, str):
             break
-    return found
+    if isinstance(found, str):
+        return found
+    inverse_depth, std = found
+    T_wc = se3_inverse(T_cw[center])
+    along_c = _rays(sweep.camera, torch.tensor([pixel], dtype=torch.float64, device="cpu")) / inverse_depth
+    point_w = transform(T_wc, along_c)[0]
+    distance = float(along_c.norm())
+    ray_w = (point_w - T_wc[:3, 3]) / distance
+    outer = ray_w[:, None] * ray_w
+    along, across = distance * std / inverse_depth, distance * CLICK_STD_PX / float(sweep.camera.focal)
+    eye = torch.eye(3, dtype=outer.dtype, device="cpu")
+    return LocatedPixel(point_w, along**2 * outer + across**2 * (eye - outer))
 
 
-def _search(sweep: _Sweep, low: float, high: float, where: str) -> LocatedPixel | str:
-    """Find the point between two inverse depths; or say why it was not found."""
+def _search(sweep: _Sweep, low: float, high: float, where: str) -> tuple[float, float] | str:
+    """Find the inverse depth between two, and its standard deviation; or say why it was not found."""
     coarse = torch.linspace(low, high, PLANES, dtype=torch.float64, device="cpu")
     single = sweep.single_scores(np.zeros(2), coarse)
     scores = _joint(single)
@@ -127,7 +182,7 @@ def _search(sweep: _Sweep, low: float, high: float, where: str) -> LocatedPixel 
     single_std = math.hypot(match, float(np.std(np.array(own))))
     clicked = float(np.std(np.array([inverse_depth, *beside])))
     layers = _layer_std(sweep, coarse[::LAYER_EVERY], inverse_depth)
-    return sweep.located(inverse_depth, math.hypot(clicked, layers, single_std / math.sqrt(LEAST_FRAMES)))
+    return inverse_depth, math.hypot(clicked, layers, single_std / math.sqrt(LEAST_FRAMES))
 
 
 def _layer_std(sweep: _Sweep, coarse: Float[Tensor, " D"], inverse_depth: float) -> float:
@@ -186,18 +241,12 @@ def _maximum(at: Float[Tensor, " N"], scores: Float[Tensor, " N"]) -> float:
 class _Sweep:
     """A window of a frame, and the other frames that are searched for it."""
 
-    view: SubmapView
-    T_cw: Float[Tensor, "4 4"]
+    camera: Camera
     pixel: tuple[float, float]
     reference: Float[np.ndarray, "H W"]
     others: list[Float[np.ndarray, "H W"]]
-    T_ow: Float[Tensor, "F 4 4"]
+    T_oc: Float[Tensor, "F 4 4"]
     radius: int = RADII[0]
-
-    @property
-    def spacing(self) -> float:
-        """Pixels from one sample of the window to the next."""
-        return max(1.0, SAMPLE_SHARE * self.reference.shape[1])
 
     @classmethod
     def of(
@@ -208,16 +257,29 @@ class _Sweep:
         pixel: tuple[float, float],
         depth: float,
     ) -> _Sweep | None:
-        """Read the images of the frame and of others with parallax; None where there are too few."""
-        point_w = _point(view, T_cw[center], pixel, 1 / depth)
-        rows = _chosen(view, T_cw, center, point_w)
-        reference = read_gray(view, int(view.frame_index[center]))
-        images = [read_gray(view, int(view.frame_index[row])) for row in rows.tolist()]
-        kept = [number for number, image in enumerate(images) if image is not None]
-        if reference is None or len(kept) < LEAST_FRAMES:
+        """Read the images of the frame and, evenly over those with a fitting parallax, of others; None for too few."""
+        camera, T_oc = view.camera.to("cpu"), T_cw @ se3_inverse(T_cw[center])
+        point_c = depth * _rays(camera, torch.tensor([pixel], dtype=torch.float64, device="cpu"))
+        pixels, seen = camera.project(transform(T_oc, point_c))
+        border = RADII[0] * max(1.0, SAMPLE_SHARE * camera.width)
+        seen = (seen & camera.in_image(pixels, border))[:, 0]
+        toward = torch.nn.functional.normalize(point_c - se3_inverse(T_oc)[:, :3, 3], dim=-1)
+        angles = torch.rad2deg(torch.acos((toward @ toward[center]).clamp(-1, 1)))
+        rows = torch.nonzero(seen & (angles >= ANGLES_DEG[0]) & (angles <= ANGLES_DEG[1]))[:, 0]
+        if len(rows) > FRAMES:
+            places = torch.linspace(0, len(rows) - 1, FRAMES, dtype=torch.float64, device="cpu")
+            rows = rows[places.round().long()]
+        reference = view.gray(int(view.frame_index[center]))
+        images = {row: view.gray(int(view.frame_index[row])) for row in rows.tolist()}
+        others = {row: image for row, image in images.items() if image is not None}
+        if reference is None or len(others) < LEAST_FRAMES:
             return None
-        others = [image for image in images if image is not None]
-        return cls(view, T_cw[center], pixel, reference, others, T_cw[rows[kept]])
+        return cls(camera, pixel, reference, list(others.values()), T_oc[list(others)])
+
+    @property
+    def spacing(self) -> float:
+        """Pixels from one sample of the window to the next."""
+        return max(1.0, SAMPLE_SHARE * self.camera.width)
 
     def single_scores(
         self, offset: Float[np.ndarray, " 2"], inverse_depths: Float[Tensor, " D"]
@@ -226,62 +288,23 @@ class _Sweep:
         steps = self.spacing * np.arange(-self.radius, self.radius + 1)
         window = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2) + np.array(self.pixel) + offset
         own = sample_windows(self.reference, torch.from_numpy(window)[None])
-        camera = self.view.camera.to("cpu")
-        rays = camera.unproject(torch.from_numpy(window))
-        rays = rays / rays[:, 2:]
-        points_c = rays / inverse_depths[:, None, None]  # (D, P, 3)
+        points_c = _rays(self.camera, torch.from_numpy(window)) / inverse_depths[:, None, None]  # (D, P, 3)
         scores = []
-        for image, T_ow in zip(self.others, self.T_ow, strict=True):
-            points_o = transform(T_ow @ se3_inverse(self.T_cw), points_c)
-            pixels, seen = camera.project(points_o)
-            inside = (seen & camera.in_image(pixels)).all(dim=-1)
-            other = sample_windows(image, pixels, seen)
-            alike = torch.from_numpy((own * other).sum(axis=-1))
-            scores.append(torch.where(inside, alike, -1.0))
+        for image, T_oc in zip(self.others, self.T_oc, strict=True):
+            alike, inside = correlate(own, transform(T_oc, points_c), self.camera, image)
+            scores.append(torch.from_numpy(np.where(inside, alike, -1.0)))
         return torch.stack(scores)
 
     def pixels_per_inverse_depth(self, inverse_depth: float) -> float:
         """How far the pixel moves in the other images with the inverse depth; the median."""
-        camera, step = self.view.camera.to("cpu"), 1e-4 * inverse_depth
-        points_w = torch.stack(
-            [_point(self.view, self.T_cw, self.pixel, inverse_depth + sign * step) for sign in (-1, 1)]
-        )
-        pixels, _ = camera.project(transform(self.T_ow, points_w))
+        step = 1e-4 * inverse_depth
+        ray_c = _rays(self.camera, torch.tensor([self.pixel], dtype=torch.float64, device="cpu"))
+        points_c = torch.cat([ray_c / (inverse_depth + sign * step) for sign in (-1, 1)])
+        pixels, _ = self.camera.project(transform(self.T_oc, points_c))
         return float((pixels[:, 1] - pixels[:, 0]).norm(dim=-1).median()) / (2 * step)
 
-    def located(self, inverse_depth: float, std: float) -> LocatedPixel:
-        """The point at an inverse depth with a standard deviation."""
-        point_w = _point(self.view, self.T_cw, self.pixel, inverse_depth)
-        center_w = se3_inverse(self.T_cw)[:3, 3]
-        ray_w = (point_w - center_w) / (point_w - center_w).norm()
-        distance = float((point_w - center_w).norm())
-        along = distance * std / inverse_depth
-        across = distance * CLICK_STD_PX / float(self.view.camera.focal)
-        outer = ray_w[:, None] * ray_w
-        eye = torch.eye(3, dtype=outer.dtype, device="cpu")
-        return LocatedPixel(point_w, along**2 * outer + across**2 * (eye - outer))
 
-
-def _point(
-    view: SubmapView, T_cw: Float[Tensor, "4 4"], pixel: tuple[float, float], inverse_depth: float
-) -> Float[Tensor, " 3"]:
-    """The point of a pixel at an inverse depth."""
-    ray = view.camera.to("cpu").unproject(torch.tensor([pixel], dtype=torch.float64, device="cpu"))
-    point_w: Tensor = transform(se3_inverse(T_cw), ray / (ray[:, 2:] * inverse_depth))[0]
-    return point_w
-
-
-def _chosen(
-    view: SubmapView, T_cw: Float[Tensor, "K 4 4"], center: int, point_w: Float[Tensor, " 3"]
-) -> Int[Tensor, " F"]:
-    """Frames that may see a point from another place, evenly over those with a fitting parallax."""
-    camera = view.camera.to("cpu")
-    pixels, seen = camera.project(transform(T_cw, point_w[None])[:, :1])
-    border = RADII[0] * max(1.0, SAMPLE_SHARE * camera.width)
-    seen = (seen & camera.in_image(pixels, border))[:, 0]
-    rays = torch.nn.functional.normalize(point_w - se3_inverse(T_cw)[:, :3, 3], dim=-1)
-    angles = torch.rad2deg(torch.acos((rays @ rays[center]).clamp(-1, 1)))
-    fits = torch.nonzero(seen & (angles >= ANGLES_DEG[0]) & (angles <= ANGLES_DEG[1]))[:, 0]
-    if len(fits) <= FRAMES:
-        return fits
-    return fits[torch.linspace(0, len(fits) - 1, FRAMES, dtype=torch.float64, device="cpu").round().long()]
+def _rays(camera: Camera, pixels: Float[Tensor, "P 2"]) -> Float[Tensor, "P 3"]:
+    """Rays of pixels with z = 1."""
+    rays = camera.unproject(pixels)
+    return rays / rays[:, 2:]

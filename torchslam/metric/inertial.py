@@ -17,23 +17,33 @@ al., "Inertial-only optimization for visual-inertial initialization", 2020; incr
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.inertial import InertialCalibration, InertialSamples
+from torchslam.data.inertial import (
+    InertialCalibration,
+    InertialSamples,
+    read_imu,
+    read_inertial_calibration,
+)
+from torchslam.errors import MeasurementError
 from torchslam.metric.inertial_equations import (
     equations_of,
+    lever_arm,
     minimum,
     prior_information,
     squared_residuals,
     standard_errors,
+    stretch_rows,
+    stretches_of,
 )
 from torchslam.metric.inertial_rotation import InertialRotation, align_rotations
-from torchslam.metric.inertial_stretches import lever_arm, stretch_rows, stretches_of
+from torchslam.metric.options import Given
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 EDGE = 0.05
 """Seconds from the first and the last sample within which frames are left out, for the clocks may be apart."""
@@ -159,10 +169,9 @@ def align_inertial(
     gravity_std = math.hypot(gravity_std, float(rotation.R_std.norm()))
     scale = found[0]
     is_determined = bool(scale > 0) and relative_std < WORST
-    reason = InertialReason.MEASURED if is_determined else InertialReason.NOT_DETERMINED
     starts = timestamps[torch.tensor([each[0] for each in rows], device=timestamps.device)]
     return InertialAlignment(
-        reason,
+        InertialReason.MEASURED if is_determined else InertialReason.NOT_DETERMINED,
         scale,
         math.hypot(relative_std, SENSOR_STD),
         found[1:4],
@@ -197,3 +206,67 @@ def _nothing(
     return InertialAlignment(
         reason, like.new_ones(()), math.inf, zero, math.inf, zero, rotation, zero, math.inf, 0
     )
+
+
+@dataclass(frozen=True)
+class InertialSource:
+    """Samples of an inertial sensor that moves with the camera.
+
+    Attributes:
+        samples: of the sensor.
+        calibration: how it is mounted, as far as that is known.
+    """
+
+    samples: InertialSamples
+    calibration: InertialCalibration = field(default_factory=InertialCalibration)
+
+    def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
+        """Measure the unit of a submap and its vertical.
+
+        Raises:
+            MeasurementError: images and samples have no time in common, or the rates another unit.
+        """
+        timestamps, T_cw = view.timestamps.cpu().double(), view.T_cw.cpu().double()
+        if len(timestamps):
+            start, end = (float(self.samples.timestamps[row]) for row in (0, -1))
+            first, last = (float(timestamps[row]) + self.calibration.offset for row in (0, -1))
+            if first > end or last < start:
+                raise MeasurementError(
+                    f"{self.samples.source}: samples from {start:.3f} to {end:.3f} s, but images from {first:.3f} to "
+                    f"{last:.3f} s: both need the same clock"
+                )
+        found = align_inertial(timestamps, T_cw, self.samples, self.calibration)
+        if found.reason is not InertialReason.MEASURED or found.rotation is None:
+            uncertain = found.reason is InertialReason.NOT_DETERMINED and found.relative_std < 1
+            more = f": its scale is uncertain by {found.relative_std:.0%}" if uncertain else ""
+            return Unmeasured(ScaleSource.INERTIAL, f"{found.reason}{more}")
+        turn = math.degrees(float(found.rotation.bias.norm()))
+        note = (
+            f"inertial sensor: bias of the gyroscope {turn:.3f} degrees/s, of the accelerometer "
+            f"{float(found.accelerometer_bias.norm()):.3f} m/s^2; its clock differs by "
+            f"{1e3 * float(found.rotation.offset):+.1f} ms; it is {float(found.lever_c.norm()):.3f} m from the camera"
+        )
+        return ScaleMeasurement(
+            ScaleSource.INERTIAL,
+            float(found.meters_per_unit),
+            found.relative_std,
+            found.stretches,
+            "stretches",
+            tuple(f"the stretch from {time:.2f} s on contradicts the others" for time in found.rejected),
+            up_w=-found.gravity_w / found.gravity_w.norm(),
+            up_std=found.gravity_std,
+            notes=(note,),
+        )
+
+
+def from_options(given: Given) -> list[InertialSource]:
+    """The source of `--imu FILE --imu-camera FILE`.
+
+    Raises:
+        MeasurementError: a file is wrong, or there are two sensors.
+    """
+    if len(given["imu"]) > 1:
+        raise MeasurementError("--imu is given twice; one sensor can be used")
+    imu = given["imu"][0][0]
+    camera = given["imu_camera"][-1][0] if "imu_camera" in given else None
+    return [InertialSource(read_imu(imu), read_inertial_calibration(camera, imu))]

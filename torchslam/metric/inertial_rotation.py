@@ -38,10 +38,6 @@ ROBUST_SCALE = 2.0
 """Of Cauchy's kernel, in standard errors of a turn, which leaves Gaussian errors 95 % of their information."""
 ROUNDS, WIDE_ROUNDS = 6, 3
 """Steps, and those of them by reweighted least squares, which come from afar; those of Newton after them converge."""
-SMALLEST_TURN_STD = 1e-7
-"""rad: turns of exact data."""
-TURN_PRIOR = 1e3
-"""rad, of a rotation between the sensors before it is measured: without axes of turning, it stays where it was."""
 MOUNTING_STD, FOUND_MOUNTING_STD = 2e-3, 6e-3
 """rad about each axis: errors of a calibrated rotation between camera and body, where calibrations of one rig differ by
 0.1 degrees, and what is added to those of one that is found. On a drone's recording that is off by 0.7 degrees, which
@@ -119,11 +115,16 @@ def align_rotations(
     return found
 
 
-def _increments(times: Tensor, samples: InertialSamples, bias: Tensor) -> Increments:
-    steps = inertial_steps(
-        samples.timestamps, samples.gyroscope, samples.accelerometer, times[:-1], times[1:]
-    )
-    return preintegrate(steps, torch.cat((bias, torch.zeros_like(bias))), 1.0, 1.0)
+def increments(
+    samples: InertialSamples,
+    start: Float[Tensor, " B"],
+    end: Float[Tensor, " B"],
+    bias: Float[Tensor, " 3"],
+    densities: tuple[float, float] = (1.0, 1.0),
+) -> Increments:
+    """Increments between times, with a bias of the gyroscope, and the densities of both sensors' noise."""
+    steps = inertial_steps(samples.timestamps, samples.gyroscope, samples.accelerometer, start, end)
+    return preintegrate(steps, torch.cat((bias, torch.zeros_like(bias))), *densities)
 
 
 def _start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, given: float) -> float:
@@ -167,9 +168,9 @@ def _start_rotation(
     times: Tensor, turns_c: Tensor, samples: InertialSamples, T_bc: Tensor | None
 ) -> tuple[Tensor, Tensor]:
     """R_bc and the bias, from rotation vectors of both sensors."""
-    increments = _increments(times, samples, torch.zeros_like(samples.gyroscope[0]))
-    duration = increments.duration[:, None]
-    rates_c, rates_b = so3_log(turns_c) / duration, so3_log(increments.R_ij) / duration
+    found = increments(samples, times[:-1], times[1:], torch.zeros_like(samples.gyroscope[0]))
+    duration = found.duration[:, None]
+    rates_c, rates_b = so3_log(turns_c) / duration, so3_log(found.R_ij) / duration
     if T_bc is None:
         _, R_bc, bias = umeyama(rates_c, rates_b, with_scale=False)
         return R_bc, bias
@@ -193,28 +194,26 @@ def _refined(
     At the minimum the gradient of the latter is that of the minimum, up to the curvature of rotations times the errors.
     """
     at = times + offset
-    increments = _increments(at, samples, bias)
+    found = increments(samples, at[:-1], at[1:], bias)
     left, part = between_rows(samples.timestamps, at)
     rates = samples.gyroscope[left].lerp(samples.gyroscope[left + 1], part[:, None]) - bias
-    R_ij, turns_b = increments.R_ij, R_bc @ turns_c @ R_bc.mT
+    R_ij, turns_b = found.R_ij, R_bc @ turns_c @ R_bc.mT
     error = so3_log(turns_b @ R_ij.mT)
     inverse, from_right = so3_left_jacobian_inverse(error), so3_left_jacobian_inverse(-error)
     shift = (R_ij @ rates[1:, :, None]) - rates[:-1, :, None]
     turned = torch.eye(3, dtype=R_ij.dtype, device=R_ij.device) - turns_b
-    J = torch.cat(
-        (inverse @ turned, -from_right @ increments.jacobian[:, 6:, :3], -from_right @ shift), dim=-1
-    )
-    std = median_scale(error.detach().abs().flatten()).clamp_min(SMALLEST_TURN_STD)
+    J = torch.cat((inverse @ turned, -from_right @ found.jacobian[:, 6:, :3], -from_right @ shift), dim=-1)
+    std = median_scale(error.detach().abs().flatten()).clamp_min(1e-7)  # of exact data
     std = std if turn_std is None else torch.full_like(std, turn_std)
     kernel = robustify((error / std).square().sum(-1), "cauchy", std.new_tensor(ROBUST_SCALE))
     weighted = (kernel.weight[:, None] * error / std**2)[..., None]
     if not rotation_free:
         J = torch.cat((torch.zeros_like(J[..., :3]), J[..., 3:]), dim=-1)
-    known = bias.new_tensor((*(TURN_PRIOR,) * 3, *(BIAS_STD,) * 3, OFFSET_STD)) ** -2
+    # Without axes of turning, the rotation between the sensors stays where it was.
+    known = bias.new_tensor((*(1e3,) * 3, *(BIAS_STD,) * 3, OFFSET_STD)) ** -2
     off = torch.cat((torch.zeros_like(bias), bias, (offset - prior)[None]))
     gradient = (J.mT @ weighted).sum(0).squeeze(-1) + known * off
-    normal = (J.mT @ (kernel.weight[:, None, None] * J)).sum(0) / std**2 + torch.diag(known)
-    hessian = normal
+    hessian = normal = (J.mT @ (kernel.weight[:, None, None] * J)).sum(0) / std**2 + torch.diag(known)
     if exact:
         along = J.mT @ (error / std**2)[..., None]
         hessian = normal + 2 * (kernel.curvature[:, None, None] * along @ along.mT).sum(0)
@@ -226,14 +225,8 @@ def _refined(
         hessian = hessian + torch.nn.functional.pad(bend.view(1, 1), (6, 0, 6, 0))
     change = -torch.linalg.solve(hessian, gradient)
     stds = torch.linalg.inv(normal.detach()).diagonal().sqrt()
-    return InertialRotation(
-        so3_exp(change[:3]) @ R_bc if rotation_free else R_bc,
-        bias + change[3:6],
-        offset + change[6],
-        torch.hypot(stds[:3], torch.full_like(stds[:3], FOUND_MOUNTING_STD))
-        if rotation_free
-        else torch.full_like(stds[:3], MOUNTING_STD),
-        stds[3:6],
-        stds[6],
-        std,
-    )
+    R_std = torch.full_like(stds[:3], MOUNTING_STD)
+    if rotation_free:
+        R_bc = so3_exp(change[:3]) @ R_bc
+        R_std = torch.hypot(stds[:3], torch.full_like(R_std, FOUND_MOUNTING_STD))
+    return InertialRotation(R_bc, bias + change[3:6], offset + change[6], R_std, stds[3:6], stds[6], std)

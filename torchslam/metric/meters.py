@@ -1,33 +1,81 @@
-"""A submap goes into meters: all sources measure, their measurements are combined, a similarity changes the world."""
+"""A submap goes into meters: all sources measure, their measurements are combined, a similarity changes the world.
+
+The logarithms of the scales are Gaussian, so that they are combined by their information.
+"""
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.geometry import se3_inverse
+from torchslam.errors import MeasurementError
+from torchslam.geometry import se3_inverse, sim3_scale
 from torchslam.geometry.transforms import level_rotation
 from torchslam.map.unit import MetricUnit, UnitSource
-from torchslam.metric.scale import CombinedScale, ScaleMeasurement, ScaleSource, combine_scales
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
+
+MAX_DISAGREEMENT = 3.0
+"""Standard errors by which two measurements may differ before they count as a contradiction: .3 % of right pairs do."""
 
 
 @dataclass(frozen=True)
-class Vertical:
-    """The vertical from all measurements that know it.
+class CombinedScale:
+    """The unit of a submap from all its measurements.
 
     Attributes:
-        up_w: unit vector against gravity.
-        std: its standard error, radians.
+        meters_per_unit: length of a map unit, meters.
+        relative_std: its relative standard error.
+        measurements: those it is made of.
+        contradictions: one line for each two measurements that differ by more than their errors allow.
     """
 
-    up_w: Float[Tensor, " 3"]
-    std: float
+    meters_per_unit: float
+    relative_std: float
+    measurements: tuple[ScaleMeasurement, ...]
+    contradictions: tuple[str, ...] = ()
+
+
+def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
+    """Average the logarithms of the scales, weighted by their information.
+
+    Where measurements contradict each other, the error grows by their disagreement (the Birge ratio, 1932), and each
+    contradiction is listed.
+
+    Raises:
+        MeasurementError: there is no measurement.
+    """
+    if not measurements:
+        raise MeasurementError("there is no measurement of the scale")
+    logs = torch.tensor(
+        [math.log(m.meters_per_unit) for m in measurements], dtype=torch.float64, device="cpu"
+    )
+    information = torch.tensor([m.relative_std**-2 for m in measurements], dtype=torch.float64, device="cpu")
+    mean = (information * logs).sum() / information.sum()
+    birge = 1.0
+    if len(measurements) > 1:
+        chi_square = float((information * (logs - mean).square()).sum())
+        birge = max(1.0, math.sqrt(chi_square / (len(measurements) - 1)))
+    contradictions = []
+    for one, other in itertools.combinations(measurements, 2):
+        off = math.log(one.meters_per_unit / other.meters_per_unit)
+        if abs(off) > MAX_DISAGREEMENT * math.hypot(one.relative_std, other.relative_std):
+            contradictions.append(
+                f"{one.source} and {other.source} contradict each other: "
+                f"{one.meters_per_unit:.4g} ± {one.relative_std:.1%} and "
+                f"{other.meters_per_unit:.4g} ± {other.relative_std:.1%} meters per unit"
+            )
+    return CombinedScale(
+        math.exp(float(mean)),
+        birge / math.sqrt(float(information.sum())),
+        tuple(measurements),
+        tuple(contradictions),
+    )
 
 
 @torch.no_grad()
@@ -41,7 +89,7 @@ def bring_into_meters(
     the measurements are then compared with its unit.
 
     Returns:
-        The similarity S_mw from the world before to the new one, and the sources that could not say anything.
+        The similarity S_mw from the world before to the new one, and the sources without a result.
 
     Raises:
         MeasurementError: measurements are wrong.
@@ -50,82 +98,46 @@ def bring_into_meters(
     answers = [source.measure(view) for source in sources]
     silent = tuple(answer for answer in answers if isinstance(answer, Unmeasured))
     measurements = [answer for answer in answers if not isinstance(answer, Unmeasured)]
-    eye = torch.eye(4, dtype=torch.float64, device="cpu")
-    if not measurements:
-        return eye, silent
-    if submap.metric is not None:
+    S_mw = torch.eye(4, dtype=torch.float64, device="cpu")
+    if measurements and submap.metric is not None:
         before = ScaleMeasurement(ScaleSource.MAP, 1.0, submap.metric.relative_std, 1, "map in meters")
         contradictions = combine_scales([before, *measurements]).contradictions
         submap.metric = replace(
             submap.metric, contradictions=(*submap.metric.contradictions, *contradictions)
         )
-        return eye, silent
-    scale, vertical = combine_scales(measurements), combine_verticals(measurements)
-    centers_w = se3_inverse(view.T_cw)[:, :3, 3].to(eye)
-    S_mw = similarity_to_meters(scale, vertical, centers_w)
-    submap.transform(S_mw.to(submap.map.T_cw))
-    submap.metric = unit_record(scale, vertical, S_mw)
+    elif measurements:
+        S_mw, submap.metric = _similarity_to_meters(view, combine_scales(measurements))
+        submap.transform(S_mw.to(submap.map.T_cw))
     return S_mw, silent
 
 
-def combine_verticals(measurements: Sequence[ScaleMeasurement]) -> Vertical | None:
-    """The mean direction against gravity, weighted by information; None if no measurement has one."""
-    known = [(m.up_w.detach().cpu().double(), m.up_std**-2) for m in measurements if m.up_w is not None]
-    if not known:
-        return None
-    ups, weights = zip(*known, strict=True)
-    mean = torch.stack(ups).mul(torch.tensor(weights, dtype=torch.float64, device="cpu")[:, None]).sum(dim=0)
-    return Vertical(mean / mean.norm(), 1 / math.sqrt(sum(weights)))
+def _similarity_to_meters(view: SubmapView, scale: CombinedScale) -> tuple[Float[Tensor, "4 4"], MetricUnit]:
+    """The similarity from the world of a submap to one in meters, and the record of its unit.
 
-
-def similarity_to_meters(
-    scale: CombinedScale, vertical: Vertical | None, centers_w: Float[Tensor, "K 3"]
-) -> Float[Tensor, "4 4"]:
-    """The similarity from the world of a submap to one in meters.
-
-    Args:
-        scale: of the submap.
-        vertical: level the world by it, unless a measurement has a frame of its own.
-        centers_w: of the cameras. Their mean keeps its place in the frame of a measurement, whatever the others say of
-            the scale.
+    In the frame of a measurement, the mean of the cameras keeps its place, whatever the others say of the scale.
     """
     S_mw = torch.eye(4, dtype=torch.float64, device="cpu")
-    framed = next((m.S_ew.detach().cpu().double() for m in scale.measurements if m.S_ew is not None), None)
-    if framed is None:
-        R_mw = S_mw[:3, :3].clone() if vertical is None else level_rotation(vertical.up_w)
-        S_mw[:3, :3] = scale.meters_per_unit * R_mw
-        return S_mw
-    own = torch.linalg.det(framed[:3, :3]) ** (1 / 3)
-    S_mw[:3, :3] = scale.meters_per_unit / own * framed[:3, :3]
-    middle_w = centers_w.mean(dim=0)
-    S_mw[:3, 3] = framed[:3, :3] @ middle_w + framed[:3, 3] - S_mw[:3, :3] @ middle_w
-    return S_mw
-
-
-def unit_record(scale: CombinedScale, vertical: Vertical | None, S_mw: Float[Tensor, "4 4"]) -> MetricUnit:
-    """The record of a combined scale that a submap keeps."""
-    measurements = scale.measurements
-    framed = next((m for m in measurements if m.S_ew is not None), None)
-    up_std = None if vertical is None else vertical.std
-    if framed is not None:
+    framed = next((m for m in scale.measurements if m.S_ew is not None), None)
+    ups = [(m.up_w.to(S_mw), m.up_std**-2) for m in scale.measurements if m.up_w is not None]
+    up_std = 1 / math.sqrt(sum(weight for _, weight in ups)) if ups else None
+    if framed is not None and framed.S_ew is not None:
+        S_ew = framed.S_ew.to(S_mw)
+        S_mw[:3, :3] = scale.meters_per_unit / sim3_scale(S_ew) * S_ew[:3, :3]
+        middle_w = se3_inverse(view.T_cw)[:, :3, 3].to(S_mw).mean(dim=0)
+        S_mw[:3, 3] = S_ew[:3, :3] @ middle_w + S_ew[:3, 3] - S_mw[:3, :3] @ middle_w
         up_std = framed.up_std if math.isfinite(framed.up_std) else 0.0
-    return MetricUnit(
+    else:
+        if ups:
+            mean = torch.stack([weight * up_w for up_w, weight in ups]).sum(dim=0)
+            S_mw[:3, :3] = level_rotation(mean / mean.norm())
+        S_mw[:3, :3] *= scale.meters_per_unit
+    names = [field.name for field in fields(UnitSource)]
+    unit = MetricUnit(
         scale.relative_std,
-        tuple(
-            UnitSource(
-                str(m.source),
-                m.meters_per_unit,
-                m.relative_std,
-                m.count,
-                m.unit,
-                m.apart,
-                tuple(m.rejected),
-                tuple(m.notes),
-            )
-            for m in measurements
-        ),
-        tuple(scale.contradictions),
+        tuple(UnitSource(*(getattr(m, name) for name in names)) for m in scale.measurements),
+        scale.contradictions,
         tuple(map(tuple, S_mw.tolist())),
         up_std,
         None if framed is None else framed.origin,
     )
+    return S_mw, unit

@@ -54,7 +54,8 @@ class SourceKind:
 
     Attributes:
         options: the first one makes a source, the others are its details.
-        make: `module:function`, which makes the sources of `Given`; called if the first option is given.
+        make: `module:function`, which makes the sources of `Given`; called if the first option is given. The module is
+            below `torchslam.metric`.
         on_request: what a dataset brings of this kind counts only where the user writes `AUTO`.
     """
 
@@ -62,41 +63,22 @@ class SourceKind:
     make: str
     on_request: bool = False
 
-    def sources(self, given: Given) -> list[MetricSource]:
-        """Make the sources.
-
-        Raises:
-            TorchslamError: an option or a file that it names is wrong.
-        """
-        module, name = self.make.split(":")
-        made: list[MetricSource] = getattr(import_module(module), name)(given)
-        return made
-
 
 KINDS: tuple[SourceKind, ...] = (
-    SourceKind((Option("marker", ("FAMILY:METERS",)),), "torchslam.metric.markers.source:from_options"),
+    SourceKind((Option("marker", ("FAMILY:METERS",)),), "markers.source:from_options"),
+    SourceKind((Option("distance", ("FRAME:X,Y", "FRAME:X,Y", "METERS")),), "distances:from_options"),
+    SourceKind((Option("camera_height", ("METERS",)),), "camera_height:from_options"),
+    SourceKind((Option("gps", ("FILE",)), Option("gps_clock", ("CLOCK",))), "positions:from_options"),
     SourceKind(
-        (Option("distance", ("FRAME:X,Y", "FRAME:X,Y", "METERS")),), "torchslam.metric.distances:from_options"
-    ),
-    SourceKind((Option("camera_height", ("METERS",)),), "torchslam.metric.camera_height:from_options"),
-    SourceKind(
-        (Option("gps", ("FILE",)), Option("gps_clock", ("CLOCK",))), "torchslam.metric.positions:from_options"
-    ),
-    SourceKind(
-        (Option("speed", ("FILE",)), Option("speed_clock", ("CLOCK",))),
-        "torchslam.metric.speeds:from_options",
+        (Option("speed", ("FILE",)), Option("speed_clock", ("CLOCK",))), "odometry:speeds_from_options"
     ),
     SourceKind(
-        (Option("odometry", ("FILE",)), Option("odometry_clock", ("CLOCK",))),
-        "torchslam.metric.odometry:from_options",
+        (Option("odometry", ("FILE",)), Option("odometry_clock", ("CLOCK",))), "odometry:from_options"
     ),
-    SourceKind(
-        (Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))),
-        "torchslam.metric.inertial_source:from_options",
-    ),
+    SourceKind((Option("imu", ("FILE",)), Option("imu_camera", ("FILE",))), "inertial:from_options"),
     SourceKind(
         (Option("depth", ("FOLDER[:SCALE]",)), Option("depth_camera", ("CAMERA",))),
-        "torchslam.metric.sensor_depth:from_options",
+        "sensor_depth:from_options",
         on_request=True,
     ),
 )
@@ -186,4 +168,9 @@ def sources_of(given: Given) -> list[MetricSource]:
     Raises:
         TorchslamError: an option or a file that it names is wrong.
     """
-    return [source for kind in KINDS if kind.options[0].name in given for source in kind.sources(given)]
+    made = []
+    for kind in KINDS:
+        if kind.options[0].name in given:
+            module, name = kind.make.split(":")
+            made += getattr(import_module(f"torchslam.metric.{module}"), name)(given)
+    return made

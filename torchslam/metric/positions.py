@@ -13,30 +13,18 @@ from torchslam.data.formats.fix_files import Fixes, read_fixes
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, sim3_scale
-from torchslam.metric.camera_path import (
-    CameraPath,
-    Clock,
-    clock_notes,
-    clocks_of,
-    found_shift,
-    on_clock_of_images,
-)
+from torchslam.metric.camera_path import CameraPath, Clock, clock_notes, clocks_of, found_shift
 from torchslam.metric.options import Given
 from torchslam.metric.position_fit import (
-    CLOCK_STD,
     MIN_POSITIONS,
     PositionFit,
     PositionPairs,
     fit_positions,
     start_distance,
 )
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.slow_noise import MAX_RELATIVE_STD
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
-MIN_AGREEING = 0.5
-"""Part of the positions that must agree with the path: the start is right with up to half of them wrong."""
-MAX_RELATIVE_STD = 0.25
-"""Relative standard error from which on a scale is no measurement: positions then hardly differ beyond their noise."""
 SWAPPED = 3.0
 """How much nearer a path must be to positions with latitude and longitude exchanged before a note is written."""
 LINE_UP_STD = math.radians(15.0)
@@ -59,6 +47,10 @@ LISTED = 3
 """Most positions off the path that are listed one by one."""
 
 
+class _NoFit(Exception):
+    """Positions do not determine a similarity, for a reason."""
+
+
 @dataclass(frozen=True)
 class PositionSource:
     """The positions of one file.
@@ -74,61 +66,77 @@ class PositionSource:
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """The unit, the level and the place of a submap; see `MetricSource`."""
         path = CameraPath.of(view)
-        if len(path.timestamps) < MIN_POSITIONS:
-            return _unmeasured(f"only {len(path.timestamps)} frames have a pose")
-        if self.fixes.timestamps is None:
-            if view.sequence is None:
-                return _unmeasured(f"{self.fixes.path} has positions of images, which are not available")
-            names = [view.sequence.file_name(index) for index in view.frame_index.tolist()]
-            found = self._by_names(names, path)
-        else:
-            found = self._by_times(path)
-        if isinstance(found, Unmeasured):
-            return found
-        pairs, fit, shift = found
-        return self._result(pairs, fit, shift)
+        try:
+            if len(path.timestamps) < MIN_POSITIONS:
+                raise _NoFit(f"only {len(path.timestamps)} frames have a pose")
+            pairs, fit, shift = (self._by_names if self.fixes.timestamps is None else self._by_times)(
+                view, path
+            )
+        except _NoFit as error:
+            return Unmeasured(ScaleSource.POSITION, str(error))
+        is_line = fit.up_std > LINE_UP_STD
+        notes, offset = list(self.fixes.notes), shift + fit.offset
+        if abs(offset) > SAID * fit.offset_std:
+            notes += clock_notes(self.fixes.path, offset, fit.offset_std)
+        if is_line:
+            notes.append(
+                f"{self.fixes.path}: the positions lie on a line; the rotation about it is chosen such that the images "
+                "are upright"
+            )
+        return ScaleMeasurement(
+            ScaleSource.POSITION,
+            float(sim3_scale(fit.S_ew)),
+            fit.relative_std,
+            int(fit.inliers.sum()),
+            f"positions, {fit.noise[0]:.2g} m from the path",
+            tuple(_rejected(pairs, fit)),
+            up_w=None if is_line else fit.up_w,
+            up_std=fit.up_std,
+            S_ew=fit.S_ew,
+            origin=self.origin,
+            notes=tuple(notes),
+        )
 
-    # --- which position is whose -----------------------------------------------------------------------------
-
-    def _by_names(
-        self, names: list[str], path: CameraPath
-    ) -> tuple[PositionPairs, PositionFit, float] | Unmeasured:
+    def _by_names(self, view: SubmapView, path: CameraPath) -> tuple[PositionPairs, PositionFit, float]:
+        """Positions of named images, the fit to them, and a difference of clocks of zero."""
+        if view.sequence is None:
+            raise _NoFit(f"{self.fixes.path} has positions of images, which are not available")
+        names = [view.sequence.file_name(index) for index in view.frame_index.tolist()]
         rows = rows_by_name(self.fixes.names, names)
         found = rows >= 0
         if not bool(found.any()):
             raise MeasurementError(
                 f"{self.fixes.path}: no image has one of its names, such as {self.fixes.names[0]}"
             )
-        positions_e, std, has_height = self._local(rows[found])
         positions_w = path.T_wc[found, :3, 3]
         still = torch.zeros_like(positions_w)
-        pairs = PositionPairs(path.timestamps[found], positions_w, still, positions_e, std, has_height)
-        fit = self._fitted(pairs, path, CLOCK_STD)
-        return fit if isinstance(fit, Unmeasured) else (pairs, fit, 0.0)
+        pairs = PositionPairs(path.timestamps[found], positions_w, still, *self._local(rows[found]))
+        return pairs, self._fitted(pairs, path), 0.0
 
-    def _by_times(self, path: CameraPath) -> tuple[PositionPairs, PositionFit, float] | Unmeasured:
+    def _by_times(self, view: SubmapView, path: CameraPath) -> tuple[PositionPairs, PositionFit, float]:
+        """Positions at times, the fit to them, and the seconds that the clock of the images is ahead."""
         assert self.fixes.timestamps is not None
-        times = on_clock_of_images(self.fixes.timestamps, path, self.clock, self.fixes.path, "--gps-clock")
-        if bool((self.fixes.geodetic.nan_to_num() == self.fixes.geodetic[0].nan_to_num()).all()):
-            return _unmeasured(f"all {len(self.fixes)} positions are the same")
+        times = path.on_its_clock(self.fixes.timestamps, self.clock, self.fixes.path, "--gps-clock")
+        geodetic = self.fixes.geodetic.nan_to_num()
+        if bool((geodetic == geodetic[0]).all()):
+            raise _NoFit(f"all {len(self.fixes)} positions are the same")
         moved = torch.ones_like(times, dtype=torch.bool)
         # Until it has a new position a receiver, or what writes its file, repeats the last one.
         moved[1:] = (self.fixes.geodetic.diff(dim=0).nan_to_num() != 0).any(-1)
         rows = torch.nonzero(moved)[:, 0]
-        positions_e, std, has_height = self._local(rows)
-        times = times[rows]
+        times, local = times[rows], self._local(rows)
 
-        def fitted(shift: float) -> tuple[PositionPairs, PositionFit | Unmeasured]:
+        def fitted(shift: float) -> tuple[PositionPairs, PositionFit]:
             positions_w, velocities_w, known = path.at(times + shift)
-            pairs = PositionPairs(times, positions_w, velocities_w, positions_e, std, has_height)
-            return pairs.select(known), self._fitted(pairs.select(known), path, CLOCK_STD)
+            pairs = PositionPairs(times, positions_w, velocities_w, *local).select(known)
+            return pairs, self._fitted(pairs, path)
 
-        shift = self._search(path, times, positions_e, has_height) if self.clock.seconds is None else 0.0
+        shift = self._search(path, times, local[0], local[2]) if self.clock.seconds is None else 0.0
         pairs, fit = fitted(shift)
-        if isinstance(fit, PositionFit) and abs(fit.offset) > SECOND_PASS:
+        if abs(fit.offset) > SECOND_PASS:
             shift += fit.offset
             pairs, fit = fitted(shift)
-        return fit if isinstance(fit, Unmeasured) else (pairs, fit, shift)
+        return pairs, fit, shift
 
     def _local(self, rows: Tensor) -> tuple[Float[Tensor, "M 3"], Float[Tensor, "M 2"], Bool[Tensor, " M"]]:
         """Positions east, north and up of the origin, their standard deviations, and which have a height."""
@@ -172,23 +180,21 @@ class PositionSource:
 
         return found_shift(cost_at, path.duration, SEARCH_STEP, SEARCH_GAIN)
 
-    # --- the result ----------------------------------------------------------------------------------------
-
-    def _fitted(self, pairs: PositionPairs, path: CameraPath, clock_std: float) -> PositionFit | Unmeasured:
+    def _fitted(self, pairs: PositionPairs, path: CameraPath) -> PositionFit:
         if len(pairs) < MIN_POSITIONS:
-            return _unmeasured(f"{len(pairs)} positions are at times with a pose, {MIN_POSITIONS} are needed")
+            raise _NoFit(f"{len(pairs)} positions are at times with a pose, {MIN_POSITIONS} are needed")
         extent = float((pairs.positions_e.amax(0) - pairs.positions_e.amin(0)).norm())
         if extent == 0:
-            return _unmeasured(f"all {len(pairs)} positions are the same")
+            raise _NoFit(f"all {len(pairs)} positions are the same")
         if not bool(pairs.positions_w.std(0).norm() > 0):
-            return _unmeasured("the camera does not move")
-        fit = fit_positions(pairs, path.up_w, clock_std)
-        if fit is None or float(fit.inliers.double().mean()) < MIN_AGREEING:
+            raise _NoFit("the camera does not move")
+        fit = fit_positions(pairs, path.up_w)
+        if fit is None or float(fit.inliers.double().mean()) < 0.5:
             self._check_swapped(pairs)
-            return _unmeasured(f"the {len(pairs)} positions do not have the shape of the camera's path")
+            raise _NoFit(f"the {len(pairs)} positions do not have the shape of the camera's path")
         if fit.relative_std > MAX_RELATIVE_STD:
             self._check_swapped(pairs)
-            return _unmeasured(
+            raise _NoFit(
                 f"{len(pairs)} positions over {extent:.1f} m scatter by {fit.noise[0]:.1f} m about the camera's path: "
                 f"the scale is uncertain by {fit.relative_std:.0%}"
             )
@@ -211,34 +217,6 @@ class PositionSource:
                 "exchanged: are they swapped in the file?"
             )
 
-    def _result(self, pairs: PositionPairs, fit: PositionFit, shift: float) -> ScaleMeasurement:
-        line = fit.up_std > LINE_UP_STD
-        return ScaleMeasurement(
-            ScaleSource.POSITION,
-            float(sim3_scale(fit.S_ew)),
-            fit.relative_std,
-            int(fit.inliers.sum()),
-            f"positions, {fit.noise[0]:.2g} m from the path",
-            tuple(_rejected(pairs, fit)),
-            up_w=None if line else fit.up_w,
-            up_std=fit.up_std,
-            S_ew=fit.S_ew,
-            origin=self.origin,
-            notes=tuple(self._notes(fit, shift, line)),
-        )
-
-    def _notes(self, fit: PositionFit, shift: float, line: bool) -> list[str]:
-        notes = list(self.fixes.notes)
-        offset = shift + fit.offset
-        if abs(offset) > SAID * fit.offset_std:
-            notes += clock_notes(self.fixes.path, offset, fit.offset_std)
-        if line:
-            notes.append(
-                f"{self.fixes.path}: the positions lie on a line; the rotation about it is chosen such that the images "
-                "are upright"
-            )
-        return notes
-
 
 def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:
     """What does not agree, in a few lines."""
@@ -253,10 +231,6 @@ def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:
         f"{len(wrong)} of {len(pairs)} positions, the first one at {float(pairs.times[wrong[0]]):.1f} s, are "
         f"{float(distances.min()):.1f} to {float(distances.max()):.1f} m from the path"
     ]
-
-
-def _unmeasured(reason: str) -> Unmeasured:
-    return Unmeasured(ScaleSource.POSITION, reason)
 
 
 def from_options(given: Given) -> list[MetricSource]:

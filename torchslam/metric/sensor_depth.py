@@ -24,9 +24,8 @@ from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera, transform
 from torchslam.geometry.robust import weighted_median
 from torchslam.metric.options import Given
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
 from torchslam.metric.slow_noise import scale_of_series
-from torchslam.metric.source import MetricSource, SubmapView, Unmeasured
+from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
 IMAGES = 60
 """Depth images that are read at most, evenly over the recording; with 20 and with 100 redkitchen's scale is the same to
@@ -103,7 +102,14 @@ class SensorDepth:
             if found is not None:
                 rows.append(row)
                 logs.append(found)
-        notes = self._notes(unreadable)
+        notes = []
+        if not self.images.said:
+            notes.append(
+                f"{self.images.source}: assuming {self.images.units_per_meter:g} units per meter; "
+                "--depth FOLDER:SCALE states another number"
+            )
+        if unreadable:
+            notes.append(f"{len(unreadable)} depth images cannot be read, the first one: {unreadable[0]}")
         if len(rows) < LEAST_IMAGES:
             why = f"points of the map have depth in {len(rows)} of {len(chosen)} depth images"
             return Unmeasured(ScaleSource.DEPTH, "; ".join([why, *notes]))
@@ -118,7 +124,7 @@ class SensorDepth:
             lambda row: f"that of frame {int(view.frame_index[rows[row]])}",
             disagreement="depth images differ by {} from each other",
             shared_std=SENSOR_STD,
-            notes=notes,
+            notes=tuple(notes),
         )
 
     def _camera(self, camera: Camera, depth: Float[np.ndarray, "H W"]) -> Camera:
@@ -127,17 +133,6 @@ class SensorDepth:
         if self.camera:
             return parse_calibration(self.camera, "--depth-camera").camera(size).to(torch.float64)
         return scale_camera(camera.to("cpu").to(torch.float64), size)
-
-    def _notes(self, unreadable: list[str]) -> tuple[str, ...]:
-        units = self.images.units_per_meter
-        notes = []
-        if not self.images.said:
-            notes.append(
-                f"{self.images.source}: assuming {units:g} units per meter; --depth FOLDER:SCALE states another number"
-            )
-        if unreadable:
-            notes.append(f"{len(unreadable)} depth images cannot be read, the first one: {unreadable[0]}")
-        return tuple(notes)
 
     def _pairs(self, view: SubmapView) -> list[tuple[int, Path]] | str:
         """The frames that have a depth image, by their row in the view, and its file; or why there are none."""
@@ -185,13 +180,15 @@ def frame_ratio(view: SubmapView, row: int, depth: Float[np.ndarray, "H W"], cam
         depth: of a sensor, meters, 0 where it is not known.
         camera: of the depth image, at the place of the camera and with its axes.
     """
-    pixels, z = _observed(view, row)
+    frames, slam_map = view.submap.posed_frames, view.submap.map
+    own = torch.nonzero(frames.observations["frame_row"] == view.rows[row])[:, 0]
+    points = slam_map.follow_merges(frames.observations["point_ids"][own])
+    z = transform(view.T_cw[row], slam_map.positions_w[points])[:, 2].detach().cpu().double()
+    pixels = frames.observations["pixels"][own].detach().cpu().double()
     rays = view.camera.to("cpu").to(torch.float64).unproject(pixels)
     seen, valid = camera.project(rays / rays[:, 2:])
-    near, far, mean = (
-        filtered(depth, np.ones((PATCH, PATCH), np.uint8)) for filtered in (cv2.erode, cv2.dilate, _mean)
-    )
-    border = PATCH // 2
+    patch, border = np.ones((PATCH, PATCH), np.uint8), PATCH // 2
+    near, far, mean = cv2.erode(depth, patch), cv2.dilate(depth, patch), cv2.blur(depth, patch.shape)
     place = seen.round().long()
     height, width = depth.shape
     inside = valid & (z > 0) & (place >= border).all(dim=-1)
@@ -204,16 +201,3 @@ def frame_ratio(view: SubmapView, row: int, depth: Float[np.ndarray, "H W"], cam
     z, middle = z[inside][is_one], middle[is_one]
     weights = 1 / (POINT_STD**2 + (NOISE * middle).square())
     return weighted_median((middle / z).log(), weights)
-
-
-def _observed(view: SubmapView, row: int) -> tuple[Float[Tensor, "R 2"], Float[Tensor, " R"]]:
-    """The pixels at which a frame observes points of the map, and their depths in map units."""
-    frames, slam_map = view.submap.posed_frames, view.submap.map
-    own = torch.nonzero(frames.observations["frame_row"] == view.rows[row])[:, 0]
-    points = slam_map.follow_merges(frames.observations["point_ids"][own])
-    z = transform(view.T_cw[row], slam_map.positions_w[points])[:, 2]
-    return frames.observations["pixels"][own].detach().cpu().double(), z.detach().cpu().double()
-
-
-def _mean(depth: Float[np.ndarray, "H W"], patch: np.ndarray) -> np.ndarray:
-    return cv2.blur(depth, patch.shape)

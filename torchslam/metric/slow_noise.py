@@ -16,16 +16,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry.robust import fit_inliers, median_scale
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
-from torchslam.metric.source import Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, Unmeasured
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviations of the slow noise, in those of the white noise; beyond the last one the white noise does not
 matter."""
 DURATIONS = (0.1, 0.3, 3.0)
 """After these parts of the recording the slow noise is forgotten; the last one is a walk without an end."""
-FORGOTTEN = DURATIONS[:2]
-"""For means: noise that lasts as long as the recording is part of its mean."""
 MAX_GROUPS = 120
 """Values that covariances are made for; of more, successive ones are averaged, which loses no slow noise."""
 GATE = 4.0
@@ -34,8 +31,6 @@ ROUNDS = 20
 """Rejections until nothing changes; two to four are usual."""
 MAX_RELATIVE_STD = 0.25
 """Relative standard error from which on a scale is no measurement."""
-LEAST_STD = 1e-6
-"""Of exact data."""
 
 
 def slow_correlations(
@@ -138,7 +133,8 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
     kept, own = values[inliers], stds[inliers].square()
     white = group_means(own, group, size) / size
     at = group_means(times[inliers], group, size)
-    V = slow_correlations(at, FORGOTTEN) * own.mean() + torch.diag(white)
+    # Noise that lasts as long as the recording is part of its mean.
+    V = slow_correlations(at, DURATIONS[:2]) * own.mean() + torch.diag(white)
     L = torch.linalg.cholesky(V)
     y = torch.linalg.solve_triangular(
         L, group_means(kept, group, size).expand(len(V), -1)[..., None], upper=False
@@ -181,16 +177,12 @@ def scale_of_series(
     """Average a series of logarithms of meters per unit, up to half of them wrong; see `slow_mean`.
 
     Args:
-        source: where they come from.
-        times: seconds, ascending.
-        logs: the logarithms.
-        stds: their standard deviations, relative to each other.
-        unit: what is counted, in the plural.
+        source, unit, notes: of the measurement.
+        times, logs, stds: as for `slow_mean`.
         name_of: the name of a row, such as "at 3.2 s".
         disagreement: message where they determine no scale, with `{}` for their relative standard deviation.
         cause: end of the message about rejected ones.
         shared_std: relative standard deviation of an error that all have in common.
-        notes: remarks.
     """
     mean = slow_mean(times, logs, stds)
     if mean.std > MAX_RELATIVE_STD or float(mean.inliers.double().mean()) < 0.5:
@@ -207,7 +199,7 @@ def scale_of_series(
     return ScaleMeasurement(
         source,
         math.exp(mean.mean),
-        max(math.hypot(mean.std, shared_std), LEAST_STD),
+        max(math.hypot(mean.std, shared_std), 1e-6),
         int(mean.inliers.sum()),
         unit,
         tuple(rejected),

@@ -1,18 +1,88 @@
-"""The interface of a source of metric measurements: from a finished submap to a measurement of its unit."""
+"""The interface of a source of metric measurements: from a finished submap to a measurement of its unit.
+
+One camera determines a map up to a similarity. A marker, a known length, positions, speeds or an inertial sensor each
+measure how many meters its unit has.
+"""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from enum import StrEnum
 from typing import Protocol
 
+import numpy as np
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.map.atlas import Submap
-from torchslam.metric.scale import ScaleMeasurement, ScaleSource
+
+
+class ScaleSource(StrEnum):
+    """Where a measurement of the scale comes from."""
+
+    MARKER = "marker"
+    DISTANCE = "distance"
+    CAMERA_HEIGHT = "camera height"
+    POSITION = "position"
+    INERTIAL = "inertial"
+    SPEED = "speed"
+    ODOMETRY = "odometry"
+    DEPTH = "depth"
+    MAP = "map"
+    """A map in meters that the session goes on with."""
+
+
+@dataclass(frozen=True)
+class ScaleMeasurement:
+    """The measurement of the unit of one submap by one source.
+
+    Attributes:
+        source: where it comes from.
+        meters_per_unit: length of a map unit, meters.
+        relative_std: its relative standard error, the disagreement of the single measurements included.
+        count, unit: how many single measurements count, and what they are, in the plural, such as 12 "markers".
+        rejected: one line for each single measurement, or group of them, that contradicts the others.
+        up_w: unit vector against gravity in the frame of the map; None where the source does not determine it.
+        up_std: its standard error, radians.
+        S_ew: similarity from the map to a metric frame of the source (east, north, up), scale in the rotation block;
+            None where the source has no such frame.
+        origin: latitude and longitude in degrees and altitude in meters (WGS84) of the origin of that frame; None where
+            it is nowhere on earth.
+        apart: relative standard deviation of the single measurements; None where it is not known.
+        notes: remarks for the user, one line each.
+    """
+
+    source: ScaleSource
+    meters_per_unit: float
+    relative_std: float
+    count: int
+    unit: str
+    rejected: tuple[str, ...] = ()
+    up_w: Float[Tensor, " 3"] | None = None
+    up_std: float = math.inf
+    S_ew: Float[Tensor, "4 4"] | None = None
+    origin: tuple[float, float, float] | None = None
+    apart: float | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not (0 < self.meters_per_unit < math.inf and 0 < self.relative_std < math.inf):
+            raise MeasurementError(
+                f"a scale of {self.meters_per_unit} with an error of {self.relative_std} is no measurement"
+            )
+
+
+@dataclass(frozen=True)
+class Unmeasured:
+    """A source without a result for a submap, and the reason, such as "the camera does not move"."""
+
+    source: ScaleSource
+    reason: str
 
 
 class Images(Protocol):
@@ -69,18 +139,17 @@ class SubmapView:
         """Poses of the same frames, world to camera, in the arbitrary unit of the submap."""
         return self.submap.posed_frames.T_cw(self.submap.map)[self.rows]
 
+    @property
+    def has_images(self) -> bool:
+        """Whether there are images to look at."""
+        return self.sequence is not None and not self.sequence.brings_features
 
-@dataclass(frozen=True)
-class Unmeasured:
-    """A source without a result for a submap.
-
-    Attributes:
-        source: which one.
-        reason: why, for the user, such as "the camera does not move".
-    """
-
-    source: ScaleSource
-    reason: str
+    def gray(self, frame_index: int) -> Float[np.ndarray, "H W"] | None:
+        """The image of a frame, gray in [0, 1]; None if there is none, or it cannot be read."""
+        try:
+            return None if self.sequence is None else self.sequence.image(frame_index)[0, 0].cpu().numpy()
+        except FrameError:
+            return None
 
 
 class MetricSource(Protocol):

@@ -20,8 +20,7 @@ from experiments.dense.truth import EVERY, Sensor
 from experiments.meters.scale import view_of_results
 from torchslam.geometry import se3_inverse, transform
 from torchslam.metric.distances import Click, Distance, measure_distance
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView
+from torchslam.metric.source import ScaleMeasurement, SubmapView
 
 CORNERS = 24
 """Clicks in a frame."""

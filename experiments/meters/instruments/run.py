@@ -16,11 +16,9 @@ from torchslam.data.formats.fix_files import Fixes
 from torchslam.data.formats.vehicle_files import Speeds
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import geodetic_from_enu, rigid, se3_exp, se3_inverse, so3_exp
-from torchslam.metric.odometry import OdometrySource
+from torchslam.metric.odometry import OdometrySource, SpeedSource
 from torchslam.metric.positions import PositionSource
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import MetricSource
-from torchslam.metric.speeds import SpeedSource
+from torchslam.metric.source import MetricSource, ScaleMeasurement
 from torchslam.types import Trajectory
 
 ORIGIN = torch.tensor((48.98, 8.39, 112.0), dtype=torch.float64)

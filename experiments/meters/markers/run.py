@@ -10,8 +10,8 @@ import experiments.meters.markers.scene  # noqa: F401  it adds scenes
 from experiments.common import parser_of, publish, table
 from experiments.meters.scale import scale_by, scale_error, view_of_run
 from torchslam import open_sequence
+from torchslam.metric.markers.detection import parse_target
 from torchslam.metric.markers.source import Markers
-from torchslam.metric.markers.targets import parse_target
 
 CASES = (
     ("tags", "4 tags, a fifth of another size that is stated", "apriltag-36h11:0.16,9=0.2"),

@@ -11,7 +11,7 @@ from tests.fuzz.valid_inputs import SENSOR, euroc, place
 from torchslam.config import MetricConfig
 from torchslam.data import Calibrated, open_sequence
 from torchslam.errors import CalibrationError, SequenceError, TrajectoryError
-from torchslam.metric.inertial_source import InertialSource
+from torchslam.metric.inertial import InertialSource
 from torchslam.metric.options import given_options, sources_of
 
 

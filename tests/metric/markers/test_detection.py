@@ -8,9 +8,14 @@ import pytest
 import torch
 
 from torchslam.geometry import Camera
-from torchslam.metric.markers.detection import detector_of, side_bends
-from torchslam.metric.markers.edges import fit_corners, sides
-from torchslam.metric.markers.targets import dictionary, parse_target
+from torchslam.metric.markers.detection import (
+    detector_of,
+    dictionary,
+    fit_corners,
+    parse_target,
+    side_bends,
+    sides,
+)
 
 SIZE = (320, 240)
 PINHOLE = Camera.pinhole(300.0, 300.0, 159.5, 119.5, size=SIZE)

@@ -9,10 +9,9 @@ import pytest
 import experiments.meters.markers.scene  # noqa: F401  it adds scenes
 from torchslam.data import open_sequence
 from torchslam.evaluation import evaluate
+from torchslam.metric.markers.detection import parse_target
 from torchslam.metric.markers.source import Markers
-from torchslam.metric.markers.targets import parse_target
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView
+from torchslam.metric.source import ScaleMeasurement, SubmapView
 from torchslam.system.slam import SLAM
 
 

@@ -10,12 +10,9 @@ from torch import Tensor
 
 from tests.map.simulated import CAMERA, simulated_submap
 from torchslam.geometry import Camera, SensorModel, transform
-from torchslam.metric.markers.corners import PlacedTarget
-from torchslam.metric.markers.detection import Detection
-from torchslam.metric.markers.source import Markers, log_sizes
-from torchslam.metric.markers.targets import Target, parse_target
-from torchslam.metric.scale import ScaleMeasurement
-from torchslam.metric.source import SubmapView, Unmeasured
+from torchslam.metric.markers.detection import Detection, Target, parse_target
+from torchslam.metric.markers.source import Markers, PlacedTarget, log_sizes
+from torchslam.metric.source import ScaleMeasurement, SubmapView, Unmeasured
 
 SIDE = 0.5
 """Of all markers, units of the map."""
@@ -141,11 +138,10 @@ def test_the_size_is_differentiable() -> None:
     sizes = torch.rand(2, 4, 2, generator=generator, dtype=torch.float64).requires_grad_()
 
     def logs(points_w: Tensor, sizes: Tensor) -> Tensor:
-        targets = [
-            PlacedTarget("", torch.arange(4) + 4 * row, sizes[row], torch.arange(0), 1.0, 1.0)
-            for row in (0, 1)
-        ]
-        return log_sizes(targets, points_w)
+        none = (points_w[:4], torch.arange(0), torch.arange(0), sizes[0, :0], sizes[0, :0, 0])
+        return log_sizes(
+            [PlacedTarget("", torch.arange(4) + 4 * row, sizes[row], *none) for row in (0, 1)], points_w
+        )
 
     assert torch.autograd.gradcheck(logs, (points_w, sizes))
     assert torch.allclose(logs(2 * points_w, sizes), logs(points_w, sizes) - math.log(2))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from torchslam.errors import MeasurementError
+from torchslam.metric.markers.detection import TargetKind, parse_target
 from torchslam.metric.markers.source import from_options
-from torchslam.metric.markers.targets import TargetKind, parse_target
 
 
 def test_a_marker_has_its_size_and_others_have_theirs() -> None:
