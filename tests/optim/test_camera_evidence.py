@@ -11,15 +11,15 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_exp, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.optim import GRAPH_OPTIONS, BundleProblem, solve_bundle
-from torchslam.optim.bundle._camera_scores import camera_scores
-from torchslam.optim.camera_evidence import (
+from torchslam.optim.bundle._scores import camera_scores
+from torchslam.optim.model_choice import LEAST_GAIN, LEAST_UPDATE
+from torchslam.optim.sensor_estimate import (
     STRETCH_FRAMES,
     USUAL_FACTOR,
     USUAL_STRETCHES,
     CameraEvidence,
     camera_evidence,
 )
-from torchslam.optim.model_choice import LEAST_GAIN, LEAST_UPDATE
 
 TRUTH = Camera.radial_tangential(400.0, 404.0, 320.0, 240.0, -0.05, 0.02, 0.0, 0.0, size=(640, 480))
 OPTIONS = GRAPH_OPTIONS.replace(backward="detached", tolerance=1e-12)

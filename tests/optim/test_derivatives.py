@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import jacfwd, jacrev, jvp, vmap
 
-from tests.optim.pose_graph.test_pose_graph import make_scene
+from tests.optim.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
 from torchslam.optim import (

@@ -22,8 +22,7 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.robust import robustify
 from torchslam.global_mapping.depth_ratios import DepthRatio, PairDepths, ViewRays, depth_ratio
 from torchslam.global_mapping.view_graph import Relation, ViewPair
-from torchslam.optim.pose_graph._problem import Groups
-from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, factorize_sparse
+from torchslam.optim._core.sparse_cholesky import Groups, build_block_structure, factorize_sparse
 from torchslam.types import FrameFeatures
 
 SYSTEMATIC_STD = 0.03

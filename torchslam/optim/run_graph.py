@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from itertools import accumulate
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple, Self, TypeVar
@@ -30,12 +31,11 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import OBSERVATION_VARIANCE, CameraMeasurement
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
-from torchslam.optim._core.levenberg_marquardt import Progress, check_minimum
-from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
+from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, Progress, SolverOptions, check_minimum
 from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
-from torchslam.optim.pose._refinement import solve_pose
+from torchslam.optim.pose import solve_pose
 from torchslam.types import Trajectory
 from torchslam.utils.files import check_regular
 
@@ -63,6 +63,9 @@ FIRST_TOLERANCE = 1e-6
 only."""
 GRADIENT_ROUNDS = 8
 """Rounds with a rolling shutter that gradients pass: each leaves a tenth to a third of the gradient's error."""
+
+_UNREADABLE = OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RuntimeError
+"""What reading another file raises."""
 
 Schema = dict[str, tuple[str, tuple[int, ...], type]]
 """Per column: what it has a row for (K frames, N points or O observations), the shape of a row, the kind of numbers."""
@@ -163,16 +166,14 @@ class ObservationGraph:
         """Write to a safetensors file."""
         tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}
         tensors["camera"] = self.camera.params.detach().cpu().contiguous()
-        if self.calibration is not None:
-            given = self.calibration
-            parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
-            tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
-        if self.readout is not None:
-            tensors[_READOUT] = self.readout.numbers
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
-        if self.calibration is not None:
-            metadata[_VARIANCE] = repr(self.calibration.observation_variance)
+        if (given := self.calibration) is not None:
+            parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
+            tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
+            metadata[_VARIANCE] = repr(given.observation_variance)
+        if self.readout is not None:
+            tensors[_READOUT] = self.readout.numbers
         safetensors.torch.save_file(tensors, path, metadata)
 
     @classmethod
@@ -205,15 +206,7 @@ class ObservationGraph:
             graph = cls(camera=camera, calibration=calibration, readout=readout, **columns)
             graph._check()
             return graph
-        except (
-            OSError,
-            SafetensorError,
-            KeyError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            RuntimeError,
-        ) as error:
+        except _UNREADABLE as error:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
 
     def _check(self) -> None:
@@ -279,11 +272,9 @@ class RunGraph(ObservationGraph):
     @property
     def recordings(self) -> Int[Tensor, " K"]:
         """The recording of each frame: those of one session in one submap."""
-        return (
-            self.submap * (1 + int(self.sessions.max())) + self.sessions
-            if len(self.sessions)
-            else self.submap
-        )
+        if not len(self.sessions):
+            return self.submap
+        return self.submap * (1 + int(self.sessions.max())) + self.sessions
 
     _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
         "frame_ids": ("K", (), int),
@@ -446,13 +437,12 @@ def _solve_global_shutter(
 
 def _check_factors(graph: ObservationGraph, factors: Sequence[FrameFactors]) -> None:
     """Raises ValueError where a factor joins other frames than keyframes of one submap."""
-    for factor in factors:
-        if factor.frames.numel() and not 0 <= int(factor.frames.min()) <= int(factor.frames.max()) < len(
-            graph.T_cw
-        ):
-            raise ValueError(f"frames of factors must lie in 0 ... {len(graph.T_cw) - 1}")
-        submaps = graph.submap[factor.frames]
-        if not bool(graph.is_keyframe[factor.frames].all()) or bool((submaps[:, 0] != submaps[:, 1]).any()):
+    count = len(graph.T_cw)
+    for frames in (factor.frames for factor in factors):
+        if frames.numel() and not 0 <= int(frames.min()) <= int(frames.max()) < count:
+            raise ValueError(f"frames of factors must lie in 0 ... {count - 1}")
+        submaps = graph.submap[frames]
+        if not bool(graph.is_keyframe[frames].all()) or bool((submaps[:, 0] != submaps[:, 1]).any()):
             raise ValueError("factors must join keyframes of one submap")
 
 
@@ -463,20 +453,21 @@ def _with_factors(
     depth_prior: DepthPrior | None,
 ) -> BundleProblem:
     """The bundle adjustment of a submap with its share of the factors and depths of its graph."""
-    slots = torch.full_like(graph.submap, -1)
-    slots[submap.keyframes] = torch.arange(len(submap.keyframes), device=slots.device)
-    own = []
-    for factor in factors:
-        rows = (slots[factor.frames[:, 0]] >= 0).nonzero().squeeze(-1)
-        own.append(
-            FrameFactors(
-                slots[factor.frames[rows]], factor.measured[rows], factor.information[rows], factor.error
-            )
-        )
+    slots, own = _slots(graph, submap.keyframes), []
+    for each in factors:
+        rows = (slots[each.frames[:, 0]] >= 0).nonzero().squeeze(-1)
+        given = each.measured[rows], each.information[rows], each.error
+        own.append(FrameFactors(slots[each.frames[rows]], *given))
     if depth_prior is not None:
-        rows = submap.rows
-        depth_prior = DepthPrior(depth_prior.depths[rows], depth_prior.information[rows])
+        depth_prior = DepthPrior(depth_prior.depths[submap.rows], depth_prior.information[submap.rows])
     return replace(submap.problem, frame_factors=tuple(own), depth_prior=depth_prior)
+
+
+def _slots(graph: ObservationGraph, keyframes: Tensor) -> Tensor:
+    """The place (K,) of each frame among keyframes; -1 of others."""
+    slots = torch.full_like(graph.submap, -1)
+    slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
+    return slots
 
 
 def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
@@ -502,8 +493,7 @@ def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tens
     """The keyframes (k,) of one submap, its points (p,), the observations (o,), and their bundle adjustment."""
     frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
-    slots = torch.full_like(graph.submap, -1)
-    slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
+    slots = _slots(graph, keyframes)
     rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
     problem = BundleProblem(
         graph.T_cw[keyframes],
@@ -518,12 +508,6 @@ def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tens
     return keyframes, points, rows, problem
 
 
-def _bundle_converged(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
-    """Whether the bundle adjustment of the submap of each frame (K,) has converged; in the order of `graph.submaps`."""
-    converged = torch.cat([bundle.convergence.converged for bundle in bundles])
-    return converged[torch.unique(graph.submap, return_inverse=True)[1]]
-
-
 def _pose_other_frames(
     graph: ObservationGraph,
     T_cw: Tensor,
@@ -533,11 +517,8 @@ def _pose_other_frames(
     success: Tensor,
     options: SolverOptions,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The poses (K, 4, 4), with frames that are not keyframes refined against the points, `success` and `converged`.
-
-    Args:
-        camera: one for all frames, or one for each, params (K, P)
-    """
+    """The poses, with frames that are not keyframes refined against the points, `success` and `converged`; camera: one
+    for all frames or one of each, params (K, P)."""
     others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
@@ -584,11 +565,6 @@ class _GraphSubmap(NamedTuple):
     rows: Tensor
     problem: BundleProblem
 
-    @property
-    def cells(self) -> int:
-        """How large it is where many are solved at once."""
-        return len(self.problem.T_cw) * len(self.points)
-
 
 @full_precision
 def solve_graphs(
@@ -601,17 +577,10 @@ def solve_graphs(
     """
     strict, options = options.strict, options.replace(strict=False)
 
-    def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
-        return _adjust_together(submaps, options)
-
     alike: dict[tuple[object, ...], list[int]] = {}
     for row, graph in enumerate(graphs):
-        kind: tuple[object, ...] = (
-            graph.camera.model,
-            graph.camera.params.dtype,
-            graph.camera.params.device,
-            graph.weights.ndim,
-        )
+        params = graph.camera.params
+        kind: tuple[object, ...] = graph.camera.model, params.dtype, params.device, graph.weights.ndim
         if graph.calibration is not None or graph.readout is not None:
             kind = (row,)  # directions or rounds of its own
         alike.setdefault(kind, []).append(row)
@@ -621,14 +590,12 @@ def solve_graphs(
         if len(rows) == 1:
             found = (solve_graph(graphs[rows[0]], options=options),)
         else:
-            found = _solve([graphs[row] for row in rows], adjust, options)
+            found = _solve([graphs[row] for row in rows], partial(_adjust_together, options=options), options)
         solved.update(zip(rows, found, strict=True))
     solutions = tuple(solved[row] for row in range(len(graphs)))
     if strict and solutions:
-        success, converged = (
-            torch.cat([getattr(each, name) for each in solutions]) for name in ("success", "converged")
-        )
-        check_minimum(success, converged, "frames")
+        success = torch.cat([each.success for each in solutions])
+        check_minimum(success, torch.cat([each.converged for each in solutions]), "frames")
     return solutions
 
 
@@ -651,51 +618,52 @@ def _solve(
     frame_starts, point_starts = _starts([g.T_cw for g in graphs]), _starts([g.points_w for g in graphs])
     frames = torch.cat([submap.keyframes + frame_starts[submap.graph] for submap in submaps])
     points = torch.cat([submap.points + point_starts[submap.graph] for submap in submaps])
-    success, moved = torch.zeros_like(joined.is_keyframe), joined.points_w.new_zeros(len(joined.points_w))
-    finite = joined.T_cw[frames].isfinite().flatten(1).all(-1)
-    succeeded = torch.cat([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles])
-    T_cw = joined.T_cw.detach().index_copy(0, frames, torch.cat([bundle.T_cw for bundle in bundles]))
+
+    def of_frames(values: Sequence[Tensor], start: Tensor) -> Tensor:
+        return start.index_copy(0, frames, torch.cat([*values]))
+
+    T_cw = of_frames([bundle.T_cw for bundle in bundles], joined.T_cw.detach())
+    success = of_frames([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles], joined.is_keyframe)
+    success = success & joined.T_cw.isfinite().flatten(1).all(-1)
     points_w = torch.cat([bundle.points_w for bundle in bundles])
     points_w = joined.points_w.detach().index_copy(0, points, points_w)
-    moved = moved.bool().index_copy(0, points, torch.cat([bundle.moved_points for bundle in bundles]))
-    success = success.index_copy(0, frames, succeeded & finite)
+    moved = joined.points_w.new_zeros(len(joined.points_w)).bool()
+    moved = moved.index_copy(0, points, torch.cat([bundle.moved_points for bundle in bundles]))
     cameras = [graph.camera for graph in graphs] if len(graphs) > 1 else [bundles[0].camera]
     camera = cameras[0]
     if len(cameras) > 1:
         camera = camera.with_params(torch.stack([each.params for each in cameras])[joined.submap])
-    T_cw, success, is_minimum = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, options)
+    T_cw, success, converged = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, options)
     solutions = []
     for number, graph in enumerate(graphs):
         rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
         places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
         own = tuple(bundle for bundle, submap in zip(bundles, submaps, strict=True) if submap.graph == number)
-        converged = is_minimum[rows] & _bundle_converged(graph, own)
-        found = T_cw[rows], points_w[places], cameras[number], success[rows], moved[places], converged
-        solutions.append(GraphSolution(graph.timestamps, *found, graph.submap, own))
+        of_bundles = torch.cat([bundle.convergence.converged for bundle in own])
+        of_bundles = of_bundles[torch.unique(graph.submap, return_inverse=True)[1]]
+        found = T_cw[rows], points_w[places], cameras[number], success[rows], moved[places]
+        solutions.append(
+            GraphSolution(graph.timestamps, *found, converged[rows] & of_bundles, graph.submap, own)
+        )
     return tuple(solutions)
 
 
 def _adjust_together(submaps: Sequence[_GraphSubmap], options: SolverOptions) -> list[BundleSolution]:
     """The bundle adjustment of each submap, found together with those of like size."""
+    cells = [len(submap.problem.T_cw) * len(submap.points) for submap in submaps]
+    groups: list[list[int]] = []
+    for row in sorted(range(len(submaps)), key=lambda row: cells[row]):
+        if groups and cells[row] <= _MAX_SIZE_RATIO * cells[groups[-1][0]]:
+            groups[-1].append(row)
+        else:
+            groups.append([row])
     found: dict[int, BundleSolution] = {}
-    for rows in _group_by_size(submaps):
+    for rows in groups:
         problems = [submaps[row].problem for row in rows]
         together = solve_bundle(_padded(problems), options=options)
         for number, (row, problem) in enumerate(zip(rows, problems, strict=True)):
             found[row] = together.element(number, len(problem.T_cw), len(problem.points_w))
     return [found[row] for row in range(len(submaps))]
-
-
-def _group_by_size(submaps: Sequence[_GraphSubmap]) -> list[list[int]]:
-    """Rows of the submaps, in groups within which none is much larger than another."""
-    groups: list[list[int]] = []
-    for row in sorted(range(len(submaps)), key=lambda row: submaps[row].cells):
-        least = submaps[groups[-1][0]].cells if groups else 0
-        if groups and submaps[row].cells <= _MAX_SIZE_RATIO * least:
-            groups[-1].append(row)
-        else:
-            groups.append([row])
-    return groups
 
 
 def _padded(problems: Sequence[BundleProblem]) -> BundleProblem:
@@ -708,17 +676,9 @@ def _padded(problems: Sequence[BundleProblem]) -> BundleProblem:
     weights = [problem.weights for problem in problems if problem.weights is not None]
     counted = [torch.ones_like(problem.frame_index, dtype=torch.bool) for problem in problems]
     cameras = torch.stack([problem.camera.params for problem in problems])
-    return BundleProblem(
-        T_cw,
-        points_w,
-        frame_index,
-        point_index,
-        pixels,
-        first.camera.with_params(cameras),
-        pad_sequence(weights, batch_first=True),
-        first.fixed_frames,
-        mask=pad_sequence(counted, batch_first=True),
-    )
+    camera, mask = first.camera.with_params(cameras), pad_sequence(counted, batch_first=True)
+    observed = frame_index, point_index, pixels, camera, pad_sequence(weights, batch_first=True)
+    return BundleProblem(T_cw, points_w, *observed, first.fixed_frames, mask=mask)
 
 
 def _plain(graph: ObservationGraph, number: int) -> ObservationGraph:

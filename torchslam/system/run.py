@@ -25,7 +25,6 @@ from torchslam.map.posed_frames import PosedFrames
 from torchslam.map.unit import MetricUnit
 from torchslam.mapping.local_bundle import adjust_all, noise_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
-from torchslam.optim.camera_evidence import graph_evidence
 from torchslam.optim.rolling_shutter import RollingShutter
 from torchslam.optim.run_graph import (
     POSE_ITERATIONS,
@@ -35,7 +34,7 @@ from torchslam.optim.run_graph import (
     keyframe_problem,
     solve_graph,
 )
-from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor
+from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor, graph_evidence
 from torchslam.system.front_end import source
 from torchslam.system.online_camera import CameraChange, OnlineCamera, given_readout
 from torchslam.system.session import Session

@@ -209,8 +209,8 @@ def test_many_frames_are_factorized_by_blocks():
 
 def test_blocks_are_numbered_by_the_pairs_that_share_a_point_or_a_factor():
     seen = [(torch.tensor([0, 1, 3]), torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, 1.0]]))]
-    pairs = covisible_pairs(5, 6, seen, torch.tensor([(4, 2)]), 0.3)
-    assert covisible_pairs(5, 6, seen, torch.tensor([(4, 2)]), 0.29) is None
+    pairs = covisible_pairs(5, seen, torch.tensor([(4, 2)]), 0.3)
+    assert covisible_pairs(5, seen, torch.tensor([(4, 2)]), 0.29) is None
     numbers = pairs.number(*torch.meshgrid(torch.arange(5), torch.arange(5), indexing="ij"))
     none = 5 + 2 * 3
     assert numbers.tolist() == [

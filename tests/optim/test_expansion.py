@@ -7,7 +7,7 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_exp, transform
 from torchslam.optim._core.residuals import ReprojectionData
 from torchslam.optim._core.tangent import retract
-from torchslam.optim.pose._refinement import PoseObservations
+from torchslam.optim.pose import PoseInputs, PoseProblem
 
 PINHOLE = Camera.pinhole(500.0, 480.0, 320.0, 240.0, size=(640, 480))
 BENT = Camera.radial_tangential(500.0, 480.0, 320.0, 240.0, -0.2, 0.05, 1e-3, -5e-4, size=(640, 480))
@@ -15,7 +15,7 @@ STRAIGHT = Camera.radial_tangential(500.0, 480.0, 320.0, 240.0, 0.0, 0.0, 0.0, 0
 ALL, NONE = torch.ones(2, dtype=torch.bool), torch.zeros(2, dtype=torch.bool)
 
 
-def scene(camera: Camera, generator: torch.Generator) -> tuple[Tensor, PoseObservations]:
+def scene(camera: Camera, generator: torch.Generator) -> tuple[Tensor, PoseProblem]:
     """Two poses of 30 points, the first ones far off their pixels and the last one behind the camera."""
     points_w = torch.rand(2, 30, 3, generator=generator, dtype=torch.float64) * 4 - 2
     points_w[..., 2] += 6
@@ -26,7 +26,8 @@ def scene(camera: Camera, generator: torch.Generator) -> tuple[Tensor, PoseObser
     pixels[:, :6] += 20
     weights = 0.5 + torch.rand(2, 30, generator=generator, dtype=torch.float64)
     scale = torch.tensor([2.0], dtype=torch.float64)
-    return T_cw, PoseObservations(points_w, ReprojectionData(pixels, weights, camera, "cauchy", scale))
+    observations = ReprojectionData(pixels, weights, camera, "cauchy", scale)
+    return T_cw, PoseProblem(PoseInputs(points_w, observations, None))
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
@@ -42,7 +43,7 @@ def test_the_curvature_is_exact_for_linear_residuals(camera: Camera, generator: 
     """Hessian and curvature term make the Hessian of the cost, with the residual in its place linear in xi."""
     T_cw, observations = scene(camera, generator)
     inputs = observations.observations
-    points_w = observations.points_w.mT
+    points_w = observations.points_w
 
     def residuals(xi: Tensor) -> Tensor:
         return inputs.camera.project(transform(retract(T_cw, xi), points_w))[0] - inputs.pixels
@@ -76,13 +77,12 @@ def test_the_pinhole_shortcut_equals_the_general_expansion(generator: torch.Gene
     T_cw, short = scene(PINHOLE, generator)
     inputs = short.observations
     straight = ReprojectionData(inputs.pixels, inputs.weights, STRAIGHT, inputs.kernel, inputs.scale)
-    general = PoseObservations(short.points_w.mT, straight)
+    general = PoseProblem(PoseInputs(short.points_w, straight, None))
     moved = se3_exp(torch.tensor([0.05, 0, -0.1, 0.01, 0.02, 0.0], dtype=torch.float64)) @ T_cw
     for T in (T_cw, moved):
         torch.testing.assert_close(short.expand(T, ALL), general.expand(T, ALL))
     batch = Camera("pinhole", PINHOLE.params * torch.tensor([[1.0], [1.1]], dtype=torch.float64), (640, 480))
-    pair = PoseObservations(
-        short.points_w.mT, ReprojectionData(inputs.pixels, inputs.weights, batch, inputs.kernel, inputs.scale)
-    )
+    two = ReprojectionData(inputs.pixels, inputs.weights, batch, inputs.kernel, inputs.scale)
+    pair = PoseProblem(PoseInputs(short.points_w, two, None))
     torch.testing.assert_close(pair.expand(T_cw, ALL).hessian[0], short.expand(T_cw, ALL).hessian[0])
     assert not torch.allclose(pair.expand(T_cw, ALL).hessian[1], short.expand(T_cw, ALL).hessian[1])

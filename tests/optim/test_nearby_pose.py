@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints, se3_exp, se3_inverse, se3_log
-from torchslam.optim.pose.frame_pose import MIN_AGREEING, nearby_pose
+from torchslam.optim.frame_pose import MIN_AGREEING, nearby_pose
 
 THRESHOLD = 3.0  # pixels
 

@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchslam.geometry import KeypointNoise, UndistortedKeypoints, se3_exp, se3_inverse, se3_log
 from torchslam.optim import POSE_OPTIONS, solve_pose
-from torchslam.optim.pose.frame_pose import SCALE, FrameProblem
+from torchslam.optim.frame_pose import SCALE, FrameProblem
 
 
 def problem_of(scene, noise: KeypointNoise | None = None) -> FrameProblem:

@@ -44,9 +44,7 @@ class PoseLinearization:
 
     Attributes:
         pose: world to camera
-        rows: derivatives of the whitened errors in the left perturbation of the pose, then the
-            errors
-        squares, z: (N,) what `squared` and `depths` return
+        rows: derivatives of the whitened errors in the left perturbation of the pose, then the errors
         like: type and device of the tensors that properties return
     """
 
@@ -108,12 +106,7 @@ class FrameProblem:
     def __init__(
         self, points_w: Float[Tensor, "N 3"], xy: Float[Tensor, "2 N"], whitened: Float[Tensor, "2 2 N"]
     ) -> None:
-        """Take the matches, all finite.
-
-        Args:
-            xy: undistorted coordinates.
-            whitened: as returned by `UndistortedKeypoints.whitened`.
-        """
+        """Take the matches, all finite: undistorted coordinates, and slopes as of `UndistortedKeypoints.whitened`."""
         self.points_w, self.like = np.ascontiguousarray(to_numpy(points_w).T), points_w.detach()
         self.xy = to_numpy(xy)
         self.along_x, self.along_y = np.ascontiguousarray(to_numpy(whitened))
@@ -125,12 +118,9 @@ class FrameProblem:
     def minimize(
         self, start: PoseLinearization, weights: Float[Tensor, " N"], kernel: RobustKernel
     ) -> FramePose:
-        """Find the pose of minimal robust cost by Levenberg-Marquardt.
+        """Find the pose of minimal robust cost by Levenberg-Marquardt, with a kernel of scale `SCALE`.
 
-        Args:
-            start: the linearization at the start.
-            weights: of the squared errors, not negative; zero where a point does not count.
-            kernel: robust kernel, of scale `SCALE`.
+        weights: of the squared errors, not negative; zero where a point does not count.
         """
         counts = to_numpy(weights)
 
@@ -178,7 +168,7 @@ def nearby_pose(
         threshold: maximum error of a match that agrees, px.
 
     Returns:
-        The pose (4, 4), or None where less than `MIN_AGREEING` of the matches agree with it.
+        The pose, or None where less than `MIN_AGREEING` of the matches agree with it.
     """
     problem = FrameProblem(points_w, undistorted.xy, undistorted.slope / threshold)
     ones = torch.ones_like(points_w[:, 0])

@@ -27,6 +27,25 @@ _LEAF_NODES = 40
 _BALANCE = 0.3
 
 
+@dataclass(frozen=True)
+class Groups:
+    """Rows that are summed by group, in a fixed order."""
+
+    order: Int[Tensor, " N"]
+    counts: Int[Tensor, " G"]
+
+    @staticmethod
+    def of(index: Int[Tensor, " N"], count: int) -> Groups:
+        return Groups(torch.argsort(index, stable=True), torch.bincount(index, minlength=count))
+
+    def sum(self, values: Float[Tensor, "B N ..."]) -> Float[Tensor, "B G ..."]:
+        """Sums over the rows of each of G groups."""
+        shape = (len(self.counts), values.shape[0], *values.shape[2:])
+        flat = values.transpose(0, 1).index_select(0, self.order).flatten(1)
+        total = torch.segment_reduce(flat, "sum", lengths=self.counts, unsafe=True)
+        return total.view(shape).transpose(0, 1)
+
+
 @dataclass
 class FrontNodes:
     """Nodes that are eliminated together, those they are joined with then, and the fronts to be done before."""
@@ -62,6 +81,11 @@ def _split(part: list[int], neighbors: list[list[int]], fronts: list[FrontNodes]
     roots: list[int] = []
     pool: list[int] = []
     inside = set(part)
+
+    def append(nodes: list[int], children: list[int]) -> None:
+        roots.append(len(fronts))
+        fronts.append(FrontNodes(nodes, children))
+
     for start in part:
         if start not in inside:
             continue
@@ -69,23 +93,16 @@ def _split(part: list[int], neighbors: list[list[int]], fronts: list[FrontNodes]
         component = [node for level in levels for node in level]
         if len(component) > _LEAF_NODES:
             separator, halves = _separator(_levels(component[-1], neighbors, inside))
-            children = [root for half in halves if half for root in _split(half, neighbors, fronts)]
-            fronts.append(FrontNodes(separator, children))
-            roots.append(len(fronts) - 1)
+            append(separator, [root for half in halves if half for root in _split(half, neighbors, fronts)])
         else:
             pool += component
         inside.difference_update(component)
         if len(pool) > _LEAF_NODES:
-            pool = _append_leaf(pool, fronts, roots)
+            append(pool, [])
+            pool = []
     if pool:
-        _append_leaf(pool, fronts, roots)
+        append(pool, [])
     return roots
-
-
-def _append_leaf(nodes: list[int], fronts: list[FrontNodes], roots: list[int]) -> list[int]:
-    fronts.append(FrontNodes(nodes, []))
-    roots.append(len(fronts) - 1)
-    return []
 
 
 def _levels(start: int, neighbors: list[list[int]], inside: set[int]) -> list[list[int]]:
@@ -125,8 +142,7 @@ class Front:
     Attributes:
         size: (eliminated, all) scalar rows of the front
         rows: rows of the whole system
-        entries: blocks of the system that first appear here, at block row and column `places` (2,
-            m)
+        entries: blocks of the system that first appear here, at these block rows and columns `places`
         parent: the front that takes what remains, at its scalar rows `parent_rows`; -1 where nothing remains
     """
 
@@ -140,11 +156,7 @@ class Front:
 
 @dataclass(frozen=True)
 class BlockStructure:
-    """Which nodes are joined, and the order of elimination; made once per problem.
-
-    Attributes:
-        pairs: every joined pair once
-    """
+    """Which pairs of nodes are joined, each once, and the order of elimination; made once per problem."""
 
     num_nodes: int
     dims: int
@@ -154,7 +166,7 @@ class BlockStructure:
 
 def build_block_structure(num_nodes: int, dims: int, pairs: Int[Tensor, "L 2"]) -> BlockStructure:
     """The structure of a system with (dims, dims) blocks for `num_nodes` nodes and the pairs (P, 2) of them."""
-    device, listed = pairs.device, pairs.tolist()
+    device, listed, within = pairs.device, pairs.tolist(), torch.arange(dims, device=pairs.device)
     ordered = dissect(num_nodes, listed)
     local = [
         {node: place for place, node in enumerate(front.eliminated + front.boundary)} for front in ordered
@@ -167,14 +179,11 @@ def build_block_structure(num_nodes: int, dims: int, pairs: Int[Tensor, "L 2"]) 
     for number, (a, b) in enumerate(listed):
         index = min(front_of[a], front_of[b])
         row, column = local[index][a], local[index][b]
-        appear[index] += [
-            (num_nodes + number, row, column),
-            (num_nodes + len(listed) + number, column, row),
-        ]
+        appear[index].append((num_nodes + number, row, column))
+        appear[index].append((num_nodes + len(listed) + number, column, row))
 
     def scalars(places: list[int]) -> Tensor:
-        blocks = torch.tensor(places, dtype=torch.int64, device=device)
-        return (blocks[:, None] * dims + torch.arange(dims, device=device)).flatten()
+        return (torch.tensor(places, device=device).long()[:, None] * dims + within).flatten()
 
     fronts = []
     for index, front in enumerate(ordered):
@@ -194,8 +203,7 @@ class SparseFactor:
 
     Attributes:
         scale: such that scale * matrix * scale has a unit diagonal
-        factors: per front the lower triangle (B, n, n) of the eliminated nodes, and the rows below it (B, m,
-            n)
+        factors: per front the lower triangle (B, n, n) of the eliminated nodes, and the rows below (B, m, n)
         definite: the matrix is positive definite, whatever its units
     """
 
@@ -293,8 +301,13 @@ def factorize_sparse(
     remaining: dict[int, list[tuple[Tensor, Tensor]]] = defaultdict(list)
     factors = []
     for index, front in enumerate(structure.fronts):
-        matrix = _assemble(structure.dims, front, blocks, remaining.pop(index, []))
-        n = front.size[0]
+        (n, size), dims = front.size, structure.dims
+        # Blocks that first appear in the front, and what remains of the fronts before.
+        matrix = blocks.new_zeros(len(blocks), size // dims, size // dims, dims, dims)
+        matrix[:, front.places[0], front.places[1]] = blocks.index_select(1, front.entries)
+        matrix = matrix.transpose(2, 3).reshape(-1, size, size)
+        for rows, rest in remaining.pop(index, []):
+            matrix[:, rows[:, None], rows] += rest
         lower, info = torch.linalg.cholesky_ex(matrix[:, :n, :n])
         if info.any():  # unit matrices instead: what follows stays finite, its gradient included
             definite = definite & (info == 0)
@@ -310,14 +323,3 @@ def factorize_sparse(
         pivots = torch.cat([lower.diagonal(dim1=-2, dim2=-1) for lower, _ in factors], dim=-1)
         definite = definite & (pivots > smallest_pivot(d.dtype)).all(-1)
     return SparseFactor(structure, scale.flatten(1), factors, definite)
-
-
-def _assemble(dims: int, front: Front, blocks: Tensor, parts: list[tuple[Tensor, Tensor]]) -> Tensor:
-    """The matrix of a front: blocks that first appear in it, and what remains of the fronts before."""
-    size, count = front.size[1], front.size[1] // dims
-    matrix = blocks.new_zeros(len(blocks), count, count, dims, dims)
-    matrix[:, front.places[0], front.places[1]] = blocks.index_select(1, front.entries)
-    matrix = matrix.transpose(2, 3).reshape(-1, size, size)
-    for rows, rest in parts:
-        matrix[:, rows[:, None], rows] += rest
-    return matrix

@@ -18,9 +18,9 @@ from torchslam.geometry import (
     so3_exp,
 )
 from torchslam.optim import POSE_GRAPH_OPTIONS, PoseGraph, solve_pose_graph
-from torchslam.optim.pose_graph._api import _sanitized
-from torchslam.optim.pose_graph._problem import PoseGraphProblem, build_pose_graph_layout
-from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, dissect, factorize_sparse
+from torchslam.optim._core.sparse_cholesky import build_block_structure, dissect, factorize_sparse
+from torchslam.optim._pose_graph_problem import PoseGraphProblem, build_pose_graph_layout
+from torchslam.optim.pose_graph import _sanitized
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-26}
 SIGMAS = torch.tensor([0.02, 0.02, 0.02, 0.005, 0.005, 0.005, 0.01], dtype=torch.float64)
