@@ -22,7 +22,7 @@ from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.robust import robustify
 from torchslam.global_mapping.depth_ratios import DepthRatio, PairDepths, ViewRays, depth_ratio
 from torchslam.global_mapping.view_graph import Relation, ViewPair
-from torchslam.optim._core.sparse_cholesky import Groups, build_block_structure, factorize_sparse
+from torchslam.optim._core.linear import Groups, build_block_structure, factorize_sparse
 from torchslam.types import FrameFeatures
 
 SYSTEMATIC_STD = 0.03

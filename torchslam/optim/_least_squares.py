@@ -187,7 +187,7 @@ def solve_least_squares(
     minimization = _Minimization(residual, product, options, tensors)
     found = find_minimum(minimization, tensors, options.backward)
     solution, (success, *how) = found[: len(unknowns)], found[len(unknowns) :]
-    convergence = Convergence(*how, options.iterations)
+    convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
         check_minimum(success, convergence.converged, "elements")
     if options.backward == "truncated":

@@ -32,15 +32,15 @@ from torchslam.geometry.lie import (
 from torchslam.geometry.robust import Kernel, Robustified, robustify
 from torchslam.optim._core.implicit import Ndims, Tensors
 from torchslam.optim._core.levenberg_marquardt import minimize_batch, select_models
-from torchslam.optim._core.linear import diagonal_floor
-from torchslam.optim._core.residuals import flat_along
-from torchslam.optim._core.sparse_cholesky import (
+from torchslam.optim._core.linear import (
     BlockStructure,
     Groups,
     SparseFactor,
     build_block_structure,
+    diagonal_floor,
     factorize_sparse,
 )
+from torchslam.optim._core.residuals import flat_along
 from torchslam.optim._core.tangent import pull_back_sim3, push, retract_sim3
 from torchslam.utils.indexing import connected_parts
 

@@ -338,7 +338,7 @@ def solve_pose(
     tensors = (T_cw, *inputs.tensors())
     found = find_minimum(minimization, tensors, options.backward)
     refined, success, *how = found
-    convergence = Convergence(*how, options.iterations)
+    convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
         check_minimum(success, convergence.converged, "poses")
     if options.backward == "truncated":

@@ -97,7 +97,7 @@ def solve_pose_graph(graph: PoseGraph, *, options: SolverOptions = POSE_GRAPH_OP
     tensors = (*inputs, counted, fixed, graph.edges)
     found = find_minimum(minimization, tensors, options.backward)
     solution, success, moving, *how = found
-    convergence = Convergence(*how, options.iterations)
+    convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
         check_minimum(success, convergence.converged, "pose graphs")
     at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)

@@ -36,7 +36,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     SolverReason,
     check_minimum,
 )
-from torchslam.optim._core.sparse_cholesky import factorize_sparse
+from torchslam.optim._core.linear import factorize_sparse
 from torchslam.optim._pose_graph_problem import PoseGraphLayout, build_pose_graph_layout
 from torchslam.optim.pose_graph import PoseGraph, PoseGraphSolution, is_similarity, solve_pose_graph
 from torchslam.utils.indexing import connected_parts

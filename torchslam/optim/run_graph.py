@@ -17,7 +17,7 @@ from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import safetensors.torch
 import torch
@@ -29,7 +29,7 @@ from torch.nn.utils.rnn import pad_sequence
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import OBSERVATION_VARIANCE, CameraMeasurement
-from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.precision import check_dtypes, full_precision, without_autocast
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, Progress, SolverOptions, check_minimum
 from torchslam.optim._core.tangent import CameraPrior
@@ -67,9 +67,6 @@ GRADIENT_ROUNDS = 8
 _UNREADABLE = OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RuntimeError
 """What reading another file raises."""
 
-Schema = dict[str, tuple[str, tuple[int, ...], type]]
-"""Per column: what it has a row for (K frames, N points or O observations), the shape of a row, the kind of numbers."""
-
 
 @dataclass(frozen=True)
 class ObservationGraph:
@@ -100,18 +97,6 @@ class ObservationGraph:
     submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64, device="cpu"))
     calibration: CameraMeasurement | None = None
     readout: Readout | None = None
-
-    _SCHEMA: ClassVar[Schema] = {
-        "timestamps": ("K", (), float),
-        "T_cw": ("K", (4, 4), float),
-        "is_keyframe": ("K", (), bool),
-        "submap": ("K", (), int),
-        "points_w": ("N", (3,), float),
-        "frame_index": ("O", (), int),
-        "point_index": ("O", (), int),
-        "pixels": ("O", (2,), float),
-        "weights": ("O", (), float),
-    }
 
     def __post_init__(self) -> None:
         if len(self.submap) == 0:
@@ -211,23 +196,18 @@ class ObservationGraph:
 
     def _check(self) -> None:
         """Raises ValueError where a column does not fit the others, or has indices out of range."""
-        rows = {"K": len(self.T_cw), "N": len(self.points_w), "O": len(self.pixels)}
-        for name, (owner, shape, kind) in self._SCHEMA.items():
-            column = getattr(self, name)
-            if name == "weights" and column.ndim == 3:
-                shape = (2, 2)
-            if tuple(column.shape) != (rows[owner], *shape):
-                raise ValueError(f"{name} is {tuple(column.shape)}, not {(rows[owner], *shape)}")
-            if name != "timestamps" or not column.is_floating_point():
-                wanted = {int: torch.int64, bool: torch.bool}.get(kind, self.camera.params.dtype)
-                if column.dtype != wanted:
-                    raise ValueError(f"{name} is of type {column.dtype}, not {wanted}")
+        check = _run_fits if isinstance(self, RunGraph) else _fits
+        check(self)
+        for name in self.columns():
+            column, wanted = getattr(self, name), self.camera.params.dtype
+            if name in ("T_cw", "points_w", "pixels", "weights") and column.dtype != wanted:
+                raise ValueError(f"{name} is of type {column.dtype}, not {wanted}")
             if not bool(column.isfinite().all()):
                 raise ValueError(f"{name} is not finite")
-        for name, owner in (("frame_index", "K"), ("point_index", "N")):
+        for name, count in (("frame_index", len(self.T_cw)), ("point_index", len(self.points_w))):
             index = getattr(self, name)
-            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < rows[owner]:
-                raise ValueError(f"{name} from {int(index.min())} to {int(index.max())} of {rows[owner]}")
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < count:
+                raise ValueError(f"{name} from {int(index.min())} to {int(index.max())} of {count}")
         _check_submaps(self)
         params = self.camera.params
         check_dtypes(camera=params)
@@ -276,12 +256,15 @@ class RunGraph(ObservationGraph):
             return self.submap
         return self.submap * (1 + int(self.sessions.max())) + self.sessions
 
-    _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
-        "frame_ids": ("K", (), int),
-        "sessions": ("K", (), int),
-        "point_ids": ("N", (), int),
-        "keypoint_index": ("O", (), int),
-    }
+
+@without_autocast
+def _fits(graph: ObservationGraph) -> None:
+    """Raises ValueError where a column is of another kind or does not fit the others."""
+
+
+@without_autocast
+def _run_fits(graph: RunGraph) -> None:
+    """As `_fits`."""
 
 
 Graph = TypeVar("Graph", bound=ObservationGraph)
@@ -384,22 +367,17 @@ def _solve_in_rounds(
 ) -> GraphSolution:
     """Correct the keypoints of a rolling shutter and solve the graph of a global one, until they stay where they are.
 
-    With gradients, the number of rounds is fixed, and all of them are differentiated. Without, the first round, of
-    which the keypoints are not the last ones, ends at `FIRST_TOLERANCE`.
+    With gradients, the number of rounds is fixed. Without, the first round ends at `FIRST_TOLERANCE`.
     """
     at, before = graph, graph.pixels
     passes_gradient = options.backward != "detached"
-    first = options
-    if not passes_gradient:
-        first = options.replace(tolerance=max(options.tolerance, FIRST_TOLERANCE))
-    for number in range(MAX_ROUNDS):
+    rough = options.replace(tolerance=max(options.tolerance, FIRST_TOLERANCE))
+    for number in range(GRADIENT_ROUNDS if passes_gradient else MAX_ROUNDS):
         corrected = at.global_shutter()
-        solution = solved(corrected, options if number else first)
+        is_rough = number == 0 and not passes_gradient and rough != options
+        solution = solved(corrected, rough if is_rough else options)
         at = replace(at, T_cw=solution.T_cw, points_w=solution.points_w, camera=solution.camera)
-        if passes_gradient and number + 1 == GRADIENT_ROUNDS:
-            break
         change = (corrected.pixels - before).detach().square().sum(-1).mean().sqrt()
-        is_rough = number == 0 and first != options
         if not passes_gradient and not is_rough and bool(change < SETTLED_PX):
             break
         before = corrected.pixels

@@ -186,13 +186,7 @@ class _Solve(torch.autograd.Function):
         direction, tensors = _split(ctx.saved_tensors, problem.num_vectors)
         _, found, inputs = _parts(problem, ctx.num_found, tensors)
         adjoint = _solve(problem, gradient, found, inputs, many)
-
-        def curvature(tensors: Tensors) -> Tensor:
-            at = _split(tensors, len(found))
-            return -_nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
-                (direction, adjoint)
-            ).sum()
-
+        curvature = _curvature_of(problem, len(found), direction, tuple(-part for part in adjoint), many)
         needed = ctx.needs_input_grad[3 + problem.num_vectors :]
         return (None, None, None, *adjoint, *_gradient(curvature, (*found, *inputs), needed))
 
@@ -204,12 +198,7 @@ class _Solve(torch.autograd.Function):
         right, found, inputs = _parts(problem, ctx.num_found, tensors)
 
         def change_of_curvature(probe: Tensors) -> Tensor:
-            def curvature(tensors: Tensors) -> Tensor:
-                at = _split(tensors, len(found))
-                return _nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
-                    (direction, probe)
-                ).sum()
-
+            curvature = _curvature_of(problem, len(found), direction, probe, many)
             return _along(curvature, (*found, *inputs), changes[len(right) :])
 
         hessian_product = grad(change_of_curvature)(_zeros(right))
@@ -260,16 +249,23 @@ def _zeros(tensors: Tensors) -> Tensors:
     return tuple(torch.zeros_like(tensor) for tensor in tensors)
 
 
-def _curvature(
-    problem: Minimization, found: Tensors, inputs: Tensors, direction: Tensors, probe: Tensors
-) -> Tensor:
-    """() probe . H direction, differentiable."""
+def _curvature_of(
+    problem: Minimization, num_found: int, direction: Tensors, probe: Tensors, many: int
+) -> Callable[[Tensors], Tensor]:
+    """The function (*found, *inputs) -> () probe . H direction, summed over `many` dimensions of both."""
 
-    def slope(step: Tensors) -> Tensor:
-        return problem.slope(problem.retracted(found, step), inputs, probe)
+    def curvature(tensors: Tensors) -> Tensor:
+        found, inputs = _split(tensors, num_found)
 
-    hessian_product = grad(slope)(_zeros(direction))
-    return torch.stack([(x * y).sum() for x, y in zip(hessian_product, direction, strict=True)]).sum()
+        def of_one(ends: tuple[Tensors, Tensors]) -> Tensor:
+            direction, probe = ends
+            product = grad(lambda step: problem.slope(problem.retracted(found, step), inputs, probe))
+            pairs = zip(product(_zeros(direction)), direction, strict=True)
+            return torch.stack([(x * y).sum() for x, y in pairs]).sum()
+
+        return _nested_vmap(of_one, many)((direction, probe)).sum()
+
+    return curvature
 
 
 def _last_gradient(

@@ -143,7 +143,7 @@ class Convergence:
 
     def of(self, row: int) -> Convergence:
         """Of one element."""
-        return Convergence(*(tensor[row : row + 1] for tensor in self.tensors), self.limit)
+        return Convergence(*(tensor[row : row + 1] for tensor in self.tensors), limit=self.limit)
 
 
 class Outcome:

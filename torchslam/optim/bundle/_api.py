@@ -178,6 +178,6 @@ def solve_bundle(
         found.success[row],
         found.moved_frames[row],
         found.moved_points[row],
-        Convergence(*found[-4:], options.iterations),
+        Convergence(*found[-4:], limit=options.iterations),
         marginals,
     )

@@ -224,7 +224,7 @@ def frames_with_factors(
     touched = torch.zeros(len(information), num_frames, dtype=torch.int64, device=information.device)
     matrices = information.split([len(kind.frames) * kind.size**2 for kind in kinds], dim=-1) if kinds else ()
     for kind, own in zip(kinds, matrices, strict=True):
-        counts = (own.unflatten(-1, (len(kind.frames), -1)) != 0).any(-1).long()
+        counts = (own.unflatten(-1, (len(kind.frames), kind.size**2)) != 0).any(-1).long()
         for frames in kind.frames.unbind(1):
             touched = touched.index_add(1, frames, counts)
     return touched > 0

@@ -308,9 +308,8 @@ def _parts(given: BundleData, moving: MovingParts, kinds: Sequence[FactorKind] =
         if use_dense:
             parts.append(BatchPart(rows, build_dense_layout(given.part(rows), of_part)))
             continue
-        index, masks = (given.frame_index[start], given.point_index[start]), (mask[0] for mask in of_part)
-        cameras = given.camera_index[start], given.params.shape[1]
-        parts.append(BatchPart(rows, build_sparse_layout(*index, *masks, *cameras, joined=joined)))
+        of_one = MovingParts(*(mask[0] for mask in of_part))
+        parts.append(BatchPart(rows, build_sparse_layout(given.part(start), of_one, joined)))
     return parts
 
 

@@ -20,12 +20,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import DefiniteFactor, smallest_pivot
-from torchslam.optim._core.sparse_cholesky import (
+from torchslam.optim._core.linear import (
     BlockStructure,
+    DefiniteFactor,
     SparseFactor,
     build_block_structure,
     factorize_sparse,
+    smallest_pivot,
 )
 
 SPARSE_FRAMES = 200

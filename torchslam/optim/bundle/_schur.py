@@ -21,8 +21,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import diagonal_floor, factorize
-from torchslam.optim._core.sparse_cholesky import Groups
+from torchslam.optim._core.linear import Groups, diagonal_floor, factorize
 from torchslam.optim.bundle._factors import FrameBlocks
 from torchslam.optim.bundle._reduced import (
     FRAME_DIMS,

@@ -38,6 +38,7 @@ from torchslam.optim.bundle._factors import FactorKind, FrameBlocks, depth_terms
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
+    MovingParts,
     PriorTerms,
     gauge_motions,
     open_motions,
@@ -84,17 +85,11 @@ class SparseLayout:
 
 
 def build_sparse_layout(
-    frame_index: Int[Tensor, " O"],
-    point_index: Int[Tensor, " O"],
-    counted: Bool[Tensor, " O"],
-    free_frames: Bool[Tensor, " K"],
-    free_points: Bool[Tensor, " N"],
-    camera_index: Int[Tensor, " K"],
-    num_cameras: int,
-    joined: Int[Tensor, "M 2"] | None = None,
+    given: BundleData, moving: MovingParts, joined: Int[Tensor, "M 2"] | None = None
 ) -> SparseLayout:
-    """Order the observations that count; frames and points are free or fixed as in `MovingParts`, and factors join
-    pairs of frames."""
+    """Order the observations of one problem that count; factors join pairs of frames."""
+    counted, free_frames, free_points = moving
+    frame_index, point_index = given.frame_index, given.point_index
     num_points = len(free_points)
     count = int(free_frames.sum())
     slots = torch.where(free_frames, free_frames.cumsum(0) - 1, count)
@@ -112,7 +107,7 @@ def build_sparse_layout(
     free = free_frames.nonzero().squeeze(-1)
     if joined is not None:
         joined = slots[joined[free_frames[joined].all(-1)]]
-    cameras = camera_index[free], camera_index[frames], num_cameras
+    cameras = given.camera_index[free], given.camera_index[frames], len(given.params)
     structure = build_structure(slots[frames], points, num_points, *cameras, joined)
     return SparseLayout(
         rows, frames, points, point_order, point_rank, free, free_points[point_order], structure
