@@ -100,3 +100,26 @@ def test_dtype_and_device_come_from_the_inputs(name: str, dtype: torch.dtype, de
             assert tensor.dtype == dtype
     first, exact = (next(x for _, x in leaves(each)) for each in (found, expected))
     torch.testing.assert_close(first.cpu().double(), exact, rtol=0, atol=1e-2)
+
+
+@pytest.mark.parametrize("name", ["solve_pose", "solve_bundle", "solve_pose_graph", "solve_rotations"])
+def test_backward_modes_agree_where_they_should(name: str) -> None:
+    arguments = arguments_of(name)
+    data, gradients = dict(leaves(arguments))[DATA[name]], {}
+    modes: list[Backward] = ["implicit", "unroll", "truncated"]
+    for mode in modes:
+        leaf = data.clone().requires_grad_()
+        options = OPTIONS[name].replace(kernel="cauchy", iterations=30, tolerance=0.0, backward=mode)
+        solution = calls()[name].function(**{**changed(arguments, DATA[name], leaf), "options": options})
+        found = next(x for _, x in leaves(solution) if x.requires_grad)
+        weights = torch.cos(torch.arange(found.numel(), dtype=torch.float64)).view_as(found)
+        (gradients[mode],) = torch.autograd.grad((weights * found).sum(), leaf)
+    unroll, truncated = (
+        float((gradients[mode] - gradients["implicit"]).norm() / gradients["implicit"].norm())
+        for mode in ("unroll", "truncated")
+    )
+    assert unroll < 1e-5
+    assert 1e-4 < truncated < 1
+    leaf = data.clone().requires_grad_()
+    detached = solved(name, changed(arguments, DATA[name], leaf), "detached")
+    assert not any(x.requires_grad for _, x in leaves(detached))

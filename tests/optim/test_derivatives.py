@@ -16,10 +16,8 @@ from tests.optim.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
 from torchslam.optim import (
-    POSE_OPTIONS,
     PosePrior,
     solve_bundle,
-    solve_pose,
 )
 from torchslam.optim.run_graph import solve_graph
 
@@ -216,32 +214,6 @@ def test_second_derivatives_are_the_same_in_every_order(problem):
         torch.testing.assert_close(found, expected, **EXACT)
     with pytest.raises(RuntimeError, match="forward mode within forward mode"):
         jacfwd(jacfwd(loss))(x)
-
-
-def test_vmap_over_every_input_of_a_pose(pose_scene):
-    scene = pose_scene(batch=6, outliers=0.1)
-    scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    mask = torch.rand(3, 2, 40, generator=torch.Generator().manual_seed(1)) < 0.8
-    params = scene.camera.params * torch.tensor([[1.0], [1.01], [1.02]], dtype=torch.float64)
-    inputs = [x.unflatten(0, (3, 2)) for x in (scene.start, scene.points_w, scene.pixels)]
-
-    def refine(start, points, pixels, mask, scale, params):
-        camera = scene.camera.with_params(params)
-        refined = solve_pose(
-            points, pixels, T_cw=start, camera=camera, mask=mask, options=POSE_OPTIONS.replace(scale=scale)
-        )
-        return refined.T_cw, refined.success, refined.cost, refined.convergence.iterations
-
-    arguments = (*inputs, mask, scale, params)
-    together = vmap(refine)(*arguments)
-    alone = [refine(*(x[row] for x in arguments)) for row in range(3)]
-    for found, *expected in zip(together, *alone, strict=True):
-        torch.testing.assert_close(found, torch.stack(expected), **EXACT)
-    last = vmap(refine, in_dims=(1, 1, 1, 1, None, None))(
-        *(x.transpose(0, 1) for x in arguments[:4]), scale[0], params[0]
-    )
-    first = refine(*(x[0] for x in arguments))
-    torch.testing.assert_close(last[0][0], first[0], **EXACT)
 
 
 def test_failures_have_no_derivative_under_any_transform(pose_scene):

@@ -94,17 +94,6 @@ def test_gradients_reach_the_matrices(pose_scene, bundle_scene, generator):
     assert torch.autograd.gradcheck(moved_by, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
-def test_a_batch_of_problems_with_matrices_is_the_same_as_a_loop(bundle_scene, generator):
-    problem = bundle_scene(frames=4, points=20, noise=1.0).problem
-    weights = matrices(generator, 3, len(problem.pixels))
-    together = adjusted(
-        replace(problem, T_cw=problem.T_cw.expand(3, -1, -1, -1), weights=weights), kernel="huber", scale=2.0
-    )
-    for row in range(3):
-        alone = adjusted(replace(problem, weights=weights[row]), kernel="huber", scale=2.0)
-        torch.testing.assert_close(alone.T_cw, together.T_cw[row], atol=1e-9, rtol=0)
-
-
 def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
     scene = pose_scene(batch=2, count=15)
     weights = matrices(generator, 3, 2, 15)

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from torch.func import jacfwd, jacrev, vmap
+from torch.func import jacfwd, jacrev
 
 from tests.optim.conftest import minimized
 from torchslam.geometry import se3_exp, sim3_exp, sim3_scale, transform, umeyama
@@ -173,19 +173,6 @@ def test_every_transform_agrees(problem):
     expected = torch.autograd.functional.jacobian(solve, p)
     torch.testing.assert_close(jacrev(solve)(p), expected, rtol=0, atol=1e-9)
     torch.testing.assert_close(jacfwd(solve)(p), expected, rtol=0, atol=1e-9)
-
-
-def test_vmap_equals_a_batch():
-    x, y = normal(4, 3, 9), normal(4, 3, 9, seed=1)
-
-    def fit(x: Tensor, y: Tensor) -> Tensor:
-        return minimized(line, torch.zeros(3, 2).double(), (x, y), kernel="huber").unknowns[0]
-
-    expected = torch.stack([fit(*row) for row in zip(x, y, strict=True)])
-    torch.testing.assert_close(vmap(fit)(x, y), expected, rtol=1e-10, atol=1e-12)
-    torch.testing.assert_close(
-        vmap(jacrev(fit, argnums=1))(x, y)[2], jacrev(fit, argnums=1)(x[2], y[2]), rtol=1e-9, atol=1e-11
-    )
 
 
 def test_a_batch_equals_a_loop_over_its_elements(pose_scene):

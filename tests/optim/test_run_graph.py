@@ -8,7 +8,7 @@ from safetensors.torch import save_file
 from tests.optim.conftest import solved_graph
 from torchslam.errors import ConvergenceError, TorchslamError
 from torchslam.evaluation import ate
-from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
+from torchslam.geometry import Camera, se3_exp, se3_inverse, transform, umeyama
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.optim import GRAPH_OPTIONS, DepthPrior, FrameFactors
 from torchslam.optim.run_graph import (
@@ -65,13 +65,6 @@ def test_exact_data_gives_the_exact_trajectory():
     solution = solve_graph(graph)
     assert solution.success.all()
     assert aligned_error(solution, truth) < 1e-8
-
-
-def test_noisy_data_improves_on_the_start():
-    truth, graph = simulated()
-    solution = solve_graph(graph)
-    before = se3_log(graph.T_cw @ se3_inverse(truth)).norm()
-    assert aligned_error(solution, truth) < 0.3 * before
 
 
 def test_gradient_of_the_trajectory_error_to_pixels_weights_and_camera():
@@ -163,14 +156,6 @@ def test_frames_say_whether_they_are_at_a_minimum():
 def test_all_frames_may_be_keyframes():
     _, graph = simulated()
     assert solve_graph(replace(graph, is_keyframe=torch.ones(10, dtype=torch.bool))).success.all()
-
-
-def test_saved_and_loaded_graph_gives_the_same_bytes(tmp_path):
-    _, graph = simulated()
-    graph.save(tmp_path / "graph.safetensors")
-    loaded = ObservationGraph.load(tmp_path / "graph.safetensors")
-    assert loaded.camera.size == (640, 480)
-    assert torch.equal(solve_graph(loaded).T_cw, solve_graph(graph).T_cw)
 
 
 def run_graph(graph, start=0):
@@ -328,14 +313,6 @@ def test_joined_run_graphs_keep_their_names():
     assert torch.equal(both.point_ids, torch.cat([2 * torch.arange(50)] * 2))
     assert torch.equal(both.frame_index[len(graph.pixels) :], graph.frame_index + 10)
     assert torch.equal(both.point_index[len(graph.pixels) :], graph.point_index + 50)
-
-
-@pytest.mark.usefixtures("without_shape_checks")
-def test_a_file_of_another_format_is_refused(tmp_path):
-    path = tmp_path / "graph.safetensors"
-    path.write_bytes(b"something else")
-    with pytest.raises(TorchslamError, match=r"graph\.safetensors is not an observation graph"):
-        ObservationGraph.load(path)
 
 
 def measured(graph, std=0.02, factor=1.02):

@@ -126,17 +126,6 @@ def test_a_camera_that_stands_still_is_tied_tightly() -> None:
     assert max(found[6:15]) < 1.2 * max(moving)
 
 
-def test_a_door_that_few_frames_show_ties_less_than_a_wall() -> None:
-    """Far points move in the image by little: what is before and after it may be of different scales."""
-    T_cw, points_w = walk(12, 300)
-    near = stds(seen_by(T_cw, points_w))[5]
-    problem = seen_by(T_cw, points_w)
-    seen = torch.stack([problem.frame_index <= 5, problem.frame_index > 5])
-    ends = [torch.zeros(300, dtype=torch.bool).index_fill(0, problem.point_index[own], True) for own in seen]
-    far = points_w[:, 2] > points_w[:, 2][ends[0] & ends[1]].quantile(0.9)
-    assert stds(only(problem, (~(ends[0] & ends[1]) | far)[problem.point_index]))[5] > 2 * near
-
-
 def bend(problem: BundleProblem, moment: int, factor: float) -> BundleProblem:
     """The second half of a map, frames and the points that only they see, scaled about its first frame."""
     T_wc = se3_inverse(problem.T_cw)

@@ -196,8 +196,10 @@ class ObservationGraph:
 
     def _check(self) -> None:
         """Raises ValueError where a column does not fit the others, or has indices out of range."""
-        check = _run_fits if isinstance(self, RunGraph) else _fits
-        check(self)
+        if isinstance(self, RunGraph):
+            _run_fits(self)
+        else:
+            _fits(self)
         for name in self.columns():
             column, wanted = getattr(self, name), self.camera.params.dtype
             if name in ("T_cw", "points_w", "pixels", "weights") and column.dtype != wanted:

@@ -55,18 +55,6 @@ def one_each(problem: BundleProblem) -> BundleProblem:
     return replace(problem, camera=problem.camera[index], camera_index=torch.arange(len(index)))
 
 
-def test_a_camera_per_frame_is_found(bundle_scene):
-    """Also those of the two frames whose poses are fixed."""
-    problem, params = zoomed(bundle_scene)
-    problem, params = one_each(problem), params[problem.camera_index]
-    off = 1 + torch.linspace(-0.03, 0.03, 8, dtype=torch.float64)[:, None] * torch.tensor([1, 1, 0, 0])
-    problem = replace(problem, camera=problem.camera.with_params(off * params))
-    solution = adjusted(problem, free_camera=True, kernel="none", iterations=60, tolerance=1e-16)
-    assert solution.success
-    torch.testing.assert_close(solution.camera.params, params, atol=1e-4, rtol=1e-6)
-    assert solution.covariance().camera.shape == (32, 32)
-
-
 def test_cameras_tied_by_a_prior_are_as_one(bundle_scene):
     """A camera per frame, held by a strong prior at shared ones; the prior is then its covariance."""
     shared, _ = zoomed(bundle_scene, noise=1.0)

@@ -98,15 +98,6 @@ def test_it_reaches_the_solution_of_solve_bundle(bundle_scene, fixed, weights) -
     assert torch.equal(found.T_cw[list(fixed)], problem.T_cw[list(fixed)])
 
 
-@pytest.mark.parametrize("iterations", [1, 2, 4])
-def test_its_steps_equal_those_of_solve_bundle(bundle_scene, iterations) -> None:
-    """One by one, without a kernel's curvature at first and then with it."""
-    problem = with_outliers(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
-    found, wanted = both(problem, iterations, 1e-14)
-    assert int(wanted.convergence.iterations) == iterations
-    assert_same(found, wanted, atol=1e-9)
-
-
 def test_the_predicted_decrease_equals_that_of_solve_bundle(bundle_scene) -> None:
     """So that both stop together, whatever the tolerance."""
     problem = with_outliers(bundle_scene(frames=6, points=60, perturbation=0.03).problem)
@@ -161,13 +152,6 @@ def test_the_order_of_the_inputs_does_not_matter(bundle_scene) -> None:
     one, other = (solve_bundle_numpy(each, SCALE, 10, 1e-10) for each in (problem, shuffled))
     torch.testing.assert_close(one.T_cw, other.T_cw, rtol=0, atol=1e-10)
     torch.testing.assert_close(one.points_w, other.points_w, rtol=0, atol=1e-9)
-
-
-def test_exact_observations_leave_no_residual(bundle_scene) -> None:
-    scene = bundle_scene(noise=0.0)
-    found = solve_bundle_numpy(scene.problem, SCALE, 20, 1e-8)
-    assert found.cost < 1e-12
-    torch.testing.assert_close(found.T_cw, scene.T_cw, rtol=0, atol=1e-7)
 
 
 @pytest.mark.parametrize(("name", "size"), [("frame_index", 5), ("point_index", 30)])

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Protocol, Self, TypeVar, get_args, runtime_checkable
 
@@ -119,7 +119,7 @@ class Convergence:
     converged: Bool[Tensor, " B"]
     initial_cost: Float[Tensor, " B"]
     cost: Float[Tensor, " B"]
-    limit: int
+    limit: int = field(kw_only=True)
 
     def reasons(self, success: Bool[Tensor, "*batch"]) -> list[SolverReason]:
         """How the search ended for each element of a solution, given which of them are determined."""
@@ -251,7 +251,7 @@ def minimize_batch(
         where, models = zip(*finished, (rows, model), strict=True)
         order = torch.argsort(torch.cat(where))
         model = tree_map(lambda *parts: torch.cat(parts).index_select(0, order), *models)
-    return model, Convergence(steps, converged, initial_cost, model.cost.detach(), iterations)
+    return model, Convergence(steps, converged, initial_cost, model.cost.detach(), limit=iterations)
 
 
 MAX_ITERATIONS = 200
