@@ -167,7 +167,8 @@ def test_splitting_a_large_batch_does_not_change_the_result(bundle_scene, monkey
     monkeypatch.setattr(minimization, "_MAX_CELLS_CPU", 400)
     reported = []
     batch = batch_of(problems)
-    adjusted(batch, progress=lambda now, most: reported.append((now, most)), iterations=20)
+    options = BUNDLE_OPTIONS.replace(iterations=20)
+    solve_bundle(batch, progress=lambda now, most: reported.append((now, most)), options=options)
     given = sanitized(batch, 1.0)
     assert len(minimization._parts(given, select_moving(given))) == 2
     assert reported == sorted(reported)

@@ -354,32 +354,6 @@ def test_a_camera_of_which_nothing_is_free_is_held():
     torch.testing.assert_close(solution.T_cw, solve_graph(replace(given, calibration=None)).T_cw)
 
 
-def test_the_gradient_reaches_the_calibration():
-    """It is that of central differences, and zero for the focal length from which the search starts."""
-    truth, graph = simulated()
-    given = measured(graph)
-
-    def loss(params):
-        calibration = replace(given.calibration, camera=given.camera.with_params(params))
-        return aligned_error(
-            solved_graph(replace(given, calibration=calibration), **CONVERGED),
-            truth,
-        )
-
-    params = given.calibration.camera.params.clone().requires_grad_()
-    loss(params).backward()
-    assert (params.grad[:2] != 0).all()
-    step = torch.zeros_like(params)
-    step[0] = 0.05
-    with torch.no_grad():
-        numeric = (loss(params + step) - loss(params - step)) / 0.1
-    torch.testing.assert_close(params.grad[0], numeric, rtol=1e-5, atol=0)
-    start = given.camera.params.clone().requires_grad_()
-    moved = replace(given, camera=given.camera.with_params(start))
-    aligned_error(solved_graph(moved, **CONVERGED), truth).backward()
-    assert start.grad[:2] @ given.calibration.directions[:2, 0] == pytest.approx(0.0, abs=1e-9)
-
-
 def test_the_main_submap_determines_the_camera_of_all():
     _, (one, two), both = two_submaps()
     given = measured(both)

@@ -238,28 +238,22 @@ class _Model(NamedTuple):
     hessian: Tensor
 
 
-class _Data(NamedTuple):
-    """What the costs are made of, leading with the batch; zero weight where nothing counts."""
-
-    counted: Tensor
-    weights: Tensor
-    scale: Tensor
-    inputs: Tensors
-
-
 @dataclass(frozen=True)
 class _Problem:
-    """The least-squares problems for `minimize_batch`, with their exact Hessians."""
+    """The least-squares problems for `minimize_batch`, with their exact Hessians; zero weight where nothing counts."""
 
     residual: Residual
     product: Product
     kernel: Kernel
-    data: _Data
+    counted: Tensor
+    weights: Tensor
+    scale: Tensor
+    inputs: Tensors
     solvable: Tensor
 
     def part(self, rows: Tensor) -> _Problem:
-        data, solvable = index_tree((self.data, self.solvable), rows)
-        return _Problem(self.residual, self.product, self.kernel, data, solvable)
+        tensors = index_tree((self.counted, self.weights, self.scale, self.inputs, self.solvable), rows)
+        return _Problem(self.residual, self.product, self.kernel, *tensors)
 
     def evaluate(self, unknowns: Tensors, use_curvature: Tensor) -> _Model:
         basis, moved = self.product.basis(unknowns), self._moved(unknowns)
@@ -314,18 +308,18 @@ class _Problem:
 
     def _residuals(self, unknowns: Tensors) -> Tensor:
         """Residuals (B, N, D), zero where nothing counts."""
-        r = self.residual(*unknowns, *self.data.inputs)
+        r = self.residual(*unknowns, *self.inputs)
         r = r[..., None] if r.ndim == 2 else r
-        return torch.where(self.data.counted[..., None], r, 0.0)
+        return torch.where(self.counted[..., None], r, 0.0)
 
     def _weighed(self, residual: Tensor, J: Tensor) -> Linearization:
-        _, weights, scale, _ = self.data
-        rho, slope, curvature = robustify(weights * residual.square().sum(-1), self.kernel, scale[:, None])
+        weights, squared = self.weights, self.weights * residual.square().sum(-1)
+        rho, slope, curvature = robustify(squared, self.kernel, self.scale[:, None])
         return Linearization(residual, J, 0.5 * rho, weights * slope, 2 * weights * weights * curvature)
 
 
 class _Minimization:
-    """`minimize` for `find_minimum`; inputs are the start, `_Data` without its nesting; vectors (B, n)."""
+    """`minimize` for `find_minimum`; inputs are the start, then what `_Problem` has; vectors (B, n)."""
 
     num_vectors = 1
 
@@ -387,6 +381,7 @@ class _Minimization:
     def _problem(self, inputs: Tensors, solvable: Tensor | None = None) -> _Problem:
         counted, weights, scale, *rest = inputs[self.num_unknowns :]
         weights = torch.where(counted, weights, 0.0)
-        data = _Data(counted, weights, scale, tuple(rest))
         solvable = torch.ones_like(scale, dtype=torch.bool) if solvable is None else solvable
-        return _Problem(self.residual, self.product, self.options.kernel, data, solvable)
+        return _Problem(
+            self.residual, self.product, self.options.kernel, counted, weights, scale, tuple(rest), solvable
+        )

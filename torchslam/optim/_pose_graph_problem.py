@@ -35,12 +35,11 @@ from torchslam.optim._core.levenberg_marquardt import minimize_batch, select_mod
 from torchslam.optim._core.linear import (
     BlockStructure,
     Groups,
-    SparseFactor,
     build_block_structure,
     diagonal_floor,
     factorize_sparse,
 )
-from torchslam.optim._core.residuals import flat_along
+from torchslam.optim._core.residuals import ROUNDINGS, flat_along
 from torchslam.optim._core.tangent import pull_back_sim3, push, retract_sim3
 from torchslam.utils.indexing import connected_parts
 
@@ -176,13 +175,6 @@ def build_pose_graph_layout(
     )
 
 
-# A long loop resists bending as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
-_DAMPING_SHARE = 1e-4
-# Bound on the rounding error of an edge, in roundings of the largest coordinate. A start along a tree of
-# edges without a loop is off the minimum by these alone.
-_ROUNDINGS = 16.0
-
-
 class PoseGraphInputs(NamedTuple):
     """All that gradients may flow to: S_cw (B, K, n, n), S_ji (B, E, n, n), information (B, E, D, D), scale."""
 
@@ -237,7 +229,8 @@ class PoseGraphProblem:
     def rounding(self) -> Tensor:
         S_cw, S_ji, information, _ = (part.detach() for part in self.inputs)
         size = torch.cat((S_cw.flatten(1), S_ji.flatten(1)), dim=-1).abs().amax(-1)
-        rounding = _ROUNDINGS * torch.finfo(size.dtype).eps * size
+        # A start along a tree of edges without a loop is off the minimum by these alone.
+        rounding = ROUNDINGS * torch.finfo(size.dtype).eps * size
         return 0.5 * information.diagonal(dim1=-2, dim2=-1).sum((1, 2)) * rounding.square()
 
     def evaluate(self, S_cw: Tensor, use_curvature: Tensor) -> PoseGraphModel:
@@ -251,7 +244,8 @@ class PoseGraphProblem:
         return self._assemble(S_cw, lin, lin.J.mT @ curve @ lin.J, None)
 
     def step(self, model: PoseGraphModel, damping: Tensor) -> tuple[Tensor, Tensor]:
-        damping = _DAMPING_SHARE * damping
+        # A long loop resists bending as a whole by a tiny share of what its edges do; damped as these, it creeps.
+        damping = 1e-4 * damping
         factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
         xi = factor.solve(model.gradient)
         predicted_reduction = 0.5 * (xi * model.gradient).sum((-2, -1))
@@ -260,10 +254,6 @@ class PoseGraphProblem:
         return moved, torch.where(factor.definite, predicted_reduction, torch.inf)
 
     select = staticmethod(select_models)
-
-    def factorized(self, model: PoseGraphModel) -> SparseFactor:
-        """The undamped equations of a model at a minimum, ready to be solved."""
-        return factorize_sparse(self.layout.structure, model.diagonal, model.across)
 
     def exact_model(self, S_cw: Tensor) -> PoseGraphModel:
         """The model with the exact Hessian of the cost in the left perturbations."""
@@ -363,14 +353,16 @@ class PoseGraphMinimization:
         problem = self._problem(inputs)
         model, convergence = minimize_batch(problem, inputs[0], self.iterations, self.tolerance)
         with torch.no_grad():
-            success = problem.solvable & problem.factorized(model).definite
+            factor = factorize_sparse(problem.layout.structure, model.diagonal, model.across)
+        success = problem.solvable & factor.definite
         return model.S_cw, success, problem.layout.moving, *convergence.tensors
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
         S_cw, success, moving, *_ = found
         problem, use = self._problem(inputs), (moving & success[:, None])[..., None]
         with torch.no_grad():
-            factor = problem.factorized(problem.exact_model(S_cw))
+            model = problem.exact_model(S_cw)
+            factor = factorize_sparse(problem.layout.structure, model.diagonal, model.across)
 
         def solve(right: Tensors) -> Tensors:
             return (torch.where(use, factor.solve(torch.where(use, right[0], 0.0)), 0.0),)

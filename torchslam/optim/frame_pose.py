@@ -33,10 +33,6 @@ SCALE = 2.0
 MIN_AGREEING = 0.75
 """Fraction of the matches that must agree in `nearby_pose`: another pose with as many would share at least half."""
 
-_ITERATIONS = 10
-"""Largest number of steps. The tracker starts close. Tried at this value only."""
-_TOLERANCE = 1e-4  # relative to the cost: a smaller reduction moves the pose by hundredths of its noise
-
 
 @dataclass(frozen=True)
 class PoseLinearization:
@@ -127,7 +123,8 @@ class FrameProblem:
         def evaluate(pose: Array) -> _Model:
             return _Model.of(self._linearize(pose), counts, kernel)
 
-        model = minimize_model(_Model.of(start, counts, kernel), evaluate, _ITERATIONS, _TOLERANCE)
+        # A reduction below the share 1e-4 of the cost moves the pose by hundredths of its noise.
+        model = minimize_model(_Model.of(start, counts, kernel), evaluate, iterations=10, tolerance=1e-4)
         success = is_definite(model.normal[:6, :6])
         return FramePose(model.linearization if success else start, success, model)
 

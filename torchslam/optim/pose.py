@@ -67,10 +67,6 @@ class PoseModel(NamedTuple):
     curvature_term: Float[Tensor, "B 6 6"]
 
 
-_MIN_POINTS = 3
-"""Points that determine a pose, by two equations each for six unknowns."""
-
-
 @dataclass(frozen=True)
 class PoseInputs:
     """What a pose problem is made of: finite tensors, rows that do not count having weight zero."""
@@ -98,7 +94,7 @@ class PoseProblem:
         self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
         self.eye = torch.eye(6, dtype=self.points_w.dtype, device=self.points_w.device)
         counted = (self.observations.factors > 0).sum(-1)
-        self.solvable = counted >= (_MIN_POINTS if self.prior is None else 0)
+        self.solvable = counted >= (3 if self.prior is None else 0)  # two equations each for six unknowns
         camera = self.observations.camera
         self._columns_w = self.points_w.mT.contiguous()
         self._is_pinhole = camera.model == "pinhole" and not self.observations.has_matrices

@@ -44,9 +44,6 @@ are alike."""
 ERROR_FACTOR = 1.8
 """By which errors of a readout exceed the scatter of stretches: without it, 45 and 76 % of 29 rendered readouts (the
 tuning half of experiments/decisions) were within one and two stated errors."""
-ITERATIONS, TOLERANCE = 30, 1e-8
-"""Of the projection, and the ratio of the squared gradient at which it ends."""
-RIDGE = 1e-9  # of normalized derivatives, whose squares may be singular for a point seen along its ray
 MIN_INFORMATION = 1.0
 """Of the readout: less is a formal standard error of more than one frame interval, as of a camera at rest."""
 MIN_SHIFT = 0.05
@@ -111,7 +108,8 @@ class _Block:
         inverse = torch.where(norms > 0, 1 / norms.masked_fill(norms == 0, 1.0), 0.0)
         scaled = derivatives * inverse[index][:, None]
         gram = scaled.new_zeros(count, size, size).index_add(0, index, scaled.mT @ scaled)
-        gram = gram + torch.diag_embed(torch.where(norms > 0, RIDGE, 1.0).float())
+        # The squares may be singular for a point seen along its ray.
+        gram = gram + torch.diag_embed(torch.where(norms > 0, 1e-9, 1.0).float())
         factor = torch.linalg.cholesky(gram)
         orthonormal = torch.linalg.solve_triangular(factor[index], scaled.mT, upper=False).mT
         return cls(orthonormal, index, count)
@@ -137,8 +135,8 @@ def project_out(values: Float[Tensor, "O 2 D"], blocks: Sequence[_Block]) -> Flo
 
     gradient = [block.gathered(values) for block in blocks]
     direction, squared = gradient, dot(gradient, gradient)
-    enough = TOLERANCE * squared
-    for _ in range(ITERATIONS):
+    enough = 1e-8 * squared
+    for _ in range(30):
         if bool((squared <= enough).all()):
             break
         change = torch.stack([block.spread(d) for block, d in zip(blocks, direction, strict=True)]).sum(0)

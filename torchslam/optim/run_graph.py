@@ -44,9 +44,6 @@ POSE_ITERATIONS = 30
 
 _FRAMES_AT_ONCE = 64
 """Frames whose poses are refined in one batch, which bounds the memory."""
-_MAX_BYTES = 1 << 34
-"""Largest file that is read."""
-_MAX_SIDE = 1 << 26  # of an image, pixels
 # Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
 _MAX_SIZE_RATIO = 2.0
 _CALIBRATION = "calibration.params", "calibration.directions"
@@ -169,7 +166,7 @@ class ObservationGraph:
         one.
         """
         try:
-            check_regular(path, _MAX_BYTES, "a graph that is read")
+            check_regular(path, 1 << 34, "a graph that is read")
             with safe_open(str(path), framework="pt") as file:
                 metadata, known = file.metadata() or {}, set(file.keys())
                 # From here on `cls` is what the file holds; in the signature, what is asked for.
@@ -225,7 +222,7 @@ class ObservationGraph:
             if not 0 < self.calibration.observation_variance < math.inf:
                 raise ValueError("the calibration's observation variance is not above zero and finite")
         weights = self.weights.diagonal(dim1=1, dim2=2) if self.weights.ndim == 3 else self.weights
-        if min(self.camera.size) < 1 or max(self.camera.size) > _MAX_SIDE or bool((weights < 0).any()):
+        if min(self.camera.size) < 1 or max(self.camera.size) > 1 << 26 or bool((weights < 0).any()):
             raise ValueError("an image of an impossible size, or a negative weight")
 
     @classmethod

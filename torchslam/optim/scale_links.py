@@ -22,9 +22,6 @@ from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptio
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.run_graph import RunGraph, keyframe_problem
 
-RIDGE = 1e-9
-"""Of the information of a point in units of its trace: a point on the ray of all its views has a singular one."""
-
 
 @dataclass(frozen=True)
 class ScaleLinks:
@@ -121,7 +118,8 @@ def _scale_std(
     unit = offsets.norm(dim=-1).median().clamp_min(1e-12)
     offsets = offsets / unit
     eye = torch.eye(3, dtype=offsets.dtype, device=offsets.device)
-    ridge = RIDGE * total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * eye
+    # A point on the ray of all its views has a singular information.
+    ridge = 1e-9 * total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * eye
     # The two sides of a point are two springs in series.
     series = before @ torch.linalg.solve(total + ridge, total - before)
     moves = torch.cat((eye.expand(len(offsets), 3, 3), -skew(offsets), offsets[..., None]), dim=-1)

@@ -34,9 +34,6 @@ from torchslam.optim.model_choice import Gain
 from torchslam.optim.rolling_shutter import MAX_FRAMES, RollingShutter, find_rolling_shutter, readout_by
 from torchslam.optim.run_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem
 
-READOUT_STEPS = 2
-"""Gauss-Newton steps of the readout, each with the keypoints corrected by the one before: the second changes it by a
-thirtieth."""
 MAX_STRETCHES, STRETCH_FRAMES = 10, 3
 """Stretches of a recording, and the least frames of one. By 4 to 20 stretches of seven recordings the errors of the
 focal length are the same within a third."""
@@ -313,7 +310,8 @@ def estimate_sensor(
     """
     readout, shutter = graph.readout, None
     if prior.readout.is_sought or prior.readout.is_given:
-        for _ in range(READOUT_STEPS):
+        # Gauss-Newton steps, each with the keypoints corrected by the one before: the second changes it by a thirtieth.
+        for _ in range(2):
             shutter = find_rolling_shutter(replace(graph, readout=readout), readout_frames, for_shaking)
             # The one in use stays where none is better.
             readout = readout_by(shutter, prior.readout) or readout

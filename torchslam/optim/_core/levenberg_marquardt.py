@@ -30,7 +30,6 @@ DAMPING_DOWN, DAMPING_UP = 0.1, 10.0
 """Factors on the damping after a step that lowers the cost, and after one that does not (Marquardt, 1963)."""
 _DAMPING_RANGE = (1e-10, 1e8)
 """Below, a step is that of Gauss and Newton; above, it is too short to matter, and the element gives up."""
-_NAMED = 10  # rows that an error lists
 CURVATURE_BELOW = 1e-2
 """Predicted relative reduction of the cost below which the kernel's curvature is used."""
 
@@ -125,16 +124,15 @@ class Convergence:
         """How the search ended for each element of a solution, given which of them are determined."""
         shape = success.flatten().shape
         rows = (x.expand(shape).tolist() for x in (success.flatten(), self.converged, self.iterations))
-        return [
-            SolverReason.UNDETERMINED
-            if not determined
-            else SolverReason.CONVERGED
-            if converged
-            else SolverReason.GAVE_UP
-            if steps < self.limit
-            else SolverReason.ITERATION_LIMIT
-            for determined, converged, steps in zip(*rows, strict=True)
-        ]
+
+        def reason(determined: bool, converged: bool, steps: int) -> SolverReason:
+            if not determined:
+                return SolverReason.UNDETERMINED
+            if converged:
+                return SolverReason.CONVERGED
+            return SolverReason.GAVE_UP if steps < self.limit else SolverReason.ITERATION_LIMIT
+
+        return [reason(*row) for row in zip(*rows, strict=True)]
 
     @property
     def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -167,12 +165,10 @@ def check_minimum(success: Bool[Tensor, "*batch"], converged: Bool[Tensor, "*bat
     """Raise ConvergenceError with the rows of the elements, which are named by `what`, that are not at a minimum."""
     undetermined = (~success).flatten().nonzero().flatten().tolist()
     unfinished = (success & ~converged).flatten().nonzero().flatten().tolist()
+    kinds = (undetermined, "not determined"), (unfinished, "not converged: allow more iterations")
     parts = [
-        f"{len(rows)} {problem} ({', '.join(map(str, rows[:_NAMED]))}{', ...' if len(rows) > _NAMED else ''})"
-        for rows, problem in (
-            (undetermined, "not determined"),
-            (unfinished, "not converged: allow more iterations"),
-        )
+        f"{len(rows)} {problem} ({', '.join(map(str, rows[:10]))}{', ...' if len(rows) > 10 else ''})"
+        for rows, problem in kinds
         if rows
     ]
     if parts:
@@ -254,10 +250,6 @@ def minimize_batch(
     return model, Convergence(steps, converged, initial_cost, model.cost.detach(), limit=iterations)
 
 
-MAX_ITERATIONS = 200
-"""With a fifth of outliers a Huber kernel needs up to 50, and short of the minimum the gradient is another one."""
-
-
 @dataclass(frozen=True)
 class SolverOptions:
     """How a solver minimizes.
@@ -278,7 +270,7 @@ class SolverOptions:
 
     kernel: Kernel
     scale: Float[Tensor, "*#scale"] | float
-    iterations: int = MAX_ITERATIONS
+    iterations: int = 200  # a Huber kernel with a fifth of outliers needs up to 50
     tolerance: float = 1e-8
     backward: Backward = "implicit"
     strict: bool = False

@@ -116,8 +116,6 @@ def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0
 
 # Parts this small are dense fronts: less work than the calls for splitting them further.
 _LEAF_NODES = 40
-# A separator leaves at least this share of a part on either side.
-_BALANCE = 0.3
 
 
 @dataclass(frozen=True)
@@ -213,13 +211,13 @@ def _levels(start: int, neighbors: list[list[int]], inside: set[int]) -> list[li
 
 
 def _separator(levels: list[list[int]]) -> tuple[list[int], tuple[list[int], list[int]]]:
-    """The smallest level near the middle, or the middle one, and what lies on either side of it."""
+    """The smallest level that leaves 0.3 of a part on either side, or the middle one, and what lies on either side."""
     total = sum(len(level) for level in levels)
     best, best_size, before = 0, total + 1, 0
     for index, level in enumerate(levels):
         after = total - before - len(level)
         middle = before <= total / 2 and after <= total / 2
-        size = len(level) if min(before, after) >= _BALANCE * total else total if middle else total + 1
+        size = len(level) if min(before, after) >= 0.3 * total else total if middle else total + 1
         if size < best_size:
             best, best_size = index, size
         before += len(level)

@@ -32,8 +32,6 @@ RobustKernel = Literal["cauchy", "huber"]
 MIN_DEPTH = float(np.finfo(np.float64).eps)
 """A point at a smaller depth counts as behind the camera."""
 
-_COST_SLACK = 1 + 1e-13  # an increase of the cost by rounding does not reject a step
-
 X = TypeVar("X", covariant=True)
 
 
@@ -66,7 +64,7 @@ def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tole
         state, predicted_reduction = proposal
         trial = evaluate(state)
         converged = not predicted_reduction > tolerance * model.cost
-        accepted = trial.cost <= _COST_SLACK * model.cost
+        accepted = trial.cost <= (1 + 1e-13) * model.cost  # an increase by rounding does not reject a step
         if accepted:
             use_curvature = predicted_reduction < CURVATURE_BELOW * model.cost
             model = trial

@@ -60,8 +60,8 @@ class ReprojectionData:
         return ReprojectionData(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
-# Bound on the rounding error of a projection, in roundings of a pixel's coordinates.
-_ROUNDINGS = 16.0
+ROUNDINGS = 16.0
+"""Bound on the rounding error of a residual, in roundings of the largest coordinate that enters it."""
 
 
 def rounding_cost(weights: Float[Tensor, "B ..."], params: Float[Tensor, "B C P"]) -> Float[Tensor, " B"]:
@@ -71,7 +71,7 @@ def rounding_cost(weights: Float[Tensor, "B ..."], params: Float[Tensor, "B C P"
     diagonals of inverse covariances, zero where nothing counts.
     """
     pixels = params.detach()[..., :4].abs().amax((1, 2))
-    rounding = _ROUNDINGS * torch.finfo(pixels.dtype).eps * pixels
+    rounding = ROUNDINGS * torch.finfo(pixels.dtype).eps * pixels
     return 0.5 * weights.detach().flatten(1).sum(1) * rounding.square()
 
 

@@ -51,9 +51,6 @@ from torchslam.optim.bundle._problem import (
 )
 from torchslam.optim.bundle._schur import Marginals
 
-# An observation of the sparse equations costs as much as this number of cells of a grid.
-_MAX_CELLS_PER_OBSERVATION = 8
-
 
 class DenseLayout(NamedTuple):
     """The discrete part of the problems; every tensor leads with the batch.
@@ -77,21 +74,14 @@ class DenseLayout(NamedTuple):
     held_points: Bool[Tensor, " B"]
 
 
-class DenseData(NamedTuple):
-    """All that the problems are made of, in the layout's order: pixels (B, K, 2, N) and weights (B, K, N), zero where
-    nothing was seen."""
-
-    layout: DenseLayout
-    given: BundleData
-
-
 def suits_dense(given: BundleData, moving: MovingParts) -> bool:
     """Whether grids are the faster way: no point is seen twice in a frame, and few cells are empty."""
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     cells = moving.frames.numel() * num_points
     if given.weights.ndim > 2 or given.depths.shape[1] or given.measured.shape[1]:
         return False  # the dense equations take scalar weights only, and neither depths nor factors
-    if not 0 < cells <= _MAX_CELLS_PER_OBSERVATION * int(moving.counted.sum()):
+    # An observation of the sparse equations costs as much as 8 cells of a grid.
+    if not 0 < cells <= 8 * int(moving.counted.sum()):
         return False
     places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)
     return int(torch.bincount(places[moving.counted.flatten()], minlength=1).max()) <= 1
@@ -118,12 +108,13 @@ def build_dense_layout(given: BundleData, moving: MovingParts) -> DenseLayout:
     )
 
 
-def dense_data(layout: DenseLayout, given: BundleData) -> DenseData:
-    """The grids, filled."""
+def dense_data(layout: DenseLayout, given: BundleData) -> BundleData:
+    """The problems in the layout's order, with grids of pixels (B, K, 2, N) and weights (B, K, N), zero where nothing
+    was seen."""
     priors = given.prior_T_cw, given.prior_information
     if given.pose_prior is not None:
         priors = take_rows(priors[0], layout.order), take_rows(priors[1], layout.order)
-    given = given._replace(
+    return given._replace(
         T_cw=take_rows(given.T_cw, layout.order),
         pixels=_spread(layout, given.pixels.mT),
         weights=_spread(layout, given.weights[:, None])[:, :, 0],
@@ -131,7 +122,6 @@ def dense_data(layout: DenseLayout, given: BundleData) -> DenseData:
         prior_information=priors[1],
         camera_index=take_rows(given.camera_index, layout.order),
     )
-    return DenseData(layout, given)
 
 
 def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:
@@ -254,32 +244,32 @@ class DenseModel(NamedTuple):
 class DenseBundle:
     """A batch of bundle adjustments for `minimize_batch`, with their covariances and exact solvers.
 
-    Attributes:
-        directions: in which the cameras' parameters move, None where they do not
+    given: as of `dense_data`; directions: in which the cameras' parameters move, None where they do not
     """
 
-    data: DenseData
+    layout: DenseLayout
+    given: BundleData
     camera: Camera
     kernel: Kernel
     directions: Float[Tensor, "P n"] | None
 
     @property
     def solvable(self) -> Tensor:
-        layout, has_prior = self.data.layout, self.data.given.pose_prior is not None
+        layout, has_prior = self.layout, self.given.pose_prior is not None
         observed = (layout.cells < layout.order.shape[1] * layout.free_points.shape[1]).any(1)
         return observed | layout.free.any(1) if has_prior else observed
 
     @property
     def start(self) -> BundleEstimate:
-        given = self.data.given
-        return BundleEstimate(given.T_cw, given.points_w.mT, given.params)
+        return BundleEstimate(self.given.T_cw, self.given.points_w.mT, self.given.params)
 
     def rounding(self) -> Tensor:
-        return rounding_cost(self.data.given.weights, self.data.given.params)
+        return rounding_cost(self.given.weights, self.given.params)
 
     def part(self, rows: Tensor) -> DenseBundle:
         """The problems of some elements of the batch."""
-        return replace(self, data=index_tree(self.data, rows))
+        layout, given = index_tree((self.layout, self.given), rows)
+        return replace(self, layout=layout, given=given)
 
     def evaluate(self, estimate: BundleEstimate, use_curvature: Tensor) -> DenseModel:
         lin = self._linearize(estimate)
@@ -309,7 +299,7 @@ class DenseBundle:
 
     def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
         """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
-        layout, ordered = self.data.layout, self.ordered(estimate)
+        layout, ordered = self.layout, self.ordered(estimate)
         points_c = self._points_c(ordered)
         expansion = exact_expansion(self._observations(ordered), points_c.mT, self.directions is not None)
         if self.directions is not None:
@@ -333,7 +323,7 @@ class DenseBundle:
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (B, K, 6, 6), (B, N, 3, 3), (B, C n, C n) in the order of the problems, zero for what stays."""
-        layout, ordered = self.data.layout, self.ordered(estimate)
+        layout, ordered = self.layout, self.ordered(estimate)
         lin = self._linearize(ordered)
         observed = self._observations(ordered)
         flat = replace(observed, pixels=observed.pixels.flatten(1, 2), weights=observed.weights.flatten(1))
@@ -355,12 +345,12 @@ class DenseBundle:
 
     def ordered(self, estimate: BundleEstimate) -> BundleEstimate:
         """An estimate as the grids have it."""
-        T_cw = take_rows(estimate.T_cw, self.data.layout.order)
+        T_cw = take_rows(estimate.T_cw, self.layout.order)
         return BundleEstimate(T_cw, estimate.points_w.mT, estimate.params)
 
     def in_order(self, estimate: BundleEstimate) -> BundleEstimate:
         """An estimate as the problems have it."""
-        T_cw = take_rows(estimate.T_cw, self.data.layout.rank)
+        T_cw = take_rows(estimate.T_cw, self.layout.rank)
         return BundleEstimate(T_cw, estimate.points_w.mT, estimate.params)
 
     def _points_c(self, estimate: BundleEstimate) -> Tensor:
@@ -369,7 +359,7 @@ class DenseBundle:
         return T_cw[..., :3, :3] @ estimate.points_w[:, None] + T_cw[..., :3, 3:]
 
     def _observations(self, estimate: BundleEstimate) -> ReprojectionData:
-        given, params = self.data.given, estimate.params
+        given, params = self.given, estimate.params
         if params.shape[1] > 1:
             params = take_rows(params, given.camera_index)
         camera, scale = self.camera.with_params(params), given.scale[:, None, None]
@@ -406,7 +396,7 @@ class DenseBundle:
     def _observed(self, estimate: BundleEstimate, expansion: Expansion, exact: bool) -> DenseEquations:
         """The equations of the observations, with the expansion in the points in the camera frames and the n directions
         of the frame's camera: (B, K, 3 + n, N) and (B, K, 3 + n, 3 + n, N)."""
-        free, camera_of = self.data.layout.free, self.data.given.camera_index
+        free, camera_of = self.layout.free, self.given.camera_index
         R_cw, t_cw, num_cameras = (
             estimate.T_cw[..., :3, :3],
             estimate.T_cw[..., :3, 3:],
@@ -448,7 +438,7 @@ class DenseBundle:
         return DenseEquations(gradient, points_gradient, reduced, points, coupling)
 
     def _priors(self, estimate: BundleEstimate, exact: bool = False) -> PriorTerms | None:
-        given, free = self.data.given, self.data.layout.free
+        given, free = self.given, self.layout.free
         if not given.has_priors:
             return None
         leading = free.shape[1]
@@ -461,17 +451,17 @@ class DenseBundle:
 
     def _split(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """The parts of (B, D) that are of the free frames (B, K', 6) and of the cameras."""
-        leading = self.data.layout.free.shape[1]
+        leading = self.layout.free.shape[1]
         return vector[:, : 6 * leading].unflatten(1, (leading, 6)), vector[:, 6 * leading :]
 
     def _factorized(
         self, estimate: BundleEstimate, equations: DenseEquations, damping: Tensor | None = None
     ) -> FactorizedDense:
         """Eliminate the points and factorize what is left, as `NormalEquations.factorized` does."""
-        free, reduced = self.data.layout.free, equations.reduced
+        free, reduced = self.layout.free, equations.reduced
         frames = 6 * free.shape[1]
         more = reduced.shape[-1] - frames
-        root = _inverse_root(equations.points, self.data.layout.free_points, damping)
+        root = _inverse_root(equations.points, self.layout.free_points, damping)
         c0, c1, c2 = equations.coupling.unbind(2)
         q0, q1, q2 = root[:, None].unbind(2)
         rows = (
@@ -497,7 +487,7 @@ class DenseBundle:
 
     def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
         """Gauge directions (B, 6 K', g) along the axes of the world, zero where the gauge is fixed; None if all are."""
-        layout = self.data.layout
+        layout = self.layout
         free, anchors = layout.free, layout.anchors.sum(1)
         is_open = (anchors < 2) & ~layout.held_points & free.any(1)
         if not is_open.any():

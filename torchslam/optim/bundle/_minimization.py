@@ -131,12 +131,12 @@ class BundleMinimization:
 
     def _minimize(self, given: BundleData, moving: MovingParts, part: BatchPart) -> BundleMinimum:
         bundle, moving = self._bundle(given, part), MovingParts(*(mask[part.rows] for mask in moving))
-        iterations, tolerance, progress = self.options.iterations, self.options.tolerance, None
-        if (report := self.progress) is not None:  # as if one element came after the other
-
-            def progress(now: int, most: int) -> None:
-                report(iterations * part.rows.start + now, most * len(given.T_cw))
-
+        iterations, tolerance, report = self.options.iterations, self.options.tolerance, self.progress
+        before, batch = (
+            iterations * part.rows.start,
+            len(given.T_cw),
+        )  # as if one element came after the other
+        progress = None if report is None else lambda now, most: report(before + now, most * batch)
         model, convergence = minimize_batch(bundle, bundle.start, iterations, tolerance, progress)
         with torch.no_grad():
             success = bundle.solvable & given.finite[part.rows]
@@ -281,7 +281,7 @@ class BundleMinimization:
         given, layout, kernel = given.part(part.rows), part.layout, self.options.kernel
         directions = self._directions(given.params)
         if isinstance(layout, DenseLayout):
-            return DenseBundle(dense_data(layout, given), self.camera, kernel, directions)
+            return DenseBundle(layout, dense_data(layout, given), self.camera, kernel, directions)
         return SparseBundle(layout, given.part(0), self.camera, kernel, directions, self.kinds)
 
     def _laid_out(self, given: BundleData) -> tuple[MovingParts, list[BatchPart]]:

@@ -139,10 +139,6 @@ class BundleEstimate(NamedTuple):
 
 _MIN_PARALLAX = 1e-4
 """Radians, 0.05 pixels with a focal length of 500: depth is then as uncertain as it is large, or more so."""
-_MIN_POINTS_PER_FRAME = 3
-"""Points that determine a pose, by two equations each for six unknowns."""
-_MIN_FRAMES_PER_POINT = 2
-"""Views that determine a point, by two equations each for three unknowns."""
 
 
 class MovingParts(NamedTuple):
@@ -157,9 +153,9 @@ def select_moving(given: BundleData, kinds: Sequence[FactorKind] = ()) -> Moving
     """Of what may move, points seen less than twice and frames that see less than three points and have no prior and no
     factor stay, and are not observed."""
     frame_index, point_index, counted = given.frame_index, given.point_index, given.counted
-    seen = _counts(point_index, counted, given.free_points) >= _MIN_FRAMES_PER_POINT
+    seen = _counts(point_index, counted, given.free_points) >= 2
     counted = counted & (seen | ~given.free_points).gather(1, point_index)
-    seeing = _counts(frame_index, counted, given.free_frames) >= _MIN_POINTS_PER_FRAME
+    seeing = _counts(frame_index, counted, given.free_frames) >= 3
     seeing = seeing | _held_frames(given, kinds)
     counted = counted & (seeing | ~given.free_frames).gather(1, frame_index)
     return MovingParts(counted, given.free_frames & seeing, given.free_points & seen)
@@ -186,7 +182,7 @@ def frames_are_determined(
 ) -> Bool[Tensor, " B"]:
     """Whether all frames that move see three points with a depth, or have a prior or a factor."""
     has_depth = (with_parallax | ~moving.points).gather(1, given.point_index)
-    enough = _counts(given.frame_index, moving.counted & has_depth, moving.frames) >= _MIN_POINTS_PER_FRAME
+    enough = _counts(given.frame_index, moving.counted & has_depth, moving.frames) >= 3
     return (enough | _held_frames(given, kinds) | ~moving.frames).all(1)
 
 

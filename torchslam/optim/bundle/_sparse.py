@@ -59,8 +59,6 @@ other, and it converges in a few steps."""
 _INNER_STEPS, _INNER_GAIN = 3, 1e-4
 """Most steps of the points alone after a joint step, and the share of the cost that one must gain to be followed by
 another. Three adjustments of office_loop need 147 joint steps without any, 55 with at most one, 29 with three."""
-_INNER_DAMPING, _INNER_DOWN, _INNER_UP = 1e-4, 0.1, 100.0
-"""Damping of these steps, and its factors after better and worse ones."""
 
 
 @dataclass(frozen=True)
@@ -266,7 +264,7 @@ class SparseBundle:
         """
         if len(self.layout.free_frames) < _INNER_FRAMES or not self.layout.free_points.any():
             return estimate
-        damping = torch.full_like(estimate.points_w[:, 0], _INNER_DAMPING)
+        damping = torch.full_like(estimate.points_w[:, 0], 1e-4)
         now = self._of_points(estimate)
         for _ in range(_INNER_STEPS):
             moved = estimate.points_w - self._point_steps(now[1], now[2], damping)
@@ -278,7 +276,7 @@ class SparseBundle:
             if bool(gain < _INNER_GAIN * now[0].sum()):
                 break
             now = tuple(torch.where(better, one, other) for one, other in zip(found, now, strict=True))
-            damping = torch.where(better, damping * _INNER_DOWN, damping * _INNER_UP)
+            damping = torch.where(better, 0.1 * damping, 100 * damping)
         return estimate
 
     def _of_points(self, estimate: BundleEstimate) -> tuple[Tensor, ...]:
