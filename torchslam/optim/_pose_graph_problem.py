@@ -128,12 +128,10 @@ class PoseGraphLayout:
     """The discrete part of a pose graph: counted edges, moving nodes, and the order of elimination.
 
     Attributes:
-        i, j: (E,) int64 nodes of the edges
         moving: nodes that counted edges join with one that stays
-        linking: edges that, in some element, join two moving nodes; transposed: (L,) bool, whether the block
-            of the pair of nodes is the transpose of the edge's
-        by_pair: the edges of each pair
-        by_node: the edges' ends, first all i, then all j, of each node
+        linking: edges that, in some element, join two moving nodes
+        transposed: whether the block of the pair of nodes is the transpose of the edge's
+        by_pair: the edges of each pair; by_node: the edges' ends, first all i, then all j, of each node
     """
 
     i: Int[Tensor, " E"]
@@ -334,11 +332,8 @@ def linearize_edges(
 
 
 class PoseGraphMinimization:
-    """A pose graph; its inputs are those of `PoseGraphInputs`, edges that count (B, E), fixed nodes (B, K), and
-    the edges (E, 2).
-
-    Found are the nodes (B, K, n, n), `success` (B,), what moved (B, K), and how it went; vectors are (B, K, D).
-    """
+    """A pose graph; its inputs are those of `PoseGraphInputs`, edges that count (B, E), fixed nodes (B, K), and the
+    edges (E, 2). Found are nodes, `success`, what moved (B, K), and how it went; vectors are (B, K, D)."""
 
     num_unknowns = 1
     num_vectors = 1

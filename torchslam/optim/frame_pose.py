@@ -71,12 +71,7 @@ class PoseLinearization:
 
 @dataclass(frozen=True)
 class FramePose:
-    """A pose of minimal robust cost.
-
-    Attributes:
-        linearization: at the pose
-        success: the weighted points determine the pose; otherwise it is the start
-    """
+    """A pose of minimal robust cost, or the start where the weighted points do not determine one."""
 
     linearization: PoseLinearization
     success: bool

@@ -52,13 +52,8 @@ from torchslam.optim._core.tangent import (
 
 
 class PoseModel(NamedTuple):
-    """The local model of the cost at poses, in xi.
-
-    Attributes:
-        hessian: of iteratively reweighted least squares, positive semi-definite, for steps far from the optimum
-        curvature_term: curvature of the kernel near the optimum, never positive: the steps become
-            Newton steps, several times as effective; zero elsewhere
-    """
+    """The local model of the cost at poses, in xi: the Hessian of iteratively reweighted least squares, which is
+    positive semi-definite, and the kernel's curvature near the optimum, never positive, for Newton's steps."""
 
     T_cw: Float[Tensor, "B 4 4"]
     cost: Float[Tensor, " B"]

@@ -160,10 +160,10 @@ class ObservationGraph:
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote. Raises TorchslamError where the file is something else.
+        """Read what `save` wrote: a `RunGraph` where the file has the origin of the rows, and one submap where it has
+        none.
 
-        A file of a run's graph gives a `RunGraph`, with the origin of its rows. One from before there were submaps has
-        one.
+        Raises TorchslamError where the file is something else.
         """
         try:
             check_regular(path, 1 << 34, "a graph that is read")

@@ -28,8 +28,7 @@ class ReprojectionData:
     """Pixels that points were seen at, and how errors are weighed.
 
     Attributes:
-        weights: inverse variances, px^-2, or (..., N, 2, 2) inverse covariances; zero where the
-            observation does not count
+        weights: inverse variances, px^-2, or inverse covariances; zero where the observation does not count
         camera: parameters (P,) or (..., P)
         scale: scalar, or with the batch dimensions and a last one of size 1 or N
     """
@@ -83,8 +82,7 @@ class Linearization(NamedTuple):
         J: d residual / d points_c, followed by d residual / d camera.params where it is free
         cost: contribution to the objective, half of rho
         weight: weights * rho', zero where the point cannot be projected
-        curvature_term: c = 2 * weights^2 * rho''; weight * I + c r r^T is the Hessian of the cost in
-            the residual
+        curvature_term: c = 2 * weights^2 * rho''; weight * I + c r r^T is the Hessian of the cost in the residual
     """
 
     residual: Float[Tensor, "*batch N R"]

@@ -45,8 +45,7 @@ _MAX_CELLS_CPU, _MAX_CELLS_GPU = 1 << 14, 1 << 20
 
 
 class BundleMinimum(NamedTuple):
-    """Estimates, moved frames (B, K) and points (B, N), counted observations (B, O), the moved points that have a depth
-    (B, N), and convergence (B,)."""
+    """Estimates, what moved, counted observations (B, O), the moved points that have a depth, and convergence."""
 
     T_cw: Tensor
     points_w: Tensor

@@ -29,8 +29,7 @@ class CameraScores(NamedTuple):
         scores: the share of an observation in the slope of the cost along the directions of the camera, downhill,
             where frames and points follow the camera to their minimum.
         information: its share in the Gauss-Newton Hessian of that cost.
-        frame_index: rows of the problem's `T_cw`.
-        point_index: rows of its `points_w`.
+        frame_index: rows of the problem's `T_cw`; point_index: of its `points_w`.
         variance: variance of an observation by the residuals, in units of the stated one.
     """
 
