@@ -42,7 +42,7 @@ from torchslam.global_mapping.mapper import (
 )
 from torchslam.global_mapping.rounds import COARSE
 from torchslam.global_mapping.view_graph import Relation, ViewPair
-from torchslam.optim.camera_evidence import CONTRADICTED
+from torchslam.optim.sensor_estimate import CONTRADICTED
 from torchslam.system.front_end import Simulated
 from torchslam.types import State, StepResult
 

@@ -2,15 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
 
 import pytest
 import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, transform
-from torchslam.optim import BundleProblem
+from torchslam.optim import (
+    BUNDLE_OPTIONS,
+    GRAPH_OPTIONS,
+    LEAST_SQUARES_OPTIONS,
+    POSE_GRAPH_OPTIONS,
+    POSE_OPTIONS,
+    BundleProblem,
+    BundleSolution,
+    DepthPrior,
+    FrameFactors,
+    LeastSquaresSolution,
+    PoseGraph,
+    PoseGraphSolution,
+    PosePrior,
+    RefinedPose,
+    solve_bundle,
+    solve_least_squares,
+    solve_pose,
+    solve_pose_graph,
+)
+from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
 
 MODELS = ("pinhole", "radial_tangential", "fisheye")
 
@@ -38,6 +59,71 @@ class PoseScene(NamedTuple):
     points_w: Tensor
     pixels: Tensor
     camera: Camera
+
+    def solved(
+        self,
+        *,
+        weights: Tensor | None = None,
+        mask: Tensor | None = None,
+        prior: PosePrior | None = None,
+        points_w: Tensor | None = None,
+        pixels: Tensor | None = None,
+        start: Tensor | None = None,
+        camera: Camera | None = None,
+        **options: Any,
+    ) -> RefinedPose:
+        """The pose with some inputs and options changed."""
+        return solve_pose(
+            self.points_w if points_w is None else points_w,
+            self.pixels if pixels is None else pixels,
+            T_cw=self.start if start is None else start,
+            camera=self.camera if camera is None else camera,
+            weights=weights,
+            mask=mask,
+            prior=prior,
+            options=POSE_OPTIONS.replace(**options),
+        )
+
+
+def draw(seed: int, *shape: int) -> Tensor:
+    """Standard normal numbers."""
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+
+
+def only(problem: BundleProblem, rows: Tensor) -> BundleProblem:
+    """The problem with some of its observations."""
+    names = ("frame_index", "point_index", "pixels") + ("weights",) * (problem.weights is not None)
+    return replace(problem, **{name: getattr(problem, name)[rows] for name in names})
+
+
+def adjusted(
+    problem: BundleProblem, *, free_camera: bool | Tensor = False, check: bool = True, **options: Any
+) -> BundleSolution:
+    """`solve_bundle` with some options changed."""
+    changed = BUNDLE_OPTIONS.replace(**options)
+    return solve_bundle(problem, free_camera=free_camera, check=check, options=changed)
+
+
+def optimized(graph: PoseGraph, **options: Any) -> PoseGraphSolution:
+    """`solve_pose_graph` with some options changed."""
+    return solve_pose_graph(graph, options=POSE_GRAPH_OPTIONS.replace(**options))
+
+
+def solved_graph(
+    graph: ObservationGraph,
+    *,
+    frame_factors: Sequence[FrameFactors] = (),
+    depth_prior: DepthPrior | None = None,
+    **options: Any,
+) -> GraphSolution:
+    """`solve_graph` with some options changed."""
+    more = {"frame_factors": frame_factors, "depth_prior": depth_prior}
+    return solve_graph(graph, **more, options=GRAPH_OPTIONS.replace(**options))
+
+
+def minimized(residual: Any, start: Any, *given: Any, **options: Any) -> LeastSquaresSolution:
+    """`solve_least_squares` with some options changed."""
+    return solve_least_squares(residual, start, *given, options=LEAST_SQUARES_OPTIONS.replace(**options))
 
 
 @pytest.fixture(params=MODELS)

@@ -11,15 +11,15 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_exp, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.optim import GRAPH_OPTIONS, BundleProblem, solve_bundle
-from torchslam.optim.bundle._camera_scores import camera_scores
-from torchslam.optim.camera_evidence import (
+from torchslam.optim.bundle._scores import camera_scores
+from torchslam.optim.model_choice import LEAST_GAIN, LEAST_UPDATE
+from torchslam.optim.sensor_estimate import (
     STRETCH_FRAMES,
     USUAL_FACTOR,
     USUAL_STRETCHES,
     CameraEvidence,
     camera_evidence,
 )
-from torchslam.optim.model_choice import LEAST_GAIN, LEAST_UPDATE
 
 TRUTH = Camera.radial_tangential(400.0, 404.0, 320.0, 240.0, -0.05, 0.02, 0.0, 0.0, size=(640, 480))
 OPTIONS = GRAPH_OPTIONS.replace(backward="detached", tolerance=1e-12)
@@ -55,6 +55,12 @@ def off_by(factor: float, std: float = 0.02) -> CameraMeasurement:
     params = TRUTH.params.clone()
     params[:2] *= factor
     return CameraMeasurement.of(TRUTH.with_params(params), std)
+
+
+def evidence_of(problem: BundleProblem, given: CameraMeasurement) -> CameraEvidence:
+    evidence = camera_evidence(solved(problem, given), given, OPTIONS)
+    assert evidence is not None
+    return evidence
 
 
 def test_scores_are_the_slope_of_the_cost_where_frames_and_points_follow() -> None:
@@ -102,8 +108,7 @@ def whitened_errors(seeds: range, factor: float, shifted: float = 0.0) -> Tensor
             frames = len(problem.T_cw)
             zoom = (zoom - zoom.mean() + 1)[problem.frame_index * 4 // frames][:, None]
             problem = replace(problem, pixels=center + zoom * (problem.pixels - center))
-        evidence = camera_evidence(solved(problem, given), given, OPTIONS)
-        assert evidence is not None
+        evidence = evidence_of(problem, given)
         estimate = evidence.estimate(3)
         off = torch.linalg.pinv(evidence.given.directions) @ (TRUTH.params - given.camera.params)
         found.append((estimate.step - off) / estimate.covariance.diagonal().sqrt())
@@ -125,21 +130,18 @@ def test_errors_that_stretches_have_in_common_are_stated() -> None:
     off = whitened_errors(range(12), 1.0, shifted=0.01).abs()
     assert float((off[:, 0] < 2).double().mean()) > 0.85
     given = off_by(1.0)
-    plain = camera_evidence(solved(walk(0), given), given, OPTIONS)
+    plain = evidence_of(walk(0), given)
     problem = walk(0)
     zoom = 1 + 0.04 * torch.sin(problem.frame_index / 4)[:, None]
     wavy = replace(problem, pixels=TRUTH.params[2:4] + zoom * (problem.pixels - TRUTH.params[2:4]))
-    wavy = camera_evidence(solved(wavy, given), given, OPTIONS)
-    assert plain is not None
-    assert wavy is not None
+    wavy = evidence_of(wavy, given)
     ratio = wavy.estimate(3).covariance[0, 0] / plain.estimate(3).covariance[0, 0]
     assert float(ratio) > 2 * wavy.variance / plain.variance
 
 
 def test_prior_and_evidence_are_weighed_by_their_errors() -> None:
     given = off_by(1.02)
-    evidence = camera_evidence(solved(walk(3), given), given, OPTIONS)
-    assert evidence is not None
+    evidence = evidence_of(walk(3), given)
     loose, tight = (
         replace(
             evidence,
@@ -210,8 +212,7 @@ def test_the_order_of_the_rows_does_not_matter() -> None:
 
 def test_a_departure_is_from_the_camera_that_is_asked_for() -> None:
     given = off_by(1.02)
-    evidence = camera_evidence(solved(walk(3), given), given, OPTIONS)
-    assert evidence is not None
+    evidence = evidence_of(walk(3), given)
     estimate = evidence.estimate(3)
     assert estimate.departure == estimate.departure_from(given.camera)
     directions = evidence.given.directions
@@ -222,12 +223,6 @@ def test_a_departure_is_from_the_camera_that_is_asked_for() -> None:
     step = alone.step + alone.covariance[0].sqrt()
     moved = given.camera.with_params(given.camera.params + directions[:, :1] @ step)
     assert alone.departure_from(moved) == pytest.approx(1.0, rel=1e-6)
-
-
-def evidence_of(problem: BundleProblem, given: CameraMeasurement) -> CameraEvidence:
-    evidence = camera_evidence(solved(problem, given), given, OPTIONS)
-    assert evidence is not None
-    return evidence
 
 
 def test_a_better_camera_replaces_a_given_one_and_a_right_one_stays() -> None:

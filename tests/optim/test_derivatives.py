@@ -11,18 +11,13 @@ from torch import Tensor
 from torch.autograd import forward_ad
 from torch.func import jacfwd, jacrev, jvp, vmap
 
-from tests.optim.pose_graph.test_pose_graph import make_scene
+from tests.optim.conftest import adjusted, optimized, solved_graph
+from tests.optim.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
 from torchslam.optim import (
-    BUNDLE_OPTIONS,
-    GRAPH_OPTIONS,
-    POSE_GRAPH_OPTIONS,
-    POSE_OPTIONS,
     PosePrior,
     solve_bundle,
-    solve_pose,
-    solve_pose_graph,
 )
 from torchslam.optim.run_graph import solve_graph
 
@@ -44,14 +39,14 @@ def pose_problem(pose_scene, model="pinhole", with_prior=False) -> Problem:
         prior = None
         if with_prior:
             prior = PosePrior(se3_exp(0.01 * x[:6]) @ scene.start, (1 + x[0]).square() * 400 * eye)
-        return solve_pose(
-            points,
-            pixels,
-            T_cw=scene.start,
+        return scene.solved(
+            points_w=points,
+            pixels=pixels,
             camera=camera,
             weights=weights,
             prior=prior,
-            options=POSE_OPTIONS.replace(scale=2 + x[7], **CONVERGED),
+            scale=2 + x[7],
+            **CONVERGED,
         ).T_cw[:, :3]
 
     return poses, torch.linspace(-0.5, 0.5, 8, dtype=torch.float64)
@@ -62,7 +57,7 @@ def bundle_problem(bundle_scene, free_camera=False, **options) -> Problem:
 
     def estimate(x: Tensor) -> Tensor:
         ramp = torch.linspace(-1, 1, len(problem.pixels), dtype=torch.float64)[:, None]
-        solution = solve_bundle(
+        solution = adjusted(
             replace(
                 problem,
                 T_cw=se3_exp(torch.nn.functional.pad(0.01 * x[:1], (0, 5))) @ problem.T_cw,
@@ -71,7 +66,9 @@ def bundle_problem(bundle_scene, free_camera=False, **options) -> Problem:
                 camera=problem.camera.with_params(problem.camera.params * (1 + 0.01 * x[3])),
             ),
             free_camera=free_camera,
-            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=3 + x[4], **CONVERGED),
+            kernel="cauchy",
+            scale=3 + x[4],
+            **CONVERGED,
         )
         parts = solution.T_cw[:, :3], solution.points_w, 1e-3 * solution.camera.params
         return torch.cat([part.flatten() for part in parts])
@@ -90,7 +87,7 @@ def graph_problem() -> Problem:
             weights=graph.weights * (1 + x[2] * ramp[:, 0].square()),
             camera=graph.camera.with_params(graph.camera.params * (1 + 0.01 * x[3])),
         )
-        T_cw = solve_graph(moved, options=GRAPH_OPTIONS.replace(kernel="cauchy", scale=3.0, **CONVERGED)).T_cw
+        T_cw = solved_graph(moved, kernel="cauchy", scale=3.0, **CONVERGED).T_cw
         centers = se3_inverse(T_cw)[:, :3, 3] - se3_inverse(T_cw)[:1, :3, 3]  # of any scale
         return torch.cat((T_cw[:, :3, :3].flatten(), (centers / centers.norm()).flatten()))
 
@@ -110,12 +107,9 @@ def pose_graph_problem(with_scale=True) -> Problem:
             S_ji=sim3_exp(twist) @ graph.S_ji,
             information=graph.information * (1 + x[3].square()),
         )
-        return solve_pose_graph(
-            moved,
-            options=POSE_GRAPH_OPTIONS.replace(
-                kernel="cauchy", scale=3 + x[4], iterations=100, tolerance=1e-26
-            ),
-        ).S_cw[..., :3, :]
+        return optimized(moved, kernel="cauchy", scale=3 + x[4], iterations=100, tolerance=1e-26).S_cw[
+            ..., :3, :
+        ]
 
     return nodes, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
 
@@ -131,12 +125,7 @@ def rotation_graph_problem() -> Problem:
             S_ji=so3_exp(0.1 * x[:3] * ramp) @ graph.S_ji[..., :3, :3],
             information=4e4 * (1 + x[3] * ramp.squeeze(-1)),
         )
-        return solve_pose_graph(
-            moved,
-            options=POSE_GRAPH_OPTIONS.replace(
-                kernel="cauchy", scale=3 + x[4], iterations=100, tolerance=1e-26
-            ),
-        ).S_cw
+        return optimized(moved, kernel="cauchy", scale=3 + x[4], iterations=100, tolerance=1e-26).S_cw
 
     return nodes, torch.linspace(-0.3, 0.4, 5, dtype=torch.float64)
 
@@ -195,23 +184,6 @@ def test_second_order_gradients_by_gradcheck(problem):
     assert torch.autograd.gradgradcheck(function, (x,), eps=1e-4, atol=1e-7, rtol=1e-3, fast_mode=True)
 
 
-def test_a_gradient_penalty_agrees_with_finite_differences(problem):
-    """Of a loss linear in the answer, too, whose gradient once came without a graph."""
-    function, x = problem
-    weights = torch.linspace(-1, 1, function(x).numel(), dtype=torch.float64)
-
-    def squared_gradient(x: Tensor) -> Tensor:
-        leaf = x if x.requires_grad else x.clone().requires_grad_()
-        (gradient,) = torch.autograd.grad((function(leaf).flatten() * weights).sum(), leaf, create_graph=True)
-        return gradient.square().sum()
-
-    leaf = x.clone().requires_grad_()
-    (found,) = torch.autograd.grad(squared_gradient(leaf), leaf)
-    step = 1e-4 * torch.nn.functional.normalize(torch.cos(torch.arange(len(x), dtype=x.dtype)), dim=0)
-    expected = (squared_gradient(x + step) - squared_gradient(x - step)) / 2
-    assert float(found @ step) == pytest.approx(float(expected.detach()), rel=1e-4)
-
-
 def test_forward_and_reverse_mode_agree(problem):
     function, x = mixed(problem[0]), problem[1]
     expected = torch.autograd.functional.jacobian(function, x)
@@ -244,32 +216,6 @@ def test_second_derivatives_are_the_same_in_every_order(problem):
         jacfwd(jacfwd(loss))(x)
 
 
-def test_vmap_over_every_input_of_a_pose(pose_scene):
-    scene = pose_scene(batch=6, outliers=0.1)
-    scale = torch.tensor([1.0, 2.0, 3.0], dtype=torch.float64)
-    mask = torch.rand(3, 2, 40, generator=torch.Generator().manual_seed(1)) < 0.8
-    params = scene.camera.params * torch.tensor([[1.0], [1.01], [1.02]], dtype=torch.float64)
-    inputs = [x.unflatten(0, (3, 2)) for x in (scene.start, scene.points_w, scene.pixels)]
-
-    def refine(start, points, pixels, mask, scale, params):
-        camera = scene.camera.with_params(params)
-        refined = solve_pose(
-            points, pixels, T_cw=start, camera=camera, mask=mask, options=POSE_OPTIONS.replace(scale=scale)
-        )
-        return refined.T_cw, refined.success, refined.cost, refined.convergence.iterations
-
-    arguments = (*inputs, mask, scale, params)
-    together = vmap(refine)(*arguments)
-    alone = [refine(*(x[row] for x in arguments)) for row in range(3)]
-    for found, *expected in zip(together, *alone, strict=True):
-        torch.testing.assert_close(found, torch.stack(expected), **EXACT)
-    last = vmap(refine, in_dims=(1, 1, 1, 1, None, None))(
-        *(x.transpose(0, 1) for x in arguments[:4]), scale[0], params[0]
-    )
-    first = refine(*(x[0] for x in arguments))
-    torch.testing.assert_close(last[0][0], first[0], **EXACT)
-
-
 def test_failures_have_no_derivative_under_any_transform(pose_scene):
     scene = pose_scene(batch=2, count=20)
     start, mask = scene.start.clone(), torch.ones(2, 20, dtype=torch.bool)
@@ -277,7 +223,7 @@ def test_failures_have_no_derivative_under_any_transform(pose_scene):
     mask[1, 2:] = False
 
     def poses(pixels):
-        refined = solve_pose(scene.points_w, pixels, T_cw=start, camera=scene.camera, mask=mask)
+        refined = scene.solved(pixels=pixels, start=start, mask=mask)
         return refined.T_cw, refined.success
 
     T_cw, success = poses(scene.pixels)
@@ -301,30 +247,11 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
     assert success.tolist() == [row != 4 for row in range(len(T_cw))]
 
 
-@pytest.mark.usefixtures("without_shape_checks")
-def test_inconsistent_batch_inputs_are_rejected_by_name(pose_scene, bundle_scene):
-    scene = pose_scene()
-    with pytest.raises(ValueError, match=r"pixels is torch.float32, but points_w is torch.float64"):
-        solve_pose(scene.points_w, scene.pixels.float(), T_cw=scene.start, camera=scene.camera)
-    with pytest.raises(ValueError, match=r"T_cw must be float32 or float64, not torch.bfloat16"):
-        solve_pose(scene.points_w, scene.pixels, T_cw=scene.start.bfloat16(), camera=scene.camera)
-    with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or .*, not \(40,\)"):
-        solve_pose(
-            scene.points_w,
-            scene.pixels,
-            T_cw=scene.start,
-            camera=scene.camera,
-            weights=torch.ones(40).double(),
-        )
+def test_a_camera_follows_the_dtype_of_the_data(bundle_scene):
     problem = bundle_scene().problem
-    single = problem.camera.to(torch.float32)  # a camera follows the dtype of the data
+    single = problem.camera.to(torch.float32)
     found, wanted = (
         solve_bundle(replace(problem, camera=each)) for each in (single, single.to(torch.float64))
     )
     assert torch.equal(found.T_cw, wanted.T_cw)
     assert found.T_cw.dtype is torch.float64
-    with pytest.raises(ValueError, match=r"weights must be \(..., O\) or \(..., O, 2, 2\), not \(3,\)"):
-        solve_bundle(replace(problem, weights=torch.ones(3, dtype=torch.float64)))
-    graph = make_scene().graph
-    with pytest.raises(ValueError, match=r"S_ji is torch.float32"):
-        solve_pose_graph(replace(graph, S_ji=graph.S_ji.float()))

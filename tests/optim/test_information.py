@@ -7,10 +7,11 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.optim.conftest import adjusted, solved_graph
 from tests.optim.test_run_graph import aligned_error, simulated
 from torchslam.errors import TorchslamError
-from torchslam.optim import BUNDLE_OPTIONS, GRAPH_OPTIONS, POSE_OPTIONS, solve_bundle, solve_pose
-from torchslam.optim.run_graph import ObservationGraph, solve_graph
+from torchslam.optim import POSE_OPTIONS, solve_bundle, solve_pose
+from torchslam.optim.run_graph import ObservationGraph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -30,15 +31,7 @@ def test_a_weight_as_a_matrix_equals_the_scalar_weight(pose_scene, bundle_scene,
     scene = pose_scene(outliers=0.1, model=model)
     weights = 0.5 + torch.rand(scene.pixels.shape[:2], generator=generator, dtype=torch.float64)
     one, other = (
-        solve_pose(
-            scene.points_w,
-            scene.pixels,
-            T_cw=scene.start,
-            camera=scene.camera,
-            weights=w,
-            options=POSE_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED),
-        )
-        for w in (weights, isotropic(weights))
+        scene.solved(weights=w, kernel=kernel, scale=2.0, **CONVERGED) for w in (weights, isotropic(weights))
     )
     torch.testing.assert_close(one.T_cw, other.T_cw, atol=1e-9, rtol=0)
     torch.testing.assert_close(one.cost, other.cost)
@@ -46,9 +39,7 @@ def test_a_weight_as_a_matrix_equals_the_scalar_weight(pose_scene, bundle_scene,
     problem = bundle_scene(noise=1.0, model=model).problem
     weights = 0.5 + torch.rand(len(problem.pixels), generator=generator, dtype=torch.float64)
     one, other = (
-        solve_bundle(
-            replace(problem, weights=w), options=BUNDLE_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED)
-        )
+        adjusted(replace(problem, weights=w), kernel=kernel, scale=2.0, **CONVERGED)
         for w in (weights, isotropic(weights))
     )
     torch.testing.assert_close(one.T_cw, other.T_cw, atol=1e-7, rtol=0)
@@ -62,14 +53,7 @@ def test_the_cost_sums_whitened_errors(pose_scene, generator):
     weights = matrices(generator, *scene.pixels.shape[:2])
     weights[:, 5] = 0.0
     weights[:, 6] = torch.tensor([[1.0, 2.0], [2.0, 1.0]])  # not definite
-    refined = solve_pose(
-        scene.points_w,
-        scene.pixels,
-        T_cw=scene.start,
-        camera=scene.camera,
-        weights=weights,
-        options=POSE_OPTIONS.replace(scale=2.0, **CONVERGED),
-    )
+    refined = scene.solved(weights=weights, scale=2.0, **CONVERGED)
     T_cw = refined.T_cw.clone().requires_grad_()
     points_c = scene.points_w @ T_cw[:, :3, :3].mT + T_cw[:, None, :3, 3]
     errors = (scene.camera.project(points_c)[0] - scene.pixels)[..., None]
@@ -97,11 +81,9 @@ def test_gradients_reach_the_matrices(pose_scene, bundle_scene, generator):
     problem = bundle_scene(frames=5, points=15, noise=1.0, perturbation=1e-3).problem
     weights = matrices(generator, len(problem.pixels)).requires_grad_()
 
-    def adjusted(pixels, weights, params):
+    def moved_by(pixels, weights, params):
         moved = replace(problem, pixels=pixels, weights=weights, camera=problem.camera.with_params(params))
-        solution = solve_bundle(
-            moved, options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
-        )
+        solution = adjusted(moved, kernel="cauchy", scale=2.0, **CONVERGED)
         return solution.T_cw[:, :3], solution.points_w
 
     leaves = (
@@ -109,21 +91,7 @@ def test_gradients_reach_the_matrices(pose_scene, bundle_scene, generator):
         weights,
         problem.camera.params.clone().requires_grad_(),
     )
-    assert torch.autograd.gradcheck(adjusted, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
-
-
-def test_a_batch_of_problems_with_matrices_is_the_same_as_a_loop(bundle_scene, generator):
-    problem = bundle_scene(frames=4, points=20, noise=1.0).problem
-    weights = matrices(generator, 3, len(problem.pixels))
-    together = solve_bundle(
-        replace(problem, T_cw=problem.T_cw.expand(3, -1, -1, -1), weights=weights),
-        options=BUNDLE_OPTIONS.replace(kernel="huber", scale=2.0),
-    )
-    for row in range(3):
-        alone = solve_bundle(
-            replace(problem, weights=weights[row]), options=BUNDLE_OPTIONS.replace(kernel="huber", scale=2.0)
-        )
-        torch.testing.assert_close(alone.T_cw, together.T_cw[row], atol=1e-9, rtol=0)
+    assert torch.autograd.gradcheck(moved_by, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
 def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
@@ -131,29 +99,10 @@ def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
     weights = matrices(generator, 3, 2, 15)
 
     def refined(weights):
-        return solve_pose(
-            scene.points_w, scene.pixels, T_cw=scene.start, camera=scene.camera, weights=weights
-        ).T_cw
+        return scene.solved(weights=weights).T_cw
 
     wanted = torch.stack([refined(each) for each in weights])
     torch.testing.assert_close(torch.func.vmap(refined)(weights), wanted, atol=1e-10, rtol=0)
-
-
-@pytest.mark.parametrize("shape", [(2, 39), (2, 40, 2), (2, 40, 3, 3), (40,), (2, 41, 2, 2)])
-@pytest.mark.usefixtures("without_shape_checks")
-def test_wrong_shapes_are_named(pose_scene, bundle_scene, shape):
-    scene = pose_scene()
-    with pytest.raises(ValueError, match=r"weights must be \(B, N\) = \(2, 40\) or \(B, N, 2, 2\).*, not"):
-        solve_pose(
-            scene.points_w,
-            scene.pixels,
-            T_cw=scene.start,
-            camera=scene.camera,
-            weights=torch.ones(shape).double(),
-        )
-    problem = bundle_scene().problem
-    with pytest.raises(ValueError, match=r"weights must be \(..., O\) or \(..., O, 2, 2\), not"):
-        solve_bundle(replace(problem, weights=torch.ones(len(problem.pixels), 3, 3).double()))
 
 
 def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, generator):
@@ -165,10 +114,7 @@ def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, gene
 
     def loss(weights):
         return aligned_error(
-            solve_graph(
-                replace(graph, weights=weights),
-                options=GRAPH_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED),
-            ),
+            solved_graph(replace(graph, weights=weights), kernel="cauchy", scale=2.0, **CONVERGED),
             truth,
         )
 
@@ -191,8 +137,8 @@ def test_a_covariance_is_that_of_the_solution_whatever_moves_in_place_later(pose
         if solver == "pose":
             scene = pose_scene()
             given = scene.points_w.clone(), scene.pixels.clone(), scene.camera.params.clone()
-            solution = solve_pose(
-                given[0], given[1], T_cw=scene.start, camera=scene.camera.with_params(given[2])
+            solution = scene.solved(
+                points_w=given[0], pixels=given[1], camera=scene.camera.with_params(given[2])
             )
         else:
             problem = bundle_scene().problem

@@ -7,10 +7,11 @@ import math
 import pytest
 import torch
 from torch import Tensor
-from torch.func import jacfwd, jacrev, vmap
+from torch.func import jacfwd, jacrev
 
+from tests.optim.conftest import minimized
 from torchslam.geometry import se3_exp, sim3_exp, sim3_scale, transform, umeyama
-from torchslam.optim import LEAST_SQUARES_OPTIONS, POSE_OPTIONS, solve_least_squares, solve_pose
+from torchslam.optim import LEAST_SQUARES_OPTIONS, solve_least_squares
 
 CONVERGED = {"iterations": 60, "tolerance": 0.0}
 
@@ -53,22 +54,10 @@ def test_a_pose_equals_that_of_solve_pose(pose_scene, kernel, model):
         if general:
             inputs = (points, pixels)
             residual = reprojection(scene.camera)
-            solution = solve_least_squares(
-                residual,
-                scene.start,
-                inputs,
-                "se3",
-                options=LEAST_SQUARES_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED),
-            )
+            solution = minimized(residual, scene.start, inputs, "se3", kernel=kernel, scale=2.0, **CONVERGED)
             T_cw = solution.unknowns[0]
         else:
-            solution = solve_pose(
-                points,
-                pixels,
-                T_cw=scene.start,
-                camera=scene.camera,
-                options=POSE_OPTIONS.replace(kernel=kernel, scale=2.0, **CONVERGED),
-            )
+            solution = scene.solved(points_w=points, pixels=pixels, kernel=kernel, scale=2.0, **CONVERGED)
             T_cw = solution.T_cw
         (T_cw[:, :3] * normal(3, 3, 4, seed=5)).sum().backward()
         found.append((T_cw.detach(), solution.cost, points.grad, pixels.grad))
@@ -82,13 +71,7 @@ def test_a_similarity_equals_that_of_umeyama():
     b = transform(S_ba.double(), a) + 0.05 * normal(2, 20, 3, seed=1)
     start = torch.eye(4, dtype=torch.float64).repeat(2, 1, 1)
     start[1, :2, :2] *= -1  # half a turn
-    solution = solve_least_squares(
-        lambda S, a, b: transform(S, a) - b,
-        start,
-        (a, b),
-        "sim3",
-        options=LEAST_SQUARES_OPTIONS.replace(**CONVERGED),
-    )
+    solution = minimized(lambda S, a, b: transform(S, a) - b, start, (a, b), "sim3", **CONVERGED)
     assert solution.success.all()
     for row in range(2):
         s, R, t = umeyama(a[row], b[row])
@@ -132,12 +115,7 @@ def test_flow_from_two_images_and_its_gradient_to_every_pixel():
 
     def flow(first: Tensor, second: Tensor) -> Tensor:
         zero = torch.zeros(2, 2, dtype=torch.float64)
-        return solve_least_squares(
-            residual,
-            zero,
-            (first, second),
-            options=LEAST_SQUARES_OPTIONS.replace(kernel="cauchy", scale=0.1, **CONVERGED),
-        ).unknowns[0]
+        return minimized(residual, zero, (first, second), kernel="cauchy", scale=0.1, **CONVERGED).unknowns[0]
 
     torch.testing.assert_close(flow(first, second), shifts, atol=0.04, rtol=0)
     images = [image.clone().requires_grad_() for image in (first, second)]
@@ -165,16 +143,17 @@ def problem():
     drift, spread = 0.05 * normal(2, 6, 3, seed=3), normal(2, 6, seed=4).square()
 
     def solve(p: Tensor) -> Tensor:
-        solution = solve_least_squares(
+        solution = minimized(
             residual,
             (T, torch.ones(2, 3, dtype=torch.float64)),
             (x + p[0] * drift, y + 0.1 * p[1] * x.square()),
             ("se3", "euclidean"),
             1 + p[2] * spread,
             torch.tensor([[True] * 6, [True] * 5 + [False]]),
-            options=LEAST_SQUARES_OPTIONS.replace(
-                kernel="cauchy", scale=1 + p[3], iterations=25, tolerance=0.0
-            ),
+            kernel="cauchy",
+            scale=1 + p[3],
+            iterations=25,
+            tolerance=0.0,
         )
         T_found, scale_found = solution.unknowns
         return torch.cat((T_found[:, :3].flatten(1), scale_found), dim=1)
@@ -196,21 +175,6 @@ def test_every_transform_agrees(problem):
     torch.testing.assert_close(jacfwd(solve)(p), expected, rtol=0, atol=1e-9)
 
 
-def test_vmap_equals_a_batch():
-    x, y = normal(4, 3, 9), normal(4, 3, 9, seed=1)
-
-    def fit(x: Tensor, y: Tensor) -> Tensor:
-        return solve_least_squares(
-            line, torch.zeros(3, 2).double(), (x, y), options=LEAST_SQUARES_OPTIONS.replace(kernel="huber")
-        ).unknowns[0]
-
-    expected = torch.stack([fit(*row) for row in zip(x, y, strict=True)])
-    torch.testing.assert_close(vmap(fit)(x, y), expected, rtol=1e-10, atol=1e-12)
-    torch.testing.assert_close(
-        vmap(jacrev(fit, argnums=1))(x, y)[2], jacrev(fit, argnums=1)(x[2], y[2]), rtol=1e-9, atol=1e-11
-    )
-
-
 def test_a_batch_equals_a_loop_over_its_elements(pose_scene):
     scene = pose_scene(batch=5, outliers=0.2)
     residual = reprojection(scene.camera)
@@ -230,11 +194,8 @@ def test_backward_modes_agree_where_they_should():
     gradients = {}
     for backward in ("implicit", "unroll", "truncated", "detached"):
         leaf = y.clone().requires_grad_()
-        solution = solve_least_squares(
-            line,
-            torch.zeros(2, 2).double(),
-            (x, leaf),
-            options=LEAST_SQUARES_OPTIONS.replace(kernel="cauchy", backward=backward, **CONVERGED),
+        solution = minimized(
+            line, torch.zeros(2, 2).double(), (x, leaf), kernel="cauchy", backward=backward, **CONVERGED
         )
         (coefficients,) = solution.unknowns
         if backward == "detached":
@@ -266,17 +227,6 @@ def test_a_failure_does_not_affect_the_other_elements(pose_scene):
     assert pixels.grad.isfinite().all()
     assert (pixels.grad[1:] == 0).all()
     assert pixels.grad[0].norm() > 0
-
-
-def test_dtype_and_device(dtype, device):
-    if device.type not in ("cpu", "cuda"):
-        pytest.skip("torch.func's wrappers do not reach a device written in Python")
-    x, y = (normal(2, 9, seed=seed).to(device, dtype) for seed in (0, 1))
-    start = torch.zeros(2, 2, dtype=dtype, device=device)
-    solution = solve_least_squares(line, start, (x, y), options=LEAST_SQUARES_OPTIONS.replace(kernel="huber"))
-    assert solution.success.all()
-    assert solution.unknowns[0].dtype == dtype
-    assert solution.unknowns[0].device.type == device.type
 
 
 @pytest.mark.usefixtures("without_shape_checks")

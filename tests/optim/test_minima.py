@@ -6,13 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.optim.conftest import camera_of
+from tests.optim.conftest import adjusted, camera_of, minimized, optimized
 from torchslam.errors import ConvergenceError
 from torchslam.geometry import se3_exp, se3_inverse, transform
 from torchslam.optim import (
-    BUNDLE_OPTIONS,
-    LEAST_SQUARES_OPTIONS,
-    POSE_GRAPH_OPTIONS,
     POSE_OPTIONS,
     BundleProblem,
     PoseGraph,
@@ -30,12 +27,7 @@ def line_residual(slope: Tensor, x: Tensor, y: Tensor) -> Tensor:
 
 def fit_line(batch: int = 3, **options):
     x = torch.linspace(0, 1, 10, dtype=torch.float64).expand(batch, 10)
-    return solve_least_squares(
-        line_residual,
-        torch.zeros(batch, 1).double(),
-        (x, torch.exp(0.8 * x)),
-        options=LEAST_SQUARES_OPTIONS.replace(**options),
-    )
+    return minimized(line_residual, torch.zeros(batch, 1).double(), (x, torch.exp(0.8 * x)), **options)
 
 
 def square_of_poses(**options) -> PoseGraph:
@@ -51,19 +43,9 @@ def solvers(pose_scene, bundle_scene):
     """Each solver, on a problem that it solves."""
     pose, bundle, graph = pose_scene(), bundle_scene().problem, square_of_poses()
     return {
-        "poses": lambda **options: solve_pose(
-            pose.points_w,
-            pose.pixels,
-            T_cw=pose.start,
-            camera=pose.camera,
-            options=POSE_OPTIONS.replace(**options),
-        ),
-        "bundle adjustments": lambda **options: solve_bundle(
-            bundle, options=BUNDLE_OPTIONS.replace(**options)
-        ),
-        "pose graphs": lambda **options: solve_pose_graph(
-            graph, options=POSE_GRAPH_OPTIONS.replace(**options)
-        ),
+        "poses": lambda **options: pose.solved(**options),
+        "bundle adjustments": lambda **options: adjusted(bundle, **options),
+        "pose graphs": lambda **options: optimized(graph, **options),
         "elements": fit_line,
     }
 
@@ -76,14 +58,19 @@ def test_strict_raises_where_the_search_did_not_end(solvers, what):
     assert not unfinished.converged.any()
     assert finished.converged.all()
     assert finished.converged.shape == finished.success.shape
+    assert finished.reasons == [SolverReason.CONVERGED] * finished.success.numel()
+    assert {*unfinished.reasons} == {SolverReason.ITERATION_LIMIT}
     with pytest.raises(ConvergenceError, match=rf"{what}: .* not converged"):
         solve(iterations=1, strict=True)
 
 
-def test_strict_names_the_elements(pose_scene):
+def test_elements_that_are_not_determined_are_named(pose_scene):
     scene = pose_scene(batch=4)
     mask = torch.ones(4, 40, dtype=torch.bool)
     mask[[1, 3], 2:] = False
+    lost, right = SolverReason.UNDETERMINED, SolverReason.CONVERGED
+    assert scene.solved(mask=mask).reasons == [right, lost, right, lost]
+    assert str(lost).startswith("not determined: too few observations")
     strict = POSE_OPTIONS.replace(strict=True)
     with pytest.raises(ConvergenceError, match=r"of 4 poses: 2 not determined \(1, 3\)$"):
         solve_pose(
@@ -96,7 +83,7 @@ def test_strict_names_the_elements(pose_scene):
 @pytest.mark.parametrize("perturbation", [0.01, 0.04])
 def test_solve_bundle_converges_at_its_defaults_with_a_fifth_of_outliers(bundle_scene, perturbation):
     def distances(problem, **options):
-        solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(**options))
+        solution = adjusted(problem, **options)
         centers = se3_inverse(solution.T_cw)[:, :3, 3]
         lengths = (centers[1:] - centers[:1]).norm(dim=-1)
         return solution, (lengths / lengths.sum()).square().sum()
@@ -152,7 +139,7 @@ def test_a_window_without_parallax_is_no_success(motion, determined, batched):
     problem = BundleProblem(T_cw, points_w, frame_index, point_index, pixels, camera_of())
     if batched:
         problem = replace(problem, T_cw=T_cw.repeat(2, 1, 1, 1))
-    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(iterations=10))
+    solution = adjusted(problem, iterations=10)
     assert (solution.success == determined).all()
     (gradient,) = torch.autograd.grad(solution.points_w.square().sum() + solution.T_cw.sum(), pixels)
     assert (gradient.abs().max() > 0) == determined
@@ -176,24 +163,6 @@ def test_a_point_without_parallax_has_no_gradient_and_leaves_the_others_theirs(b
     assert (through_far == 0).all()
     (gradient,) = torch.autograd.grad(solution.points_w.sum(), pixels)
     assert 0 < gradient.abs().max() < 1
-
-
-@pytest.mark.parametrize("what", ["poses", "bundle adjustments", "pose graphs", "elements"])
-def test_a_solution_says_how_its_search_ended(solvers, what):
-    solve = solvers[what]
-    assert {*solve().reasons} == {SolverReason.CONVERGED}
-    assert {*solve(iterations=1).reasons} == {SolverReason.ITERATION_LIMIT}
-    assert len(solve().reasons) == solve().success.numel()
-
-
-def test_poses_that_are_not_determined_say_so(pose_scene):
-    scene = pose_scene(batch=4)
-    mask = torch.ones(4, 40, dtype=torch.bool)
-    mask[[1, 3], 2:] = False
-    found = solve_pose(scene.points_w, scene.pixels, T_cw=scene.start, camera=scene.camera, mask=mask)
-    lost, right = SolverReason.UNDETERMINED, SolverReason.CONVERGED
-    assert found.reasons == [right, lost, right, lost]
-    assert str(lost).startswith("not determined: too few observations")
 
 
 def test_a_search_that_no_step_helps_has_given_up():

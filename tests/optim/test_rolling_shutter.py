@@ -11,9 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rolling_scene import CAMERA, FRAME_RATE, NOISE_PX, recording
 
+from tests.optim.conftest import solved_graph
 from torchslam.geometry import transform
 from torchslam.geometry.rolling_shutter import Readout
-from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.model_choice import LEAST_GAIN, Gain
 from torchslam.optim.rolling_shutter import (
     RollingShutter,
@@ -22,7 +22,7 @@ from torchslam.optim.rolling_shutter import (
     project_out,
     readout_by,
 )
-from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs, solve_graph
+from torchslam.optim.run_graph import ObservationGraph, concatenate_graphs
 
 
 def estimated(graph: ObservationGraph) -> RollingShutter:
@@ -39,7 +39,7 @@ def numbers(found: RollingShutter) -> dict[str, float]:
 
 def adjusted(graph: ObservationGraph) -> ObservationGraph:
     """As a run leaves it: poses and points have absorbed what they can."""
-    solution = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached"))
+    solution = solved_graph(graph, backward="detached")
     return replace(graph, T_cw=solution.T_cw, points_w=solution.points_w)
 
 
@@ -58,7 +58,7 @@ def test_the_readout_is_found_in_an_adjusted_graph(readout: float) -> None:
 def test_a_known_readout_is_improved(start: float) -> None:
     """The second test starts where the first one ended, with keypoints that are corrected by it."""
     graph = replace(adjusted(recording(0.9)), readout=Readout.known(start / FRAME_RATE, 0.01))
-    solution = solve_graph(graph, options=GRAPH_OPTIONS.replace(backward="detached"))
+    solution = solved_graph(graph, backward="detached")
     found = estimated(replace(graph, T_cw=solution.T_cw, points_w=solution.points_w))
     assert found.readout * FRAME_RATE == pytest.approx(0.9, abs=0.04)
 

@@ -11,6 +11,7 @@ from rolling_scene import CAMERA, FRAME_RATE, recording
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from tests.optim.conftest import solved_graph
 from torchslam.errors import TorchslamError
 from torchslam.evaluation import ate
 from torchslam.geometry.camera_measurement import CameraMeasurement
@@ -74,7 +75,7 @@ def test_gradients_agree_with_solving_again() -> None:
             calibration=replace(calibration, camera=CAMERA.with_params(params)),
             readout=replace(known, seconds=seconds),
         )
-        solution = solve_graph(changed, options=GRAPH_OPTIONS.replace(tolerance=0.0, iterations=12))
+        solution = solved_graph(changed, tolerance=0.0, iterations=12)
         assert bool(solution.success.all())
         return error(solution, truth)
 

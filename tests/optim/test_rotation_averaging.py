@@ -11,15 +11,12 @@ from hypothesis import strategies as st
 from torch import Tensor
 from torch.func import hessian, jacfwd, jacrev, vmap
 
+from tests.optim.conftest import draw
 from torchslam.geometry import matrix_from_quaternion, so3_exp, so3_log
 from torchslam.optim import ROTATION_OPTIONS, UNWEIGHTED_ROTATION_OPTIONS, RotationAverage, solve_rotations
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-26}
 NOISE = math.radians(1.0)
-
-
-def draw(seed: int, *shape: int) -> Tensor:
-    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
 
 
 @dataclass
@@ -368,29 +365,10 @@ def test_a_view_whose_start_is_not_finite_is_left_out() -> None:
     assert errors(solution.R_cw, views.R_cw)[[0, 1, 2, 4, 5, 6, 7]].isfinite().all()
 
 
-def test_dtype_and_device_come_from_the_inputs(dtype: torch.dtype, device: torch.device) -> None:
-    views = make_views(scattered(20, 8), wrong=0.2)
-    solution = solve_rotations(
-        views.edges.to(device), views.R_ji.to(device, dtype), 20, views.weights.to(device, dtype)
-    )
-    for tensor in (solution.R_cw, solution.angles):
-        assert tensor.dtype == dtype
-        assert tensor.device.type == device.type
-    assert solution.success.all()
-    expected = average(views)
-    torch.testing.assert_close(solution.R_cw.cpu().double(), expected.R_cw, rtol=0, atol=1e-4)
-
-
 @pytest.mark.usefixtures("without_shape_checks")
 def test_invalid_input_is_rejected_by_name() -> None:
     views = make_views(chain(4, 2))
     edges, R_ji = views.edges, views.R_ji
-    with pytest.raises(ValueError, match=r"\(E, 2\)"):
-        solve_rotations(edges[:, :1], R_ji, 4)
-    with pytest.raises(ValueError, match=r"\(E, 3, 3\)"):
-        solve_rotations(edges, R_ji[1:], 4)
-    with pytest.raises(ValueError, match="weights"):
-        solve_rotations(edges, R_ji, 4, views.weights[1:])
     with pytest.raises(ValueError, match="start"):
         solve_rotations(edges, R_ji, 4, start=views.R_cw[1:])
     with pytest.raises(ValueError, match=r"0 \.\.\. 2"):
@@ -399,11 +377,5 @@ def test_invalid_input_is_rejected_by_name() -> None:
         solve_rotations(0 * edges, R_ji, 4)
     with pytest.raises(ValueError, match="num_views"):
         solve_rotations(edges[:0], R_ji[:0], 0)
-    with pytest.raises(ValueError, match="float32"):
-        solve_rotations(edges, R_ji, 4, views.weights.float())
     with pytest.raises(ValueError, match="scale"):
         solve_rotations(edges, R_ji, 4, options=UNWEIGHTED_ROTATION_OPTIONS.replace(scale=0.0))
-    with pytest.raises(ValueError, match="'exact'"):
-        solve_rotations(edges, R_ji, 4, options=UNWEIGHTED_ROTATION_OPTIONS.replace(backward="exact"))
-    with pytest.raises(ValueError, match="'l2'"):
-        solve_rotations(edges, R_ji, 4, options=UNWEIGHTED_ROTATION_OPTIONS.replace(kernel="l2"))

@@ -5,9 +5,10 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
+from tests.optim.conftest import solved_graph
 from torchslam.errors import ConvergenceError, TorchslamError
 from torchslam.evaluation import ate
-from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform, umeyama
+from torchslam.geometry import Camera, se3_exp, se3_inverse, transform, umeyama
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.optim import GRAPH_OPTIONS, DepthPrior, FrameFactors
 from torchslam.optim.run_graph import (
@@ -66,22 +67,17 @@ def test_exact_data_gives_the_exact_trajectory():
     assert aligned_error(solution, truth) < 1e-8
 
 
-def test_noisy_data_improves_on_the_start():
-    truth, graph = simulated()
-    solution = solve_graph(graph)
-    before = se3_log(graph.T_cw @ se3_inverse(truth)).norm()
-    assert aligned_error(solution, truth) < 0.3 * before
-
-
 def test_gradient_of_the_trajectory_error_to_pixels_weights_and_camera():
     """Central differences along a random direction of each input, through keyframes and the frames in between."""
     truth, graph = simulated(noise=1.0)
 
     def loss(pixels, weights, params):
         camera = graph.camera.with_params(params)
-        solution = solve_graph(
+        solution = solved_graph(
             replace(graph, pixels=pixels, weights=weights, camera=camera),
-            options=GRAPH_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED),
+            kernel="cauchy",
+            scale=2.0,
+            **CONVERGED,
         )
         return aligned_error(solution, truth)
 
@@ -149,30 +145,17 @@ def test_a_graph_without_observations_is_flagged_as_failed():
 
 def test_frames_say_whether_they_are_at_a_minimum():
     _, graph = simulated()
-    first = solve_graph(graph, options=GRAPH_OPTIONS.replace(iterations=1))
+    first = solved_graph(graph, iterations=1)
     assert not first.converged.any()  # without points there, no frame is where it belongs
     there = replace(graph, T_cw=solve_graph(graph).T_cw, points_w=solve_graph(graph).points_w)
     off = replace(there, T_cw=torch.where(graph.is_keyframe[:, None, None], there.T_cw, graph.T_cw))
-    assert solve_graph(there, options=GRAPH_OPTIONS.replace(iterations=2)).converged.all()
-    assert torch.equal(
-        solve_graph(off, options=GRAPH_OPTIONS.replace(iterations=2)).converged, graph.is_keyframe
-    )
+    assert solved_graph(there, iterations=2).converged.all()
+    assert torch.equal(solved_graph(off, iterations=2).converged, graph.is_keyframe)
 
 
-def test_keyframes_only_and_no_keyframe():
+def test_all_frames_may_be_keyframes():
     _, graph = simulated()
-    everyone = replace(graph, is_keyframe=torch.ones(10, dtype=torch.bool))
-    assert solve_graph(everyone).success.all()
-    with pytest.raises(ValueError, match="no keyframe"):
-        solve_graph(replace(graph, is_keyframe=torch.zeros(10, dtype=torch.bool)))
-
-
-def test_saved_and_loaded_graph_gives_the_same_bytes(tmp_path):
-    _, graph = simulated()
-    graph.save(tmp_path / "graph.safetensors")
-    loaded = ObservationGraph.load(tmp_path / "graph.safetensors")
-    assert loaded.camera.size == (640, 480)
-    assert torch.equal(solve_graph(loaded).T_cw, solve_graph(graph).T_cw)
+    assert solve_graph(replace(graph, is_keyframe=torch.ones(10, dtype=torch.bool))).success.all()
 
 
 def run_graph(graph, start=0):
@@ -275,7 +258,7 @@ def test_gradients_of_all_submaps_reach_pixels_and_the_shared_camera():
     def gradients(graph, loss):
         pixels, params = graph.pixels.clone().requires_grad_(), graph.camera.params.clone().requires_grad_()
         moved = replace(graph, pixels=pixels, camera=graph.camera.with_params(params))
-        loss(solve_graph(moved, options=GRAPH_OPTIONS.replace(**CONVERGED)).T_cw).backward()
+        loss(solved_graph(moved, **CONVERGED).T_cw).backward()
         return pixels.grad, params.grad
 
     pixels, params = gradients(
@@ -290,16 +273,6 @@ def test_gradients_of_all_submaps_reach_pixels_and_the_shared_camera():
     torch.testing.assert_close(params, params_1 + params_2)
     assert (params_1 != 0).all()
     assert (params_2 != 0).all()
-
-
-def test_submaps_that_cannot_be_solved_are_refused():
-    _, _, both = two_submaps()
-    with pytest.raises(ValueError, match="no keyframe"):
-        solve_graph(replace(both, is_keyframe=both.is_keyframe & (both.submap == 1)))
-    shared = both.point_index.clone()
-    shared[both.frame_index == 10] = 0
-    with pytest.raises(ValueError, match="seen in two submaps"):
-        solve_graph(replace(both, point_index=shared))
 
 
 def damaged(graph, name, change):
@@ -318,7 +291,7 @@ def damaged(graph, name, change):
         ),
         ("point_index", torch.zeros_like, "a point is seen in two submaps"),
         ("points_w", torch.Tensor.float, "points_w is of type torch.float32, not torch.float64"),
-        ("T_cw", torch.Tensor.half, "T_cw is of type torch.float16, not torch.float64"),
+        ("T_cw", torch.Tensor.half, "T_cw must be float32 or float64, not torch.float16"),
         ("weights", lambda weights: -weights, "a negative weight"),
     ],
 )
@@ -342,14 +315,6 @@ def test_joined_run_graphs_keep_their_names():
     assert torch.equal(both.point_index[len(graph.pixels) :], graph.point_index + 50)
 
 
-@pytest.mark.usefixtures("without_shape_checks")
-def test_a_file_of_another_format_is_refused(tmp_path):
-    path = tmp_path / "graph.safetensors"
-    path.write_bytes(b"something else")
-    with pytest.raises(TorchslamError, match=r"graph\.safetensors is not an observation graph"):
-        ObservationGraph.load(path)
-
-
 def measured(graph, std=0.02, factor=1.02):
     """The graph with a calibration whose focal length is off by a factor, as where its camera starts."""
     params = graph.camera.params.clone()
@@ -367,14 +332,6 @@ def test_a_calibration_with_an_error_is_corrected_by_the_images():
     assert torch.equal(held.camera.params, given.camera.params)
     assert solution.camera.params[2:4].tolist() == graph.camera.params[2:4].tolist()  # exact, as given
     assert aligned_error(solution, truth) < aligned_error(held, truth)
-
-
-def test_a_certain_calibration_is_kept():
-    _, graph = simulated()
-    solution = solve_graph(measured(graph, std=1e-6))
-    torch.testing.assert_close(
-        solution.camera.params, 1.0 * measured(graph).camera.params, rtol=1e-5, atol=1e-6
-    )
 
 
 def test_a_calibration_counts_as_much_as_observations_vary():
@@ -395,32 +352,6 @@ def test_a_camera_of_which_nothing_is_free_is_held():
     solution = solve_graph(replace(given, calibration=held))
     assert torch.equal(solution.camera.params, given.camera.params)
     torch.testing.assert_close(solution.T_cw, solve_graph(replace(given, calibration=None)).T_cw)
-
-
-def test_the_gradient_reaches_the_calibration():
-    """It is that of central differences, and zero for the focal length from which the search starts."""
-    truth, graph = simulated()
-    given = measured(graph)
-
-    def loss(params):
-        calibration = replace(given.calibration, camera=given.camera.with_params(params))
-        return aligned_error(
-            solve_graph(replace(given, calibration=calibration), options=GRAPH_OPTIONS.replace(**CONVERGED)),
-            truth,
-        )
-
-    params = given.calibration.camera.params.clone().requires_grad_()
-    loss(params).backward()
-    assert (params.grad[:2] != 0).all()
-    step = torch.zeros_like(params)
-    step[0] = 0.05
-    with torch.no_grad():
-        numeric = (loss(params + step) - loss(params - step)) / 0.1
-    torch.testing.assert_close(params.grad[0], numeric, rtol=1e-5, atol=0)
-    start = given.camera.params.clone().requires_grad_()
-    moved = replace(given, camera=given.camera.with_params(start))
-    aligned_error(solve_graph(moved, options=GRAPH_OPTIONS.replace(**CONVERGED)), truth).backward()
-    assert start.grad[:2] @ given.calibration.directions[:2, 0] == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_main_submap_determines_the_camera_of_all():
@@ -456,9 +387,9 @@ def test_graphs_with_calibrations_are_solved_as_alone():
 
 def test_strict_raises_where_a_frame_is_not_at_a_minimum():
     graph = simulated()[1]
-    assert solve_graph(graph, options=GRAPH_OPTIONS.replace(strict=True)).converged.all()
+    assert solved_graph(graph, strict=True).converged.all()
     for solve in (
-        lambda: solve_graph(graph, options=GRAPH_OPTIONS.replace(iterations=1, strict=True)),
+        lambda: solved_graph(graph, iterations=1, strict=True),
         lambda: solve_graphs([graph, graph], options=GRAPH_OPTIONS.replace(iterations=1, strict=True)),
     ):
         with pytest.raises(ConvergenceError, match=r"frames: .* not converged"):
@@ -472,7 +403,7 @@ def test_factors_and_depths_of_a_graph_determine_the_scale_of_every_submap():
         ((graph.submap == submap) & graph.is_keyframe).nonzero().squeeze(-1) for submap in graph.submaps
     ]
     frames = torch.stack((keyframes[0][:-1], keyframes[0][1:]), dim=-1)
-    exact = solve_graph(graph, options=GRAPH_OPTIONS.replace(kernel="none", iterations=200, tolerance=1e-20))
+    exact = solved_graph(graph, kernel="none", iterations=200, tolerance=1e-20)
 
     def centers(solution, rows):
         return se3_inverse(solution.T_cw)[rows, :3, 3]
@@ -484,12 +415,7 @@ def test_factors_and_depths_of_a_graph_determine_the_scale_of_every_submap():
     depths = 1.2 * (seen.sum(-1) + exact.T_cw[graph.frame_index, 2, 3])
     information = torch.where(graph.submap[graph.frame_index] == graph.submaps[1], 1e4, 0.0).double()
     prior = DepthPrior(depths.detach(), information)
-    solution = solve_graph(
-        graph,
-        frame_factors=factors,
-        depth_prior=prior,
-        options=GRAPH_OPTIONS.replace(kernel="none", strict=True),
-    )
+    solution = solved_graph(graph, frame_factors=factors, depth_prior=prior, kernel="none", strict=True)
     for rows in keyframes:
         grown = centers(solution, rows) - centers(solution, rows[:1])
         before = centers(exact, rows) - centers(exact, rows[:1])

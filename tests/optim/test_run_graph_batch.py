@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.optim.conftest import solved_graph
 from tests.optim.test_run_graph import aligned_error, simulated, two_submaps
 from torchslam.geometry import Camera
 from torchslam.optim import GRAPH_OPTIONS, run_graph
@@ -91,9 +92,7 @@ def test_convergence_is_reported_per_graph_and_submap() -> None:
     assert torch.equal(found[1].converged, apart.submap == 4)
     assert found[2].converged.all()
     for each, alone in zip(found, (graph, half, there), strict=True):
-        assert torch.equal(
-            each.converged, solve_graph(alone, options=GRAPH_OPTIONS.replace(iterations=2)).converged
-        )
+        assert torch.equal(each.converged, solved_graph(alone, iterations=2).converged)
 
 
 @pytest.mark.parametrize("kernel", ["huber", "cauchy"])
@@ -111,7 +110,7 @@ def test_gradients_in_a_batch_equal_those_of_single_solves(kernel: str) -> None:
         found = (
             solve_graphs(moved, options=GRAPH_OPTIONS.replace(kernel=kernel))
             if together
-            else [solve_graph(graph, options=GRAPH_OPTIONS.replace(kernel=kernel)) for graph in moved]
+            else [solved_graph(graph, kernel=kernel) for graph in moved]
         )  # type: ignore[arg-type]
         loss = sum(aligned_error(one, truth) for one, truth in zip(found, truths, strict=True))
         return list(torch.autograd.grad(loss, leaves))  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from torch import Tensor
 import torchslam
 from tests.geometry.geometry_scenes import points_and_pixels, two_views
 from tests.optim.conftest import camera_of
-from tests.optim.pose_graph.test_pose_graph import make_scene
+from tests.optim.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam import Features, evaluation, geometry
 from torchslam import optim as solvers

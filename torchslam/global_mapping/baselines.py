@@ -26,8 +26,7 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.robust import median_with_error, robustify
 from torchslam.global_mapping.view_graph import Relation, ViewPair
-from torchslam.optim.pose_graph._problem import Groups
-from torchslam.optim.pose_graph._sparse_cholesky import build_block_structure, factorize_sparse
+from torchslam.optim._core.linear import Groups, build_block_structure, factorize_sparse
 from torchslam.types import FrameFeatures
 
 MIN_PARALLAX_SIGMAS = 5.0

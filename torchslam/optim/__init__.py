@@ -1,8 +1,7 @@
 """Differentiable least squares for poses, maps and pose graphs: robust, batched, with implicit gradients."""
 
 from torchslam.optim._core.implicit import Backward
-from torchslam.optim._core.levenberg_marquardt import Convergence, Progress, SolverReason
-from torchslam.optim._core.options import (
+from torchslam.optim._core.levenberg_marquardt import (
     BUNDLE_OPTIONS,
     GRAPH_OPTIONS,
     LEAST_SQUARES_OPTIONS,
@@ -10,7 +9,10 @@ from torchslam.optim._core.options import (
     POSE_OPTIONS,
     ROTATION_OPTIONS,
     UNWEIGHTED_ROTATION_OPTIONS,
+    Convergence,
+    Progress,
     SolverOptions,
+    SolverReason,
 )
 from torchslam.optim._core.tangent import CameraPrior, PosePrior
 from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, solve_least_squares
@@ -22,12 +24,12 @@ from torchslam.optim.bundle._factors import (
     log_distance_error,
     relative_pose_error,
 )
-from torchslam.optim.bundle._pose_covariance import pose_covariance
 from torchslam.optim.bundle._schur import Marginals
-from torchslam.optim.camera_evidence import CameraEstimate, CameraEvidence, camera_evidence
-from torchslam.optim.pose._refinement import RefinedPose, solve_pose
-from torchslam.optim.pose_graph._api import PoseGraph, PoseGraphSolution, solve_pose_graph
+from torchslam.optim.bundle._scores import pose_covariance
+from torchslam.optim.pose import RefinedPose, solve_pose
+from torchslam.optim.pose_graph import PoseGraph, PoseGraphSolution, solve_pose_graph
 from torchslam.optim.rotation_averaging import RotationAverage, solve_rotations
+from torchslam.optim.sensor_estimate import CameraEstimate, CameraEvidence, camera_evidence
 
 __all__ = [
     "BUNDLE_OPTIONS",

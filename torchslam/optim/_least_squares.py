@@ -17,8 +17,10 @@ from torchslam.geometry.robust import Kernel, kernel_scale, robustify
 from torchslam.optim._core import tangent
 from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
+    LEAST_SQUARES_OPTIONS,
     Convergence,
-    SolverReason,
+    Outcome,
+    SolverOptions,
     check_minimum,
     index_tree,
     minimize_batch,
@@ -26,7 +28,6 @@ from torchslam.optim._core.levenberg_marquardt import (
     where_tree,
 )
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
-from torchslam.optim._core.options import LEAST_SQUARES_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import Linearization, flat_along
 
 Manifold = Literal["euclidean", "se3", "sim3"]
@@ -38,20 +39,12 @@ Manifold = Literal["euclidean", "se3", "sim3"]
 """
 
 
-class _Moves(NamedTuple):
-    """For steps (..., D) of matrices (..., 4, 4): as the functions of `tangent`."""
-
-    dims: int
-    retract: Callable[[Tensor, Tensor], Tensor]
-    push: Callable[[Tensor, Tensor], Tensor]
-    pull_back: Callable[[Tensor, Tensor], Tensor]
-
-
-_MATRICES = {
-    "se3": _Moves(6, tangent.retract, tangent.push, tangent.pull_back),
-    "sim3": _Moves(7, tangent.retract_sim3, tangent.push_sim3, tangent.pull_back_sim3),
+_Move = Callable[[Tensor, Tensor], Tensor]
+_MATRICES: dict[str, tuple[int, _Move, _Move]] = {
+    "se3": (6, tangent.retract, tangent.pull_back),
+    "sim3": (7, tangent.retract_sim3, tangent.pull_back_sim3),
 }
-"""The manifolds of matrices by name, with the dimension of their steps."""
+"""The manifolds of matrices (..., 4, 4) by name: the dimension of steps, their retraction and the pull-back to them."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +70,7 @@ class Product:
     def step_shapes(self) -> list[tuple[int, ...]]:
         """Of a step of each unknown, without the batch."""
         return [
-            (*shape[:-2], _MATRICES[name].dims) if name in _MATRICES else shape
+            (*shape[:-2], _MATRICES[name][0]) if name in _MATRICES else shape
             for name, shape in zip(self.manifolds, self.shapes, strict=True)
         ]
 
@@ -99,23 +92,23 @@ class Product:
     def retract(self, unknowns: Tensors, step: Tensor) -> Tensors:
         """The unknowns moved along a step (B, n)."""
         return tuple(
-            _MATRICES[name].retract(x, part) if name in _MATRICES else x + part
+            _MATRICES[name][1](x, part) if name in _MATRICES else x + part
             for name, x, part in zip(self.manifolds, unknowns, self._parts(step), strict=True)
         )
 
     def push(self, unknowns: Tensors, step: Tensor) -> Tensors:
         """The change of the unknowns, to first order, along a step (B, n)."""
         return tuple(
-            _MATRICES[name].push(x, part) if name in _MATRICES else part
+            tangent.push(x, part) if name in _MATRICES else part
             for name, x, part in zip(self.manifolds, unknowns, self._parts(step), strict=True)
         )
 
     def pull_back(self, unknowns: Tensors, gradient: Tensors) -> Tensor:
         """The gradient (B, n) in the step of a loss with this gradient in the unknowns."""
-        parts = [
-            _MATRICES[name].pull_back(x, part) if name in _MATRICES else part
+        parts = (
+            _MATRICES[name][2](x, part) if name in _MATRICES else part
             for name, x, part in zip(self.manifolds, unknowns, gradient, strict=True)
-        ]
+        )
         return torch.cat([part.flatten(1) for part in parts], dim=1)
 
     def _parts(self, step: Tensor) -> list[Tensor]:
@@ -129,7 +122,7 @@ Residual = Callable[..., Tensor]
 
 
 @dataclass(frozen=True)
-class LeastSquaresSolution:
+class LeastSquaresSolution(Outcome):
     """The minima of a batch.
 
     Attributes:
@@ -144,16 +137,6 @@ class LeastSquaresSolution:
     cost: Float[Tensor, " B"]
     success: Bool[Tensor, " B"]
     convergence: Convergence
-
-    @property
-    def converged(self) -> Bool[Tensor, " B"]:
-        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
-        return self.convergence.converged.view_as(self.success)
-
-    @property
-    def reasons(self) -> list[SolverReason]:
-        """How the search ended, for each element."""
-        return self.convergence.reasons(self.success)
 
 
 @full_precision
@@ -200,23 +183,16 @@ def solve_least_squares(
     names = (manifolds,) * len(unknowns) if isinstance(manifolds, str) else tuple(manifolds)
     product = Product.of(names, unknowns)
     weights, counted, scale = _checked(residual, unknowns, tuple(inputs), weights, mask, options.scale)
-    minimization = _Minimization(
-        residual, product, len(unknowns), options.kernel, options.iterations, options.tolerance
-    )
     tensors = (*unknowns, counted, weights, scale, *inputs)
-    minimization.ndims = minimization.dimensions(tensors)
+    minimization = _Minimization(residual, product, options, tensors)
     found = find_minimum(minimization, tensors, options.backward)
-    solution, (success, cost, steps, converged, initial_cost) = (
-        found[: len(unknowns)],
-        found[len(unknowns) :],
-    )
+    solution, (success, *how) = found[: len(unknowns)], found[len(unknowns) :]
+    convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
-        check_minimum(success, converged, "elements")
+        check_minimum(success, convergence.converged, "elements")
     if options.backward == "truncated":
         solution = minimization.last_step(solution, tensors, success)
-    return LeastSquaresSolution(
-        solution, cost, success, Convergence(steps, converged, initial_cost, cost, options.iterations)
-    )
+    return LeastSquaresSolution(solution, convergence.cost, success, convergence)
 
 
 def _checked(
@@ -232,18 +208,15 @@ def _checked(
     for number, tensor in enumerate((*unknowns, *inputs)):
         name = f"unknown {number}" if number < len(unknowns) else f"input {number - len(unknowns)}"
         if tensor.ndim == 0 or len(tensor) != batch:
-            raise ValueError(
-                f"{name} must lead with the batch of {batch}, not have shape {tuple(tensor.shape)}"
-            )
+            shape = tuple(tensor.shape)
+            raise ValueError(f"{name} must lead with the batch of {batch}, not have shape {shape}")
     with torch.enable_grad():
         value = residual(*(tensor.detach() for tensor in (*unknowns, *inputs)))
     if value.requires_grad:
         raise ValueError("the residual depends on a tensor with gradient that is not among its inputs")
+    rows, shape = value.shape[:2], tuple(value.shape)
     if value.ndim not in (2, 3) or len(value) != batch:
-        raise ValueError(
-            f"the residual must be (B, N) or (B, N, D) with B = {batch}, not {tuple(value.shape)}"
-        )
-    rows = value.shape[:2]
+        raise ValueError(f"the residual must be (B, N) or (B, N, D) with B = {batch}, not {shape}")
     weights = value.new_ones(rows) if weights is None else weights
     counted = torch.ones(rows, dtype=torch.bool, device=value.device) if mask is None else mask
     for name, tensor in (("weights", weights), ("mask", counted)):
@@ -265,41 +238,36 @@ class _Model(NamedTuple):
     hessian: Tensor
 
 
-class _Data(NamedTuple):
-    """What the costs are made of, leading with the batch; zero weight where nothing counts."""
-
-    counted: Tensor
-    weights: Tensor
-    scale: Tensor
-    inputs: Tensors
-
-
 @dataclass(frozen=True)
 class _Problem:
-    """The least-squares problems for `minimize_batch`, with their exact Hessians."""
+    """The least-squares problems for `minimize_batch`, with their exact Hessians; zero weight where nothing counts."""
 
     residual: Residual
     product: Product
     kernel: Kernel
-    data: _Data
+    counted: Tensor
+    weights: Tensor
+    scale: Tensor
+    inputs: Tensors
     solvable: Tensor
 
     def part(self, rows: Tensor) -> _Problem:
-        data, solvable = index_tree((self.data, self.solvable), rows)
-        return _Problem(self.residual, self.product, self.kernel, data, solvable)
+        tensors = index_tree((self.counted, self.weights, self.scale, self.inputs, self.solvable), rows)
+        return _Problem(self.residual, self.product, self.kernel, *tensors)
 
     def evaluate(self, unknowns: Tensors, use_curvature: Tensor) -> _Model:
-        basis = self.product.basis(unknowns)
-
-        def moved(step: Tensor) -> Tensor:
-            return self._residuals(self.product.retract(unknowns, step))
-
+        basis, moved = self.product.basis(unknowns), self._moved(unknowns)
         zero = torch.zeros_like(basis[0])
         r = moved(zero)
         J = vmap(lambda step: jvp(moved, (zero,), (step,))[1], out_dims=-1)(basis)
         lin = self._weighed(r, J)
+        # As in `gauss_newton_expansion`.
+        residual, squared = lin.residual, lin.residual.square().sum(-1)
+        curvature_term = flat_along(lin.weight, lin.curvature_term, squared, use_curvature[:, None])
+        along = (residual[..., None, :] @ lin.J) * (curvature_term[..., None] * residual)[..., None]
+        pulled = lin.weight[..., None, None] * lin.J + along
         J = lin.J.flatten(1, 2)
-        hessian = J.mT @ _pull(lin, use_curvature[:, None]).flatten(1, 2)
+        hessian = J.mT @ pulled.flatten(1, 2)
         gradient = (J.mT @ lin.gradient_wrt_residual.flatten(1)[..., None]).squeeze(-1)
         return _Model(unknowns, lin.cost.sum(1), gradient, hessian)
 
@@ -312,8 +280,7 @@ class _Problem:
         predicted_reduction = torch.where(factor.definite, predicted_reduction, torch.inf)
         return self.product.retract(model.unknowns, -step), predicted_reduction
 
-    def select(self, accept: Tensor, new: _Model, old: _Model) -> _Model:
-        return select_models(accept, new, old)
+    select = staticmethod(select_models)
 
     def cost(self, unknowns: Tensors) -> Tensor:
         """The costs (B,)."""
@@ -322,11 +289,7 @@ class _Problem:
 
     def slope(self, unknowns: Tensors, direction: Tensor) -> Tensor:
         """The derivatives (B,) of the costs along directions (B, n)."""
-
-        def moved(step: Tensor) -> Tensor:
-            return self._residuals(self.product.retract(unknowns, step))
-
-        r, velocity = jvp(moved, (torch.zeros_like(direction),), (direction,))[:2]
+        r, velocity = jvp(self._moved(unknowns), (torch.zeros_like(direction),), (direction,))[:2]
         return (self._weighed(r, velocity[..., None]).gradient_wrt_residual * velocity).sum((1, 2))
 
     def exact_factor(self, unknowns: Tensors) -> DefiniteFactor:
@@ -339,59 +302,45 @@ class _Problem:
         zero = torch.zeros_like(basis[0])
         return factorize(vmap(lambda step: jvp(gradient, (zero,), (step,))[1], out_dims=-1)(basis))
 
+    def _moved(self, unknowns: Tensors) -> Callable[[Tensor], Tensor]:
+        """The residuals as a function of a step (B, n)."""
+        return lambda step: self._residuals(self.product.retract(unknowns, step))
+
     def _residuals(self, unknowns: Tensors) -> Tensor:
         """Residuals (B, N, D), zero where nothing counts."""
-        r = self.residual(*unknowns, *self.data.inputs)
+        r = self.residual(*unknowns, *self.inputs)
         r = r[..., None] if r.ndim == 2 else r
-        return torch.where(self.data.counted[..., None], r, 0.0)
+        return torch.where(self.counted[..., None], r, 0.0)
 
     def _weighed(self, residual: Tensor, J: Tensor) -> Linearization:
-        _, weights, scale, _ = self.data
-        rho, slope, curvature = robustify(weights * residual.square().sum(-1), self.kernel, scale[:, None])
+        weights, squared = self.weights, self.weights * residual.square().sum(-1)
+        rho, slope, curvature = robustify(squared, self.kernel, self.scale[:, None])
         return Linearization(residual, J, 0.5 * rho, weights * slope, 2 * weights * weights * curvature)
 
 
-def _pull(lin: Linearization, use_curvature: Tensor) -> Tensor:
-    """The Hessians of the costs in the residuals times J, (B, N, D, n); see `gauss_newton_expansion`."""
-    residual, weight = lin.residual, lin.weight
-    curvature_term = flat_along(weight, lin.curvature_term, residual.square().sum(-1), use_curvature)
-    along = (residual[..., None, :] @ lin.J) * (curvature_term[..., None] * residual)[..., None]
-    return weight[..., None, None] * lin.J + along
-
-
 class _Minimization:
-    """`minimize` for `find_minimum`; inputs are the start, `_Data` without its nesting; vectors (B, n)."""
+    """`minimize` for `find_minimum`; inputs are the start, then what `_Problem` has; vectors (B, n)."""
 
     num_vectors = 1
 
     def __init__(
-        self,
-        residual: Residual,
-        product: Product,
-        num_unknowns: int,
-        kernel: Kernel,
-        iterations: int,
-        tolerance: float,
+        self, residual: Residual, product: Product, options: SolverOptions, tensors: Tensors
     ) -> None:
-        self.residual, self.product, self.num_unknowns = residual, product, num_unknowns
-        self.kernel, self.iterations, self.tolerance = kernel, iterations, tolerance
-        self.ndims: tuple[Ndims, Ndims, Ndims] | None = None
-
-    def dimensions(self, tensors: Tensors) -> tuple[Ndims, Ndims, Ndims]:
-        """Numbers of dimensions of vectors, results and inputs, without the batch."""
+        self.residual, self.product, self.options = residual, product, options
+        self.num_unknowns = len(product.shapes)
         inputs = tuple(tensor.ndim - 1 for tensor in tensors)
-        return (1,), (*inputs[: self.num_unknowns], 0, 0, 0, 0, 0), inputs
+        self.ndims: tuple[Ndims, Ndims, Ndims] = (1,), (*inputs[: self.num_unknowns], 0, 0, 0, 0, 0), inputs
 
     def minimize(self, inputs: Tensors) -> Tensors:
         start, finite = self.product.sanitized(inputs[: self.num_unknowns])
         with torch.no_grad():
             finite = finite & torch.isfinite(self._problem(inputs).cost(start))
         problem = self._problem(inputs, finite)
-        model, convergence = minimize_batch(problem, start, self.iterations, self.tolerance)
+        iterations, tolerance = self.options.iterations, self.options.tolerance
+        model, convergence = minimize_batch(problem, start, iterations, tolerance)
         with torch.no_grad():
             success = finite & factorize(torch.where(finite[:, None, None], model.hessian, 0.0)).definite
-        how = convergence.iterations, convergence.converged, convergence.initial_cost
-        return *model.unknowns, success, convergence.cost, *how
+        return *model.unknowns, success, *convergence.tensors
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
         unknowns, success = found[: self.num_unknowns], found[self.num_unknowns]
@@ -432,6 +381,7 @@ class _Minimization:
     def _problem(self, inputs: Tensors, solvable: Tensor | None = None) -> _Problem:
         counted, weights, scale, *rest = inputs[self.num_unknowns :]
         weights = torch.where(counted, weights, 0.0)
-        data = _Data(counted, weights, scale, tuple(rest))
         solvable = torch.ones_like(scale, dtype=torch.bool) if solvable is None else solvable
-        return _Problem(self.residual, self.product, self.kernel, data, solvable)
+        return _Problem(
+            self.residual, self.product, self.options.kernel, counted, weights, scale, tuple(rest), solvable
+        )

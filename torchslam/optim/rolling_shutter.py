@@ -29,7 +29,7 @@ from torchslam.geometry.lie import skew
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import robustify
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities
-from torchslam.optim._core.options import GRAPH_OPTIONS
+from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS
 from torchslam.optim.model_choice import Gain
 from torchslam.optim.run_graph import ObservationGraph
 
@@ -44,9 +44,6 @@ are alike."""
 ERROR_FACTOR = 1.8
 """By which errors of a readout exceed the scatter of stretches: without it, 45 and 76 % of 29 rendered readouts (the
 tuning half of experiments/decisions) were within one and two stated errors."""
-ITERATIONS, TOLERANCE = 30, 1e-8
-"""Of the projection, and the ratio of the squared gradient at which it ends."""
-RIDGE = 1e-9  # of normalized derivatives, whose squares may be singular for a point seen along its ray
 MIN_INFORMATION = 1.0
 """Of the readout: less is a formal standard error of more than one frame interval, as of a camera at rest."""
 MIN_SHIFT = 0.05
@@ -61,7 +58,7 @@ or less on real sequences, 0.16 or more where the rows of their images are shift
 
 @dataclass(frozen=True)
 class RollingShutter:
-    """What the residuals of a run say about the exposure of the rows.
+    """The exposure of the rows by the residuals of a run.
 
     Attributes:
         readout: Time from the first to the last row, seconds; negative from the last to the first.
@@ -96,13 +93,7 @@ class RollingShutter:
 
 @dataclass(frozen=True)
 class _Block:
-    """Derivatives of whitened residuals (O, 2, n), orthonormal for each of the variables that rows belong to.
-
-    Attributes:
-        derivatives: of an observation.
-        index: its variable.
-        count: number of variables.
-    """
+    """Derivatives of whitened residuals, orthonormal for each of the `count` variables that observations belong to."""
 
     derivatives: Float[Tensor, "O 2 n"]
     index: Int[Tensor, " O"]
@@ -117,7 +108,8 @@ class _Block:
         inverse = torch.where(norms > 0, 1 / norms.masked_fill(norms == 0, 1.0), 0.0)
         scaled = derivatives * inverse[index][:, None]
         gram = scaled.new_zeros(count, size, size).index_add(0, index, scaled.mT @ scaled)
-        gram = gram + torch.diag_embed(torch.where(norms > 0, RIDGE, 1.0).float())
+        # The squares may be singular for a point seen along its ray.
+        gram = gram + torch.diag_embed(torch.where(norms > 0, 1e-9, 1.0).float())
         factor = torch.linalg.cholesky(gram)
         orthonormal = torch.linalg.solve_triangular(factor[index], scaled.mT, upper=False).mT
         return cls(orthonormal, index, count)
@@ -143,8 +135,8 @@ def project_out(values: Float[Tensor, "O 2 D"], blocks: Sequence[_Block]) -> Flo
 
     gradient = [block.gathered(values) for block in blocks]
     direction, squared = gradient, dot(gradient, gradient)
-    enough = TOLERANCE * squared
-    for _ in range(ITERATIONS):
+    enough = 1e-8 * squared
+    for _ in range(30):
         if bool((squared <= enough).all()):
             break
         change = torch.stack([block.spread(d) for block, d in zip(blocks, direction, strict=True)]).sum(0)
@@ -186,11 +178,12 @@ def find_rolling_shutter(
     frames = frames[torch.arange(count, device=frames.device) * len(frames) // count]
     rank = torch.full_like(graph.submap, -1)
     rank[frames] = torch.arange(count, device=rank.device)
-    rows = _shared_rows(graph, rank)
-    frame, (points, point) = (
-        rank[graph.frame_index[rows]],
-        torch.unique(graph.point_index[rows], return_inverse=True),
-    )
+    # Of points that two of these frames see.
+    rows = (rank[graph.frame_index] >= 0).nonzero()[:, 0]
+    seen = torch.bincount(graph.point_index[rows], minlength=len(graph.points_w))
+    rows = rows[seen[graph.point_index[rows]] > 1]
+    frame = rank[graph.frame_index[rows]]
+    points, point = torch.unique(graph.point_index[rows], return_inverse=True)
     T_cw = graph.T_cw[graph.frame_index[rows]]
     points_c = transform(T_cw, graph.points_w[graph.point_index[rows]][:, None])[:, 0]
     pixels, valid, J_points, J_camera = graph.camera.project_with_jacobians(points_c)
@@ -215,7 +208,9 @@ def find_rolling_shutter(
     left = left - readout * shift
     ratios = [] if for_shaking else [math.nan, math.nan]
     for place in (row, column) if for_shaking else ():
-        bends = [bend * J_poses[..., 3:5] for bend in _curves(place)]
+        # Legendre polynomials of the second and third degree on -1/2 ... 1/2, without that of the first: up to a
+        # rotation, a shift along x that grows with the row is a shift along y that grows with the column.
+        bends = [bend * J_poses[..., 3:5] for bend in (6 * place**2 - 0.5, 20 * place**3 - 3 * place)]
         bent = _Block.of(torch.cat((J_poses, *bends), dim=-1), frame, count)
         remaining = project_out(left, [bent, *others]).square().sum() / left.square().sum()
         ratios.append(1.0 - float(remaining))
@@ -235,13 +230,6 @@ def readout_by(found: RollingShutter | None, known: Readout) -> Readout | None:
     return known if known.is_given else None
 
 
-def _shared_rows(graph: ObservationGraph, rank: Int[Tensor, " K"]) -> Int[Tensor, " R"]:
-    """The observations by frames that have a rank, of points that two of these frames see."""
-    rows = (rank[graph.frame_index] >= 0).nonzero()[:, 0]
-    seen = torch.bincount(graph.point_index[rows], minlength=len(graph.points_w))
-    return rows[seen[graph.point_index[rows]] > 1]
-
-
 def _robust_whitening(
     weights: Float[Tensor, "R *information"], errors: Float[Tensor, "R 2"], valid: Bool[Tensor, " R"]
 ) -> Float[Tensor, "R 2 2"]:
@@ -255,15 +243,6 @@ def _robust_whitening(
     return W * torch.where(valid, factors, 0.0)[:, None, None]
 
 
-def _curves(place: Float[Tensor, "*batch"]) -> list[Float[Tensor, "*batch"]]:
-    """Legendre polynomials of the second and third degree on -1/2 ... 1/2.
-
-    That of the first degree is left out: up to a rotation, a shift along x that grows with the row is a shift along y
-    that grows with the column.
-    """
-    return [6 * place**2 - 0.5, 20 * place**3 - 3 * place]
-
-
 def _regress(
     left: Float[Tensor, "O 2"],
     shift: Float[Tensor, "O 2"],
@@ -274,14 +253,8 @@ def _regress(
     """The coefficient of residuals on shifts, its standard error, and the gain over no readout.
 
     Errors count as independent between frames, which are in order of time, or between stretches of the run, whichever
-    gives the larger standard error, times `ERROR_FACTOR`.
-
-    Args:
-        left: residuals, corrected by `start` times the shifts.
-        shift: by a readout of one.
-        frame: of each observation.
-        frames: number of frames.
-        start: the coefficient by which residuals are corrected already.
+    gives the larger standard error, times `ERROR_FACTOR`. The residuals are corrected already by `start` times the
+    shifts, which are those by a readout of one.
     """
     information = shift.square().sum()
     if not bool(information > MIN_INFORMATION):
@@ -289,17 +262,16 @@ def _regress(
     readout = (shift * left).sum() / information
     scores = (shift * (left - readout * shift)).sum(-1)
     parts = max(2, min(PARTS, frames // PART_FRAMES))
+
+    def sums(values: Tensor, groups: int) -> Tensor:
+        return values.new_zeros(groups).index_add(0, frame * groups // frames, values)
+
     stds = [
-        scores.new_zeros(groups).index_add(0, frame * groups // frames, scores).norm()
-        * math.sqrt(groups / (groups - 1))
-        / information
+        sums(scores, groups).norm() * math.sqrt(groups / (groups - 1)) / information
         for groups in (frames, parts)
     ]
-    part = frame * parts // frames
-    products, squares = (
-        shift.new_zeros(parts).index_add(0, part, (shift * each).sum(-1))
-        for each in (left + start * shift, shift)
-    )
+    corrected = left + start * shift
+    products, squares = (sums((shift * each).sum(-1), parts) for each in (corrected, shift))
     others = (products.sum() - products) / (squares.sum() - squares).clamp_min(MIN_INFORMATION)
     # By the scatter where that is larger than the variance of the residuals: errors of neighbors are alike.
     variance = torch.maximum(

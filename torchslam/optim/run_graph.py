@@ -14,9 +14,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import partial
 from itertools import accumulate
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self, TypeVar
 
 import safetensors.torch
 import torch
@@ -28,14 +29,13 @@ from torch.nn.utils.rnn import pad_sequence
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import OBSERVATION_VARIANCE, CameraMeasurement
-from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.precision import check_dtypes, full_precision, without_autocast
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
-from torchslam.optim._core.levenberg_marquardt import Progress, check_minimum
-from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
+from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, Progress, SolverOptions, check_minimum
 from torchslam.optim._core.tangent import CameraPrior
 from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
-from torchslam.optim.pose._refinement import solve_pose
+from torchslam.optim.pose import solve_pose
 from torchslam.types import Trajectory
 from torchslam.utils.files import check_regular
 
@@ -44,9 +44,6 @@ POSE_ITERATIONS = 30
 
 _FRAMES_AT_ONCE = 64
 """Frames whose poses are refined in one batch, which bounds the memory."""
-_MAX_BYTES = 1 << 34
-"""Largest file that is read."""
-_MAX_SIDE = 1 << 26  # of an image, pixels
 # Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
 _MAX_SIZE_RATIO = 2.0
 _CALIBRATION = "calibration.params", "calibration.directions"
@@ -64,8 +61,8 @@ only."""
 GRADIENT_ROUNDS = 8
 """Rounds with a rolling shutter that gradients pass: each leaves a tenth to a third of the gradient's error."""
 
-Schema = dict[str, tuple[str, tuple[int, ...], type]]
-"""Per column: what it has a row for (K frames, N points or O observations), the shape of a row, the kind of numbers."""
+_UNREADABLE = OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RuntimeError
+"""What reading another file raises."""
 
 
 @dataclass(frozen=True)
@@ -97,18 +94,6 @@ class ObservationGraph:
     submap: Int[Tensor, " K"] = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64, device="cpu"))
     calibration: CameraMeasurement | None = None
     readout: Readout | None = None
-
-    _SCHEMA: ClassVar[Schema] = {
-        "timestamps": ("K", (), float),
-        "T_cw": ("K", (4, 4), float),
-        "is_keyframe": ("K", (), bool),
-        "submap": ("K", (), int),
-        "points_w": ("N", (3,), float),
-        "frame_index": ("O", (), int),
-        "point_index": ("O", (), int),
-        "pixels": ("O", (2,), float),
-        "weights": ("O", (), float),
-    }
 
     def __post_init__(self) -> None:
         if len(self.submap) == 0:
@@ -163,27 +148,25 @@ class ObservationGraph:
         """Write to a safetensors file."""
         tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}
         tensors["camera"] = self.camera.params.detach().cpu().contiguous()
-        if self.calibration is not None:
-            given = self.calibration
-            parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
-            tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
-        if self.readout is not None:
-            tensors[_READOUT] = self.readout.numbers
         width, height = self.camera.size
         metadata = {"camera_model": self.camera.model, "camera_size": f"{width} {height}"}
-        if self.calibration is not None:
-            metadata[_VARIANCE] = repr(self.calibration.observation_variance)
+        if (given := self.calibration) is not None:
+            parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
+            tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
+            metadata[_VARIANCE] = repr(given.observation_variance)
+        if self.readout is not None:
+            tensors[_READOUT] = self.readout.numbers
         safetensors.torch.save_file(tensors, path, metadata)
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
-        """Read what `save` wrote. Raises TorchslamError where the file is something else.
+        """Read what `save` wrote: a `RunGraph` where the file has the origin of the rows, and one submap where it has
+        none.
 
-        A file of a run's graph gives a `RunGraph`, with the origin of its rows. One from before there were submaps has
-        one.
+        Raises TorchslamError where the file is something else.
         """
         try:
-            check_regular(path, _MAX_BYTES, "a graph that is read")
+            check_regular(path, 1 << 34, "a graph that is read")
             with safe_open(str(path), framework="pt") as file:
                 metadata, known = file.metadata() or {}, set(file.keys())
                 # From here on `cls` is what the file holds; in the signature, what is asked for.
@@ -205,36 +188,25 @@ class ObservationGraph:
             graph = cls(camera=camera, calibration=calibration, readout=readout, **columns)
             graph._check()
             return graph
-        except (
-            OSError,
-            SafetensorError,
-            KeyError,
-            ValueError,
-            TypeError,
-            AttributeError,
-            RuntimeError,
-        ) as error:
+        except _UNREADABLE as error:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
 
     def _check(self) -> None:
         """Raises ValueError where a column does not fit the others, or has indices out of range."""
-        rows = {"K": len(self.T_cw), "N": len(self.points_w), "O": len(self.pixels)}
-        for name, (owner, shape, kind) in self._SCHEMA.items():
-            column = getattr(self, name)
-            if name == "weights" and column.ndim == 3:
-                shape = (2, 2)
-            if tuple(column.shape) != (rows[owner], *shape):
-                raise ValueError(f"{name} is {tuple(column.shape)}, not {(rows[owner], *shape)}")
-            if name != "timestamps" or not column.is_floating_point():
-                wanted = {int: torch.int64, bool: torch.bool}.get(kind, self.camera.params.dtype)
-                if column.dtype != wanted:
-                    raise ValueError(f"{name} is of type {column.dtype}, not {wanted}")
+        if isinstance(self, RunGraph):
+            _run_fits(self)
+        else:
+            _fits(self)
+        for name in self.columns():
+            column, wanted = getattr(self, name), self.camera.params.dtype
+            if name in ("T_cw", "points_w", "pixels", "weights") and column.dtype != wanted:
+                raise ValueError(f"{name} is of type {column.dtype}, not {wanted}")
             if not bool(column.isfinite().all()):
                 raise ValueError(f"{name} is not finite")
-        for name, owner in (("frame_index", "K"), ("point_index", "N")):
+        for name, count in (("frame_index", len(self.T_cw)), ("point_index", len(self.points_w))):
             index = getattr(self, name)
-            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < rows[owner]:
-                raise ValueError(f"{name} from {int(index.min())} to {int(index.max())} of {rows[owner]}")
+            if len(index) and not 0 <= int(index.min()) <= int(index.max()) < count:
+                raise ValueError(f"{name} from {int(index.min())} to {int(index.max())} of {count}")
         _check_submaps(self)
         params = self.camera.params
         check_dtypes(camera=params)
@@ -250,7 +222,7 @@ class ObservationGraph:
             if not 0 < self.calibration.observation_variance < math.inf:
                 raise ValueError("the calibration's observation variance is not above zero and finite")
         weights = self.weights.diagonal(dim1=1, dim2=2) if self.weights.ndim == 3 else self.weights
-        if min(self.camera.size) < 1 or max(self.camera.size) > _MAX_SIDE or bool((weights < 0).any()):
+        if min(self.camera.size) < 1 or max(self.camera.size) > 1 << 26 or bool((weights < 0).any()):
             raise ValueError("an image of an impossible size, or a negative weight")
 
     @classmethod
@@ -279,18 +251,19 @@ class RunGraph(ObservationGraph):
     @property
     def recordings(self) -> Int[Tensor, " K"]:
         """The recording of each frame: those of one session in one submap."""
-        return (
-            self.submap * (1 + int(self.sessions.max())) + self.sessions
-            if len(self.sessions)
-            else self.submap
-        )
+        if not len(self.sessions):
+            return self.submap
+        return self.submap * (1 + int(self.sessions.max())) + self.sessions
 
-    _SCHEMA: ClassVar[Schema] = ObservationGraph._SCHEMA | {
-        "frame_ids": ("K", (), int),
-        "sessions": ("K", (), int),
-        "point_ids": ("N", (), int),
-        "keypoint_index": ("O", (), int),
-    }
+
+@without_autocast
+def _fits(graph: ObservationGraph) -> None:
+    """Raises ValueError where a column is of another kind or does not fit the others."""
+
+
+@without_autocast
+def _run_fits(graph: RunGraph) -> None:
+    """As `_fits`."""
 
 
 Graph = TypeVar("Graph", bound=ObservationGraph)
@@ -393,22 +366,17 @@ def _solve_in_rounds(
 ) -> GraphSolution:
     """Correct the keypoints of a rolling shutter and solve the graph of a global one, until they stay where they are.
 
-    With gradients, the number of rounds is fixed, and all of them are differentiated. Without, the first round, of
-    which the keypoints are not the last ones, ends at `FIRST_TOLERANCE`.
+    With gradients, the number of rounds is fixed. Without, the first round ends at `FIRST_TOLERANCE`.
     """
     at, before = graph, graph.pixels
     passes_gradient = options.backward != "detached"
-    first = options
-    if not passes_gradient:
-        first = options.replace(tolerance=max(options.tolerance, FIRST_TOLERANCE))
-    for number in range(MAX_ROUNDS):
+    rough = options.replace(tolerance=max(options.tolerance, FIRST_TOLERANCE))
+    for number in range(GRADIENT_ROUNDS if passes_gradient else MAX_ROUNDS):
         corrected = at.global_shutter()
-        solution = solved(corrected, options if number else first)
+        is_rough = number == 0 and not passes_gradient and rough != options
+        solution = solved(corrected, rough if is_rough else options)
         at = replace(at, T_cw=solution.T_cw, points_w=solution.points_w, camera=solution.camera)
-        if passes_gradient and number + 1 == GRADIENT_ROUNDS:
-            break
         change = (corrected.pixels - before).detach().square().sum(-1).mean().sqrt()
-        is_rough = number == 0 and first != options
         if not passes_gradient and not is_rough and bool(change < SETTLED_PX):
             break
         before = corrected.pixels
@@ -446,13 +414,12 @@ def _solve_global_shutter(
 
 def _check_factors(graph: ObservationGraph, factors: Sequence[FrameFactors]) -> None:
     """Raises ValueError where a factor joins other frames than keyframes of one submap."""
-    for factor in factors:
-        if factor.frames.numel() and not 0 <= int(factor.frames.min()) <= int(factor.frames.max()) < len(
-            graph.T_cw
-        ):
-            raise ValueError(f"frames of factors must lie in 0 ... {len(graph.T_cw) - 1}")
-        submaps = graph.submap[factor.frames]
-        if not bool(graph.is_keyframe[factor.frames].all()) or bool((submaps[:, 0] != submaps[:, 1]).any()):
+    count = len(graph.T_cw)
+    for frames in (factor.frames for factor in factors):
+        if frames.numel() and not 0 <= int(frames.min()) <= int(frames.max()) < count:
+            raise ValueError(f"frames of factors must lie in 0 ... {count - 1}")
+        submaps = graph.submap[frames]
+        if not bool(graph.is_keyframe[frames].all()) or bool((submaps[:, 0] != submaps[:, 1]).any()):
             raise ValueError("factors must join keyframes of one submap")
 
 
@@ -463,20 +430,21 @@ def _with_factors(
     depth_prior: DepthPrior | None,
 ) -> BundleProblem:
     """The bundle adjustment of a submap with its share of the factors and depths of its graph."""
-    slots = torch.full_like(graph.submap, -1)
-    slots[submap.keyframes] = torch.arange(len(submap.keyframes), device=slots.device)
-    own = []
-    for factor in factors:
-        rows = (slots[factor.frames[:, 0]] >= 0).nonzero().squeeze(-1)
-        own.append(
-            FrameFactors(
-                slots[factor.frames[rows]], factor.measured[rows], factor.information[rows], factor.error
-            )
-        )
+    slots, own = _slots(graph, submap.keyframes), []
+    for each in factors:
+        rows = (slots[each.frames[:, 0]] >= 0).nonzero().squeeze(-1)
+        given = each.measured[rows], each.information[rows], each.error
+        own.append(FrameFactors(slots[each.frames[rows]], *given))
     if depth_prior is not None:
-        rows = submap.rows
-        depth_prior = DepthPrior(depth_prior.depths[rows], depth_prior.information[rows])
+        depth_prior = DepthPrior(depth_prior.depths[submap.rows], depth_prior.information[submap.rows])
     return replace(submap.problem, frame_factors=tuple(own), depth_prior=depth_prior)
+
+
+def _slots(graph: ObservationGraph, keyframes: Tensor) -> Tensor:
+    """The place (K,) of each frame among keyframes; -1 of others."""
+    slots = torch.full_like(graph.submap, -1)
+    slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
+    return slots
 
 
 def camera_prior(calibration: CameraMeasurement) -> CameraPrior:
@@ -502,8 +470,7 @@ def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tens
     """The keyframes (k,) of one submap, its points (p,), the observations (o,), and their bundle adjustment."""
     frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
-    slots = torch.full_like(graph.submap, -1)
-    slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
+    slots = _slots(graph, keyframes)
     rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
     problem = BundleProblem(
         graph.T_cw[keyframes],
@@ -518,12 +485,6 @@ def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tens
     return keyframes, points, rows, problem
 
 
-def _bundle_converged(graph: ObservationGraph, bundles: Sequence[BundleSolution]) -> Tensor:
-    """Whether the bundle adjustment of the submap of each frame (K,) has converged; in the order of `graph.submaps`."""
-    converged = torch.cat([bundle.convergence.converged for bundle in bundles])
-    return converged[torch.unique(graph.submap, return_inverse=True)[1]]
-
-
 def _pose_other_frames(
     graph: ObservationGraph,
     T_cw: Tensor,
@@ -533,11 +494,8 @@ def _pose_other_frames(
     success: Tensor,
     options: SolverOptions,
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """The poses (K, 4, 4), with frames that are not keyframes refined against the points, `success` and `converged`.
-
-    Args:
-        camera: one for all frames, or one for each, params (K, P)
-    """
+    """The poses, with frames that are not keyframes refined against the points, `success` and `converged`; camera: one
+    for all frames or one of each, params (K, P)."""
     others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
@@ -584,11 +542,6 @@ class _GraphSubmap(NamedTuple):
     rows: Tensor
     problem: BundleProblem
 
-    @property
-    def cells(self) -> int:
-        """How large it is where many are solved at once."""
-        return len(self.problem.T_cw) * len(self.points)
-
 
 @full_precision
 def solve_graphs(
@@ -601,17 +554,10 @@ def solve_graphs(
     """
     strict, options = options.strict, options.replace(strict=False)
 
-    def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
-        return _adjust_together(submaps, options)
-
     alike: dict[tuple[object, ...], list[int]] = {}
     for row, graph in enumerate(graphs):
-        kind: tuple[object, ...] = (
-            graph.camera.model,
-            graph.camera.params.dtype,
-            graph.camera.params.device,
-            graph.weights.ndim,
-        )
+        params = graph.camera.params
+        kind: tuple[object, ...] = graph.camera.model, params.dtype, params.device, graph.weights.ndim
         if graph.calibration is not None or graph.readout is not None:
             kind = (row,)  # directions or rounds of its own
         alike.setdefault(kind, []).append(row)
@@ -621,14 +567,12 @@ def solve_graphs(
         if len(rows) == 1:
             found = (solve_graph(graphs[rows[0]], options=options),)
         else:
-            found = _solve([graphs[row] for row in rows], adjust, options)
+            found = _solve([graphs[row] for row in rows], partial(_adjust_together, options=options), options)
         solved.update(zip(rows, found, strict=True))
     solutions = tuple(solved[row] for row in range(len(graphs)))
     if strict and solutions:
-        success, converged = (
-            torch.cat([getattr(each, name) for each in solutions]) for name in ("success", "converged")
-        )
-        check_minimum(success, converged, "frames")
+        success = torch.cat([each.success for each in solutions])
+        check_minimum(success, torch.cat([each.converged for each in solutions]), "frames")
     return solutions
 
 
@@ -651,51 +595,52 @@ def _solve(
     frame_starts, point_starts = _starts([g.T_cw for g in graphs]), _starts([g.points_w for g in graphs])
     frames = torch.cat([submap.keyframes + frame_starts[submap.graph] for submap in submaps])
     points = torch.cat([submap.points + point_starts[submap.graph] for submap in submaps])
-    success, moved = torch.zeros_like(joined.is_keyframe), joined.points_w.new_zeros(len(joined.points_w))
-    finite = joined.T_cw[frames].isfinite().flatten(1).all(-1)
-    succeeded = torch.cat([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles])
-    T_cw = joined.T_cw.detach().index_copy(0, frames, torch.cat([bundle.T_cw for bundle in bundles]))
+
+    def of_frames(values: Sequence[Tensor], start: Tensor) -> Tensor:
+        return start.index_copy(0, frames, torch.cat([*values]))
+
+    T_cw = of_frames([bundle.T_cw for bundle in bundles], joined.T_cw.detach())
+    success = of_frames([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles], joined.is_keyframe)
+    success = success & joined.T_cw.isfinite().flatten(1).all(-1)
     points_w = torch.cat([bundle.points_w for bundle in bundles])
     points_w = joined.points_w.detach().index_copy(0, points, points_w)
-    moved = moved.bool().index_copy(0, points, torch.cat([bundle.moved_points for bundle in bundles]))
-    success = success.index_copy(0, frames, succeeded & finite)
+    moved = joined.points_w.new_zeros(len(joined.points_w)).bool()
+    moved = moved.index_copy(0, points, torch.cat([bundle.moved_points for bundle in bundles]))
     cameras = [graph.camera for graph in graphs] if len(graphs) > 1 else [bundles[0].camera]
     camera = cameras[0]
     if len(cameras) > 1:
         camera = camera.with_params(torch.stack([each.params for each in cameras])[joined.submap])
-    T_cw, success, is_minimum = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, options)
+    T_cw, success, converged = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, options)
     solutions = []
     for number, graph in enumerate(graphs):
         rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
         places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
         own = tuple(bundle for bundle, submap in zip(bundles, submaps, strict=True) if submap.graph == number)
-        converged = is_minimum[rows] & _bundle_converged(graph, own)
-        found = T_cw[rows], points_w[places], cameras[number], success[rows], moved[places], converged
-        solutions.append(GraphSolution(graph.timestamps, *found, graph.submap, own))
+        of_bundles = torch.cat([bundle.convergence.converged for bundle in own])
+        of_bundles = of_bundles[torch.unique(graph.submap, return_inverse=True)[1]]
+        found = T_cw[rows], points_w[places], cameras[number], success[rows], moved[places]
+        solutions.append(
+            GraphSolution(graph.timestamps, *found, converged[rows] & of_bundles, graph.submap, own)
+        )
     return tuple(solutions)
 
 
 def _adjust_together(submaps: Sequence[_GraphSubmap], options: SolverOptions) -> list[BundleSolution]:
     """The bundle adjustment of each submap, found together with those of like size."""
+    cells = [len(submap.problem.T_cw) * len(submap.points) for submap in submaps]
+    groups: list[list[int]] = []
+    for row in sorted(range(len(submaps)), key=lambda row: cells[row]):
+        if groups and cells[row] <= _MAX_SIZE_RATIO * cells[groups[-1][0]]:
+            groups[-1].append(row)
+        else:
+            groups.append([row])
     found: dict[int, BundleSolution] = {}
-    for rows in _group_by_size(submaps):
+    for rows in groups:
         problems = [submaps[row].problem for row in rows]
         together = solve_bundle(_padded(problems), options=options)
         for number, (row, problem) in enumerate(zip(rows, problems, strict=True)):
             found[row] = together.element(number, len(problem.T_cw), len(problem.points_w))
     return [found[row] for row in range(len(submaps))]
-
-
-def _group_by_size(submaps: Sequence[_GraphSubmap]) -> list[list[int]]:
-    """Rows of the submaps, in groups within which none is much larger than another."""
-    groups: list[list[int]] = []
-    for row in sorted(range(len(submaps)), key=lambda row: submaps[row].cells):
-        least = submaps[groups[-1][0]].cells if groups else 0
-        if groups and submaps[row].cells <= _MAX_SIZE_RATIO * least:
-            groups[-1].append(row)
-        else:
-            groups.append([row])
-    return groups
 
 
 def _padded(problems: Sequence[BundleProblem]) -> BundleProblem:
@@ -708,17 +653,9 @@ def _padded(problems: Sequence[BundleProblem]) -> BundleProblem:
     weights = [problem.weights for problem in problems if problem.weights is not None]
     counted = [torch.ones_like(problem.frame_index, dtype=torch.bool) for problem in problems]
     cameras = torch.stack([problem.camera.params for problem in problems])
-    return BundleProblem(
-        T_cw,
-        points_w,
-        frame_index,
-        point_index,
-        pixels,
-        first.camera.with_params(cameras),
-        pad_sequence(weights, batch_first=True),
-        first.fixed_frames,
-        mask=pad_sequence(counted, batch_first=True),
-    )
+    camera, mask = first.camera.with_params(cameras), pad_sequence(counted, batch_first=True)
+    observed = frame_index, point_index, pixels, camera, pad_sequence(weights, batch_first=True)
+    return BundleProblem(T_cw, points_w, *observed, first.fixed_frames, mask=mask)
 
 
 def _plain(graph: ObservationGraph, number: int) -> ObservationGraph:

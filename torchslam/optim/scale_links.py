@@ -18,12 +18,9 @@ from torch import Tensor
 from torchslam.geometry.lie import skew, transform
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import robustify
-from torchslam.optim._core.options import GRAPH_OPTIONS, SolverOptions
+from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.run_graph import RunGraph, keyframe_problem
-
-RIDGE = 1e-9
-"""Of the information of a point in units of its trace: a point on the ray of all its views has a singular one."""
 
 
 @dataclass(frozen=True)
@@ -41,14 +38,8 @@ class ScaleLinks:
 
     def weakest(self, before: int, after: int) -> float:
         """The largest standard deviation at a moment between two frames; 0 where there is none."""
-        return max(
-            (
-                std
-                for first, last, std in zip(self.frames, self.frames[1:], self.std, strict=False)
-                if first < after and last > before
-            ),
-            default=0.0,
-        )
+        moments = zip(self.frames, self.frames[1:], self.std, strict=False)
+        return max((std for first, last, std in moments if first < after and last > before), default=0.0)
 
 
 def scale_links(graph: RunGraph, session: int = 0) -> ScaleLinks:
@@ -84,11 +75,7 @@ def scale_stds(
     total = information.new_zeros(len(points_w), 3, 3).index_add_(0, point, information)
     before = torch.zeros_like(total)
     when = rank[frame]
-    first = (
-        torch.full_like(point, frames)
-        .new_full((len(points_w),), frames)
-        .scatter_reduce(0, point, when, "amin")
-    )
+    first = point.new_full((len(points_w),), frames).scatter_reduce(0, point, when, "amin")
     last = first.new_full((len(points_w),), -1).scatter_reduce(0, point, when, "amax")
     order, ends = torch.argsort(when, stable=True), torch.bincount(when, minlength=frames).cumsum(0).tolist()
     centers_w = -(T_cw[:, :3, :3].mT @ T_cw[:, :3, 3:])[torch.argsort(rank), :, 0]
@@ -131,7 +118,8 @@ def _scale_std(
     unit = offsets.norm(dim=-1).median().clamp_min(1e-12)
     offsets = offsets / unit
     eye = torch.eye(3, dtype=offsets.dtype, device=offsets.device)
-    ridge = RIDGE * total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * eye
+    # A point on the ray of all its views has a singular information.
+    ridge = 1e-9 * total.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * eye
     # The two sides of a point are two springs in series.
     series = before @ torch.linalg.solve(total + ridge, total - before)
     moves = torch.cat((eye.expand(len(offsets), 3, 3), -skew(offsets), offsets[..., None]), dim=-1)

@@ -16,10 +16,9 @@ from torchslam.geometry.gating import passes_gate
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import adjust_all, noise_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
-from torchslam.optim.camera_evidence import graph_evidence
 from torchslam.optim.rolling_shutter import RollingShutter
 from torchslam.optim.run_graph import POSE_ITERATIONS, GraphSolution, RunGraph, keyframe_problem, solve_graph
-from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor
+from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor, graph_evidence
 from torchslam.system.online_camera import given_readout
 
 FINAL_CHI_SQUARE = 1.5**2

@@ -18,7 +18,7 @@ from torchslam.geometry import (
     start_pose,
 )
 from torchslam.map.map import Map
-from torchslam.optim.pose.frame_pose import FramePose, FrameProblem, RobustKernel, nearby_pose
+from torchslam.optim.frame_pose import FramePose, FrameProblem, RobustKernel, nearby_pose
 from torchslam.tracking.data_association import (
     MATURE_OBSERVATIONS,
     Projected,

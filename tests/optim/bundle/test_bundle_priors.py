@@ -8,8 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
+from tests.optim.conftest import adjusted
 from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform
-from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, CameraPrior, PosePrior, solve_bundle
+from torchslam.optim import BundleProblem, CameraPrior, PosePrior, solve_bundle
 
 CONVERGED = {"iterations": 60, "tolerance": 0.0}
 
@@ -29,12 +30,10 @@ def zoomed(bundle_scene, noise=0.0, **options) -> tuple[BundleProblem, torch.Ten
 
 def test_every_frame_has_its_camera(bundle_scene):
     problem, _ = zoomed(bundle_scene)
-    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none"))
+    solution = adjusted(problem, kernel="none")
     assert solution.cost < 1e-12
     assert solution.camera.params.shape == (2, 4)
-    swapped = solve_bundle(
-        replace(problem, camera_index=1 - problem.camera_index), options=BUNDLE_OPTIONS.replace(kernel="none")
-    )
+    swapped = adjusted(replace(problem, camera_index=1 - problem.camera_index), kernel="none")
     assert swapped.cost > 1
 
 
@@ -44,11 +43,7 @@ def test_every_camera_is_found(bundle_scene, directions):
     step = torch.tensor([1.0, 1.02, 0.0, 0.0], dtype=torch.float64)
     off = params + torch.tensor([[20.0], [-15.0]], dtype=torch.float64) * step
     problem = replace(problem, camera=problem.camera.with_params(off))
-    solution = solve_bundle(
-        problem,
-        free_camera=directions,
-        options=BUNDLE_OPTIONS.replace(kernel="none", iterations=60, tolerance=1e-16),
-    )
+    solution = adjusted(problem, free_camera=directions, kernel="none", iterations=60, tolerance=1e-16)
     torch.testing.assert_close(solution.camera.params, params, atol=1e-4, rtol=1e-6)
     size = 8 if directions is True else 2
     assert solution.covariance().camera.shape == (size, size)
@@ -60,34 +55,14 @@ def one_each(problem: BundleProblem) -> BundleProblem:
     return replace(problem, camera=problem.camera[index], camera_index=torch.arange(len(index)))
 
 
-def test_a_camera_per_frame_is_found(bundle_scene):
-    """Also those of the two frames whose poses are fixed."""
-    problem, params = zoomed(bundle_scene)
-    problem, params = one_each(problem), params[problem.camera_index]
-    off = 1 + torch.linspace(-0.03, 0.03, 8, dtype=torch.float64)[:, None] * torch.tensor([1, 1, 0, 0])
-    problem = replace(problem, camera=problem.camera.with_params(off * params))
-    solution = solve_bundle(
-        problem,
-        free_camera=True,
-        options=BUNDLE_OPTIONS.replace(kernel="none", iterations=60, tolerance=1e-16),
-    )
-    assert solution.success
-    torch.testing.assert_close(solution.camera.params, params, atol=1e-4, rtol=1e-6)
-    assert solution.covariance().camera.shape == (32, 32)
-
-
 def test_cameras_tied_by_a_prior_are_as_one(bundle_scene):
     """A camera per frame, held by a strong prior at shared ones; the prior is then its covariance."""
     shared, _ = zoomed(bundle_scene, noise=1.0)
-    one = solve_bundle(
-        shared, free_camera=True, options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
-    )
+    one = adjusted(shared, free_camera=True, kernel="cauchy", scale=2.0, **CONVERGED)
     eye = 1e6 * torch.eye(4, dtype=torch.float64).expand(8, 4, 4)
     mean = one.camera.params[shared.camera_index]
     tied = replace(one_each(shared), camera_prior=CameraPrior(mean, eye))
-    found = solve_bundle(
-        tied, free_camera=True, options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0, **CONVERGED)
-    )
+    found = adjusted(tied, free_camera=True, kernel="cauchy", scale=2.0, **CONVERGED)
     torch.testing.assert_close(found.T_cw, one.T_cw, atol=1e-5, rtol=0)
     torch.testing.assert_close(found.camera.params, mean, atol=1e-3, rtol=0)
     spread = found.covariance().camera.unflatten(0, (8, 4)).unflatten(2, (8, 4)).diagonal(dim1=0, dim2=2)
@@ -103,10 +78,8 @@ def test_the_gradient_of_a_camera_per_frame_by_gradcheck(bundle_scene):
     def solve(pixels, weights, scale, centers):
         params = torch.cat((problem.camera.params[:, :2], centers), dim=1)
         moved = replace(problem, pixels=pixels, weights=weights, camera=problem.camera.with_params(params))
-        solution = solve_bundle(
-            moved,
-            free_camera=focal,
-            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=scale, iterations=30, tolerance=0.0),
+        solution = adjusted(
+            moved, free_camera=focal, kernel="cauchy", scale=scale, iterations=30, tolerance=0.0
         )
         return solution.T_cw[:, :3], solution.points_w, solution.camera.params
 
@@ -123,9 +96,10 @@ def test_two_equal_cameras_give_the_result_of_one(bundle_scene, model):
     gradients, solutions = [], []
     for camera, camera_index in ((problem.camera, None), (cameras, index)):
         params = camera.params.clone().requires_grad_()
-        solution = solve_bundle(
+        solution = adjusted(
             replace(problem, camera=camera.with_params(params), camera_index=camera_index),
-            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=2.0),
+            kernel="cauchy",
+            scale=2.0,
         )
         solution.T_cw.sum().backward()
         gradients.append(params.grad)
@@ -144,11 +118,9 @@ def pose_prior(problem: BundleProblem, T_cw: torch.Tensor, weights: list[float])
 def test_a_strong_prior_acts_like_a_fixed_frame(bundle_scene):
     """And one without information is none."""
     problem = bundle_scene(frames=5, points=40).problem
-    fixed = solve_bundle(
-        replace(problem, fixed_frames=(0, 1, 3)), options=BUNDLE_OPTIONS.replace(**CONVERGED)
-    )
+    fixed = adjusted(replace(problem, fixed_frames=(0, 1, 3)), **CONVERGED)
     held = pose_prior(problem, problem.T_cw, [0, 0, 0, 1e12, 0])
-    solution = solve_bundle(replace(problem, pose_prior=held), options=BUNDLE_OPTIONS.replace(**CONVERGED))
+    solution = adjusted(replace(problem, pose_prior=held), **CONVERGED)
     torch.testing.assert_close(solution.T_cw, fixed.T_cw, atol=1e-6, rtol=0)
     nothing = pose_prior(problem, problem.T_cw, [0] * 5)
     torch.testing.assert_close(
@@ -164,7 +136,7 @@ def test_priors_instead_of_fixed_frames(bundle_scene, batched, weights, is_open)
     problem = replace(scene.problem, pose_prior=pose_prior(scene.problem, scene.T_cw, weights))
     if batched:
         problem = replace(problem, T_cw=problem.T_cw.expand(3, 5, 4, 4))
-    solution = solve_bundle(problem, options=BUNDLE_OPTIONS.replace(kernel="none", **CONVERGED))
+    solution = adjusted(problem, kernel="none", **CONVERGED)
     assert solution.success.all()
     T_cw = solution.T_cw.view(-1, 5, 4, 4)[-1]
     torch.testing.assert_close(T_cw[0], scene.T_cw[0], atol=1e-8, rtol=0)
@@ -182,9 +154,7 @@ def test_a_prior_weighs_against_pixels(bundle_scene):
     off = se3_exp(torch.tensor([0.01, 0, 0, 0, 0.02, 0], dtype=torch.float64)) @ problem.T_cw
     weights = [0, 0, 0, 1e4, 1e4]
     prior = pose_prior(problem, off, weights)
-    solution = solve_bundle(
-        replace(problem, pose_prior=prior), options=BUNDLE_OPTIONS.replace(kernel="none", **CONVERGED)
-    )
+    solution = adjusted(replace(problem, pose_prior=prior), kernel="none", **CONVERGED)
     twist = torch.zeros(5, 6, dtype=torch.float64, requires_grad=True)
     T_cw = se3_exp(twist) @ solution.T_cw
     points_c = transform(T_cw[problem.frame_index], solution.points_w[problem.point_index][:, None])[:, 0]
@@ -221,13 +191,9 @@ def test_the_camera_lies_between_its_prior_and_the_data(bundle_scene):
     for weight in (0.0, 1.0, 1e9):
         information = weight * torch.eye(4, dtype=torch.float64)
         prior = CameraPrior(mean, information)
-        solution = solve_bundle(
-            replace(problem, camera_prior=prior),
-            free_camera=True,
-            options=BUNDLE_OPTIONS.replace(**CONVERGED),
-        )
+        solution = adjusted(replace(problem, camera_prior=prior), free_camera=True, **CONVERGED)
         found.append(solution.camera.params)
-    free = solve_bundle(problem, free_camera=True, options=BUNDLE_OPTIONS.replace(**CONVERGED)).camera.params
+    free = adjusted(problem, free_camera=True, **CONVERGED).camera.params
     torch.testing.assert_close(found[0], free, rtol=1e-8, atol=0)
     torch.testing.assert_close(found[2], mean, atol=1e-4, rtol=0)
     assert free[0] < found[1][0] < mean[0]
@@ -257,10 +223,8 @@ def test_gradients_to_priors_and_cameras_by_gradcheck(bundle_scene, angle):
             pose_prior=prior,
             camera_prior=CameraPrior(mean, 0.5 * (tight + tight.mT)),
         )
-        solution = solve_bundle(
-            moved,
-            free_camera=not angle,
-            options=BUNDLE_OPTIONS.replace(kernel="cauchy", scale=3.0, iterations=30, tolerance=0.0),
+        solution = adjusted(
+            moved, free_camera=not angle, kernel="cauchy", scale=3.0, iterations=30, tolerance=0.0
         )
         return solution.T_cw[:, :3], solution.points_w, solution.camera.params
 

@@ -6,16 +6,15 @@ import pytest
 import torch
 from torch.autograd import gradcheck
 
+from tests.optim.conftest import adjusted, minimized
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, transform
 from torchslam.optim import (
     BUNDLE_OPTIONS,
-    LEAST_SQUARES_OPTIONS,
     DepthPrior,
     FrameFactors,
     displacement_error,
     relative_pose_error,
     solve_bundle,
-    solve_least_squares,
 )
 from torchslam.optim.bundle.dense_numpy import solve_bundle_numpy
 
@@ -81,9 +80,7 @@ def test_each_determines_the_scale(bundle_scene, kind, fixed):
             )
         },
     }[kind]
-    solution = solve_bundle(
-        replace(scene.problem, **more), options=BUNDLE_OPTIONS.replace(kernel="none", **CONVERGED)
-    )
+    solution = adjusted(replace(scene.problem, **more), kernel="none", **CONVERGED)
     found = (centers(solution.T_cw)[1:] - centers(solution.T_cw)[0]).norm(dim=-1)
     true = (centers(scene.T_cw)[1:] - centers(scene.T_cw)[0]).norm(dim=-1)
     torch.testing.assert_close(found, 1.3 * true, rtol=1e-5, atol=0)
@@ -146,9 +143,7 @@ def test_the_minimum_is_that_of_the_written_out_cost(bundle_scene):
     problem = scene.problem
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in tensors.items()}
     pixels = problem.pixels.clone().requires_grad_()
-    solution = solve_bundle(
-        with_all(leaves, pixels=pixels), options=BUNDLE_OPTIONS.replace(kernel="none", **CONVERGED)
-    )
+    solution = adjusted(with_all(leaves, pixels=pixels), kernel="none", **CONVERGED)
 
     def residual(T_free, points_w, T_21, T_info, distances, d_info, depths, z_info, heights, pixels):
         T_cw = torch.cat((problem.T_cw[:1].expand(len(T_free), 1, 4, 4), T_free), dim=1)
@@ -170,12 +165,8 @@ def test_the_minimum_is_that_of_the_written_out_cost(bundle_scene):
 
     start = problem.T_cw[None, 1:], problem.points_w[None]
     other = [tensor.clone().requires_grad_() for tensor in (*tensors.values(), problem.pixels)]
-    expected = solve_least_squares(
-        residual,
-        start,
-        [x[None] for x in other],
-        ("se3", "euclidean"),
-        options=LEAST_SQUARES_OPTIONS.replace(iterations=100, tolerance=1e-18),
+    expected = minimized(
+        residual, start, [x[None] for x in other], ("se3", "euclidean"), iterations=100, tolerance=1e-18
     )
     assert expected.success.all()
     torch.testing.assert_close(solution.T_cw[1:], expected.unknowns[0][0], rtol=0, atol=1e-9)
@@ -217,19 +208,16 @@ def test_a_frame_that_sees_nothing_follows_its_factors(bundle_scene):
     T_21 = motions_of(scene.T_cw, frames)
     factors = (FrameFactors.relative_poses(frames, T_21, torch.eye(6).double()[None]),)
     blind = replace(problem, mask=problem.frame_index != 4, frame_factors=factors)
-    solution = solve_bundle(blind, options=BUNDLE_OPTIONS.replace(kernel="none", **CONVERGED))
+    solution = adjusted(blind, kernel="none", **CONVERGED)
     torch.testing.assert_close(solution.T_cw, scene.T_cw, atol=1e-7, rtol=0)
-    unheld = solve_bundle(replace(blind, frame_factors=()), options=BUNDLE_OPTIONS.replace(kernel="none"))
+    unheld = adjusted(replace(blind, frame_factors=()), kernel="none")
     assert torch.equal(unheld.T_cw[4], problem.T_cw[4])
 
 
 def test_covariances_shrink_by_what_is_measured(bundle_scene):
     scene = bundle_scene(noise=0.5, frames=5, points=40)  # two fixed frames: the scale is not open without
     with_all, tensors = mixed(scene, torch.tensor([(0, 2), (1, 2)]))
-    bare, held = (
-        solve_bundle(p, options=BUNDLE_OPTIONS.replace(kernel="none")).covariance().frames
-        for p in (scene.problem, with_all(tensors))
-    )
+    bare, held = (adjusted(p, kernel="none").covariance().frames for p in (scene.problem, with_all(tensors)))
     assert (held[2:].diagonal(dim1=1, dim2=2) > 0).all()
     assert held[2].trace() < 0.9 * bare[2].trace()
 
@@ -240,15 +228,13 @@ def test_a_batch_gives_what_its_problems_alone_give(bundle_scene):
     with_all, tensors = mixed(scene, frames)
     noisy = scene.problem.pixels + torch.stack([draw(*scene.problem.pixels.shape, seed=s) for s in (0, 1)])
     both = with_all(tensors, pixels=noisy, T_cw=scene.problem.T_cw.repeat(2, 1, 1, 1))
-    together = solve_bundle(both, options=BUNDLE_OPTIONS.replace(**CONVERGED))
+    together = adjusted(both, **CONVERGED)
     for row in range(2):
-        alone = solve_bundle(
-            with_all(tensors, pixels=noisy[row]), options=BUNDLE_OPTIONS.replace(**CONVERGED)
-        )
+        alone = adjusted(with_all(tensors, pixels=noisy[row]), **CONVERGED)
         torch.testing.assert_close(together.T_cw[row], alone.T_cw, rtol=0, atol=1e-10)
     T_21 = torch.stack([tensors["T_21"], se3_exp(0.01 * draw(2, 6)) @ tensors["T_21"]])
     own = (FrameFactors.relative_poses(frames, T_21, tensors["T_information"].expand(2, -1, -1, -1)),)
-    apart = solve_bundle(replace(both, frame_factors=own), options=BUNDLE_OPTIONS.replace(**CONVERGED))
+    apart = adjusted(replace(both, frame_factors=own), **CONVERGED)
     assert se3_log(apart.T_cw[1] @ se3_inverse(together.T_cw[1])).norm() > 1e-4
 
 
@@ -281,9 +267,7 @@ def test_second_derivatives_and_transforms(bundle_scene):
 
     def last(distances):
         factors = (FrameFactors.distances(frames, distances, torch.full((2,), 1e3).double()),)
-        return solve_bundle(
-            replace(scene.problem, frame_factors=factors), options=BUNDLE_OPTIONS.replace(kernel="none")
-        ).T_cw[3, :3, 3]
+        return adjusted(replace(scene.problem, frame_factors=factors), kernel="none").T_cw[3, :3, 3]
 
     reverse, forward = torch.func.jacrev(last)(long), torch.func.jacfwd(last)(long)
     torch.testing.assert_close(forward, reverse, rtol=1e-6, atol=1e-10)

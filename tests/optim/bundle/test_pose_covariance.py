@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from tests.optim.conftest import only
 from tests.optim.test_camera_evidence import OPTIONS, TRUTH, walk
 from torchslam.geometry import se3_inverse, se3_log
 from torchslam.geometry.camera_measurement import CameraMeasurement
@@ -114,10 +115,5 @@ def test_it_is_right_a_little_off_the_minimum_of_the_points() -> None:
 def test_undetermined_poses_have_no_covariance() -> None:
     problem = still(6, 0.5)
     few = problem.point_index < 2
-    problem = replace(
-        problem,
-        frame_index=problem.frame_index[few],
-        point_index=problem.point_index[few],
-        pixels=problem.pixels[few],
-    )
+    problem = only(problem, few)
     assert not bool(pose_covariance(problem, OPTIONS).any())

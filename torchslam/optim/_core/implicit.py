@@ -40,14 +40,16 @@ InDims = Sequence[int | None]
 
 
 def _alone(function: Callable[P, R]) -> Callable[P, R]:
-    """The function without anomaly detection inside, which `vmap` cannot do: autograd tests what it returns."""
+    """The function in full precision, without anomaly detection inside, which `vmap` cannot do: autograd tests what it
+    returns."""
+    exact = full_precision(function)
 
     @wraps(function)
     def alone(*args: P.args, **kwargs: P.kwargs) -> R:
         if not torch.is_anomaly_enabled():
-            return function(*args, **kwargs)
+            return exact(*args, **kwargs)
         with torch.autograd.set_detect_anomaly(False):
-            return function(*args, **kwargs)
+            return exact(*args, **kwargs)
 
     return alone
 
@@ -62,12 +64,11 @@ class Minimization(Protocol):
 
     num_unknowns: int
     num_vectors: int
-    ndims: tuple[Ndims, Ndims, Ndims] | None
-    """Dimensions of the tensors of a vector, of found and of inputs without that of a batch, which may lead each of
-    them; None where there are no batches."""
+    ndims: tuple[Ndims, Ndims, Ndims]
+    """Dimensions of the tensors of a vector, of found and of inputs without that of a batch, which may lead each."""
 
     def minimize(self, inputs: Tensors) -> Tensors:
-        """The minimum, followed by the other results."""
+        """The minimum, followed by the other results, the last of which are `Convergence.tensors`."""
         ...
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
@@ -115,7 +116,6 @@ class _Minimum(torch.autograd.Function):
 
     @staticmethod
     @_alone
-    @full_precision
     def forward(problem: Minimization, *inputs: Tensor) -> Tensors:
         return tuple(tensor.detach() for tensor in problem.minimize(inputs))
 
@@ -129,7 +129,6 @@ class _Minimum(torch.autograd.Function):
 
     @staticmethod
     @_alone
-    @full_precision
     def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
         problem, needed = ctx.problem, ctx.needs_input_grad[1:]
         inputs, found = _split(ctx.saved_tensors, ctx.num_inputs)
@@ -143,7 +142,6 @@ class _Minimum(torch.autograd.Function):
 
     @staticmethod
     @_alone
-    @full_precision
     def jvp(ctx: Any, _: None, *changes: Tensor | None) -> tuple[Tensor | None, ...]:
         problem = ctx.problem
         inputs, found = _split(ctx.saved_tensors, ctx.num_inputs)
@@ -161,12 +159,8 @@ class _Minimum(torch.autograd.Function):
         def apply(*tensors: Tensor) -> Tensors:
             return _Minimum.apply(problem, *tensors)
 
-        if problem.ndims is None:
-            found = _vmap_by_loop(apply, info.batch_size, in_dims[1:], inputs)
-        else:
-            found = _vmap_by_fold(
-                apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], (0,) * len(inputs)
-            )
+        before = (0,) * len(inputs)
+        found = _vmap_by_fold(apply, info.batch_size, in_dims[1:], inputs, problem.ndims[2], before)
         return found, (0,) * len(found)
 
 
@@ -175,7 +169,6 @@ class _Solve(torch.autograd.Function):
 
     @staticmethod
     @_alone
-    @full_precision
     def forward(problem: Minimization, many: int, num_found: int, *tensors: Tensor) -> Tensors:
         right, found, inputs = _parts(problem, num_found, tensors)
         return tuple(_nested_vmap(problem.factorized(found, inputs), many)(right))
@@ -188,37 +181,24 @@ class _Solve(torch.autograd.Function):
 
     @staticmethod
     @_alone
-    @full_precision
     def backward(ctx: Any, *gradient: Tensor) -> tuple[Any, ...]:
         problem, many = ctx.problem, ctx.many
         direction, tensors = _split(ctx.saved_tensors, problem.num_vectors)
         _, found, inputs = _parts(problem, ctx.num_found, tensors)
         adjoint = _solve(problem, gradient, found, inputs, many)
-
-        def curvature(tensors: Tensors) -> Tensor:
-            at = _split(tensors, len(found))
-            return -_nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
-                (direction, adjoint)
-            ).sum()
-
+        curvature = _curvature_of(problem, len(found), direction, tuple(-part for part in adjoint), many)
         needed = ctx.needs_input_grad[3 + problem.num_vectors :]
         return (None, None, None, *adjoint, *_gradient(curvature, (*found, *inputs), needed))
 
     @staticmethod
     @_alone
-    @full_precision
     def jvp(ctx: Any, _: None, __: None, ___: None, *changes: Tensor | None) -> Tensors:
         problem, many = ctx.problem, ctx.many
         direction, tensors = _split(ctx.saved_tensors, problem.num_vectors)
         right, found, inputs = _parts(problem, ctx.num_found, tensors)
 
         def change_of_curvature(probe: Tensors) -> Tensor:
-            def curvature(tensors: Tensors) -> Tensor:
-                at = _split(tensors, len(found))
-                return _nested_vmap(lambda ends: _curvature(problem, *at, *ends), many)(
-                    (direction, probe)
-                ).sum()
-
+            curvature = _curvature_of(problem, len(found), direction, probe, many)
             return _along(curvature, (*found, *inputs), changes[len(right) :])
 
         hessian_product = grad(change_of_curvature)(_zeros(right))
@@ -241,8 +221,6 @@ class _Solve(torch.autograd.Function):
         def apply(*tensors: Tensor) -> Tensors:
             return _Solve.apply(problem, many, num_found, *tensors)
 
-        if problem.ndims is None:
-            return _vmap_by_loop(apply, info.batch_size, dims, tensors), (0,) * count
         before = (many,) * count + (0,) * (len(tensors) - count)
         solved = _vmap_by_fold(apply, info.batch_size, dims, tensors, sum(problem.ndims, ()), before)
         return tuple(part.movedim(many, 0) for part in solved), (0,) * count
@@ -271,16 +249,23 @@ def _zeros(tensors: Tensors) -> Tensors:
     return tuple(torch.zeros_like(tensor) for tensor in tensors)
 
 
-def _curvature(
-    problem: Minimization, found: Tensors, inputs: Tensors, direction: Tensors, probe: Tensors
-) -> Tensor:
-    """() probe . H direction, differentiable."""
+def _curvature_of(
+    problem: Minimization, num_found: int, direction: Tensors, probe: Tensors, many: int
+) -> Callable[[Tensors], Tensor]:
+    """The function (*found, *inputs) -> () probe . H direction, summed over `many` dimensions of both."""
 
-    def slope(step: Tensors) -> Tensor:
-        return problem.slope(problem.retracted(found, step), inputs, probe)
+    def curvature(tensors: Tensors) -> Tensor:
+        found, inputs = _split(tensors, num_found)
 
-    hessian_product = grad(slope)(_zeros(direction))
-    return torch.stack([(x * y).sum() for x, y in zip(hessian_product, direction, strict=True)]).sum()
+        def of_one(ends: tuple[Tensors, Tensors]) -> Tensor:
+            direction, probe = ends
+            product = grad(lambda step: problem.slope(problem.retracted(found, step), inputs, probe))
+            pairs = zip(product(_zeros(direction)), direction, strict=True)
+            return torch.stack([(x * y).sum() for x, y in pairs]).sum()
+
+        return _nested_vmap(of_one, many)((direction, probe)).sum()
+
+    return curvature
 
 
 def _last_gradient(
@@ -333,17 +318,6 @@ def _nested_vmap(function: Callable[[Any], Any], many: int) -> Callable[[Any], A
 def _leading(tensor: Tensor, dim: int | None, size: int) -> Tensor:
     """Move the mapped dimension to the front, or expand a shared tensor."""
     return tensor.expand(size, *tensor.shape) if dim is None else tensor.movedim(dim, 0)
-
-
-def _vmap_by_loop(
-    function: Callable[..., Tensors], size: int, dims: InDims, tensors: Sequence[Tensor]
-) -> Tensors:
-    """Apply the function to one element after the other."""
-    elements = [
-        function(*(x if dim is None else x.select(dim, row) for x, dim in zip(tensors, dims, strict=True)))
-        for row in range(size)
-    ]
-    return tuple(torch.stack(parts) for parts in zip(*elements, strict=True))
 
 
 def _vmap_by_fold(

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt for many independent least-squares problems at once.
+"""Levenberg-Marquardt for many independent least-squares problems at once, and the options of all solvers.
 
 The loop knows nothing of poses or points: a `LeastSquares` problem evaluates a local quadratic model, proposes a damped
 step, and chooses per element between the old model and the new one. Every element has its own damping, accepts or
@@ -9,10 +9,11 @@ can be differentiated through ("unroll"). Sources: Levenberg, 1944; Marquardt, 1
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from enum import Enum
-from typing import Protocol, Self, TypeVar, runtime_checkable
+from typing import Any, Protocol, Self, TypeVar, get_args, runtime_checkable
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -20,6 +21,8 @@ from torch import Tensor
 from torch.utils._pytree import tree_map
 
 from torchslam.errors import ConvergenceError
+from torchslam.geometry.robust import TAIL_SCALE, Kernel
+from torchslam.optim._core.implicit import Backward
 
 INITIAL_DAMPING = 1e-4
 """Relative to the diagonal of the Hessian: nearly a step of Gauss and Newton at first. Tried at this value only."""
@@ -27,7 +30,6 @@ DAMPING_DOWN, DAMPING_UP = 0.1, 10.0
 """Factors on the damping after a step that lowers the cost, and after one that does not (Marquardt, 1963)."""
 _DAMPING_RANGE = (1e-10, 1e8)
 """Below, a step is that of Gauss and Newton; above, it is too short to matter, and the element gives up."""
-_NAMED = 10  # rows that an error lists
 CURVATURE_BELOW = 1e-2
 """Predicted relative reduction of the cost below which the kernel's curvature is used."""
 
@@ -55,20 +57,16 @@ class LeastSquares(Protocol[X, M]):
         ...
 
     def evaluate(self, estimate: X, use_curvature: Bool[Tensor, " B"]) -> M:
-        """The cost and its quadratic model at an estimate. use_curvature: (B,) bool, add the kernel's curvature."""
+        """The cost and its quadratic model at an estimate, with the kernel's curvature where it is used."""
         ...
 
     def step(self, model: M, damping: Float[Tensor, " B"]) -> tuple[X, Float[Tensor, " B"]]:
-        """The estimate that minimizes the damped model, and the decrease (B,) of the cost that the model predicts.
-
-        Args:
-            damping: relative to the diagonal of the Hessian. The decrease is infinite where there is no
-                solution.
-        """
+        """The estimate that minimizes the damped model, and the decrease of the cost that the model predicts; infinite
+        where there is no solution. The damping is relative to the diagonal of the Hessian."""
         ...
 
     def select(self, accept: Bool[Tensor, " B"], new: M, old: M) -> M:
-        """Per element, `new` where `accept` (B,) and `old` elsewhere; `select_models` for trees."""
+        """Per element, `new` where `accept` and `old` elsewhere: `select_models`."""
         ...
 
 
@@ -120,45 +118,57 @@ class Convergence:
     converged: Bool[Tensor, " B"]
     initial_cost: Float[Tensor, " B"]
     cost: Float[Tensor, " B"]
-    limit: int
+    limit: int = field(kw_only=True)
 
     def reasons(self, success: Bool[Tensor, "*batch"]) -> list[SolverReason]:
         """How the search ended for each element of a solution, given which of them are determined."""
         shape = success.flatten().shape
         rows = (x.expand(shape).tolist() for x in (success.flatten(), self.converged, self.iterations))
-        return [
-            SolverReason.UNDETERMINED
-            if not determined
-            else SolverReason.CONVERGED
-            if converged
-            else SolverReason.GAVE_UP
-            if steps < self.limit
-            else SolverReason.ITERATION_LIMIT
-            for determined, converged, steps in zip(*rows, strict=True)
-        ]
+
+        def reason(determined: bool, converged: bool, steps: int) -> SolverReason:
+            if not determined:
+                return SolverReason.UNDETERMINED
+            if converged:
+                return SolverReason.CONVERGED
+            return SolverReason.GAVE_UP if steps < self.limit else SolverReason.ITERATION_LIMIT
+
+        return [reason(*row) for row in zip(*rows, strict=True)]
+
+    @property
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """All but the limit."""
+        return self.iterations, self.converged, self.initial_cost, self.cost
 
     def of(self, row: int) -> Convergence:
         """Of one element."""
-        one = slice(row, row + 1)
-        return replace(
-            self,
-            iterations=self.iterations[one],
-            converged=self.converged[one],
-            initial_cost=self.initial_cost[one],
-            cost=self.cost[one],
-        )
+        return Convergence(*(tensor[row : row + 1] for tensor in self.tensors), limit=self.limit)
+
+
+class Outcome:
+    """How the search for a solution ended."""
+
+    success: Bool[Tensor, "*batch"]
+    convergence: Convergence
+
+    @property
+    def converged(self) -> Bool[Tensor, "*batch"]:
+        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
+        return self.convergence.converged.view_as(self.success)
+
+    @property
+    def reasons(self) -> list[SolverReason]:
+        """How the search ended, for each element."""
+        return self.convergence.reasons(self.success)
 
 
 def check_minimum(success: Bool[Tensor, "*batch"], converged: Bool[Tensor, "*batch"], what: str) -> None:
     """Raise ConvergenceError with the rows of the elements, which are named by `what`, that are not at a minimum."""
     undetermined = (~success).flatten().nonzero().flatten().tolist()
     unfinished = (success & ~converged).flatten().nonzero().flatten().tolist()
+    kinds = (undetermined, "not determined"), (unfinished, "not converged: allow more iterations")
     parts = [
-        f"{len(rows)} {problem} ({', '.join(map(str, rows[:_NAMED]))}{', ...' if len(rows) > _NAMED else ''})"
-        for rows, problem in (
-            (undetermined, "not determined"),
-            (unfinished, "not converged: allow more iterations"),
-        )
+        f"{len(rows)} {problem} ({', '.join(map(str, rows[:10]))}{', ...' if len(rows) > 10 else ''})"
+        for rows, problem in kinds
         if rows
     ]
     if parts:
@@ -176,22 +186,14 @@ def index_tree(tree: Tree, rows: Int[Tensor, " R"]) -> Tree:
 
 def where_tree(first: Bool[Tensor, " B"], one: Tree, other: Tree) -> Tree:
     """Select per element: `one` where `first` (B,) is true, `other` elsewhere."""
-
-    def choose(a: Tensor, b: Tensor) -> Tensor:
-        return torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b)
-
-    return tree_map(choose, one, other)
+    return tree_map(lambda a, b: torch.where(first.view(-1, *(1,) * (a.ndim - 1)), a, b), one, other)
 
 
 def select_models(accept: Bool[Tensor, " B"], new: Tree, old: Tree) -> Tree:
-    """`LeastSquares.select` for models that are trees."""
-    return new if accept.all() else where_tree(accept, new, old)
-
-
-def concat_tree(trees: Sequence[Tree], rows: Sequence[Tensor]) -> Tree:
-    """Merge trees into one batch; each has the elements of its rows (b,)."""
-    order = torch.argsort(torch.cat(list(rows)))
-    return tree_map(lambda *parts: torch.cat(parts).index_select(0, order), *trees)
+    """Per element, `new` where `accept` and `old` elsewhere; a model that is no tree has one element."""
+    if bool(accept.all()):
+        return new
+    return where_tree(accept, new, old) if bool(accept.any()) else old
 
 
 def minimize_batch(
@@ -243,5 +245,75 @@ def minimize_batch(
     converged = torch.ones_like(steps, dtype=torch.bool).index_copy(0, rows, ~active) & ~given_up
     if finished:
         where, models = zip(*finished, (rows, model), strict=True)
-        model = concat_tree(models, where)
-    return model, Convergence(steps, converged, initial_cost, model.cost.detach(), iterations)
+        order = torch.argsort(torch.cat(where))
+        model = tree_map(lambda *parts: torch.cat(parts).index_select(0, order), *models)
+    return model, Convergence(steps, converged, initial_cost, model.cost.detach(), limit=iterations)
+
+
+@dataclass(frozen=True)
+class SolverOptions:
+    """How a solver minimizes.
+
+    Each solver has a constant with its defaults: `solve_pose(..., options=POSE_OPTIONS.replace(strict=True))`.
+
+    Attributes:
+        kernel: robust kernel.
+        scale: of the kernel, in units of the whitened residual: a number, a scalar tensor, or (B,) of a batch.
+        iterations: maximum number of steps.
+        tolerance: stop where the predicted reduction of the cost is below this share of it.
+        backward: how gradients reach the inputs.
+        strict: raise ConvergenceError for any element that is not at a minimum: `success` or `converged` is False.
+
+    Raises:
+        ValueError: A name is unknown, or a number is below zero.
+    """
+
+    kernel: Kernel
+    scale: Float[Tensor, "*#scale"] | float
+    iterations: int = 200  # a Huber kernel with a fifth of outliers needs up to 50
+    tolerance: float = 1e-8
+    backward: Backward = "implicit"
+    strict: bool = False
+
+    def __post_init__(self) -> None:
+        if self.kernel not in get_args(Kernel):
+            raise ValueError(f"unknown kernel {self.kernel!r}; known are {', '.join(get_args(Kernel))}")
+        if not self.iterations >= 0:
+            raise ValueError(f"iterations must not be below zero, got {self.iterations}")
+        if not self.tolerance >= 0:
+            raise ValueError(f"tolerance must not be below zero, got {self.tolerance}")
+        if self.backward not in get_args(Backward):
+            known = ", ".join(get_args(Backward))
+            raise ValueError(f"unknown backward mode {self.backward!r}; known are {known}")
+
+    def replace(self, **changes: Any) -> Self:
+        """The same options with some changed."""
+        return replace(self, **changes)
+
+
+LEAST_SQUARES_OPTIONS = SolverOptions("none", 1.0, tolerance=1e-10)
+"""Plain least squares, as nothing is known of the residual; the tolerance as for poses, since problems are as small."""
+
+POSE_OPTIONS = SolverOptions("cauchy", 1.0, tolerance=1e-10)
+"""Matches to known points are the least certain ones: Cauchy's kernel gives up on wrong ones, as Huber's does not.
+
+The scale is one standard deviation. Steps of six unknowns cost little, and gradients are then right to about 1e-4."""
+
+BUNDLE_OPTIONS = SolverOptions("huber", 1.0)
+"""Huber's kernel is convex in the residual: frames and points far from the minimum find the way. The scale is one
+standard deviation."""
+
+POSE_GRAPH_OPTIONS = SolverOptions("huber", 3.75)
+"""95 % of the norms of seven standard normal numbers lie below the scale: edges are averages and mostly right."""
+
+ROTATION_OPTIONS = SolverOptions("geman_mcclure", 2.8)
+"""Relative rotations are right or wrong by any angle, which a kernel without a limit would average. 95 % of the norms
+of three standard normal numbers lie below the scale."""
+
+UNWEIGHTED_ROTATION_OPTIONS = ROTATION_OPTIONS.replace(scale=math.radians(5.0))
+"""Without weights the scale is in radians, as COLMAP's: relative rotations of two views are right to a degree or two,
+or wrong."""
+
+GRAPH_OPTIONS = SolverOptions("cauchy", TAIL_SCALE, tolerance=1e-10)
+"""A run has rejected wrong matches before, but errors of right ones have heavy tails. The weights of its graph are by
+the noise that the run found, which mostly is a half to a fifth of a pixel of the level."""

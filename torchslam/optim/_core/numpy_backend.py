@@ -1,6 +1,6 @@
 """Least squares by NumPy in double precision, for the two problems that every run solves again and again.
 
-They are the pose of a frame (`optim.pose.frame_pose`) and the local map of a keyframe (`optim.bundle.dense_numpy`).
+They are the pose of a frame (`optim.frame_pose`) and the local map of a keyframe (`optim.bundle.dense_numpy`).
 With a few hundred values, the overhead of a call dominates, and a NumPy call costs about a third of a PyTorch call.
 There are no gradients: `optim.run_graph`, which solves the graph of a finished run, has them.
 """
@@ -32,8 +32,6 @@ RobustKernel = Literal["cauchy", "huber"]
 MIN_DEPTH = float(np.finfo(np.float64).eps)
 """A point at a smaller depth counts as behind the camera."""
 
-_COST_SLACK = 1 + 1e-13  # an increase of the cost by rounding does not reject a step
-
 X = TypeVar("X", covariant=True)
 
 
@@ -54,11 +52,8 @@ M = TypeVar("M", bound=LocalModel[Any])
 def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tolerance: float) -> M:
     """Run Levenberg-Marquardt from `model` and return the model at the last accepted state.
 
-    Args:
-        model: the model at the start.
-        evaluate: makes the model at a state that `LocalModel.step` returned.
-        iterations: maximum number of steps.
-        tolerance: stop after a step with a predicted reduction of at most this share of the cost.
+    `evaluate` makes the model at a state that `LocalModel.step` returned. The search ends after a step with a predicted
+    reduction of at most the share `tolerance` of the cost.
     """
     damping, use_curvature = INITIAL_DAMPING, False
     for _ in range(iterations):
@@ -69,7 +64,7 @@ def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tole
         state, predicted_reduction = proposal
         trial = evaluate(state)
         converged = not predicted_reduction > tolerance * model.cost
-        accepted = trial.cost <= _COST_SLACK * model.cost
+        accepted = trial.cost <= (1 + 1e-13) * model.cost  # an increase by rounding does not reject a step
         if accepted:
             use_curvature = predicted_reduction < CURVATURE_BELOW * model.cost
             model = trial
@@ -123,13 +118,7 @@ def variance_factor(
 ) -> float:
     """Variance of unit weight from residuals of two components, as in `_core.residuals.variance_factor`.
 
-    Args:
-        squared: (N,) weighted squared errors.
-        influence: (N,) the kernel's rho' of them.
-        weights: (N,) zero where an error does not count.
-        kernel: robust kernel.
-        scale: of the kernel.
-        num_parameters: number of estimated parameters.
+    Of weighted squared errors (N,), the kernel's rho' of them, and weights, zero where an error does not count.
     """
     counted = (weights > 0).astype(np.float64)
     across = influence * counted

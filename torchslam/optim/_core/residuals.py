@@ -28,8 +28,7 @@ class ReprojectionData:
     """Pixels that points were seen at, and how errors are weighed.
 
     Attributes:
-        weights: inverse variances, px^-2, or (..., N, 2, 2) inverse covariances; zero where the
-            observation does not count
+        weights: inverse variances, px^-2, or inverse covariances; zero where the observation does not count
         camera: parameters (P,) or (..., P)
         scale: scalar, or with the batch dimensions and a last one of size 1 or N
     """
@@ -60,21 +59,18 @@ class ReprojectionData:
         return ReprojectionData(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
-# Bound on the rounding error of a projection, in roundings of a pixel's coordinates.
-_ROUNDINGS = 16.0
+ROUNDINGS = 16.0
+"""Bound on the rounding error of a residual, in roundings of the largest coordinate that enters it."""
 
 
 def rounding_cost(weights: Float[Tensor, "B ..."], params: Float[Tensor, "B C P"]) -> Float[Tensor, " B"]:
     """The cost of exact observations from rounding alone, below which there is nothing to be gained.
 
-    Args:
-        weights: inverse variances, or the diagonals of inverse covariances, zero where nothing
-            counts
-        params: of the cameras: focal lengths and principal points bound the terms of a pixel's
-            coordinates
+    Focal lengths and principal points bound the terms of a pixel's coordinates. Weights are inverse variances, or the
+    diagonals of inverse covariances, zero where nothing counts.
     """
     pixels = params.detach()[..., :4].abs().amax((1, 2))
-    rounding = _ROUNDINGS * torch.finfo(pixels.dtype).eps * pixels
+    rounding = ROUNDINGS * torch.finfo(pixels.dtype).eps * pixels
     return 0.5 * weights.detach().flatten(1).sum(1) * rounding.square()
 
 
@@ -86,8 +82,7 @@ class Linearization(NamedTuple):
         J: d residual / d points_c, followed by d residual / d camera.params where it is free
         cost: contribution to the objective, half of rho
         weight: weights * rho', zero where the point cannot be projected
-        curvature_term: c = 2 * weights^2 * rho''; weight * I + c r r^T is the Hessian of the cost in
-            the residual
+        curvature_term: c = 2 * weights^2 * rho''; weight * I + c r r^T is the Hessian of the cost in the residual
     """
 
     residual: Float[Tensor, "*batch N R"]
@@ -129,23 +124,16 @@ def has_weight(weights: Float[Tensor, "*batch 2 2"]) -> Bool[Tensor, "*batch"]:
 def linearize(
     observations: ReprojectionData, points_c: Float[Tensor, "*batch N 3"], free_camera: bool = False
 ) -> Linearization:
-    """Errors and Jacobians of finite points_c (..., N, 3)."""
+    """Errors and Jacobians of finite points_c; each of (N, 3) may have a camera of its own."""
+    if observations.camera.params.ndim == points_c.ndim:
+        lin = linearize(_apart(observations), points_c[:, None], free_camera)
+        return Linearization(*(part.squeeze(1) for part in lin))
     pixels, valid, J = _project(observations.camera, points_c, free_camera)
     residual = pixels - observations.pixels
     if observations.has_matrices:
         W = whitening(observations.weights)
         residual, J = (W @ residual[..., None]).squeeze(-1), W @ J
     return Linearization(residual, J, *weigh(observations, residual.square().sum(-1), valid))
-
-
-def linearize_each(
-    observations: ReprojectionData, points_c: Float[Tensor, "N 3"], free_camera: bool = False
-) -> Linearization:
-    """`linearize` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
-    if observations.camera.params.ndim == 1:
-        return linearize(observations, points_c, free_camera)
-    lin = linearize(_apart(observations), points_c[:, None], free_camera)
-    return Linearization(*(part.squeeze(1) for part in lin))
 
 
 def _apart(observations: ReprojectionData) -> ReprojectionData:
@@ -159,18 +147,11 @@ def _apart(observations: ReprojectionData) -> ReprojectionData:
     )
 
 
-class Weighed(NamedTuple):
-    """`cost`, `weight` and `curvature_term` of a `Linearization`, all (..., N)."""
-
-    cost: Float[Tensor, "*batch N"]
-    weight: Float[Tensor, "*batch N"]
-    curvature_term: Float[Tensor, "*batch N"]
-
-
 def weigh(
     observations: ReprojectionData, squared_px: Float[Tensor, "*batch N"], valid: Bool[Tensor, "*batch N"]
-) -> Weighed:
-    """Costs and weights of squared errors (..., N), px or whitened; errors that are not valid have weight zero."""
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`cost`, `weight` and `curvature_term` of a `Linearization` by squared errors, px^2 or whitened; errors that are
+    not valid have weight zero."""
     camera, weights = observations.camera, observations.factors
     diagonal: Tensor | float = float(camera.width**2 + camera.height**2)
     if observations.has_matrices:
@@ -178,7 +159,7 @@ def weigh(
     squared = weights * torch.where(valid, squared_px, diagonal)
     rho, slope, curvature = robustify(squared, observations.kernel, observations.scale)
     counted = torch.where(valid, weights, 0.0)
-    return Weighed(0.5 * rho, counted * slope, 2 * counted * counted * curvature)
+    return 0.5 * rho, counted * slope, 2 * counted * counted * curvature
 
 
 def _project(camera: Camera, points_c: Tensor, free_camera: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -217,11 +198,7 @@ def flat_along(
 
 
 class Expansion(NamedTuple):
-    """The second-order expansion of the cost in points_c and, where it is free, camera.params.
-
-    Attributes:
-        hessian: with D = 3, or 3 + P where the camera is free.
-    """
+    """The second-order expansion of the cost in points_c, D = 3, and where it is free camera.params, D = 3 + P."""
 
     gradient: Float[Tensor, "*batch N D"]
     hessian: Float[Tensor, "*batch N D D"]
@@ -255,11 +232,15 @@ def gauss_newton_expansion(
 def exact_expansion(
     observations: ReprojectionData, points_c: Float[Tensor, "*batch N 3"], free_camera: bool = False
 ) -> Expansion:
-    """Exact gradient and Hessian of the cost per observation, with the curvature of kernel and projection.
+    """Exact gradient and Hessian of the cost per observation, with the curvature of kernel and projection; cameras as
+    in `linearize`.
 
     The projection's own second derivative is that of J^T g with the gradient g in the residual fixed: autograd of the
     analytic Jacobian.
     """
+    if observations.camera.params.ndim == points_c.ndim:
+        expansion = exact_expansion(_apart(observations), points_c[:, None], free_camera)
+        return Expansion(*(part.squeeze(1) for part in expansion))
     lin = linearize(observations, points_c, free_camera)
     gradient_wrt_residual = lin.gradient_wrt_residual[..., None]
     along = (lin.residual[..., None, :] @ lin.J) * (lin.curvature_term[..., None] * lin.residual)[..., None]
@@ -271,16 +252,6 @@ def exact_expansion(
     )
     hessian = hessian + _projection_curvature(observations.camera, points_c, pull.detach(), free_camera)
     return Expansion((lin.J.mT @ gradient_wrt_residual).squeeze(-1), hessian)
-
-
-def exact_expansion_of_each(
-    observations: ReprojectionData, points_c: Float[Tensor, "N 3"], free_camera: bool = False
-) -> Expansion:
-    """`exact_expansion` of N observations and points_c (N, 3), of one camera (P,) or of one each, (N, P)."""
-    if observations.camera.params.ndim == 1:
-        return exact_expansion(observations, points_c, free_camera)
-    expansion = exact_expansion(_apart(observations), points_c[:, None], free_camera)
-    return Expansion(*(part.squeeze(1) for part in expansion))
 
 
 def _projection_curvature(

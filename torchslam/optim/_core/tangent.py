@@ -42,10 +42,12 @@ def pull_back(
     return torch.cat((grads[..., 3], rotation), dim=-1)
 
 
-def push(T: Float[Tensor, "*#batch 4 4"], xi: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 4 4"]:
-    """The change of T, to first order, when it moves along xi."""
+def push(T: Float[Tensor, "*#batch 4 4"], xi: Float[Tensor, "*#batch D"]) -> Float[Tensor, "*batch 4 4"]:
+    """The change of T, to first order, when it moves along xi, with D = 6 or for a similarity 7."""
     columns = T[..., :3, :]
-    rotated = torch.linalg.cross(xi[..., 3:, None].expand_as(columns), columns, dim=-2)
+    rotated = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
+    if xi.shape[-1] == 7:
+        rotated = rotated + xi[..., 6:, None] * columns
     changed = torch.cat((rotated[..., :3], rotated[..., 3:] + xi[..., :3, None]), dim=-1)
     return torch.nn.functional.pad(changed, (0, 0, 0, 1))
 
@@ -84,20 +86,9 @@ def retract_sim3(
 def pull_back_sim3(
     S: Float[Tensor, "*#batch 4 4"], grad_S: Float[Tensor, "*#batch 4 4"]
 ) -> Float[Tensor, "*batch 7"]:
-    """The gradient with respect to xi (..., 7), at zero, of a loss with gradient `grad_S` at exp(xi) @ S."""
-    columns, grads = S[..., :3, :], grad_S[..., :3, :]
-    rotation = torch.linalg.cross(columns, grads, dim=-2).sum(-1)
-    return torch.cat((grads[..., 3], rotation, (columns * grads).sum((-2, -1))[..., None]), dim=-1)
-
-
-def push_sim3(S: Float[Tensor, "*#batch 4 4"], xi: Float[Tensor, "*#batch D"]) -> Float[Tensor, "*batch 4 4"]:
-    """The change of S, to first order, when it moves along xi."""
-    columns = S[..., :3, :]
-    rotated = torch.linalg.cross(xi[..., 3:6, None].expand_as(columns), columns, dim=-2)
-    if xi.shape[-1] == 7:
-        rotated = rotated + xi[..., 6:, None] * columns
-    changed = torch.cat((rotated[..., :3], rotated[..., 3:] + xi[..., :3, None]), dim=-1)
-    return torch.nn.functional.pad(changed, (0, 0, 0, 1))
+    """As `pull_back`, for similarities."""
+    scale = (S[..., :3, :] * grad_S[..., :3, :]).sum((-2, -1))
+    return torch.cat((pull_back(S, grad_S), scale[..., None]), dim=-1)
 
 
 @dataclass(frozen=True)

@@ -13,8 +13,14 @@ from torch import Tensor
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.implicit import find_minimum
-from torchslam.optim._core.levenberg_marquardt import Convergence, Progress, SolverReason, check_minimum
-from torchslam.optim._core.options import BUNDLE_OPTIONS, SolverOptions
+from torchslam.optim._core.levenberg_marquardt import (
+    BUNDLE_OPTIONS,
+    Convergence,
+    Outcome,
+    Progress,
+    SolverOptions,
+    check_minimum,
+)
 from torchslam.optim.bundle._factors import factor_kinds
 from torchslam.optim.bundle._minimization import BundleMinimization, BundleMinimum
 from torchslam.optim.bundle._problem import BundleProblem, sanitized
@@ -25,7 +31,7 @@ __all__ = ["BundleProblem", "BundleSolution", "solve_bundle"]
 
 
 @dataclass(frozen=True)
-class BundleSolution:
+class BundleSolution(Outcome):
     """The minimum of a bundle adjustment; for a batch, everything leads with B.
 
     Attributes:
@@ -50,16 +56,6 @@ class BundleSolution:
     moved_points: Bool[Tensor, "*batch N"]
     convergence: Convergence
     _marginals: Callable[[], Marginals] = field(repr=False)
-
-    @property
-    def converged(self) -> Bool[Tensor, "*batch"]:
-        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
-        return self.convergence.converged.view_as(self.success)
-
-    @property
-    def reasons(self) -> list[SolverReason]:
-        """How the search ended, for each problem."""
-        return self.convergence.reasons(self.success)
 
     @cached_property
     def _covariance(self) -> Marginals:
@@ -154,33 +150,20 @@ def solve_bundle(
         ValueError: a shape or an index does not fit, or a name is unknown.
         ConvergenceError: with `options.strict`.
     """
-    backward = options.backward
     given = sanitized(problem, options.scale)
-    minimization = BundleMinimization(
-        problem.camera,
-        options.kernel,
-        free_camera,
-        options.iterations,
-        options.tolerance,
-        progress,
-        check,
-        given.weights.ndim > 2,
-        factor_kinds(problem.frame_factors),
-    )
-    found = BundleMinimum(*find_minimum(minimization, given, backward))
+    matrices, kinds = given.weights.ndim > 2, factor_kinds(problem.frame_factors)
+    minimization = BundleMinimization(problem.camera, free_camera, options, progress, check, matrices, kinds)
+    found = BundleMinimum(*find_minimum(minimization, given, options.backward))
     if options.strict:
         check_minimum(found.success, found.converged, "bundle adjustments")
     detached = [x.detach() for x in given]
     solution = found.estimate
-    if backward == "implicit":
+    if options.backward == "implicit":
         points_w = torch.where(found.with_depth[..., None], found.points_w, found.points_w.detach())
         solution = minimization.at_minimum(found._replace(points_w=points_w), given)
-    if backward == "truncated":
+    if options.backward == "truncated":
         solution = minimization.last_step(found, given)
     params = solution.params if problem.camera_index is not None else solution.params[:, 0]
-    convergence = Convergence(
-        found.iterations, found.converged, found.initial_cost, found.cost, options.iterations
-    )
 
     def marginals() -> Marginals:
         of_all = minimization.marginals(found, detached)
@@ -195,6 +178,6 @@ def solve_bundle(
         found.success[row],
         found.moved_frames[row],
         found.moved_points[row],
-        convergence,
+        Convergence(*found[-4:], limit=options.iterations),
         marginals,
     )

@@ -16,11 +16,17 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import se3_inverse
+from torchslam.geometry.lie import se3_inverse, skew
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Tensors
 from torchslam.optim._core.levenberg_marquardt import index_tree, select_models
-from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize, inverse_root_3x3
+from torchslam.optim._core.linear import (
+    LOWER_3X3,
+    DefiniteFactor,
+    diagonal_floor,
+    factorize,
+    inverse_root_3x3,
+)
 from torchslam.optim._core.residuals import (
     Expansion,
     Linearization,
@@ -35,7 +41,6 @@ from torchslam.optim._core.tangent import cross_entries, retract, rotated
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
-    BundleInputs,
     MovingParts,
     PriorTerms,
     block_diagonal,
@@ -45,9 +50,6 @@ from torchslam.optim.bundle._problem import (
     prior_terms,
 )
 from torchslam.optim.bundle._schur import Marginals
-
-# An observation of the sparse equations costs as much as this number of cells of a grid.
-_MAX_CELLS_PER_OBSERVATION = 8
 
 
 class DenseLayout(NamedTuple):
@@ -72,26 +74,14 @@ class DenseLayout(NamedTuple):
     held_points: Bool[Tensor, " B"]
 
 
-class DenseData(NamedTuple):
-    """All that the problems are made of, in the layout's order.
-
-    Attributes:
-        inputs: as `BundleInputs`, but pixels (B, K, 2, N) and weights (B, K, N), zero where nothing was seen
-        camera_of: the camera of each frame
-    """
-
-    layout: DenseLayout
-    inputs: BundleInputs
-    camera_of: Int[Tensor, "B K"]
-
-
 def suits_dense(given: BundleData, moving: MovingParts) -> bool:
     """Whether grids are the faster way: no point is seen twice in a frame, and few cells are empty."""
     num_frames, num_points = moving.frames.shape[1], moving.points.shape[1]
     cells = moving.frames.numel() * num_points
     if given.weights.ndim > 2 or given.depths.shape[1] or given.measured.shape[1]:
         return False  # the dense equations take scalar weights only, and neither depths nor factors
-    if not 0 < cells <= _MAX_CELLS_PER_OBSERVATION * int(moving.counted.sum()):
+    # An observation of the sparse equations costs as much as 8 cells of a grid.
+    if not 0 < cells <= 8 * int(moving.counted.sum()):
         return False
     places = flat_rows(given.frame_index * num_points + given.point_index, num_frames * num_points)
     return int(torch.bincount(places[moving.counted.flatten()], minlength=1).max()) <= 1
@@ -118,19 +108,20 @@ def build_dense_layout(given: BundleData, moving: MovingParts) -> DenseLayout:
     )
 
 
-def dense_data(layout: DenseLayout, given: BundleData) -> DenseData:
-    """The grids, filled."""
-    inputs = given.inputs._replace(
+def dense_data(layout: DenseLayout, given: BundleData) -> BundleData:
+    """The problems in the layout's order, with grids of pixels (B, K, 2, N) and weights (B, K, N), zero where nothing
+    was seen."""
+    priors = given.prior_T_cw, given.prior_information
+    if given.pose_prior is not None:
+        priors = take_rows(priors[0], layout.order), take_rows(priors[1], layout.order)
+    return given._replace(
         T_cw=take_rows(given.T_cw, layout.order),
         pixels=_spread(layout, given.pixels.mT),
         weights=_spread(layout, given.weights[:, None])[:, :, 0],
+        prior_T_cw=priors[0],
+        prior_information=priors[1],
+        camera_index=take_rows(given.camera_index, layout.order),
     )
-    if inputs.pose_prior is not None:
-        inputs = inputs._replace(
-            prior_T_cw=take_rows(given.prior_T_cw, layout.order),
-            prior_information=take_rows(given.prior_information, layout.order),
-        )
-    return DenseData(layout, inputs, given.camera_index.gather(1, layout.order))
 
 
 def take_rows(tensor: Tensor, rows: Tensor) -> Tensor:
@@ -147,20 +138,8 @@ def _spread(layout: DenseLayout, values: Tensor) -> Tensor:
     return grid.unflatten(-1, (num_frames, num_points)).transpose(1, 2).contiguous()
 
 
-# eps_ijk of the cross product: (a x b)_i = eps_ijk a_j b_k.
-_AXES = torch.eye(3, dtype=torch.float64, device="cpu")
-_CROSS = torch.linalg.cross(_AXES[:, None].expand(3, 3, 3), _AXES.expand(3, 3, 3))
-"""The tensor eps_ijk."""
-
-
-class DenseExpansion(NamedTuple):
-    """`residuals.Expansion` of every frame and point: gradient (B, K, D, N), hessian (B, K, D, D, N).
-
-    D = 3 + n, with the n directions in which the frame's camera moves.
-    """
-
-    gradient: Float[Tensor, "B K D N"]
-    hessian: Float[Tensor, "B K D D N"]
+_CROSS = skew(torch.eye(3, dtype=torch.float64, device="cpu")).transpose(0, 1)
+"""eps_ijk of the cross product: (a x b)_i = eps_ijk a_j b_k."""
 
 
 class DenseEquations(NamedTuple):
@@ -173,65 +152,6 @@ class DenseEquations(NamedTuple):
     reduced: Float[Tensor, "B D D"]
     points: Float[Tensor, "B 3 3 N"]
     coupling: Float[Tensor, "B D 3 N"]
-
-
-def assemble_dense(
-    expansion: DenseExpansion,
-    rays_w: Float[Tensor, "B K 3 N"],
-    R_cw: Float[Tensor, "B K 3 3"],
-    free: Bool[Tensor, "B F"],
-    camera_of: Int[Tensor, "B K"],
-    num_cameras: int,
-    exact: bool,
-) -> DenseEquations:
-    """Normal equations over the first frames, of which those that are free (B, K') move, all points, and the cameras.
-
-    Args:
-        expansion: in the points in the camera frames
-        rays_w: from the cameras to the points, in the axes of the world
-        camera_of: the camera of each frame
-        exact: include the second-order terms of the rotation
-    """
-    dims, leading, R_wc = expansion.gradient.shape[2], free.shape[1], R_cw.mT
-    upper = expansion.hessian[:, :, :3]
-    curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, K, 3, 3, N): R^T C R
-    slope, across = R_wc @ expansion.gradient[:, :, :3], _times(R_wc, upper[:, :, :, 3:])
-    points, points_gradient = curve.sum(1), slope.sum(1)
-    points_cameras = _sum_by_camera(across, camera_of, num_cameras, over_points=False)
-
-    slope, curve, across, rays_w = (part[:, :leading] for part in (slope, curve, across, rays_w))
-    coupling = torch.stack(
-        (*curve.unbind(2), *cross_entries(rays_w[..., None, :].unbind(2), curve.unbind(2))), dim=2
-    )
-    sums = _sum_by_frame(slope, across, coupling, rays_w, exact)
-    if exact:
-        eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[None, None, ..., None]
-        curvature_term = torch.stack(cross_entries(slope[:, :, :, None].unbind(2), eye.unbind(2)), dim=2)
-        coupling = coupling - torch.nn.functional.pad(curvature_term, (0, 0, 0, 0, 3, 0))
-    gradient, frames, frames_camera = sums
-    if not free.all():  # what only fills up stays where it is
-        gradient = torch.where(free[..., None], gradient, 0.0)
-        eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
-        frames = torch.where(free[..., None, None], frames, eye)
-        frames_camera = torch.where(free[..., None, None], frames_camera, 0.0)
-        coupling = torch.where(free[..., None, None, None], coupling, 0.0)
-    coupling, reduced = coupling.flatten(1, 2), block_diagonal(frames)
-    cameras_gradient = _sum_by_camera(expansion.gradient[:, :, 3:], camera_of, num_cameras)
-    if dims > 3:
-        every = torch.arange(num_cameras, device=camera_of.device)
-        own = camera_of[:, :leading, None, None, None] == every[:, None]  # (B, K', 1, C, 1)
-        frames_cameras = torch.where(own, frames_camera[..., None, :], 0.0).flatten(3).flatten(1, 2)
-        cameras = block_diagonal(_sum_by_camera(expansion.hessian[:, :, 3:, 3:], camera_of, num_cameras))
-        coupling = torch.cat((coupling, points_cameras.transpose(2, 3).flatten(1, 2)), dim=1)
-        reduced = torch.cat(
-            (
-                torch.cat((reduced, frames_cameras), dim=-1),
-                torch.cat((frames_cameras.mT, cameras), dim=-1),
-            ),
-            dim=1,
-        )
-    gradient = torch.cat((gradient.flatten(1), cameras_gradient.flatten(1)), dim=-1)
-    return DenseEquations(gradient, points_gradient, reduced, points, coupling)
 
 
 def _sum_by_camera(values: Tensor, camera_of: Tensor, num_cameras: int, over_points: bool = True) -> Tensor:
@@ -302,76 +222,20 @@ class FactorizedDense(NamedTuple):
         return inverse, root.mT @ inner @ root
 
 
-def factorize_dense(
-    equations: DenseEquations,
-    free: Bool[Tensor, "B K"],
-    free_points: Bool[Tensor, "B N"],
-    num_camera: int,
-    damping: Float[Tensor, " B"] | None = None,
-    gauge: Float[Tensor, "B R g"] | None = None,
-) -> FactorizedDense:
-    """Eliminate the points and factorize what is left, as `NormalEquations.factorized` does.
-
-    The last `num_camera` rows are those of the cameras.
-    """
-    root = _inverse_root(equations.points, free_points, damping)
-    c0, c1, c2 = equations.coupling.unbind(2)
-    q = root[:, None].unbind(2)
-    whitened = torch.stack(
-        (
-            q[0][:, :, 0] * c0,
-            q[1][:, :, 0] * c0 + q[1][:, :, 1] * c1,
-            q[2][:, :, 0] * c0 + q[2][:, :, 1] * c1 + q[2][:, :, 2] * c2,
-        ),
-        dim=2,
-    ).flatten(2)
-    reduced, frames = equations.reduced, equations.reduced.shape[-1] - num_camera
-    if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
-        growth = damping[:, None] * reduced.diagonal(dim1=-2, dim2=-1)
-        growth[:, :frames] += diagonal_floor(growth.dtype)
-        reduced = reduced + torch.diag_embed(growth)
-    reduced = torch.baddbmm(reduced, whitened, whitened.mT, alpha=-1)
-    if gauge is not None:
-        c = gauge * _mean_of(reduced, free, num_camera).sqrt()[:, None, None]
-        c = torch.nn.functional.pad(c, (0, 0, 0, num_camera))
-        reduced = torch.baddbmm(reduced, c, c.mT)
-    return FactorizedDense(root, whitened, factorize(reduced, strict=damping is None))
-
-
-def _mean_of(reduced: Tensor, free: Tensor, num_camera: int) -> Tensor:
-    """Mean (B,) of the diagonal, without padding: for each problem the same as for it alone."""
-    diagonal = reduced.diagonal(dim1=-2, dim2=-1)
-    if free.all():
-        return diagonal.mean(-1)
-    rows = torch.nn.functional.pad(free.repeat_interleave(6, dim=1), (0, num_camera), value=True)
-    return torch.where(rows, diagonal, 0.0).sum(-1) / rows.sum(-1).clamp_min(1)
-
-
 def _inverse_root(blocks: Tensor, free: Tensor, damping: Tensor | None) -> Tensor:
     """`inverse_root_3x3` of blocks (B, 3, 3, N), with diagonals grown by the share `damping`, where they are free."""
-    diagonal = blocks.diagonal(dim1=1, dim2=2).mT
-    if damping is not None:
-        diagonal = diagonal * (1 + damping[:, None, None])
-    d0, d1, d2 = diagonal.unbind(1)
-    lower = d0, blocks[:, 1, 0], d1, blocks[:, 2, 0], blocks[:, 2, 1], d2
+    grown = 1.0 if damping is None else 1 + damping[:, None]
+    lower = [blocks[:, i, j] * grown if i == j else blocks[:, i, j] for i, j in LOWER_3X3]
     smallest = torch.finfo(blocks.dtype).eps ** 0.8 if damping is None else 0.0
     q00, q10, q11, q20, q21, q22 = inverse_root_3x3(lower, free, smallest)
     zero = torch.zeros_like(q00)
     return torch.stack((q00, zero, zero, q10, q11, zero, q20, q21, q22), dim=1).unflatten(1, (3, 3))
 
 
-class DenseEstimate(NamedTuple):
-    """Poses (B, K, 4, 4) in the layout's order, points (B, 3, N), camera parameters (B, C, P)."""
-
-    T_cw: Float[Tensor, "B K 4 4"]
-    points_w: Float[Tensor, "B 3 N"]
-    params: Float[Tensor, "B C P"]
-
-
 class DenseModel(NamedTuple):
-    """The local models of the costs (B,) at an estimate."""
+    """The local models of the costs at an estimate, which has the layout's order and points (B, 3, N)."""
 
-    estimate: DenseEstimate
+    estimate: BundleEstimate
     cost: Float[Tensor, " B"]
     equations: DenseEquations
 
@@ -380,46 +244,44 @@ class DenseModel(NamedTuple):
 class DenseBundle:
     """A batch of bundle adjustments for `minimize_batch`, with their covariances and exact solvers.
 
-    Attributes:
-        directions: in which the cameras' parameters move, None where they do not
+    given: as of `dense_data`; directions: in which the cameras' parameters move, None where they do not
     """
 
-    data: DenseData
+    layout: DenseLayout
+    given: BundleData
     camera: Camera
     kernel: Kernel
     directions: Float[Tensor, "P n"] | None
 
     @property
     def solvable(self) -> Tensor:
-        layout, has_prior = self.data.layout, self.data.inputs.pose_prior is not None
+        layout, has_prior = self.layout, self.given.pose_prior is not None
         observed = (layout.cells < layout.order.shape[1] * layout.free_points.shape[1]).any(1)
         return observed | layout.free.any(1) if has_prior else observed
 
     @property
-    def start(self) -> DenseEstimate:
-        inputs = self.data.inputs
-        return DenseEstimate(inputs.T_cw, inputs.points_w.mT, inputs.params)
+    def start(self) -> BundleEstimate:
+        return BundleEstimate(self.given.T_cw, self.given.points_w.mT, self.given.params)
 
     def rounding(self) -> Tensor:
-        return rounding_cost(self.data.inputs.weights, self.data.inputs.params)
+        return rounding_cost(self.given.weights, self.given.params)
 
     def part(self, rows: Tensor) -> DenseBundle:
         """The problems of some elements of the batch."""
-        return replace(self, data=index_tree(self.data, rows))
+        layout, given = index_tree((self.layout, self.given), rows)
+        return replace(self, layout=layout, given=given)
 
-    def evaluate(self, estimate: DenseEstimate, use_curvature: Tensor) -> DenseModel:
-        points_c = self._points_c(estimate)
-        lin = self._linearize(estimate, points_c)
+    def evaluate(self, estimate: BundleEstimate, use_curvature: Tensor) -> DenseModel:
+        lin = self._linearize(estimate)
         equations, prior_cost = self._equations(estimate, _expanded(lin, use_curvature))
         return DenseModel(estimate, lin.cost.sum((1, 2)) + prior_cost, equations)
 
-    def step(self, model: DenseModel, damping: Tensor) -> tuple[DenseEstimate, Tensor]:
+    def step(self, model: DenseModel, damping: Tensor) -> tuple[BundleEstimate, Tensor]:
         equations, (T_cw, points_w, params) = model.equations, model.estimate
         factorized = self._factorized(model.estimate, equations, damping)
         step, points = factorized.solve(equations.gradient, equations.points_gradient)
-        predicted_reduction = (step * equations.gradient).sum(1) + (points * equations.points_gradient).sum(
-            (1, 2)
-        )
+        of_points = (points * equations.points_gradient).sum((1, 2))
+        predicted_reduction = (step * equations.gradient).sum(1) + of_points
         predicted_reduction = torch.where(factorized.reduced.definite, 0.5 * predicted_reduction, torch.inf)
         frames, camera = self._split(step)
         leading = frames.shape[1]
@@ -427,10 +289,9 @@ class DenseBundle:
         T_cw = torch.cat((moved, T_cw[:, leading:]), dim=1)
         if self.directions is not None:
             params = params - camera.unflatten(1, (params.shape[1], -1)) @ self.directions.mT
-        return DenseEstimate(T_cw, points_w - points, params), predicted_reduction
+        return BundleEstimate(T_cw, points_w - points, params), predicted_reduction
 
-    def select(self, accept: Tensor, new: DenseModel, old: DenseModel) -> DenseModel:
-        return select_models(accept, new, old)
+    select = staticmethod(select_models)
 
     def definite(self, model: DenseModel) -> Tensor:
         """Whether (B,) all that moves is determined, up to the gauge."""
@@ -438,12 +299,13 @@ class DenseBundle:
 
     def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
         """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
-        layout, ordered = self.data.layout, self.ordered(estimate)
+        layout, ordered = self.layout, self.ordered(estimate)
         points_c = self._points_c(ordered)
         expansion = exact_expansion(self._observations(ordered), points_c.mT, self.directions is not None)
         if self.directions is not None:
             expansion = expansion.along(self._columns)
-        equations, _ = self._equations(ordered, _as_grid(expansion), exact=True)
+        gradient, hessian = expansion.gradient.mT.contiguous(), expansion.hessian.movedim(2, -1).contiguous()
+        equations, _ = self._equations(ordered, Expansion(gradient, hessian), exact=True)
         factorized = self._factorized(ordered, equations)
         leading = layout.free.shape[1]
         padding, R_cw = layout.order.shape[1] - leading, ordered.T_cw[:, :leading, :3, :3]
@@ -461,13 +323,10 @@ class DenseBundle:
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (B, K, 6, 6), (B, N, 3, 3), (B, C n, C n) in the order of the problems, zero for what stays."""
-        layout, ordered = self.data.layout, self.ordered(estimate)
-        points_c = self._points_c(ordered)
-        lin = self._linearize(ordered, points_c)
-        observations = self._observations(ordered)
-        flat = replace(
-            observations, pixels=observations.pixels.flatten(1, 2), weights=observations.weights.flatten(1)
-        )
+        layout, ordered = self.layout, self.ordered(estimate)
+        lin = self._linearize(ordered)
+        observed = self._observations(ordered)
+        flat = replace(observed, pixels=observed.pixels.flatten(1, 2), weights=observed.weights.flatten(1))
         num_cameras = 0 if self.directions is None else estimate.params.shape[1] * self.directions.shape[1]
         num_parameters = 6 * layout.free.sum(1) + 3 * layout.free_points.sum(1) + num_cameras
         factor = variance_factor(flat, Linearization(*(part.flatten(1, 2) for part in lin)), num_parameters)
@@ -484,28 +343,27 @@ class DenseBundle:
         frames = take_rows(torch.nn.functional.pad(frames, (0, 0, 0, 0, 0, padding)), layout.rank)
         return Marginals(frames, points, inverse[:, size:, size:])
 
-    def ordered(self, estimate: BundleEstimate) -> DenseEstimate:
+    def ordered(self, estimate: BundleEstimate) -> BundleEstimate:
         """An estimate as the grids have it."""
-        T_cw = take_rows(estimate.T_cw, self.data.layout.order)
-        return DenseEstimate(T_cw, estimate.points_w.mT, estimate.params)
-
-    def in_order(self, estimate: DenseEstimate) -> BundleEstimate:
-        """An estimate as the problems have it."""
-        T_cw = take_rows(estimate.T_cw, self.data.layout.rank)
+        T_cw = take_rows(estimate.T_cw, self.layout.order)
         return BundleEstimate(T_cw, estimate.points_w.mT, estimate.params)
 
-    def _points_c(self, estimate: DenseEstimate) -> Tensor:
+    def in_order(self, estimate: BundleEstimate) -> BundleEstimate:
+        """An estimate as the problems have it."""
+        T_cw = take_rows(estimate.T_cw, self.layout.rank)
+        return BundleEstimate(T_cw, estimate.points_w.mT, estimate.params)
+
+    def _points_c(self, estimate: BundleEstimate) -> Tensor:
         """Points in the camera frames, (B, K, 3, N)."""
         T_cw = estimate.T_cw
         return T_cw[..., :3, :3] @ estimate.points_w[:, None] + T_cw[..., :3, 3:]
 
-    def _observations(self, estimate: DenseEstimate) -> ReprojectionData:
-        inputs = self.data.inputs
-        params = estimate.params
+    def _observations(self, estimate: BundleEstimate) -> ReprojectionData:
+        given, params = self.given, estimate.params
         if params.shape[1] > 1:
-            params = take_rows(params, self.data.camera_of)
-        camera, scale = self.camera.with_params(params), inputs.scale[:, None, None]
-        return ReprojectionData(inputs.pixels.mT, inputs.weights, camera, self.kernel, scale)
+            params = take_rows(params, given.camera_index)
+        camera, scale = self.camera.with_params(params), given.scale[:, None, None]
+        return ReprojectionData(given.pixels.mT, given.weights, camera, self.kernel, scale)
 
     @property
     def _columns(self) -> Tensor:
@@ -514,24 +372,17 @@ class DenseBundle:
         eye = torch.eye(3, dtype=self.directions.dtype, device=self.directions.device)
         return torch.block_diag(eye, self.directions)
 
-    def _linearize(self, estimate: DenseEstimate, points_c: Tensor) -> Linearization:
+    def _linearize(self, estimate: BundleEstimate) -> Linearization:
         """Of every frame and point, (B, K, N, ...)."""
-        lin = linearize(self._observations(estimate), points_c.mT, self.directions is not None)
+        observations, points_c = self._observations(estimate), self._points_c(estimate)
+        lin = linearize(observations, points_c.mT, self.directions is not None)
         return lin if self.directions is None else lin._replace(J=lin.J @ self._columns)
 
     def _equations(
-        self,
-        estimate: DenseEstimate,
-        expansion: DenseExpansion,
-        exact: bool = False,
-        share: Tensor | float = 1.0,
+        self, estimate: BundleEstimate, expansion: Expansion, exact: bool = False, share: Tensor | float = 1.0
     ) -> tuple[DenseEquations, Tensor | float]:
         """The equations with a share of the priors, and the priors' cost (B,)."""
-        R_cw, t_cw = estimate.T_cw[..., :3, :3], estimate.T_cw[..., :3, 3:]
-        rays_w = estimate.points_w[:, None] + R_cw.mT @ t_cw
-        cameras = self.data.camera_of, estimate.params.shape[1]
-        equations = assemble_dense(expansion, rays_w, R_cw, self.data.layout.free, *cameras, exact)
-        terms = self._priors(estimate, exact)
+        equations, terms = self._observed(estimate, expansion, exact), self._priors(estimate, exact)
         if terms is None:
             return equations, 0.0
         gradient = torch.cat((terms.frames_gradient.flatten(1), terms.cameras_gradient.flatten(1)), dim=1)
@@ -539,44 +390,104 @@ class DenseBundle:
         size, more = frames.shape[-1], camera.shape[-1]
         hessian = torch.nn.functional.pad(frames, (0, more, 0, more))
         hessian = hessian + torch.nn.functional.pad(camera, (size, 0, size, 0))
-        return (
-            equations._replace(
-                gradient=equations.gradient + gradient, reduced=equations.reduced + share * hessian
-            ),
-            terms.cost,
-        )
+        gradient, reduced = equations.gradient + gradient, equations.reduced + share * hessian
+        return equations._replace(gradient=gradient, reduced=reduced), terms.cost
 
-    def _priors(self, estimate: DenseEstimate, exact: bool = False) -> PriorTerms | None:
-        inputs, free = self.data.inputs, self.data.layout.free
-        if not inputs.has_priors:
+    def _observed(self, estimate: BundleEstimate, expansion: Expansion, exact: bool) -> DenseEquations:
+        """The equations of the observations, with the expansion in the points in the camera frames and the n directions
+        of the frame's camera: (B, K, 3 + n, N) and (B, K, 3 + n, 3 + n, N)."""
+        free, camera_of = self.layout.free, self.given.camera_index
+        R_cw, t_cw, num_cameras = (
+            estimate.T_cw[..., :3, :3],
+            estimate.T_cw[..., :3, 3:],
+            estimate.params.shape[1],
+        )
+        leading, R_wc = free.shape[1], R_cw.mT
+        rays_w = estimate.points_w[:, None] + R_wc @ t_cw
+        upper = expansion.hessian[:, :, :3]
+        curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, K, 3, 3, N): R^T C R
+        slope, across = R_wc @ expansion.gradient[:, :, :3], _times(R_wc, upper[:, :, :, 3:])
+        points, points_gradient = curve.sum(1), slope.sum(1)
+        points_cameras = _sum_by_camera(across, camera_of, num_cameras, over_points=False)
+
+        slope, curve, across, rays_w = (part[:, :leading] for part in (slope, curve, across, rays_w))
+        turning = cross_entries(rays_w[..., None, :].unbind(2), curve.unbind(2))
+        coupling = torch.stack((*curve.unbind(2), *turning), dim=2)
+        gradient, frames, frames_camera = _sum_by_frame(slope, across, coupling, rays_w, exact)
+        if exact:
+            eye = torch.eye(3, dtype=slope.dtype, device=slope.device)[None, None, ..., None]
+            curvature_term = torch.stack(cross_entries(slope[:, :, :, None].unbind(2), eye.unbind(2)), dim=2)
+            coupling = coupling - torch.nn.functional.pad(curvature_term, (0, 0, 0, 0, 3, 0))
+        if not free.all():  # what only fills up stays where it is
+            gradient = torch.where(free[..., None], gradient, 0.0)
+            eye = torch.eye(6, dtype=frames.dtype, device=frames.device)
+            frames = torch.where(free[..., None, None], frames, eye)
+            frames_camera = torch.where(free[..., None, None], frames_camera, 0.0)
+            coupling = torch.where(free[..., None, None, None], coupling, 0.0)
+        coupling, reduced = coupling.flatten(1, 2), block_diagonal(frames)
+        cameras_gradient = _sum_by_camera(expansion.gradient[:, :, 3:], camera_of, num_cameras)
+        if self.directions is not None:
+            every = torch.arange(num_cameras, device=camera_of.device)
+            own = camera_of[:, :leading, None, None, None] == every[:, None]  # (B, K', 1, C, 1)
+            frames_cameras = torch.where(own, frames_camera[..., None, :], 0.0).flatten(3).flatten(1, 2)
+            cameras = block_diagonal(_sum_by_camera(expansion.hessian[:, :, 3:, 3:], camera_of, num_cameras))
+            coupling = torch.cat((coupling, points_cameras.transpose(2, 3).flatten(1, 2)), dim=1)
+            rows = (reduced, frames_cameras), (frames_cameras.mT, cameras)
+            reduced = torch.cat([torch.cat(row, dim=-1) for row in rows], dim=1)
+        gradient = torch.cat((gradient.flatten(1), cameras_gradient.flatten(1)), dim=-1)
+        return DenseEquations(gradient, points_gradient, reduced, points, coupling)
+
+    def _priors(self, estimate: BundleEstimate, exact: bool = False) -> PriorTerms | None:
+        given, free = self.given, self.layout.free
+        if not given.has_priors:
             return None
-        if inputs.pose_prior is not None:
-            leading = free.shape[1]
-            inputs = inputs._replace(
-                prior_T_cw=inputs.prior_T_cw[:, :leading],
-                prior_information=inputs.prior_information[:, :leading],
-            )
-        T_cw = estimate.T_cw[:, : free.shape[1]]
-        terms = prior_terms(inputs, T_cw, estimate.params, free, self.directions, exact)
+        leading = free.shape[1]
+        if given.pose_prior is not None:
+            T_cw, information = given.prior_T_cw[:, :leading], given.prior_information[:, :leading]
+            given = given._replace(prior_T_cw=T_cw, prior_information=information)
+        T_cw = estimate.T_cw[:, :leading]
+        terms = prior_terms(given, T_cw, estimate.params, free, self.directions, exact)
         return terms.in_world(T_cw[..., :3, :3])
 
     def _split(self, vector: Tensor) -> tuple[Tensor, Tensor]:
         """The parts of (B, D) that are of the free frames (B, K', 6) and of the cameras."""
-        leading = self.data.layout.free.shape[1]
+        leading = self.layout.free.shape[1]
         return vector[:, : 6 * leading].unflatten(1, (leading, 6)), vector[:, 6 * leading :]
 
     def _factorized(
-        self, estimate: DenseEstimate, equations: DenseEquations, damping: Tensor | None = None
+        self, estimate: BundleEstimate, equations: DenseEquations, damping: Tensor | None = None
     ) -> FactorizedDense:
-        layout = self.data.layout
-        more = equations.reduced.shape[-1] - 6 * layout.free.shape[1]
-        return factorize_dense(
-            equations, layout.free, layout.free_points, more, damping, self._gauge(estimate)
+        """Eliminate the points and factorize what is left, as `NormalEquations.factorized` does."""
+        free, reduced = self.layout.free, equations.reduced
+        frames = 6 * free.shape[1]
+        more = reduced.shape[-1] - frames
+        root = _inverse_root(equations.points, self.layout.free_points, damping)
+        c0, c1, c2 = equations.coupling.unbind(2)
+        q0, q1, q2 = root[:, None].unbind(2)
+        rows = (
+            q0[:, :, 0] * c0,
+            q1[:, :, 0] * c0 + q1[:, :, 1] * c1,
+            q2[:, :, 0] * c0 + q2[:, :, 1] * c1 + q2[:, :, 2] * c2,
         )
+        whitened = torch.stack(rows, dim=2).flatten(2)
+        if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
+            growth = damping[:, None] * reduced.diagonal(dim1=-2, dim2=-1)
+            growth[:, :frames] += diagonal_floor(growth.dtype)
+            reduced = reduced + torch.diag_embed(growth)
+        reduced = torch.baddbmm(reduced, whitened, whitened.mT, alpha=-1)
+        if (gauge := self._gauge(estimate)) is not None:
+            diagonal = reduced.diagonal(dim1=-2, dim2=-1)
+            mean = diagonal.mean(-1)
+            if not free.all():  # without padding: for each problem the same as for it alone
+                is_own = torch.nn.functional.pad(free.repeat_interleave(6, dim=1), (0, more), value=True)
+                mean = torch.where(is_own, diagonal, 0.0).sum(-1) / is_own.sum(-1).clamp_min(1)
+            c = torch.nn.functional.pad(gauge * mean.sqrt()[:, None, None], (0, 0, 0, more))
+            reduced = torch.baddbmm(reduced, c, c.mT)
+        return FactorizedDense(root, whitened, factorize(reduced, strict=damping is None))
 
-    def _gauge(self, estimate: DenseEstimate) -> Tensor | None:
+    def _gauge(self, estimate: BundleEstimate) -> Tensor | None:
         """Gauge directions (B, 6 K', g) along the axes of the world, zero where the gauge is fixed; None if all are."""
-        layout = self.data.layout
+        layout = self.layout
         free, anchors = layout.free, layout.anchors.sum(1)
         is_open = (anchors < 2) & ~layout.held_points & free.any(1)
         if not is_open.any():
@@ -602,13 +513,8 @@ class DenseBundle:
         return motions.flatten(1, 2)
 
 
-def _expanded(lin: Linearization, use_curvature: Tensor) -> DenseExpansion:
+def _expanded(lin: Linearization, use_curvature: Tensor) -> Expansion:
     """Without the curvature of the projection; use_curvature: (B,)."""
     J = lin.J.movedim((-2, -1), (0, 1))
     gradient, hessian = gauss_newton_expansion(lin, J, use_curvature[:, None, None])
-    return DenseExpansion(gradient.movedim(0, 2).contiguous(), hessian.movedim((0, 1), (2, 3)).contiguous())
-
-
-def _as_grid(expansion: Expansion) -> DenseExpansion:
-    """The expansion of every frame and point, with the points last."""
-    return DenseExpansion(expansion.gradient.mT.contiguous(), expansion.hessian.movedim(2, -1).contiguous())
+    return Expansion(gradient.movedim(0, 2).contiguous(), hessian.movedim((0, 1), (2, 3)).contiguous())

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from math import prod
 from typing import NamedTuple
 
@@ -20,7 +21,7 @@ from torch.func import grad, jvp, vmap
 from torchslam.geometry.lie import se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.residuals import Expansion
-from torchslam.optim._core.tangent import retract, rotated
+from torchslam.optim._core.tangent import retract
 
 FrameError = Callable[[Tensor, Tensor, Tensor], Tensor]
 """error(T_1w, T_2w, measured) -> (..., F, D), of poses (..., F, 4, 4), each row from its own rows alone."""
@@ -102,13 +103,8 @@ class FrameFactors:
         distances: Float[Tensor, "*batch F"],
         information: Float[Tensor, "*batch F"],
     ) -> FrameFactors:
-        """Measured distances between camera centers, which determine the scale.
-
-        Args:
-            frames: pairs.
-            distances: in the unit of the points.
-            information: inverse variances of the logarithm, that is of the relative error.
-        """
+        """Measured distances between camera centers, in the unit of the points, which determine the scale; information:
+        inverse variances of the logarithm, that is of the relative error."""
         return cls(frames, distances, information[..., None, None], log_distance_error)
 
     @classmethod
@@ -124,8 +120,7 @@ class FrameFactors:
 
         Args:
             frames: pairs.
-            displacements_w: along the axes of the world, in the unit of the points.
-            information: inverse covariances.
+            displacements_w: along the axes of the world, in the unit of the points; information: inverse covariances.
             lever_c: position of the antenna in the camera, in the unit of the points; None: at its center.
         """
         lever = torch.zeros_like(displacements_w[..., 0, :]) if lever_c is None else lever_c
@@ -139,8 +134,7 @@ class DepthPrior:
 
     Attributes:
         depths: z in the camera, in the unit of the points.
-        information: inverse variances of the logarithm of the depth, that is of its relative error; zero for
-            observations without a depth.
+        information: inverse variances of the relative error of the depth (of its logarithm); zero without a depth.
     """
 
     depths: Float[Tensor, "*#batch O"]
@@ -166,13 +160,15 @@ class FrameBlocks(NamedTuple):
 
 def factor_kinds(factors: Sequence[FrameFactors]) -> list[FactorKind]:
     """The discrete parts of factors that `packed_factors` has accepted."""
-    kinds = []
-    for each in factors:
-        lead = each.information.ndim - 2
-        kinds.append(
-            FactorKind(each.frames, tuple(each.measured.shape[lead:]), each.information.shape[-1], each.error)
+    return [
+        FactorKind(
+            each.frames,
+            tuple(each.measured.shape[each.information.ndim - 2 :]),
+            each.information.shape[-1],
+            each.error,
         )
-    return kinds
+        for each in factors
+    ]
 
 
 def packed_factors(
@@ -209,19 +205,15 @@ def _unpacked(
     kinds: Sequence[FactorKind], measured: Float[Tensor, "*batch M"], information: Float[Tensor, "*batch L"]
 ) -> list[tuple[FactorKind, Tensor, Tensor]]:
     """Each kind with its measured (..., F, ...) and its information (..., F, D, D)."""
-    counts = [len(kind.frames) for kind in kinds]
-    sizes = [
-        (count * prod(kind.shape), count * kind.size**2) for kind, count in zip(kinds, counts, strict=True)
-    ]
-    parts = measured.split([size for size, _ in sizes], dim=-1)
-    matrices = information.split([size for _, size in sizes], dim=-1)
+    parts = measured.split([len(kind.frames) * prod(kind.shape) for kind in kinds], dim=-1)
+    matrices = information.split([len(kind.frames) * kind.size**2 for kind in kinds], dim=-1)
     return [
         (
             kind,
-            part.reshape(*part.shape[:-1], count, *kind.shape),
-            matrix.reshape(*matrix.shape[:-1], count, kind.size, kind.size),
+            part.unflatten(-1, (len(kind.frames), *kind.shape)),
+            matrix.unflatten(-1, (len(kind.frames), kind.size, kind.size)),
         )
-        for kind, count, part, matrix in zip(kinds, counts, parts, matrices, strict=True)
+        for kind, part, matrix in zip(kinds, parts, matrices, strict=True)
     ]
 
 
@@ -230,36 +222,12 @@ def frames_with_factors(
 ) -> Tensor:
     """Which frames (B, K) have a factor that counts."""
     touched = torch.zeros(len(information), num_frames, dtype=torch.int64, device=information.device)
-    start = 0
-    for kind in kinds:
-        count, size = len(kind.frames), kind.size**2
-        own = information[:, start : start + count * size].reshape(len(information), count, size)
-        counts = (own != 0).any(-1).long()
+    matrices = information.split([len(kind.frames) * kind.size**2 for kind in kinds], dim=-1) if kinds else ()
+    for kind, own in zip(kinds, matrices, strict=True):
+        counts = (own.unflatten(-1, (len(kind.frames), kind.size**2)) != 0).any(-1).long()
         for frames in kind.frames.unbind(1):
             touched = touched.index_add(1, frames, counts)
-        start += count * size
     return touched > 0
-
-
-class FactorTerms(NamedTuple):
-    """Cost (), and gradient (K, 6) and Hessian over frames: blocks on the diagonal (K, 6, 6), and between pairs."""
-
-    cost: Tensor
-    gradient: Tensor
-    diagonal: Tensor
-    between: FrameBlocks
-
-    def in_world(self, R_cw: Float[Tensor, "K 3 3"]) -> FactorTerms:
-        """The same for frames that move along the axes of the world."""
-        R_wc = R_cw.mT
-        first, second, blocks = self.between
-        blocks = rotated(R_wc[second], rotated(R_wc[first], blocks).mT).mT
-        return FactorTerms(
-            self.cost,
-            rotated(R_wc, self.gradient[..., None])[..., 0],
-            rotated(R_wc, rotated(R_wc, self.diagonal).mT),
-            FrameBlocks(first, second, blocks),
-        )
 
 
 def factor_terms(
@@ -268,8 +236,11 @@ def factor_terms(
     measured: Float[Tensor, " M"],
     information: Float[Tensor, " L"],
     exact: bool,
-) -> FactorTerms:
-    """The terms at poses. exact: the exact Hessian, not that of Gauss and Newton."""
+) -> tuple[Tensor, Tensor, Tensor, FrameBlocks]:
+    """Cost (), and gradient (K, 6) and Hessian over frames: blocks on the diagonal (K, 6, 6), and between pairs.
+
+    exact: the exact Hessian, not that of Gauss and Newton.
+    """
     cost, gradient = T_cw.new_zeros(()), T_cw.new_zeros(len(T_cw), 6)
     diagonal, pairs, blocks = T_cw.new_zeros(len(T_cw), 6, 6), [], []
     for kind, own, matrix in _unpacked(kinds, measured, information):
@@ -277,20 +248,10 @@ def factor_terms(
         T_1w, T_2w = T_cw[first], T_cw[second]
         moved = _moved(kind, T_1w, T_2w, own)
         zero = T_cw.new_zeros(len(first), 12)
-        basis = torch.eye(12, dtype=zero.dtype, device=zero.device)[:, None].expand(12, len(first), 12)
-        error = moved(zero)
-        J = vmap(lambda step, at=moved, zero=zero: jvp(at, (zero,), (step,))[1], out_dims=-1)(basis)
+        error, J = moved(zero), _jacobian(moved, zero)
         pulled = J.mT @ matrix
         slope = (pulled @ error[..., None]).squeeze(-1)
-        hessian = pulled @ J
-        if exact:
-
-            def slope_of(step: Tensor, at: Callable[[Tensor], Tensor] = moved, W: Tensor = matrix) -> Tensor:
-                return grad(lambda step: _cost(at(step), W))(step)
-
-            hessian = vmap(lambda step, zero=zero, f=slope_of: jvp(f, (zero,), (step,))[1], out_dims=-1)(
-                basis
-            )
+        hessian = _jacobian(grad(partial(_cost_at, moved, matrix)), zero) if exact else pulled @ J
         cost = cost + _cost(error, matrix)
         gradient = gradient.index_add(0, first, slope[:, :6]).index_add(0, second, slope[:, 6:])
         diagonal = diagonal.index_add(0, first, hessian[:, :6, :6])
@@ -298,7 +259,13 @@ def factor_terms(
         pairs.append(kind.frames)
         blocks.append(hessian[:, :6, 6:])
     ends = torch.cat(pairs)
-    return FactorTerms(cost, gradient, diagonal, FrameBlocks(ends[:, 0], ends[:, 1], torch.cat(blocks)))
+    return cost, gradient, diagonal, FrameBlocks(ends[:, 0], ends[:, 1], torch.cat(blocks))
+
+
+def _jacobian(function: Callable[[Tensor], Tensor], zero: Float[Tensor, "F 12"]) -> Float[Tensor, "F D 12"]:
+    """Derivatives of each row in its own 12 numbers."""
+    basis = torch.eye(12, dtype=zero.dtype, device=zero.device)[:, None].expand(12, *zero.shape)
+    return vmap(lambda step: jvp(function, (zero,), (step,))[1], out_dims=-1)(basis)
 
 
 def factor_slope(
@@ -326,6 +293,10 @@ def _moved(kind: FactorKind, T_1w: Tensor, T_2w: Tensor, measured: Tensor) -> Ca
         return kind.error(retract(T_1w, step[..., :6]), retract(T_2w, step[..., 6:]), measured)
 
     return at
+
+
+def _cost_at(moved: Callable[[Tensor], Tensor], information: Tensor, step: Tensor) -> Tensor:
+    return _cost(moved(step), information)
 
 
 def _cost(error: Tensor, information: Tensor) -> Tensor:

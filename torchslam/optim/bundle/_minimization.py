@@ -9,10 +9,15 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Ndims, Tensors
-from torchslam.optim._core.levenberg_marquardt import LeastSquares, M, Progress, X, minimize_batch
-from torchslam.optim._core.residuals import ReprojectionData, linearize_each, only
+from torchslam.optim._core.levenberg_marquardt import (
+    LeastSquares,
+    M,
+    Progress,
+    SolverOptions,
+    minimize_batch,
+)
+from torchslam.optim._core.residuals import ReprojectionData, linearize, only
 from torchslam.optim._core.tangent import move, pull_back, push, retract
 from torchslam.optim.bundle._dense import (
     DenseBundle,
@@ -40,8 +45,7 @@ _MAX_CELLS_CPU, _MAX_CELLS_GPU = 1 << 14, 1 << 20
 
 
 class BundleMinimum(NamedTuple):
-    """Estimates, moved frames (B, K) and points (B, N), counted observations (B, O), the moved points that have a depth
-    (B, N), and convergence (B,)."""
+    """Estimates, what moved, counted observations (B, O), the moved points that have a depth, and convergence."""
 
     T_cw: Tensor
     points_w: Tensor
@@ -51,10 +55,10 @@ class BundleMinimum(NamedTuple):
     moved_points: Tensor
     used: Tensor
     with_depth: Tensor
-    cost: Tensor
     iterations: Tensor
     converged: Tensor
     initial_cost: Tensor
+    cost: Tensor
 
     @property
     def estimate(self) -> BundleEstimate:
@@ -68,31 +72,24 @@ class BatchPart(NamedTuple):
     layout: SparseLayout | DenseLayout
 
 
-class BundleFormulation(LeastSquares[X, M], Protocol[X, M]):
+class BundleFormulation(LeastSquares[BundleEstimate, M], Protocol[M]):
     """Solver of one element (`SparseBundle`) or of many (`DenseBundle`), in an order of its own."""
 
     @property
-    def start(self) -> X: ...
+    def start(self) -> BundleEstimate: ...
 
     def definite(self, model: M) -> Tensor:
         """Whether (B,) all that moves is determined, up to the gauge."""
         ...
 
-    def ordered(self, estimate: BundleEstimate) -> X:
-        """Convert an estimate (B, ...) from the order of the problems."""
-        ...
+    def ordered(self, estimate: BundleEstimate) -> BundleEstimate: ...
 
-    def in_order(self, estimate: X) -> BundleEstimate:
-        """Convert an estimate to the order of the problems."""
-        ...
+    def in_order(self, estimate: BundleEstimate) -> BundleEstimate: ...
 
-    def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]:
-        """v -> H^-1 v with the exact Hessians at minima, in the order of the problems."""
-        ...
+    # Both in the order of the problems.
+    def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]: ...
 
-    def marginals(self, estimate: BundleEstimate) -> Marginals:
-        """Covariances in the order of the problems."""
-        ...
+    def marginals(self, estimate: BundleEstimate) -> Marginals: ...
 
 
 class BundleMinimization:
@@ -108,24 +105,21 @@ class BundleMinimization:
     def __init__(
         self,
         camera: Camera,
-        kernel: Kernel,
         free_camera: bool | Tensor,
-        iterations: int,
-        tolerance: float,
-        progress: Progress | None,
+        options: SolverOptions,
+        progress: Progress | None = None,
         check: bool = True,
         matrices: bool = False,
         kinds: Sequence[FactorKind] = (),
     ) -> None:
         """matrices: whether weights are inverse covariances; kinds: of factors"""
-        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
+        self.ndims: tuple[Ndims, Ndims, Ndims] = (
             (2, 2, 1),
             (3, 2, 2, 0, 1, 1, 1, 1, 0, 0, 0, 0),
             (3, 2, 2, 3 if matrices else 1, 2, 0, 3, 3, 2, 3, 1, 1, 1, 1, 1, 0, 1, 1, 1, 1, 1),
         )
-        self.camera, self.kernel = camera, kernel
-        self.free_camera = free_camera
-        self.iterations, self.tolerance, self.progress = iterations, tolerance, progress
+        self.camera, self.free_camera = camera, free_camera
+        self.options, self.progress = options, progress
         self.check, self.kinds = check, kinds
         self._last: tuple[Tensor, MovingParts, list[BatchPart]] | None = None
 
@@ -136,9 +130,13 @@ class BundleMinimization:
 
     def _minimize(self, given: BundleData, moving: MovingParts, part: BatchPart) -> BundleMinimum:
         bundle, moving = self._bundle(given, part), MovingParts(*(mask[part.rows] for mask in moving))
-        model, convergence = minimize_batch(
-            bundle, bundle.start, self.iterations, self.tolerance, self._progress(given, part)
-        )
+        iterations, tolerance, report = self.options.iterations, self.options.tolerance, self.progress
+        before, batch = (
+            iterations * part.rows.start,
+            len(given.T_cw),
+        )  # as if one element came after the other
+        progress = None if report is None else lambda now, most: report(before + now, most * batch)
+        model, convergence = minimize_batch(bundle, bundle.start, iterations, tolerance, progress)
         with torch.no_grad():
             success = bundle.solvable & given.finite[part.rows]
             with_parallax = moving.points
@@ -154,10 +152,7 @@ class BundleMinimization:
             moving.points,
             moving.counted,
             moving.points & with_parallax,
-            convergence.cost,
-            convergence.iterations,
-            convergence.converged,
-            convergence.initial_cost,
+            *convergence.tensors,
         )
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
@@ -191,11 +186,11 @@ class BundleMinimization:
             given.pixels.flatten(0, 1),
             only(found.used, given.weights).flatten(0, 1),
             cameras[0 if in_cameras is None else in_cameras],
-            self.kernel,
+            self.options.kernel,
             given.scale[:, None].expand_as(given.counted).flatten(),
         )
         is_free = self.free_camera is not False
-        lin = linearize_each(observed, points_c, is_free)
+        lin = linearize(observed, points_c, is_free)
         velocity = move(points_c, frames.flatten(0, 1).index_select(0, in_frames))
         moving = points.flatten(0, 1).index_select(0, in_points)[..., None]
         velocity = velocity + (T_cw[:, :3, :3] @ moving).squeeze(-1)
@@ -211,16 +206,12 @@ class BundleMinimization:
         if self.kinds:
             moved = torch.where(found.moved_frames[..., None], frames, 0.0)
             slope = slope + factor_slope(self.kinds, at.T_cw, given.measured, given.factor_information, moved)
-        if not given.inputs.has_priors:
+        if not given.has_priors:
             return slope
-        priors = prior_terms(
-            given.inputs, at.T_cw, at.params, found.moved_frames, self._directions(at.params), exact=False
-        )
-        return (
-            slope
-            + (priors.frames_gradient * frames).sum()
-            + (priors.cameras_gradient.flatten(1) * camera).sum()
-        )
+        directions = self._directions(at.params)
+        priors = prior_terms(given, at.T_cw, at.params, found.moved_frames, directions, exact=False)
+        slope = slope + (priors.frames_gradient * frames).sum()
+        return slope + (priors.cameras_gradient.flatten(1) * camera).sum()
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
         frames, points, camera = direction
@@ -278,28 +269,19 @@ class BundleMinimization:
     def marginals(self, found: BundleMinimum, inputs: Sequence[Tensor]) -> Marginals:
         with torch.no_grad():
             bundles = self.formulations(BundleData(*inputs))
-            return Marginals(
-                *_concatenated([bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles])
-            )
+            parts = [bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles]
+            return Marginals(*_concatenated(parts))
 
-    def _progress(self, given: BundleData, part: BatchPart) -> Progress | None:
-        """Reports the iterations of all elements, as if one came after the other."""
-        report, before = self.progress, self.iterations * part.rows.start
-        return None if report is None else lambda now, most: report(before + now, most * len(given.T_cw))
-
-    def formulations(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any, Any]]]:
+    def formulations(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any]]]:
         """The parts of a batch and their solvers."""
         return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
 
-    def _bundle(self, given: BundleData, part: BatchPart) -> BundleFormulation[Any, Any]:
-        given, layout = given.part(part.rows), part.layout
+    def _bundle(self, given: BundleData, part: BatchPart) -> BundleFormulation[Any]:
+        given, layout, kernel = given.part(part.rows), part.layout, self.options.kernel
         directions = self._directions(given.params)
         if isinstance(layout, DenseLayout):
-            return DenseBundle(dense_data(layout, given), self.camera, self.kernel, directions)
-        one = BundleData(*(tensor[0] for tensor in given))
-        return SparseBundle(
-            layout, one.inputs, self.camera, self.kernel, directions, given.camera_of[0], self.kinds
-        )
+            return DenseBundle(layout, dense_data(layout, given), self.camera, kernel, directions)
+        return SparseBundle(layout, given.part(0), self.camera, kernel, directions, self.kinds)
 
     def _laid_out(self, given: BundleData) -> tuple[MovingParts, list[BatchPart]]:
         """The layouts for the observations that count; the last ones are kept, which mostly are the next ones."""
@@ -325,11 +307,8 @@ def _parts(given: BundleData, moving: MovingParts, kinds: Sequence[FactorKind] =
         if use_dense:
             parts.append(BatchPart(rows, build_dense_layout(given.part(rows), of_part)))
             continue
-        counted, frames, points = (mask[0] for mask in of_part)
-        index = given.frame_index[start], given.point_index[start]
-        cameras = given.camera_index[start], given.params.shape[1]
-        layout = build_sparse_layout(*index, counted, frames, points, *cameras, joined=joined)
-        parts.append(BatchPart(rows, layout))
+        of_one = MovingParts(*(mask[0] for mask in of_part))
+        parts.append(BatchPart(rows, build_sparse_layout(given.part(start), of_one, joined)))
     return parts
 
 

@@ -12,7 +12,6 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_adjoint, transform
-from torchslam.geometry.precision import check_dtypes
 from torchslam.geometry.robust import kernel_scale
 from torchslam.optim._core.residuals import only, usable
 from torchslam.optim._core.tangent import CameraPrior, PosePrior, prior_expansion, prior_hessian, rotated
@@ -75,48 +74,14 @@ class BundleProblem:
         return self.T_cw.ndim == 4
 
 
-class BundleInputs(NamedTuple):
-    """All that gradients may flow to, in the order of the problem; every tensor of a batch of B leads with it.
-
-    params (C, P), scale (); priors, depths and factors have no rows where there are none. Depths are by observation,
-    what the factors measure and their information flat, as `packed_factors` has them.
-    """
-
-    T_cw: Tensor
-    points_w: Tensor
-    pixels: Tensor
-    weights: Tensor
-    params: Tensor
-    scale: Tensor
-    prior_T_cw: Tensor
-    prior_information: Tensor
-    prior_params: Tensor
-    prior_params_information: Tensor
-    depths: Tensor
-    depth_information: Tensor
-    measured: Tensor
-    factor_information: Tensor
-
-    @property
-    def pose_prior(self) -> PosePrior | None:
-        return PosePrior(self.prior_T_cw, self.prior_information) if self.prior_T_cw.shape[-3] else None
-
-    @property
-    def has_priors(self) -> bool:
-        """Whether there is a prior, on poses or on the camera."""
-        return self.pose_prior is not None or self.camera_prior is not None
-
-    @property
-    def camera_prior(self) -> CameraPrior | None:
-        if not self.prior_params.shape[-2]:
-            return None
-        return CameraPrior(self.prior_params, self.prior_params_information)
-
-
 class BundleData(NamedTuple):
-    """All that bundle adjustments are made of, batched: the tensors of `BundleInputs`, which observations count (B, O),
-    whether all frames that anything counts of are finite (B,), the rows of `BundleProblem`, and what may move, (B, K)
-    and (B, N)."""
+    """All that bundle adjustments are made of: finite tensors, of a batch each leading with B.
+
+    First what gradients may flow to: params (C, P), scale (); priors, depths and factors have no rows where there are
+    none, depths are by observation, and what factors measure is flat, as `packed_factors` has it. Then which
+    observations count (O,), whether all frames are finite that anything counts of (), the rows of `BundleProblem`, and
+    which frames and points may move, (K,) and (N,).
+    """
 
     T_cw: Tensor
     points_w: Tensor
@@ -141,16 +106,26 @@ class BundleData(NamedTuple):
     free_points: Tensor
 
     @property
-    def inputs(self) -> BundleInputs:
-        return BundleInputs(*self[: len(BundleInputs._fields)])
+    def pose_prior(self) -> PosePrior | None:
+        return PosePrior(self.prior_T_cw, self.prior_information) if self.prior_T_cw.shape[-3] else None
+
+    @property
+    def camera_prior(self) -> CameraPrior | None:
+        has_rows = bool(self.prior_params.shape[-2])
+        return CameraPrior(self.prior_params, self.prior_params_information) if has_rows else None
+
+    @property
+    def has_priors(self) -> bool:
+        """Whether there is a prior, on poses or on the camera."""
+        return self.pose_prior is not None or self.camera_prior is not None
 
     @property
     def camera_of(self) -> Tensor:
-        """The camera (B, O) of each observation."""
-        return self.camera_index.gather(1, self.frame_index)
+        """The camera (..., O) of each observation."""
+        return self.camera_index.gather(-1, self.frame_index)
 
-    def part(self, rows: slice) -> BundleData:
-        """Some elements of the batch."""
+    def part(self, rows: slice | int) -> BundleData:
+        """Some elements of the batch, or one."""
         return BundleData(*(tensor[rows] for tensor in self))
 
 
@@ -162,10 +137,8 @@ class BundleEstimate(NamedTuple):
     params: Float[Tensor, "*batch C P"]
 
 
-_MIN_POINTS_PER_FRAME = 3
-"""Points that determine a pose, by two equations each for six unknowns."""
-_MIN_FRAMES_PER_POINT = 2
-"""Views that determine a point, by two equations each for three unknowns."""
+_MIN_PARALLAX = 1e-4
+"""Radians, 0.05 pixels with a focal length of 500: depth is then as uncertain as it is large, or more so."""
 
 
 class MovingParts(NamedTuple):
@@ -180,20 +153,16 @@ def select_moving(given: BundleData, kinds: Sequence[FactorKind] = ()) -> Moving
     """Of what may move, points seen less than twice and frames that see less than three points and have no prior and no
     factor stay, and are not observed."""
     frame_index, point_index, counted = given.frame_index, given.point_index, given.counted
-    seen = _counts(point_index, counted, given.free_points) >= _MIN_FRAMES_PER_POINT
+    seen = _counts(point_index, counted, given.free_points) >= 2
     counted = counted & (seen | ~given.free_points).gather(1, point_index)
-    seeing = _counts(frame_index, counted, given.free_frames) >= _MIN_POINTS_PER_FRAME
+    seeing = _counts(frame_index, counted, given.free_frames) >= 3
     seeing = seeing | _held_frames(given, kinds)
     counted = counted & (seeing | ~given.free_frames).gather(1, frame_index)
     return MovingParts(counted, given.free_frames & seeing, given.free_points & seen)
 
 
-# Radians, 0.05 pixels with a focal length of 500: depth is then as uncertain as it is large, or more so.
-_MIN_PARALLAX = 1e-4
-
-
 def points_with_parallax(given: BundleData, used: Tensor, at: BundleEstimate) -> Bool[Tensor, "B N"]:
-    """Which points the used observations (B, O) see from different directions: the others have no depth."""
+    """Which points the used observations (B, O) see from different directions; the others have no depth."""
     in_frames = flat_rows(given.frame_index, at.T_cw.shape[1])
     in_points = flat_rows(given.point_index, at.points_w.shape[1])
     centers_w = -(at.T_cw[..., :3, :3].mT @ at.T_cw[..., :3, 3:]).squeeze(-1).flatten(0, 1)
@@ -213,14 +182,14 @@ def frames_are_determined(
 ) -> Bool[Tensor, " B"]:
     """Whether all frames that move see three points with a depth, or have a prior or a factor."""
     has_depth = (with_parallax | ~moving.points).gather(1, given.point_index)
-    enough = _counts(given.frame_index, moving.counted & has_depth, moving.frames) >= _MIN_POINTS_PER_FRAME
+    enough = _counts(given.frame_index, moving.counted & has_depth, moving.frames) >= 3
     return (enough | _held_frames(given, kinds) | ~moving.frames).all(1)
 
 
 def _held_frames(given: BundleData, kinds: Sequence[FactorKind]) -> Tensor:
     """Which frames (B, K) have a prior or a factor."""
     held = frames_with_factors(kinds, given.factor_information, given.T_cw.shape[1])
-    if given.inputs.pose_prior is not None:
+    if given.pose_prior is not None:
         held = held | (given.prior_information != 0).flatten(2).any(-1)
     return held
 
@@ -237,33 +206,19 @@ def flat_rows(index: Int[Tensor, "B O"], size: int) -> Int[Tensor, " R"]:
 
 
 def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
-    """The problem as a batch, with zero or the identity for what is not finite.
-
-    Raises ValueError for shapes, dtypes and indices that do not fit.
-    """
+    """The problem as a batch, with zero or the identity for what is not finite; raises ValueError for shapes, dtypes
+    and indices that do not fit."""
     T_cw = problem.T_cw if problem.is_batch else problem.T_cw[None]
     if not len(T_cw):
         raise ValueError("a batch must have a problem")
     points_w, pixels, weights, mask = _rows(problem, T_cw)
     params, camera_index = _cameras(problem, T_cw)
     priors = _priors(problem, T_cw, params)
-    depths, depth_information = _depths(problem, mask)
+    depths, depth_information = (T_cw.new_zeros(len(T_cw), 0),) * 2
+    if (depth := problem.depth_prior) is not None:
+        depths = _over("depth_prior.depths", "(O,)", depth.depths, tuple(mask.shape))
+        depth_information = _over("depth_prior.information", "(O,)", depth.information, tuple(mask.shape))
     measured, factor_information = packed_factors(problem.frame_factors, T_cw)
-    check_dtypes(
-        T_cw=T_cw,
-        points_w=points_w,
-        pixels=pixels,
-        weights=weights,
-        camera_params=params,
-        prior_T_cw=priors[0],
-        prior_information=priors[1],
-        prior_params=priors[2],
-        prior_params_information=priors[3],
-        depths=depths,
-        depth_information=depth_information,
-        factors=measured,
-        factor_information=factor_information,
-    )
     (batch, num_frames), num_points = T_cw.shape[:2], points_w.shape[1]
     rows = mask.shape
     frame_index = checked_rows("frame_index", problem.frame_index, rows, num_frames)
@@ -274,6 +229,10 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
     counted = mask & usable(pixels, seen_points, weights) & is_finite.gather(1, frame_index)
     counts = frame_index.new_zeros(batch, num_frames)
     is_observing = counts.scatter_add(1, frame_index, mask.long()) > 0
+    if depths.shape[1]:
+        use = counted & depths.isfinite() & (depths > 0)
+        use = use & depth_information.isfinite() & (depth_information > 0)
+        depths, depth_information = torch.where(use, depths, 1.0), torch.where(use, depth_information, 0.0)
     eye = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
     return BundleData(
         torch.where(is_finite[..., None, None], T_cw, eye),
@@ -283,7 +242,8 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
         params,
         kernel_scale(scale, T_cw).expand(batch),
         *priors,
-        *usable_depths(depths, depth_information, counted),
+        depths,
+        depth_information,
         measured,
         factor_information,
         counted,
@@ -297,44 +257,18 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
 
 
 def _rows(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Points (B, N, 3), and of the observations pixels (B, O, 2), weights (B, O) and mask (B, O)."""
-    points_w, pixels = problem.points_w, problem.pixels
-    if T_cw.shape[2:] != (4, 4) or points_w.shape[-1:] != (3,) or pixels.shape[-1:] != (2,):
-        raise ValueError(
-            "T_cw, points_w and pixels must be (K, 4, 4), (N, 3) and (O, 2), not "
-            f"{tuple(T_cw.shape[1:])}, {tuple(points_w.shape)} and {tuple(pixels.shape)}"
-        )
-    batch, count = T_cw.shape[0], pixels.shape[-2]
-    points_w = _over("points_w", "(N, 3)", points_w, (batch, points_w.shape[-2], 3))
-    pixels = _over("pixels", "(O, 2)", pixels, (batch, count, 2))
-    weights = torch.ones_like(pixels[..., 0]) if problem.weights is None else problem.weights
-    mask = torch.ones_like(pixels[..., 0], dtype=torch.bool) if problem.mask is None else problem.mask
+    """Points (B, N, 3), and of the observations pixels (B, O, 2), weights (B, O, ...) and mask (B, O)."""
+    points_w, pixels, weights, mask = problem.points_w, problem.pixels, problem.weights, problem.mask
+    batch, count = len(T_cw), pixels.shape[-2]
+    weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
+    mask = torch.ones_like(pixels[..., 0], dtype=torch.bool) if mask is None else mask
     matrix = (2, 2) if weights.shape[-2:] == (2, 2) and weights.shape[-3:-2] == (count,) else ()
     return (
-        points_w,
-        pixels,
+        _over("points_w", "(N, 3)", points_w, (batch, points_w.shape[-2], 3)),
+        _over("pixels", "(O, 2)", pixels, (batch, count, 2)),
         _over("weights", "(O,) or (O, 2, 2)", weights, (batch, count, *matrix)),
         _over("mask", "(O,)", mask, (batch, count)),
     )
-
-
-def _depths(problem: BundleProblem, mask: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths and their information (B, O), or (B, 0) where there are none."""
-    batch, like, prior = len(mask), problem.T_cw, problem.depth_prior
-    if prior is None:
-        return like.new_zeros(batch, 0), like.new_zeros(batch, 0)
-    return (
-        _over("depth_prior.depths", "(O,)", prior.depths, tuple(mask.shape)),
-        _over("depth_prior.information", "(O,)", prior.information, tuple(mask.shape)),
-    )
-
-
-def usable_depths(depths: Tensor, information: Tensor, counted: Tensor) -> tuple[Tensor, Tensor]:
-    """Depths and information (B, O), one and zero where a depth is none or its observation does not count."""
-    if not depths.shape[1]:
-        return depths, information
-    use = counted & depths.isfinite() & (depths > 0) & information.isfinite() & (information > 0)
-    return torch.where(use, depths, 1.0), torch.where(use, information, 0.0)
 
 
 def _cameras(problem: BundleProblem, T_cw: Tensor) -> tuple[Tensor, Tensor]:
@@ -387,8 +321,8 @@ def checked_rows(name: str, index: Tensor, shape: tuple[int, ...], size: int) ->
 
 
 class PriorTerms(NamedTuple):
-    """Cost (...), and gradients and Hessians over frames, (..., K, 6), (..., K, 6, 6), and the cameras' n free
-    directions each, (..., C, n), (..., C, n, n)."""
+    """Cost (...), and gradients and Hessians over frames (..., K, 6) and the n free directions of cameras (..., C,
+    n)."""
 
     cost: Tensor
     frames_gradient: Tensor
@@ -399,22 +333,25 @@ class PriorTerms(NamedTuple):
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
         """The same for frames (..., K, 3, 3) that move along the axes of the world."""
-        frames = rotated(R_cw.mT, rotated(R_cw.mT, self.frames).mT)
-        gradient = rotated(R_cw.mT, self.frames_gradient[..., None])[..., 0]
-        return self._replace(frames_gradient=gradient, frames=frames)
+        R_wc, between = R_cw.mT, self.between
+        if between is not None:
+            first, second, blocks = between
+            between = FrameBlocks(first, second, rotated(R_wc[second], rotated(R_wc[first], blocks).mT).mT)
+        return self._replace(
+            frames_gradient=rotated(R_wc, self.frames_gradient[..., None])[..., 0],
+            frames=rotated(R_wc, rotated(R_wc, self.frames).mT),
+            between=between,
+        )
 
 
 def prior_terms(
-    inputs: BundleInputs, T_cw: Tensor, params: Tensor, moving: Tensor, directions: Tensor | None, exact: bool
+    given: BundleData, T_cw: Tensor, params: Tensor, moving: Tensor, directions: Tensor | None, exact: bool
 ) -> PriorTerms:
-    """The terms at poses (..., K, 4, 4) and parameters (..., C, P).
+    """The terms at poses (..., K, 4, 4) and parameters (..., C, P), which move along directions (P, n) or not at all.
 
-    Args:
-        moving: (..., K) bool, of which frames the prior counts
-        directions: (P, n), none where the camera is fixed
-        exact: the exact Hessian, not that of Gauss and Newton
+    moving: (..., K) bool, of which frames the prior counts; exact: the exact Hessian, not that of Gauss and Newton
     """
-    poses, camera = inputs.pose_prior, inputs.camera_prior
+    poses, camera = given.pose_prior, given.camera_prior
     cost = T_cw.new_zeros(T_cw.shape[:-3])
     g_frames, H_frames = T_cw.new_zeros(*T_cw.shape[:-2], 6), T_cw.new_zeros(*T_cw.shape[:-2], 6, 6)
     if poses is not None:

@@ -15,18 +15,18 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import NamedTuple, Protocol
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import DefiniteFactor, smallest_pivot
-from torchslam.optim.pose_graph._sparse_cholesky import (
+from torchslam.optim._core.linear import (
     BlockStructure,
+    DefiniteFactor,
     SparseFactor,
     build_block_structure,
     factorize_sparse,
+    smallest_pivot,
 )
 
 SPARSE_FRAMES = 200
@@ -43,66 +43,31 @@ of 1,000 frames share a point: blocks then take as long as the dense matrix, and
 percent. Tried at this value only."""
 
 
-class Inverse(Protocol):
-    """Parts of the inverse of a reduced system."""
-
-    def among(self, frames: Int[Tensor, " F"], rows: Int[Tensor, " R"]) -> Float[Tensor, "R R"]:
-        """At the rows of frames that share points, then of cameras; blocks of frames without common points may be 0."""
-        ...
-
-    @property
-    def frames(self) -> Float[Tensor, "K D D"]:
-        """The blocks of the frames."""
-        ...
-
-    @property
-    def cameras(self) -> Float[Tensor, "n n"]:
-        """The block of the cameras."""
-        ...
-
-
-class Reduced(Protocol):
-    """A factorized reduced system, whose rows are those of the frames, then of the cameras."""
-
-    @property
-    def definite(self) -> Bool[Tensor, ""]:
-        """Whether the matrix is positive definite."""
-        ...
-
-    def solve(self, right: Float[Tensor, "R m"]) -> Float[Tensor, "R m"]:
-        """matrix^-1 right, zero where the matrix is not definite."""
-        ...
-
-    def inverse(self) -> Inverse:
-        """Parts of the inverse."""
-        ...
+FRAME_DIMS = 6
+"""Unknowns of a frame: translation and rotation."""
 
 
 @dataclass(frozen=True)
 class DenseReduced:
-    """A reduced system as one dense matrix.
-
-    Attributes:
-        factor: of the matrix
-        frame_dims: rows of each frame
-        num_frames: how many frames there are
-    """
+    """A factorized reduced system of `num_frames` frames, then of the cameras, as one dense matrix."""
 
     factor: DefiniteFactor
-    frame_dims: int
     num_frames: int
 
     @property
-    def definite(self) -> Tensor:
+    def definite(self) -> Bool[Tensor, ""]:
+        """Whether the matrix is positive definite."""
         return self.factor.definite
 
-    def solve(self, right: Tensor) -> Tensor:
+    def solve(self, right: Float[Tensor, "R m"]) -> Float[Tensor, "R m"]:
+        """matrix^-1 right, zero where the matrix is not definite."""
         return self.factor.solve(right)
 
     def inverse(self) -> DenseInverse:
-        matrix = self.factor.factor
-        eye = torch.eye(matrix.shape[-1], dtype=matrix.dtype, device=matrix.device)
-        return DenseInverse(self.factor.solve(eye), self.frame_dims, self.num_frames)
+        """The inverse."""
+        return DenseInverse(
+            self.factor.solve(_eye(len(self.factor.factor), self.factor.factor)), self.num_frames
+        )
 
 
 @dataclass(frozen=True)
@@ -110,21 +75,23 @@ class DenseInverse:
     """The inverse of a reduced system, all of it."""
 
     matrix: Float[Tensor, "R R"]
-    frame_dims: int
     num_frames: int
 
-    def among(self, frames: Tensor, rows: Tensor) -> Tensor:
+    def among(self, frames: Int[Tensor, " F"], rows: Int[Tensor, " R"]) -> Float[Tensor, "R R"]:
+        """At the rows of frames, then of cameras."""
         return self.matrix[rows[:, None], rows[None, :]]
 
     @property
-    def frames(self) -> Tensor:
-        dims, split = self.frame_dims, self.frame_dims * self.num_frames
-        frames = self.matrix[:split, :split].unflatten(0, (-1, dims)).unflatten(-1, (-1, dims))
+    def frames(self) -> Float[Tensor, "K D D"]:
+        """The blocks of the frames."""
+        split = FRAME_DIMS * self.num_frames
+        frames = self.matrix[:split, :split].unflatten(0, (-1, FRAME_DIMS)).unflatten(-1, (-1, FRAME_DIMS))
         return frames.diagonal(dim1=0, dim2=2).movedim(-1, 0)
 
     @property
-    def cameras(self) -> Tensor:
-        split = self.frame_dims * self.num_frames
+    def cameras(self) -> Float[Tensor, "n n"]:
+        """The block of the cameras."""
+        split = FRAME_DIMS * self.num_frames
         return self.matrix[split:, split:]
 
 
@@ -132,11 +99,8 @@ class DenseInverse:
 class CovisiblePairs:
     """The pairs of frames that share a point or a factor, and the order in which their blocks are eliminated.
 
-    Blocks are numbered: those of the K frames, of the L pairs, of the transposed pairs, and one of zeros.
-
-    Attributes:
-        keys: K times the lower plus the higher frame of each pair, ascending, and one above all
-        structure: of the sparse factorization
+    Blocks are numbered: those of the K frames, of the L pairs, of the transposed pairs, and one of zeros. Keys are K
+    times the lower plus the higher frame of each pair, ascending, and one above all.
     """
 
     keys: Int[Tensor, " L1"]
@@ -154,19 +118,13 @@ class CovisiblePairs:
 
 def covisible_pairs(
     num_frames: int,
-    frame_dims: int,
     seen: Iterable[tuple[Int[Tensor, " F"], Float[Tensor, "p F"]]],
     joined: Int[Tensor, "M 2"],
     most: float,
 ) -> CovisiblePairs | None:
-    """The pairs of frames that see a common point; None where they are more than a share `most` of all.
+    """The pairs of frames that see a common point or that factors join; None where they are more than a share `most`.
 
-    Args:
-        num_frames: K.
-        frame_dims: rows of each frame in the reduced system.
-        seen: for each tile its frames, and how often each of its points is seen by them.
-        joined: pairs that factors join.
-        most: share of all pairs.
+    seen: for each tile its frames, and how often each of its points is seen by them
     """
     covisible = torch.zeros(num_frames, num_frames, dtype=torch.bool, device=joined.device)  # 4 MB of 2,000
     for frames, counts in seen:
@@ -178,14 +136,7 @@ def covisible_pairs(
         return None
     end = pairs.new_full((1,), num_frames * num_frames)
     keys = torch.cat((pairs[:, 0] * num_frames + pairs[:, 1], end))
-    return CovisiblePairs(keys, build_block_structure(num_frames, frame_dims, pairs))
-
-
-class Border(NamedTuple):
-    """Columns that join all frames: their blocks against the frames, and their own."""
-
-    columns: Float[Tensor, "R b"]
-    own: Float[Tensor, "b b"]
+    return CovisiblePairs(keys, build_block_structure(num_frames, FRAME_DIMS, pairs))
 
 
 @dataclass(frozen=True)
@@ -198,7 +149,6 @@ class BlockReduced:
         solved: the factor's solution for them
         rest: the inverse of the border's block, the frames eliminated
         camera_units: of the camera's columns
-        definite: whether the matrix is positive definite
     """
 
     pairs: CovisiblePairs
@@ -232,10 +182,8 @@ class BlockReduced:
 
 @dataclass(frozen=True)
 class BlockInverse:
-    """The inverse of a reduced system at covisible pairs.
-
-    It is that of the frames' blocks, and lifted rest lifted^T, which the border adds.
-    """
+    """The inverse of a reduced system at covisible pairs: that of the frames' blocks, and lifted rest lifted^T, which
+    the border adds."""
 
     pairs: CovisiblePairs
     blocks: Float[Tensor, "M D D"]
@@ -266,7 +214,8 @@ class BlockInverse:
 def factorize_blocks(
     pairs: CovisiblePairs,
     blocks: Float[Tensor, "M D D"],
-    cameras: Border,
+    camera_columns: Float[Tensor, "R n"],
+    cameras: Float[Tensor, "n n"],
     gauge: Float[Tensor, "R g"] | None,
     strict: bool,
 ) -> BlockReduced:
@@ -274,15 +223,15 @@ def factorize_blocks(
 
     Args:
         blocks: of the frames and of the pairs, as `pairs` numbers them.
-        cameras: columns and block of the cameras.
+        camera_columns: of the cameras against the frames; cameras: their own block.
         gauge: directions of the frames whose products with themselves are added to the matrix.
         strict: count the matrix as definite only if it is clearly so, beyond rounding.
     """
     structure = pairs.structure
     diagonal, across = blocks[: structure.num_nodes], blocks[structure.num_nodes :][: len(pairs.keys) - 1]
-    size = cameras.own.diagonal()
+    size = cameras.diagonal()
     units = torch.where(size > 0, size, 1.0).rsqrt()
-    columns, own = [cameras.columns * units], [units[:, None] * cameras.own * units]
+    columns, own = [camera_columns * units], [units[:, None] * cameras * units]
     if gauge is not None:
         d = diagonal.diagonal(dim1=-2, dim2=-1).flatten()
         pinned = _pinned_rows(gauge)
@@ -330,3 +279,7 @@ def _pinned_rows(gauge: Float[Tensor, "R g"]) -> Int[Tensor, " p"]:
         along = left[row] / sizes[row].sqrt()
         left = left - (left @ along)[:, None] * along
     return torch.stack(pinned) if pinned else torch.zeros(0, dtype=torch.int64, device=gauge.device)
+
+
+Reduced = DenseReduced | BlockReduced
+"""A factorized reduced system."""

@@ -21,14 +21,14 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import diagonal_floor, factorize
+from torchslam.optim._core.linear import Groups, diagonal_floor, factorize
 from torchslam.optim.bundle._factors import FrameBlocks
 from torchslam.optim.bundle._reduced import (
+    FRAME_DIMS,
     MOST_CAMERAS,
     MOST_COVISIBLE,
     SPARSE_FRAMES,
     BlockReduced,
-    Border,
     CovisiblePairs,
     DenseReduced,
     Reduced,
@@ -41,12 +41,10 @@ from torchslam.optim.bundle._reduced import (
 _TILE_POINTS, _TILE_POINTS_OF_MANY = 512, 64
 _MANY_FRAMES = 64
 """Frames from which on the tiles are smaller."""
-FRAME_DIMS = 6
-"""Unknowns of a frame: translation and rotation."""
 
 
 class Columns(NamedTuple):
-    """The frames or the cameras of a tile, in ascending order, and the slice of the coupling's rows with its blocks."""
+    """The frames or the cameras of a tile, ascending, and the slice of the coupling's rows with its blocks."""
 
     members: Int[Tensor, " n"]
     storage: slice
@@ -62,12 +60,7 @@ class Tile(NamedTuple):
 
 class Coupling(NamedTuple):
     """How the blocks that join points with frames, or with cameras, are stored: tile by tile, row by row, with a block
-    of every member of the tile.
-
-    Attributes:
-        rows: storage row of each row of the blocks, which have three
-        size: number of storage rows
-    """
+    of every member of the tile. `rows`: the storage row of each of their three rows; `size`: number of storage rows."""
 
     rows: Int[Tensor, " R"]
     size: int
@@ -87,27 +80,21 @@ class Structure:
 
     Attributes:
         frame_ends: for every free frame, the end of its observations
-        by_point: the observations ordered by point
-        point_counts: number of observations of each point
         cameras: camera of each free frame
         camera_ends: for every camera, the end of its observations when they are ordered by camera
         by_camera: that order; None for a single camera
-        by_pair: the observations ordered by point and camera
-        pair_counts: number of observations of each pair that there is of a point and a camera
-        coupling: of the observations by free frames
-        camera_coupling: of those pairs
+        by_pair: the observations of each pair that there is of a point and a camera
+        coupling: of the observations by free frames; camera_coupling: of those pairs
         pairs: the covisible pairs of frames; None where the reduced system is dense
     """
 
     num_points: int
     frame_ends: list[int]
-    by_point: Int[Tensor, " O"]
-    point_counts: Int[Tensor, " N"]
+    by_point: Groups
     cameras: Int[Tensor, " K"]
     camera_ends: list[int]
     by_camera: Int[Tensor, " O"] | None
-    by_pair: Int[Tensor, " O"]
-    pair_counts: Int[Tensor, " M"]
+    by_pair: Groups
     coupling: Coupling
     camera_coupling: Coupling
     tiles: list[Tile]
@@ -124,28 +111,21 @@ class Structure:
         return self.frame_ends[-1] if self.frame_ends else 0
 
     def sum_by_point(self, values: Float[Tensor, "O ..."]) -> Float[Tensor, "N ..."]:
-        """Sums over each point's observations. (O, ...) -> (N, ...)."""
-        return _sum_segments(values, self.by_point, self.point_counts)
+        """Sums over each point's observations."""
+        return self.by_point.sum(values[None])[0]
 
     def sum_by_pair(self, values: Float[Tensor, "O ..."]) -> Float[Tensor, "M ..."]:
-        """Sums over each pair's observations. (O, ...) -> (M, ...)."""
-        return _sum_segments(values, self.by_pair, self.pair_counts)
+        """Sums over each pair's observations."""
+        return self.by_pair.sum(values[None])[0]
 
     def sum_by_frame(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "K ..."]:
-        """Sums over each free frame's observations. (..., O) -> (K, ...)."""
+        """Sums over each free frame's observations."""
         return _sum_runs(values, self.frame_ends)
 
     def sum_by_camera(self, values: Float[Tensor, "... O"]) -> Float[Tensor, "C ..."]:
-        """Sums over each camera's observations. (..., O) -> (C, ...)."""
+        """Sums over each camera's observations."""
         ordered = values if self.by_camera is None else values.index_select(-1, self.by_camera)
         return _sum_runs(ordered, self.camera_ends)
-
-
-def _sum_segments(values: Tensor, order: Int[Tensor, " O"], counts: Int[Tensor, " M"]) -> Tensor:
-    """Sums over runs of values (O, ...) in an order, in the order of each run: the same bytes on every run."""
-    flat = values.flatten(1)[order]
-    total = torch.segment_reduce(flat, "sum", lengths=counts, unsafe=True)
-    return total.view(len(counts), *values.shape[1:])
 
 
 def _sum_runs(values: Float[Tensor, "... O"], ends: Sequence[int]) -> Float[Tensor, "R ..."]:
@@ -163,12 +143,11 @@ def build_structure(
     num_cameras: int,
     joined: Int[Tensor, "M 2"] | None = None,
 ) -> Structure:
-    """The structure of observations (O,) in the order of `Structure`.
+    """The structure of observations in the order of `Structure`.
 
     Args:
         frame_slots: slot of the observing frame, K for all fixed ones.
-        cameras: of the free frames
-        camera_of: of the observations
+        cameras: of the free frames; camera_of: of the observations
         joined: free frames that factors join
     """
     num_frames = len(cameras)
@@ -176,35 +155,31 @@ def build_structure(
     linked = frame_ends[-1] if frame_ends else 0
     height = _TILE_POINTS if num_frames <= _MANY_FRAMES else _TILE_POINTS_OF_MANY
     coupling, frames_of = _stored(frame_slots[:linked], point_index[:linked], num_frames, num_points, height)
-    by_point, pair = torch.argsort(point_index, stable=True), point_index * num_cameras + camera_of
-    by_pair = torch.argsort(pair, stable=True) if num_cameras > 1 else by_point
-    pairs, pair_counts = torch.unique_consecutive(pair[by_pair], return_counts=True)
-    of_pairs = pairs % num_cameras, pairs // num_cameras
+    by_point, pair = Groups.of(point_index, num_points), point_index * num_cameras + camera_of
+    order = torch.argsort(pair, stable=True) if num_cameras > 1 else by_point.order
+    numbers, counts = torch.unique_consecutive(pair[order], return_counts=True)
+    of_pairs = numbers % num_cameras, numbers // num_cameras
     camera_coupling, cameras_of = _stored(*of_pairs, num_cameras, num_points, height)
     runs = [slice(start, min(start + height, num_points)) for start in range(0, num_points, height)]
     pairs = None
     if num_frames >= SPARSE_FRAMES and num_cameras <= MOST_CAMERAS:
-        counts = coupling.stored(
-            torch.ones(linked, 3, 1, dtype=torch.float32, device=frame_slots.device)
-        ).squeeze(-1)
+        ones = torch.ones(linked, 3, 1, dtype=torch.float32, device=frame_slots.device)
+        views = coupling.stored(ones).squeeze(-1)
         seen = (
-            (columns.members, counts[columns.storage].view(run.stop - run.start, 3, -1)[:, 0])
+            (columns.members, views[columns.storage].view(run.stop - run.start, 3, -1)[:, 0])
             for run, columns in zip(runs, frames_of, strict=True)
             if len(columns.members)
         )
-        none = frame_slots.new_zeros(0, 2)
-        joined = none if joined is None else joined
-        pairs = covisible_pairs(num_frames, FRAME_DIMS, seen, joined, MOST_COVISIBLE)
+        joined = frame_slots.new_zeros(0, 2) if joined is None else joined
+        pairs = covisible_pairs(num_frames, seen, joined, MOST_COVISIBLE)
     return Structure(
         num_points,
         frame_ends,
         by_point,
-        torch.bincount(point_index, minlength=num_points),
         cameras,
         torch.bincount(camera_of, minlength=num_cameras).cumsum(0).tolist(),
         torch.argsort(camera_of, stable=True) if num_cameras > 1 else None,
-        by_pair,
-        pair_counts,
+        Groups(order, counts),
         coupling,
         camera_coupling,
         [Tile(*parts) for parts in zip(runs, frames_of, cameras_of, strict=True)],
@@ -264,7 +239,6 @@ class NormalEquations:
         frames_cameras: blocks of frames against their cameras
         coupling: the blocks of points against frames, as `Structure.coupling` stores them
         camera_coupling: those against cameras
-        free_points: the points that move
         between: blocks between two free frames, by slots, where there are factors
     """
 
@@ -284,11 +258,9 @@ class NormalEquations:
     ) -> FactorizedEquations:
         """Eliminate the points and factorize what is left, after the diagonals grew by the share `damping`.
 
-        Points that their observations do not determine are left out, as if fixed.
-
-        Args:
-            gauge: directions of the frames along which the solution is set to zero. If they span
-                the null space of the observations, solutions for right sides orthogonal to it do not change.
+        Points that their observations do not determine are left out, as if fixed. Along the gauge, directions of the
+        frames, the solution is zero: if they span the null space of the observations, solutions for right sides
+        orthogonal to it do not change.
         """
         root = factorize(_damped(self.points, damping), strict=damping is None).inverse_root()
         root = torch.where(self.free_points[:, None, None], root, 0.0)
@@ -299,14 +271,27 @@ class NormalEquations:
 
     def _dense(self, tiles: list[WhitenedTile], damping: Tensor | None, gauge: Tensor | None) -> DenseReduced:
         """The reduced system as one matrix."""
-        reduced = self._frames_and_cameras(damping)
+        frame_rows, camera_rows = self.rows
+        size = frame_rows.numel() + camera_rows.numel()
+        reduced = self.frames.new_zeros(size, size)
+        reduced[_at(frame_rows, frame_rows)] = self._own_frames(damping)
+        if self.between is not None:
+            first, second, blocks = self.between
+            first, second = frame_rows[first], frame_rows[second]
+            reduced.index_put_(_at(first, second), blocks, accumulate=True)
+            reduced.index_put_(_at(second, first), blocks.mT, accumulate=True)
+        if camera_rows.numel():
+            own = camera_rows[self.structure.cameras]
+            reduced[_at(camera_rows, camera_rows)] = _damped(self.cameras, damping)
+            reduced[_at(frame_rows, own)] = self.frames_cameras
+            reduced[_at(own, frame_rows)] = self.frames_cameras.mT
         for _, rows, A in tiles:
             reduced.index_put_((rows[:, None], rows[None, :]), -(A.mT @ A), accumulate=True)
         if gauge is not None:
             c = gauge * reduced.diagonal().mean().sqrt()
             reduced[: len(c), : len(c)] += c @ c.mT
         factor = factorize(reduced, strict=damping is None)
-        return DenseReduced(factor, FRAME_DIMS, self.structure.num_frames)
+        return DenseReduced(factor, self.structure.num_frames)
 
     def _blocks(
         self, tiles: list[WhitenedTile], damping: Tensor | None, gauge: Tensor | None
@@ -322,9 +307,9 @@ class NormalEquations:
         blocks[:count] = self._own_frames(damping)
         if self.between is not None:
             first, second, between = self.between
+            low, high = torch.minimum(first, second), torch.maximum(first, second)
             between = torch.where((first < second)[:, None, None], between, between.mT)
-            number = pairs.number(torch.minimum(first, second), torch.maximum(first, second))
-            blocks.index_add_(0, number, between)
+            blocks.index_add_(0, pairs.number(low, high), between)
         columns, own = self.frames.new_zeros(split, size), self.frames.new_zeros(size, size)
         if size:
             of_cameras = camera_rows - split
@@ -343,7 +328,7 @@ class NormalEquations:
                 border, of_cameras = A[:, width:], rows[width:] - split
                 columns.index_put_((rows[:width, None], of_cameras), -products[:, width:], accumulate=True)
                 own.index_put_((of_cameras[:, None], of_cameras), -(border.mT @ border), accumulate=True)
-        return factorize_blocks(pairs, blocks, Border(columns, own), gauge, strict=damping is None)
+        return factorize_blocks(pairs, blocks, columns, own, gauge, strict=damping is None)
 
     def _own_frames(self, damping: Tensor | None) -> Tensor:
         """The blocks (K, D, D) of the frames before elimination."""
@@ -352,24 +337,6 @@ class NormalEquations:
             eye = torch.eye(FRAME_DIMS, dtype=frames.dtype, device=frames.device)
             frames = frames + diagonal_floor(frames.dtype) * eye
         return frames
-
-    def _frames_and_cameras(self, damping: Tensor | None) -> Tensor:
-        """The reduced system before elimination, (6 K + C n, 6 K + C n)."""
-        frame_rows, camera_rows = self.rows
-        size = frame_rows.numel() + camera_rows.numel()
-        reduced = self.frames.new_zeros(size, size)
-        reduced[_at(frame_rows, frame_rows)] = self._own_frames(damping)
-        if self.between is not None:
-            first, second, blocks = self.between
-            first, second = frame_rows[first], frame_rows[second]
-            reduced.index_put_(_at(first, second), blocks, accumulate=True)
-            reduced.index_put_(_at(second, first), blocks.mT, accumulate=True)
-        if camera_rows.numel():
-            own = camera_rows[self.structure.cameras]
-            reduced[_at(camera_rows, camera_rows)] = _damped(self.cameras, damping)
-            reduced[_at(frame_rows, own)] = self.frames_cameras
-            reduced[_at(own, frame_rows)] = self.frames_cameras.mT
-        return reduced
 
     @cached_property
     def rows(self) -> tuple[Int[Tensor, "K D"], Int[Tensor, "C n"]]:
@@ -407,12 +374,8 @@ class WhitenedTile(NamedTuple):
 
 @dataclass(frozen=True)
 class FactorizedEquations:
-    """Normal equations, ready to be solved for any right side.
-
-    Attributes:
-        points_root: Q with Q^T Q the inverse of a point's block, zero for points that do not move
-        reduced: factor of the system over frames and cameras
-    """
+    """Normal equations, ready to be solved for any right side: `points_root` is Q with Q^T Q the inverse of a point's
+    block, zero for points that do not move."""
 
     equations: NormalEquations
     points_root: Float[Tensor, "N 3 3"]
@@ -446,11 +409,7 @@ class FactorizedEquations:
 
 
 class Marginals(NamedTuple):
-    """Marginal covariances.
-
-    Attributes:
-        frames: of the left perturbations (translation, rotation).
-    """
+    """Marginal covariances, of frames those of the left perturbations (translation, rotation)."""
 
     frames: Float[Tensor, "*batch K 6 6"]
     points: Float[Tensor, "*batch N 3 3"]

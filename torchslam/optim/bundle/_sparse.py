@@ -21,22 +21,24 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Tensors
+from torchslam.optim._core.levenberg_marquardt import select_models
 from torchslam.optim._core.linear import LOWER_3X3, inverse_root_3x3
 from torchslam.optim._core.residuals import (
     Expansion,
     Linearization,
     ReprojectionData,
-    exact_expansion_of_each,
+    exact_expansion,
     gauss_newton_expansion,
-    linearize_each,
+    linearize,
     rounding_cost,
     variance_factor,
 )
 from torchslam.optim._core.tangent import cross_entries, retract, rotated
 from torchslam.optim.bundle._factors import FactorKind, FrameBlocks, depth_terms, factor_terms, with_depths
 from torchslam.optim.bundle._problem import (
+    BundleData,
     BundleEstimate,
-    BundleInputs,
+    MovingParts,
     PriorTerms,
     gauge_motions,
     open_motions,
@@ -57,8 +59,6 @@ other, and it converges in a few steps."""
 _INNER_STEPS, _INNER_GAIN = 3, 1e-4
 """Most steps of the points alone after a joint step, and the share of the cost that one must gain to be followed by
 another. Three adjustments of office_loop need 147 joint steps without any, 55 with at most one, 29 with three."""
-_INNER_DAMPING, _INNER_DOWN, _INNER_UP = 1e-4, 0.1, 100.0
-"""Damping of these steps, and its factors after better and worse ones."""
 
 
 @dataclass(frozen=True)
@@ -67,12 +67,9 @@ class SparseLayout:
 
     Attributes:
         observations: rows of the problem's observations that count, in the order of `Structure`
-        frame_index: rows of T_cw
-        point_index: positions in point_order
-        point_order: rows of points_w, in the order of `Structure`
-        point_rank: its inverse
-        free_frames: rows of T_cw that move
-        free_points: in point_order
+        frame_index: rows of T_cw; point_index: positions in point_order
+        point_order: rows of points_w, in the order of `Structure`; point_rank: its inverse
+        free_frames: rows of T_cw that move; free_points: in point_order
     """
 
     observations: Int[Tensor, " O"]
@@ -86,55 +83,32 @@ class SparseLayout:
 
 
 def build_sparse_layout(
-    frame_index: Int[Tensor, " O"],
-    point_index: Int[Tensor, " O"],
-    counted: Bool[Tensor, " O"],
-    free_frames: Bool[Tensor, " K"],
-    free_points: Bool[Tensor, " N"],
-    camera_index: Int[Tensor, " K"],
-    num_cameras: int,
-    joined: Int[Tensor, "M 2"] | None = None,
+    given: BundleData, moving: MovingParts, joined: Int[Tensor, "M 2"] | None = None
 ) -> SparseLayout:
-    """Order the observations (O,) that count; frames (K,) and points (N,) are free or fixed as in `MovingParts`.
-
-    Args:
-        joined: frames that factors join
-    """
+    """Order the observations of one problem that count; factors join pairs of frames."""
+    counted, free_frames, free_points = moving
+    frame_index, point_index = given.frame_index, given.point_index
     num_points = len(free_points)
     count = int(free_frames.sum())
     slots = torch.where(free_frames, free_frames.cumsum(0) - 1, count)
     rows = counted.nonzero().squeeze(-1)
     rows = rows[torch.argsort(slots[frame_index[rows]], stable=True)]
+    frames = frame_index[rows]
     first = torch.full((num_points,), count, device=rows.device)
-    first = first.scatter_reduce(0, point_index[rows], slots[frame_index[rows]], "amin")
+    first = first.scatter_reduce(0, point_index[rows], slots[frames], "amin")
     last = torch.full_like(first, -1)
-    last = last.scatter_reduce(0, point_index[rows], slots[frame_index[rows]], "amax")
+    last = last.scatter_reduce(0, point_index[rows], slots[frames], "amax")
     # So that the frames of a tile are few.
     point_order = torch.argsort(first * (count + 2) + last, stable=True)
     point_rank = torch.argsort(point_order)
     points = point_rank[point_index[rows]]
     free = free_frames.nonzero().squeeze(-1)
-    frames = frame_index[rows]
     if joined is not None:
         joined = slots[joined[free_frames[joined].all(-1)]]
-    structure = build_structure(
-        slots[frames],
-        points,
-        num_points,
-        camera_index[free],
-        camera_index[frames],
-        num_cameras,
-        joined,
-    )
+    cameras = given.camera_index[free], given.camera_index[frames], len(given.params)
+    structure = build_structure(slots[frames], points, num_points, *cameras, joined)
     return SparseLayout(
-        rows,
-        frames,
-        points,
-        point_order,
-        point_rank,
-        free,
-        free_points[point_order],
-        structure,
+        rows, frames, points, point_order, point_rank, free, free_points[point_order], structure
     )
 
 
@@ -148,8 +122,7 @@ def assemble_sparse(
     """Normal equations of observations in the order of `structure`, for frames that move along the world's axes.
 
     Args:
-        expansion: gradient (3 + n, O) and Hessian (3 + n, 3 + n, O) in the point in the world and what moves of the
-            camera that sees it
+        expansion: gradient (3 + n, O) and Hessian (3 + n, 3 + n, O) in the point in the world and the camera
         rays_w: from the observing camera to the point, in the axes of the world
         exact: include the second-order terms of the rotation, for the exact Hessian
     """
@@ -193,10 +166,8 @@ def product(A: Float[Tensor, "m 3 O"], B: Float[Tensor, "3 n O"]) -> Float[Tenso
 
 @dataclass(frozen=True)
 class SparseModel:
-    """The local model of the cost (1,) at an estimate; its equations are assembled on first use.
-
-    The last model of a minimization never needs them, and they are most of the work.
-    """
+    """The local model of the cost at an estimate; its equations are assembled on first use: the last model of a
+    minimization never needs them, and they are most of the work."""
 
     estimate: BundleEstimate
     cost: Float[Tensor, " 1"]
@@ -222,44 +193,38 @@ class SparseBundle:
     def __init__(
         self,
         layout: SparseLayout,
-        inputs: BundleInputs,
+        given: BundleData,
         camera: Camera,
         kernel: Kernel,
         directions: Tensor | None,
-        camera_of: Tensor,
         kinds: Sequence[FactorKind],
     ) -> None:
-        """directions: (P, n) in which the parameters move, None where they stay; camera_of: (O,); kinds: of factors"""
+        """given: of one problem; directions: (P, n) in which the parameters move, None where they stay; kinds: of
+        factors"""
         self.kinds = kinds
-        self.layout, self.inputs, self.directions = layout, inputs, directions
+        self.layout, self.given, self.directions = layout, given, directions
         self.camera, self.kernel = camera, kernel
+        rows = layout.observations
         self.camera_of: Tensor | None = None  # where there are several, of each observation
-        if len(inputs.params) > 1:
-            self.camera_of = camera_of.index_select(0, layout.observations)
-        self.observations = self._observed(
-            inputs.pixels.index_select(0, layout.observations),
-            inputs.weights.index_select(0, layout.observations),
-            inputs.params,
-        )
+        if len(given.params) > 1:
+            self.camera_of = given.camera_of.index_select(0, rows)
+        pixels, weights = given.pixels.index_select(0, rows), given.weights.index_select(0, rows)
+        self.observations = self._observed(pixels, weights, given.params)
         self.start = BundleEstimate(
-            inputs.T_cw, inputs.points_w.index_select(0, layout.point_order), inputs.params
+            given.T_cw, given.points_w.index_select(0, layout.point_order), given.params
         )
         self.depths: tuple[Tensor, Tensor] | None = None
-        if len(inputs.depths):
-            depths = inputs.depths, inputs.depth_information
-            self.depths = (
-                depths[0].index_select(0, layout.observations),
-                depths[1].index_select(0, layout.observations),
-            )
-        has_prior = (inputs.pose_prior is not None or len(kinds) > 0) and len(layout.free_frames) > 0
-        solvable = len(layout.observations) > 0 or has_prior
-        self.solvable = torch.tensor([solvable], device=inputs.pixels.device)
+        if len(given.depths):
+            information = given.depth_information.index_select(0, rows)
+            self.depths = given.depths.index_select(0, rows), information
+        has_prior = (given.pose_prior is not None or len(kinds) > 0) and len(layout.free_frames) > 0
+        self.solvable = torch.tensor([len(rows) > 0 or has_prior], device=given.pixels.device)
 
     def rounding(self) -> Tensor:
-        weights = self.inputs.weights
+        weights = self.given.weights
         if self.observations.has_matrices:
             weights = weights.diagonal(dim1=-2, dim2=-1)
-        return rounding_cost(weights[None], self.inputs.params[None])
+        return rounding_cost(weights[None], self.given.params[None])
 
     def evaluate(self, estimate: BundleEstimate, use_curvature: Tensor) -> SparseModel:
         seen, terms = self._seen(estimate), self._priors(estimate)
@@ -299,32 +264,25 @@ class SparseBundle:
         """
         if len(self.layout.free_frames) < _INNER_FRAMES or not self.layout.free_points.any():
             return estimate
-        damping = torch.full_like(estimate.points_w[:, 0], _INNER_DAMPING)
-        cost, gradient, hessian = self._of_points(estimate)
+        damping = torch.full_like(estimate.points_w[:, 0], 1e-4)
+        now = self._of_points(estimate)
         for _ in range(_INNER_STEPS):
-            trial = estimate._replace(
-                points_w=estimate.points_w - self._point_steps(gradient, hessian, damping)
-            )
-            found = self._of_points(trial)
-            better = found[0] < cost
-            gain = torch.where(better, cost - found[0], 0.0).sum()
-            points_w = torch.where(better[:, None], trial.points_w, estimate.points_w)
+            moved = estimate.points_w - self._point_steps(now[1], now[2], damping)
+            found = self._of_points(estimate._replace(points_w=moved))
+            better = found[0] < now[0]
+            gain = torch.where(better, now[0] - found[0], 0.0).sum()
+            points_w = torch.where(better[:, None], moved, estimate.points_w)
             estimate = estimate._replace(points_w=points_w)
-            enough = bool(gain < _INNER_GAIN * cost.sum())
-            cost = torch.where(better, found[0], cost)
-            gradient = torch.where(better, found[1], gradient)
-            hessian = torch.where(better, found[2], hessian)
-            damping = torch.where(better, damping * _INNER_DOWN, damping * _INNER_UP)
-            if enough:
+            if bool(gain < _INNER_GAIN * now[0].sum()):
                 break
+            now = tuple(torch.where(better, one, other) for one, other in zip(found, now, strict=True))
+            damping = torch.where(better, 0.1 * damping, 100 * damping)
         return estimate
 
-    def _of_points(
-        self, estimate: BundleEstimate
-    ) -> tuple[Float[Tensor, " N"], Float[Tensor, "3 N"], Float[Tensor, "3 3 N"]]:
-        """The cost of each point's observations, and its gradient and Gauss-Newton Hessian in the point."""
+    def _of_points(self, estimate: BundleEstimate) -> tuple[Tensor, ...]:
+        """The cost (N,) of each point's observations, and its gradient (3, N) and Gauss-Newton Hessian (3, 3, N)."""
         seen = self._seen(estimate)
-        lin = linearize_each(self._observations(estimate), seen.points_c)
+        lin = linearize(self._observations(estimate), seen.points_c)
         J = product(lin.J.movedim(0, -1), seen.R_cw)
         expansion = gauss_newton_expansion(lin, J, torch.zeros_like(self.solvable))
         cost = lin.cost
@@ -348,8 +306,7 @@ class SparseBundle:
             (q00 * first + q10 * second + q20 * third, q11 * second + q21 * third, q22 * third), dim=-1
         )
 
-    def select(self, accept: Tensor, new: SparseModel, old: SparseModel) -> SparseModel:
-        return new if bool(accept) else old
+    select = staticmethod(select_models)
 
     def definite(self, model: SparseModel) -> Tensor:
         """Whether (1,) all that moves is determined, up to the gauge."""
@@ -375,16 +332,15 @@ class SparseBundle:
         is_anchor[layout.frame_index] = True
         is_anchor[layout.free_frames] = False
         anchors = T_cw[is_anchor]
-        fixed_points = ~layout.free_points & (layout.structure.point_counts > 0)
+        fixed_points = ~layout.free_points & (layout.structure.by_point.counts > 0)
         if len(anchors) > 1 or fixed_points.any() or not len(layout.free_frames):
             return None
         T_free = T_cw[layout.free_frames]
         origin = se3_inverse(anchors[0] if len(anchors) else T_free[0])[:3, 3]
         motions = gauge_motions(T_free, origin)
         motions = motions[..., :1] if len(anchors) else motions
-        if self.depths is not None and bool(
-            (self.depths[1] > 0).any()
-        ):  # they hold the scale, which comes first
+        has_depths = self.depths is not None and bool((self.depths[1] > 0).any())
+        if has_depths:  # they hold the scale, which comes first
             if len(anchors):
                 return None
             motions = motions[..., 1:]
@@ -395,35 +351,31 @@ class SparseBundle:
 
     def _priors(self, estimate: BundleEstimate, exact: bool = False) -> PriorTerms | None:
         """What priors on free frames (K') and cameras, and factors, add, in the axes of the world."""
-        frames, inputs = self.layout.free_frames, self.inputs
-        poses = inputs.pose_prior
-        if not inputs.has_priors and not self.kinds:
+        frames, given = self.layout.free_frames, self.given
+        if not given.has_priors and not self.kinds:
             return None
-        if poses is not None:
-            T_cw, information = (x.index_select(0, frames) for x in (poses.T_cw, poses.information))
-            inputs = inputs._replace(prior_T_cw=T_cw, prior_information=information)
+        if given.pose_prior is not None:
+            T_cw, information = (
+                x.index_select(0, frames) for x in (given.prior_T_cw, given.prior_information)
+            )
+            given = given._replace(prior_T_cw=T_cw, prior_information=information)
         T_cw = estimate.T_cw.index_select(0, frames)
         moving = torch.ones_like(frames).bool()
-        terms = prior_terms(inputs, T_cw, estimate.params, moving, self.directions, exact)
-        return self._with_factors(terms.in_world(T_cw[:, :3, :3]), estimate, exact)
-
-    def _with_factors(self, terms: PriorTerms, estimate: BundleEstimate, exact: bool) -> PriorTerms:
-        """The terms with those of the factors, of which what belongs to frames that stay is left out."""
-        if not self.kinds:
-            return terms
-        given, frames, T_cw = self.inputs, self.layout.free_frames, estimate.T_cw
-        found = factor_terms(self.kinds, T_cw, given.measured, given.factor_information, exact)
-        found = found.in_world(T_cw[:, :3, :3])
-        slots = torch.full((len(T_cw),), -1, device=frames.device)
-        slots[frames] = torch.arange(len(frames), device=frames.device)
-        first, second, blocks = found.between
-        joined = (slots[first] >= 0) & (slots[second] >= 0)
-        return terms._replace(
-            cost=terms.cost + found.cost,
-            frames_gradient=terms.frames_gradient + found.gradient[frames],
-            frames=terms.frames + found.diagonal[frames],
-            between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
-        )
+        terms = prior_terms(given, T_cw, estimate.params, moving, self.directions, exact)
+        if self.kinds:  # what belongs to frames that stay is left out
+            cost, gradient, diagonal, (first, second, blocks) = factor_terms(
+                self.kinds, estimate.T_cw, given.measured, given.factor_information, exact
+            )
+            slots = torch.full((len(estimate.T_cw),), -1, device=frames.device)
+            slots[frames] = torch.arange(len(frames), device=frames.device)
+            joined = (slots[first] >= 0) & (slots[second] >= 0)
+            terms = terms._replace(
+                cost=terms.cost + cost,
+                frames_gradient=terms.frames_gradient + gradient[frames],
+                frames=terms.frames + diagonal[frames],
+                between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
+            )
+        return terms.in_world(T_cw[:, :3, :3])
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (1, K, 6, 6), (1, N, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
@@ -447,12 +399,8 @@ class SparseBundle:
     def linear_system(
         self, estimate: BundleEstimate
     ) -> tuple[Linearization, Float[Tensor, "2 m O"], Float[Tensor, "3 O"], FactorizedEquations]:
-        """The observations alone, linearized at an estimate in the layout's order.
-
-        Returns:
-            Residuals, their derivatives in the point and what moves of the camera, in the axes of the world, the rays
-            from the observing frames to the points, and the normal equations, factorized.
-        """
+        """Linearize the observations alone at an estimate in the layout's order: residuals, their derivatives in the
+        point and the camera, the rays from frames to points, in the axes of the world, and the factorized equations."""
         seen = self._seen(estimate)
         lin = self._linearize(estimate, seen)
         equations = self._equations(seen, lin, torch.zeros_like(self.solvable))
@@ -487,7 +435,7 @@ class SparseBundle:
         return Seen(R_cw, rays_w, product(R_cw, rays_w[:, None])[:, 0].mT)
 
     def _linearize(self, estimate: BundleEstimate, seen: Seen) -> Linearization:
-        return linearize_each(self._observations(estimate), seen.points_c, self.directions is not None)
+        return linearize(self._observations(estimate), seen.points_c, self.directions is not None)
 
     def _in_world(self, rows: Tensor, R_cw: Tensor) -> Tensor:
         """Derivatives (m, 3 + P, O') in points_c and the camera, as such in points_w and what moves of the camera."""
@@ -499,7 +447,7 @@ class SparseBundle:
     def _observed(self, pixels: Tensor, weights: Tensor, params: Tensor) -> ReprojectionData:
         camera = self.camera.with_params(params)
         camera = camera[0] if self.camera_of is None else camera[self.camera_of]
-        return ReprojectionData(pixels, weights, camera, self.kernel, self.inputs.scale)
+        return ReprojectionData(pixels, weights, camera, self.kernel, self.given.scale)
 
     def _observations(self, estimate: BundleEstimate) -> ReprojectionData:
         if self.directions is None:
@@ -510,13 +458,11 @@ class SparseBundle:
         self, seen: Seen, lin: Linearization, use_curvature: Tensor, share: Tensor | float = 1.0
     ) -> NormalEquations:
         """Without the curvature of the projection, and without priors; with a share of the depths."""
-        expansion = gauss_newton_expansion(
-            lin, self._in_world(lin.J.movedim(0, -1), seen.R_cw), use_curvature
-        )
+        J = self._in_world(lin.J.movedim(0, -1), seen.R_cw)
+        expansion = gauss_newton_expansion(lin, J, use_curvature)
         expansion = self._with_depths(expansion, seen, exact=False, share=share)
-        return assemble_sparse(
-            self.layout.structure, expansion, seen.rays_w, self.layout.free_points, exact=False
-        )
+        layout = self.layout
+        return assemble_sparse(layout.structure, expansion, seen.rays_w, layout.free_points, exact=False)
 
     def _with_depths(
         self, expansion: Expansion, seen: Seen, exact: bool, share: Tensor | float = 1.0
@@ -531,7 +477,7 @@ class SparseBundle:
         seen = self._seen(estimate)
         R_cw, rays_w, points_c = seen
         observations, is_free = self._observations(estimate), self.directions is not None
-        gradient, hessian = exact_expansion_of_each(observations, points_c, is_free)
+        gradient, hessian = exact_expansion(observations, points_c, is_free)
         half = self._in_world(hessian.movedim(0, -1), R_cw).transpose(0, 1)
         expansion = Expansion(self._in_world(gradient.mT[None], R_cw)[0], self._in_world(half, R_cw))
         expansion = self._with_depths(expansion, seen, exact=True)
@@ -546,16 +492,13 @@ def _with_priors(
     """The equations with a share of the priors added."""
     if terms is None:
         return equations
-    gradient = equations.gradient
-    gradient = gradient._replace(
-        frames=gradient.frames + terms.frames_gradient, cameras=gradient.cameras + terms.cameras_gradient
-    )
-    between = None
-    if terms.between is not None:
-        between = terms.between._replace(blocks=share * terms.between.blocks)
+    frames, points, cameras = equations.gradient
+    between = terms.between
+    if between is not None:
+        between = between._replace(blocks=share * between.blocks)
     return replace(
         equations,
-        gradient=gradient,
+        gradient=BundleTangent(frames + terms.frames_gradient, points, cameras + terms.cameras_gradient),
         between=between,
         frames=equations.frames + share * terms.frames,
         cameras=equations.cameras + share * terms.cameras,

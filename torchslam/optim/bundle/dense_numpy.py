@@ -2,13 +2,12 @@
 
 `_dense` is the same formulation by PyTorch, for batches and with gradients: frames move along the axes of the world,
 the free ones come first, and the Schur complement on the points is one dense matrix, since most of a local window of a
-dozen frames is filled. The backends share the constants of Levenberg-Marquardt, the floor of the damped diagonal and
-the inverse roots of the points' blocks; `tests/optim/bundle/test_dense_numpy.py` holds them to the same minima and the
-same steps to rounding. NumPy takes half of the time for one problem, and has neither gradients nor covariances.
+dozen frames is filled. `tests/optim/bundle/test_dense_numpy.py` compares minima and steps. NumPy takes half of the time
+for one problem, and has neither gradients nor covariances.
 
-They differ in the residual of a distorted camera: as in `pose.frame_pose`, errors here are taken in undistorted
-coordinates and multiplied with the slope of the distortion at the keypoint, which is exact for pinhole cameras and to
-first order for others.
+They differ in the residual of a distorted camera: as in `frame_pose`, errors here are taken in undistorted coordinates
+and multiplied with the slope of the distortion at the keypoint, which is exact for pinhole cameras and to first order
+for others.
 """
 
 from __future__ import annotations
@@ -158,9 +157,8 @@ class _Bundle:
     def solution(self, model: _Model) -> NumpyBundleSolution:
         """The estimate of a model in the order and the dtype of the problem."""
         T_cw = self.problem.T_cw.detach().clone()
-        T_cw[self.order[: self.num_free], :3] = torch.from_numpy(model.estimate.poses[: self.num_free]).to(
-            T_cw
-        )
+        free = torch.from_numpy(model.estimate.poses[: self.num_free])
+        T_cw[self.order[: self.num_free], :3] = free.to(T_cw)
         points_w = torch.from_numpy(np.ascontiguousarray(model.estimate.points.T)).to(self.problem.points_w)
         return NumpyBundleSolution(T_cw, points_w, model.cost)
 
@@ -186,13 +184,10 @@ def _observed(problem: BundleProblem, rows: Tensor) -> tuple[Array, Array, Array
     weights = torch.ones_like(pixels[:, 0]) if problem.weights is None else problem.weights[rows]
     diagonal = float(camera.width**2 + camera.height**2)
     if weights.ndim == 1:
-        return (
-            to_numpy(undistorted.xy),
-            to_numpy(undistorted.slope * weights.sqrt()),
-            to_numpy(diagonal * weights),
-        )
-    along = torch.einsum("oki,jio->jko", whitening(weights), undistorted.slope)
-    behind = 0.5 * diagonal * weights.diagonal(dim1=-2, dim2=-1).sum(-1)
+        along, behind = undistorted.slope * weights.sqrt(), diagonal * weights
+    else:
+        along = torch.einsum("oki,jio->jko", whitening(weights), undistorted.slope)
+        behind = 0.5 * diagonal * weights.diagonal(dim1=-2, dim2=-1).sum(-1)
     return to_numpy(undistorted.xy), np.ascontiguousarray(to_numpy(along)), to_numpy(behind)
 
 
@@ -251,15 +246,7 @@ class _Model:
         sums, lower = (np.add.reduceat(x, bundle.first, axis=2) if linked else x for x in (blocks, twice))
         frames[:, :, :3], frames[:, :3, 3:] = sums[:, :3].transpose(2, 0, 1), sums[3:, :3].transpose(2, 1, 0)
         frames[:, 3:, 3:] = lower.transpose(2, 0, 1)
-        return _Equations(
-            frames,
-            sums[:, 3].T.copy(),
-            points[3:],
-            points[:3],
-            blocks[:, :3],
-            bundle.point[:linked],
-            bundle.cells,
-        )
+        return _Equations(bundle, frames, sums[:, 3].T.copy(), points[3:], points[:3], blocks[:, :3])
 
 
 class _Step(NamedTuple):
@@ -275,24 +262,24 @@ class _Equations:
     """Normal equations of frames that move along the axes of the world, as in `bundle._sparse`, and of points.
 
     frames: (K', 6, 6), frames_gradient: (K', 6); points: (6, N) as `LOWER_3X3`, points_gradient: (3, N)
-    blocks: (6, 3, O') of observations by free frames, frame against point; point: (O',) of each
-    cells:  (18 O',) as `_Bundle.cells`
+    blocks: (6, 3, O') of observations by free frames, frame against point
     """
 
+    bundle: _Bundle
     frames: Array
     frames_gradient: Array
     points: Array
     points_gradient: Array
     blocks: Array
-    point: Array
-    cells: Array
 
     def step(self, damping: float, gauge: Array | None) -> _Step | None:
         """The step to the minimum of the damped model; None where there is none.
 
         gauge: (6 K', g) directions of the frames along which the step is zero
         """
-        root = _damped_inverse_root(self.points, damping)
+        damped = self.points.copy()
+        damped[[0, 2, 5]] *= 1 + damping
+        root = np.stack(inverse_root_3x3(damped))
         halves = _lower_times(root, self.points_gradient)
         num_free = len(self.frames)
         if not num_free:
@@ -312,21 +299,19 @@ class _Equations:
         if frames is None:
             return None
         points = _upper_times(root, halves - (frames @ coupling).reshape(3, -1))
-        predicted_reduction = 0.5 * float(
-            frames @ self.frames_gradient.reshape(-1) + (points * self.points_gradient).sum()
-        )
-        return _Step(frames.reshape(-1, 6), points, predicted_reduction)
+        slope = frames @ self.frames_gradient.reshape(-1) + (points * self.points_gradient).sum()
+        return _Step(frames.reshape(-1, 6), points, 0.5 * float(slope))
 
     def _coupling(self, root: Array) -> Array:
         """Blocks (6 K', 3 N) of frames against points, times the inverse roots of the points' blocks."""
-        q, blocks = root.take(self.point, axis=1), self.blocks
+        q, blocks = root.take(self.bundle.point[: self.bundle.linked], axis=1), self.blocks
         whitened = np.empty(blocks.shape)
         whitened[:, 0] = q[0] * blocks[:, 0]
         whitened[:, 1] = q[1] * blocks[:, 0] + q[2] * blocks[:, 1]
         whitened[:, 2] = q[3] * blocks[:, 0] + q[4] * blocks[:, 1] + q[5] * blocks[:, 2]
         shape = 6 * len(self.frames), 3 * root.shape[1]
-        coupling: Array = np.bincount(self.cells, whitened.reshape(-1), shape[0] * shape[1]).reshape(shape)
-        return coupling
+        coupling: Array = np.bincount(self.bundle.cells, whitened.reshape(-1), shape[0] * shape[1])
+        return coupling.reshape(shape)
 
 
 def _lower_times(q: Array, v: Array) -> Array:
@@ -337,10 +322,3 @@ def _lower_times(q: Array, v: Array) -> Array:
 def _upper_times(q: Array, v: Array) -> Array:
     """Q^T v of lower triangles (6, N) and vectors (3, N)."""
     return np.stack((q[0] * v[0] + q[1] * v[1] + q[3] * v[2], q[2] * v[1] + q[4] * v[2], q[5] * v[2]))
-
-
-def _damped_inverse_root(blocks: Array, damping: float) -> Array:
-    """`inverse_root_3x3` of blocks (6, N) whose diagonals grew by the share `damping`."""
-    damped = blocks.copy()
-    damped[[0, 2, 5]] *= 1 + damping
-    return np.stack(inverse_root_3x3(damped))

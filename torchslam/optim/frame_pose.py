@@ -33,10 +33,6 @@ SCALE = 2.0
 MIN_AGREEING = 0.75
 """Fraction of the matches that must agree in `nearby_pose`: another pose with as many would share at least half."""
 
-_ITERATIONS = 10
-"""Largest number of steps. The tracker starts close. Tried at this value only."""
-_TOLERANCE = 1e-4  # relative to the cost: a smaller reduction moves the pose by hundredths of its noise
-
 
 @dataclass(frozen=True)
 class PoseLinearization:
@@ -44,9 +40,7 @@ class PoseLinearization:
 
     Attributes:
         pose: world to camera
-        rows: derivatives of the whitened errors in the left perturbation of the pose, then the
-            errors
-        squares, z: (N,) what `squared` and `depths` return
+        rows: derivatives of the whitened errors in the left perturbation of the pose, then the errors
         like: type and device of the tensors that properties return
     """
 
@@ -77,12 +71,7 @@ class PoseLinearization:
 
 @dataclass(frozen=True)
 class FramePose:
-    """A pose of minimal robust cost.
-
-    Attributes:
-        linearization: at the pose
-        success: the weighted points determine the pose; otherwise it is the start
-    """
+    """A pose of minimal robust cost, or the start where the weighted points do not determine one."""
 
     linearization: PoseLinearization
     success: bool
@@ -108,12 +97,7 @@ class FrameProblem:
     def __init__(
         self, points_w: Float[Tensor, "N 3"], xy: Float[Tensor, "2 N"], whitened: Float[Tensor, "2 2 N"]
     ) -> None:
-        """Take the matches, all finite.
-
-        Args:
-            xy: undistorted coordinates.
-            whitened: as returned by `UndistortedKeypoints.whitened`.
-        """
+        """Take the matches, all finite: undistorted coordinates, and slopes as of `UndistortedKeypoints.whitened`."""
         self.points_w, self.like = np.ascontiguousarray(to_numpy(points_w).T), points_w.detach()
         self.xy = to_numpy(xy)
         self.along_x, self.along_y = np.ascontiguousarray(to_numpy(whitened))
@@ -125,19 +109,17 @@ class FrameProblem:
     def minimize(
         self, start: PoseLinearization, weights: Float[Tensor, " N"], kernel: RobustKernel
     ) -> FramePose:
-        """Find the pose of minimal robust cost by Levenberg-Marquardt.
+        """Find the pose of minimal robust cost by Levenberg-Marquardt, with a kernel of scale `SCALE`.
 
-        Args:
-            start: the linearization at the start.
-            weights: of the squared errors, not negative; zero where a point does not count.
-            kernel: robust kernel, of scale `SCALE`.
+        weights: of the squared errors, not negative; zero where a point does not count.
         """
         counts = to_numpy(weights)
 
         def evaluate(pose: Array) -> _Model:
             return _Model.of(self._linearize(pose), counts, kernel)
 
-        model = minimize_model(_Model.of(start, counts, kernel), evaluate, _ITERATIONS, _TOLERANCE)
+        # A reduction below the share 1e-4 of the cost moves the pose by hundredths of its noise.
+        model = minimize_model(_Model.of(start, counts, kernel), evaluate, iterations=10, tolerance=1e-4)
         success = is_definite(model.normal[:6, :6])
         return FramePose(model.linearization if success else start, success, model)
 
@@ -178,7 +160,7 @@ def nearby_pose(
         threshold: maximum error of a match that agrees, px.
 
     Returns:
-        The pose (4, 4), or None where less than `MIN_AGREEING` of the matches agree with it.
+        The pose, or None where less than `MIN_AGREEING` of the matches agree with it.
     """
     problem = FrameProblem(points_w, undistorted.xy, undistorted.slope / threshold)
     ones = torch.ones_like(points_w[:, 0])

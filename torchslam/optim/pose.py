@@ -17,21 +17,21 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import transform
-from torchslam.geometry.precision import check_dtypes, full_precision
-from torchslam.geometry.robust import Kernel, kernel_scale
+from torchslam.geometry.precision import full_precision
+from torchslam.geometry.robust import kernel_scale
 from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
+    POSE_OPTIONS,
     Convergence,
-    SolverReason,
+    Outcome,
+    SolverOptions,
     check_minimum,
     minimize_batch,
     select_models,
 )
 from torchslam.optim._core.linear import diagonal_floor, factorize
-from torchslam.optim._core.options import POSE_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import (
     ReprojectionData,
-    Weighed,
     exact_expansion,
     linearize,
     only,
@@ -52,87 +52,14 @@ from torchslam.optim._core.tangent import (
 
 
 class PoseModel(NamedTuple):
-    """The local model of the cost at poses T_cw (B, 4, 4): cost (B,), gradient (B, 6), hessian (B, 6, 6) in xi.
-
-    Attributes:
-        hessian: of iteratively reweighted least squares, positive semi-definite, for steps far from the optimum
-        curvature_term: curvature of the kernel near the optimum, never positive: the steps become
-            Newton steps, several times as effective; zero elsewhere
-    """
+    """The local model of the cost at poses, in xi: the Hessian of iteratively reweighted least squares, which is
+    positive semi-definite, and the kernel's curvature near the optimum, never positive, for Newton's steps."""
 
     T_cw: Float[Tensor, "B 4 4"]
     cost: Float[Tensor, " B"]
     gradient: Float[Tensor, "B 6"]
     hessian: Float[Tensor, "B 6 6"]
     curvature_term: Float[Tensor, "B 6 6"]
-
-
-class PoseObservations:
-    """Observations (B, N) of known points, laid out for expansions at many poses."""
-
-    def __init__(self, points_w: Float[Tensor, "B N 3"], observations: ReprojectionData) -> None:
-        """points_w: (B, N, 3)"""
-        self.observations = observations
-        camera = observations.camera
-        self.points_w = points_w.mT.contiguous()
-        self.pinhole = camera.model == "pinhole" and not observations.has_matrices
-        self.metric = camera.params.new_ones(1, 1)  # what turns products of rows into those of pixels
-        if self.pinhole:
-            focal, center = camera.params[..., :2, None], camera.params[..., 2:4, None]
-            self.normalized = ((observations.pixels.mT - center) / focal).contiguous()
-            self.metric = focal.square()  # (2, 1) or (B, 2, 1)
-
-    def expand(self, T_cw: Float[Tensor, "B 4 4"], use_curvature: Bool[Tensor, " B"]) -> PoseModel:
-        """The model at T_cw (B, 4, 4); `use_curvature` (B,) selects where to add the curvature term."""
-        points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self.points_w)
-        rows, (cost, weight, curvature_term) = (
-            self._pinhole(points_c) if self.pinhole else self._general(points_c)
-        )
-        moments = (rows * (weight[:, None] * self.metric)[:, None]).flatten(2) @ rows.flatten(2).mT
-        hessian, gradient = moments[:, :6, :6], moments[:, :6, 6]
-        if use_curvature.any():
-            pulls = (rows[:, :6] * (self.metric[..., None, :, :] * rows[:, 6:])).sum(2)
-            added = (pulls * (curvature_term * use_curvature[:, None])[:, None]) @ pulls.mT
-        else:
-            added = torch.zeros_like(hessian)
-        return PoseModel(T_cw, cost.sum(-1), gradient, hessian, added)
-
-    def _pinhole(self, points_c: Tensor) -> tuple[Tensor, Weighed]:
-        """Rows (B, 7, 2, N) of d residual / d xi and of the residual, in units of the focal length."""
-        depth = points_c[:, 2:]
-        valid = depth > torch.finfo(depth.dtype).eps
-        inverse = torch.where(valid, depth, 1.0).reciprocal()
-        xy = points_c[:, :2] * inverse
-        residual = xy - self.normalized
-        squared_px = (self.metric * residual.square()).sum(1)
-
-        inverse = inverse[:, 0]
-        u, v = xy.unbind(1)
-        zero, product = torch.zeros_like(u), u * v
-        # d(u, v) / d(translation), then / d(rotation): each line is a column of the Jacobian.
-        columns = (
-            *(inverse, zero),
-            *(zero, inverse),
-            *(-inverse * u, -inverse * v),
-            *(-product, -1 - v * v),
-            *(1 + u * u, product),
-            *(-v, u),
-            *residual.unbind(1),
-        )
-        rows = torch.stack(columns, dim=1).unflatten(1, (7, 2))
-        return rows, weigh(self.observations, squared_px, valid[:, 0])
-
-    def _general(self, points_c: Tensor) -> tuple[Tensor, Weighed]:
-        """As `_pinhole`, for any camera; rows are in pixels."""
-        points_c = points_c.mT
-        lin = linearize(self.observations, points_c)
-        J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(lin.J), lin.J)
-        rows = torch.cat((lin.J, J_rotation, lin.residual[..., None]), dim=-1)
-        return rows.permute(0, 3, 2, 1), Weighed(lin.cost, lin.weight, lin.curvature_term)
-
-
-_MIN_POINTS = 3
-"""Points that determine a pose, by two equations each for six unknowns."""
 
 
 @dataclass(frozen=True)
@@ -142,55 +69,6 @@ class PoseInputs:
     points_w: Tensor
     observations: ReprojectionData
     prior: PosePrior | None
-
-    @staticmethod
-    def sanitized(
-        T_cw: Tensor,
-        points_w: Tensor,
-        pixels: Tensor,
-        camera: Camera,
-        weights: Tensor | None,
-        mask: Tensor | None,
-        kernel: Kernel,
-        scale: Tensor | float,
-        prior: PosePrior | None,
-    ) -> PoseInputs:
-        if T_cw.shape[1:] != (4, 4) or points_w.ndim != 3 or pixels.ndim != 3:
-            raise ValueError(
-                "T_cw, points_w and pixels must be (B, 4, 4), (B, N, 3) and (B, N, 2), not "
-                f"{tuple(T_cw.shape)}, {tuple(points_w.shape)} and {tuple(pixels.shape)}"
-            )
-        prior_T, information = (None, None) if prior is None else (prior.T_cw, prior.information)
-        check_dtypes(
-            T_cw=T_cw,
-            points_w=points_w,
-            pixels=pixels,
-            weights=weights,
-            camera_params=camera.params,
-            prior_T_cw=prior_T,
-            prior_information=information,
-        )
-        batch, count = T_cw.shape[0], points_w.shape[1]
-        shapes = [(size, count, *matrix) for size in (batch, 1) for matrix in ((), (2, 2))]
-        if weights is not None and weights.shape not in shapes:
-            raise ValueError(
-                f"weights must be (B, N) = {(batch, count)} or (B, N, 2, 2), not {tuple(weights.shape)}"
-            )
-        points_w, pixels = points_w.expand(batch, count, 3), pixels.expand(batch, count, 2)
-        weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
-        weights = weights.expand(batch, *weights.shape[1:])
-        use = usable(pixels, points_w, weights)
-        use = use if mask is None else use & mask
-        rows = use[..., None]
-        scale = kernel_scale(scale, T_cw)
-        if prior is not None:
-            prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
-        # A copy, as of the others: parameters may move in place before the covariance is asked for.
-        camera = camera.with_params(camera.params.clone())
-        observations = ReprojectionData(
-            torch.where(rows, pixels, 0.0), only(use, weights), camera, kernel, scale[..., None]
-        )
-        return PoseInputs(torch.where(rows, points_w, 0.0), observations, prior)
 
     def tensors(self) -> list[Tensor]:
         """All that gradients may flow to."""
@@ -209,19 +87,72 @@ class PoseProblem:
 
     def __init__(self, inputs: PoseInputs) -> None:
         self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
-        self.laid_out = PoseObservations(inputs.points_w, inputs.observations)
         self.eye = torch.eye(6, dtype=self.points_w.dtype, device=self.points_w.device)
         counted = (self.observations.factors > 0).sum(-1)
-        self.solvable = counted >= (_MIN_POINTS if self.prior is None else 0)
+        self.solvable = counted >= (3 if self.prior is None else 0)  # two equations each for six unknowns
+        camera = self.observations.camera
+        self._columns_w = self.points_w.mT.contiguous()
+        self._is_pinhole = camera.model == "pinhole" and not self.observations.has_matrices
+        self._metric = camera.params.new_ones(1, 1)  # what turns products of rows into those of pixels
+        if self._is_pinhole:
+            focal, center = camera.params[..., :2, None], camera.params[..., 2:4, None]
+            self._normalized = ((self.observations.pixels.mT - center) / focal).contiguous()
+            self._metric = focal.square()  # (2, 1) or (B, 2, 1)
 
     def evaluate(self, T_cw: Tensor, use_curvature: Tensor) -> PoseModel:
-        model = self.laid_out.expand(T_cw, use_curvature)
+        model = self.expand(T_cw, use_curvature)
         if self.prior is None:
             return model
         cost, gradient, hessian = prior_expansion(self.prior, T_cw)
         return model._replace(
             cost=model.cost + cost, gradient=model.gradient + gradient, hessian=model.hessian + hessian
         )
+
+    def expand(self, T_cw: Float[Tensor, "B 4 4"], use_curvature: Bool[Tensor, " B"]) -> PoseModel:
+        """The model of the observations alone."""
+        points_c = torch.baddbmm(T_cw[:, :3, 3:], T_cw[:, :3, :3], self._columns_w)
+        expanded = self._pinhole(points_c) if self._is_pinhole else self._general(points_c)
+        rows, (cost, weight, curvature_term) = expanded
+        moments = (rows * (weight[:, None] * self._metric)[:, None]).flatten(2) @ rows.flatten(2).mT
+        hessian, gradient = moments[:, :6, :6], moments[:, :6, 6]
+        added = torch.zeros_like(hessian)
+        if use_curvature.any():
+            pulls = (rows[:, :6] * (self._metric[..., None, :, :] * rows[:, 6:])).sum(2)
+            added = (pulls * (curvature_term * use_curvature[:, None])[:, None]) @ pulls.mT
+        return PoseModel(T_cw, cost.sum(-1), gradient, hessian, added)
+
+    def _pinhole(self, points_c: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """Rows (B, 7, 2, N) of d residual / d xi and of the residual, in units of the focal length; `weigh`."""
+        depth = points_c[:, 2:]
+        valid = depth > torch.finfo(depth.dtype).eps
+        inverse = torch.where(valid, depth, 1.0).reciprocal()
+        xy = points_c[:, :2] * inverse
+        residual = xy - self._normalized
+        squared_px = (self._metric * residual.square()).sum(1)
+
+        inverse = inverse[:, 0]
+        u, v = xy.unbind(1)
+        zero, product = torch.zeros_like(u), u * v
+        # d(u, v) / d(translation), then / d(rotation): each line is a column of the Jacobian.
+        columns = (
+            *(inverse, zero),
+            *(zero, inverse),
+            *(-inverse * u, -inverse * v),
+            *(-product, -1 - v * v),
+            *(1 + u * u, product),
+            *(-v, u),
+            *residual.unbind(1),
+        )
+        rows = torch.stack(columns, dim=1).unflatten(1, (7, 2))
+        return rows, weigh(self.observations, squared_px, valid[:, 0])
+
+    def _general(self, points_c: Tensor) -> tuple[Tensor, tuple[Tensor, Tensor, Tensor]]:
+        """As `_pinhole`, for any camera; rows are in pixels."""
+        points_c = points_c.mT
+        lin = linearize(self.observations, points_c)
+        J_rotation = torch.linalg.cross(points_c[..., None, :].expand_as(lin.J), lin.J)
+        rows = torch.cat((lin.J, J_rotation, lin.residual[..., None]), dim=-1)
+        return rows.permute(0, 3, 2, 1), lin[2:]
 
     def step(self, model: PoseModel, damping: Tensor) -> tuple[Tensor, Tensor]:
         # Elements without any weight stay solvable: their step is zero.
@@ -241,7 +172,7 @@ class PoseProblem:
         """Covariances (B, 6, 6) at minima, zero where the pose is not determined."""
         lin = linearize(self.observations, transform(T_cw, self.points_w))
         factor = variance_factor(self.observations, lin, num_parameters=6)[:, None, None]
-        information = self.laid_out.expand(T_cw, torch.zeros_like(self.solvable)).hessian
+        information = self.expand(T_cw, torch.zeros_like(self.solvable)).hessian
         if self.prior is not None:  # in absolute units, which the residuals do not calibrate
             information = information + factor * prior_expansion(self.prior, T_cw)[2]
         return factor * factorize(information).solve(self.eye.expand_as(information))
@@ -270,9 +201,8 @@ class PoseMinimization:
 
     def __init__(self, inputs: PoseInputs, iterations: int, tolerance: float) -> None:
         self.inputs, self.iterations, self.tolerance = inputs, iterations, tolerance
-        prior = () if inputs.prior is None else (2, 2)
-        weights = inputs.observations.weights.ndim - 1
-        self.ndims: tuple[Ndims, Ndims, Ndims] | None = (
+        weights, prior = inputs.observations.weights.ndim - 1, () if inputs.prior is None else (2, 2)
+        self.ndims: tuple[Ndims, Ndims, Ndims] = (
             (1,),
             (2, 0, 0, 0, 0, 0),
             (2, 2, 2, weights, 1, 1, *prior),
@@ -287,8 +217,7 @@ class PoseMinimization:
         with torch.no_grad():
             success = problem.solvable & factorize(model.hessian).definite & finite
         refined = torch.where(success[:, None, None], model.T_cw, start.detach())
-        how = convergence.iterations, convergence.converged, convergence.initial_cost
-        return refined, success, convergence.cost, *how
+        return refined, success, *convergence.tensors
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
         T_cw, success, *_ = found
@@ -322,7 +251,7 @@ class PoseMinimization:
 
 
 @dataclass(frozen=True)
-class RefinedPose:
+class RefinedPose(Outcome):
     """Poses at the minimum of their robust reprojection error.
 
     Attributes:
@@ -337,16 +266,6 @@ class RefinedPose:
     success: Bool[Tensor, " B"]
     convergence: Convergence
     _inputs: PoseInputs = field(repr=False)
-
-    @property
-    def converged(self) -> Bool[Tensor, " B"]:
-        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
-        return self.convergence.converged.view_as(self.success)
-
-    @property
-    def reasons(self) -> list[SolverReason]:
-        """How the search ended, for each pose."""
-        return self.convergence.reasons(self.success)
 
     @cached_property
     def covariance(self) -> Float[Tensor, "B 6 6"]:
@@ -392,19 +311,30 @@ def solve_pose(
         ValueError: a shape does not fit, or a name is unknown.
         ConvergenceError: with `options.strict`.
     """
-    inputs = PoseInputs.sanitized(
-        T_cw, points_w, pixels, camera, weights, mask, options.kernel, options.scale, prior
-    )
+    batch, count = T_cw.shape[0], points_w.shape[1]
+    points_w, pixels = points_w.expand(batch, count, 3), pixels.expand(batch, count, 2)
+    weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
+    weights = weights.expand(batch, *weights.shape[1:])
+    use = usable(pixels, points_w, weights)
+    use = use if mask is None else use & mask
+    rows, scale = use[..., None], kernel_scale(options.scale, T_cw)[..., None]
+    if prior is not None:
+        prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
+    pixels, weights = torch.where(rows, pixels, 0.0), only(use, weights)
+    # A copy, as of the others: parameters may move in place before the covariance is asked for.
+    camera = camera.with_params(camera.params.clone())
+    observations = ReprojectionData(pixels, weights, camera, options.kernel, scale)
+    inputs = PoseInputs(torch.where(rows, points_w, 0.0), observations, prior)
     minimization = PoseMinimization(inputs, options.iterations, options.tolerance)
     tensors = (T_cw, *inputs.tensors())
     found = find_minimum(minimization, tensors, options.backward)
-    refined, success, cost, steps, converged, initial_cost = found
+    refined, success, *how = found
+    convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
-        check_minimum(success, converged, "poses")
+        check_minimum(success, convergence.converged, "poses")
     if options.backward == "truncated":
         problem = PoseProblem(inputs)
-        last, _ = problem.step(problem.evaluate(refined, ~success), torch.zeros_like(cost))
+        at_minimum = problem.evaluate(refined, ~success)
+        last, _ = problem.step(at_minimum, torch.zeros_like(convergence.cost))
         refined = torch.where(success[:, None, None], last, refined)
-    return RefinedPose(
-        refined, cost, success, Convergence(steps, converged, initial_cost, cost, options.iterations), inputs
-    )
+    return RefinedPose(refined, convergence.cost, success, convergence, inputs)

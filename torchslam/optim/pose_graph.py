@@ -9,12 +9,17 @@ import torch
 from jaxtyping import Bool, Float, Int, Shaped
 from torch import Tensor
 
-from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import kernel_scale
 from torchslam.optim._core.implicit import find_minimum
-from torchslam.optim._core.levenberg_marquardt import Convergence, SolverReason, check_minimum
-from torchslam.optim._core.options import POSE_GRAPH_OPTIONS, SolverOptions
-from torchslam.optim.pose_graph._problem import PoseGraphInputs, PoseGraphMinimization
+from torchslam.optim._core.levenberg_marquardt import (
+    POSE_GRAPH_OPTIONS,
+    Convergence,
+    Outcome,
+    SolverOptions,
+    check_minimum,
+)
+from torchslam.optim._pose_graph_problem import PoseGraphInputs, PoseGraphMinimization
 from torchslam.utils.indexing import row_mask
 
 
@@ -46,7 +51,7 @@ class PoseGraph:
 
 
 @dataclass(frozen=True)
-class PoseGraphSolution:
+class PoseGraphSolution(Outcome):
     """The minimum of a pose graph; without the B where the graph had none.
 
     Attributes:
@@ -63,16 +68,6 @@ class PoseGraphSolution:
     success: Bool[Tensor, "*batch"]
     moved: Bool[Tensor, "*batch K"]
     convergence: Convergence
-
-    @property
-    def converged(self) -> Bool[Tensor, "*batch"]:
-        """The search ended at a minimum. Elsewhere the gradient may be wrong by any factor, `success` or not."""
-        return self.convergence.converged.view_as(self.success)
-
-    @property
-    def reasons(self) -> list[SolverReason]:
-        """How the search ended, for each graph."""
-        return self.convergence.reasons(self.success)
 
 
 @full_precision
@@ -96,78 +91,56 @@ def solve_pose_graph(graph: PoseGraph, *, options: SolverOptions = POSE_GRAPH_OP
         ValueError: a shape or an index does not fit, or a name is unknown.
         ConvergenceError: with `options.strict`.
     """
-    backward = options.backward
     counted, fixed, inputs = _sanitized(graph, options.scale)
-    minimization = PoseGraphMinimization(
-        inputs.information.shape[-1], options.kernel, options.iterations, options.tolerance
-    )
+    dims = inputs.information.shape[-1]
+    minimization = PoseGraphMinimization(dims, options.kernel, options.iterations, options.tolerance)
     tensors = (*inputs, counted, fixed, graph.edges)
-    found = find_minimum(minimization, tensors, backward)
-    solution, success, moving, cost, steps, converged, initial_cost = found
+    found = find_minimum(minimization, tensors, options.backward)
+    solution, success, moving, *how = found
+    convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
-        check_minimum(success, converged, "pose graphs")
+        check_minimum(success, convergence.converged, "pose graphs")
     at_minimum = torch.where(moving[..., None, None], solution.detach(), inputs.S_cw)
-    if backward == "implicit":
+    if options.backward == "implicit":
         solution = torch.where(moving[..., None, None], solution, inputs.S_cw)
-    elif backward == "truncated":
+    elif options.backward == "truncated":
         solution = minimization.last_step(at_minimum, tensors, success)
-    if backward != "detached":
+    if options.backward != "detached":
         solution = torch.where(success[:, None, None, None], solution, at_minimum)
-
     row = slice(None) if graph.S_cw.ndim == 4 else 0
-    return PoseGraphSolution(
-        solution[row],
-        cost[row],
-        success[row],
-        moving[row],
-        Convergence(steps, converged, initial_cost, cost, options.iterations),
-    )
+    return PoseGraphSolution(solution[row], convergence.cost[row], success[row], moving[row], convergence)
 
 
 def _sanitized(graph: PoseGraph, scale: Tensor | float) -> tuple[Tensor, Tensor, PoseGraphInputs]:
     """Edges that count (B, E), fixed nodes (B, K), and the tensors, all batched and finite."""
     S_cw, S_ji, edges = graph.S_cw, graph.S_ji, graph.edges
-    if S_cw.ndim not in (3, 4) or S_cw.shape[-2:] not in ((4, 4), (3, 3)) or edges.shape[1:] != (2,):
-        raise ValueError(
-            "S_cw and edges must be (B, K, 4, 4) or (K, 4, 4), or 3 by 3, and (E, 2), not "
-            f"{tuple(S_cw.shape)} and {tuple(edges.shape)}"
-        )
+    if S_cw.ndim not in (3, 4) or S_cw.shape[-1] not in (4, 3):
+        raise ValueError(f"S_cw must be (B, K, 4, 4) or (K, 4, 4), or 3 by 3, not {tuple(S_cw.shape)}")
     S_cw = S_cw if S_cw.ndim == 4 else S_cw[None]
     (batch, num_nodes, n, _), num_edges = S_cw.shape, len(edges)
-    if S_ji.shape[-3:] != (num_edges, n, n):
-        raise ValueError(
-            f"S_ji must be (B, E, {n}, {n}) or (E, {n}, {n}) with E = {num_edges}, not {tuple(S_ji.shape)}"
-        )
     if num_edges and not 0 <= int(edges.min()) <= int(edges.max()) < num_nodes:
         raise ValueError(f"edges must lie in 0 ... {num_nodes - 1}")
     if (edges[:, 0] == edges[:, 1]).any():
         raise ValueError("an edge must join two nodes, not one with itself")
     S_ji = S_ji.expand(batch, num_edges, n, n)
-    check_dtypes(S_cw=S_cw, S_ji=S_ji, information=graph.information)
     information = _information(graph, S_cw, batch, num_edges)
 
     nodes, measured = is_similarity(S_cw), is_similarity(S_ji)
     diagonal = information.detach().diagonal(dim1=-2, dim2=-1)
-    weighted = (
-        torch.isfinite(information).flatten(2).all(-1) & (diagonal >= 0).all(-1) & (diagonal > 0).any(-1)
-    )
-    counted = measured & weighted & nodes[:, edges[:, 0]] & nodes[:, edges[:, 1]]
+    weighted = torch.isfinite(information).flatten(2).all(-1) & (diagonal >= 0).all(-1)
+    counted = measured & weighted & (diagonal > 0).any(-1) & nodes[:, edges].all(-1)
     if graph.mask is not None:
         counted = counted & graph.mask
     fixed = row_mask("fixed", graph.fixed, nodes)
     eye = torch.eye(n, dtype=S_cw.dtype, device=S_cw.device)
-    scale = kernel_scale(scale, S_cw)
     rows = counted[..., None, None]
-    return (
-        counted,
-        fixed,
-        PoseGraphInputs(
-            torch.where(nodes[..., None, None], S_cw, eye),
-            torch.where(rows, S_ji, eye),
-            torch.where(rows, information, 0.0),
-            scale[..., None],
-        ),
+    inputs = PoseGraphInputs(
+        torch.where(nodes[..., None, None], S_cw, eye),
+        torch.where(rows, S_ji, eye),
+        torch.where(rows, information, 0.0),
+        kernel_scale(scale, S_cw)[..., None],
     )
+    return counted, fixed, inputs
 
 
 def _information(graph: PoseGraph, S_cw: Tensor, batch: int, num_edges: int) -> Tensor:

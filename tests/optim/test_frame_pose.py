@@ -7,8 +7,7 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import KeypointNoise, UndistortedKeypoints, se3_exp, se3_inverse, se3_log
-from torchslam.optim import POSE_OPTIONS, solve_pose
-from torchslam.optim.pose.frame_pose import SCALE, FrameProblem
+from torchslam.optim.frame_pose import MIN_AGREEING, SCALE, FrameProblem, nearby_pose
 
 
 def problem_of(scene, noise: KeypointNoise | None = None) -> FrameProblem:
@@ -29,14 +28,8 @@ def test_it_reaches_the_pose_of_solve_pose(pose_scene, kernel, model):
     noise = KeypointNoise.of(1 + torch.arange(200).double() % 3, None)
     weights = torch.where(torch.arange(200) % 4 == 0, 0.5, 1.0).double()
     mask = torch.arange(200) % 7 != 0
-    wanted = solve_pose(
-        scene.points_w,
-        scene.pixels,
-        T_cw=scene.start,
-        camera=scene.camera,
-        weights=(noise.weights * weights)[None],
-        mask=mask[None],
-        options=POSE_OPTIONS.replace(kernel=kernel, scale=SCALE),
+    wanted = scene.solved(
+        weights=(noise.weights * weights)[None], mask=mask[None], kernel=kernel, scale=SCALE
     )
     problem = problem_of(scene, noise)
     found = problem.minimize(problem.linearize(scene.start[0]), weights * mask, kernel)
@@ -105,3 +98,63 @@ def test_single_precision_is_kept(pose_scene):
     exact = problem_of(scene)
     wanted = exact.minimize(exact.linearize(scene.start[0]), torch.ones(40).double(), "cauchy")
     assert apart(found.T_cw.double(), wanted.T_cw).norm() < 1e-4
+
+
+THRESHOLD = 3.0  # pixels
+
+
+def found(scene, expected: Tensor) -> Tensor | None:
+    undistorted = UndistortedKeypoints.of(scene.pixels[0], scene.camera)
+    return nearby_pose(expected, scene.points_w[0], undistorted, THRESHOLD)
+
+
+def off(T_cw: Tensor | None, scene) -> float:
+    assert T_cw is not None
+    return float(se3_log(T_cw @ se3_inverse(scene.T_cw[0])).norm())
+
+
+def test_exact_matches_give_the_exact_pose(pose_scene, model):
+    scene = pose_scene(batch=1, count=60, noise=0.0, model=model, perturbation=0.01)
+    assert off(found(scene, scene.start[0]), scene) < (1e-7 if model == "pinhole" else 1e-4)
+
+
+@pytest.mark.parametrize("share", [0.1, 0.2])
+def test_outliers_do_not_move_the_pose(pose_scene, share):
+    scene = pose_scene(batch=1, count=100, noise=0.0, outliers=share, perturbation=0.01)
+    assert off(found(scene, scene.start[0]), scene) < 1e-6
+
+
+@pytest.mark.parametrize(("wrong", "is_found"), [(24, True), (26, False)])
+def test_a_majority_must_agree(pose_scene, wrong, is_found):
+    scene = pose_scene(batch=1, count=100)
+    assert MIN_AGREEING == 0.75
+    scene.pixels[0, :wrong] += 40.0 * torch.linspace(-1, 1, 2 * wrong).view(wrong, 2).sign().double()
+    assert (found(scene, scene.T_cw[0]) is not None) is is_found
+
+
+def test_inliers_are_within_the_threshold(pose_scene):
+    scene = pose_scene(batch=1, count=100)
+    scene.pixels[0, :30, 0] += THRESHOLD * torch.tensor([1.0, -1.0]).repeat(15) * 0.9
+    assert found(scene, scene.T_cw[0]) is not None
+    scene.pixels[0, :30, 0] += THRESHOLD * torch.tensor([1.0, -1.0]).repeat(15) * 0.6
+    assert found(scene, scene.T_cw[0]) is None
+
+
+def test_the_pose_is_not_biased_towards_the_prediction(pose_scene):
+    """From either side the same pose, though a quarter is wrong."""
+    scene = pose_scene(batch=1, count=100, outliers=0.2, noise=0.5)
+    step = se3_exp(torch.tensor([0.02, -0.01, 0.02, 0.01, -0.01, 0.0], dtype=torch.float64))
+    one, other = found(scene, step @ scene.T_cw[0]), found(scene, se3_inverse(step) @ scene.T_cw[0])
+    assert one is not None
+    assert other is not None
+    torch.testing.assert_close(one, other, rtol=0, atol=2e-5)
+
+
+def test_points_on_a_line_determine_no_pose(pose_scene):
+    scene = pose_scene(batch=1, count=20)
+    along = torch.linspace(0, 1, 20, dtype=torch.float64)[:, None]
+    points = torch.tensor([-1.0, 0.3, 4.0]).double() + along * torch.tensor([2.0, -0.4, 1.0]).double()
+    pixels, _ = scene.camera.project(points)
+    undistorted = UndistortedKeypoints.of(pixels, scene.camera)
+    eye = torch.eye(4, dtype=torch.float64)
+    assert nearby_pose(eye, points, undistorted, THRESHOLD) is None

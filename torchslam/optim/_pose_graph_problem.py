@@ -4,6 +4,9 @@ An edge's error is e = log(E) with E = X S_ji^-1, X = S_j S_i^-1. Nodes moved by
 exp(xi_j) exp(-Ad(X) xi_i) E: to first order by eta = xi_j - Ad(X) xi_i, from the left too, so that the derivative of e
 is the inverse left Jacobian of the group. To second order the product adds half of a bracket. An edge's share in the
 normal equations therefore follows from its gradient and Hessian in eta alone.
+
+Rotations are similarities without translation and scale: optimized as such, every step would cost (6 / 3)^3
+times as much for the same result.
 """
 
 from __future__ import annotations
@@ -16,37 +19,108 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from torchslam.geometry.lie import (
+    sim3_adjoint,
+    sim3_inverse,
+    sim3_left_jacobian_inverse,
+    sim3_log,
+    skew,
+    so3_exp,
+    so3_left_jacobian_inverse,
+    so3_log,
+)
 from torchslam.geometry.robust import Kernel, Robustified, robustify
 from torchslam.optim._core.implicit import Ndims, Tensors
 from torchslam.optim._core.levenberg_marquardt import minimize_batch, select_models
-from torchslam.optim._core.linear import diagonal_floor
-from torchslam.optim.pose_graph._groups import Group, group_of
-from torchslam.optim.pose_graph._sparse_cholesky import (
+from torchslam.optim._core.linear import (
     BlockStructure,
-    SparseFactor,
+    Groups,
     build_block_structure,
+    diagonal_floor,
     factorize_sparse,
 )
+from torchslam.optim._core.residuals import ROUNDINGS, flat_along
+from torchslam.optim._core.tangent import pull_back_sim3, push, retract_sim3
 from torchslam.utils.indexing import connected_parts
 
 
 @dataclass(frozen=True)
-class Groups:
-    """Rows that are summed by group, in a fixed order."""
+class Similarities:
+    """Sim(3), or with six dimensions its elements of fixed scale; matrices (..., n, n), tangent vectors (..., D)."""
 
-    order: Tensor
-    counts: Tensor
+    dims: int
 
-    @staticmethod
-    def of(index: Tensor, count: int) -> Groups:
-        return Groups(torch.argsort(index, stable=True), torch.bincount(index, minlength=count))
+    def inverse(self, S: Tensor) -> Tensor:
+        return sim3_inverse(S)
 
-    def sum(self, values: Float[Tensor, "B N ..."]) -> Float[Tensor, "B G ..."]:
-        """Sums over the rows of each of G groups."""
-        shape = (len(self.counts), values.shape[0], *values.shape[2:])
-        flat = values.transpose(0, 1).index_select(0, self.order).flatten(1)
-        total = torch.segment_reduce(flat, "sum", lengths=self.counts, unsafe=True)
-        return total.view(shape).transpose(0, 1)
+    def log(self, S: Tensor) -> Tensor:
+        """D numbers that are an edge's error, and then those that stay as they are."""
+        return sim3_log(S)
+
+    def left_jacobian_inverse(self, log: Tensor) -> Tensor:
+        """(..., D, D) the derivative of log(exp(xi) S) in xi at zero."""
+        return sim3_left_jacobian_inverse(log)[..., : self.dims, : self.dims]
+
+    def adjoint(self, S: Tensor) -> Tensor:
+        """(..., D, D) Ad with S exp(xi) = exp(Ad xi) S."""
+        return sim3_adjoint(S)[..., : self.dims, : self.dims]
+
+    def bracket(self, force: Tensor) -> Tensor:
+        """(..., D, D) half of force . [a, b] as a bilinear form a^T M b of tangent vectors."""
+        v, omega = skew(force[..., :3]), skew(force[..., 3:6])
+        M = torch.cat((torch.cat((torch.zeros_like(v), -v), -1), torch.cat((-v, -omega), -1)), dim=-2)
+        if self.dims == 7:
+            M = torch.nn.functional.pad(M, (0, 1, 0, 1))
+            M[..., 6, :3], M[..., :3, 6] = force[..., :3], -force[..., :3]
+        return 0.5 * M
+
+    def retract(self, S: Tensor, xi: Tensor) -> Tensor:
+        """exp(xi) S."""
+        return retract_sim3(S, xi)
+
+    def push(self, S: Tensor, xi: Tensor) -> Tensor:
+        """The change of S, to first order, when it moves along xi."""
+        return push(S, xi)
+
+    def pull_back(self, S: Tensor, grad_S: Tensor) -> Tensor:
+        """The gradient in xi, at zero, of a loss with gradient `grad_S` at exp(xi) S."""
+        return pull_back_sim3(S, grad_S)[..., : self.dims]
+
+
+@dataclass(frozen=True)
+class Rotations(Similarities):
+    """SO(3), with the operations of `Similarities`."""
+
+    dims: int = 3
+
+    def inverse(self, S: Tensor) -> Tensor:
+        return S.mT
+
+    def log(self, S: Tensor) -> Tensor:
+        return so3_log(S)
+
+    def left_jacobian_inverse(self, log: Tensor) -> Tensor:
+        return so3_left_jacobian_inverse(log)
+
+    def adjoint(self, S: Tensor) -> Tensor:
+        return S
+
+    def bracket(self, force: Tensor) -> Tensor:
+        return -0.5 * skew(force)
+
+    def retract(self, S: Tensor, xi: Tensor) -> Tensor:
+        return so3_exp(xi) @ S
+
+    def push(self, S: Tensor, xi: Tensor) -> Tensor:
+        return skew(xi) @ S
+
+    def pull_back(self, S: Tensor, grad_S: Tensor) -> Tensor:
+        return torch.linalg.cross(S, grad_S, dim=-2).sum(-1)
+
+
+def group_of(dims: int) -> Similarities:
+    """The group whose tangent vectors have this number of dimensions: 3, 6 or 7."""
+    return Rotations() if dims == 3 else Similarities(dims)
 
 
 @dataclass(frozen=True)
@@ -54,12 +128,10 @@ class PoseGraphLayout:
     """The discrete part of a pose graph: counted edges, moving nodes, and the order of elimination.
 
     Attributes:
-        i, j: (E,) int64 nodes of the edges
         moving: nodes that counted edges join with one that stays
-        linking: edges that, in some element, join two moving nodes; transposed: (L,) bool, whether the block
-            of the pair of nodes is the transpose of the edge's
-        by_pair: the edges of each pair
-        by_node: the edges' ends, first all i, then all j, of each node
+        linking: edges that, in some element, join two moving nodes
+        transposed: whether the block of the pair of nodes is the transpose of the edge's
+        by_pair: the edges of each pair; by_node: the edges' ends, first all i, then all j, of each node
     """
 
     i: Int[Tensor, " E"]
@@ -76,10 +148,10 @@ class PoseGraphLayout:
 def build_pose_graph_layout(
     edges: Int[Tensor, "E 2"], counted: Bool[Tensor, "B E"], fixed: Bool[Tensor, "B K"], dims: int
 ) -> PoseGraphLayout:
-    """Find the moving nodes and the order of elimination. edges: (E, 2); counted: (B, E); fixed: (B, K)."""
+    """Find the moving nodes and the order of elimination."""
     i, j = edges.unbind(-1)
     num_nodes = fixed.shape[1]
-    part = connected_parts(edges, fixed.shape[1], counted)
+    part = connected_parts(edges, num_nodes, counted)
     is_first = part == torch.arange(num_nodes, device=part.device)
     stays = torch.where(fixed.any(1, keepdim=True), fixed, is_first)
     reached = torch.zeros_like(part).scatter_reduce(1, part, stays.long(), "amax").gather(1, part) > 0
@@ -101,13 +173,6 @@ def build_pose_graph_layout(
     )
 
 
-# A long loop resists bending as a whole by a tiny share of what its edges do; damped relative to these, it creeps.
-_DAMPING_SHARE = 1e-4
-# Bound on the rounding error of an edge, in roundings of the largest coordinate. A start along a tree of
-# edges without a loop is off the minimum by these alone.
-_ROUNDINGS = 16.0
-
-
 class PoseGraphInputs(NamedTuple):
     """All that gradients may flow to: S_cw (B, K, n, n), S_ji (B, E, n, n), information (B, E, D, D), scale."""
 
@@ -121,10 +186,8 @@ class EdgeLinearization(NamedTuple):
     """Errors of the edges and how they change.
 
     Attributes:
-        J: d error / d eta
-        carry: Ad(X), so that eta = xi_j - carry xi_i
-        weighted_residual: information @ error
-        squared: error^T information error
+        J: d error / d eta; carry: Ad(X), so that eta = xi_j - carry xi_i
+        weighted_residual: information @ error; squared: error^T information error
         kernel: rho and its derivatives (B, E); zero where the edge does not count
         rest: what the logarithm has beyond the error: its log scale where scales are fixed, a constant
     """
@@ -144,11 +207,7 @@ class EdgeLinearization(NamedTuple):
 
 
 class PoseGraphModel(NamedTuple):
-    """The local model of the cost (B,) at nodes S_cw (B, K, n, n).
-
-    Attributes:
-        across: the Hessian, the identity where nothing moves
-    """
+    """The local model of the cost at nodes; the Hessian is the identity where nothing moves."""
 
     S_cw: Float[Tensor, "B K n n"]
     cost: Float[Tensor, " B"]
@@ -168,44 +227,36 @@ class PoseGraphProblem:
     def rounding(self) -> Tensor:
         S_cw, S_ji, information, _ = (part.detach() for part in self.inputs)
         size = torch.cat((S_cw.flatten(1), S_ji.flatten(1)), dim=-1).abs().amax(-1)
-        rounding = _ROUNDINGS * torch.finfo(size.dtype).eps * size
+        # A start along a tree of edges without a loop is off the minimum by these alone.
+        rounding = ROUNDINGS * torch.finfo(size.dtype).eps * size
         return 0.5 * information.diagonal(dim1=-2, dim2=-1).sum((1, 2)) * rounding.square()
 
     def evaluate(self, S_cw: Tensor, use_curvature: Tensor) -> PoseGraphModel:
         lin = self._linearize(S_cw)
-        # As in `residuals.flat_along`: the negative curvature along an outlier's error counts as flat.
-        flat = -lin.kernel.weight / torch.where(lin.squared > 0, lin.squared, 1.0)
-        curvature_term = torch.maximum(2 * lin.kernel.curvature, flat) * use_curvature[:, None]
+        _, weight, curvature = lin.kernel
+        curvature_term = flat_along(weight, 2 * curvature, lin.squared, use_curvature[:, None])[
+            ..., None, None
+        ]
         outer = lin.weighted_residual[..., :, None] * lin.weighted_residual[..., None, :]
-        curve = (
-            lin.kernel.weight[..., None, None] * self.inputs.information
-            + curvature_term[..., None, None] * outer
-        )
-        return self._assemble(S_cw, lin, lin.J.mT @ curve @ lin.J, twist=None)
+        curve = weight[..., None, None] * self.inputs.information + curvature_term * outer
+        return self._assemble(S_cw, lin, lin.J.mT @ curve @ lin.J, None)
 
     def step(self, model: PoseGraphModel, damping: Tensor) -> tuple[Tensor, Tensor]:
-        damping = _DAMPING_SHARE * damping
+        # A long loop resists bending as a whole by a tiny share of what its edges do; damped as these, it creeps.
+        damping = 1e-4 * damping
         factor = factorize_sparse(self.layout.structure, model.diagonal, model.across, damping, strict=False)
         xi = factor.solve(model.gradient)
         predicted_reduction = 0.5 * (xi * model.gradient).sum((-2, -1))
-        moved = torch.where(
-            self.layout.moving[..., None, None], self.group.retract(model.S_cw, -xi), model.S_cw
-        )
+        moved = self.group.retract(model.S_cw, -xi)
+        moved = torch.where(self.layout.moving[..., None, None], moved, model.S_cw)
         return moved, torch.where(factor.definite, predicted_reduction, torch.inf)
 
-    def select(self, accept: Tensor, new: PoseGraphModel, old: PoseGraphModel) -> PoseGraphModel:
-        return select_models(accept, new, old)
-
-    def factorized(self, model: PoseGraphModel) -> SparseFactor:
-        """The undamped equations of a model at a minimum, ready to be solved."""
-        return factorize_sparse(self.layout.structure, model.diagonal, model.across)
+    select = staticmethod(select_models)
 
     def exact_model(self, S_cw: Tensor) -> PoseGraphModel:
         """The model with the exact Hessian of the cost in the left perturbations."""
         lin = self._linearize(S_cw)
-        return self._assemble(
-            S_cw, lin, self._exact_hessian(lin), twist=self.group.bracket(lin.gradient_wrt_eta)
-        )
+        return self._assemble(S_cw, lin, self._exact_hessian(lin), self.group.bracket(lin.gradient_wrt_eta))
 
     def _linearize(self, S_cw: Tensor) -> EdgeLinearization:
         layout = self.layout
@@ -250,9 +301,8 @@ class PoseGraphProblem:
             error = lin.error.detach().expand(dims, *lin.error.shape).clone().requires_grad_()
             full = torch.cat((error, lin.rest.detach().expand(dims, *lin.rest.shape)), dim=-1)
             weighted_residual = (information @ error[..., None]).squeeze(-1)
-            slope = robustify(
-                (error * weighted_residual).sum(-1), self.kernel, self.inputs.scale.detach()
-            ).weight
+            squared = (error * weighted_residual).sum(-1)
+            slope = robustify(squared, self.kernel, self.inputs.scale.detach()).weight
             J = self.group.left_jacobian_inverse(full)
             gradient_wrt_eta = (J.mT @ (slope[..., None] * weighted_residual)[..., None]).squeeze(-1)
             (rows,) = torch.autograd.grad(gradient_wrt_eta.movedim(-1, 0).diagonal().sum(), error)
@@ -266,7 +316,7 @@ def linearize_edges(
     j: Int[Tensor, " E"],
     counted: Bool[Tensor, "B E"],
     inputs: PoseGraphInputs,
-    group: Group,
+    group: Similarities,
     kernel: Kernel,
 ) -> EdgeLinearization:
     """Errors of the edges from nodes i to j, (E,) each, and how they change; counted: (B, E)."""
@@ -282,15 +332,12 @@ def linearize_edges(
 
 
 class PoseGraphMinimization:
-    """A pose graph; its inputs are those of `PoseGraphInputs`, edges that count (B, E), fixed nodes (B, K), and
-    the edges (E, 2).
-
-    Found are the nodes (B, K, n, n), `success` (B,), what moved (B, K), and how it went; vectors are (B, K, D).
-    """
+    """A pose graph; its inputs are those of `PoseGraphInputs`, edges that count (B, E), fixed nodes (B, K), and the
+    edges (E, 2). Found are nodes, `success`, what moved (B, K), and how it went; vectors are (B, K, D)."""
 
     num_unknowns = 1
     num_vectors = 1
-    ndims: tuple[Ndims, Ndims, Ndims] | None = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1, 2))
+    ndims: tuple[Ndims, Ndims, Ndims] = ((2,), (3, 0, 1, 0, 0, 0, 0), (3, 3, 3, 1, 1, 1, 2))
 
     def __init__(self, dims: int, kernel: Kernel, iterations: int, tolerance: float) -> None:
         self.group, self.kernel = group_of(dims), kernel
@@ -301,15 +348,16 @@ class PoseGraphMinimization:
         problem = self._problem(inputs)
         model, convergence = minimize_batch(problem, inputs[0], self.iterations, self.tolerance)
         with torch.no_grad():
-            success = problem.solvable & problem.factorized(model).definite
-        how = convergence.iterations, convergence.converged, convergence.initial_cost
-        return model.S_cw, success, problem.layout.moving, convergence.cost, *how
+            factor = factorize_sparse(problem.layout.structure, model.diagonal, model.across)
+        success = problem.solvable & factor.definite
+        return model.S_cw, success, problem.layout.moving, *convergence.tensors
 
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
         S_cw, success, moving, *_ = found
         problem, use = self._problem(inputs), (moving & success[:, None])[..., None]
         with torch.no_grad():
-            factor = problem.factorized(problem.exact_model(S_cw))
+            model = problem.exact_model(S_cw)
+            factor = factorize_sparse(problem.layout.structure, model.diagonal, model.across)
 
         def solve(right: Tensors) -> Tensors:
             return (torch.where(use, factor.solve(torch.where(use, right[0], 0.0)), 0.0),)

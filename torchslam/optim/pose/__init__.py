@@ -1,1 +1,0 @@
-"""Pose of a single frame from its matches with the map."""

@@ -1,1 +1,0 @@
-"""Pose graphs over SE(3) and Sim(3)."""
