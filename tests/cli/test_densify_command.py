@@ -208,10 +208,7 @@ def test_missing_images_are_reported(
     assert densify(results, "--images", ROOM) == 0
     path.write_text(json.dumps(json.loads(path.read_text()) | {"source": None}))
     assert densify(results) == 2
-    assert (
-        "metrics.json: the location of the images is unknown; give it with --images"
-        in capsys.readouterr().err
-    )
+    assert "metrics.json: the location of the images is unknown; use --images" in capsys.readouterr().err
 
 
 def test_an_image_that_cannot_be_read_is_skipped_and_counted(

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from experiments.benchmarks.slam import run, stages
-from torchslam.io.results import write_frames
+from torchslam.io.write_run import write_frames
 from torchslam.types import State, StepResult
 
 OURS = ["ours", "ours, one process"]

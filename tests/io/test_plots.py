@@ -12,8 +12,7 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 
 from torchslam.io import plots
-from torchslam.io.plots import style
-from torchslam.io.plots.scene import _wrapped
+from torchslam.io.plots.scene import upright_axes
 from torchslam.types import State, StepResult, Trajectory
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -96,7 +95,7 @@ def test_a_map_with_y_down_is_plotted_over_x_and_z(trajectory: Trajectory, point
 def test_upright_axes_bring_up_to_z_without_mirroring(up: list[int]) -> None:
     T_wc = np.eye(4)[None].copy()
     T_wc[0, :3, 1] = -np.array(up)
-    matrix, labels = style.upright_axes(T_wc)
+    matrix, labels = upright_axes(T_wc)
     np.testing.assert_array_equal(matrix @ up, [0, 0, 1])
     assert np.linalg.det(matrix) == pytest.approx(1.0)
     for row, label in zip(matrix, labels, strict=True):
@@ -189,7 +188,3 @@ def test_ellipses_of_points_are_of_true_size(trajectory: Trajectory, points_w: t
     (ellipses,) = (c for c in figure.axes[0].collections if isinstance(c, EllipseCollection))
     assert len(ellipses.get_offsets()) == int(points_w.isfinite().all(-1).sum())
     np.testing.assert_allclose(ellipses.get_widths(), 2 * 3e-3)
-
-
-def test_long_titles_wrap_in_narrow_pictures() -> None:
-    assert max(map(len, _wrapped("words " * 40, 4.5).split("\n"))) <= 60

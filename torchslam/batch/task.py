@@ -24,7 +24,7 @@ from torchslam.batch.result_store import (
     run_or_reuse,
 )
 from torchslam.batch.rows import Row
-from torchslam.calibration.find_camera import find_camera, with_stated_std
+from torchslam.calibration.find_camera import camera_remark, find_camera, with_stated_std
 from torchslam.config import Config, MetricConfig, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.formats.depth_images import find_depth_images, parse_depth_folder
@@ -37,8 +37,7 @@ from torchslam.global_mapping.learned_links import learned_config
 from torchslam.global_mapping.mapper import mapping_config
 from torchslam.global_mapping.recording import run_recording
 from torchslam.io.report import compute_metrics
-from torchslam.io.results import source_of
-from torchslam.io.write_run import write_run
+from torchslam.io.write_run import source_of, write_run
 from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.front_end import source
 from torchslam.system.online_run import OnlineRun
@@ -196,7 +195,7 @@ def _run(task: Task, folder: Path) -> Columns:
         raise KeyboardInterrupt
     finished = replace(finished, config=replace(finished.config, metric=config.metric))
     seconds = time.process_time() - start
-    metrics = compute_metrics(finished, sequence, camera, mapped=mapped)
+    metrics = compute_metrics(finished, sequence, camera_remark(finished, camera), mapped=mapped)
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
     metrics |= source_of(row.resolve(row.sequence), row.fps, sequence)

@@ -91,6 +91,13 @@ def add_directory(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
 
 
+def add_images(parser: argparse.ArgumentParser) -> None:
+    """Add the argument for the location of a run's images."""
+    parser.add_argument(
+        "--images", metavar="PATH", help="the images of the run, if they are not where the run read them"
+    )
+
+
 def sequence(options: argparse.Namespace, camera: Calibration | None = None) -> Sequence:
     """Open the sequence given by the arguments of `add_sequence`; print its notes to stderr.
 

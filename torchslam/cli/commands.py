@@ -76,13 +76,9 @@ def add_arguments_plot(parser: argparse.ArgumentParser) -> None:
 
 def execute_plot(options: argparse.Namespace) -> int:
     """Redraw the plots and view.html of a run from its results folder."""
-    from torchslam.io.results import read_results
-    from torchslam.io.viewer.page import write_view
-    from torchslam.io.write_run import draw
+    from torchslam.io.write_run import redraw
 
-    results = read_results(options.directory)
-    for path in [*draw(results, options.directory), write_view(results, options.directory)]:
-        print(path)
+    print(*redraw(options.directory), sep="\n")
     return 0
 
 

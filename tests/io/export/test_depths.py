@@ -14,9 +14,10 @@ from torchslam.dense import DepthMaps
 from torchslam.dense.depth_maps import read_frames
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, rigid, so3_exp, transform
-from torchslam.io.export.depths import UNIT, colmap_map, depth_png, enlarged, write_workspace
+from torchslam.io.export.colmap import colmap_map, write_workspace
+from torchslam.io.export.nerfstudio import UNIT, depth_png
 from torchslam.io.export.ply import read_cloud
-from torchslam.io.export.scene import ExportedScene, Undistorter, undistorted
+from torchslam.io.export.scene import ExportedScene, Undistorter, enlarged, undistorted
 
 SMALL = Camera.pinhole(50.0, 52.0, 31.0, 23.0, size=(64, 48))
 FRAMES = 6

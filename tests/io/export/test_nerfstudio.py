@@ -15,11 +15,10 @@ from tests.io.export.conftest import reprojection_error
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import upright_rotation
-from torchslam.io.export.depths import enlarged
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import VERTEX
 from torchslam.io.export.ply import read_cloud as read_dense
-from torchslam.io.export.scene import ExportedScene, undistorted
+from torchslam.io.export.scene import ExportedScene, enlarged, undistorted
 
 
 def distort(about: dict, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 import shutil
@@ -21,8 +22,7 @@ from torchslam.dense import PointCloud
 from torchslam.geometry import Camera, transform
 from torchslam.io.results import Results, read_results
 from torchslam.io.viewer import page as view_data
-from torchslam.io.viewer.arrays import decoded, encoded
-from torchslam.io.viewer.page import page, write_view
+from torchslam.io.viewer.page import encoded, page, write_view
 from torchslam.system.run import Run
 from torchslam.types import State, Trajectory
 
@@ -53,6 +53,12 @@ def data_of(text: str) -> dict[str, Any]:
     """What a page holds."""
     (found,) = re.findall(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
     return json.loads(found)
+
+
+def decoded(packed: dict[str, str]) -> np.ndarray:
+    """A flat array of the page."""
+    kind = np.dtype(packed["type"]).newbyteorder("<")
+    return np.frombuffer(base64.b64decode(packed["data"]), kind)
 
 
 def array(packed: dict[str, str], *shape: int) -> np.ndarray:

@@ -29,6 +29,7 @@ DENSE_VERTEX = np.dtype([*COLORED, ("confidence", "<f4")])
 PROPERTY_TYPES = {"<f4": "float", "|u1": "uchar"}
 CAMERA_COLOR = (213, 73, 63)
 """Red, green, blue of the trajectory in the cloud."""
+MAX_DRAWN = 500_000  # of a dense cloud that a program draws, or starts a splat from
 MAX_BYTES = 1 << 33  # of a cloud that is read: 270 million points
 UNIT_TOLERANCE = 1e-3  # of the length of a normal
 

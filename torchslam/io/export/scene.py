@@ -21,7 +21,7 @@ from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.data.formats.image_file import write_image
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Sequence
-from torchslam.data.transforms import resize
+from torchslam.data.transforms import resize, scale_camera
 from torchslam.errors import FrameError, ResultsError, SequenceError
 from torchslam.geometry import Camera, SensorModel, se3_inverse, squared_reprojection_errors, transform
 from torchslam.geometry.rolling_shutter import Readout
@@ -78,11 +78,17 @@ class ExportedScene:
         if missing:
             raise ResultsError(f"frame {missing[0]} has no pose in this map")
         rows = torch.nonzero(torch.isin(self.frame_ids, frame_ids))[:, 0]
-        slot = torch.full((len(self.T_cw),), -1, device="cpu").index_copy(
-            0, rows, torch.arange(len(rows), device="cpu")
-        )
-        is_kept = _of_tracks(slot[self.frame_index] >= 0, self.point_index, len(self.points_w))
-        points, point_index = torch.unique(self.point_index[is_kept], return_inverse=True)
+        return self._part(rows, torch.ones_like(self.frame_index, dtype=torch.bool))
+
+    def _part(self, rows: Int[Tensor, " R"], is_seen: Bool[Tensor, " O"]) -> ExportedScene:
+        """The scene of rows of frames, in their order, and of points in two or more of the observations that count."""
+        slot = torch.full((len(self.T_cw),), -1, device="cpu")
+        slot[rows] = torch.arange(len(rows), device="cpu")
+        is_seen = is_seen & (slot[self.frame_index] >= 0)
+        tracks = torch.bincount(self.point_index[is_seen], minlength=len(self.points_w))
+        seen = torch.nonzero(is_seen & (tracks[self.point_index] >= 2))[:, 0]
+        seen = seen[torch.argsort(slot[self.frame_index[seen]], stable=True)]
+        points, point_index = torch.unique(self.point_index[seen], return_inverse=True)
         return replace(
             self,
             frame_ids=self.frame_ids[rows],
@@ -91,9 +97,9 @@ class ExportedScene:
             T_cw=self.T_cw[rows],
             points_w=self.points_w[points],
             colors=self.colors[points],
-            frame_index=slot[self.frame_index[is_kept]],
+            frame_index=slot[self.frame_index[seen]],
             point_index=point_index,
-            pixels=self.pixels[is_kept],
+            pixels=self.pixels[seen],
         )
 
     def errors(self) -> Float[Tensor, " O"]:
@@ -128,35 +134,20 @@ def scene_of(
             f"submap {submap.number} holds no frames of this run: it was only localized, or all of it is elsewhere"
         )
     rows = rows[torch.argsort(graph.timestamps[rows], stable=True)]
-    slot = torch.full((len(graph.T_cw),), -1, device="cpu").index_copy(
-        0, rows, torch.arange(len(rows), device="cpu")
-    )
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])
-    is_kept = (slot[graph.frame_index] >= 0) & camera.project(points_c[:, 0])[1]
-    is_kept = _of_tracks(is_kept, graph.point_index, len(graph.points_w))
-    seen = torch.nonzero(is_kept)[:, 0]
-    seen = seen[torch.argsort(slot[graph.frame_index[seen]], stable=True)]
-    points, point_index = torch.unique(graph.point_index[seen], return_inverse=True)
-    return ExportedScene(
+    scene = ExportedScene(
         camera=camera.to(torch.float64),
-        frame_ids=graph.frame_ids[rows],
-        timestamps=graph.timestamps[rows],
-        is_keyframe=graph.is_keyframe[rows],
-        T_cw=graph.T_cw[rows].double(),
-        points_w=graph.points_w[points].double(),
-        colors=submap.map.points["colors"][graph.point_ids[points]],
-        frame_index=slot[graph.frame_index[seen]],
-        point_index=point_index,
-        pixels=graph.pixels[seen].double(),
+        frame_ids=graph.frame_ids,
+        timestamps=graph.timestamps,
+        is_keyframe=graph.is_keyframe,
+        T_cw=graph.T_cw.double(),
+        points_w=graph.points_w.double(),
+        colors=submap.map.points["colors"][graph.point_ids],
+        frame_index=graph.frame_index,
+        point_index=graph.point_index,
+        pixels=graph.pixels.double(),
     )
-
-
-def _of_tracks(
-    is_kept: Bool[Tensor, " O"], point_index: Int[Tensor, " O"], points: int
-) -> Bool[Tensor, " O"]:
-    """Return the kept observations without those of points that fewer than two of them see."""
-    tracks = torch.bincount(point_index[is_kept], minlength=points)
-    return is_kept & (tracks[point_index] >= 2)
+    return scene._part(rows, camera.project(points_c[:, 0])[1])
 
 
 def pinhole_within(camera: Camera) -> Camera:
@@ -179,6 +170,13 @@ def pinhole_within(camera: Camera) -> Camera:
     width, height = (int(side) + 1 for side in scale * extent)
     params = torch.cat((scale * focal, -scale * focal * low))
     return Camera("pinhole", params, (width, height))
+
+
+def enlarged(pinhole: Camera, camera: Camera) -> Camera:
+    """The camera of a depth map, for images as large as those of the camera that it was made from."""
+    factor = max(1.0, float(camera.params[0] / pinhole.params[0]))
+    size = (round(factor * pinhole.width), round(factor * pinhole.height))
+    return scale_camera(pinhole, size)
 
 
 def undistorted(scene: ExportedScene, pinhole: Camera | None = None) -> ExportedScene:
