@@ -67,30 +67,33 @@ class Engine:
         Raises:
             ConfigError: Ray is not installed, or not found at the address.
         """
-        rows = list(rows)
+        # As text: Arrow would infer different types for blocks whose columns are None.
+        items = [{"number": number, "row": json.dumps(row)} for number, row in enumerate(rows)]
         if self.kind == "ray":
-            yield from _map_with_ray(work, rows, self.workers, self.address, self.gpus)
+            yield from _map_with_ray(work, items, self.workers, self.address, self.gpus)
             return
-        for number, row in enumerate(rows):
-            yield number, work(json.loads(json.dumps(row)))
+        for item in items:
+            yield item["number"], work(json.loads(item["row"]))
 
 
 def _map_with_ray(
-    work: Work, rows: list[Columns], workers: int | None, address: str | None, gpus: int = 0
+    work: Work, items: list[Columns], workers: int | None, address: str | None, gpus: int
 ) -> Iterator[tuple[int, Columns | None]]:
     """Run `Engine.map_unordered` as Ray tasks of one row and one processor each."""
 
     def on_item(item: Columns) -> Columns:
         return {"number": item["number"], "row": json.dumps(work(json.loads(item["row"])))}
 
-    ray, data = _import_ray()
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise it reports each cluster to its makers
+    try:
+        ray, data = importlib.import_module("ray"), importlib.import_module("ray.data")
+    except ImportError as error:
+        raise ConfigError(f"--engine ray needs pip install 'torchslam[ray]': {error}") from None
     _start(ray, workers, address)
     try:
         context = data.DataContext.get_current()
         context.enable_progress_bars, context.max_errored_blocks = False, -1
-        # As text: Arrow would infer different types for blocks whose columns are None.
-        items = [{"number": number, "row": json.dumps(row)} for number, row in enumerate(rows)]
-        left = set(range(len(rows)))
+        left = set(range(len(items)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # max_retries is deprecated in Ray 2.64, without a replacement
             done = data.from_items(items, override_num_blocks=len(items)).map(
@@ -109,39 +112,17 @@ def _map_with_ray(
         ray.shutdown()
 
 
-def _import_ray() -> tuple[Any, Any]:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise it reports each cluster to its makers
-    try:
-        return importlib.import_module("ray"), importlib.import_module("ray.data")
-    except ImportError as error:
-        raise ConfigError(f"--engine ray needs pip install 'torchslam[ray]': {error}") from None
-
-
 def _start(ray: Any, workers: int | None, address: str | None) -> None:
     logging.getLogger("ray.data").setLevel(logging.ERROR)  # reports why a worker died or did not start
-    options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR}
+    options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR, "address": address or "local"}
     if address is None:
-        options |= {
-            "num_cpus": workers,
-            "include_dashboard": False,
-            "object_store_memory": STORE_BYTES,
-            "address": "local",
-        }
-    else:
-        options["address"] = address
+        options |= {"num_cpus": workers, "include_dashboard": False, "object_store_memory": STORE_BYTES}
     try:
         ray.init(**options)
     except Exception as error:  # Ray raises various types
         line = " ".join(str(error).split())[:500]
-        where = (
-            "the Ray cluster of this machine did not start"
-            if address is None
-            else f"no Ray cluster at {address}"
-        )
+        where = f"no Ray cluster at {address}" if address else "the Ray cluster of this machine did not start"
         raise ConfigError(f"--engine ray: {where}: {type(error).__name__}: {line}") from error
-
-
-AUTO = "auto"
 
 
 @dataclass(frozen=True)
@@ -156,10 +137,10 @@ class Shard:
     count: int = 1
 
     def __post_init__(self) -> None:
-        if not 0 <= self.index < self.count:
-            last = f"{self.count - 1}/{self.count}"
+        count = self.count
+        if not 0 <= self.index < count:
             raise ConfigError(
-                f"--shard {self.index}/{self.count}: shards count from 0/{self.count} to {last}"
+                f"--shard {self.index}/{count}: shards count from 0/{count} to {count - 1}/{count}"
             )
 
 
@@ -169,7 +150,7 @@ def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard
     Raises:
         ConfigError: Anything else, or the environment lacks the index.
     """
-    if text == AUTO:
+    if text == "auto":
         return _of_system(environment)
     index, _, count = text.partition("/")
     numbers = parse_count(index), parse_count(count)
@@ -221,20 +202,16 @@ def run_batch(
 
     Raises:
         ConfigError: The engine is not available.
-        OSError: The table cannot be written.
     """
     engine, shard = engine or Engine(), shard or Shard()
     mine = tasks[shard.index :: shard.count]
     found: dict[int, Columns] = {}
     for number, columns in engine.map_unordered(run_row, [task.as_dict() for task in mine]):
-        found[number] = _lost(mine[number]) if columns is None else columns
-        on_progress(found[number])
+        if columns is None:
+            known = {"name": mine[number].row.name, "configuration": configuration(mine[number])}
+            columns = store_failure(Path(mine[number].output), known, LOST)
+        found[number] = columns
+        on_progress(columns)
     if tasks:
         write_table(tasks, Path(tasks[0].output))
     return [found[number] for number in range(len(mine))]
-
-
-def _lost(task: Task) -> Columns:
-    """Record the error of a row whose process died."""
-    known = {"name": task.row.name, "configuration": configuration(task)}
-    return store_failure(Path(task.output), known, LOST)

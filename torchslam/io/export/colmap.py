@@ -8,7 +8,7 @@ neighbors, and channels come last.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -46,8 +46,14 @@ def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
     return "FULL_OPENCV", [*params, 0.0, 0.0, 0.0][:12]  # k4, k5, k6: zero without a rational model
 
 
-def write_colmap(folder: Path, scene: ExportedScene) -> None:
-    """Write the model, binary and text, into a folder that is made if need be."""
+def write_colmap(folder: Path, scene: ExportedScene, names: Sequence[str] | None = None) -> None:
+    """Write the model, binary and text, into a folder that is made if need be.
+
+    Args:
+        folder: of the files.
+        scene: what is written.
+        names: of the images of its frames; None: `scene.image_names`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     model, params = colmap_camera(scene.camera)
     camera = struct.pack(f"<IiQQ{len(params)}d", CAMERA_ID, MODEL_IDS[model], *scene.camera.size, *params)
@@ -61,7 +67,7 @@ def write_colmap(folder: Path, scene: ExportedScene) -> None:
     poses = torch.cat((quaternions, translations), dim=1).tolist()
     binary, lines = list[bytes](), list[Iterable[Any]]()
     for number, (name, pose, points) in enumerate(
-        zip(scene.image_names, poses, np.split(seen, ends)[:-1], strict=True), 1
+        zip(names or scene.image_names, poses, np.split(seen, ends)[:-1], strict=True), 1
     ):
         header = struct.pack("<I7dI", number, *pose, CAMERA_ID) + name.encode() + b"\0"
         binary.append(header + struct.pack("<Q", len(points)) + points.tobytes())

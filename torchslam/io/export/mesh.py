@@ -7,10 +7,9 @@ which the mesh is the zero level (marching cubes).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -42,9 +41,8 @@ MIN_TRIANGLES = 100  # of a connected part: smaller ones are errors of depth
 UNPAINTED = 180  # gray, without images
 
 
-@dataclass(frozen=True)
-class MeshSize:
-    """voxel: width of a voxel, map units; vertices, triangles: numbers in the file."""
+class MeshSize(NamedTuple):
+    """Width of a voxel in map units, and numbers in the file."""
 
     voxel: float
     vertices: int
@@ -56,9 +54,8 @@ def import_open3d() -> ModuleType:
     try:
         import open3d
     except ImportError as error:
-        raise ResultsError(
-            f"Open3D is required for a mesh: pip install 'torchslam[mesh]' ({error})"
-        ) from None
+        hint = "Open3D is required for a mesh: pip install 'torchslam[mesh]'"
+        raise ResultsError(f"{hint} ({error})") from None
     return open3d
 
 
@@ -89,7 +86,11 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
     )
     for maps in DepthMaps.blocks(depths, 1):
         depth = o3d.t.geometry.Image(o3d.core.Tensor(_sure_depth(maps, middle).numpy()))
-        color = o3d.t.geometry.Image(o3d.core.Tensor(_color(maps, images)))
+        pixels = np.full((*maps.depth.shape[1:], 3), UNPAINTED / 255, np.float32)
+        if images is not None:
+            rgb = cv2.cvtColor(images.bgr(int(maps.frame_index)), cv2.COLOR_BGR2RGB)
+            pixels = rgb.astype(np.float32) / 255
+        color = o3d.t.geometry.Image(o3d.core.Tensor(pixels))
         K = o3d.core.Tensor(maps.camera.K.double().numpy())
         T_cu = o3d.core.Tensor((maps.T_cw[0].double() @ turn.mT).numpy())
         limits = (1.0, FARTHEST * middle, TRUNCATION)  # scale and largest depth
@@ -115,9 +116,8 @@ def _ordered(o3d: ModuleType, mesh: Any) -> Any:
     order = np.lexsort((*colors.T, *vertices.T))
     triangles = np.argsort(order)[np.asarray(mesh.triangles)]
     first = triangles.argmin(axis=1)[:, None]
-    triangles = np.take_along_axis(
-        triangles, (first + np.arange(3)) % 3, axis=1
-    )  # keeps the side that is outside
+    # Turning the corners keeps the side that is outside.
+    triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
     triangles = triangles[np.lexsort(triangles.T)]
     vector = o3d.utility.Vector3dVector
     ordered = o3d.geometry.TriangleMesh(vector(vertices[order]), o3d.utility.Vector3iVector(triangles))
@@ -153,10 +153,3 @@ def _voxel(depths: Path, middle: float) -> float:
     while len(torch.unique((torch.cat(points) / (BLOCK * voxel)).floor(), dim=0)) > MAX_BLOCKS:
         voxel *= WIDENING
     return voxel
-
-
-def _color(maps: DepthMaps, images: Images | None) -> Float[np.ndarray, "H W 3"]:
-    """The image of a map: red, green, blue, 0 to 1."""
-    if images is None:
-        return np.full((*maps.depth.shape[1:], 3), UNPAINTED / 255, np.float32)
-    return cv2.cvtColor(images.bgr(int(maps.frame_index)), cv2.COLOR_BGR2RGB).astype(np.float32) / 255

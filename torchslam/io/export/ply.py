@@ -126,14 +126,14 @@ def read_cloud(path: str | Path, R: Float[Tensor, "3 3"] | None = None) -> Point
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        cloud = _cloud(_vertices(content))
+        cloud = _cloud(content)
     except ValueError as error:
         raise ResultsError(f"{path}: not a dense cloud of torchslam: {error}") from None
     return cloud if R is None else cloud.turned(R.mT)
 
 
-def _vertices(content: bytes) -> np.ndarray:
-    """The rows (N,) of DENSE_VERTEX of a file. Raises ValueError for any other content."""
+def _cloud(content: bytes) -> PointCloud:
+    """The cloud of a file. Raises ValueError for any other content and for impossible numbers."""
     found = re.match(rb"ply\nformat binary_little_endian 1\.0\nelement vertex (\d{1,10})\n", content)
     if found is None:
         raise ValueError("no header of a binary PLY file")
@@ -143,17 +143,9 @@ def _vertices(content: bytes) -> np.ndarray:
         raise ValueError(f"its properties are not {', '.join(DENSE_VERTEX.names or ())}")
     if len(content) != len(header) + count * DENSE_VERTEX.itemsize:
         raise ValueError(f"{count} points and a file of {len(content)} bytes")
-    return np.frombuffer(content, DENSE_VERTEX, offset=len(header))
-
-
-def _cloud(vertices: np.ndarray) -> PointCloud:
-    """The cloud of rows of DENSE_VERTEX. Raises ValueError for impossible numbers."""
-    cloud = PointCloud(
-        points_w=_columns(vertices, POSITION),
-        normals_w=_columns(vertices, NORMAL),
-        colors=_columns(vertices, COLOR),
-        confidence=torch.from_numpy(vertices["confidence"].copy()),
-    )
+    rows = np.frombuffer(content, DENSE_VERTEX, offset=len(header))
+    columns = (np.stack([rows[name] for name in names], axis=1) for names in (POSITION, NORMAL, COLOR))
+    cloud = PointCloud(*map(torch.from_numpy, (*columns, rows["confidence"].copy())))
     if not bool(torch.isfinite(cloud.points_w).all()):
         raise ValueError("positions are not finite")
     if not bool(((cloud.normals_w.norm(dim=-1) - 1).abs() < UNIT_TOLERANCE).all()):
@@ -161,10 +153,6 @@ def _cloud(vertices: np.ndarray) -> PointCloud:
     if not bool(((cloud.confidence >= 0) & (cloud.confidence <= 1)).all()):
         raise ValueError("confidence is not between 0 and 1")
     return cloud
-
-
-def _columns(vertices: np.ndarray, names: tuple[str, ...]) -> Tensor:
-    return torch.from_numpy(np.stack([vertices[name] for name in names], axis=1))
 
 
 def _fill(vertices: np.ndarray, names: tuple[str, ...], values: Tensor) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -28,21 +27,6 @@ MAX_ELLIPSES = 1500  # of points; more hide the picture
 SIGMAS = 3.0  # size of an ellipse in standard deviations
 TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
 """Style of the true trajectory."""
-
-
-@dataclass(frozen=True)
-class _Scene:
-    """Everything drawn, as numpy arrays in upright axes (z up)."""
-
-    path: np.ndarray
-    rotations: np.ndarray
-    cameras: np.ndarray
-    camera_covariances: np.ndarray  # of their positions; zero where unknown
-    points: np.ndarray
-    point_covariances: np.ndarray
-    groundtruth: np.ndarray
-    labels: tuple[str, str, str]
-    gaps: list[int]
 
 
 def upright_axes(
@@ -71,6 +55,39 @@ def inside(points: Float[np.ndarray, "N D"], box: Float[np.ndarray, "D 2"]) -> B
     return np.all((points >= box[:, 0]) & (points <= box[:, 1]), axis=1)
 
 
+class _Scene:
+    """Everything drawn, as numpy arrays in upright axes (z up); covariances are zero where unknown."""
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        points_w: Tensor,
+        groundtruth: Trajectory | None,
+        keyframes: Trajectory | None,
+        keyframe_covariances_w: Tensor | None = None,
+        point_covariances_w: Tensor | None = None,
+    ) -> None:
+        T_wc = style.to_numpy(trajectory.T_wc)
+        upright, self.labels = upright_axes(T_wc)
+        shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
+        rows = style.thin(len(shown), MAX_CAMERAS)
+        points = style.to_numpy(points_w).reshape(-1, 3)
+        finite = np.isfinite(points).all(axis=1)
+        truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
+
+        def turned(covariances_w: Tensor | None, count: int) -> np.ndarray:
+            if covariances_w is None:
+                return np.zeros((count, 3, 3))
+            return upright @ style.to_numpy(covariances_w) @ upright.T
+
+        self.path, self.gaps = T_wc[:, :3, 3] @ upright.T, gaps(trajectory.timestamps)
+        self.rotations, self.cameras = upright @ shown[rows, :3, :3], shown[rows, :3, 3] @ upright.T
+        self.camera_covariances = turned(keyframe_covariances_w, len(shown))[rows]
+        self.points = points[finite] @ upright.T
+        self.point_covariances = turned(point_covariances_w, len(points))[finite]
+        self.groundtruth = truth @ upright.T
+
+
 def plot_scene(
     trajectory: Trajectory,
     points_w: Float[Tensor, "N 3"],
@@ -87,7 +104,7 @@ def plot_scene(
         keyframes: frames to draw axes for: red x, green y, blue z (the viewing direction); default: all
         unit: unit of length; "" if the scale is unknown
     """
-    scene = _scene(trajectory, points_w, groundtruth, keyframes)
+    scene = _Scene(trajectory, points_w, groundtruth, keyframes)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth]), scene.points)
     with style.house_style():
         figure = style.new_figure(11.0, 4.7)
@@ -118,7 +135,7 @@ def plot_top_view(
         keyframe_covariances_w, point_covariances_w: covariances of the positions, drawn as ellipses of three
             standard deviations, those of keyframes magnified by the power of ten in the legend; none where zero
     """
-    scene = _scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
+    scene = _Scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
     span = box[:, 1] - box[:, 0]
     width = float(np.clip(6.2 * span[0] / span[1], 4.5, 11.0))
@@ -133,41 +150,6 @@ def plot_top_view(
         figure.suptitle("\n".join(lines), x=0.02, ha="left", fontsize=10.5)
         figure.legend(loc="outside lower center", ncols=4 if width > 8.0 else 2)
     return figure
-
-
-def _scene(
-    trajectory: Trajectory,
-    points_w: Tensor,
-    groundtruth: Trajectory | None,
-    keyframes: Trajectory | None,
-    keyframe_covariances_w: Tensor | None = None,
-    point_covariances_w: Tensor | None = None,
-) -> _Scene:
-    T_wc = style.to_numpy(trajectory.T_wc)
-    upright, labels = upright_axes(T_wc)
-    shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
-    rows = style.thin(len(shown), MAX_CAMERAS)
-    points = style.to_numpy(points_w).reshape(-1, 3)
-    finite = np.isfinite(points).all(axis=1)
-    truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
-    return _Scene(
-        path=T_wc[:, :3, 3] @ upright.T,
-        rotations=upright @ shown[rows, :3, :3],
-        cameras=shown[rows, :3, 3] @ upright.T,
-        camera_covariances=_turned(keyframe_covariances_w, len(shown), upright)[rows],
-        points=points[finite] @ upright.T,
-        point_covariances=_turned(point_covariances_w, len(points), upright)[finite],
-        groundtruth=truth @ upright.T,
-        labels=labels,
-        gaps=gaps(trajectory.timestamps),
-    )
-
-
-def _turned(covariances_w: Tensor | None, count: int, upright: np.ndarray) -> np.ndarray:
-    """Covariances (count, 3, 3) in upright axes, zero where there are none."""
-    if covariances_w is None:
-        return np.zeros((count, 3, 3))
-    return upright @ style.to_numpy(covariances_w) @ upright.T
 
 
 def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit: str) -> None:
