@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch, content, table, task
-from tests.cli.test_cli import write_tum_folder
+from tests.cli.conftest import write_tum_folder
 from tests.fuzz import valid_inputs
 from torchslam.batch import Engine, Row, Task, run_batch, run_row
 from torchslam.batch import results_table as tables

@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from tests.cli.conftest import FAST, write_tum_folder
 from tests.cli.test_align_command import Known
-from tests.cli.test_cli import FAST, write_tum_folder
 from tests.refine.test_refine import disturbed
 from torchslam.cli.main import main
 from torchslam.data import open_sequence, read_trajectory

@@ -11,7 +11,6 @@ import torch
 
 from tests.box_room import HALF, box_cloud, box_depths, wall_colors
 from torchslam.dense import DepthMaps
-from torchslam.dense.depth_maps import read_frames
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.io.export.colmap import colmap_map, write_workspace
@@ -61,15 +60,6 @@ class Painted:
 
     def bgr(self, frame_id: int) -> np.ndarray:
         return np.ascontiguousarray(self._by_frame[frame_id][..., ::-1])
-
-
-def test_maps_are_read_one_by_one(room: tuple[ExportedScene, Path]) -> None:
-    maps, found = DepthMaps.load(room[1]), list(DepthMaps.blocks(room[1], 1))
-    assert torch.equal(torch.cat([each.depth for each in found]), maps.depth)
-    assert torch.equal(torch.cat([each.T_cw for each in found]), maps.T_cw)
-    frames, camera = read_frames(room[1])
-    assert torch.equal(frames, maps.frame_index)
-    assert camera.size == SMALL.size
 
 
 def test_a_depth_image_has_thousandths_and_zero_where_depth_is_unknown() -> None:

@@ -205,10 +205,6 @@ def test_a_large_dense_cloud_is_thinned(
     assert submap["dense"]["total"] == len(dense)
 
 
-def test_without_a_dense_cloud_the_page_has_none(kept: Results) -> None:
-    assert data_of(page(kept))["submaps"][0]["dense"] is None
-
-
 def test_the_size_of_a_page_is_bounded(kept: Results, dense: PointCloud) -> None:
     """Any number of points and of frames fits."""
     count, frames = 200_000, 40_000
