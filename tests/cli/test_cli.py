@@ -299,7 +299,7 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
 
 
 def test_the_command_list_shows_each_commands_summary() -> None:
-    for name, (_, summary) in COMMANDS.items():
+    for name, summary in COMMANDS.items():
         first = load_command(name)[0].split("\n")[0].rstrip(".")
         assert summary == first[0].lower() + first[1:]
 

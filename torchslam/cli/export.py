@@ -28,6 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -58,8 +59,6 @@ from torchslam.utils.console import table
 
 FOLDER = "export"  # in the folder of results
 MODEL = Path("sparse") / "0"  # where COLMAP's programs and trainers of splats look for it
-WORKSPACE = "dense"  # for COLMAP's programs
-SPLAT_START = "points3D.ply"  # in MODEL: what 3D Gaussian Splatting reads instead of the points of the model
 
 
 @dataclass(frozen=True)
@@ -118,34 +117,23 @@ class Job:
         return (scene if pinhole is None else undistorted(scene, pinhole)), images
 
 
-@dataclass(frozen=True)
-class Target:
-    """An export format.
-
-    Attributes:
-        write: writes the export and returns rows for `table`.
-        name: file or folder name.
-        is_of_images: whether the format includes images.
-        keyframes: whether only keyframes are exported by default.
-    """
+class Target(NamedTuple):
+    """An export format: its writer, which returns rows for `table`, and the name of its file or folder."""
 
     write: Callable[[Job], dict[str, str]]
     name: str
-    is_of_images: bool
-    keyframes: bool
+    is_of_images: bool = True
+    """The format includes images."""
+    keyframes: bool = True
+    """By default only keyframes are exported."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam export`."""
     arguments.add_directory(parser)
     parser.add_argument("--to", choices=TARGETS, required=True, help="export format")
-    parser.add_argument(
-        "--output",
-        "-o",
-        type=Path,
-        metavar="PATH",
-        help=f"file or folder to write (default: in DIR/{FOLDER})",
-    )
+    about = f"file or folder to write (default: in DIR/{FOLDER})"
+    parser.add_argument("--output", "-o", type=Path, metavar="PATH", help=about)
     parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     parser.add_argument(
         "--frames",
@@ -201,14 +189,15 @@ def _colmap(job: Job) -> dict[str, str]:
         write_images(job.output / IMAGES, scene, images)
     write_colmap(job.output / MODEL, scene)
     about = {"camera": colmap_camera(scene.camera)[0]} | _describe_scene(job, scene)
-    cloud = job.cloud
-    (job.output / MODEL / SPLAT_START).unlink(missing_ok=True)
+    # What 3D Gaussian Splatting reads instead of the points of the model.
+    cloud, start = job.cloud, job.output / MODEL / "points3D.ply"
+    start.unlink(missing_ok=True)
     if cloud is not None:
-        write_cloud(job.output / MODEL / SPLAT_START, cloud.thinned(MAX_DRAWN))
+        write_cloud(start, cloud.thinned(MAX_DRAWN))
     if job.depths is not None:
         frame_ids, camera = read_frames(job.depths)
         dense, small_images = job.scene(camera, frame_ids)
-        write_workspace(job.output / WORKSPACE, dense, job.depths, cloud, small_images)
+        write_workspace(job.output / "dense", dense, job.depths, cloud, small_images)
     return about | _describe_dense(job, cloud)
 
 
@@ -278,7 +267,7 @@ def _ply(job: Job) -> dict[str, str]:
     return {"points": f"{job.submap.map.num_points}, and {keyframes} keyframes"}
 
 
-def _trajectory(write: Callable[[Path, Trajectory], None], job: Job) -> dict[str, str]:
+def _poses(write: Callable[[Path, Trajectory], None], job: Job) -> dict[str, str]:
     if job.keyframes_alone:
         trajectory = job.submap.map.keyframe_trajectory(job.run.session)
     else:  # from the file, since localization adds no poses to the map
@@ -290,13 +279,11 @@ def _trajectory(write: Callable[[Path, Trajectory], None], job: Job) -> dict[str
 
 
 TARGETS = {
-    "colmap": Target(_colmap, "colmap", is_of_images=True, keyframes=True),
-    "nerfstudio": Target(_nerfstudio, "nerfstudio", is_of_images=True, keyframes=True),
-    "ply": Target(_ply, "map.ply", is_of_images=False, keyframes=True),
-    "rerun": Target(_rerun, "recording.rrd", is_of_images=True, keyframes=False),
-    "tum": Target(
-        partial(_trajectory, write_trajectory), "trajectory.txt", is_of_images=False, keyframes=False
-    ),
-    "kitti": Target(partial(_trajectory, write_kitti), "kitti", is_of_images=False, keyframes=False),
-    "mesh": Target(_mesh, "mesh.ply", is_of_images=True, keyframes=True),
+    "colmap": Target(_colmap, "colmap"),
+    "nerfstudio": Target(_nerfstudio, "nerfstudio"),
+    "ply": Target(_ply, "map.ply", is_of_images=False),
+    "rerun": Target(_rerun, "recording.rrd", keyframes=False),
+    "tum": Target(partial(_poses, write_trajectory), "trajectory.txt", is_of_images=False, keyframes=False),
+    "kitti": Target(partial(_poses, write_kitti), "kitti", is_of_images=False, keyframes=False),
+    "mesh": Target(_mesh, "mesh.ply"),
 }
