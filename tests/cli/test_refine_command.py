@@ -125,8 +125,7 @@ def test_refined_poses_are_in_meters_where_a_length_is_known(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(
-        "torchslam.cli.arguments.sources_of",
-        lambda given: [Known(3.0)] if "camera_height" in given else [],
+        "torchslam.cli.arguments.sources_of", lambda given: [Known(3.0)] if "camera_height" in given else []
     )
     poses = write("tum", given, tmp_path)
     call = [

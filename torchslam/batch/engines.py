@@ -68,7 +68,7 @@ class Engine:
             ConfigError: Ray is not installed, or not found at the address.
         """
         # As text: Arrow would infer different types for blocks whose columns are None.
-        items = [{"number": number, "row": json.dumps(row)} for number, row in enumerate(rows)]
+        items: list[Columns] = [{"number": n, "row": json.dumps(row)} for n, row in enumerate(rows)]
         if self.kind == "ray":
             yield from _map_with_ray(work, items, self.workers, self.address, self.gpus)
             return

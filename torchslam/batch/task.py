@@ -14,15 +14,7 @@ from typing import Any
 
 import torch
 
-from torchslam.batch.result_store import (
-    DIGITS,
-    DONE,
-    NO_MAP,
-    Columns,
-    hash_files,
-    program_hash,
-    run_or_reuse,
-)
+from torchslam.batch.result_store import DIGITS, DONE, NO_MAP, Columns, hash_files, program_hash, run_or_reuse
 from torchslam.batch.rows import Row
 from torchslam.calibration.find_camera import camera_remark, find_camera, with_stated_std
 from torchslam.config import Config, MetricConfig, load_config, to_toml

@@ -19,23 +19,11 @@ from torchslam.cli import arguments
 from torchslam.config import load_config
 from torchslam.data.trajectories import read_trajectory, write_trajectory
 from torchslam.errors import ConfigError, ResultsError
+from torchslam.io import results as files
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.export.scene import Images
 from torchslam.io.report import accuracy, unit_words
-from torchslam.io.results import (
-    KEYFRAMES,
-    MAP,
-    ONLINE,
-    OTHER_TRAJECTORY,
-    POINT_CLOUD,
-    TRAJECTORY,
-    SavedRun,
-    aligned,
-    delete_dense,
-    open_run,
-    read_results,
-    write_metrics,
-)
+from torchslam.io.results import SavedRun, aligned, delete_dense, open_run, read_results, write_metrics
 from torchslam.io.write_run import redraw
 from torchslam.map.atlas import Submap
 from torchslam.map.file import write_atlas
@@ -107,14 +95,14 @@ def _write(run: SavedRun, moved: dict[int, Float[Tensor, "4 4"]], unmeasured: li
     for submap in run.submaps:
         if submap.number not in moved:
             continue
-        name = TRAJECTORY if submap is run.main else OTHER_TRAJECTORY.format(submap.number)
+        name = files.TRAJECTORY if submap is run.main else files.OTHER_TRAJECTORY.format(submap.number)
         write_trajectory(directory / name, submap.trajectory(session))  # markers have moved single poses
         if submap is run.main:
-            online = aligned(read_trajectory(directory / ONLINE), moved[submap.number])
-            write_trajectory(directory / ONLINE, online)
-            write_trajectory(directory / KEYFRAMES, submap.map.keyframe_trajectory(session))
-            write_map_cloud(directory / POINT_CLOUD, submap.map, session, submap.metric)
-    write_atlas(directory / MAP, run.submaps, run.camera, run.saved.sessions)
+            online = aligned(read_trajectory(directory / files.ONLINE), moved[submap.number])
+            write_trajectory(directory / files.ONLINE, online)
+            write_trajectory(directory / files.KEYFRAMES, submap.map.keyframe_trajectory(session))
+            write_map_cloud(directory / files.POINT_CLOUD, submap.map, session, submap.metric)
+    write_atlas(directory / files.MAP, run.submaps, run.camera, run.saved.sessions)
     if delete_dense(directory):
         say(
             f"dense depth had another scale and is removed; `torchslam densify {directory}` computes it again"

@@ -19,25 +19,10 @@ from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import FrameError
 from torchslam.geometry import geodetic_from_enu
+from torchslam.io import results as files
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.plots import draw
-from torchslam.io.results import (
-    CONFIG,
-    EXAMPLE_IMAGE,
-    FRAMES,
-    GROUND_TRUTH,
-    KEYFRAMES,
-    MAP,
-    ONLINE,
-    OTHER_TRAJECTORY,
-    POINT_CLOUD,
-    STAGE_SUFFIX,
-    TRAJECTORY,
-    delete_dense,
-    example_keyframe,
-    read_results,
-    write_metrics,
-)
+from torchslam.io.results import delete_dense, example_keyframe, read_results, write_metrics
 from torchslam.io.viewer.page import write_view
 from torchslam.map.file import write_atlas
 from torchslam.map.map import Map
@@ -129,29 +114,29 @@ def write_results(
         online: the run frame by frame, if `run` is a global map.
     """
     directory.mkdir(parents=True, exist_ok=True)
-    stale = [directory / name for name in (GROUND_TRUTH, EXAMPLE_IMAGE, GEOJSON, GPX)]
-    for old in [*stale, *directory.glob(OTHER_TRAJECTORY.format("[0-9]*"))]:
+    stale = [directory / name for name in (files.GROUND_TRUTH, files.EXAMPLE_IMAGE, GEOJSON, GPX)]
+    for old in [*stale, *directory.glob(files.OTHER_TRAJECTORY.format("[0-9]*"))]:
         old.unlink(missing_ok=True)
     delete_dense(directory)
-    write_trajectory(directory / TRAJECTORY, run.trajectory)
+    write_trajectory(directory / files.TRAJECTORY, run.trajectory)
     if run.metric is not None:
         write_earth(directory, run.trajectory, run.metric)
-    write_trajectory(directory / ONLINE, (run if online is None else online).online)
+    write_trajectory(directory / files.ONLINE, (run if online is None else online).online)
     for submap in run.submaps:
         if submap is not run.main and submap.posed_frames.count(run.session):
-            path = directory / OTHER_TRAJECTORY.format(submap.number)
+            path = directory / files.OTHER_TRAJECTORY.format(submap.number)
             write_trajectory(path, submap.trajectory(run.session))
-    write_trajectory(directory / KEYFRAMES, run.keyframes)
+    write_trajectory(directory / files.KEYFRAMES, run.keyframes)
     if sequence.groundtruth is not None:
-        write_trajectory(directory / GROUND_TRUTH, sequence.groundtruth)
-    write_atlas(directory / MAP, run.submaps, run.camera, run.sessions)
-    write_map_cloud(directory / POINT_CLOUD, run.map, run.session, run.metric)
+        write_trajectory(directory / files.GROUND_TRUTH, sequence.groundtruth)
+    write_atlas(directory / files.MAP, run.submaps, run.camera, run.sessions)
+    write_map_cloud(directory / files.POINT_CLOUD, run.map, run.session, run.metric)
     if run.calibration is not None and not run.session:
         remark, std = str(metrics.get("camera", "")), run.calibration.focal_std
         write_calibration(directory / CALIBRATION, run.camera, [remark] if remark else [], std)
-    (directory / CONFIG).write_text(to_toml(run.config), encoding="utf-8")
+    (directory / files.CONFIG).write_text(to_toml(run.config), encoding="utf-8")
     write_metrics(directory, metrics)
-    write_frames(directory / FRAMES, run.results, sequence)
+    write_frames(directory / files.FRAMES, run.results, sequence)
     keyframe = example_keyframe(run.map, run.session)
     if keyframe is not None:
         try:
@@ -159,7 +144,7 @@ def write_results(
         except FrameError:  # simulated features need no image; then there is nothing to draw
             return
         pixels = (image[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy()
-        write_image(directory / EXAMPLE_IMAGE, pixels)
+        write_image(directory / files.EXAMPLE_IMAGE, pixels)
 
 
 def source_of(path: str, fps: float | None, sequence: Sequence) -> dict[str, Any]:
@@ -173,7 +158,7 @@ def write_frames(path: str | Path, results: list[StepResult], sequence: Sequence
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*FRAME_COLUMNS, *(stage + STAGE_SUFFIX for stage in stages)])
+        writer.writerow([*FRAME_COLUMNS, *(stage + files.STAGE_SUFFIX for stage in stages)])
         for result in results:
             times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
             submap = "" if result.submap is None else result.submap

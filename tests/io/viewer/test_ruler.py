@@ -250,12 +250,7 @@ def test_a_browser_takes_fingers_that_do_not_move(tmp_path: Path, kept: Results)
     said.missed = [words(), ruler.rows.length];
     """
     said = handled(write_view(kept, tmp_path), script)
-    assert said == {
-        "dragged": [0, True],
-        "pinched": 0,
-        "tapped": 1,
-        "missed": ["There is no point.", 1],
-    }
+    assert said == {"dragged": [0, True], "pinched": 0, "tapped": 1, "missed": ["There is no point.", 1]}
 
 
 def test_a_browser_gives_no_option_for_points_of_another_session(tmp_path: Path, kept: Results) -> None:

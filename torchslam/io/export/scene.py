@@ -300,10 +300,7 @@ class ImageSource:
 
 
 def open_images(
-    source: ImageSource,
-    scene: ExportedScene,
-    pinhole: Camera | None = None,
-    otherwise: str = WITHOUT,
+    source: ImageSource, scene: ExportedScene, pinhole: Camera | None = None, otherwise: str = WITHOUT
 ) -> Images:
     """Open the images of a scene, in the size of the run.
 

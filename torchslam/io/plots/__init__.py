@@ -19,15 +19,7 @@ from torchslam.map.map import NO_POINT, Map
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = [
-    "draw",
-    "plot_errors",
-    "plot_features",
-    "plot_scene",
-    "plot_top_view",
-    "plot_tracking",
-    "save",
-]
+__all__ = ["draw", "plot_errors", "plot_features", "plot_scene", "plot_top_view", "plot_tracking", "save"]
 
 
 def draw(results: Results, directory: Path) -> list[Path]:
@@ -89,10 +81,7 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     shown = keyframes if len(keyframes) else None  # a run that only localized shows the axes of its frames
     yield "scene", plot_scene(trajectory, points_w, truth, shown, unit, title)
     certainty = of_keyframes if len(keyframes) else None
-    yield (
-        "top_view",
-        plot_top_view(trajectory, points_w, truth, shown, unit, title, certainty, of_points),
-    )
+    yield "top_view", plot_top_view(trajectory, points_w, truth, shown, unit, title, certainty, of_points)
 
 
 def _example(slam_map: Map, keyframe: int, session: int, image: Float[Tensor, "H W"]) -> Figure:

@@ -29,9 +29,7 @@ TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, 
 """Style of the true trajectory."""
 
 
-def upright_axes(
-    T_wc: Float[np.ndarray, "K 4 4"],
-) -> tuple[Float[np.ndarray, "3 3"], tuple[str, str, str]]:
+def upright_axes(T_wc: Float[np.ndarray, "K 4 4"]) -> tuple[Float[np.ndarray, "3 3"], tuple[str, str, str]]:
     """The signed axis permutation that brings the cameras' mean up direction closest to +z, and its names.
 
     The names are labels such as ("x", "z", "-y"). The world's own axes are kept, so the labels stay true: a world

@@ -302,9 +302,7 @@ def clearest_observations(
     return frames, pixels
 
 
-def error_factors(
-    covariances: Float[Tensor, "N 3 3"],
-) -> tuple[Float[Tensor, " N"], Int[Tensor, "N 6"]]:
+def error_factors(covariances: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, " N"], Int[Tensor, "N 6"]]:
     """Return covariances as numbers of steps, of their Cholesky factors L.
 
     Returns:
