@@ -124,24 +124,16 @@ def test_the_path_is_broken_where_poses_are_missing(trajectory: Trajectory, poin
     assert [len(part.get_xdata()) for part in parts] == [10, 10]
 
 
-def test_spans_without_a_pose_are_shaded(results: list[StepResult]) -> None:
-    axes = plots.plot_tracking(results).axes[0]
-    spans = {patch.get_label(): patch for patch in axes.patches}
-    assert spans.keys() == {"initializing", "lost"}
-    lost = spans["lost"]
-    assert lost.get_x() == pytest.approx(18 / 30)
-    assert lost.get_width() == pytest.approx(4 / 30)
-
-
-def test_uncertain_spans_are_shaded_in_their_own_color(results: list[StepResult]) -> None:
+def test_spans_without_a_certain_pose_are_shaded(results: list[StepResult]) -> None:
     doubtful = [
         replace(result, state=State.UNCERTAIN) if 6 <= result.index < 9 else result for result in results
     ]
     patches = plots.plot_tracking(doubtful).axes[0].patches
     spans = {patch.get_label(): patch for patch in patches if not patch.get_label().startswith("_")}
     assert spans.keys() == {"initializing", "lost", "uncertain"}
-    assert spans["uncertain"].get_x() == pytest.approx(6 / 30)
-    assert spans["uncertain"].get_width() == pytest.approx(3 / 30)
+    for name, first, count in (("lost", 18, 4), ("uncertain", 6, 3)):
+        assert spans[name].get_x() == pytest.approx(first / 30)
+        assert spans[name].get_width() == pytest.approx(count / 30)
     assert len({patch.get_facecolor() for patch in spans.values()}) == 3
 
 

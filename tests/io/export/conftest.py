@@ -1,16 +1,12 @@
-"""A scene that is seen by four cameras, in every camera model; and the fixtures of a small run."""
+"""A scene that is seen by four cameras, in every camera model."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from tests.sample_run import camera as camera
-from tests.sample_run import results, run, slam_map, submap, trajectory
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.io.export.scene import ExportedScene
-
-__all__ = ["results", "run", "slam_map", "submap", "trajectory"]
 
 SIZE = (320, 240)
 PINHOLE = (200.0, 210.0, 158.0, 121.5)

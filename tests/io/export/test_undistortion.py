@@ -51,13 +51,6 @@ def test_undistorted_images_agree_with_opencv(lens: Camera) -> None:
     assert difference.max() <= 2
 
 
-def test_a_point_keeps_its_ray(scene: ExportedScene) -> None:
-    flat = undistorted(scene)
-    torch.testing.assert_close(
-        flat.camera.unproject(flat.pixels), scene.camera.unproject(scene.pixels), atol=1e-9, rtol=0
-    )
-
-
 def test_only_a_pinhole_camera_is_unchanged(scene: ExportedScene) -> None:
     assert (undistorted(scene) is scene) == (scene.camera.model == "pinhole")
 
