@@ -60,12 +60,8 @@ class Engine:
     def map_unordered(self, work: Work, rows: Iterable[Columns]) -> Iterator[tuple[int, Columns | None]]:
         """Yield the index of each row with its result as they finish; None if the process died or could not start.
 
-        Args:
-            work: A function of a module; rows and results must be JSON values.
-            rows: Its arguments.
-
-        Raises:
-            ConfigError: Ray is not installed, or not found at the address.
+        The work is a function of a module; rows and results must be JSON values. Raises ConfigError if Ray is not
+        installed, or not found at the address.
         """
         # As text: Arrow would infer different types for blocks whose columns are None.
         items: list[Columns] = [{"number": n, "row": json.dumps(row)} for n, row in enumerate(rows)]
@@ -127,11 +123,7 @@ def _start(ray: Any, workers: int | None, address: str | None) -> None:
 
 @dataclass(frozen=True)
 class Shard:
-    """Part `index`, from 0, of `count`: every `count`-th row from row `index` on.
-
-    Raises:
-        ConfigError: The index is not in range.
-    """
+    """Part `index`, from 0, of `count`: every `count`-th row from row `index` on. Raises ConfigError out of range."""
 
     index: int = 0
     count: int = 1
@@ -152,11 +144,10 @@ def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard
     """
     if text == "auto":
         return _of_system(environment)
-    index, _, count = text.partition("/")
-    numbers = parse_count(index), parse_count(count)
-    if numbers[0] is None or not numbers[1]:
+    index, count = map(parse_count, text.partition("/")[::2])
+    if index is None or not count:
         raise ConfigError(f"--shard {text[:100]}: expected i/n, the first of three is 0/3; or auto")
-    return Shard(numbers[0], numbers[1])
+    return Shard(index, count)
 
 
 def _of_system(environment: Mapping[str, str]) -> Shard:

@@ -69,10 +69,7 @@ def describe_statuses(rows: Sequence[Mapping[str, Any]]) -> str:
 def collect_rows(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
     """Read the rows of the table from the records in the folder of a batch; an invalid record is an error row.
 
-    Args:
-        tasks: All rows of the list.
-        configurations: Configuration of each task by `task.configuration`; empty if that failed.
-        output: Folder of the batch.
+    The configuration of each task is that by `task.configuration`, empty if that failed.
     """
     rows = []
     for task, settings in zip(tasks, configurations, strict=True):

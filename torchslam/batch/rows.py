@@ -154,11 +154,9 @@ def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
             f"at most {MAX_NAME}"
         )
     for key in ("stride", "limit"):
-        if key in values:
-            count = parse_count(values[key])
-            if not count:
-                raise SequenceError(f"{where}: {key} must be a positive integer, not `{values[key]}`")
-            values[key] = count
+        values[key] = parse_count(cells[key]) if key in cells else None
+        if key in cells and not values[key]:
+            raise SequenceError(f"{where}: {key} must be a positive integer, not `{cells[key]}`")
     if "fps" in values:
         values["fps"] = parse_number(values["fps"], f"{where}: fps", SequenceError)
         if values["fps"] <= 0:

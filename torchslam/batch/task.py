@@ -48,9 +48,7 @@ class Task:
     """A row with the options that all rows of a batch share.
 
     Attributes:
-        row: What to run.
         output: Folder of the batch.
-        device: Of torch.
         overwrite: Replace results of other settings, inputs or versions.
         plots: Draw plots and write view.html.
     """
@@ -75,14 +73,8 @@ class Task:
 def run_row(task: Mapping[str, Any]) -> Columns:
     """Run a sequence, evaluate it and write its results, unless they exist already.
 
-    The same task gives the same bytes (except `times.json`) in any process and after any other task: it runs on one
-    thread and keeps no state. It raises no Exception, see `run_or_reuse`.
-
-    Args:
-        task: A `Task` as a dictionary.
-
-    Returns:
-        Its row of the table.
+    The same task, a `Task` as a dictionary, gives the same bytes (except `times.json`) in any process and after any
+    other task: it runs on one thread and keeps no state. It raises no Exception, see `run_or_reuse`.
     """
     todo = Task.from_dict(task)
     with _one_thread(), warnings.catch_warnings():

@@ -49,7 +49,7 @@ def write_run(
     plots: bool = True,
     viewer: bool = True,
 ) -> None:
-    """Color the map points, write the results folder and draw the run.
+    """Write a run and its drawings into a results folder.
 
     Args:
         run: the finished run; its map points receive colors.
@@ -57,8 +57,7 @@ def write_run(
         metrics: the content of metrics.json, as by `compute_metrics`.
         folder: the results folder.
         online: the run frame by frame, if `run` is a global map.
-        plots: whether to draw the plots.
-        viewer: whether to write the viewer page.
+        plots, viewer: whether to draw the plots and to write the viewer page.
     """
     colorize_points([submap.map for submap in run.submaps], sequence, run.session)
     write_results(run, sequence, metrics, folder, online)
@@ -104,15 +103,7 @@ def colorize_points(maps: Iterable[Map], sequence: Sequence, session: int) -> No
 def write_results(
     run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path, online: Run | None = None
 ) -> None:
-    """Write the results of a run, except plots and viewer, into a folder; existing results are replaced.
-
-    Args:
-        run: the finished run.
-        sequence: its images.
-        metrics: the content of metrics.json.
-        directory: the results folder, created if missing.
-        online: the run frame by frame, if `run` is a global map.
-    """
+    """Write the results of a run as `write_run`, but no colors, plots and viewer; existing results are replaced."""
     directory.mkdir(parents=True, exist_ok=True)
     stale = [directory / name for name in (files.GROUND_TRUTH, files.EXAMPLE_IMAGE, GEOJSON, GPX)]
     for old in [*stale, *directory.glob(files.OTHER_TRAJECTORY.format("[0-9]*"))]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -198,7 +197,7 @@ def test_a_video_has_every_frame_and_marks_tracked_points(tmp_path: Path) -> Non
     result = StepResult(7, 0.0, State.TRACKING, None, inliers=1)
     snapshot = FrameSnapshot(result, gray, torch.tensor([[200.0, 60.0]]), torch.tensor([[1000.0, 60.0]]))
     video = VideoRecorder(tmp_path / "it.mp4", (1920, 120), 10.0)
-    for shown in (snapshot, replace(snapshot, tracked=torch.zeros(0, 2))):
+    for shown in (snapshot, snapshot._replace(tracked=torch.zeros(0, 2))):
         video.show(shown)
     video.close()
     first, second = (image.astype(int) for image in frames_of(tmp_path / "it.mp4"))

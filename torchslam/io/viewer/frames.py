@@ -6,9 +6,8 @@ import shutil
 import sys
 import warnings
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -41,15 +40,8 @@ UNMATCHED = (150, 150, 150)
 FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 
 
-@dataclass(frozen=True)
-class FrameSnapshot:
-    """One frame and its tracking result.
-
-    Attributes:
-        image: gray.
-        keypoints: all keypoints, in pixels.
-        tracked: keypoints of the map points that support a reliable pose.
-    """
+class FrameSnapshot(NamedTuple):
+    """One frame, gray, and its tracking result: all keypoints, and those of map points that support a reliable pose."""
 
     result: StepResult
     image: UInt8[np.ndarray, "H W"]
