@@ -70,8 +70,7 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, every: int, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
-        self._path = folder / CHECKPOINT
-        self._every = every
+        self._path, self._every = folder / CHECKPOINT, every
         self._run = slam, so_far, sequence
         self._last = self._keyframes()
 
@@ -176,8 +175,7 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError("--mapping global needs a recording, and no --map")
     status = run(opened, config, options)
     if options.dense and status == DONE:
-        dense = densify_results(options.output, options)
-        print(f"\n{table(dense)}")
+        print(f"\n{table(densify_results(options.output, options))}")
     return status
 
 
@@ -231,16 +229,14 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         if mapped is not None and mapped.why:
             say(f"ran global mapping because {mapped.why}; kept the {mapped.kept} map")
         stop_signals.begin("when the results are written")
-        remark = camera_remark(finished, camera)
-        metrics = compute_metrics(finished, sequence, remark, warn, mapped)
+        metrics = compute_metrics(finished, sequence, camera_remark(finished, camera), warn, mapped)
         metrics |= _latency(latencies) | _usage(before_s) | source_of(options.path, options.fps, sequence)
-        online_run = None if mapped is None else mapped.online
-        write_run(finished, sequence, metrics, options.output, online=online_run)
+        before = None if mapped is None else mapped.online
+        write_run(finished, sequence, metrics, options.output, online=before)
         watching.end(finished)
-    written = {"results": options.output, "view": options.output / VIEW}
-    written |= {"video": options.output / VIDEO} if options.video else {}
-    words = summary(metrics) | {label: str(path) for label, path in written.items()}
-    print(f"\n{sequence.name}\n{table(words)}")
+    rows = summary(metrics) | {"results": str(options.output), "view": str(options.output / VIEW)}
+    rows |= {"video": str(options.output / VIDEO)} if options.video else {}
+    print(f"\n{sequence.name}\n{table(rows)}")
     for warning in result_warnings(metrics):
         warn(warning)
     if finished.interrupted:

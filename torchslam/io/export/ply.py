@@ -78,18 +78,15 @@ def write_ply(
         normals_w: direction from each point to the cameras that observed it; None: zero.
         observations: number of keyframes that observe each point; None: 0.
     """
-    vertices = np.zeros(len(points_w) + len(centers_w), VERTEX)
-    points, cameras = vertices[: len(points_w)], vertices[len(points_w) :]
-    _fill(points, POSITION, points_w)
-    _fill(points, COLOR, colors)
-    _fill(cameras, POSITION, centers_w)
-    if normals_w is not None:
-        _fill(points, NORMAL, normals_w)
-    if observations is not None:
-        points["observations"] = observations.detach().cpu().numpy()
-    for name, value in zip(COLOR, CAMERA_COLOR, strict=True):
-        cameras[name] = value
-    write_whole(path, [_header(vertices.dtype, len(vertices)), vertices.tobytes()])
+    red = torch.tensor(CAMERA_COLOR, dtype=torch.uint8, device=colors.device).expand(len(centers_w), 3)
+    nothing, none = torch.zeros_like(centers_w), centers_w.new_zeros(len(centers_w))
+    columns = (
+        torch.cat((points_w, centers_w)),
+        torch.cat((torch.zeros_like(points_w) if normals_w is None else normals_w, nothing)),
+        torch.cat((colors, red)),
+        torch.cat((points_w.new_zeros(len(points_w)) if observations is None else observations, none)),
+    )
+    _write(path, VERTEX, *columns)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud, R: Float[Tensor, "3 3"] | None = None) -> None:
@@ -101,12 +98,7 @@ def write_cloud(path: str | Path, cloud: PointCloud, R: Float[Tensor, "3 3"] | N
         R: rotation from the map's world to that of the file, as `upright_from_map`; None: the same.
     """
     cloud = cloud if R is None else cloud.turned(R)
-    vertices = np.zeros(len(cloud), DENSE_VERTEX)
-    _fill(vertices, POSITION, cloud.points_w)
-    _fill(vertices, NORMAL, cloud.normals_w)
-    _fill(vertices, COLOR, cloud.colors)
-    vertices["confidence"] = cloud.confidence.detach().cpu().numpy()
-    write_whole(path, [_header(vertices.dtype, len(vertices)), vertices.tobytes()])
+    _write(path, DENSE_VERTEX, cloud.points_w, cloud.normals_w, cloud.colors, cloud.confidence)
 
 
 def read_cloud(path: str | Path, R: Float[Tensor, "3 3"] | None = None) -> PointCloud:
@@ -155,9 +147,13 @@ def _cloud(content: bytes) -> PointCloud:
     return cloud
 
 
-def _fill(vertices: np.ndarray, names: tuple[str, ...], values: Tensor) -> None:
-    for name, column in zip(names, values.detach().cpu().numpy().T, strict=True):
-        vertices[name] = column
+def _write(path: str | Path, types: np.dtype[np.void], *columns: Tensor) -> None:
+    """Write the properties of a kind of vertex: columns of a property, or of three."""
+    vertices = np.zeros(len(columns[0]), types)
+    values = [row for column in columns for row in np.atleast_2d(column.detach().cpu().numpy().T)]
+    for name, row in zip(types.names or (), values, strict=True):
+        vertices[name] = row
+    write_whole(path, [_header(types, len(vertices)), vertices.tobytes()])
 
 
 def _header(types: np.dtype[np.void], count: int) -> bytes:
