@@ -80,10 +80,15 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_output(parser: argparse.ArgumentParser, content: str = "the results") -> None:
+def add_output(
+    parser: argparse.ArgumentParser, content: str = "the results", default: Path | None = None
+) -> None:
     """Add the argument for the folder that a command writes."""
-    about = f"folder for {content}"
-    parser.add_argument("--output", "-o", type=Path, required=True, metavar="DIR", help=about)
+    about = f"folder for {content}" + ("" if default is None else " (default: %(default)s)")
+    needed = default is None
+    parser.add_argument(
+        "--output", "-o", type=Path, required=needed, default=default, metavar="DIR", help=about
+    )
 
 
 def add_directory(parser: argparse.ArgumentParser) -> None:
