@@ -22,13 +22,6 @@ Work = Callable[[Columns], Columns]
 ENGINES = ("in-process", "ray")
 RETRIES = 2
 """Of a row whose worker died, for example for lack of memory; Ray would retry forever."""
-STORE_BYTES = 100 << 20
-"""Size of a local cluster's object store: rows are small, and images do not pass through it."""
-LOST = (
-    f"its process died {RETRIES + 1} times, or could not start: "
-    "not enough memory, or torchslam is not installed where it ran"
-)
-"""Error in the table for a row without a result."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +105,8 @@ def _start(ray: Any, workers: int | None, address: str | None) -> None:
     logging.getLogger("ray.data").setLevel(logging.ERROR)  # reports why a worker died or did not start
     options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR, "address": address or "local"}
     if address is None:
-        options |= {"num_cpus": workers, "include_dashboard": False, "object_store_memory": STORE_BYTES}
+        # A small store of objects: images do not pass through it.
+        options |= {"num_cpus": workers, "include_dashboard": False, "object_store_memory": 100 << 20}
     try:
         ray.init(**options)
     except Exception as error:  # Ray raises various types
@@ -200,7 +194,11 @@ def run_batch(
     for number, columns in engine.map_unordered(run_row, [task.as_dict() for task in mine]):
         if columns is None:
             known = {"name": mine[number].row.name, "configuration": configuration(mine[number])}
-            columns = store_failure(Path(mine[number].output), known, LOST)
+            why = (
+                f"its process died {RETRIES + 1} times, or could not start: not enough memory, or torchslam is not "
+                "installed where it ran"
+            )
+            columns = store_failure(Path(mine[number].output), known, why)
         found[number] = columns
         on_progress(columns)
     if tasks:

@@ -18,7 +18,6 @@ from torchslam.utils.files import write_whole
 from torchslam.utils.text import without_credentials
 
 CSV = "table.csv"
-PARQUET = "table.parquet"
 TIMES_CSV = "times.csv"
 
 # Columns and their types, the same for every batch.
@@ -55,7 +54,7 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
         times = [{"name": row["name"]} | read_times(output / RUNS / row["name"]) for row in rows]
         _put(output / TIMES_CSV, _csv(times, TIME_COLUMNS).encode())
         if (content := _parquet(rows)) is not None:
-            _put(output / PARQUET, content)
+            _put(output / "table.parquet", content)
     return found
 
 

@@ -23,8 +23,6 @@ MAX_BYTES = 1 << 26
 MAX_NAME = 100
 """Characters of a name; folders are named by it."""
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+=-]*")
-SEPARATOR = ";"
-"""Of the settings in one cell."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +159,7 @@ def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
         values["fps"] = parse_number(values["fps"], f"{where}: fps", SequenceError)
         if values["fps"] <= 0:
             raise SequenceError(f"{where}: fps must be a positive number, not `{cells['fps']}`")
-    settings = (setting.strip() for setting in values.get("overrides", "").split(SEPARATOR))
+    settings = (setting.strip() for setting in values.get("overrides", "").split(";"))
     values["overrides"] = tuple(setting for setting in settings if setting)
     try:
         for setting in values["overrides"]:

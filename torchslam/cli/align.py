@@ -32,11 +32,6 @@ from torchslam.metric.options import KINDS, given_options, sources_of
 from torchslam.metric.source import SubmapView
 from torchslam.utils.console import say, table, warn
 
-DONE = 0
-"""Exit status of a run in meters."""
-NOTHING = 3
-"""Exit status where no source determined the scale."""
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam align`."""
@@ -67,12 +62,12 @@ def execute(options: argparse.Namespace) -> int:
         warn(line)
     if not moved:
         say(f"{run.directory}: no source determined the scale; nothing was changed")
-        return NOTHING
+        return 3
     metrics = _write(run, moved, unmeasured)
     for line in (metrics["metric"] or {}).get("remarks", ()):
         warn(line)
     print(table({"unit": unit_words(metrics), "results": str(run.directory)} | accuracy(metrics)))
-    return DONE
+    return 0
 
 
 def _images(run: SavedRun, submap: Submap, elsewhere: str | None) -> Images | None:

@@ -22,8 +22,6 @@ from torchslam.utils.text import printable, without_credentials
 
 ERROR = 2
 """Exit status of an error, as of argparse."""
-INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 and the number of the signal, as of shells."""
 
 # The first line of the description of each command.
 COMMANDS = {
@@ -92,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ERROR
     except KeyboardInterrupt:
         say("interrupted")
-        return INTERRUPTED
+        return 130  # 128 and the number of the signal, as of shells
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:

@@ -33,10 +33,6 @@ from torchslam.refine.files import write_refined
 from torchslam.system.metric_run import run_in_meters
 from torchslam.utils.console import say, table, warn
 
-DONE, NO_MAP = 0, 3
-"""Exit status with a map, and without one."""
-RADIAL = 2  # coefficients of the distortion that may be found
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam refine`."""
@@ -86,7 +82,8 @@ def execute(options: argparse.Namespace) -> int:
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.IF_CONTRADICTED
     if options.fix_camera:
         choice = CameraChoice.FIXED
-    radial = RADIAL if options.refine_distortion or (is_guess and not options.fix_camera) else 0
+    # Coefficients of the distortion that may be found.
+    radial = 2 if options.refine_distortion or (is_guess and not options.fix_camera) else 0
     config = arguments.config(options)
     # What a dataset brings along counts where it is asked for alone: the unit of the given poses stays otherwise.
     sources = arguments.metric_sources(replace(config.metric, own=False), sequence)
@@ -114,8 +111,8 @@ def execute(options: argparse.Namespace) -> int:
         warn(line)
     if refined.run.failure:
         say(refined.run.failure)
-        return NO_MAP
-    return DONE
+        return 3
+    return 0
 
 
 def _write(refined: RefinementResult, sequence: Sequence, options: argparse.Namespace) -> dict[str, Any]:

@@ -60,7 +60,6 @@ METRICS = "metrics.json"
 FRAMES = "frames.csv"
 EXAMPLE_IMAGE = "example.png"
 PLOTS = "plots"
-NEEDED = ("submap", "submaps", "session", "posed", "keyframes")  # of metrics.json, to read and draw the rest
 STAGE_SUFFIX = "_ms"  # of the columns of frames.csv that have times
 MAX_COUNT = 1 << 31  # of indices, counts and numbers of submaps in files
 MAX_FRAMES_BYTES = 1 << 28
@@ -289,7 +288,8 @@ def read_metrics(directory: Path) -> dict[str, Any]:
     metrics = read_object(path, ResultsError)
     if metrics is None:
         raise ResultsError(f"{path}: cannot be read: No such file or directory")
-    missing = [name for name in NEEDED if name not in metrics]
+    needed = ("submap", "submaps", "session", "posed", "keyframes")  # to read and draw the rest
+    missing = [name for name in needed if name not in metrics]
     if missing:
         raise ResultsError(f"{path}: not the metrics of a run: {', '.join(missing)} missing")
     for name, is_right in _METRIC_CHECKS.items():

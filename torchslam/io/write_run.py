@@ -32,7 +32,6 @@ from torchslam.types import StepResult, Trajectory
 
 GEOJSON = "trajectory.geojson"
 GPX = "trajectory.gpx"
-FRAME_COLUMNS = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason", "image")
 SINCE_1970 = 1e8
 """Seconds: times from here on (1973) are dates, smaller ones count from the start of a recording."""
 DIGITS = 9
@@ -146,10 +145,11 @@ def source_of(path: str, fps: float | None, sequence: Sequence) -> dict[str, Any
 
 def write_frames(path: str | Path, results: list[StepResult], sequence: Sequence | None = None) -> None:
     """Write one row per frame; a missing submap, file or stage is an empty cell. The poses are in online.txt."""
+    columns = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason", "image")
     stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
     with Path(path).open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*FRAME_COLUMNS, *(stage + files.STAGE_SUFFIX for stage in stages)])
+        writer.writerow([*columns, *(stage + files.STAGE_SUFFIX for stage in stages)])
         for result in results:
             times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
             submap = "" if result.submap is None else result.submap

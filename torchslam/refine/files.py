@@ -21,7 +21,6 @@ from torchslam.refine.pose_refinement import RefinementResult
 from torchslam.types import Trajectory
 from torchslam.utils.files import JSON_BYTES, parse_json
 
-COVARIANCES = "covariances.txt"
 # Keys of a camera in a transforms.json; all of them are replaced.
 CAMERA_KEYS = (
     *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"),
@@ -33,7 +32,7 @@ def write_refined(folder: Path, refined: RefinementResult) -> Path:
     """Write the refined poses, and the covariances of the keyframes, into a folder; return the file or folder."""
     folder.mkdir(parents=True, exist_ok=True)
     given, run = refined.given, refined.run
-    _write_covariances(folder / COVARIANCES, refined)
+    _write_covariances(folder / "covariances.txt", refined)
     if given.kind == COLMAP:  # images are renumbered in the order of the frames
         assert run.main is not None
         scene = scene_of(run.main, run.camera, run.session, keyframes_alone=False)

@@ -31,7 +31,6 @@ MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 """COLMAP's numbers of camera models (src/colmap/sensor/models.h)."""
 POINT_IN_IMAGE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
 TRACK = np.dtype([("image", "<u4"), ("index", "<u4")])  # which image, and the how many-th of its points
-NEIGHBORS = 20  # COLMAP's default: images that it compares a depth map with
 
 
 def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
@@ -116,7 +115,8 @@ def write_workspace(
         (stereo / "depth_maps" / name).write_bytes(colmap_map(maps.depth))
         (stereo / "normal_maps" / name).write_bytes(colmap_map(maps.normal[0]))
     (stereo / "fusion.cfg").write_text("".join(f"{name}\n" for name in names.values()), encoding="utf-8")
-    neighbors = "".join(f"{name}\n__auto__, {NEIGHBORS}\n" for name in names.values())
+    # COLMAP's default: a depth map is compared with 20 images.
+    neighbors = "".join(f"{name}\n__auto__, 20\n" for name in names.values())
     (stereo / "patch-match.cfg").write_text(neighbors, encoding="utf-8")
     write_colmap(folder / "sparse", scene)
     if images is not None:

@@ -31,14 +31,10 @@ DEPTH_STD = 0.01
 BLOCK = 8  # voxels to a side: memory is taken in blocks
 MAX_BLOCKS = 50_000
 """Blocks with a surface: about 2 GB with the blocks beside it. In a larger scene, voxels are wider."""
-FIRST_BLOCKS = 10_000  # that memory is taken for at once; there may be more
 BLOCK_STRIDE = 4  # pixels, of the depth that the blocks are counted from
-WIDENING = 1.25  # of the voxels, while there are too many blocks
 TRUNCATION = 4.0  # voxels to either side of a surface
 FARTHEST = 5.0  # median depths: what is farther has no detail
-MIN_MAPS = 2  # that see a voxel, if there are as many
 MIN_TRIANGLES = 100  # of a connected part: smaller ones are errors of depth
-UNPAINTED = 180  # gray, without images
 
 
 class MeshSize(NamedTuple):
@@ -81,12 +77,12 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
         attr_channels=(1, 1, 3),
         voxel_size=voxel,
         block_resolution=BLOCK,
-        block_count=FIRST_BLOCKS,
+        block_count=10_000,  # that memory is taken for at once; there may be more
         device=o3d.core.Device("CPU:0"),
     )
     for maps in DepthMaps.blocks(depths, 1):
         depth = o3d.t.geometry.Image(o3d.core.Tensor(_sure_depth(maps, middle).numpy()))
-        pixels = np.full((*maps.depth.shape[1:], 3), UNPAINTED / 255, np.float32)
+        pixels = np.full((*maps.depth.shape[1:], 3), 180 / 255, np.float32)  # gray
         if images is not None:
             rgb = cv2.cvtColor(images.bgr(int(maps.frame_index)), cv2.COLOR_BGR2RGB)
             pixels = rgb.astype(np.float32) / 255
@@ -96,7 +92,7 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
         limits = (1.0, FARTHEST * middle, TRUNCATION)  # scale and largest depth
         blocks = grid.compute_unique_block_coordinates(depth, K, T_cu, *limits)
         grid.integrate(blocks, depth, color, K, T_cu, *limits)
-    weight = min(MIN_MAPS, len(read_frames(depths)[0]))
+    weight = min(2, len(read_frames(depths)[0]))  # maps that see a voxel
     mesh = grid.extract_triangle_mesh(weight_threshold=weight - 0.5).to_legacy()  # weights are whole
     part, counts, _ = mesh.cluster_connected_triangles()
     mesh.remove_triangles_by_mask(np.asarray(counts)[np.asarray(part)] < MIN_TRIANGLES)
@@ -151,5 +147,5 @@ def _voxel(depths: Path, middle: float) -> float:
         points.append(transform(se3_inverse(maps.T_cw[0].double()), points_c))
     voxel = middle * max(DEPTH_STD, VOXEL_PX / float(maps.camera.params[0]))
     while len(torch.unique((torch.cat(points) / (BLOCK * voxel)).floor(), dim=0)) > MAX_BLOCKS:
-        voxel *= WIDENING
+        voxel *= 1.25
     return voxel

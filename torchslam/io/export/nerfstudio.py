@@ -29,13 +29,11 @@ from torchslam.geometry.transforms import corner_camera, opengl
 from torchslam.io.export.ply import MAX_DRAWN, write_cloud, write_ply
 from torchslam.io.export.scene import ExportedScene
 
-TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"
 DENSE_CLOUD = "dense_pc.ply"
 IMAGES = "images"
 DEPTHS = "depths"
 UNIT = 1e-3  # of the numbers of a depth image, in map units
-FARTHEST = 65535  # of these units: what is farther counts as unknown
 NAMES = {"pinhole": "PINHOLE", "radial_tangential": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 """Names of camera models; the formulas and names of their coefficients are OpenCV's."""
 
@@ -56,7 +54,7 @@ def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
 def depth_png(depth: Float[Tensor, "H W"]) -> bytes:
     """Encode depth as a 16-bit PNG image in UNIT; 0 where it is unknown."""
     units = (depth.double() / UNIT).round()
-    units = torch.where(units <= FARTHEST, units, 0.0)
+    units = torch.where(units <= 65535, units, 0.0)  # what is farther counts as unknown
     return cv2.imencode(".png", units.cpu().numpy().astype(np.uint16))[1].tobytes()
 
 
@@ -92,7 +90,7 @@ def write_nerfstudio(
         "upright_from_map": R_up.tolist(),  # for the reader: nerfstudio does not know it
         "frames": frames,
     }
-    (folder / TRANSFORMS).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    (folder / "transforms.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     write_ply(folder / POINT_CLOUD, upright.points_w, upright.colors, centers_w=upright.points_w[:0])
     if cloud is not None:
         write_cloud(folder / DENSE_CLOUD, cloud.thinned(MAX_DRAWN), R_up)

@@ -26,12 +26,10 @@ COLORED = [*((name, "<f4") for name in POSITION + NORMAL), *((name, "u1") for na
 # COLMAP refuses a file with integers of more than a byte.
 VERTEX = np.dtype([*COLORED, ("observations", "<f4")])
 DENSE_VERTEX = np.dtype([*COLORED, ("confidence", "<f4")])
-PROPERTY_TYPES = {"<f4": "float", "|u1": "uchar"}
 CAMERA_COLOR = (213, 73, 63)
 """Red, green, blue of the trajectory in the cloud."""
 MAX_DRAWN = 500_000  # of a dense cloud that a program draws, or starts a splat from
 MAX_BYTES = 1 << 33  # of a cloud that is read: 270 million points
-UNIT_TOLERANCE = 1e-3  # of the length of a normal
 
 
 def upright_from_map(slam_map: Map, unit: MetricUnit | None = None) -> Float[Tensor, "3 3"]:
@@ -140,7 +138,7 @@ def _cloud(content: bytes) -> PointCloud:
     cloud = PointCloud(*map(torch.from_numpy, (*columns, rows["confidence"].copy())))
     if not bool(torch.isfinite(cloud.points_w).all()):
         raise ValueError("positions are not finite")
-    if not bool(((cloud.normals_w.norm(dim=-1) - 1).abs() < UNIT_TOLERANCE).all()):
+    if not bool(((cloud.normals_w.norm(dim=-1) - 1).abs() < 1e-3).all()):
         raise ValueError("normals are not of unit length")
     if not bool(((cloud.confidence >= 0) & (cloud.confidence <= 1)).all()):
         raise ValueError("confidence is not between 0 and 1")
@@ -157,6 +155,7 @@ def _write(path: str | Path, types: np.dtype[np.void], *columns: Tensor) -> None
 
 
 def _header(types: np.dtype[np.void], count: int) -> bytes:
-    properties = [f"property {PROPERTY_TYPES[types[name].str]} {name}" for name in types.names or ()]
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    properties = [f"property {kinds[types[name].str]} {name}" for name in types.names or ()]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header"]
     return ("\n".join(lines) + "\n").encode("ascii")

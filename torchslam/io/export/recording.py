@@ -22,14 +22,9 @@ from torchslam.io.export.ply import MAX_DRAWN
 from torchslam.io.export.scene import ExportedScene, Images
 
 APPLICATION = "torchslam"
-JPEG_QUALITY = 90
-"""Of images in the recording, percent. Tried at this value only."""
 CAMERA = "world/camera"
 KEYFRAME = "world/keyframe"
 DEPTH = "world/depth"
-POINTS = "world/points"
-UNPAINTED = (125, 135, 148)  # points before images have colored them
-TRACKED = (87, 190, 65)  # keypoints
 GAP = 5  # usual intervals without a pose that break the line of the path
 
 
@@ -67,10 +62,13 @@ class Recorder:
         self._log(entity, pinhole, static=True)
 
     def points(
-        self, points_w: Float[Tensor, "N 3"], colors: UInt8[Tensor, "N 3"] | None, entity: str = POINTS
+        self,
+        points_w: Float[Tensor, "N 3"],
+        colors: UInt8[Tensor, "N 3"] | None,
+        entity: str = "world/points",
     ) -> None:
         """Replace the points of the map, or another cloud, with or without colors."""
-        painted = UNPAINTED if colors is None else _numpy(colors)
+        painted = (125, 135, 148) if colors is None else _numpy(colors)
         self._log(entity, self._rr.Points3D(_numpy(points_w), colors=painted), static=True)
 
     def path(self, positions_w: Float[Tensor, "K 3"], breaks: list[int]) -> None:
@@ -92,13 +90,13 @@ class Recorder:
         self, entity: str, pixels: Float[Tensor, "N 2"], colors: UInt8[Tensor, "N 3"] | None = None
     ) -> None:
         """Log the keypoints of a camera."""
-        painted = TRACKED if colors is None else _numpy(colors)
+        painted = (87, 190, 65) if colors is None else _numpy(colors)
         content = self._rr.Points2D(_numpy(corner_pixels(pixels)), colors=painted, radii=2.0)
         self._log(f"{entity}/keypoints", content)
 
     def image(self, entity: str, image: UInt8[np.ndarray, "H W *channels"]) -> None:
         """Log the image of a camera, gray or BGR."""
-        _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+        _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 90))
         self._log(entity, self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
 
     def depth(self, entity: str, depth: Float[Tensor, "H W"]) -> None:

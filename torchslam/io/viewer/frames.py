@@ -28,16 +28,12 @@ from torchslam.types import State, StepResult, Trajectory
 VIDEO = "tracked.mp4"
 MAX_WIDTH = 960  # pixels of the film: it is to stay small
 BAR = 26  # pixels, for the text under the image
-USUAL_RATE = 30.0  # frames per second of a video of unknown rate
 COLORS = {  # blue, green, red
     State.INITIALIZING: (170, 200, 215),
     State.TRACKING: (65, 190, 87),
     State.UNCERTAIN: (225, 130, 190),
     State.LOST: (61, 85, 200),
 }
-UNMATCHED = (150, 150, 150)
-"""Red, green, blue of keypoints without a map point."""
-FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 
 
 class FrameSnapshot(NamedTuple):
@@ -172,7 +168,7 @@ class LiveView(FrameViewer):
 
     def close(self) -> None:
         try:
-            self._recording.flush(timeout_sec=FLUSH_SECONDS)
+            self._recording.flush(timeout_sec=5.0)  # a viewer may have been closed
         except RuntimeError as error:  # the window was closed; the run goes on
             warnings.warn(f"the viewer of rerun did not get everything: {error}", stacklevel=2)
         self._recording.disconnect()
@@ -202,7 +198,7 @@ class VideoRecorder(FrameViewer):
         result = snapshot.result
         small = cv2.resize(snapshot.image, self._size, interpolation=cv2.INTER_AREA)
         image, own = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), COLORS[result.state]
-        for pixels, color, radius in ((snapshot.keypoints, UNMATCHED, 1), (snapshot.tracked, own, 3)):
+        for pixels, color, radius in ((snapshot.keypoints, (150, 150, 150), 1), (snapshot.tracked, own, 3)):
             for x, y in (pixels * self._scale).round().int().tolist():
                 cv2.circle(image, (x, y), radius, color, 1, cv2.LINE_AA)
         image = cv2.copyMakeBorder(image, 0, BAR, 0, 0, cv2.BORDER_CONSTANT, value=(24, 21, 19))
@@ -218,4 +214,4 @@ class VideoRecorder(FrameViewer):
 def film_of(sequence: Sequence, directory: Path) -> VideoRecorder:
     """Create the video of a run in the results folder, at the frame rate of the sequence."""
     rate = sequence.frame_rate if sequence.known_length is not None and len(sequence.timestamps) > 1 else 0.0
-    return VideoRecorder(directory / VIDEO, sequence.size, rate or USUAL_RATE)
+    return VideoRecorder(directory / VIDEO, sequence.size, rate or 30.0)

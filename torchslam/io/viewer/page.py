@@ -43,8 +43,6 @@ FACTOR_STEPS = 127
 """Steps of an entry of the factor of a covariance, over the largest one of the point: half a percent is enough."""
 MAX_FRAMES = 20_000  # 100 bytes each in the page
 MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
-FRUSTUM = 0.035  # its depth, in radii of the scene
-STATES = tuple(State)
 
 
 def write_view(results: Results, directory: Path) -> Path:
@@ -76,7 +74,7 @@ def page_data(results: Results) -> dict[str, Any]:
     `frames` has a row per displayed frame: index, seconds since the first one, state and so on. `submaps` has
     those with frames of the run, the main one first, see `_submap`.
     """
-    metrics = results.metrics
+    metrics, states = results.metrics, list(State)
     frames = [results.frames[row] for row in thin(len(results.frames), MAX_FRAMES)]
     times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64, device="cpu")
     reasons = list(dict.fromkeys(frame.reason for frame in frames))
@@ -98,7 +96,7 @@ def page_data(results: Results) -> dict[str, Any]:
         "frames": {
             "index": encoded([frame.index for frame in frames], "int32"),
             "seconds": encoded(times - times[:1], "float64"),
-            "state": encoded([STATES.index(frame.state) for frame in frames], "uint8"),
+            "state": encoded([states.index(frame.state) for frame in frames], "uint8"),
             "keyframe": encoded([frame.is_keyframe for frame in frames], "uint8"),
             "inliers": encoded([frame.inliers for frame in frames], "int32"),
             "reason": encoded([number_of[frame.reason] for frame in frames], "int32"),
@@ -165,6 +163,7 @@ def _submap(
     breaks = gaps(frame)
     steps = shown[:, :3, 3].diff(dim=0).norm(dim=-1)
     steps[[row - 1 for row in breaks]] = 0.0
+    radius = float((box[1] - box[0]).norm()) / 2
     return {
         "name": f"{submap.number}" + (", the main one" if is_main else ""),
         "unit": "" if evaluation is None and submap.metric is None else "m",
@@ -185,8 +184,8 @@ def _submap(
         **of_points(submap.map, ids[kept], S, results.session, results.camera.size),
         "dense": None if cloud is None else _dense(cloud, S, box),
         "box": box.tolist(),
-        "radius": float((box[1] - box[0]).norm()) / 2,
-        "frustum": FRUSTUM * float((box[1] - box[0]).norm()) / 2,
+        "radius": radius,
+        "frustum": 0.035 * radius,
     }
 
 
