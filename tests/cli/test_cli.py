@@ -246,13 +246,6 @@ def test_damaged_sequences_are_named_by_file_and_line(
     assert expected in err
 
 
-def test_unreadable_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "broken.mp4").write_bytes(b"not a video")
-    status, _, err = run_and_read(capsys, "info", str(tmp_path / "broken.mp4"), "--camera", "500,500,320,240")
-    assert status == 2
-    assert "broken.mp4" in err
-
-
 def test_results_that_cannot_be_written_stop_before_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

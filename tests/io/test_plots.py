@@ -67,13 +67,6 @@ def test_plots_are_drawn_deterministically(
     assert 0.01 < (picture < 200).any(axis=2).mean() < 0.9  # neither blank nor black
 
 
-@pytest.mark.parametrize("name", ["top_view", "errors", "tracking", "features"])
-def test_axes_are_labeled_with_units(name: str, figures: dict[str, Callable[[], Figure]]) -> None:
-    axes = figures[name]().axes
-    assert any("(" in panel.get_xlabel() or panel.get_xlabel() == "frame" for panel in axes)
-    assert any(panel.get_ylabel() for panel in axes)
-
-
 def test_far_points_do_not_stretch_the_picture(trajectory: Trajectory, points_w: torch.Tensor) -> None:
     figure = plots.plot_top_view(trajectory, points_w)
     axes = figure.axes[0]

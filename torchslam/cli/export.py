@@ -102,11 +102,9 @@ class Job:
     def scene(
         self, pinhole: Camera | None = None, frame_ids: Int[torch.Tensor, " R"] | None = None
     ) -> tuple[ExportedScene, Images | None]:
-        """The exported scene and its images, if requested. Raises ResultsError if they cannot be read.
+        """The exported scene and its images, if requested, as requested or of other frames and another camera.
 
-        Args:
-            pinhole: camera to undistort to; None: as requested.
-            frame_ids: the frames to export; None: as requested.
+        Raises ResultsError if the images cannot be read.
         """
         scene = self.run.scene(self.submap, self.keyframes_alone and frame_ids is None)
         if frame_ids is not None:

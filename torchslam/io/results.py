@@ -121,13 +121,7 @@ class SavedRun:
         elsewhere: str | None = None,
         otherwise: str = WITHOUT,
     ) -> Images:
-        """Open the images of a scene, see `open_images`.
-
-        Args:
-            scene: the frames.
-            pinhole: camera of the undistorted images; None: the images as they are.
-            elsewhere: the images' new location; None: where the run read them.
-            otherwise: what to do without them, for the error.
+        """Open the images of a scene, see `open_images`; `elsewhere` is their location if they were moved.
 
         Raises:
             ResultsError: the images are missing or other ones, or frames.csv is missing or damaged.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
@@ -52,6 +53,20 @@ def scene(lens: Camera, generator: torch.Generator) -> ExportedScene:
         point_index=point_index,
         pixels=pixels + NOISE_PX * torch.randn(pixels.shape, **noise),
     )
+
+
+class PointErrors:
+    """Mean over the points of their mean error, of pixels that another program would compute."""
+
+    def __init__(self, points: int) -> None:
+        self._total, self._count = np.zeros(points), np.zeros(points)
+
+    def add(self, ids: np.ndarray, pixels: np.ndarray, keypoints: np.ndarray) -> None:
+        np.add.at(self._total, ids, np.hypot(*(pixels - keypoints).T))
+        np.add.at(self._count, ids, 1)
+
+    def mean(self) -> float:
+        return float(np.mean(self._total / self._count))
 
 
 def reprojection_error(scene: ExportedScene) -> float:

@@ -12,7 +12,7 @@ import torch
 from tests.io.export.conftest import reprojection_error
 from torchslam.geometry import transform
 from torchslam.io.export.colmap import write_colmap
-from torchslam.io.export.scene import ExportedScene, undistorted
+from torchslam.io.export.scene import ExportedScene
 
 pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
 
@@ -66,15 +66,6 @@ def test_the_colmap_camera_projects_like_ours(scene: ExportedScene, tmp_path: Pa
     theirs = np.array([made.camera(1).img_from_cam(point) for point in points_c.numpy()])
     np.testing.assert_allclose(theirs, ours + 0.5, atol=1e-9)
     assert (made.camera(1).width, made.camera(1).height) == scene.camera.size
-
-
-def test_without_distortion_the_error_is_that_of_the_new_pixels(scene: ExportedScene, tmp_path: Path) -> None:
-    flat = undistorted(scene)
-    write_colmap(tmp_path, flat)
-    made = read(tmp_path, "read_binary")
-    made.update_point_3d_errors()
-    assert made.camera(1).model_name == "PINHOLE"
-    assert made.compute_mean_reprojection_error() == pytest.approx(reprojection_error(flat), abs=1e-6)
 
 
 @pytest.mark.parametrize("blind", [[1], [0, 1, 2, 3]])

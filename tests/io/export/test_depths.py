@@ -70,15 +70,6 @@ def test_a_depth_image_has_thousandths_and_zero_where_depth_is_unknown() -> None
     assert UNIT == 1e-3
 
 
-def test_pycolmap_reads_a_depth_map(room: tuple[ExportedScene, Path], tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    depth = DepthMaps.load(room[1]).depth[2:3]
-    (tmp_path / "map.bin").write_bytes(colmap_map(depth))
-    read = pycolmap.DepthMap()
-    read.read(str(tmp_path / "map.bin"))
-    np.testing.assert_array_equal(read.to_array(), depth[0])
-
-
 def test_normals_are_in_the_order_of_the_format(room: tuple[ExportedScene, Path]) -> None:
     """Column-major order of (width, height, channels). `NormalMap.to_array` of pycolmap takes it for another."""
     normal = DepthMaps.load(room[1]).normal[2]

@@ -88,14 +88,6 @@ def test_viewers_see_every_frame_once() -> None:
     assert len(tracked_pixels(slam, FRAMES)) == 0
 
 
-def test_without_viewers_the_sequence_is_unchanged() -> None:
-    walk = Pictured()
-    slam = SLAM(walk.camera, load_config(None, SIMULATED))
-    with FrameViewers(slam, walk, []) as watching:
-        assert watching.sequence is walk
-        watching.show(StepResult(0, 0.0, State.LOST, None))
-
-
 def test_watching_does_not_change_the_run() -> None:
     runs = []
     for screens in ([], [Kept()]):

@@ -69,8 +69,7 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
     """
     o3d = import_open3d()
     turn = rigid(R_up.double(), torch.zeros(3, dtype=torch.float64, device="cpu"))
-    middle = _median_depth(depths)
-    voxel = _voxel(depths, middle)
+    middle, voxel = _middle_and_voxel(depths)
     grid = o3d.t.geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight", "color"),
         attr_dtypes=(o3d.core.float32,) * 3,
@@ -127,18 +126,16 @@ def _sure_depth(maps: DepthMaps, middle: float = math.inf) -> Float[Tensor, "H W
     return torch.where((maps.confidence[0] >= MIN_CONFIDENCE) & (depth < FARTHEST * middle), depth, 0.0)
 
 
-def _median_depth(depths: Path) -> float:
-    """The median over the maps of their median depths. Raises ResultsError without any depth."""
+def _middle_and_voxel(depths: Path) -> tuple[float, float]:
+    """The median over the maps of their median depths, and the width of a voxel: what they resolve, or memory allows.
+
+    Raises ResultsError without any depth.
+    """
     seen = [depth[depth > 0] for depth in map(_sure_depth, DepthMaps.blocks(depths, 1))]
     medians = [each.median() for each in seen if len(each)]
     if not medians:
         raise ResultsError(f"{depths}: no depth of a confidence of {MIN_CONFIDENCE} or more")
-    return float(torch.stack(medians).median())
-
-
-def _voxel(depths: Path, middle: float) -> float:
-    """The width of a voxel: what the depth maps resolve, or what memory allows."""
-    points = []
+    middle, points = float(torch.stack(medians).median()), []
     for maps in DepthMaps.blocks(depths, 1):
         depth = _sure_depth(maps, middle)[::BLOCK_STRIDE, ::BLOCK_STRIDE].double()
         v, u = (BLOCK_STRIDE * index for index in torch.nonzero(depth).T)
@@ -148,4 +145,4 @@ def _voxel(depths: Path, middle: float) -> float:
     voxel = middle * max(DEPTH_STD, VOXEL_PX / float(maps.camera.params[0]))
     while len(torch.unique((torch.cat(points) / (BLOCK * voxel)).floor(), dim=0)) > MAX_BLOCKS:
         voxel *= 1.25
-    return voxel
+    return middle, voxel

@@ -253,14 +253,7 @@ def of_points(
     session: int,
     size: tuple[int, int],
 ) -> dict[str, Any]:
-    """Return what the ruler knows of each point: an image point that shows it, and the error of its position.
-
-    Args:
-        slam_map: the map.
-        point_ids: rows of the points that are shown.
-        S_shown_map: similarity from the map to the view.
-        session: number of the session whose frames are meant.
-        size: (width, height) of its images.
+    """Return what the ruler knows of each shown point: an image point of a session, and the error of its position.
 
     Returns:
         seen_frame, seen_pixel: (P,), (P, 2) as by `clearest_observations`, pixels in steps
