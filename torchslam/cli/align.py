@@ -97,7 +97,7 @@ def _write(run: SavedRun, moved: dict[int, Float[Tensor, "4 4"]], unmeasured: li
             write_trajectory(directory / files.ONLINE, online)
             write_trajectory(directory / files.KEYFRAMES, submap.map.keyframe_trajectory(session))
             write_map_cloud(directory / files.POINT_CLOUD, submap.map, session, submap.metric)
-    write_atlas(directory / files.MAP, run.submaps, run.camera, run.saved.sessions)
+    write_atlas(directory / files.MAP, run.submaps, run.camera, run.sessions)
     if delete_dense(directory):
         say(
             f"dense depth had another scale and is removed; `torchslam densify {directory}` computes it again"

@@ -34,7 +34,7 @@ from torchslam.io.export.scene import (
     scene_of,
 )
 from torchslam.map.atlas import Submap
-from torchslam.map.file import SavedAtlas, read_atlas
+from torchslam.map.file import read_atlas
 from torchslam.map.map import Map
 from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.files import write_whole
@@ -73,12 +73,15 @@ class SavedRun:
     Attributes:
         directory: the folder.
         metrics: the content of metrics.json.
-        saved: all submaps and their camera.
+        submaps, camera: all submaps and their camera.
+        sessions: number of runs over the map that changed it.
     """
 
     directory: Path
     metrics: dict[str, Any]
-    saved: SavedAtlas
+    submaps: tuple[Submap, ...]
+    camera: Camera
+    sessions: int
 
     @property
     def session(self) -> int:
@@ -86,24 +89,14 @@ class SavedRun:
         return int(self.metrics["session"])
 
     @property
-    def submaps(self) -> tuple[Submap, ...]:
-        """All submaps."""
-        return tuple(self.saved.atlas)
-
-    @property
     def main(self) -> Submap | None:
         """The main submap; None if there is none."""
-        return next((each for each in self.saved.atlas if each.number == self.metrics["submap"]), None)
+        return next((each for each in self.submaps if each.number == self.metrics["submap"]), None)
 
     @property
     def map(self) -> Map:
         """Map of the main submap; empty if there is none."""
         return Map() if self.main is None else self.main.map
-
-    @property
-    def camera(self) -> Camera:
-        """The camera of all submaps."""
-        return self.saved.camera
 
     @property
     def readout(self) -> Readout | None:
@@ -185,7 +178,8 @@ def open_run(directory: Path) -> SavedRun:
     """Read metrics and map of a results folder. Raises ResultsError for missing or damaged files."""
     if not directory.is_dir():
         raise ResultsError(f"{directory}: no such results folder")
-    return SavedRun(directory, read_metrics(directory), read_atlas(directory / MAP))
+    metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
+    return SavedRun(directory, metrics, tuple(saved.atlas), saved.camera, saved.sessions)
 
 
 def read_results(directory: Path) -> Results:

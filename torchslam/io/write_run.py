@@ -163,12 +163,8 @@ def write_frames(path: str | Path, results: list[StepResult], sequence: Sequence
 def write_earth(folder: Path, trajectory: Trajectory, unit: MetricUnit) -> list[Path]:
     """Write the path of a map whose origin is known as a GeoJSON line and as a GPX track; return the files.
 
-    Sources: RFC 7946 (longitude before latitude); GPX 1.1. GPX has times if those of the images are dates.
-
-    Args:
-        folder: the results folder.
-        trajectory: camera to world; x is east, y north, z up, in meters.
-        unit: of the map; nothing is written if it has no origin on the Earth.
+    The axes of the world are east, north and up. Nothing is written if the unit has no origin on the Earth. GPX has
+    times if those of the images are dates. Sources: RFC 7946 (longitude before latitude); GPX 1.1.
     """
     if unit.origin is None or not len(trajectory):
         return []
@@ -189,11 +185,8 @@ def write_earth(folder: Path, trajectory: Trajectory, unit: MetricUnit) -> list[
         moment = datetime.datetime.fromtimestamp(time, tz=datetime.UTC) if time >= SINCE_1970 else None
         stamp = "" if moment is None else f"<time>{moment:%Y-%m-%dT%H:%M:%S.%f}Z</time>"
         points.append(f"{place}{stamp}</trkpt>")
-    lines = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        '<gpx version="1.1" creator="torchslam" xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>',
-        *points,
-        "</trkseg></trk></gpx>",
-    ]
-    (folder / GPX).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    header = '<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="torchslam" '
+    header += 'xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
+    lines = "\n".join([header, *points, "</trkseg></trk></gpx>\n"])
+    (folder / GPX).write_text(lines, encoding="utf-8")
     return [folder / GEOJSON, folder / GPX]
