@@ -29,10 +29,9 @@ from torchslam.dense.consistency import confidence_alone, confidence_together, k
 from torchslam.dense.estimate import Estimate, estimate_depth
 from torchslam.dense.learned import HALF_INPUTS, RatingNet, net_inputs
 from torchslam.densify.views import SWEPT, ViewImages, views_of
-from torchslam.io.export.scene import open_images, pinhole_within, scene_of
-from torchslam.io.results import MAP, read_image_source, read_metrics
+from torchslam.io.export.scene import pinhole_within
+from torchslam.io.results import open_run
 from torchslam.learning import Log, Training
-from torchslam.map.file import read_atlas
 
 PER_ROOM = 8
 CROP = (72, 88)  # rows and columns at half size
@@ -82,13 +81,11 @@ def of_room(seed: int, count: int = PER_ROOM) -> list[Example]:
 @torch.no_grad()
 def of_run(folder: Path, resolution: str = str(LONG_SIDE)) -> list[Example]:
     """Keyframes of a run, at a resolution of `torchslam densify`; the target is what they agree on."""
-    metrics, saved = read_metrics(folder), read_atlas(folder / MAP)
-    submap = next(each for each in saved.atlas if each.number == metrics["submap"])
-    scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=True)
+    run = open_run(folder)
+    assert run.main is not None, f"{folder}: no map"
+    scene = run.scene(run.main, keyframes_alone=True)
     views = views_of(scene, map_size(resolution, pinhole_within(scene.camera).size))
-    source = read_image_source(folder, metrics, saved.atlas)
-    assert source is not None, f"{folder}: does not say where its images are"
-    images = ViewImages(views, open_images(source, scene, views.camera))
+    images = ViewImages(views, run.images(scene, views.camera))
     found = []
     for view in range(len(views)):
         sources = torch.stack([images.gray(other) for other in views.neighbors[view][:SWEPT]])

@@ -86,6 +86,7 @@ __all__ = [
 ]
 
 _HOMES = {
+    "torchslam": "calibration data dense errors evaluation features geometry learning optim refine types",
     "torchslam.config": "Config load_config",
     "torchslam.data": "open_sequence",
     "torchslam.errors": "TorchslamError",
@@ -99,22 +100,7 @@ _HOMES = {
     "torchslam.optim.run_graph": "GraphSolution ObservationGraph solve_graph",
     "torchslam.types": "Features Frame Matches State StepResult Trajectory",
 }
-"""Public names by the module that has them."""
-
-_SUBPACKAGES = (
-    "calibration",
-    "data",
-    "dense",
-    "errors",
-    "evaluation",
-    "features",
-    "geometry",
-    "learning",
-    "optim",
-    "refine",
-    "types",
-)
-"""Public packages and modules."""
+"""Public names by the module that has them, and public packages and modules."""
 
 
 def __getattr__(name: str) -> Any:
@@ -122,13 +108,13 @@ def __getattr__(name: str) -> Any:
     if name == "__version__":
         return _version()
     home = next((home for home, names in _HOMES.items() if name in names.split()), None)
-    if home is None and name not in _SUBPACKAGES:
+    if home is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     try:
-        module = import_module(home or f"{__name__}.{name}")
+        module = import_module(f"{home}.{name}" if home == __name__ else home)
     except ModuleNotFoundError as error:
         raise with_install_hint(error) from error
-    value = globals()[name] = getattr(module, name) if home else module
+    value = globals()[name] = module if home == __name__ else getattr(module, name)
     return value
 
 
@@ -143,4 +129,4 @@ def _version() -> str:
 
 
 def __dir__() -> list[str]:
-    return sorted([*__all__, *_SUBPACKAGES, "__version__"])
+    return sorted([*__all__, *_HOMES[__name__].split(), "__version__"])

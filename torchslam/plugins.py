@@ -53,19 +53,17 @@ def is_code_of_others(group: str, name: str) -> bool:
 
 def instantiate(kind: type, **arguments: object) -> Any:
     """Instantiate a class with those of the arguments that it takes and that are not None."""
-    return kind(**_taken(kind, arguments))
+    given = {name: value for name, value in arguments.items() if value is not None}
+    parameters = signature(kind).parameters
+    if not any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters.values()):
+        given = {name: value for name, value in given.items() if name in parameters}
+    return kind(**given)
 
 
 def load(
     group: str, name: str, make: Callable[..., Any] = instantiate, **arguments: object
 ) -> Callable[..., Any]:
-    """Load the plugin of a name.
-
-    Args:
-        group: of entry points.
-        name: of the plugin.
-        make: what a class becomes, from it and the arguments.
-        **arguments: of a class.
+    """Load the plugin of a name in a group of entry points; `make` instantiates a class with the arguments.
 
     Raises:
         ConfigError: The package or the attribute does not exist or fails, or the plugin is not callable.
@@ -111,16 +109,6 @@ def load_feature_extractor(name: str, num_keypoints: int, weights: str | None) -
     if name in EXTRACTORS or not is_known(FEATURE_EXTRACTORS, name):
         return extractor(name, num_keypoints, weights)
     return load(FEATURE_EXTRACTORS, name, make, num_keypoints=num_keypoints, weights=weights)
-
-
-def _taken(kind: type, arguments: dict[str, object]) -> dict[str, object]:
-    """The arguments that the constructor of a class takes."""
-    given = {name: value for name, value in arguments.items() if value is not None}
-    parameters = signature(kind).parameters.values()
-    if any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters):
-        return given
-    names = {parameter.name for parameter in parameters}
-    return {name: value for name, value in given.items() if name in names}
 
 
 def _words(error: Exception) -> str:

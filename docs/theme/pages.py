@@ -97,7 +97,7 @@ def _commands() -> str:
         "frame could be localized, 4 some sequences of a batch failed, 130 and 143 ended by Ctrl-C and by SIGTERM. "
         "`python -m torchslam` is the same command.",
     ]
-    for name, (_, summary) in COMMANDS.items():
+    for name, summary in COMMANDS.items():
         command = build_parser(name)._subparsers._group_actions[0].choices[name]  # type: ignore[union-attr,index]
         parts += [
             f"## torchslam {name}",

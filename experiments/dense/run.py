@@ -22,8 +22,7 @@ from torchslam.dense import DepthMaps
 from torchslam.dense.estimate import Estimate, estimate_depth
 from torchslam.densify.views import SWEPT, ViewImages, Views, views_of
 from torchslam.geometry import se3_inverse
-from torchslam.io.export.scene import open_images, scene_of
-from torchslam.io.results import DEPTHS, MAP, read_image_source, read_metrics
+from torchslam.io.results import DEPTHS, MAP, open_run, read_metrics
 from torchslam.map.file import read_atlas
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
@@ -56,15 +55,12 @@ def truth_of(folder: Path, maps: DepthMaps, depth: Path | None) -> Tensor:
 
 def opened(folder: Path, maps: DepthMaps) -> tuple[Views, ViewImages]:
     """The views that depth maps were computed of, with the default options, and their images."""
-    metrics, saved = read_metrics(folder), read_atlas(folder / MAP)
-    submap = saved.atlas.main()
-    assert submap is not None
-    scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=True)
+    run = open_run(folder)
+    assert run.main is not None
+    scene = run.scene(run.main, keyframes_alone=True)
     views = views_of(scene, maps.camera.size)
     assert torch.equal(views.frame_index, maps.frame_index), "not the views of the depth maps"
-    source = read_image_source(folder, metrics, saved.atlas)
-    assert source is not None, f"{folder}: does not say where its images are"
-    return views, ViewImages(views, open_images(source, scene, views.camera))
+    return views, ViewImages(views, run.images(scene, views.camera))
 
 
 def estimator(views: Views, images: ViewImages) -> Callable[[int], Estimate]:

@@ -16,7 +16,7 @@ from experiments.common import parser_of
 from torchslam import open_sequence
 from torchslam.data.sequence import Sequence
 from torchslam.geometry.transforms import upright_rotation
-from torchslam.io.plots.style import ACCENT, ESTIMATE, house_style, new_figure, robust_box
+from torchslam.io.plots.charts import ACCENT, ESTIMATE, house_style, new_figure, robust_box
 from torchslam.io.results import read_results
 
 if TYPE_CHECKING:

@@ -21,7 +21,7 @@ from experiments.report.animation import save_animation
 from torchslam.dense import PointCloud
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, rigid, se3_inverse, transform
-from torchslam.io.plots.style import ACCENT, thin
+from torchslam.io.plots.charts import ACCENT, thin
 from torchslam.io.results import DENSE_CLOUD, read_results
 from torchslam.types import Trajectory
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from experiments.common import parser_of, table
 from experiments.report.record import ROOT
-from torchslam.io.plots.style import (
+from torchslam.io.plots.charts import (
     GROUND_TRUTH,
     INITIALIZING,
     LOST,

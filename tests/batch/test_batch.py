@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from tests.batch.conftest import LIST, OPTIONS, ROOM, SETTINGS, STATUSES, batch, content, table, task
-from tests.cli.test_cli import write_tum_folder
+from tests.cli.conftest import write_tum_folder
 from tests.fuzz import valid_inputs
 from torchslam.batch import Engine, Row, Task, run_batch, run_row
 from torchslam.batch import results_table as tables
@@ -80,22 +80,9 @@ def test_times_are_in_files_of_their_own(whole: Path) -> None:
 def test_the_results_equal_those_of_a_run(whole: Path, tmp_path: Path) -> None:
     settings = [part for setting in SETTINGS for part in ("--set", setting)]
     assert main(["run", ROOM, "--output", str(tmp_path), *settings]) == 0
-    for name in (
-        "trajectory.txt",
-        "online.txt",
-        "keyframes.txt",
-        "map.safetensors",
-        "map.ply",
-        "config.toml",
-    ):
+    names = ("trajectory.txt", "online.txt", "keyframes.txt", "map.safetensors", "map.ply", "config.toml")
+    for name in names:
         assert (tmp_path / name).read_bytes() == (whole / RUNS / "one" / name).read_bytes(), name
-
-
-def test_plot_draws_what_a_batch_wrote(whole: Path, tmp_path: Path) -> None:
-    shutil.copytree(whole / RUNS / "one", tmp_path / "one")
-    assert main(["plot", str(tmp_path / "one")]) == 0
-    drawn = {path.name for path in (tmp_path / "one" / "plots").iterdir()}
-    assert "scene.png" in drawn
 
 
 # --- what is done is not done again --------------------------------------------------------------------------
@@ -146,10 +133,6 @@ def test_an_unrelated_folder_is_never_replaced(tmp_path: Path) -> None:
     refused = run_row(Task(task(tmp_path).row, str(tmp_path), overwrite=True, plots=False).as_dict())
     assert "not results of a batch" in refused["error"]
     assert (tmp_path / RUNS / "mine" / "thesis.tex").exists()
-
-
-def test_a_damaged_record_is_an_error(tmp_path: Path) -> None:
-    (tmp_path / RUNS / "mine").mkdir(parents=True)
     for text in ("{", "[]", '{"status": 3}'):
         (tmp_path / RUNS / "mine" / RECORD).write_text(text)
         assert RECORD in run_row(task(tmp_path).as_dict())["error"]
@@ -234,17 +217,8 @@ def until(happens: object, patience: float = 120.0) -> None:
 
 
 def test_a_killed_batch_can_be_restarted(whole: Path, listed: Path, tmp_path: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "torchslam.cli.main",
-        "batch",
-        str(listed),
-        "-o",
-        str(tmp_path),
-        *OPTIONS,
-    ]
-    process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "torchslam.cli.main", "batch", str(listed), "-o", str(tmp_path)]
+    process = subprocess.Popen([*command, *OPTIONS], stderr=subprocess.DEVNULL)
     # The second sequence is being run: its folder has begun.
     until(lambda: (tmp_path / RUNS / "one").exists() and (tmp_path / RUNS / ".two.part").exists())
     process.kill()

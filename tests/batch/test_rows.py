@@ -24,41 +24,16 @@ def test_a_text_list_has_one_path_per_line(tmp_path: Path) -> None:
 
 
 def test_a_csv_list_has_a_column_per_option(tmp_path: Path) -> None:
-    cells = {
-        "name": "first",
-        "sequence": "a,b",
-        "camera": "525,525,319.5,239.5",
-        "config": "c.toml",
-        "overrides": "seed=3; features.num_keypoints=500;",
-        "groundtruth": "t.txt",
-        "start": "1:30",
-        "stop": "200",
-        "stride": "2",
-        "fps": "12.5",
-        "limit": "9",
-        "resize": "0.5",
-        "mask": "m.png",
-    }
+    texts = {"name": "first", "sequence": "a,b", "camera": "525,525,319.5,239.5", "config": "c.toml"}
+    texts |= {"groundtruth": "t.txt", "start": "1:30", "stop": "200", "resize": "0.5", "mask": "m.png"}
+    numbers = {"stride": 2, "fps": 12.5, "limit": 9}
+    cells = texts | numbers | {"overrides": "seed=3; features.num_keypoints=500;"}
     assert set(cells) == set(COLUMNS)
     line = ",".join(f'"{cell}"' for cell in cells.values())
     (tmp_path / "l.csv").write_text(f"{','.join(cells)}\n{line}\n\n", encoding="utf-8-sig")
     (row,) = read_list(tmp_path / "l.csv")
-    assert row == Row(
-        name="first",
-        sequence="a,b",
-        camera="525,525,319.5,239.5",
-        config="c.toml",
-        overrides=("seed=3", "features.num_keypoints=500"),
-        groundtruth="t.txt",
-        start="1:30",
-        stop="200",
-        stride=2,
-        fps=12.5,
-        limit=9,
-        resize="0.5",
-        mask="m.png",
-        folder=str(tmp_path),
-    )
+    settings = ("seed=3", "features.num_keypoints=500")
+    assert row == Row(**texts, **numbers, overrides=settings, folder=str(tmp_path))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from tests.batch.conftest import table, task
-from tests.cli.test_cli import write_tum_folder
+from tests.cli.conftest import write_tum_folder
 from torchslam.batch import Row, Task, run_row
 from torchslam.batch.result_store import ERRORS, RUNS, run_or_reuse
 from torchslam.data import read_trajectory, write_trajectory

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from tests.cli.test_cli import FAST, write_tum_folder
+from tests.cli.conftest import FAST, write_tum_folder
 from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.data.calibration import check_replaceable, write_calibration

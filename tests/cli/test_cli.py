@@ -18,23 +18,13 @@ import pytest
 import torch
 
 import torchslam
+from tests.cli.conftest import FAST, ROOM, write_tum_folder
 from torchslam.cli.main import COMMANDS, load_command, main
 from torchslam.config import load_config
-from torchslam.data import open_sequence, read_trajectory
+from torchslam.data import read_trajectory
 from torchslam.data.synthetic.sequence import SyntheticSequence
 from torchslam.map.file import read_map
 from torchslam.utils.timing import cpu_seconds, peak_memory_mb
-
-ROOM = "synthetic:room?frames=16"
-FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of results of a run that went well."""
-    directory = tmp_path_factory.mktemp("run")
-    assert main(["run", ROOM, "--output", str(directory), *FAST, "--seed", "7"]) == 0
-    return directory
 
 
 def run_and_read(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:
@@ -43,35 +33,12 @@ def run_and_read(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[i
     return status, captured.out, captured.err
 
 
-def write_tum_folder(folder: Path, frames: int = 6) -> Path:
-    """A few rendered frames as a TUM folder with a calibration."""
-    sequence = open_sequence(f"synthetic:room?frames={frames}")
-    (folder / "rgb").mkdir(parents=True)
-    lines = []
-    for index in range(frames):
-        image = (sequence.image(index)[0, 0] * 255).round().to(torch.uint8).numpy()
-        cv2.imwrite(str(folder / "rgb" / f"{index}.png"), image)
-        lines.append(f"{index / 20:.2f} rgb/{index}.png")
-    (folder / "rgb.txt").write_text("\n".join(lines) + "\n")
-    (folder / "calibration.txt").write_text("500 500 319.5 239.5\n")
-    return folder
-
-
 def test_run_writes_all_results(finished: Path) -> None:
     names = {path.relative_to(finished).as_posix() for path in finished.rglob("*") if path.is_file()}
     pictures = {f"plots/{name}.png" for name in ("scene", "top_view", "errors", "features", "tracking")}
-    files = {
-        "trajectory.txt",
-        "online.txt",
-        "keyframes.txt",
-        "groundtruth.txt",
-        "map.safetensors",
-        "map.ply",
-        "calibration.txt",
-        "config.toml",
-        "view.html",
-    }
-    assert names == files | {"metrics.json", "frames.csv", "example.png"} | pictures
+    files = {f"{name}.txt" for name in ("trajectory", "online", "keyframes", "groundtruth", "calibration")}
+    files |= {"map.safetensors", "map.ply", "config.toml", "view.html", "metrics.json", "frames.csv"}
+    assert names == files | {"example.png"} | pictures
     figures = json.loads((finished / "metrics.json").read_text())
     assert figures["frames"] == 16
     assert len(read_trajectory(finished / "trajectory.txt")) == figures["posed"]
@@ -99,13 +66,8 @@ def test_same_input_and_seed_give_same_bytes(finished: Path, tmp_path: Path) -> 
 
 
 def test_plot_draws_again_from_the_files_alone(
-    finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    finished: Path, copy: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    copy = tmp_path / "copy"
-    copy.mkdir()
-    for path in finished.iterdir():
-        if path.is_file():
-            (copy / path.name).write_bytes(path.read_bytes())
     status, out, _ = run_and_read(capsys, "plot", str(copy))
     assert status == 0
     drawn = {Path(line).name for line in out.splitlines()}
@@ -149,32 +111,13 @@ def test_demo_writes_the_results_of_run(
 
 @pytest.mark.usefixtures("without_pictures")
 def test_simulated_features_and_true_scale(tmp_path: Path) -> None:
-    arguments = [
-        "--features",
-        "simulated",
-        "--scale",
-        "groundtruth",
-        "--limit",
-        "12",
-        "--set",
-        "features.num_keypoints=300",
-        "--set",
-        "simulated.noise_px=0.02",  # without any, the camera would be judged to the last bit
-    ]
+    arguments = ["--features", "simulated", "--scale", "groundtruth", "--limit", "12"]
+    # Without any noise, the camera would be judged to the last bit.
+    arguments += ["--set", "features.num_keypoints=300", "--set", "simulated.noise_px=0.02"]
     assert main(["run", ROOM + "&blank=1", "--output", str(tmp_path), *arguments]) == 0
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures["frames"] == 12
     assert figures["scale"] == pytest.approx(1.0, abs=1e-3)
-
-
-@pytest.mark.usefixtures("without_pictures")
-def test_sift_is_a_kind_of_features(tmp_path: Path) -> None:
-    arguments = ["--features", "sift", "--set", "features.num_keypoints=500", "--limit", "8"]
-    assert main(["run", ROOM, "--output", str(tmp_path), *arguments]) == 0
-    figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert figures["posed"] == 8
-    assert figures["ate_m"] < 0.05 * figures["path_length_m"]
-    assert load_config(tmp_path / "config.toml").features.kind == "sift"
 
 
 def test_a_static_camera_gives_no_map_and_a_reason(
@@ -303,13 +246,6 @@ def test_damaged_sequences_are_named_by_file_and_line(
     assert expected in err
 
 
-def test_unreadable_video(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "broken.mp4").write_bytes(b"not a video")
-    status, _, err = run_and_read(capsys, "info", str(tmp_path / "broken.mp4"), "--camera", "500,500,320,240")
-    assert status == 2
-    assert "broken.mp4" in err
-
-
 def test_results_that_cannot_be_written_stop_before_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -355,23 +291,8 @@ def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str])
     assert f"usage: torchslam {command}" in capsys.readouterr().out
 
 
-def test_the_first_screen_of_run_has_ten_options(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("COLUMNS", "80")
-    with pytest.raises(SystemExit, match="0"):
-        main(["run", "--help"])
-    screen = capsys.readouterr().out.split("\nframe selection:")[0]
-    options = [line.split()[0].rstrip(",") for line in screen.splitlines() if line.startswith("  -")]
-    assert options == [
-        "-h", "--camera", "--output", "--overwrite", "--resume", "--mapping", "--dense", "--view", "--device",
-        "--config", "--set",
-    ]  # fmt: skip
-    assert len(screen.splitlines()) <= 40
-
-
 def test_the_command_list_shows_each_commands_summary() -> None:
-    for name, (_, summary) in COMMANDS.items():
+    for name, summary in COMMANDS.items():
         first = load_command(name)[0].split("\n")[0].rstrip(".")
         assert summary == first[0].lower() + first[1:]
 

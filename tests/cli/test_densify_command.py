@@ -15,6 +15,7 @@ import torch
 from safetensors.torch import load_file
 
 from examples.train_depth import of_run
+from tests.cli.conftest import FAST
 from torchslam.cli.densify import map_size
 from torchslam.cli.main import main
 from torchslam.data import open_sequence
@@ -27,7 +28,6 @@ from torchslam.io.export.scene import Images
 from torchslam.io.results import DENSE_CLOUD, DEPTHS, MESH
 
 ROOM = "synthetic:room?frames=24"
-FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500"]
 SMALL = ["--resolution", "96"]
 
 
@@ -53,6 +53,8 @@ def test_a_run_with_dense_depth_has_all_its_results(run: Path) -> None:
     maps = DepthMaps.load(run / "dense" / "depths.safetensors")
     figures = json.loads((run / "metrics.json").read_text())["dense"]
     assert maps.camera.size == (96, 72)
+    names = {"frame_index", "depth", "normal", "confidence", "T_cw", "camera.params"}
+    assert load_file(run / "dense" / "depths.safetensors").keys() == names
     assert (maps.frame_index % 3 == 0).all()
     assert figures["depth_maps"] == len(maps) == len(list((run / "dense" / "pictures").iterdir()))
     assert figures["kept_ratio"] == pytest.approx(float((maps.depth > 0).double().mean()))
@@ -116,19 +118,6 @@ def test_the_same_bytes_with_any_number_of_processes(run: Path, results: Path) -
         assert (results / name).read_bytes() == (run / name).read_bytes()
 
 
-def test_other_settings_begin_anew(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(*arguments: Any) -> None:
-        raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch:
-        patch.setattr(passes, "_write_merged", stop)
-        assert densify(results) == 130
-    before = sorted((results / "dense" / "parts").glob("*.alone.safetensors"))
-    assert main(["densify", str(results), "--resolution", "80x64", "--every", "3"]) == 0
-    assert before
-    assert DepthMaps.load(results / "dense" / "depths.safetensors").camera.size == (80, 64)
-
-
 def test_learned_aggregation_by_option_and_by_the_configuration(run: Path, results: Path) -> None:
     assert densify(results, "--aggregation", "learned") == 0
     by_option = (results / DEPTHS).read_bytes()
@@ -143,19 +132,23 @@ def test_learned_aggregation_by_option_and_by_the_configuration(run: Path, resul
     assert (results / DEPTHS).read_bytes() == (run / DEPTHS).read_bytes()
 
 
-def test_parts_of_the_other_aggregation_are_not_used(results: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("other", [["--resolution", "80x64"], ["--aggregation", "learned"]])
+def test_parts_of_other_settings_are_not_used(
+    other: list[str], results: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def stop(*arguments: Any) -> None:
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(passes, "_write_merged", stop)
         assert densify(results) == 130
+    assert list((results / "dense" / "parts").glob("*.alone.safetensors"))
     written: list[Path] = []
     write = passes._write_alone
     monkeypatch.setattr(
         passes, "_write_alone", lambda path, *rest: (written.append(path), write(path, *rest))
     )
-    assert densify(results, "--aggregation", "learned") == 0
+    assert densify(results, *other) == 0
     assert len(written) == len(DepthMaps.load(results / DEPTHS))
 
 
@@ -208,10 +201,7 @@ def test_missing_images_are_reported(
     assert densify(results, "--images", ROOM) == 0
     path.write_text(json.dumps(json.loads(path.read_text()) | {"source": None}))
     assert densify(results) == 2
-    assert (
-        "metrics.json: the location of the images is unknown; give it with --images"
-        in capsys.readouterr().err
-    )
+    assert "metrics.json: the location of the images is unknown; use --images" in capsys.readouterr().err
 
 
 def test_an_image_that_cannot_be_read_is_skipped_and_counted(
@@ -229,10 +219,8 @@ def test_an_image_that_cannot_be_read_is_skipped_and_counted(
     assert densify(results) == 0
     error = capsys.readouterr().err
     assert error.count("torchslam: warning: skipped a view: b.png is not an image, or a damaged one\n") == 1
-    maps, figures = (
-        DepthMaps.load(results / DEPTHS),
-        json.loads((results / "metrics.json").read_text())["dense"],
-    )
+    maps = DepthMaps.load(results / DEPTHS)
+    figures = json.loads((results / "metrics.json").read_text())["dense"]
     assert broken not in maps.frame_index
     assert figures["skipped"] == 1
     assert figures["depth_maps"] == len(maps) == len(DepthMaps.load(run / DEPTHS)) - 1
@@ -314,10 +302,7 @@ def test_what_cannot_be_done_is_one_line(
     error = capsys.readouterr().err
     assert message in error
     assert error.count("\n") == 1
-
-
-def test_a_folder_without_results(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert densify(tmp_path / "none") == 2
+    assert densify(results / "none") == 2
     assert "none: no such results folder" in capsys.readouterr().err
 
 
@@ -328,8 +313,3 @@ def test_sizes_are_even_and_no_larger_than_the_image() -> None:
     assert map_size("100x80", (640, 480)) == (100, 80)
     with pytest.raises(ConfigError):
         map_size("", (640, 480))
-
-
-def test_the_file_has_the_tensors_of_the_class(run: Path) -> None:
-    names = {"frame_index", "depth", "normal", "confidence", "T_cw", "camera.params"}
-    assert load_file(run / "dense" / "depths.safetensors").keys() == names

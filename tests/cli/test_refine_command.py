@@ -11,8 +11,8 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from tests.cli.conftest import FAST, write_tum_folder
 from tests.cli.test_align_command import Known
-from tests.cli.test_cli import FAST, write_tum_folder
 from tests.refine.test_refine import disturbed
 from torchslam.cli.main import main
 from torchslam.data import open_sequence, read_trajectory
@@ -105,9 +105,8 @@ def test_refined_poses_keep_the_format_of_the_input(
     assert figures["posed"] == FRAMES - 1
     assert abs(figures["focal_px"][1] - 500) < abs(figures["focal_px"][0] - 500)
     assert len(read_trajectory(results / "trajectory.txt")) == FRAMES - 1
-    lines = [
-        line for line in (results / "refined" / "covariances.txt").read_text().splitlines() if line[0] != "#"
-    ]
+    text = (results / "refined" / "covariances.txt").read_text()
+    lines = [line for line in text.splitlines() if line[0] != "#"]
     assert len(lines) == figures["keyframes"]
     assert all(len(line.split()) == 22 for line in lines)
     if kind == "nerfstudio":
@@ -125,22 +124,11 @@ def test_refined_poses_are_in_meters_where_a_length_is_known(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     monkeypatch.setattr(
-        "torchslam.cli.arguments.sources_of",
-        lambda given: [Known(3.0)] if "camera_height" in given else [],
+        "torchslam.cli.arguments.sources_of", lambda given: [Known(3.0)] if "camera_height" in given else []
     )
     poses = write("tum", given, tmp_path)
-    call = [
-        "refine",
-        str(folder),
-        "--poses",
-        str(poses),
-        "-o",
-        str(tmp_path / "a"),
-        *FAST,
-        "--camera-height",
-        "1",
-    ]
-    assert main([*call, "--camera", "500,500,319.5,239.5"]) == 0
+    call = ["refine", str(folder), "--poses", str(poses), "-o", str(tmp_path / "a"), *FAST]
+    assert main([*call, "--camera-height", "1", "--camera", "500,500,319.5,239.5"]) == 0
     assert "scale 1.000 ± 0.010 (1 known length)" in capsys.readouterr().out
     refined = read_poses(tmp_path / "a" / "refined" / "phone.txt")
     grown = extent(refined.T_cw) / extent(given[:-1])
@@ -201,13 +189,9 @@ def test_invalid_arguments_are_one_line_with_status_2(
     folder: Path, given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     poses, output = write("tum", given, tmp_path), str(tmp_path / "results")
+    both = ["--fix-camera", "--refine-distortion"]
     cases = {
-        "--refine-distortion cannot be combined with --fix-camera": [
-            "--poses",
-            str(poses),
-            "--fix-camera",
-            "--refine-distortion",
-        ],
+        "--refine-distortion cannot be combined with --fix-camera": ["--poses", str(poses), *both],
         "nothing.txt: cannot be read": ["--poses", str(tmp_path / "nothing.txt")],
         "neither images.bin": ["--poses", str(tmp_path)],
     }
@@ -223,16 +207,7 @@ def test_invalid_arguments_are_one_line_with_status_2(
 def test_images_without_a_map_are_reported(folder: Path, given: Tensor, tmp_path: Path) -> None:
     """The results say why, there are no refined poses, and the status is 3."""
     poses = write("tum", given, tmp_path)
-    arguments = [
-        "refine",
-        str(folder),
-        "--limit",
-        "1",
-        "--poses",
-        str(poses),
-        "-o",
-        str(tmp_path / "results"),
-    ]
-    assert main([*arguments, *FAST]) == 3
+    arguments = ["refine", str(folder), "--poses", str(poses), "-o", str(tmp_path / "results"), *FAST]
+    assert main([*arguments, "--limit", "1"]) == 3
     assert "not enough" in json.loads((tmp_path / "results" / "metrics.json").read_text())["failure"]
     assert not (tmp_path / "results" / "refined").exists()

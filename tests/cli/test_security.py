@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 
+from tests.cli.conftest import FAST, ROOM
 from torchslam.cli.main import main
 from torchslam.data import open_sequence
 from torchslam.data.formats.given_poses import read_poses
@@ -23,8 +24,7 @@ from torchslam.features.weights import read_weights
 from torchslam.plugins import ALLOWED
 from torchslam.utils.console import printable, without_credentials
 
-ROOM = "synthetic:room?frames=16"
-FAST = ["--features", "opencv-orb", "--set", "features.num_keypoints=500", "--processes", "1"]
+ALONE = [*FAST, "--processes", "1"]
 Command = Callable[..., tuple[int, str, str]]
 
 
@@ -38,13 +38,6 @@ def command(capfd: pytest.CaptureFixture[str]) -> Command:
         return status, said.out, said.err
 
     return run
-
-
-@pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    directory = tmp_path_factory.mktemp("run")
-    assert main(["run", ROOM, "--output", str(directory), *FAST]) == 0
-    return directory
 
 
 def texts_below(folder: Path) -> Iterator[tuple[Path, bytes]]:
@@ -76,20 +69,12 @@ def test_a_configuration_file_imports_no_code(
     (tmp_path / "c.toml").write_text(f'[{section}]\n{key} = "trap:make"\n')
     results = shutil.copytree(finished, tmp_path / "results")
     shutil.copy(tmp_path / "c.toml", results / "config.toml")
+    file = ("--config", tmp_path / "c.toml")
     for arguments in (
-        ("run", ROOM, "-o", tmp_path / "o", "--config", tmp_path / "c.toml"),
+        ("run", ROOM, "-o", tmp_path / "o", *file),
         ("run", ROOM, "-o", tmp_path / "o", "--map", results),
-        (
-            "refine",
-            ROOM,
-            "--poses",
-            finished / "trajectory.txt",
-            "-o",
-            tmp_path / "o",
-            "--config",
-            tmp_path / "c.toml",
-        ),
-        ("config", "--config", tmp_path / "c.toml"),
+        ("refine", ROOM, "--poses", finished / "trajectory.txt", "-o", tmp_path / "o", *file),
+        ("config", *file),
     ):
         status, _, err = command(*arguments)
         assert status == 2, arguments
@@ -172,7 +157,7 @@ def test_the_credentials_of_a_stream_reach_neither_messages_nor_results(
 ) -> None:
     monkeypatch.setattr(cv2, "VideoCapture", _Stream)
     camera = open_sequence(ROOM).camera.params.tolist()
-    given = ("--camera", ",".join(map(str, camera)), "-o", tmp_path / "o", *FAST)
+    given = ("--camera", ",".join(map(str, camera)), "-o", tmp_path / "o", *ALONE)
     status, out, err = command("run", ADDRESS, *given)
     assert status in (0, 3)
     assert "127.0.0.1" in out
@@ -245,7 +230,7 @@ def test_names_of_images_reach_neither_terminal_nor_page_nor_other_paths(
     out = tmp_path / "out"
     for arguments in (
         ("info", folder),
-        ("run", folder, "-o", out, "--camera", camera, *FAST),
+        ("run", folder, "-o", out, "--camera", camera, *ALONE),
         *(("export", out, "--to", kind) for kind in ("colmap", "nerfstudio", "tum")),
         ("plot", out),
     ):

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from pathlib import Path
 
 import pytest
 
-from tests.docs.running import blocks, first_missing, run_page
+from tests.docs.running import blocks, run_page
 from torchslam.cli.main import main
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -48,32 +47,3 @@ def test_a_page_with_wrong_output_is_detected(tmp_path: Path) -> None:
     page.write_text("# Page\n\n```python\nx = 1\n```\n\n```python\n\nassert x == 2\n```\n")
     with pytest.raises(AssertionError, match=r"page\.md:8 failed(.|\n)*page\.md\", line 9"):
         run_page(page)
-
-
-@pytest.mark.parametrize(
-    ("expected", "missing"),
-    [
-        ("b 2\n", None),
-        ("a ...\nc 3\n", None),
-        ("b ...\na 1\n", "a 1"),
-        ("...\nb 3\n", "b 3"),
-        ("", None),
-    ],
-)
-def test_the_output_of_a_command_is_compared(expected: str, missing: str | None) -> None:
-    assert first_missing(expected, "a 1\n  b 2\nc 3\n") == missing
-
-
-def test_the_messages_that_a_tutorial_explains_are_the_program_s() -> None:
-    """Each part of a message in the first column of the table of symptoms is a text of the program."""
-    page = (DOCS / "tutorials" / "own_video.md").read_text(encoding="utf-8")
-    rows = [
-        line.split("|")[1] for line in page.partition("| symptom |")[2].splitlines() if line.startswith("|")
-    ]
-    messages = re.findall(r"`([^`]*\.\.\.[^`]*)`|\*([^*]+)\*", "\n".join(rows))
-    parts = [part.strip(" :") for both in messages for part in "".join(both).split("...")]
-    said = "\n".join(
-        path.read_text(encoding="utf-8") for path in sorted((DOCS.parent / "torchslam").rglob("*.py"))
-    )
-    assert len(messages) >= 5
-    assert [part for part in parts if part not in said] == []

@@ -7,7 +7,6 @@ from pathlib import Path
 
 from experiments.report.modes import PICTURE, draw_modes
 from torchslam.system.modes import TRANSITIONS, Mode
-from torchslam.system.savepoint import MANY_HELD_FRAMES, MAX_HELD_FRAMES
 
 PAGE = (Path(__file__).parents[2] / "docs" / "tracking_modes.md").read_text(encoding="utf-8")
 NAMES = [mode.name for mode in Mode]
@@ -44,15 +43,3 @@ def test_the_picture_is_drawn_anew_with_the_same_modes_and_transitions(tmp_path:
     draw_modes(again)
     assert drawn.read_bytes() == again.read_bytes()
     assert ids(drawn.read_text(encoding="utf-8")) == ids(PICTURE.read_text(encoding="utf-8"))
-
-
-def test_the_tables_of_modes_list_all_of_them_with_their_states() -> None:
-    shown = rows("| mode | state | what happens to a frame |")
-    assert [row[:2] for row in shown] == [[f"`{mode.name}`", mode.state.value] for mode in Mode]
-    kept = rows("| mode | what is kept | what is taken back |")
-    assert [row[0] for row in kept] == [f"`{name}`" for name in NAMES]
-
-
-def test_the_numbers_of_frames_are_those_of_the_program() -> None:
-    assert f"if they are {MANY_HELD_FRAMES} or more" in PAGE
-    assert f"At most\n{MAX_HELD_FRAMES} frames are held back" in PAGE

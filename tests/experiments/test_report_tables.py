@@ -16,7 +16,7 @@ from experiments.report import record, rows, run, tables
 from experiments.report.compare import compare
 from experiments.report.rows import ALL, judged, parse_agreement, peer_trajectory, read_row, run_row
 from torchslam.data.trajectories import write_trajectory
-from torchslam.io.results import write_frames
+from torchslam.io.write_run import write_frames
 from torchslam.types import State, StepResult, Trajectory
 
 FRAMES = 20

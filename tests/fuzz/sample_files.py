@@ -20,7 +20,7 @@ from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import write_cloud
 from torchslam.io.export.scene import scene_of
 from torchslam.io.report import run_metrics
-from torchslam.io.results import write_results
+from torchslam.io.write_run import write_results
 from torchslam.system.checkpoint import write_checkpoint
 from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 

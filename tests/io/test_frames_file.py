@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 
 from torchslam.errors import ResultsError
-from torchslam.io.results import read_frames, write_frames
+from torchslam.io.results import read_frames
+from torchslam.io.write_run import write_frames
 from torchslam.types import State, StepResult
 
 

@@ -12,8 +12,7 @@ from matplotlib.collections import EllipseCollection, LineCollection
 from matplotlib.figure import Figure
 
 from torchslam.io import plots
-from torchslam.io.plots import style
-from torchslam.io.plots.scene import _wrapped
+from torchslam.io.plots.scene import upright_axes
 from torchslam.types import State, StepResult, Trajectory
 
 pytestmark = pytest.mark.filterwarnings("error")
@@ -68,13 +67,6 @@ def test_plots_are_drawn_deterministically(
     assert 0.01 < (picture < 200).any(axis=2).mean() < 0.9  # neither blank nor black
 
 
-@pytest.mark.parametrize("name", ["top_view", "errors", "tracking", "features"])
-def test_axes_are_labeled_with_units(name: str, figures: dict[str, Callable[[], Figure]]) -> None:
-    axes = figures[name]().axes
-    assert any("(" in panel.get_xlabel() or panel.get_xlabel() == "frame" for panel in axes)
-    assert any(panel.get_ylabel() for panel in axes)
-
-
 def test_far_points_do_not_stretch_the_picture(trajectory: Trajectory, points_w: torch.Tensor) -> None:
     figure = plots.plot_top_view(trajectory, points_w)
     axes = figure.axes[0]
@@ -96,7 +88,7 @@ def test_a_map_with_y_down_is_plotted_over_x_and_z(trajectory: Trajectory, point
 def test_upright_axes_bring_up_to_z_without_mirroring(up: list[int]) -> None:
     T_wc = np.eye(4)[None].copy()
     T_wc[0, :3, 1] = -np.array(up)
-    matrix, labels = style.upright_axes(T_wc)
+    matrix, labels = upright_axes(T_wc)
     np.testing.assert_array_equal(matrix @ up, [0, 0, 1])
     assert np.linalg.det(matrix) == pytest.approx(1.0)
     for row, label in zip(matrix, labels, strict=True):
@@ -125,24 +117,16 @@ def test_the_path_is_broken_where_poses_are_missing(trajectory: Trajectory, poin
     assert [len(part.get_xdata()) for part in parts] == [10, 10]
 
 
-def test_spans_without_a_pose_are_shaded(results: list[StepResult]) -> None:
-    axes = plots.plot_tracking(results).axes[0]
-    spans = {patch.get_label(): patch for patch in axes.patches}
-    assert spans.keys() == {"initializing", "lost"}
-    lost = spans["lost"]
-    assert lost.get_x() == pytest.approx(18 / 30)
-    assert lost.get_width() == pytest.approx(4 / 30)
-
-
-def test_uncertain_spans_are_shaded_in_their_own_color(results: list[StepResult]) -> None:
+def test_spans_without_a_certain_pose_are_shaded(results: list[StepResult]) -> None:
     doubtful = [
         replace(result, state=State.UNCERTAIN) if 6 <= result.index < 9 else result for result in results
     ]
     patches = plots.plot_tracking(doubtful).axes[0].patches
     spans = {patch.get_label(): patch for patch in patches if not patch.get_label().startswith("_")}
     assert spans.keys() == {"initializing", "lost", "uncertain"}
-    assert spans["uncertain"].get_x() == pytest.approx(6 / 30)
-    assert spans["uncertain"].get_width() == pytest.approx(3 / 30)
+    for name, first, count in (("lost", 18, 4), ("uncertain", 6, 3)):
+        assert spans[name].get_x() == pytest.approx(first / 30)
+        assert spans[name].get_width() == pytest.approx(count / 30)
     assert len({patch.get_facecolor() for patch in spans.values()}) == 3
 
 
@@ -189,7 +173,3 @@ def test_ellipses_of_points_are_of_true_size(trajectory: Trajectory, points_w: t
     (ellipses,) = (c for c in figure.axes[0].collections if isinstance(c, EllipseCollection))
     assert len(ellipses.get_offsets()) == int(points_w.isfinite().all(-1).sum())
     np.testing.assert_allclose(ellipses.get_widths(), 2 * 3e-3)
-
-
-def test_long_titles_wrap_in_narrow_pictures() -> None:
-    assert max(map(len, _wrapped("words " * 40, 4.5).split("\n"))) <= 60

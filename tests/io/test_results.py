@@ -4,6 +4,7 @@ import json
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -24,9 +25,8 @@ from torchslam.io.results import (
     read_results,
     readout_of,
     results_in,
-    write_results,
 )
-from torchslam.io.write_run import draw
+from torchslam.io.write_run import draw, write_results
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
@@ -163,19 +163,13 @@ def test_ellipses_are_drawn_at_the_keyframes(
     keyframes = run.map.keyframes
     keyframes.keep(torch.tensor([2, 0, 1, 3, 4, 5]))
     keyframes["covariances"][:] = torch.eye(6, dtype=torch.float64) * keyframes["timestamp"][:, None, None]
-    drawn = {}
+    drawn: list[Any] = []
     monkeypatch.setattr(plots, "save", lambda figure, path: None)
-    original = plots.plot_top_view
-
-    def remember(*arguments: object, **more: object) -> object:
-        drawn.update(more, keyframes=arguments[3])
-        return original(*arguments, **more)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(plots, "plot_top_view", remember)
+    monkeypatch.setattr(plots, "plot_top_view", lambda *arguments: drawn.extend(arguments))
     write(run, tmp_path)
     draw(read_results(tmp_path), tmp_path)
-    variances = drawn["keyframe_covariances_w"][:, 0, 0]  # type: ignore[index]
-    assert torch.allclose(variances, drawn["keyframes"].timestamps)  # type: ignore[attr-defined]
+    _, _, _, keyframes, _, _, covariances_w, _ = drawn
+    assert torch.allclose(covariances_w[:, 0, 0], keyframes.timestamps)
 
 
 def test_unknown_metrics_are_refused(tmp_path: Path, run: Run) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 
-from tests.cli.test_cli import write_tum_folder
+from tests.cli.conftest import write_tum_folder
 from tests.data.mp4 import write_mp4
 from tests.parallel.test_pool import PATIENCE, wait_until_ready
 from torchslam import Features, Frame, load_config

@@ -27,18 +27,10 @@ TRUE = true_T_cw(WALK)
 
 
 def config(*overrides: str) -> Config:
-    return load_config(
-        None,
-        [
-            "features.kind=simulated",
-            "features.num_keypoints=200",
-            "simulated.points_per_view=120",
-            "simulated.depth_near=0.6",
-            "simulated.depth_far=2",
-            "simulated.noise_px=0.002",  # without any, the focal length would be looked for to the last bit
-            *overrides,
-        ],
-    )
+    features = ["features.kind=simulated", "features.num_keypoints=200", "simulated.points_per_view=120"]
+    depths = ["simulated.depth_near=0.6", "simulated.depth_far=2"]
+    # Without any noise, the focal length would be looked for to the last bit.
+    return load_config(None, [*features, *depths, "simulated.noise_px=0.002", *overrides])
 
 
 def seen(settings: Config, walk: Sequence | None = None) -> Sequence:
@@ -157,16 +149,11 @@ def test_images_without_a_map_are_reported() -> None:
     """The run says why, and has no poses."""
     settings, rest = config(), Walk(still(4))
     found = refine_poses(rest, disturbed(true_T_cw(rest)), settings)
-    assert found.run.failure == (
-        "no map: the camera stands still, only turns, or sees a plane in 6 of 6 pairs of images"
-    )
+    assert found.run.failure.startswith("no map: the camera stands still")
     assert len(found.run.trajectory) == 0
     assert [result.state for result in found.run.results] == [State.LOST] * 4
     one = GivenPoses("tum", Path("one.txt"), TRUE[:1], WALK.timestamps[:1])
-    assert (
-        refine_poses(seen(settings), one, settings).run.failure
-        == "no map: 1 images with a pose are not enough"
-    )
+    assert refine_poses(seen(settings), one, settings).run.failure.startswith("no map: 1 images")
 
 
 def test_refinement_runs_on_the_device(device: torch.device) -> None:

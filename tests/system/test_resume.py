@@ -330,11 +330,11 @@ def test_a_signal_ends_the_final_adjustment(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    from torchslam.cli.progress import ProgressBar
+    from torchslam.cli.progress import ProgressBars
 
-    original, calls = ProgressBar.adjusting, []
+    original, calls = ProgressBars.adjusting, []
 
-    def adjusting(self: ProgressBar, iteration: int, iterations: int) -> None:
+    def adjusting(self: ProgressBars, iteration: int, iterations: int) -> None:
         calls.append(iteration)
         original(self, iteration, iterations)
         if len(calls) == 1:
@@ -342,7 +342,7 @@ def test_a_signal_ends_the_final_adjustment(
             original(self, iteration, iterations)
             pytest.fail("the adjustment went on")
 
-    monkeypatch.setattr(ProgressBar, "adjusting", adjusting)
+    monkeypatch.setattr(ProgressBars, "adjusting", adjusting)
     assert command(tmp_path) == status
     assert "stopping the adjustment after this iteration" in capsys.readouterr().err
     assert calls == [0]

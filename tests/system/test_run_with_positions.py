@@ -13,7 +13,7 @@ from torchslam.data.formats.fix_files import read_fixes
 from torchslam.errors import TorchslamError
 from torchslam.geometry import enu_from_geodetic, geodetic_from_enu
 from torchslam.io.report import compute_metrics
-from torchslam.io.results import write_results
+from torchslam.io.write_run import write_results
 from torchslam.metric.options import given_options, sources_of
 from torchslam.types import Trajectory
 

@@ -22,13 +22,6 @@ Work = Callable[[Columns], Columns]
 ENGINES = ("in-process", "ray")
 RETRIES = 2
 """Of a row whose worker died, for example for lack of memory; Ray would retry forever."""
-STORE_BYTES = 100 << 20
-"""Size of a local cluster's object store: rows are small, and images do not pass through it."""
-LOST = (
-    f"its process died {RETRIES + 1} times, or could not start: "
-    "not enough memory, or torchslam is not installed where it ran"
-)
-"""Error in the table for a row without a result."""
 
 
 @dataclass(frozen=True)
@@ -60,37 +53,36 @@ class Engine:
     def map_unordered(self, work: Work, rows: Iterable[Columns]) -> Iterator[tuple[int, Columns | None]]:
         """Yield the index of each row with its result as they finish; None if the process died or could not start.
 
-        Args:
-            work: A function of a module; rows and results must be JSON values.
-            rows: Its arguments.
-
-        Raises:
-            ConfigError: Ray is not installed, or not found at the address.
+        The work is a function of a module; rows and results must be JSON values. Raises ConfigError if Ray is not
+        installed, or not found at the address.
         """
-        rows = list(rows)
+        # As text: Arrow would infer different types for blocks whose columns are None.
+        items: list[Columns] = [{"number": n, "row": json.dumps(row)} for n, row in enumerate(rows)]
         if self.kind == "ray":
-            yield from _map_with_ray(work, rows, self.workers, self.address, self.gpus)
+            yield from _map_with_ray(work, items, self.workers, self.address, self.gpus)
             return
-        for number, row in enumerate(rows):
-            yield number, work(json.loads(json.dumps(row)))
+        for item in items:
+            yield item["number"], work(json.loads(item["row"]))
 
 
 def _map_with_ray(
-    work: Work, rows: list[Columns], workers: int | None, address: str | None, gpus: int = 0
+    work: Work, items: list[Columns], workers: int | None, address: str | None, gpus: int
 ) -> Iterator[tuple[int, Columns | None]]:
     """Run `Engine.map_unordered` as Ray tasks of one row and one processor each."""
 
     def on_item(item: Columns) -> Columns:
         return {"number": item["number"], "row": json.dumps(work(json.loads(item["row"])))}
 
-    ray, data = _import_ray()
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise it reports each cluster to its makers
+    try:
+        ray, data = importlib.import_module("ray"), importlib.import_module("ray.data")
+    except ImportError as error:
+        raise ConfigError(f"--engine ray needs pip install 'torchslam[ray]': {error}") from None
     _start(ray, workers, address)
     try:
         context = data.DataContext.get_current()
         context.enable_progress_bars, context.max_errored_blocks = False, -1
-        # As text: Arrow would infer different types for blocks whose columns are None.
-        items = [{"number": number, "row": json.dumps(row)} for number, row in enumerate(rows)]
-        left = set(range(len(rows)))
+        left = set(range(len(items)))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # max_retries is deprecated in Ray 2.64, without a replacement
             done = data.from_items(items, override_num_blocks=len(items)).map(
@@ -109,57 +101,32 @@ def _map_with_ray(
         ray.shutdown()
 
 
-def _import_ray() -> tuple[Any, Any]:
-    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")  # otherwise it reports each cluster to its makers
-    try:
-        return importlib.import_module("ray"), importlib.import_module("ray.data")
-    except ImportError as error:
-        raise ConfigError(f"--engine ray needs pip install 'torchslam[ray]': {error}") from None
-
-
 def _start(ray: Any, workers: int | None, address: str | None) -> None:
     logging.getLogger("ray.data").setLevel(logging.ERROR)  # reports why a worker died or did not start
-    options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR}
+    options: Columns = {"log_to_driver": False, "logging_level": logging.ERROR, "address": address or "local"}
     if address is None:
-        options |= {
-            "num_cpus": workers,
-            "include_dashboard": False,
-            "object_store_memory": STORE_BYTES,
-            "address": "local",
-        }
-    else:
-        options["address"] = address
+        # A small store of objects: images do not pass through it.
+        options |= {"num_cpus": workers, "include_dashboard": False, "object_store_memory": 100 << 20}
     try:
         ray.init(**options)
     except Exception as error:  # Ray raises various types
         line = " ".join(str(error).split())[:500]
-        where = (
-            "the Ray cluster of this machine did not start"
-            if address is None
-            else f"no Ray cluster at {address}"
-        )
+        where = f"no Ray cluster at {address}" if address else "the Ray cluster of this machine did not start"
         raise ConfigError(f"--engine ray: {where}: {type(error).__name__}: {line}") from error
-
-
-AUTO = "auto"
 
 
 @dataclass(frozen=True)
 class Shard:
-    """Part `index`, from 0, of `count`: every `count`-th row from row `index` on.
-
-    Raises:
-        ConfigError: The index is not in range.
-    """
+    """Part `index`, from 0, of `count`: every `count`-th row from row `index` on. Raises ConfigError out of range."""
 
     index: int = 0
     count: int = 1
 
     def __post_init__(self) -> None:
-        if not 0 <= self.index < self.count:
-            last = f"{self.count - 1}/{self.count}"
+        count = self.count
+        if not 0 <= self.index < count:
             raise ConfigError(
-                f"--shard {self.index}/{self.count}: shards count from 0/{self.count} to {last}"
+                f"--shard {self.index}/{count}: shards count from 0/{count} to {count - 1}/{count}"
             )
 
 
@@ -169,13 +136,12 @@ def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard
     Raises:
         ConfigError: Anything else, or the environment lacks the index.
     """
-    if text == AUTO:
+    if text == "auto":
         return _of_system(environment)
-    index, _, count = text.partition("/")
-    numbers = parse_count(index), parse_count(count)
-    if numbers[0] is None or not numbers[1]:
+    index, count = map(parse_count, text.partition("/")[::2])
+    if index is None or not count:
         raise ConfigError(f"--shard {text[:100]}: expected i/n, the first of three is 0/3; or auto")
-    return Shard(numbers[0], numbers[1])
+    return Shard(index, count)
 
 
 def _of_system(environment: Mapping[str, str]) -> Shard:
@@ -221,20 +187,20 @@ def run_batch(
 
     Raises:
         ConfigError: The engine is not available.
-        OSError: The table cannot be written.
     """
     engine, shard = engine or Engine(), shard or Shard()
     mine = tasks[shard.index :: shard.count]
     found: dict[int, Columns] = {}
     for number, columns in engine.map_unordered(run_row, [task.as_dict() for task in mine]):
-        found[number] = _lost(mine[number]) if columns is None else columns
-        on_progress(found[number])
+        if columns is None:
+            known = {"name": mine[number].row.name, "configuration": configuration(mine[number])}
+            why = (
+                f"its process died {RETRIES + 1} times, or could not start: not enough memory, or torchslam is not "
+                "installed where it ran"
+            )
+            columns = store_failure(Path(mine[number].output), known, why)
+        found[number] = columns
+        on_progress(columns)
     if tasks:
         write_table(tasks, Path(tasks[0].output))
     return [found[number] for number in range(len(mine))]
-
-
-def _lost(task: Task) -> Columns:
-    """Record the error of a row whose process died."""
-    known = {"name": task.row.name, "configuration": configuration(task)}
-    return store_failure(Path(task.output), known, LOST)

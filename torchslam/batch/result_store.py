@@ -91,11 +91,7 @@ def store_failure(output: Path, known: Columns, message: str, trace: str = "") -
 
 
 def read_stored(output: Path, name: str, configuration: str) -> Columns:
-    """Return the record of a row's results or of its error, if of this configuration; otherwise the status `open`.
-
-    Raises:
-        ResultsError: A record is not readable.
-    """
+    """Return the record of a row's results or of its error, if of this configuration; otherwise the status `open`."""
     for path in (output / RUNS / name / RECORD, output / ERRORS / f"{name}.json"):
         record = read_record(path)
         if record is not None and record.get("configuration") == configuration:
@@ -104,11 +100,7 @@ def read_stored(output: Path, name: str, configuration: str) -> Columns:
 
 
 def read_record(path: Path) -> Columns | None:
-    """Read the columns of a record; None if there is no file.
-
-    Raises:
-        ResultsError: The file is not a record, or not readable.
-    """
+    """Read the columns of a record; None if there is no file. Raises ResultsError for any other file."""
     record = read_object(path, ResultsError)
     if record is not None and not isinstance(record.get("status"), str):
         raise ResultsError(f"{path}: not the record of a row")
@@ -121,9 +113,7 @@ def _write(path: Path, columns: Columns) -> None:
 
 def _describe(error: Exception) -> str:
     """One line; for an unexpected error with its type and location."""
-    if isinstance(error, TorchslamError):
-        return str(error)
-    if isinstance(error, OSError):
+    if isinstance(error, TorchslamError | OSError):
         return printable(without_credentials(str(error)))
     place = traceback.extract_tb(error.__traceback__)[-1]
     text = printable(without_credentials(" ".join(str(error).split())))
@@ -139,10 +129,8 @@ DIGITS = 16
 @cache
 def program_hash() -> str:
     """Hash the version and files of this package; another version may give other results."""
-    root = Path(torchslam.__file__).parent
-    paths = (
-        p for p in sorted(root.rglob("*")) if p.suffix in (".py", ".safetensors", ".js", ".css", ".html")
-    )
+    root, kinds = Path(torchslam.__file__).parent, (".py", ".safetensors", ".js", ".css", ".html")
+    paths = (path for path in sorted(root.rglob("*")) if path.suffix in kinds)
     parts = (part for path in paths for part in (path.relative_to(root).as_posix(), path.read_bytes()))
     return f"{torchslam.__version__}+{fingerprint(parts, DIGITS)}"
 
@@ -151,36 +139,26 @@ def hash_files(paths: list[str]) -> str:
     """Hash names, sizes and modification times of files, of folders with their content, and of patterns.
 
     Missing files count as such. The content is not read: that would take as long as reading all images at each start.
-
-    Raises:
-        SequenceError: There are more than `MAX_FILES` files.
-        OSError: A file cannot be looked at.
+    Raises SequenceError for more than `MAX_FILES` files.
     """
     return fingerprint((part for path in paths for part in _parts(path)), DIGITS)
 
 
 def _parts(path: str) -> Iterator[Any]:
-    """What is hashed of a path: a synthetic sequence by its name, files by theirs."""
+    """What is hashed of a path: a synthetic sequence by its name, files by theirs, in the order of their names."""
     yield path if is_synthetic(path) else None
     if is_synthetic(path):
         return
-    for file in _files(path):
-        status = file.stat()
+    files = [path] if os.path.exists(path) else sorted(glob.glob(path))
+    if os.path.isdir(path):
+        files, count = [], 0
+        for folder, folders, names in os.walk(path):
+            folders.sort()
+            count += len(folders) + len(names)
+            if count > MAX_FILES:
+                raise SequenceError(f"{path}: more than {MAX_FILES} files: not a sequence")
+            # Without dangling links.
+            files += [file for name in sorted(names) if os.path.isfile(file := os.path.join(folder, name))]
+    for file in files:
+        status = os.stat(file)
         yield os.path.relpath(file, Path(path).parent), status.st_size, status.st_mtime_ns
-
-
-def _files(path: str) -> Iterator[Path]:
-    """The files below a folder or of a pattern, in an order that does not depend on the system."""
-    if not os.path.isdir(path):
-        yield from map(Path, [path] if os.path.exists(path) else sorted(glob.glob(path)))
-        return
-    count = 0
-    for folder, folders, names in os.walk(path):
-        folders.sort()
-        count += len(folders) + len(names)
-        if count > MAX_FILES:
-            raise SequenceError(f"{path}: more than {MAX_FILES} files: not a sequence")
-        for name in sorted(names):
-            file = Path(folder, name)
-            if file.is_file():  # not a dangling link
-                yield file

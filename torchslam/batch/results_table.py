@@ -18,7 +18,6 @@ from torchslam.utils.console import without_credentials
 from torchslam.utils.files import write_whole
 
 CSV = "table.csv"
-PARQUET = "table.parquet"
 TIMES_CSV = "times.csv"
 
 # Columns and their types, the same for every batch.
@@ -45,20 +44,17 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
     """Write the table of all rows of the list, those of other shards included; return the rows.
 
     Unfinished rows have the status `open`. Each process reads all results again after writing, so the table is complete
-    in the end whichever process writes last.
-
-    Raises:
-        ResultsError: The times of a run are not readable.
-        OSError: A file cannot be written.
+    in the end whichever process writes last. Raises ResultsError for damaged times of a run.
     """
     configurations = [_configuration(task) for task in tasks]
     rows: list[Columns] | None = None
     while (found := collect_rows(tasks, configurations, output)) != rows:
         rows = found
         _put(output / CSV, _csv(rows, COLUMNS).encode())
-        _put(output / TIMES_CSV, _csv(_times(rows, output), TIME_COLUMNS).encode())
+        times = [{"name": row["name"]} | read_times(output / RUNS / row["name"]) for row in rows]
+        _put(output / TIMES_CSV, _csv(times, TIME_COLUMNS).encode())
         if (content := _parquet(rows)) is not None:
-            _put(output / PARQUET, content)
+            _put(output / "table.parquet", content)
     return found
 
 
@@ -66,17 +62,13 @@ def describe_statuses(rows: Sequence[Mapping[str, Any]]) -> str:
     """Describe the number of rows per status."""
     statuses = [row["status"] for row in rows]
     labels = {DONE: "done", NO_MAP: "without a map", ERROR: "with an error", "open": "not yet run"}
-    found = [f"{statuses.count(status)} {label}" for status, label in labels.items() if status in statuses]
-    return ", ".join(found)
+    return ", ".join(f"{statuses.count(key)} {label}" for key, label in labels.items() if key in statuses)
 
 
 def collect_rows(tasks: Sequence[Task], configurations: Sequence[str], output: Path) -> list[Columns]:
     """Read the rows of the table from the records in the folder of a batch; an invalid record is an error row.
 
-    Args:
-        tasks: All rows of the list.
-        configurations: Configuration of each task by `task.configuration`; empty if that failed.
-        output: Folder of the batch.
+    The configuration of each task is that by `task.configuration`, empty if that failed.
     """
     rows = []
     for task, settings in zip(tasks, configurations, strict=True):
@@ -106,10 +98,6 @@ def _typed(value: object, kind: type) -> Any:
     return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
 
 
-def _times(rows: Sequence[Columns], output: Path) -> list[Columns]:
-    return [{"name": row["name"]} | read_times(output / RUNS / row["name"]) for row in rows]
-
-
 def read_times(folder: Path) -> Columns:
     """Read times.json; empty if there is none. Raises ResultsError if it is not readable."""
     return read_object(folder / TIMES, ResultsError) or {}
@@ -120,11 +108,7 @@ def _csv(rows: Sequence[Columns], columns: Mapping[str, type]) -> str:
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(columns)
-    for row in rows:
-        cells = (row.get(name) for name in columns)
-        writer.writerow(
-            ["" if cell is None else repr(cell) if isinstance(cell, float) else cell for cell in cells]
-        )
+    writer.writerows([row.get(name) for name in columns] for row in rows)
     return text.getvalue()
 
 

@@ -22,8 +22,6 @@ MAX_BYTES = 1 << 26
 MAX_NAME = 100
 """Characters of a name; folders are named by it."""
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+=-]*")
-SEPARATOR = ";"
-"""Of the settings in one cell."""
 
 
 @dataclass(frozen=True)
@@ -78,18 +76,19 @@ def read_list(path: str | Path) -> list[Row]:
         SequenceError: The list is not valid; the message has file and line.
     """
     path = Path(path)
-    table = _cells if path.suffix.lower() == ".csv" else _lines
-    rows: list[Row] = []
+    if path.suffix.lower() == ".csv":
+        table = _cells(path)
+    else:
+        table = ((where, {"sequence": line}) for where, line in numbered_lines(path, SequenceError))
     seen: dict[Row, str] = {}
-    for where, cells in table(path):
+    for where, cells in table:
         row = _row(cells, where, str(path.parent.absolute()))
         if row in seen:
             raise SequenceError(f"{where}: the same as {seen[row]}; give each its own name")
         seen[row] = where
-        rows.append(row)
-    if not rows:
+    if not seen:
         raise SequenceError(f"{path}: no sequences in the list")
-    return assign_names(rows, str(path))
+    return assign_names(seen, str(path))
 
 
 def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
@@ -106,10 +105,12 @@ def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
         raise SequenceError(f"{where}: {given[twice[0]]} rows are named {twice[0]}")
     taken, found = set(given), []
     for row in rows:
-        if not row.name:
-            row = replace(row, name=_free(short_name(row.sequence), taken))
-            taken.add(row.name.casefold())
-        found.append(row)
+        name, number, short = row.name, 1, short_name(row.sequence)
+        while not name or (not row.name and name.casefold() in taken):
+            name = short if number == 1 else f"{short}-{number}"
+            number += 1
+        taken.add(name.casefold())
+        found.append(replace(row, name=name))
     return found
 
 
@@ -120,29 +121,10 @@ def short_name(sequence: str) -> str:
     return text[:MAX_NAME] or "sequence"
 
 
-def _free(name: str, taken: set[str]) -> str:
-    number, found = 1, name
-    while found.casefold() in taken:
-        number += 1
-        found = f"{name}-{number}"
-    return found
-
-
-def _lines(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
-    for where, line in numbered_lines(path, SequenceError):
-        yield where, {"sequence": line}
-
-
 def _cells(path: Path) -> Iterator[tuple[str, dict[str, str]]]:
     """The place of each row, and its cells by column."""
     rows = read_cells(path, SequenceError, MAX_BYTES, ",")
     header = [name.strip() for name in next(rows, ("", []))[1]]
-    _check_header(header, path)
-    for where, cells in rows:
-        yield where, {name: cell.strip() for name, cell in zip(header, cells, strict=True) if cell.strip()}
-
-
-def _check_header(header: list[str], path: Path) -> None:
     for name in header:
         if name not in COLUMNS:
             near = difflib.get_close_matches(name, COLUMNS, n=1)
@@ -150,6 +132,8 @@ def _check_header(header: list[str], path: Path) -> None:
             raise SequenceError(f"{path}:1: unknown column `{name[:100]}`; {hint}")
     if len(set(header)) < len(header) or "sequence" not in header:
         raise SequenceError(f"{path}:1: the header must have `sequence`, and no column twice")
+    for where, cells in rows:
+        yield where, {name: cell.strip() for name, cell in zip(header, cells, strict=True) if cell.strip()}
 
 
 def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
@@ -166,16 +150,14 @@ def _row(cells: Mapping[str, str], where: str, folder: str) -> Row:
             f"at most {MAX_NAME}"
         )
     for key in ("stride", "limit"):
-        if key in values:
-            count = parse_count(values[key])
-            if not count:
-                raise SequenceError(f"{where}: {key} must be a positive integer, not `{values[key]}`")
-            values[key] = count
+        values[key] = parse_count(cells[key]) if key in cells else None
+        if key in cells and not values[key]:
+            raise SequenceError(f"{where}: {key} must be a positive integer, not `{cells[key]}`")
     if "fps" in values:
         values["fps"] = parse_number(values["fps"], f"{where}: fps", SequenceError)
         if values["fps"] <= 0:
             raise SequenceError(f"{where}: fps must be a positive number, not `{cells['fps']}`")
-    settings = (setting.strip() for setting in values.get("overrides", "").split(SEPARATOR))
+    settings = (setting.strip() for setting in values.get("overrides", "").split(";"))
     values["overrides"] = tuple(setting for setting in settings if setting)
     try:
         for setting in values["overrides"]:

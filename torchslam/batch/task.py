@@ -14,17 +14,9 @@ from typing import Any
 
 import torch
 
-from torchslam.batch.result_store import (
-    DIGITS,
-    DONE,
-    NO_MAP,
-    Columns,
-    hash_files,
-    program_hash,
-    run_or_reuse,
-)
+from torchslam.batch.result_store import DIGITS, DONE, NO_MAP, Columns, hash_files, program_hash, run_or_reuse
 from torchslam.batch.rows import Row
-from torchslam.calibration.find_camera import find_camera, with_stated_std
+from torchslam.calibration.find_camera import camera_remark, find_camera, with_stated_std
 from torchslam.config import Config, MetricConfig, load_config, to_toml
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.formats.depth_images import find_depth_images, parse_depth_folder
@@ -37,8 +29,7 @@ from torchslam.global_mapping.links import learned_config
 from torchslam.global_mapping.mapper import mapping_config
 from torchslam.global_mapping.recording import run_recording
 from torchslam.io.report import compute_metrics
-from torchslam.io.results import source_of
-from torchslam.io.write_run import write_run
+from torchslam.io.write_run import source_of, write_run
 from torchslam.metric.options import given_files, given_options, sources_of
 from torchslam.system.front_end import source
 from torchslam.system.online_run import OnlineRun
@@ -57,9 +48,7 @@ class Task:
     """A row with the options that all rows of a batch share.
 
     Attributes:
-        row: What to run.
         output: Folder of the batch.
-        device: Of torch.
         overwrite: Replace results of other settings, inputs or versions.
         plots: Draw plots and write view.html.
     """
@@ -84,14 +73,8 @@ class Task:
 def run_row(task: Mapping[str, Any]) -> Columns:
     """Run a sequence, evaluate it and write its results, unless they exist already.
 
-    The same task gives the same bytes (except `times.json`) in any process and after any other task: it runs on one
-    thread and keeps no state. It raises no Exception, see `run_or_reuse`.
-
-    Args:
-        task: A `Task` as a dictionary.
-
-    Returns:
-        Its row of the table.
+    The same task, a `Task` as a dictionary, gives the same bytes (except `times.json`) in any process and after any
+    other task: it runs on one thread and keeps no state. It raises no Exception, see `run_or_reuse`.
     """
     todo = Task.from_dict(task)
     with _one_thread(), warnings.catch_warnings():
@@ -106,38 +89,23 @@ def run_row(task: Mapping[str, Any]) -> Columns:
 
 
 def settings_of(row: Row) -> Config:
-    """Load the configuration of a row.
-
-    Raises:
-        ConfigError: It is not valid.
-    """
+    """Load the configuration of a row. Raises ConfigError if it is not valid."""
     return load_config(None if row.config is None else row.resolve(row.config), row.overrides)
 
 
 def configuration(task: Task) -> str:
-    """Hash everything that the results depend on except the input files.
-
-    Raises:
-        ConfigError: The settings of the row are not valid.
-    """
+    """Hash everything that the results depend on except the input files. Raises ConfigError for invalid settings."""
     row = asdict(replace(task.row, config=None, overrides=(), folder=""))
     settings, device = to_toml(settings_of(task.row)), torch.device(task.device).type
     return fingerprint([row, settings, device, task.plots, program_hash()], DIGITS)
 
 
 def _input(task: Task) -> str:
-    """Hash the files that the row reads."""
+    """Hash the files that the row reads, those with measurements and those that belong to them included."""
     row, settings = task.row, settings_of(task.row)
-    names = [row.sequence, row.groundtruth, row.mask, row.camera]
-    weights = [settings.features.weights, settings.matching.weights]
-    measured = _measured(settings.metric)
-    return hash_files([*(row.resolve(name) for name in names if name), *filter(None, weights), *measured])
-
-
-def _measured(config: MetricConfig) -> list[str]:
-    """The files with measurements, and those that belong to them."""
-    found = list[str]()
-    for option, name in given_files(config):
+    found = [row.resolve(name) for name in (row.sequence, row.groundtruth, row.mask, row.camera) if name]
+    found += filter(None, (settings.features.weights, settings.matching.weights))
+    for option, name in given_files(settings.metric):
         if option == "depth":
             images = find_depth_images(*parse_depth_folder(name))
             found += [str(images.source), *map(str, images.paths)]
@@ -145,17 +113,11 @@ def _measured(config: MetricConfig) -> list[str]:
             found.append(name)
         if option == "imu":  # how its numbers are to be read may be in a file beside it
             found.append(str(Path(glob.escape(str(Path(name).parent)), "*.yaml")))
-    return found
+    return hash_files(found)
 
 
 def open_row(row: Row) -> Sequence:
-    """Open the sequence of a row with its camera and ground truth.
-
-    Raises:
-        SequenceError: The sequence cannot be opened, or is a live source.
-        CalibrationError: The camera is not valid.
-        TrajectoryError: The ground truth is not valid.
-    """
+    """Open the sequence of a row with its camera and ground truth. Raises SequenceError for a live source."""
     if is_live(row.sequence) and not Path(row.resolve(row.sequence)).exists():
         raise SequenceError(f"{row.sequence}: a live source has no end and is not repeatable")
     camera = row.camera
@@ -196,34 +158,23 @@ def _run(task: Task, folder: Path) -> Columns:
         raise KeyboardInterrupt
     finished = replace(finished, config=replace(finished.config, metric=config.metric))
     seconds = time.process_time() - start
-    metrics = compute_metrics(finished, sequence, camera, mapped=mapped)
+    metrics = compute_metrics(finished, sequence, camera_remark(finished, camera), mapped=mapped)
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
     metrics |= source_of(row.resolve(row.sequence), row.fps, sequence)
-    write_run(
-        replace(finished, results=[replace(result, stage_ms={}) for result in finished.results]),
-        sequence,
-        metrics,
-        folder,
-        online=None if mapped is None else mapped.online,
-        plots=task.plots,
-        viewer=task.plots,
-    )
+    timeless = replace(finished, results=[replace(result, stage_ms={}) for result in finished.results])
+    before = None if mapped is None else mapped.online
+    write_run(timeless, sequence, metrics, folder, online=before, plots=task.plots, viewer=task.plots)
+    flat = {key: each for key, each in metrics.items() if each is None or isinstance(each, int | float | str)}
     return {
         "sequence": without_credentials(row.sequence),
         "status": NO_MAP if finished.failure else DONE,
         "error": finished.failure,
-        **_columns(metrics),
+        **flat,
+        **{f"rpe_{key}": value for key, value in metrics.get("rpe", {}).items()},
+        "submaps": len(metrics["submaps"]),
+        "skipped": len(metrics["skipped"]),
     }
-
-
-def _columns(metrics: Mapping[str, Any]) -> Columns:
-    """The columns of a row: the numbers and strings among the metrics."""
-    flat = {
-        key: value for key, value in metrics.items() if value is None or isinstance(value, int | float | str)
-    }
-    flat |= {f"rpe_{key}": value for key, value in metrics.get("rpe", {}).items()}
-    return {**flat, "submaps": len(metrics["submaps"]), "skipped": len(metrics["skipped"])}
 
 
 @contextmanager

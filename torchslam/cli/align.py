@@ -10,8 +10,6 @@ Exit status: 0 done, 2 an error, 3 no source determined the scale, and nothing w
 from __future__ import annotations
 
 import argparse
-import json
-from pathlib import Path
 from typing import Any
 
 from jaxtyping import Float
@@ -20,99 +18,64 @@ from torch import Tensor
 from torchslam.cli import arguments
 from torchslam.config import load_config
 from torchslam.data.trajectories import read_trajectory, write_trajectory
-from torchslam.errors import ConfigError, ResultsError, TrajectoryError
-from torchslam.evaluation import evaluate
+from torchslam.errors import ConfigError, ResultsError
+from torchslam.io import results as files
 from torchslam.io.export.ply import write_map_cloud
-from torchslam.io.export.scene import Images, open_images, scene_of
+from torchslam.io.export.scene import Images
 from torchslam.io.report import accuracy, unit_words
-from torchslam.io.results import (
-    DENSE_CLOUD,
-    DEPTHS,
-    KEYFRAMES,
-    MAP,
-    MESH,
-    METRICS,
-    ONLINE,
-    OTHER_TRAJECTORY,
-    PICTURE_NAMES,
-    PICTURES,
-    POINT_CLOUD,
-    TRAJECTORY,
-    aligned,
-    read_image_source,
-    read_metrics,
-    read_results,
-    readout_of,
-)
-from torchslam.io.viewer.page import write_view
-from torchslam.io.write_run import draw
+from torchslam.io.results import SavedRun, aligned, delete_dense, open_run, read_results, write_metrics
+from torchslam.io.write_run import redraw
 from torchslam.map.atlas import Submap
-from torchslam.map.file import SavedAtlas, read_atlas, write_atlas
+from torchslam.map.file import write_atlas
 from torchslam.metric.meters import bring_into_meters
 from torchslam.metric.options import KINDS, given_options, sources_of
 from torchslam.metric.source import SubmapView
 from torchslam.utils.console import say, table, warn
-from torchslam.utils.files import write_whole
-
-DONE = 0
-"""Exit status of a run in meters."""
-NOTHING = 3
-"""Exit status where no source determined the scale."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam align`."""
     arguments.add_directory(parser)
     arguments.add_metric(parser)
-    parser.add_argument(
-        "--images", metavar="PATH", help="the images of the run, if they are not where the run read them"
-    )
+    arguments.add_images(parser)
 
 
 def execute(options: argparse.Namespace) -> int:
     """Execute `torchslam align`; returns the exit status."""
-    directory: Path = options.directory
     sources = sources_of(given_options(load_config(None, arguments.metric_overrides(options)).metric))
     if not sources:
         flags = ", ".join(kind.options[0].flag for kind in KINDS)
         raise ConfigError(f"no source of scale: give one of {flags}")
-    if not directory.is_dir():
-        raise ResultsError(f"{directory}: no such results folder")
-    metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
-    session = int(metrics["session"])
+    run = open_run(options.directory)
     moved: dict[int, Float[Tensor, "4 4"]] = {}
     unmeasured: list[str] = []
-    for submap in saved.atlas:
-        if not submap.posed_frames.count(session):
+    for submap in run.submaps:
+        if not submap.posed_frames.count(run.session):
             continue
-        images = _images(directory, metrics, saved, submap, options.images)
-        view = SubmapView(submap, saved.camera, session, images, readout_of(metrics))
+        images = _images(run, submap, options.images)
+        view = SubmapView(submap, run.camera, run.session, images, run.readout)
         S_mw, silent = bring_into_meters(view, sources)
         moved |= {submap.number: S_mw} if submap.metric is not None else {}
-        if submap.number == metrics["submap"]:
+        if submap is run.main:
             unmeasured = [f"{each.source}: {each.reason}" for each in silent]
     for line in unmeasured:
         warn(line)
     if not moved:
-        say(f"{directory}: no source determined the scale; nothing was changed")
-        return NOTHING
-    metrics = _write(directory, metrics, saved, moved, unmeasured)
+        say(f"{run.directory}: no source determined the scale; nothing was changed")
+        return 3
+    metrics = _write(run, moved, unmeasured)
     for line in (metrics["metric"] or {}).get("remarks", ()):
         warn(line)
-    print(table({"unit": unit_words(metrics), "results": str(directory)} | accuracy(metrics)))
-    return DONE
+    print(table({"unit": unit_words(metrics), "results": str(run.directory)} | accuracy(metrics)))
+    return 0
 
 
-def _images(
-    directory: Path, metrics: dict[str, Any], saved: SavedAtlas, submap: Submap, elsewhere: str | None
-) -> Images | None:
+def _images(run: SavedRun, submap: Submap, elsewhere: str | None) -> Images | None:
     """The images of the run, by its frames; None and a message where they are not available."""
-    source = read_image_source(directory, metrics, saved.atlas, elsewhere)
-    if source is None:
-        return None
-    scene = scene_of(submap, saved.camera, int(metrics["session"]), keyframes_alone=False)
+    otherwise = "use --images for its new location"
     try:
-        return open_images(source, scene, otherwise="use --images for its new location")
+        scene = run.scene(submap, keyframes_alone=False)
+        return run.images(scene, elsewhere=elsewhere, otherwise=otherwise)
     except ResultsError as error:
         if elsewhere is not None:
             raise
@@ -120,43 +83,31 @@ def _images(
         return None
 
 
-def _write(
-    directory: Path,
-    metrics: dict[str, Any],
-    saved: SavedAtlas,
-    moved: dict[int, Float[Tensor, "4 4"]],
-    unmeasured: list[str],
-) -> dict[str, Any]:
+def _write(run: SavedRun, moved: dict[int, Float[Tensor, "4 4"]], unmeasured: list[str]) -> dict[str, Any]:
     """Write what depends on the unit; returns the metrics."""
-    results, main = read_results(directory), int(metrics["submap"])
-    by_number = {submap.number: submap for submap in saved.atlas}
-    session = results.session
-    for number, S_mw in moved.items():
-        submap = by_number[number]
-        name = TRAJECTORY if number == main else OTHER_TRAJECTORY.format(number)
+    directory, session, metrics = run.directory, run.session, run.metrics
+    results = read_results(directory)  # before anything changes: all of it can be read
+    for submap in run.submaps:
+        if submap.number not in moved:
+            continue
+        name = files.TRAJECTORY if submap is run.main else files.OTHER_TRAJECTORY.format(submap.number)
         write_trajectory(directory / name, submap.trajectory(session))  # markers have moved single poses
-        if number == main:
-            write_trajectory(directory / ONLINE, aligned(read_trajectory(directory / ONLINE), S_mw))
-            write_trajectory(directory / KEYFRAMES, submap.map.keyframe_trajectory(session))
-            write_map_cloud(directory / POINT_CLOUD, submap.map, session, submap.metric)
-    write_atlas(directory / MAP, saved.atlas, saved.camera, saved.sessions)
-    gone = [directory / name for name in (DENSE_CLOUD, DEPTHS, MESH) if (directory / name).exists()]
-    for path in [*gone, *(directory / PICTURES).glob(PICTURE_NAMES)]:
-        path.unlink()
-    if gone:
+        if submap is run.main:
+            online = aligned(read_trajectory(directory / files.ONLINE), moved[submap.number])
+            write_trajectory(directory / files.ONLINE, online)
+            write_trajectory(directory / files.KEYFRAMES, submap.map.keyframe_trajectory(session))
+            write_map_cloud(directory / files.POINT_CLOUD, submap.map, session, submap.metric)
+    write_atlas(directory / files.MAP, run.submaps, run.camera, run.sessions)
+    if delete_dense(directory):
         say(
             f"dense depth had another scale and is removed; `torchslam densify {directory}` computes it again"
         )
         metrics.pop("dense", None)
-    metric = by_number[main].metric
+    main = run.main
+    metric = None if main is None else main.metric
     metrics |= {"metric": None if metric is None else metric.as_dict(), "unmeasured": unmeasured}
-    if results.groundtruth is not None and "ate_m" in metrics:
-        try:
-            metrics |= evaluate(by_number[main].trajectory(session), results.groundtruth).as_dict()
-        except TrajectoryError as error:
-            warn(f"no evaluation: {error}")
-    write_whole(directory / METRICS, (json.dumps(metrics, indent=2) + "\n").encode())
-    written = read_results(directory)
-    draw(written, directory)
-    write_view(written, directory)
+    evaluation = results.evaluation(main.trajectory(session)) if main and "ate_m" in metrics else None
+    metrics |= {} if evaluation is None else evaluation.as_dict()
+    write_metrics(directory, metrics)
+    redraw(directory)
     return metrics

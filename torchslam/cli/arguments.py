@@ -36,6 +36,7 @@ AUTO = "auto"
 """The readout of a rolling shutter that is to be found."""
 READOUTS_MS = {"kinect": 30.0}
 """Readouts by name, milliseconds: that of the Kinect's color camera at 30 frames a second."""
+METRIC_OPTIONS = [option for kind in KINDS for option in kind.options]
 GIVEN_READOUT_STD_MS = 1.0
 """Standard deviation of a readout that is given, milliseconds. Tried at this value only."""
 
@@ -80,10 +81,14 @@ def add_reading(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_output(parser: argparse.ArgumentParser, content: str = "the results") -> None:
+def add_output(
+    parser: argparse.ArgumentParser, content: str = "the results", default: Path | None = None
+) -> None:
     """Add the argument for the folder that a command writes."""
+    about = f"folder for {content}" + ("" if default is None else " (default: %(default)s)")
+    needed = default is None
     parser.add_argument(
-        "--output", "-o", type=Path, required=True, metavar="DIR", help=f"folder for {content}"
+        "--output", "-o", type=Path, required=needed, default=default, metavar="DIR", help=about
     )
 
 
@@ -92,13 +97,14 @@ def add_directory(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("directory", type=Path, metavar="DIR", help="folder that `torchslam run` wrote")
 
 
-def sequence(options: argparse.Namespace, camera: Calibration | None = None) -> Sequence:
-    """Open the sequence given by the arguments of `add_sequence`; print its notes to stderr.
+def add_images(parser: argparse.ArgumentParser) -> None:
+    """Add the argument for the location of a run's images."""
+    about = "the images of the run, if they are not where the run read them"
+    parser.add_argument("--images", metavar="PATH", help=about)
 
-    Args:
-        options: the arguments.
-        camera: the camera if the user gives none.
-    """
+
+def sequence(options: argparse.Namespace, camera: Calibration | None = None) -> Sequence:
+    """Open the sequence of the arguments of `add_sequence`, with `camera` if the user gives none; say its notes."""
     from torchslam.data import open_sequence
 
     found = open_sequence(
@@ -188,14 +194,9 @@ def config(options: argparse.Namespace) -> Config:
 
 def overrides(options: argparse.Namespace) -> list[str]:
     """Return the changes that the arguments of `add_config` make to the file, as `section.key=value`."""
-    named = {
-        "features.kind": options.features,
-        "features.weights": options.weights,
-        "matching.matcher": options.matcher,
-        "camera.std": options.camera_std,
-        "scale": options.scale,
-        "seed": options.seed,
-    }
+    named = {"features.kind": options.features, "features.weights": options.weights}
+    named |= {"matching.matcher": options.matcher, "camera.std": options.camera_std}
+    named |= {"scale": options.scale, "seed": options.seed}
     if options.readout != AUTO:
         named["camera.readout"] = options.readout
         named["camera.readout_std"] = GIVEN_READOUT_STD_MS if options.readout else 0.0
@@ -207,7 +208,7 @@ def add_metric(parser: argparse.ArgumentParser) -> None:
     """Add the options that give the map meters: those of `metric.options.KINDS`."""
     group = parser.add_argument_group("meters", "measurements that determine the scale; each can be repeated")
     about = descriptions(MetricConfig)
-    for option in (option for kind in KINDS for option in kind.options):
+    for option in METRIC_OPTIONS:
         words = about[option.name].replace("%", "%%")
         group.add_argument(
             option.flag,
@@ -223,7 +224,7 @@ def metric_overrides(options: argparse.Namespace) -> list[str]:
     """Return the changes that the arguments of `add_metric` make to the configuration, as `section.key=value`."""
     numbers = {each.name for each in fields(MetricConfig) if isinstance(each.default, float)}
     changes = []
-    for option in (option for kind in KINDS for option in kind.options):
+    for option in METRIC_OPTIONS:
         times = getattr(options, f"metric_{option.name}", None)
         if times and option.name in numbers:
             changes.append(f"metric.{option.name}={_given_once(option.flag, times)!r}")
@@ -233,11 +234,7 @@ def metric_overrides(options: argparse.Namespace) -> list[str]:
 
 
 def metric_sources(config: MetricConfig, sequence: Sequence) -> list[MetricSource]:
-    """Make the sources that measure the unit of a sequence's map.
-
-    Raises:
-        TorchslamError: an option or a file that it names is wrong, or does not fit the sequence.
-    """
+    """Make the sources that measure the unit of a sequence's map. Raises TorchslamError for a wrong option or file."""
     from torchslam.metric.distances import Distances
 
     sources = sources_of(given_options(config, sequence.measurements))

@@ -24,6 +24,7 @@ Exit status: 0 all sequences of this call are done ("no map" is a result), 4 som
 from __future__ import annotations
 
 import argparse
+import itertools
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -87,10 +88,14 @@ def execute(options: argparse.Namespace) -> int:
     output, device = str(options.output.absolute()), options.device
     tasks = [Task(row, output, str(device), options.overwrite, not options.no_plots) for row in rows]
     engine = Engine(options.engine, options.workers, options.address, int(device.type == "cuda"))
-    shard = None if options.shard is None else parse_shard(options.shard)
+    shard, number = parse_shard(options.shard or "0/1"), itertools.count(1)
+    count = len(tasks[shard.index :: shard.count])
+
+    def report(columns: Columns) -> None:
+        say(f"{next(number)}/{count} {_describe(columns)}")
+
     with _ended_by_signals():
-        progress = _Progress(len(tasks) if shard is None else len(tasks[shard.index :: shard.count]))
-        found = run_batch(tasks, engine, shard, progress.report)
+        found = run_batch(tasks, engine, shard, report)
     new = sum(columns["is_new"] for columns in found)
     print(f"{len(found)} sequences: {describe_statuses(found)}; {len(found) - new} of them already existed")
     print(f"table: {options.output / CSV}")
@@ -109,22 +114,15 @@ def _defaults(options: argparse.Namespace) -> dict[str, Any]:
     return said
 
 
-class _Progress:
-    """Progress output: a line on stderr per sequence."""
-
-    def __init__(self, count: int) -> None:
-        self._count, self._done = count, 0
-
-    def report(self, columns: Columns) -> None:
-        self._done += 1
-        words = columns["status"]
-        if columns["status"] == DONE:
-            words = f"{columns['posed']} of {columns['frames']} frames posed"
-            words += f", ATE {columns['ate_m']:.4f} m" if "ate_m" in columns else ""
-        elif columns["error"]:
-            words += f": {columns['error']}"
-        before = "" if columns["is_new"] else " (already existed)"
-        say(f"{self._done}/{self._count} {columns['name']}: {words}{before}")
+def _describe(columns: Columns) -> str:
+    """The outcome of a sequence, for a line on stderr."""
+    words = str(columns["status"])
+    if columns["status"] == DONE:
+        words = f"{columns['posed']} of {columns['frames']} frames posed"
+        words += f", ATE {columns['ate_m']:.4f} m" if "ate_m" in columns else ""
+    elif columns["error"]:
+        words += f": {columns['error']}"
+    return f"{columns['name']}: {words}" + ("" if columns["is_new"] else " (already existed)")
 
 
 @contextmanager

@@ -17,14 +17,7 @@ DEMO_SEQUENCE = "synthetic:room"
 
 def add_arguments_demo(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam demo`."""
-    parser.add_argument(
-        "--output",
-        "-o",
-        type=Path,
-        default=Path("results/demo"),
-        metavar="DIR",
-        help="folder for the results (default: %(default)s)",
-    )
+    arguments.add_output(parser, default=Path("results/demo"))
     arguments.add_device(parser)
     arguments.add_config(parser)
 
@@ -44,12 +37,8 @@ def execute_demo(options: argparse.Namespace) -> int:
 
 def add_arguments_eval(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam eval`."""
-    parser.add_argument(
-        "estimate",
-        type=Path,
-        metavar="ESTIMATE",
-        help="estimated trajectory, or folder that `torchslam run` wrote",
-    )
+    about = "estimated trajectory, or folder that `torchslam run` wrote"
+    parser.add_argument("estimate", type=Path, metavar="ESTIMATE", help=about)
     parser.add_argument("groundtruth", type=Path, metavar="GROUNDTRUTH", help="true trajectory")
     parser.add_argument("--json", action="store_true", help="print all figures as JSON instead of a table")
 
@@ -76,13 +65,9 @@ def add_arguments_plot(parser: argparse.ArgumentParser) -> None:
 
 def execute_plot(options: argparse.Namespace) -> int:
     """Redraw the plots and view.html of a run from its results folder."""
-    from torchslam.io.results import read_results
-    from torchslam.io.viewer.page import write_view
-    from torchslam.io.write_run import draw
+    from torchslam.io.write_run import redraw
 
-    results = read_results(options.directory)
-    for path in [*draw(results, options.directory), write_view(results, options.directory)]:
-        print(path)
+    print(*redraw(options.directory), sep="\n")
     return 0
 
 

@@ -11,41 +11,27 @@ Exit status: 0 done, 2 an error; 130 ended by Ctrl-C.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import re
 import warnings
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
 from torchslam.cli import arguments
 from torchslam.cli.progress import shown_warnings
 from torchslam.config import CHOICES, load_config
-from torchslam.densify import DenseSummary, densify
+from torchslam.densify import densify
 from torchslam.densify.views import views_of
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.io.export.mesh import import_open3d, write_mesh
 from torchslam.io.export.ply import upright_from_map, write_cloud
-from torchslam.io.export.scene import open_images, pinhole_within, scene_of
-from torchslam.io.results import (
-    CONFIG,
-    DENSE_CLOUD,
-    DEPTHS,
-    MAP,
-    MESH,
-    METRICS,
-    read_image_source,
-    read_metrics,
-    read_results,
-    readout_of,
-)
-from torchslam.io.viewer.page import VIEW, write_view
-from torchslam.map.file import read_atlas
+from torchslam.io.export.scene import pinhole_within
+from torchslam.io.results import CONFIG, DENSE_CLOUD, DEPTHS, MAP, MESH, open_run, write_metrics
+from torchslam.io.viewer.page import VIEW
+from torchslam.io.write_run import redraw
 from torchslam.parallel.workers import processors
 from torchslam.utils.console import table, tqdm_options
-from torchslam.utils.files import write_whole
 
 LONG_SIDE = 320
 """Default resolution: about a second per keyframe."""
@@ -59,9 +45,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam densify`."""
     arguments.add_directory(parser)
     add_options(parser)
-    parser.add_argument(
-        "--images", metavar="PATH", help="the images of the run, if they are not where the run read them"
-    )
+    arguments.add_images(parser)
     parser.add_argument(
         "--processes",
         type=arguments.at_least(1),
@@ -110,72 +94,34 @@ def densify_results(directory: Path, options: argparse.Namespace) -> dict[str, s
         directory: the results folder.
         options: those of `torchslam densify`, or of `torchslam run --dense`, which has some of them.
     """
-    device, every = options.device, options.every
+    device, every, rows = options.device, options.every, dict[str, str]()
     if options.mesh:
         import_open3d()
-    started = _cpu_seconds()
-    if not directory.is_dir():
-        raise ResultsError(f"{directory}: no such results folder")
-    metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
+    started = sum(os.times()[:4])  # of this process and of those that it has waited for
+    run = open_run(directory)
     config = load_config(directory / CONFIG if (directory / CONFIG).is_file() else None)
     aggregation = options.aggregation or config.dense.aggregation
-    submap = next((each for each in saved.atlas if each.number == metrics["submap"]), None)
-    if submap is None:
+    if run.main is None:
         raise ResultsError(f"{directory / MAP}: no map to get depth for")
-    source = read_image_source(directory, metrics, saved.atlas, options.images)
-    if source is None:
-        raise ResultsError(
-            f"{directory / METRICS}: the location of the images is unknown; give it with --images"
-        )
-    scene = scene_of(submap, saved.camera, int(metrics["session"]), every is None, readout_of(metrics))
+    scene = run.scene(run.main, every is None)
     size = map_size(options.resolution, pinhole_within(scene.camera).size)
     views = views_of(scene, size, every)
-    elsewhere = "use --images for its new location"
-    opened = open_images(source, scene, views.camera, elsewhere)
-    folder = directory / DEPTHS.parent
-    with tqdm(
-        total=2 * len(views),
-        **tqdm_options(),
-        bar_format="depth {n_fmt}/{total_fmt} |{bar:24}| {remaining} left",
-    ) as bar:
+    images = run.images(scene, views.camera, options.images, "use --images for its new location")
+    layout = "depth {n_fmt}/{total_fmt} |{bar:24}| {remaining} left"
+    with tqdm(total=2 * len(views), **tqdm_options(), bar_format=layout) as bar, shown_warnings():
 
         def on_progress(done: int, total: int) -> None:
             bar.total = total  # less where images are skipped
             bar.update(done - bar.n)
 
-        with shown_warnings():
-            count = options.processes or min(processors(), MAX_PROCESSES)
-            if (options.processes or 1) > 1 and device.type != "cpu":
-                warnings.warn("--processes is for the CPU: a GPU computes in one process", stacklevel=2)
-            found = densify(views, opened, folder, device, on_progress, count, aggregation == "learned")
-    write_cloud(directory / DENSE_CLOUD, found.cloud, upright_from_map(submap.map, submap.metric))
-    about = {"dense": _figures(found, size, aggregation, _cpu_seconds() - started)}
-    write_whole(directory / METRICS, (json.dumps(metrics | about, indent=2) + "\n").encode())
-    if (directory / VIEW).exists():
-        write_view(read_results(directory), directory)
-    (directory / MESH).unlink(missing_ok=True)
-    rows = {
-        "depth maps": f"{found.views} of {size[0]} x {size[1]} pixels",
-        "kept": f"{found.kept:.0%} of the pixels, mean confidence {found.confidence:.2f}",
-        "points": f"{len(found.cloud)}, voxels of {found.voxel:.4g} map units",
-        "dense": f"{directory / DENSE_CLOUD}, {folder}",
-    }
-    if options.mesh:
-        made = write_mesh(
-            directory / MESH, directory / DEPTHS, upright_from_map(submap.map, submap.metric), opened
-        )
-        rows["mesh"] = f"{directory / MESH}, {made.triangles} triangles, voxels of {made.voxel:.4g} map units"
-    return rows
-
-
-def _cpu_seconds() -> float:
-    """Processor seconds of this process and of those that it has waited for."""
-    return sum(os.times()[:4])
-
-
-def _figures(found: DenseSummary, size: tuple[int, int], aggregation: str, seconds: float) -> dict[str, Any]:
-    """The entry `dense` of metrics.json."""
-    return {
+        count = options.processes or min(processors(), MAX_PROCESSES)
+        if (options.processes or 1) > 1 and device.type != "cpu":
+            warnings.warn("--processes is for the CPU: a GPU computes in one process", stacklevel=2)
+        folder = directory / DEPTHS.parent
+        found = densify(views, images, folder, device, on_progress, count, aggregation == "learned")
+    R_up = upright_from_map(run.main.map, run.main.metric)
+    write_cloud(directory / DENSE_CLOUD, found.cloud, R_up)
+    figures = {
         "depth_maps": found.views,
         "skipped": len(found.skipped),
         "size": list(size),
@@ -184,7 +130,21 @@ def _figures(found: DenseSummary, size: tuple[int, int], aggregation: str, secon
         "confidence": found.confidence,
         "points": len(found.cloud),
         "voxel": found.voxel,
-        "cpu_s": seconds,
+        "cpu_s": sum(os.times()[:4]) - started,
+    }
+    write_metrics(directory, run.metrics | {"dense": figures})
+    if (directory / VIEW).exists():
+        redraw(directory, plots=False)
+    (directory / MESH).unlink(missing_ok=True)
+    if options.mesh:
+        made = write_mesh(directory / MESH, directory / DEPTHS, R_up, images)
+        rows["mesh"] = f"{directory / MESH}, {made.triangles} triangles, voxels of {made.voxel:.4g} map units"
+    return {
+        "depth maps": f"{found.views} of {size[0]} x {size[1]} pixels",
+        "kept": f"{found.kept:.0%} of the pixels, mean confidence {found.confidence:.2f}",
+        "points": f"{len(found.cloud)}, voxels of {found.voxel:.4g} map units",
+        "dense": f"{directory / DENSE_CLOUD}, {folder}",
+        **rows,
     }
 
 

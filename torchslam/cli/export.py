@@ -28,7 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -39,42 +39,26 @@ from torchslam.dense.cloud import PointCloud
 from torchslam.dense.depth_maps import read_frames
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
-from torchslam.io.export.colmap import colmap_camera, write_colmap
-from torchslam.io.export.depths import MAX_POINTS, enlarged, write_workspace
+from torchslam.io.export.colmap import colmap_camera, write_colmap, write_workspace
 from torchslam.io.export.mesh import import_open3d, write_mesh
 from torchslam.io.export.nerfstudio import IMAGES, write_nerfstudio
-from torchslam.io.export.ply import read_cloud, upright_from_map, write_cloud, write_map_cloud
+from torchslam.io.export.ply import MAX_DRAWN, read_cloud, upright_from_map, write_cloud, write_map_cloud
 from torchslam.io.export.recording import import_rerun, write_recording
 from torchslam.io.export.scene import (
-    WITHOUT,
     ExportedScene,
     Images,
-    ImageSource,
-    open_images,
+    enlarged,
     pinhole_within,
-    scene_of,
     undistorted,
     write_images,
 )
-from torchslam.io.results import (
-    DENSE_CLOUD,
-    DEPTHS,
-    MAP,
-    OTHER_TRAJECTORY,
-    TRAJECTORY,
-    read_image_source,
-    read_metrics,
-    readout_of,
-)
+from torchslam.io.results import DENSE_CLOUD, DEPTHS, OTHER_TRAJECTORY, TRAJECTORY, SavedRun, open_run
 from torchslam.map.atlas import Submap
-from torchslam.map.file import read_atlas
 from torchslam.types import Trajectory
 from torchslam.utils.console import table
 
 FOLDER = "export"  # in the folder of results
 MODEL = Path("sparse") / "0"  # where COLMAP's programs and trainers of splats look for it
-WORKSPACE = "dense"  # for COLMAP's programs
-SPLAT_START = "points3D.ply"  # in MODEL: what 3D Gaussian Splatting reads instead of the points of the model
 
 
 @dataclass(frozen=True)
@@ -82,25 +66,21 @@ class Job:
     """An export: what to write and where.
 
     Attributes:
-        directory: results folder; `metrics`: its metrics.
-        submap, camera: from its map.
-        source: of the images; None if they are not exported.
+        run: what is exported, of its `submap`.
+        output: file or folder to write.
+        keyframes_alone: export keyframes instead of all posed frames.
         undistort: convert images and keypoints to a pinhole camera.
+        has_images: images are part of it.
+        sequence: new location of the images, if they were moved.
     """
 
-    directory: Path
-    metrics: dict[str, Any]
+    run: SavedRun
     submap: Submap
-    camera: Camera
     output: Path
     keyframes_alone: bool
     undistort: bool
-    source: ImageSource | None
-
-    @property
-    def session(self) -> int:
-        """Number of the run on the map."""
-        return int(self.metrics["session"])
+    has_images: bool
+    sequence: str | None
 
     @property
     def R_up(self) -> Float[torch.Tensor, "3 3"]:
@@ -110,76 +90,48 @@ class Job:
     @property
     def depths(self) -> Path | None:
         """The file of the depth maps of the exported submap; None if there are none."""
-        path = self.directory / DEPTHS
-        return path if self.is_main and path.exists() else None
+        path = self.run.directory / DEPTHS
+        return path if self.submap is self.run.main and path.exists() else None
 
     @property
     def cloud(self) -> PointCloud | None:
         """The dense cloud in the world of the exported submap; None if there is none."""
-        path = self.directory / DENSE_CLOUD
-        return read_cloud(path, self.R_up) if self.is_main and path.exists() else None
-
-    @property
-    def is_main(self) -> bool:
-        """Whether the exported submap is the main one."""
-        return bool(self.submap.number == self.metrics["submap"])
+        path = self.run.directory / DENSE_CLOUD
+        return read_cloud(path, self.R_up) if self.submap is self.run.main and path.exists() else None
 
     def scene(
         self, pinhole: Camera | None = None, frame_ids: Int[torch.Tensor, " R"] | None = None
     ) -> tuple[ExportedScene, Images | None]:
-        """The exported scene and its images, if requested. Raises ResultsError if they cannot be read.
+        """The exported scene and its images, if requested, as requested or of other frames and another camera.
 
-        Args:
-            pinhole: camera to undistort to; None: as requested.
-            frame_ids: the frames to export; None: as requested.
+        Raises ResultsError if the images cannot be read.
         """
-        alone = self.keyframes_alone and frame_ids is None
-        scene = scene_of(self.submap, self.camera, self.session, alone, readout_of(self.metrics))
+        scene = self.run.scene(self.submap, self.keyframes_alone and frame_ids is None)
         if frame_ids is not None:
             scene = scene.of_frames(frame_ids)
         if pinhole is None and self.undistort:
             pinhole = pinhole_within(scene.camera)
-        images = None
-        if self.source is not None:
-            images = open_images(self.source, scene, pinhole)
+        images = self.run.images(scene, pinhole, self.sequence) if self.has_images else None
         return (scene if pinhole is None else undistorted(scene, pinhole)), images
 
-    def trajectory(self) -> Trajectory:
-        """The poses of the run in the submap; those of all frames are read, since localization adds none to the map."""
-        if self.keyframes_alone:
-            return self.submap.map.keyframe_trajectory(self.session)
-        name = TRAJECTORY if self.is_main else OTHER_TRAJECTORY.format(self.submap.number)
-        return read_trajectory(self.directory / name)
 
-
-@dataclass(frozen=True)
-class Target:
-    """An export format.
-
-    Attributes:
-        write: writes the export and returns rows for `table`.
-        name: file or folder name.
-        is_of_images: whether the format includes images.
-        keyframes: whether only keyframes are exported by default.
-    """
+class Target(NamedTuple):
+    """An export format: its writer, which returns rows for `table`, and the name of its file or folder."""
 
     write: Callable[[Job], dict[str, str]]
     name: str
-    is_of_images: bool
-    keyframes: bool
+    is_of_images: bool = True
+    """The format includes images."""
+    keyframes: bool = True
+    """By default only keyframes are exported."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam export`."""
     arguments.add_directory(parser)
     parser.add_argument("--to", choices=TARGETS, required=True, help="export format")
-    parser.add_argument(
-        "--output",
-        "-o",
-        type=Path,
-        metavar="PATH",
-        help=f"file or folder to write (default: in DIR/{FOLDER})",
-    )
+    about = f"file or folder to write (default: in DIR/{FOLDER})"
+    parser.add_argument("--output", "-o", type=Path, metavar="PATH", help=about)
     parser.add_argument("--overwrite", action="store_true", help="replace existing files")
     parser.add_argument(
         "--frames",
@@ -205,49 +157,28 @@ def execute(options: argparse.Namespace) -> int:
         import_rerun()
     if options.to == "mesh":
         import_open3d()
-    job = _job(options, target)
-    _make_way(job.output, options.overwrite)
-    written = target.write(job)
-    print(table(written | {"written": str(job.output)}))
-    return 0
-
-
-def _job(options: argparse.Namespace, target: Target) -> Job:
-    """Build the export from the arguments. Raises ResultsError if the results lack something."""
-    directory = options.directory
-    if not directory.is_dir():
-        raise ResultsError(f"{directory}: no such results folder")
-    metrics, saved = read_metrics(directory), read_atlas(directory / MAP)
-    number = metrics["submap"] if options.submap is None else options.submap
-    submaps = {submap.number: submap for submap in saved.atlas}
+    run = open_run(options.directory)
+    number = run.metrics["submap"] if options.submap is None else options.submap
+    submaps = {submap.number: submap for submap in run.submaps}
     if not submaps:
-        raise ResultsError(f"{directory}: contains no map: {metrics.get('failure', '')}")
+        raise ResultsError(f"{run.directory}: contains no map: {run.metrics.get('failure', '')}")
     if number not in submaps:
-        raise ResultsError(f"{directory}: no submap {number}: there are {', '.join(map(str, submaps))}")
-    keyframes_alone = options.frames == "keyframes" or (options.frames is None and target.keyframes)
-    source = None
-    if target.is_of_images and not options.no_images:
-        source = read_image_source(directory, metrics, saved.atlas, options.sequence)
-        if source is None:
-            raise ResultsError(f"{directory}: the location of the images is unknown: {WITHOUT}")
-    return Job(
-        directory=directory,
-        metrics=metrics,
-        submap=submaps[number],
-        camera=saved.camera,
-        output=options.output or directory / FOLDER / target.name,
-        keyframes_alone=keyframes_alone,
+        raise ResultsError(f"{run.directory}: no submap {number}: there are {', '.join(map(str, submaps))}")
+    job = Job(
+        run,
+        submaps[number],
+        output=options.output or run.directory / FOLDER / target.name,
+        keyframes_alone=target.keyframes if options.frames is None else options.frames == "keyframes",
         undistort=options.undistort or options.to == "rerun",
-        source=source,
+        has_images=target.is_of_images and not options.no_images,
+        sequence=options.sequence,
     )
-
-
-def _make_way(output: Path, overwrite: bool) -> None:
-    """Create the parent folder of an export. Raises ResultsError if it would replace something."""
-    is_taken = any(output.iterdir()) if output.is_dir() else output.exists()
-    if is_taken and not overwrite:
-        raise ResultsError(f"{output}: already exists; --overwrite replaces it")
-    output.parent.mkdir(parents=True, exist_ok=True)
+    is_taken = any(job.output.iterdir()) if job.output.is_dir() else job.output.exists()
+    if is_taken and not options.overwrite:
+        raise ResultsError(f"{job.output}: already exists; --overwrite replaces it")
+    job.output.parent.mkdir(parents=True, exist_ok=True)
+    print(table(target.write(job) | {"written": str(job.output)}))
+    return 0
 
 
 def _colmap(job: Job) -> dict[str, str]:
@@ -256,14 +187,15 @@ def _colmap(job: Job) -> dict[str, str]:
         write_images(job.output / IMAGES, scene, images)
     write_colmap(job.output / MODEL, scene)
     about = {"camera": colmap_camera(scene.camera)[0]} | _describe_scene(job, scene)
-    cloud = job.cloud
-    (job.output / MODEL / SPLAT_START).unlink(missing_ok=True)
+    # What 3D Gaussian Splatting reads instead of the points of the model.
+    cloud, start = job.cloud, job.output / MODEL / "points3D.ply"
+    start.unlink(missing_ok=True)
     if cloud is not None:
-        write_cloud(job.output / MODEL / SPLAT_START, cloud.thinned(MAX_POINTS))
+        write_cloud(start, cloud.thinned(MAX_DRAWN))
     if job.depths is not None:
         frame_ids, camera = read_frames(job.depths)
         dense, small_images = job.scene(camera, frame_ids)
-        write_workspace(job.output / WORKSPACE, dense, job.depths, cloud, small_images)
+        write_workspace(job.output / "dense", dense, job.depths, cloud, small_images)
     return about | _describe_dense(job, cloud)
 
 
@@ -273,7 +205,7 @@ def _nerfstudio(job: Job) -> dict[str, str]:
         scene, images = job.scene()
     else:
         frame_ids, camera = read_frames(depths)
-        scene, images = job.scene(enlarged(camera, job.camera), frame_ids)
+        scene, images = job.scene(enlarged(camera, job.run.camera), frame_ids)
     if images is not None:
         write_images(job.output / IMAGES, scene, images)
     cloud = job.cloud
@@ -282,15 +214,14 @@ def _nerfstudio(job: Job) -> dict[str, str]:
 
 
 def _rerun(job: Job) -> dict[str, str]:
-    scene, images = job.scene()
-    cloud = job.cloud
+    (scene, images), cloud = job.scene(), job.cloud
     write_recording(job.output, scene, job.R_up, images, cloud, job.depths)
     return _describe_scene(job, scene) | _describe_dense(job, cloud)
 
 
 def _mesh(job: Job) -> dict[str, str]:
     if job.depths is None:
-        raise ResultsError(f"{job.directory / DEPTHS}: no depth maps: `torchslam densify` writes them")
+        raise ResultsError(f"{job.run.directory / DEPTHS}: no depth maps: `torchslam densify` writes them")
     frame_ids, camera = read_frames(job.depths)
     images = job.scene(camera, frame_ids)[1]
     size = write_mesh(job.output, job.depths, job.R_up, images)
@@ -314,14 +245,14 @@ def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
     error = float(scene.point_errors().mean()) if len(scene.points_w) else 0.0
     frames = f"{len(scene.T_cw)}, {int(scene.is_keyframe.sum())} of them keyframes"
     if job.keyframes_alone:
-        posed = job.submap.posed_frames.count(job.session)
+        posed = job.submap.posed_frames.count(job.run.session)
         frames = f"{len(scene.T_cw)} keyframes of {posed} posed frames; --frames all exports all of them"
     about = {
         "frames": frames,
         "points": f"{len(scene.points_w)} in {len(scene.pixels)} observations",
         "error": f"{error:.4f} px, mean over the points",
     }
-    if readout := readout_of(job.metrics):
+    if readout := job.run.readout:
         about["keypoints"] = (
             f"corrected to the middle row of each image, for a readout of {readout.description()}; images are not"
         )
@@ -329,25 +260,28 @@ def _describe_scene(job: Job, scene: ExportedScene) -> dict[str, str]:
 
 
 def _ply(job: Job) -> dict[str, str]:
-    write_map_cloud(job.output, job.submap.map, job.session, job.submap.metric)
-    keyframes = len(job.submap.map.keyframe_rows(job.session))
+    write_map_cloud(job.output, job.submap.map, job.run.session, job.submap.metric)
+    keyframes = len(job.submap.map.keyframe_rows(job.run.session))
     return {"points": f"{job.submap.map.num_points}, and {keyframes} keyframes"}
 
 
-def _trajectory(write: Callable[[Path, Trajectory], None], job: Job) -> dict[str, str]:
-    trajectory = job.trajectory()
+def _poses(write: Callable[[Path, Trajectory], None], job: Job) -> dict[str, str]:
+    if job.keyframes_alone:
+        trajectory = job.submap.map.keyframe_trajectory(job.run.session)
+    else:  # from the file, since localization adds no poses to the map
+        is_main, number = job.submap is job.run.main, job.submap.number
+        name = TRAJECTORY if is_main else OTHER_TRAJECTORY.format(number)
+        trajectory = read_trajectory(job.run.directory / name)
     write(job.output, trajectory)
     return {"poses": str(len(trajectory))}
 
 
 TARGETS = {
-    "colmap": Target(_colmap, "colmap", is_of_images=True, keyframes=True),
-    "nerfstudio": Target(_nerfstudio, "nerfstudio", is_of_images=True, keyframes=True),
-    "ply": Target(_ply, "map.ply", is_of_images=False, keyframes=True),
-    "rerun": Target(_rerun, "recording.rrd", is_of_images=True, keyframes=False),
-    "tum": Target(
-        partial(_trajectory, write_trajectory), "trajectory.txt", is_of_images=False, keyframes=False
-    ),
-    "kitti": Target(partial(_trajectory, write_kitti), "kitti", is_of_images=False, keyframes=False),
-    "mesh": Target(_mesh, "mesh.ply", is_of_images=True, keyframes=True),
+    "colmap": Target(_colmap, "colmap"),
+    "nerfstudio": Target(_nerfstudio, "nerfstudio"),
+    "ply": Target(_ply, "map.ply", is_of_images=False),
+    "rerun": Target(_rerun, "recording.rrd", keyframes=False),
+    "tum": Target(partial(_poses, write_trajectory), "trajectory.txt", is_of_images=False, keyframes=False),
+    "kitti": Target(partial(_poses, write_kitti), "kitti", is_of_images=False, keyframes=False),
+    "mesh": Target(_mesh, "mesh.ply"),
 }

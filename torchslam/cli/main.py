@@ -21,51 +21,30 @@ from torchslam.utils.console import printable, say, with_install_hint, without_c
 
 ERROR = 2
 """Exit status of an error, as of argparse."""
-INTERRUPTED = 130
-"""Exit status after Ctrl-C: 128 and the number of the signal, as of shells."""
 
-# Module and first line of the description of each command; only the module of the requested command is imported.
+# The first line of the description of each command.
 COMMANDS = {
-    "run": ("run", "run SLAM on a sequence and write trajectory, map, metrics and plots"),
-    "batch": (
-        "batch",
-        "run many sequences and write one table: in one process, as shards of a job array, or on Ray",
-    ),
-    "refine": (
-        "refine",
-        "refine the poses of another program from the images and write them in their original format",
-    ),
-    "align": (
-        "align",
-        "scale a finished run to meters by markers, clicked lengths, the camera height, or other measurements",
-    ),
-    "densify": (
-        "densify",
-        "compute dense depth of a run from its map and images: depth maps, a colored cloud and pictures",
-    ),
-    "demo": (
-        "commands",
-        "run SLAM on a rendered room, evaluate and plot it: the whole system without any data",
-    ),
-    "eval": ("commands", "compare two trajectories in TUM format: absolute and relative errors"),
-    "plot": (
-        "commands",
-        "redraw the plots and view.html of a run from its results folder",
-    ),
-    "export": (
-        "export",
-        "export map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
-    ),
-    "info": ("commands", "describe a sequence: frames, size, rate, calibration, ground truth"),
-    "config": (
-        "commands",
-        "print every setting with its description, range and default, as TOML for --config",
-    ),
-    "download": (
-        "commands",
-        "download a public sequence or weights; an interrupted transfer is resumed",
-    ),
+    "run": "run SLAM on a sequence and write trajectory, map, metrics and plots",
+    "batch": "run many sequences and write one table: in one process, as shards of a job array, or on Ray",
+    "refine": "refine the poses of another program from the images and write them in their original format",
+    "align": "scale a finished run to meters by markers, clicked lengths, the camera height, or other measurements",
+    "densify": "compute dense depth of a run from its map and images: depth maps, a colored cloud and pictures",
+    "demo": "run SLAM on a rendered room, evaluate and plot it: the whole system without any data",
+    "eval": "compare two trajectories in TUM format: absolute and relative errors",
+    "plot": "redraw the plots and view.html of a run from its results folder",
+    "export": "export map and trajectory of a run to other programs: COLMAP, nerfstudio, MeshLab, rerun, evo",
+    "info": "describe a sequence: frames, size, rate, calibration, ground truth",
+    "config": "print every setting with its description, range and default, as TOML for --config",
+    "download": "download a public sequence or weights; an interrupted transfer is resumed",
 }
+SMALL = (
+    "demo",
+    "eval",
+    "plot",
+    "info",
+    "config",
+    "download",
+)  # in the module `commands`; others have their own
 
 WITHOUT_THREADS = ("config", "info")  # compute nothing and import torch only where a sequence is opened
 
@@ -110,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return ERROR
     except KeyboardInterrupt:
         say("interrupted")
-        return INTERRUPTED
+        return 130  # 128 and the number of the signal, as of shells
 
 
 def _parse(arguments: Sequence[str]) -> argparse.Namespace:
@@ -156,15 +135,11 @@ def load_command(name: str) -> tuple[str, Callable[..., None], Callable[..., int
     """Import a command; return its description, and the functions that add its arguments and execute it."""
     from inspect import getdoc
 
-    home = COMMANDS[name][0]
-    module = import_module(f"torchslam.cli.{home}")
-    suffix = "" if home == name else f"_{name}"  # in a module of several commands
+    home, suffix = ("commands", f"_{name}") if name in SMALL else (name, "")
+    module = import_module(f"torchslam.cli.{home}")  # that of the requested command alone
     execute = getattr(module, f"execute{suffix}")
-    return (
-        getdoc(execute if suffix else module) or "",
-        getattr(module, f"add_arguments{suffix}"),
-        execute,
-    )
+    about = getdoc(execute if suffix else module) or ""
+    return about, getattr(module, f"add_arguments{suffix}"), execute
 
 
 def build_parser(chosen: str) -> argparse.ArgumentParser:
@@ -175,10 +150,9 @@ def build_parser(chosen: str) -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action=Version, nargs=0, help="show the version and exit")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
-    for name, (_, summary) in COMMANDS.items():
-        command = commands.add_parser(
-            name, help=summary, formatter_class=argparse.RawDescriptionHelpFormatter
-        )
+    raw = argparse.RawDescriptionHelpFormatter
+    for name, summary in COMMANDS.items():
+        command = commands.add_parser(name, help=summary, formatter_class=raw)
         if name == chosen:
             about, add_arguments, execute = load_command(name)
             # Its first line before the options, so that these are on the first screen.

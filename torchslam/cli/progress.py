@@ -12,11 +12,12 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
-from typing import Any, Self
+from types import FrameType
+from typing import Any
 
 from tqdm import tqdm
 
+from torchslam.system.online_run import Observer
 from torchslam.types import StepResult
 from torchslam.utils.console import tqdm_options
 
@@ -38,47 +39,40 @@ def shown_warnings() -> Iterator[None]:
 
 
 class StopSignals:
-    """Signal handling of a run: the first signal makes `check` raise, the second one exits at once."""
+    """Signal handling of a run: the first signal makes `check` raise, the second one exits at once.
+
+    Attributes:
+        status: exit status for the last signal; 0 if there was none.
+        is_wanted: whether `check` will raise.
+    """
 
     def __init__(self) -> None:
-        self._signal: int | None = None
-        self._is_wanted = False
+        self.status = 0
+        self.is_wanted = False
         self._phase = ""
-
-    @property
-    def status(self) -> int:
-        """Exit status for the last signal; 0 if there was none."""
-        return 0 if self._signal is None else STATUS[signal.Signals(self._signal)]
-
-    @property
-    def is_wanted(self) -> bool:
-        """True if `check` will raise."""
-        return self._is_wanted
 
     def begin(self, phase: str) -> None:
         """Enter a phase and forget earlier signals; `phase` is shown to the user: when the run will stop."""
-        self._phase, self._is_wanted = phase, False
+        self._phase, self.is_wanted = phase, False
         for number in SIGNALS:
             signal.signal(number, self._wish)
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a signal arrived in this phase."""
-        if self._is_wanted:
-            self._is_wanted = False
+        if self.is_wanted:
+            self.is_wanted = False
             raise KeyboardInterrupt
 
     def __enter__(self) -> StopSignals:
         self._before = {number: signal.getsignal(number) for number in SIGNALS}
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
     def _wish(self, number: int, frame: FrameType | None) -> None:
-        self._signal, self._is_wanted = number, True
+        self.status, self.is_wanted = STATUS[signal.Signals(number)], True
         for each in SIGNALS:
             signal.signal(each, self._end)
         tqdm.write(f"torchslam: stopping {self._phase}; again to stop at once", file=sys.stderr)
@@ -93,94 +87,80 @@ tqdm.monitor_interval = 0
 tqdm.set_lock(threading.RLock())
 
 
-class _Bar:
-    """A progress line on stderr, with warnings above it while this is entered.
+class ProgressBars(Observer):
+    """Progress lines of a run on stderr, with warnings above them: frames, the final adjustment, stages of mapping.
 
-    A signal takes effect after the current step, when the map is consistent.
+    A signal takes effect after the current step, when the map is consistent: the method raises KeyboardInterrupt.
 
     Args:
         stop_signals: the signal handler.
-        phase: shown to the user: when the run will stop.
-    """
-
-    def __init__(self, stop_signals: StopSignals, phase: str) -> None:
-        self._stopping, self._phase = stop_signals, phase
-        self._bar: tqdm | None = None
-        self._warnings = shown_warnings()
-
-    def _show(self, layout: str, total: int | None, **options: Any) -> None:
-        """Show another bar."""
-        self._close()
-        self._bar = tqdm(total=total, bar_format=layout, **tqdm_options(), **options)
-
-    def _advance(self, done: int, total: int | None) -> None:
-        """Advance the bar to a step. Raises KeyboardInterrupt after a signal."""
-        assert self._bar is not None
-        self._bar.total = total
-        self._bar.update(done - self._bar.n)
-        self._stopping.check()
-
-    def _close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def __enter__(self) -> Self:
-        self._warnings.__enter__()
-        self._stopping.begin(self._phase)
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._warnings.__exit__(kind, error, trace)
-        self._close()
-
-
-class ProgressBar(_Bar):
-    """Progress line with frame, rate, state and map points, then with the iterations of the final adjustment.
-
-    Args:
         frames: number of frames; None if unknown.
         count_points: returns the number of map points.
-        stop_signals: the signal handler.
-        done: number of frames that a resumed run had processed.
+        after_frame: called with a frame's result and whether it is the last one, before it is shown.
     """
 
     def __init__(
-        self, frames: int | None, count_points: Callable[[], int], stop_signals: StopSignals, done: int = 0
+        self,
+        stop_signals: StopSignals,
+        frames: int | None,
+        count_points: Callable[[], int],
+        after_frame: Callable[[StepResult, bool], None],
     ) -> None:
-        super().__init__(stop_signals, "after this frame")
-        self._frames, self._count_points, self._is_adjusting = frames, count_points, False
-        bar = "{n_fmt} frames, {rate_noinv_fmt}{postfix}"
-        if frames is not None:
-            bar = "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}"
-        self._show(bar, frames, initial=done, unit=" frames")
+        self._stopping, self._frames, self._count_points = stop_signals, frames, count_points
+        self._with_frame = after_frame
+        self._bar, self._shown = tqdm(disable=True), ""
 
-    def update(self, result: StepResult) -> None:
-        """Advance to the frame of a result. Raises KeyboardInterrupt after a signal."""
-        assert self._bar is not None
+    @contextmanager
+    def online(self, first: int) -> Iterator[None]:
+        """Show a bar with frame, rate, state and map points."""
+        bar = "{n_fmt} frames, {rate_noinv_fmt}{postfix}"
+        if self._frames is not None:
+            bar = "{n_fmt}/{total_fmt} |{bar:24}| {rate_noinv_fmt}, {remaining} left{postfix}"
+        with self._stopping_when("after this frame"):
+            self._show("frames", bar, self._frames, initial=first, unit=" frames")
+            yield
+
+    @contextmanager
+    def whole(self) -> Iterator[None]:
+        """Show a bar of each stage, with the time left."""
+        with self._stopping_when("and keeping the run as it is, after this step"):
+            yield
+
+    def frame(self, result: StepResult, is_last: bool) -> None:
+        """Advance to a frame."""
+        self._with_frame(result, is_last)
         self._bar.set_postfix_str(f"{result.state.value}, {self._count_points()} points", refresh=False)
         self._advance(result.index + 1, self._frames)
 
-    def adjusting(self, iteration: int, iterations: int) -> None:
-        """Advance to an iteration of the final adjustment. Raises KeyboardInterrupt after a signal."""
-        if not self._is_adjusting:
-            self._is_adjusting = True
+    def adjusting(self, iteration: int, most: int) -> None:
+        """Advance to an iteration of the final adjustment."""
+        if self._shown != "adjusting":
             self._stopping.begin("the adjustment after this iteration")
-            self._show("adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}", iterations)
-        self._advance(iteration + 1, iterations)  # submaps begin anew
+            bar = "adjusting |{bar:24}| iteration {n_fmt} of at most {total_fmt}, {elapsed}"
+            self._show("adjusting", bar, most)
+        self._advance(iteration + 1, most)  # submaps begin anew
 
-
-class StageBar(_Bar):
-    """Progress line of stages that follow one another, with the time left of the present one."""
-
-    def __init__(self, stop_signals: StopSignals) -> None:
-        super().__init__(stop_signals, "and keeping the run as it is, after this step")
-        self._stage = ""
-
-    def update(self, stage: str, done: int, most: int) -> None:
-        """Advance to a step of a stage. Raises KeyboardInterrupt after a signal."""
-        if stage != self._stage:
-            self._stage = stage
-            self._show("{desc} |{bar:24}| {n_fmt}/{total_fmt}, {remaining} left", most, desc=stage)
+    def stage(self, stage: str, done: int, most: int) -> None:
+        """Advance to a step of a stage."""
+        if stage != self._shown:
+            self._show(stage, "{desc} |{bar:24}| {n_fmt}/{total_fmt}, {remaining} left", most, desc=stage)
         self._advance(done, most)
+
+    @contextmanager
+    def _stopping_when(self, phase: str) -> Iterator[None]:
+        with shown_warnings():
+            self._stopping.begin(phase)
+            try:
+                yield
+            finally:
+                self._bar.close()
+                self._shown = ""
+
+    def _show(self, what: str, layout: str, total: int | None, **options: Any) -> None:
+        self._bar.close()
+        self._bar, self._shown = tqdm(total=total, bar_format=layout, **tqdm_options(), **options), what
+
+    def _advance(self, done: int, total: int | None) -> None:
+        self._bar.total = total
+        self._bar.update(done - self._bar.n)
+        self._stopping.check()

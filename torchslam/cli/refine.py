@@ -19,26 +19,19 @@ import torch
 
 from torchslam.cli import arguments
 from torchslam.data import Sequence
-from torchslam.data.calibration import check_replaceable, is_found, write_calibration
+from torchslam.data.calibration import CALIBRATION, check_replaceable, is_found, write_calibration
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.sequence import Calibrated
 from torchslam.data.synthetic.sequence import is_synthetic
-from torchslam.errors import ConfigError, SequenceError, TrajectoryError
-from torchslam.evaluation import Evaluation, evaluate
+from torchslam.errors import ConfigError, SequenceError
 from torchslam.geometry.camera_measurement import with_radial_terms
-from torchslam.io.report import run_metrics, summary
-from torchslam.io.results import CALIBRATION, prepare, source_of
-from torchslam.io.write_run import write_run
+from torchslam.io.report import compute_metrics, summary
+from torchslam.io.results import prepare
+from torchslam.io.write_run import source_of, write_run
 from torchslam.refine import CameraChoice, RefinementResult, refine_poses
 from torchslam.refine.files import write_refined
 from torchslam.system.metric_run import run_in_meters
-from torchslam.types import Trajectory
 from torchslam.utils.console import say, table, warn
-
-DONE, NO_MAP = 0, 3
-"""Exit status with a map, and without one."""
-RADIAL = 2  # coefficients of the distortion that may be found
-REFINED = "refined"  # folder in the results
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -80,12 +73,17 @@ def execute(options: argparse.Namespace) -> int:
             sequence = sequence.with_camera(calibration.camera(sequence.size))
     else:
         sequence = arguments.sequence(options, calibration)
-    sequence = _with_camera(sequence)
+    if sequence.known_length is None:
+        raise SequenceError(f"{sequence.name}: a live source has no poses to refine")
+    if sequence.calibrated is Calibrated.MISSING:
+        say("no calibration found; estimating intrinsics from the images")
+    sequence = sequence.with_guess()
     is_guess = sequence.calibrated is Calibrated.GUESSED
     choice = CameraChoice.FREE if options.refine_camera or is_guess else CameraChoice.IF_CONTRADICTED
     if options.fix_camera:
         choice = CameraChoice.FIXED
-    radial = RADIAL if options.refine_distortion or (is_guess and not options.fix_camera) else 0
+    # Coefficients of the distortion that may be found.
+    radial = 2 if options.refine_distortion or (is_guess and not options.fix_camera) else 0
     config = arguments.config(options)
     # What a dataset brings along counts where it is asked for alone: the unit of the given poses stays otherwise.
     sources = arguments.metric_sources(replace(config.metric, own=False), sequence)
@@ -94,11 +92,18 @@ def execute(options: argparse.Namespace) -> int:
     refined = refine_poses(sequence, given, config, choice, radial, options.device, on_progress=say)
     refined = replace(refined, run=run_in_meters(refined.run, sequence, sources))
     metrics = _write(refined, sequence, options)
-    written = (
-        {} if refined.run.failure else {"refined": str(write_refined(options.output / REFINED, refined))}
-    )
-    rows = _describe_poses(refined, sequence) | summary(metrics) | written | {"results": str(options.output)}
+    words = f"{len(given)} from {given.path}"
+    if refined.without_image:
+        words += f"; {refined.without_image} have no image"
+    if refined.without_pose:
+        words += f"; {refined.without_pose} of {len(sequence)} images have no pose"
+    if refined.kept:
+        words += "; the images do not improve on them: kept"
+    rows = {"poses": words} | summary(metrics)
     rows.pop("speed", None)  # frames are not processed one by one
+    if not refined.run.failure:
+        rows["refined"] = str(write_refined(options.output / "refined", refined))
+    rows["results"] = str(options.output)
     if "online ATE" in rows:
         rows["ATE as given"] = rows.pop("online ATE")
     print(f"\n{sequence.name}\n{table(rows)}")
@@ -106,51 +111,28 @@ def execute(options: argparse.Namespace) -> int:
         warn(line)
     if refined.run.failure:
         say(refined.run.failure)
-        return NO_MAP
-    return DONE
-
-
-def _with_camera(sequence: Sequence) -> Sequence:
-    """Return the sequence with a guess of its camera if there is none."""
-    if sequence.known_length is None:
-        raise SequenceError(f"{sequence.name}: a live source has no poses to refine")
-    if sequence.calibrated is Calibrated.MISSING:
-        say("no calibration found; estimating intrinsics from the images")
-    return sequence.with_guess()
+        return 3
+    return 0
 
 
 def _write(refined: RefinementResult, sequence: Sequence, options: argparse.Namespace) -> dict[str, Any]:
     """Evaluate and write the refined run; returns the metrics."""
     finished = refined.run
-    before = Trajectory.empty() if finished.failure else finished.online
-    after, ate_before = _errors(finished.trajectory, sequence), _errors(before, sequence)
-    metrics = run_metrics(finished, after, None if ate_before is None else ate_before.ate_m)
+    camera = _describe_camera(refined, sequence, options.fix_camera)
+    metrics = compute_metrics(finished, sequence, camera, warn)
     metrics |= {
-        "camera": _describe_camera(refined, sequence, options.fix_camera),
         "focal_px": [float(sequence.camera.focal), float(finished.camera.focal)],
         "without_pose": refined.without_pose,
         "without_image": refined.without_image,
         "rounds": refined.rounds,
-        "dropped": sequence.dropped,
     } | source_of(options.path, options.fps, sequence)
     path = options.output / CALIBRATION
     if not torch.equal(finished.camera.params.cpu(), sequence.camera.params):
-        write_calibration(path, finished.camera, [metrics["camera"]])
+        write_calibration(path, finished.camera, [camera])
     elif is_found(path):
         path.unlink()
     write_run(finished, sequence, metrics, options.output, viewer=False)
     return metrics
-
-
-def _errors(trajectory: Trajectory, sequence: Sequence) -> Evaluation | None:
-    """Against ground truth, where there is one and there are poses to compare."""
-    if sequence.groundtruth is None or not len(trajectory):
-        return None
-    try:
-        return evaluate(trajectory, sequence.groundtruth)
-    except TrajectoryError as error:
-        warn(f"no evaluation: {error}")
-        return None
 
 
 def _describe_camera(refined: RefinementResult, sequence: Sequence, is_fixed: bool) -> str:
@@ -162,15 +144,3 @@ def _describe_camera(refined: RefinementResult, sequence: Sequence, is_fixed: bo
         return words if is_fixed or refined.run.failure else f"{words}; the images do not contradict it"
     std = "" if found is None else f" ± {focal * found.focal_std:.1f}"
     return f"focal length {focal:.1f}{std} px from the images, given {float(sequence.camera.focal):.1f}"
-
-
-def _describe_poses(refined: RefinementResult, sequence: Sequence) -> dict[str, str]:
-    """Return the number of given poses and of those not used, as a row for `table`."""
-    words = f"{len(refined.given)} from {refined.given.path}"
-    if refined.without_image:
-        words += f"; {refined.without_image} have no image"
-    if refined.without_pose:
-        words += f"; {refined.without_pose} of {len(sequence)} images have no pose"
-    if refined.kept:
-        words += "; the images do not improve on them: kept"
-    return {"poses": words}

@@ -16,20 +16,25 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import torch
 
-from torchslam.calibration.find_camera import NUM_KEYPOINTS, ROUGH_STD, find_camera, with_stated_std
+from torchslam.calibration.find_camera import (
+    NUM_KEYPOINTS,
+    ROUGH_STD,
+    camera_remark,
+    find_camera,
+    with_stated_std,
+)
 from torchslam.cli import arguments
 from torchslam.cli.densify import LONG_SIDE, add_options, densify_results, map_size
-from torchslam.cli.progress import ProgressBar, StageBar, StopSignals
+from torchslam.cli.progress import ProgressBars, StopSignals
 from torchslam.config import Config, load_config
 from torchslam.data import Sequence
-from torchslam.data.calibration import check_replaceable, is_found
+from torchslam.data.calibration import CALIBRATION, check_replaceable, is_found
 from torchslam.data.sequence import Calibrated
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.geometry import Camera
@@ -40,22 +45,13 @@ from torchslam.global_mapping.recording import Mapping, run_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
-from torchslam.io.results import (
-    CALIBRATION,
-    CHECKPOINT,
-    CONFIG,
-    MAP,
-    STAGES,
-    delete_unfinished,
-    prepare,
-    source_of,
-)
+from torchslam.io.results import CHECKPOINT, CONFIG, MAP, STAGES, delete_unfinished, prepare
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
 from torchslam.io.viewer.page import VIEW
-from torchslam.io.write_run import write_run
+from torchslam.io.write_run import source_of, write_run
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.front_end import KeptFeatures, source
-from torchslam.system.online_run import Observer, OnlineRun, RunProgress
+from torchslam.system.online_run import OnlineRun, RunProgress
 from torchslam.system.slam import SLAM
 from torchslam.types import StepResult
 from torchslam.utils.console import say, table, warn
@@ -78,8 +74,7 @@ class Checkpoints:
     """
 
     def __init__(self, folder: Path, every: int, slam: SLAM, so_far: RunProgress, sequence: Sequence) -> None:
-        self._path = folder / CHECKPOINT
-        self._every = every
+        self._path, self._every = folder / CHECKPOINT, every
         self._run = slam, so_far, sequence
         self._last = self._keyframes()
 
@@ -172,7 +167,10 @@ def execute(options: argparse.Namespace) -> int:
         own = options.map / CONFIG
         options.config = options.config or (own if own.is_file() else None)
         options.map = options.map / MAP
-    opened, config = _sequence(options), arguments.config(options)
+    opened, config = arguments.sequence(options), arguments.config(options)
+    if opened.calibrated is Calibrated.MISSING and not opened.is_live:
+        say("no calibration found; estimating intrinsics from the images (--camera auto)")
+        opened = opened.with_guess()
     if options.map is not None:  # what was measured belongs to the frames of the session before
         config = replace(config, metric=load_config(None, arguments.overrides(options)).metric)
     if options.dense:
@@ -181,78 +179,13 @@ def execute(options: argparse.Namespace) -> int:
         raise ConfigError("--mapping global needs a recording, and no --map")
     status = run(opened, config, options)
     if options.dense and status == DONE:
-        dense = densify_results(options.output, options)
-        print(f"\n{table(dense)}")
+        print(f"\n{table(densify_results(options.output, options))}")
     return status
 
 
 def _mode(sequence: Sequence, options: argparse.Namespace) -> Mapping | None:
     """Whether a recording is mapped as a whole as well; None if it is no whole recording."""
     return None if sequence.is_live or options.map is not None else Mapping(options.mapping)
-
-
-def _sequence(options: argparse.Namespace) -> Sequence:
-    """Open the sequence, with an initial guess of the camera if it has no calibration."""
-    found = arguments.sequence(options)
-    if found.calibrated is not Calibrated.MISSING or found.is_live:
-        return found
-    say("no calibration found; estimating intrinsics from the images (--camera auto)")
-    return found.with_guess()
-
-
-class _Screen(Observer):
-    """Shows the progress of a run on the terminal and in the viewers, and writes its checkpoints.
-
-    Args:
-        slam: the system.
-        sequence: the frames.
-        stop_signals: a signal ends the run after the frame or the step.
-        checkpoints: of the run.
-        watching: the viewers.
-        may_map: whether the recording may be mapped as a whole after its last frame, which is worth a checkpoint.
-    """
-
-    def __init__(
-        self,
-        slam: SLAM,
-        sequence: Sequence,
-        stop_signals: StopSignals,
-        checkpoints: Checkpoints,
-        watching: FrameViewers,
-        may_map: bool,
-    ) -> None:
-        self.slam, self.sequence, self.stop_signals = slam, sequence, stop_signals
-        self.checkpoints, self.watching, self.may_map = checkpoints, watching, may_map
-        self.latencies: list[float] = []  # milliseconds from capture to pose, of a live source
-
-    @contextmanager
-    def online(self, first: int) -> Iterator[None]:
-        """Show a bar of the frames."""
-        length = self.sequence.known_length
-        with ProgressBar(length, lambda: self.slam.map.num_points, self.stop_signals, first) as self._frames:
-            yield
-
-    @contextmanager
-    def whole(self) -> Iterator[None]:
-        """Show a bar of the stages."""
-        with StageBar(self.stop_signals) as self._stages:
-            yield
-
-    def frame(self, result: StepResult, is_last: bool) -> None:
-        """Show a frame, and write a checkpoint if one is due."""
-        if self.sequence.is_live:
-            self.latencies.append(1e3 * (time.time() - result.timestamp))
-        self.checkpoints.offer(at_once=self.stop_signals.is_wanted or (self.may_map and is_last))
-        self.watching.show(result)
-        self._frames.update(result)
-
-    def adjusting(self, iteration: int, most: int) -> None:
-        """Show an iteration of the final adjustment."""
-        self._frames.adjusting(iteration, most)
-
-    def stage(self, stage: str, done: int, most: int) -> None:
-        """Show a step of a stage."""
-        self._stages.update(stage, done, most)
 
 
 def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
@@ -269,6 +202,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         learned_config(mapping_config(config))  # raises now rather than after the online run
     prepare(options.output, options.overwrite, options.resume)
     check_replaceable(options.output / CALIBRATION)
+    latencies = list[float]()  # milliseconds from capture to pose, of a live source
     with StopSignals() as stop_signals, ExitStack() as viewers:
         kept = features_to_keep(config, sequence.size, NUM_KEYPOINTS, options.device) if may_map else None
         sequence, camera = _with_camera(sequence, config, options, kept)
@@ -276,29 +210,37 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
             config = with_stated_std(config, sequence)
         slam, so_far = _begin(sequence, config, options)
         sequence = source(sequence, config, slam.camera)
-        watching = viewers.enter_context(_watching(slam, sequence, options))
+        (options.output / VIDEO).unlink(missing_ok=True)  # of an earlier run
+        screens: list[FrameViewer] = [LiveView.spawn(slam)] if options.view else []
+        screens += [film_of(sequence, options.output)] if options.video else []
+        watching = viewers.enter_context(FrameViewers(slam, sequence, screens))
         checkpoints = Checkpoints(options.output, options.checkpoint, slam, so_far, sequence)
-        screen = _Screen(slam, sequence, stop_signals, checkpoints, watching, may_map)
-        is_watched = options.view or options.video  # then this process needs the images
-        online = OnlineRun(slam, watching.sequence, so_far, 1 if is_watched else options.processes, screen)
+
+        def after_frame(result: StepResult, is_last: bool) -> None:
+            if sequence.is_live:
+                latencies.append(1e3 * (time.time() - result.timestamp))
+            # Global mapping may follow the last frame, which is worth a checkpoint.
+            checkpoints.offer(at_once=stop_signals.is_wanted or (may_map and is_last))
+            watching.show(result)
+
+        bars = ProgressBars(stop_signals, sequence.known_length, lambda: slam.map.num_points, after_frame)
+        processes = 1 if screens else options.processes  # with viewers this process needs the images
+        online = OnlineRun(slam, watching.sequence, so_far, processes, bars)
         stages = options.output / STAGES if options.checkpoint else None
         finished, mapped = run_recording(
-            online, sequence, mode, sources, options.device, stages, kept, all_frames=is_watched
+            online, sequence, mode, sources, options.device, stages, kept, all_frames=bool(screens)
         )
         if mapped is not None and mapped.why:
             say(f"ran global mapping because {mapped.why}; kept the {mapped.kept} map")
         stop_signals.begin("when the results are written")
-        metrics = compute_metrics(finished, sequence, camera, warn, mapped)
-        metrics |= _latency(screen.latencies) | _usage(before_s)
-        metrics |= source_of(options.path, options.fps, sequence)
-        write_run(
-            finished, sequence, metrics, options.output, online=None if mapped is None else mapped.online
-        )
+        metrics = compute_metrics(finished, sequence, camera_remark(finished, camera), warn, mapped)
+        metrics |= _latency(latencies) | _usage(before_s) | source_of(options.path, options.fps, sequence)
+        before = None if mapped is None else mapped.online
+        write_run(finished, sequence, metrics, options.output, online=before)
         watching.end(finished)
-    written = {"results": options.output, "view": options.output / VIEW}
-    written |= {"video": options.output / VIDEO} if options.video else {}
-    words = summary(metrics) | {label: str(path) for label, path in written.items()}
-    print(f"\n{sequence.name}\n{table(words)}")
+    rows = summary(metrics) | {"results": str(options.output), "view": str(options.output / VIEW)}
+    rows |= {"video": str(options.output / VIDEO)} if options.video else {}
+    print(f"\n{sequence.name}\n{table(rows)}")
     for warning in result_warnings(metrics):
         warn(warning)
     if finished.interrupted:
@@ -323,15 +265,11 @@ def _with_camera(
     if not is_guess:
         return sequence.with_camera(sequence.camera, std=ROUGH_STD), ""
     goes_on = options.resume and (options.output / CHECKPOINT).exists()
-    return find_camera(
-        sequence,
-        config,
-        options.output,
-        options.device,
-        goes_on,
-        lambda words: say(f"camera: {words}"),
-        extract,
-    )
+
+    def log(words: str) -> None:
+        say(f"camera: {words}")
+
+    return find_camera(sequence, config, options.output, options.device, goes_on, log, extract)
 
 
 def _begin(sequence: Sequence, config: Config, options: argparse.Namespace) -> tuple[SLAM, RunProgress]:
@@ -354,15 +292,6 @@ def _begin(sequence: Sequence, config: Config, options: argparse.Namespace) -> t
             f"{_describe(mine)}"
         )
     return slam, RunProgress()
-
-
-def _watching(slam: SLAM, sequence: Sequence, options: argparse.Namespace) -> FrameViewers:
-    """Return the viewers of the run; delete the video of an earlier run."""
-    (options.output / VIDEO).unlink(missing_ok=True)
-    screens: list[FrameViewer] = [LiveView.spawn(slam)] if options.view else []
-    if options.video:
-        screens.append(film_of(sequence, options.output))
-    return FrameViewers(slam, sequence, screens)
 
 
 def _describe(camera: Camera) -> str:

@@ -9,7 +9,6 @@ from typing import Any, TypeVar
 
 import torch
 
-from torchslam.calibration.find_camera import camera_remark
 from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, ate_apart, evaluate
@@ -34,11 +33,10 @@ def compute_metrics(
     Args:
         finished: the run.
         sequence: its images, with the ground truth if known.
-        camera: remark on the estimated camera, from `find_camera`.
+        camera: remark on the camera, as of `camera_remark`.
         log: receives the reason if the evaluation is impossible.
         mapped: how the recording was mapped, and the check of its map.
     """
-
     online = finished if mapped is None else mapped.online
 
     def measured(run: Run, measure: Callable[[Trajectory], Errors]) -> Errors | None:
@@ -56,8 +54,8 @@ def compute_metrics(
         measured(online, lambda truth: ate_apart(online.online_parts, truth)),
         online,
     )
-    remarks = {
-        "camera": camera_remark(finished, camera),
+    metrics |= {
+        "camera": camera,
         "rolling_shutter": shake_remark(finished),
         "readout": readout_metrics(finished),
     }
@@ -66,9 +64,7 @@ def compute_metrics(
         | ({} if change.readout is None else {"readout_ms": 1e3 * float(change.readout.seconds)})
         for change in finished.camera_changes
     ]
-    return (
-        metrics | remarks | check_metrics(mapped) | {"camera_changes": changes, "dropped": sequence.dropped}
-    )
+    return metrics | check_metrics(mapped) | {"camera_changes": changes, "dropped": sequence.dropped}
 
 
 def readout_metrics(finished: Run) -> dict[str, float] | None:
@@ -95,12 +91,10 @@ def check_metrics(mapped: MappedRecording | None) -> dict[str, Any]:
     """The mapping that was kept, and the check of its map; empty where it was not checked."""
     if mapped is None:
         return {}
-    check = mapped.check
-    if check is None:
-        return {"mapping": mapped.kept.value, "mapping_reason": mapped.why, "check": None}
-    counts = {name: getattr(check, name) for name in ("pairs", "agreeing", "triplets", "consistent")}
-    breaks = [str(each) for each in check.breaks]
-    found = counts | {"score": check.score, "breaks": breaks, "sentence": check.sentence()}
+    check, found = mapped.check, None
+    if check is not None:
+        found = {name: getattr(check, name) for name in ("pairs", "agreeing", "triplets", "consistent")}
+        found |= {"score": check.score, "breaks": list(map(str, check.breaks)), "sentence": check.sentence()}
     return {"mapping": mapped.kept.value, "mapping_reason": mapped.why, "check": found}
 
 
@@ -137,12 +131,15 @@ def run_metrics(
     timed = [result for result in online.results if "total" in result.stage_ms]
     totals = [result.stage_ms["total"] for result in timed]
     later = [] if first is None else [each.stage_ms["total"] for each in timed if each.index > first.index]
-    start = None if run.failure else _start(run.results)
+    start, posed_ratio = None if run.failure else _start(run.results), 0.0
+    if start is not None:
+        since = sum(result.index >= start.index for result in run.results)
+        posed_ratio = int((run.trajectory.timestamps >= start.timestamp).sum()) / since
     metrics: dict[str, Any] = {
         "frames": len(run.results) + len(run.skipped),
         "posed": len(run.trajectory),
         "online_posed": len(online.online),
-        "posed_ratio_after_initialization": _posed_ratio(run, start),
+        "posed_ratio_after_initialization": posed_ratio,
         "uncertain": sum(result.state is State.UNCERTAIN for result in run.results),
         "lost": sum(result.state is State.LOST for result in run.results),
         "initialized_at": None if start is None else start.index,
@@ -154,9 +151,7 @@ def run_metrics(
         "submaps": submap_counts(run),
         "fps": 1e3 / mean(totals) if totals else 0.0,
         "ms_median": median(totals) if totals else 0.0,
-        "ms_p95": float(torch.tensor(totals, dtype=torch.float32, device="cpu").quantile(0.95))
-        if totals
-        else 0.0,
+        "ms_p95": float(torch.tensor(totals or [0.0], dtype=torch.float32, device="cpu").quantile(0.95)),
         "ms_longest": max(later, default=0.0),
         "stage_ms": stage_times(online.results),
         "skipped": run.skipped,
@@ -185,7 +180,7 @@ def quality(run: Run) -> dict[str, float | None]:
     - `track_length`: mean number of frames that observe a point.
     """
     found: dict[str, float | None] = {"reprojection_px": None, "far_ratio": None, "track_length": None}
-    if run.main is None or run.map.num_points == 0:
+    if run.map.num_points == 0:
         return found
     graph = run.posed_frames.graph(run.map, run.sensor).global_shutter()
     rows = torch.nonzero(graph.sessions[graph.frame_index] == run.session)[:, 0]
@@ -277,10 +272,10 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
     rows |= _describe_submaps(metrics)
     rows |= {"camera": metrics["camera"]} if metrics.get("camera") else {}
     rows |= {"readout": readout_words(readout)} if (readout := metrics.get("readout")) else {}
-    rows |= {
-        "speed": f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
-        f"{metrics['ms_p95']:.0f} ms (95th percentile)",
-    }
+    rows["speed"] = (
+        f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
+        f"{metrics['ms_p95']:.0f} ms (95th percentile)"
+    )
     return rows | accuracy(metrics) | {"unit": unit_words(metrics)}
 
 
@@ -347,11 +342,3 @@ def _start(results: list[StepResult]) -> StepResult | None:
     ]
     found = (result for result in results if result.T_cw is not None)
     return starts[-1] if starts else next(found, None)
-
-
-def _posed_ratio(run: Run, start: StepResult | None) -> float:
-    """Return the ratio of posed frames among those since initialization."""
-    if start is None:
-        return 0.0
-    since = sum(result.index >= start.index for result in run.results)
-    return int((run.trajectory.timestamps >= start.timestamp).sum()) / since

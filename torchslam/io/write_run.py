@@ -1,28 +1,41 @@
-"""Output of a finished run: colored map, results folder, plots and viewer."""
+"""Output of a finished run: the results folder, with the colors of the map, plots and viewer."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import csv
+import datetime
+import json
+from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
+from torchslam.config import to_toml
+from torchslam.data.calibration import CALIBRATION, write_calibration
+from torchslam.data.formats.image_file import write_image
+from torchslam.data.opening import full_name
 from torchslam.data.sequence import Sequence
+from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import FrameError
-from torchslam.evaluation import Evaluation, evaluate
-from torchslam.geometry import so3_log, transform
-from torchslam.io import plots as figures
-from torchslam.io.results import PLOTS, Results, aligned, example_keyframe, read_results, write_results
+from torchslam.geometry import geodetic_from_enu
+from torchslam.io import results as files
+from torchslam.io.export.ply import write_map_cloud
+from torchslam.io.plots import draw
+from torchslam.io.results import delete_dense, example_keyframe, read_results, write_metrics
 from torchslam.io.viewer.page import write_view
-from torchslam.map.map import NO_POINT, Map
+from torchslam.map.file import write_atlas
+from torchslam.map.map import Map
+from torchslam.map.unit import MetricUnit
 from torchslam.system.run import Run
-from torchslam.types import Trajectory
+from torchslam.types import StepResult, Trajectory
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
+GEOJSON = "trajectory.geojson"
+GPX = "trajectory.gpx"
+SINCE_1970 = 1e8
+"""Seconds: times from here on (1973) are dates, smaller ones count from the start of a recording."""
+DIGITS = 9
+"""Decimals of degrees: a tenth of a millimeter."""
 
 
 def write_run(
@@ -35,7 +48,7 @@ def write_run(
     plots: bool = True,
     viewer: bool = True,
 ) -> None:
-    """Color the map points, write the results folder and draw the run.
+    """Write a run and its drawings into a results folder.
 
     Args:
         run: the finished run; its map points receive colors.
@@ -43,18 +56,20 @@ def write_run(
         metrics: the content of metrics.json, as by `compute_metrics`.
         folder: the results folder.
         online: the run frame by frame, if `run` is a global map.
-        plots: whether to draw the plots.
-        viewer: whether to write the viewer page.
+        plots, viewer: whether to draw the plots and to write the viewer page.
     """
     colorize_points([submap.map for submap in run.submaps], sequence, run.session)
     write_results(run, sequence, metrics, folder, online)
+    redraw(folder, plots, viewer)
+
+
+def redraw(folder: Path, plots: bool = True, viewer: bool = True) -> list[Path]:
+    """Draw plots and viewer page of a results folder from its files; return what was written."""
     if not (plots or viewer):
-        return
+        return []
     results = read_results(folder)
-    if plots:
-        draw(results, folder)
-    if viewer:
-        write_view(results, folder)
+    paths = draw(results, folder) if plots else []
+    return [*paths, write_view(results, folder)] if viewer else paths
 
 
 def colorize_points(maps: Iterable[Map], sequence: Sequence, session: int) -> None:
@@ -66,150 +81,112 @@ def colorize_points(maps: Iterable[Map], sequence: Sequence, session: int) -> No
         if len(slam_map.points) == 0:
             continue
         device = slam_map.positions_w.device
-        total = torch.zeros(len(slam_map.points), 4, dtype=torch.int64, device=device)
+        total = torch.zeros(
+            len(slam_map.points), 4, dtype=torch.int64, device=device
+        )  # of colors, and a count
         for keyframe in slam_map.keyframe_rows(session).tolist():
-            _add_colors(total, slam_map, keyframe, sequence)
+            try:
+                image = sequence.color(int(slam_map.keyframes["frame_index"][keyframe])).to(device)
+            except FrameError:
+                continue
+            ids = slam_map.keyframes["point_ids"][keyframe]
+            height, width = image.shape[:2]
+            pixels = slam_map.keyframes["detected"][keyframe][ids >= 0].round().long()
+            colors = image[pixels[:, 1].clamp(0, height - 1), pixels[:, 0].clamp(0, width - 1)].long()
+            total.index_add_(0, ids[ids >= 0], torch.nn.functional.pad(colors, (0, 1), value=1))
         seen = torch.nonzero(total[:, 3])[:, 0]
         count = total[seen, 3:]
         slam_map.points["colors"][seen] = ((total[seen, :3] + count // 2) // count).to(torch.uint8)
 
 
-def _add_colors(total: Tensor, slam_map: Map, keyframe: int, sequence: Sequence) -> None:
-    """Add red, green, blue and a count of one to the rows (L, 4) of the points that a keyframe observes."""
-    try:
-        image = sequence.color(int(slam_map.keyframes["frame_index"][keyframe])).to(total.device)
-    except FrameError:
-        return
-    ids = slam_map.keyframes["point_ids"][keyframe]
-    height, width = image.shape[:2]
-    pixels = slam_map.keyframes["detected"][keyframe][ids >= 0].round().long()
-    colors = image[pixels[:, 1].clamp(0, height - 1), pixels[:, 0].clamp(0, width - 1)].long()
-    ones = torch.ones_like(colors[:, :1])
-    total.index_add_(0, ids[ids >= 0], torch.cat((colors, ones), dim=1))
+def write_results(
+    run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path, online: Run | None = None
+) -> None:
+    """Write the results of a run as `write_run`, but no colors, plots and viewer; existing results are replaced."""
+    directory.mkdir(parents=True, exist_ok=True)
+    stale = [directory / name for name in (files.GROUND_TRUTH, files.EXAMPLE_IMAGE, GEOJSON, GPX)]
+    for old in [*stale, *directory.glob(files.OTHER_TRAJECTORY.format("[0-9]*"))]:
+        old.unlink(missing_ok=True)
+    delete_dense(directory)
+    write_trajectory(directory / files.TRAJECTORY, run.trajectory)
+    if run.metric is not None:
+        write_earth(directory, run.trajectory, run.metric)
+    write_trajectory(directory / files.ONLINE, (run if online is None else online).online)
+    for submap in run.submaps:
+        if submap is not run.main and submap.posed_frames.count(run.session):
+            path = directory / files.OTHER_TRAJECTORY.format(submap.number)
+            write_trajectory(path, submap.trajectory(run.session))
+    write_trajectory(directory / files.KEYFRAMES, run.keyframes)
+    if sequence.groundtruth is not None:
+        write_trajectory(directory / files.GROUND_TRUTH, sequence.groundtruth)
+    write_atlas(directory / files.MAP, run.submaps, run.camera, run.sessions)
+    write_map_cloud(directory / files.POINT_CLOUD, run.map, run.session, run.metric)
+    if run.calibration is not None and not run.session:
+        remark, std = str(metrics.get("camera", "")), run.calibration.focal_std
+        write_calibration(directory / CALIBRATION, run.camera, [remark] if remark else [], std)
+    (directory / files.CONFIG).write_text(to_toml(run.config), encoding="utf-8")
+    write_metrics(directory, metrics)
+    write_frames(directory / files.FRAMES, run.results, sequence)
+    keyframe = example_keyframe(run.map, run.session)
+    if keyframe is not None:
+        try:
+            image = sequence.image(int(run.map.keyframes["frame_index"][keyframe]))
+        except FrameError:  # simulated features need no image; then there is nothing to draw
+            return
+        pixels = (image[0, 0] * 255.0).round().to(torch.uint8).cpu().numpy()
+        write_image(directory / files.EXAMPLE_IMAGE, pixels)
 
 
-def draw(results: Results, directory: Path) -> list[Path]:
-    """Draw all plots that the results allow into the folder `plots` and return the files.
+def source_of(path: str, fps: float | None, sequence: Sequence) -> dict[str, Any]:
+    """Return the entries of metrics.json from which the images are found again: path and options of `open_sequence`."""
+    entries = {"source": full_name(path), "source_fps": fps}
+    return entries | {"source_as_stored": True} if sequence.as_stored else entries
 
-    With ground truth, path and map are aligned to it by a similarity.
+
+def write_frames(path: str | Path, results: list[StepResult], sequence: Sequence | None = None) -> None:
+    """Write one row per frame; a missing submap, file or stage is an empty cell. The poses are in online.txt."""
+    columns = ("index", "timestamp", "state", "submap", "keyframe", "matches", "inliers", "reason", "image")
+    stages = list(dict.fromkeys(name for result in results for name in result.stage_ms))
+    with Path(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow([*columns, *(stage + files.STAGE_SUFFIX for stage in stages)])
+        for result in results:
+            times = [f"{result.stage_ms[stage]:.3f}" if stage in result.stage_ms else "" for stage in stages]
+            submap = "" if result.submap is None else result.submap
+            image = "" if sequence is None else sequence.file_name(result.index)
+            row = [result.index, repr(result.timestamp), result.state.value, submap]
+            writer.writerow(
+                [*row, int(result.is_keyframe), result.matches, result.inliers, result.reason, image, *times]
+            )
+
+
+def write_earth(folder: Path, trajectory: Trajectory, unit: MetricUnit) -> list[Path]:
+    """Write the path of a map whose origin is known as a GeoJSON line and as a GPX track; return the files.
+
+    The axes of the world are east, north and up. Nothing is written if the unit has no origin on the Earth. GPX has
+    times if those of the images are dates. Sources: RFC 7946 (longitude before latitude); GPX 1.1.
     """
-    folder = directory / PLOTS
-    for old in folder.glob("*.png"):
-        old.unlink()
-    paths = []
-    for name, figure in _figures(results):
-        paths.append(folder / f"{name}.png")
-        figures.save(figure, paths[-1])
-    return paths
-
-
-def _figures(results: Results) -> Iterator[tuple[str, Figure]]:
-    if results.frames:
-        yield "tracking", figures.plot_tracking(results.frames)
-    if not len(results.trajectory):
-        return
-    yield from _scenes(results)
-    if results.example_image is not None:
-        yield from _example(results.map, results.session, results.example_image)
-
-
-def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
-    evaluation, truth = _evaluation(results), None
-    trajectory, keyframes = results.trajectory, results.keyframes
-    title = f"Path and map{_title_suffix(results)}"
-    S = torch.eye(4, dtype=trajectory.T_wc.dtype, device="cpu")
-    if evaluation is not None:
-        yield "errors", _errors(evaluation, results)
-        S = evaluation.S_groundtruth_estimate
-        trajectory, keyframes, truth = evaluation.aligned, aligned(keyframes, S), _truth(results)
-        title += f", ATE {evaluation.ate_m:.3g} m on {evaluation.path_length_m:.3g} m"
-    unit = "" if truth is None and not results.metrics.get("metric") else "m"
-    ids = results.map.valid_points()
-    points_w = transform(S, results.map.positions_w[ids])
-    certainty = [
-        S[:3, :3] @ covariances_w @ S[:3, :3].mT
-        for covariances_w in (
-            results.map.center_covariances_w()[results.map.keyframe_rows(results.session)],
-            results.map.points["covariances_w"][ids],
-        )
-    ]
-    shown = keyframes if len(keyframes) else None  # a run that only localized shows the axes of its frames
-    yield "scene", figures.plot_scene(trajectory, points_w, truth, shown, unit, title)
-    yield (
-        "top_view",
-        figures.plot_top_view(
-            trajectory,
-            points_w,
-            truth,
-            shown,
-            unit,
-            title,
-            keyframe_covariances_w=certainty[0] if len(keyframes) else None,
-            point_covariances_w=certainty[1],
-        ),
-    )
-
-
-def _title_suffix(results: Results) -> str:
-    """Return which of several submaps and sessions a plot shows; empty if there is one of each."""
-    metrics, submaps = results.metrics, len(results.metrics["submaps"])
-    of = f" of submap {metrics['submap']}, the main one of {submaps}" if submaps > 1 else ""
-    return of + (f", session {results.session}" if results.session else "")
-
-
-def _truth(results: Results) -> Trajectory | None:
-    """Return the ground truth between the first and the last frame of the plotted submap."""
-    truth, frames = results.groundtruth, results.frames
-    if truth is None:
-        return None
-    start, end = frames[0].timestamp, frames[-1].timestamp
-    if len(results.metrics["submaps"]) > 1:
-        start, end = results.trajectory.timestamps[[0, -1]].tolist()
-    during = (truth.timestamps >= start) & (truth.timestamps <= end)
-    return Trajectory(truth.timestamps[during], truth.T_wc[during])
-
-
-def _errors(evaluation: Evaluation, results: Results) -> Figure:
-    estimated, true = evaluation.matched.T_wc[:, :3, :3], evaluation.groundtruth.T_wc[:, :3, :3]
-    errors_rad = so3_log(true.mT @ estimated).norm(dim=-1)
-    title = f"Error against ground truth, aligned by a similarity (scale {evaluation.scale:.4g})"
-    return figures.plot_errors(
-        evaluation.matched.timestamps, evaluation.errors_m, errors_rad, results.frames, title
-    )
-
-
-def _evaluation(results: Results) -> Evaluation | None:
-    """Return the errors against ground truth if metrics.json has them."""
-    if results.groundtruth is None or "ate_m" not in results.metrics:
-        return None
-    return evaluate(results.trajectory, results.groundtruth)
-
-
-def _example(slam_map: Map, session: int, image: Float[Tensor, "H W"]) -> Iterator[tuple[str, Figure]]:
-    """Plot the keypoints of the example keyframe, with tails to the previous keyframe."""
-    keyframe = example_keyframe(slam_map, session)
-    if keyframe is None:
-        return
-    columns = slam_map.keyframes
-    mask, ids = columns["mask"][keyframe], columns["point_ids"][keyframe]
-    previous = torch.full(
-        (len(slam_map.points) + 1, 2), torch.nan, dtype=columns["keypoints"].dtype, device="cpu"
-    )
-    rows = slam_map.keyframe_rows(session).tolist()
-    if rows[0] != keyframe:
-        before = rows[rows.index(keyframe) - 1]
-        seen = columns["point_ids"][before]
-        previous[seen[seen >= 0]] = columns["keypoints"][before][seen >= 0]
-    # NO_POINT, -1, reads the row at the end.
-    counts = torch.cat((slam_map.points["times_observed"], torch.zeros(1, dtype=torch.int64, device="cpu")))
-    yield (
-        "features",
-        figures.plot_features(
-            image,
-            columns["keypoints"][keyframe][mask],
-            (ids > NO_POINT)[mask],
-            previous[ids][mask],
-            counts[ids][mask],
-            title=f"Frame {int(columns['frame_index'][keyframe])}",
-        ),
-    )
+    if unit.origin is None or not len(trajectory):
+        return []
+    origin = torch.tensor(unit.origin, dtype=torch.float64, device="cpu")
+    places = geodetic_from_enu(trajectory.positions_w.detach().double().cpu(), origin).tolist()
+    times = trajectory.timestamps.tolist()
+    line = [[round(lon, DIGITS), round(lat, DIGITS), round(altitude, 4)] for lat, lon, altitude in places]
+    path = {
+        "type": "Feature",
+        "properties": {"timestamps": times, "meters_relative_std": unit.relative_std},
+        "geometry": {"type": "LineString" if len(line) > 1 else "MultiPoint", "coordinates": line},
+    }
+    content = json.dumps({"type": "FeatureCollection", "features": [path]})
+    (folder / GEOJSON).write_text(content + "\n", encoding="utf-8")
+    points = []
+    for time, (latitude, longitude, altitude) in zip(times, places, strict=True):
+        place = f'<trkpt lat="{latitude:.{DIGITS}f}" lon="{longitude:.{DIGITS}f}"><ele>{altitude:.4f}</ele>'
+        moment = datetime.datetime.fromtimestamp(time, tz=datetime.UTC) if time >= SINCE_1970 else None
+        stamp = "" if moment is None else f"<time>{moment:%Y-%m-%dT%H:%M:%S.%f}Z</time>"
+        points.append(f"{place}{stamp}</trkpt>")
+    header = '<?xml version="1.0" encoding="UTF-8"?>\n<gpx version="1.1" creator="torchslam" '
+    header += 'xmlns="http://www.topografix.com/GPX/1/1"><trk><trkseg>'
+    lines = "\n".join([header, *points, "</trkseg></trk></gpx>\n"])
+    (folder / GPX).write_text(lines, encoding="utf-8")
+    return [folder / GEOJSON, folder / GPX]

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float, Int
-from torch import Tensor
 
 from torchslam.data.formats.given_poses import COLMAP, NERFSTUDIO
 from torchslam.data.text_file import read_text
@@ -19,12 +16,11 @@ from torchslam.geometry import se3_inverse
 from torchslam.geometry.transforms import opengl
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import nerfstudio_camera
-from torchslam.io.export.scene import ExportedScene, scene_of
+from torchslam.io.export.scene import scene_of
 from torchslam.refine.pose_refinement import RefinementResult
 from torchslam.types import Trajectory
 from torchslam.utils.files import JSON_BYTES, parse_json
 
-COVARIANCES = "covariances.txt"
 # Keys of a camera in a transforms.json; all of them are replaced.
 CAMERA_KEYS = (
     *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"),
@@ -32,48 +28,27 @@ CAMERA_KEYS = (
 )
 
 
-@dataclass(frozen=True)
-class NamedScene(ExportedScene):
-    """A scene with the image names of another program.
-
-    Attributes:
-        names: By frame number.
-    """
-
-    names: dict[int, str]
-
-    @property
-    def image_names(self) -> list[str]:
-        """The names of the images, one per frame."""
-        return [self.names[index] for index in self.frame_ids.tolist()]
-
-
 def write_refined(folder: Path, refined: RefinementResult) -> Path:
     """Write the refined poses, and the covariances of the keyframes, into a folder; return the file or folder."""
     folder.mkdir(parents=True, exist_ok=True)
-    frames, T_cw = refined_poses(refined)
-    given = refined.given
-    _write_covariances(folder / COVARIANCES, refined)
-    if given.kind == COLMAP:
-        _write_colmap(folder, refined)
+    given, run = refined.given, refined.run
+    _write_covariances(folder / "covariances.txt", refined)
+    if given.kind == COLMAP:  # images are renumbered in the order of the frames
+        assert run.main is not None
+        scene = scene_of(run.main, run.camera, run.session, keyframes_alone=False)
+        write_colmap(folder, scene, [_name(refined, frame) for frame in scene.frame_ids.tolist()])
         return folder
+    frames, order = run.posed_frames.frames["frame_index"].cpu().sort()
+    T_wc = se3_inverse(run.posed_frames.T_cw(run.map).cpu()[order])
+    rows = refined.pose_rows[frames]
     if given.kind == NERFSTUDIO:
         path = folder / given.path.name
-        _write_transforms(path, refined, frames, T_cw)
+        _write_transforms(path, refined, dict(zip(rows.tolist(), opengl(T_wc).tolist(), strict=True)))
         return path
     path = folder / (given.path.name or "trajectory.txt")
     assert given.timestamps is not None
-    times = given.timestamps[refined.pose_rows[frames]]
-    write_trajectory(path, Trajectory(times, se3_inverse(T_cw)))
+    write_trajectory(path, Trajectory(given.timestamps[rows], T_wc))
     return path
-
-
-def refined_poses(refined: RefinementResult) -> tuple[Int[Tensor, " F"], Float[Tensor, "F 4 4"]]:
-    """Return the frames with a refined pose, ascending, and their T_cw."""
-    posed_frames, slam_map = refined.run.posed_frames, refined.run.map
-    frames = posed_frames.frames["frame_index"].cpu()
-    order = torch.argsort(frames)
-    return frames[order], posed_frames.T_cw(slam_map).cpu()[order]
 
 
 def _name(refined: RefinementResult, frame: int) -> str:
@@ -98,26 +73,15 @@ def _write_covariances(path: Path, refined: RefinementResult) -> None:
     path.write_text("".join(lines), encoding="utf-8")
 
 
-def _write_colmap(folder: Path, refined: RefinementResult) -> None:
-    """Write the model with the map's points; images are renumbered in the order of the frames."""
-    assert refined.run.main is not None
-    scene = scene_of(refined.run.main, refined.run.camera, refined.run.session, keyframes_alone=False)
-    names = {frame: _name(refined, frame) for frame in scene.frame_ids.tolist()}
-    columns: dict[str, Any] = {column.name: getattr(scene, column.name) for column in fields(ExportedScene)}
-    write_colmap(folder, NamedScene(names=names, **columns))
-
-
-def _write_transforms(path: Path, refined: RefinementResult, frames: Tensor, T_cw: Tensor) -> None:
-    """Write the original file with new poses and camera; other content stays."""
+def _write_transforms(path: Path, refined: RefinementResult, poses: dict[int, Any]) -> None:
+    """Write the original file with new poses by its rows, and the new camera; other content stays."""
     content = parse_json(read_text(refined.given.path, TrajectoryError, JSON_BYTES))
-    rows = refined.pose_rows[frames].tolist()
-    poses = dict(zip(rows, opengl(se3_inverse(T_cw)).tolist(), strict=True))
-    written_frames = [
+    frames = [
         {key: value for key, value in frame.items() if key not in CAMERA_KEYS}
         | {"transform_matrix": poses[row]}
         for row, frame in enumerate(content["frames"])
         if row in poses
     ]
     about = {key: value for key, value in content.items() if key not in CAMERA_KEYS}
-    written = nerfstudio_camera(refined.run.camera) | about | {"frames": written_frames}
+    written = nerfstudio_camera(refined.run.camera) | about | {"frames": frames}
     path.write_text(json.dumps(written, indent=2) + "\n", encoding="utf-8")

@@ -35,13 +35,7 @@ from torchslam.geometry.robust import fit_inliers
 from torchslam.geometry.similarity import align_poses
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, choose_held_back, choose_images
-from torchslam.global_mapping.rounds import (
-    GATE,
-    MIN_VIEWS,
-    ObservedTracks,
-    Reconstruction,
-    adjust_in_rounds,
-)
+from torchslam.global_mapping.rounds import GATE, MIN_VIEWS, ObservedTracks, Reconstruction, adjust_in_rounds
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
     Relation,
@@ -150,12 +144,15 @@ def refine_poses(
     refinement = _Refinement(mapper, frames, chosen, given.T_cw[rows].to(camera.params))
     failure = refinement.failure
     if not failure:
-        log(
-            f"{len(refinement.views)} images, {len(refinement.pairs)} pairs; given: {refinement.before.sentence()}"
-        )
+        counts = f"{len(refinement.views)} images, {len(refinement.pairs)} pairs"
+        log(f"{counts}; given: {refinement.before.sentence()}")
         failure = refinement.map()
     if failure:
-        run = Run((), SensorModel(camera), config, refinement.lost(failure), mapper.skipped, False, failure)
+        why = (Explanation.of(Reason.OTHER, text=failure),)
+        lost = [
+            StepResult(view.index, view.timestamp, State.LOST, None, reasons=why) for view in refinement.views
+        ]
+        run = Run((), SensorModel(camera), config, lost, mapper.skipped, False, failure)
         return RefinementResult(run, given, rows, 0)
     rounds = 1
     if choice is CameraChoice.IF_CONTRADICTED:
@@ -192,6 +189,7 @@ class _Refinement:
     ) -> None:
         """given_cw: by frame of the sequence; of frames without a pose, any."""
         self.mapper, self.frames, self.given_cw = mapper, frames, given_cw
+        self.given = {frame: given_cw[frame] for frame in frames}
         self.views = [view for view in map(mapper.view, chosen) if view is not None]
         self.pairs: list[ViewPair] = []
         self.failure = ""
@@ -205,9 +203,8 @@ class _Refinement:
             self.failure = f"no map: no two of {len(self.views)} images overlap"
             return
         self.T_cw = given_cw[torch.tensor([view.index for view in self.views], device="cpu")]
-        self.before = self._check(
-            self.T_cw, torch.ones(len(self.views), dtype=torch.bool, device="cpu"), mapper.camera
-        )
+        everything = torch.ones(len(self.views), dtype=torch.bool, device="cpu")
+        self.before = self._check(self.T_cw, everything, mapper.camera)
 
     @torch.no_grad()
     def map(self) -> str:
@@ -225,7 +222,7 @@ class _Refinement:
         known = torch.zeros(len(self.views), dtype=torch.bool, device="cpu")
         known[rows.cpu()] = True
         self.after = self._check(reconstruction.T_cw, known, reconstruction.camera)
-        self.run = self.mapper.finish(self.views, *made, self.frames, self._given())
+        self.run = self.mapper.finish(self.views, *made, self.frames, self.given)
         submap = self.run.submaps[0]
         posed = submap.posed_frames.frames["frame_index"]
         submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), self.given_cw[posed]))
@@ -242,26 +239,13 @@ class _Refinement:
         observed = self._tracks()
         found = observed.triangulate(self.T_cw, self.mapper.camera, GATE)
         rows = torch.unique(observed.tracks.view[found.agrees])
-        self.run = self.mapper.finish(
-            self.views, rows, observed, found, self.frames, self._given(), keep=True
-        )
+        self.run = self.mapper.finish(self.views, rows, observed, found, self.frames, self.given, keep=True)
         submap = self.run.submaps[0]
         frames = submap.posed_frames.frames
         T_rw = submap.map.T_cw[frames["reference_keyframe"]]
         frames["T_cr"][:] = self.given_cw[frames["frame_index"]] @ se3_inverse(T_rw)
         self.after = self.before
         return True
-
-    def lost(self, reason: str) -> list[StepResult]:
-        """A result for every image, without a pose."""
-        reasons = (Explanation.of(Reason.OTHER, text=reason),)
-        return [
-            StepResult(view.index, view.timestamp, State.LOST, None, reasons=reasons) for view in self.views
-        ]
-
-    def _given(self) -> dict[int, Float[Tensor, "4 4"]]:
-        """The given poses, by frame."""
-        return {frame: self.given_cw[frame] for frame in self.frames}
 
     def _check(self, T_cw: Tensor, known: Tensor, camera: Camera) -> MapCheck:
         reduction = self.mapper.config.features.reduction(camera.size)

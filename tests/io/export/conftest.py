@@ -1,16 +1,13 @@
-"""A scene that is seen by four cameras, in every camera model; and the fixtures of a small run."""
+"""A scene that is seen by four cameras, in every camera model."""
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 
-from tests.sample_run import camera as camera
-from tests.sample_run import results, run, slam_map, submap, trajectory
 from torchslam.geometry import Camera, rigid, so3_exp, transform
 from torchslam.io.export.scene import ExportedScene
-
-__all__ = ["results", "run", "slam_map", "submap", "trajectory"]
 
 SIZE = (320, 240)
 PINHOLE = (200.0, 210.0, 158.0, 121.5)
@@ -56,6 +53,20 @@ def scene(lens: Camera, generator: torch.Generator) -> ExportedScene:
         point_index=point_index,
         pixels=pixels + NOISE_PX * torch.randn(pixels.shape, **noise),
     )
+
+
+class PointErrors:
+    """Mean over the points of their mean error, of pixels that another program would compute."""
+
+    def __init__(self, points: int) -> None:
+        self._total, self._count = np.zeros(points), np.zeros(points)
+
+    def add(self, ids: np.ndarray, pixels: np.ndarray, keypoints: np.ndarray) -> None:
+        np.add.at(self._total, ids, np.hypot(*(pixels - keypoints).T))
+        np.add.at(self._count, ids, 1)
+
+    def mean(self) -> float:
+        return float(np.mean(self._total / self._count))
 
 
 def reprojection_error(scene: ExportedScene) -> float:

@@ -11,12 +11,12 @@ import torch
 
 from tests.box_room import HALF, box_cloud, box_depths, wall_colors
 from torchslam.dense import DepthMaps
-from torchslam.dense.depth_maps import read_frames
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, rigid, so3_exp, transform
-from torchslam.io.export.depths import UNIT, colmap_map, depth_png, enlarged, write_workspace
+from torchslam.io.export.colmap import colmap_map, write_workspace
+from torchslam.io.export.nerfstudio import UNIT, depth_png
 from torchslam.io.export.ply import read_cloud
-from torchslam.io.export.scene import ExportedScene, Undistorter, undistorted
+from torchslam.io.export.scene import ExportedScene, Undistorter, enlarged, undistorted
 
 SMALL = Camera.pinhole(50.0, 52.0, 31.0, 23.0, size=(64, 48))
 FRAMES = 6
@@ -62,30 +62,12 @@ class Painted:
         return np.ascontiguousarray(self._by_frame[frame_id][..., ::-1])
 
 
-def test_maps_are_read_one_by_one(room: tuple[ExportedScene, Path]) -> None:
-    maps, found = DepthMaps.load(room[1]), list(DepthMaps.blocks(room[1], 1))
-    assert torch.equal(torch.cat([each.depth for each in found]), maps.depth)
-    assert torch.equal(torch.cat([each.T_cw for each in found]), maps.T_cw)
-    frames, camera = read_frames(room[1])
-    assert torch.equal(frames, maps.frame_index)
-    assert camera.size == SMALL.size
-
-
 def test_a_depth_image_has_thousandths_and_zero_where_depth_is_unknown() -> None:
     depth = torch.tensor([[0.0, 1.0, 2.0004], [65.535, 65.6, 1e6]])
     image = cv2.imdecode(np.frombuffer(depth_png(depth), np.uint8), cv2.IMREAD_UNCHANGED)
     assert image.dtype == np.uint16
     assert image.tolist() == [[0, 1000, 2000], [65535, 0, 0]]
     assert UNIT == 1e-3
-
-
-def test_pycolmap_reads_a_depth_map(room: tuple[ExportedScene, Path], tmp_path: Path) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    depth = DepthMaps.load(room[1]).depth[2:3]
-    (tmp_path / "map.bin").write_bytes(colmap_map(depth))
-    read = pycolmap.DepthMap()
-    read.read(str(tmp_path / "map.bin"))
-    np.testing.assert_array_equal(read.to_array(), depth[0])
 
 
 def test_normals_are_in_the_order_of_the_format(room: tuple[ExportedScene, Path]) -> None:

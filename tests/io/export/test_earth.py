@@ -10,7 +10,7 @@ import torch
 
 from torchslam.data.formats.fix_files import read_fixes
 from torchslam.geometry import enu_from_geodetic, rigid
-from torchslam.io.export.earth import write_earth
+from torchslam.io.write_run import write_earth
 from torchslam.map.unit import MetricUnit
 from torchslam.types import Trajectory
 

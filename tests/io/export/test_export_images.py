@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from torchslam.data import open_sequence
-from torchslam.errors import FrameError, ResultsError
+from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.io.export.scene import (
     ExampleFrame,
@@ -169,19 +169,3 @@ def test_a_video_has_colors_at_every_frame(seen: ExportedScene, tmp_path: Path) 
     images = open_images(ImageSource(path), replace(seen, timestamps=times))
     for index in (3, 0, 6):  # backwards too
         assert np.abs(images.bgr(index).astype(int) - picture(index, seen.camera)).mean() < 4
-
-
-def test_a_rendered_sequence_has_three_equal_channels() -> None:
-    sequence = open_sequence("synthetic:room?frames=2&blank=1").part(1)
-    assert sequence.color(0).shape == (480, 640, 3)
-    assert sequence.color(0).unique().tolist() == [128]
-
-
-def test_a_damaged_image_is_a_frame_error(seen: ExportedScene, folder: Path) -> None:
-    sequence = open_sequence(folder, seen.camera)
-    (folder / "rgb" / "3.png").write_bytes(b"not an image")
-    with pytest.raises(FrameError, match=r"rgb\.txt:4"):
-        sequence.color(3)
-    cv2.imwrite(str(folder / "rgb" / "4.png"), np.zeros((10, 10, 3), np.uint8))
-    with pytest.raises(FrameError, match="10x10"):
-        sequence.color(4)

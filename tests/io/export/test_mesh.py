@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from tests.box_room import HALF, box_depths
 from tests.io.export.test_depths import SMALL
 from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, so3_exp
-from torchslam.io.export.mesh import import_open3d, write_mesh
+from torchslam.io.export.mesh import write_mesh
 
 R_UP = so3_exp(torch.tensor((torch.pi / 2, 0.0, 0.0), dtype=torch.float64))
 
@@ -55,9 +54,3 @@ def test_depth_without_confidence_gives_no_mesh(depths: Path, tmp_path: Path) ->
     replace(maps, confidence=0.1 * maps.confidence).save(depths)
     with pytest.raises(ResultsError, match=r"no depth of a confidence of 0\.5 or more"):
         write_mesh(tmp_path / "mesh.ply", depths, R_UP, None)
-
-
-def test_without_open3d_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "open3d", None)
-    with pytest.raises(ResultsError, match=r"pip install 'torchslam\[mesh\]'"):
-        import_open3d()

@@ -11,15 +11,14 @@ import pytest
 import torch
 
 from tests.box_room import HALF, box_cloud, box_depths
-from tests.io.export.conftest import reprojection_error
+from tests.io.export.conftest import PointErrors, reprojection_error
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import upright_rotation
-from torchslam.io.export.depths import enlarged
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.ply import VERTEX
 from torchslam.io.export.ply import read_cloud as read_dense
-from torchslam.io.export.scene import ExportedScene, undistorted
+from torchslam.io.export.scene import ExportedScene, enlarged, undistorted
 
 
 def distort(about: dict, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -56,7 +55,7 @@ def test_points_fall_on_their_keypoints(scene: ExportedScene, folder: Path) -> N
     about = json.loads((folder / "transforms.json").read_text())
     cloud = read_cloud(folder / about["ply_file_path"])
     points = np.stack([cloud[name] for name in "xyz"], axis=1).astype(float)
-    total, count = np.zeros(len(points)), np.zeros(len(points))
+    errors = PointErrors(len(points))
     for row, frame in enumerate(about["frames"]):
         seen = (scene.frame_index == row).numpy()
         ids = scene.point_index.numpy()[seen]
@@ -64,10 +63,9 @@ def test_points_fall_on_their_keypoints(scene: ExportedScene, folder: Path) -> N
         x, y, z = ((points[ids] - T_wc[:3, 3]) @ T_wc[:3, :3]).T
         x, y = distort(about, x / -z, -y / -z)
         u, v = about["fl_x"] * x + about["cx"], about["fl_y"] * y + about["cy"]
-        keypoints = scene.pixels.numpy()[seen] + 0.5  # nerfstudio's pixel centers
-        np.add.at(total, ids, np.hypot(u - keypoints[:, 0], v - keypoints[:, 1]))
-        np.add.at(count, ids, 1)
-    assert np.mean(total / count) == pytest.approx(reprojection_error(scene), abs=1e-4)  # floats in the cloud
+        # Of nerfstudio's pixel centers.
+        errors.add(ids, np.stack((u, v), axis=1), scene.pixels.numpy()[seen] + 0.5)
+    assert errors.mean() == pytest.approx(reprojection_error(scene), abs=1e-4)  # floats in the cloud
 
 
 def test_the_map_is_upright_and_the_transform_is_written(scene: ExportedScene, folder: Path) -> None:

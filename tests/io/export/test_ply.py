@@ -46,19 +46,6 @@ def test_points_and_cameras_read_back(tmp_path: Path, generator: torch.Generator
     assert seen[5:].tolist() == [list(CAMERA_COLOR)] * 2
 
 
-def test_another_program_reads_the_ply_file(tmp_path: Path, generator: torch.Generator) -> None:
-    pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
-    points_w = torch.randn(4, 3, generator=generator)
-    colors = torch.randint(0, 256, (4, 3), generator=generator, dtype=torch.uint8)
-    write_ply(tmp_path / "map.ply", points_w, colors, torch.zeros(0, 3))
-    made = pycolmap.Reconstruction()
-    made.import_PLY(str(tmp_path / "map.ply"))
-    assert len(made.points3D) == 4
-    for number, point in made.points3D.items():
-        np.testing.assert_allclose(point.xyz, points_w[number - 1], rtol=1e-6)
-        np.testing.assert_array_equal(point.color, colors[number - 1])
-
-
 def test_a_map_is_rotated_upright(tmp_path: Path, slam_map: Map) -> None:
     """By a rotation alone: up for the cameras is z, normals look at the observer as before."""
     slam_map.points["colors"][:] = torch.arange(len(slam_map.points))[:, None].to(torch.uint8)
@@ -127,15 +114,17 @@ def test_a_dense_cloud_is_turned_and_turned_back(tmp_path: Path, cloud: PointClo
     torch.testing.assert_close(read_cloud(tmp_path / "dense.ply", R).points_w, cloud.points_w)
 
 
-def test_another_program_reads_the_dense_cloud(tmp_path: Path, cloud: PointCloud) -> None:
+def test_another_program_reads_both_clouds(tmp_path: Path, cloud: PointCloud) -> None:
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap is not installed")
     write_cloud(tmp_path / "dense.ply", cloud)
-    made = pycolmap.Reconstruction()
-    made.import_PLY(str(tmp_path / "dense.ply"))
-    assert len(made.points3D) == len(cloud)
-    for number, point in made.points3D.items():
-        np.testing.assert_array_equal(point.xyz, cloud.points_w[number - 1])
-        np.testing.assert_array_equal(point.color, cloud.colors[number - 1])
+    write_ply(tmp_path / "map.ply", cloud.points_w, cloud.colors, torch.zeros(0, 3))
+    for name in ("dense.ply", "map.ply"):
+        made = pycolmap.Reconstruction()
+        made.import_PLY(str(tmp_path / name))
+        assert len(made.points3D) == len(cloud)
+        for number, point in made.points3D.items():
+            np.testing.assert_array_equal(point.xyz, cloud.points_w[number - 1])
+            np.testing.assert_array_equal(point.color, cloud.colors[number - 1])
 
 
 @pytest.mark.parametrize(

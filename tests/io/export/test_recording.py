@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,11 @@ import numpy as np
 import pytest
 
 from tests.box_room import box_cloud, box_depths
-from tests.io.export.conftest import reprojection_error
+from tests.io.export.conftest import PointErrors, reprojection_error
 from tests.walks import Walk, arc
-from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import upright_rotation
-from torchslam.io.export.recording import import_rerun, write_recording
+from torchslam.io.export.recording import write_recording
 from torchslam.io.export.scene import ExportedScene, Images, undistorted
 
 chunks = pytest.importorskip("rerun.chunk", reason="rerun is not installed: pip install 'torchslam[rerun]'")
@@ -64,7 +62,7 @@ def test_points_fall_on_their_keypoints(flat: ExportedScene, recorded: Rows) -> 
     K = only(recorded, "/world/keyframe", "Pinhole:image_from_camera").reshape(3, 3).T  # by columns
     rotations = dict(recorded["/world/keyframe", "Transform3D:mat3x3"])
     positions = dict(recorded["/world/keyframe", "Transform3D:translation"])
-    total, count = np.zeros(len(points)), np.zeros(len(points))
+    errors = PointErrors(len(points))
     keyframes = flat.frame_ids[flat.is_keyframe].tolist()
     assert [frame for frame, _ in recorded["/world/keyframe/keypoints", "Points2D:positions"]] == keyframes
     for frame, keypoints in recorded["/world/keyframe/keypoints", "Points2D:positions"]:
@@ -73,12 +71,11 @@ def test_points_fall_on_their_keypoints(flat: ExportedScene, recorded: Rows) -> 
         R_wc = np.array(rotations[frame]).reshape(3, 3).T
         in_camera = (points[ids] - np.array(positions[frame])) @ R_wc
         pixels = (in_camera / in_camera[:, 2:]) @ K.T
-        np.add.at(total, ids, np.hypot(*(pixels[:, :2] - np.array(keypoints)).T))
-        np.add.at(count, ids, 1)
+        errors.add(ids, pixels[:, :2], np.array(keypoints))
         centered = flat.pixels[flat.frame_index == row].numpy() + 0.5  # the corner of the image is the origin
         np.testing.assert_allclose(keypoints, centered, atol=1e-3)
     expected = reprojection_error(only_keyframes(flat))
-    assert np.mean(total / count) == pytest.approx(expected, abs=1e-3)
+    assert errors.mean() == pytest.approx(expected, abs=1e-3)
 
 
 def only_keyframes(scene: ExportedScene) -> ExportedScene:
@@ -116,12 +113,6 @@ def test_keyframes_have_their_image(flat: ExportedScene, recorded: Rows) -> None
     assert [frame for frame, _ in logged] == flat.frame_ids[flat.is_keyframe].tolist()
     content = np.array(logged[0][1], dtype=np.uint8).reshape(-1)
     assert cv2.imdecode(content, cv2.IMREAD_COLOR).shape == (240, 320, 3)
-
-
-def test_a_missing_rerun_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "rerun", None)
-    with pytest.raises(ResultsError, match=r"pip install 'torchslam\[rerun\]'"):
-        import_rerun()
 
 
 def test_depth_and_the_dense_cloud_are_recorded(flat: ExportedScene, tmp_path: Path) -> None:

@@ -51,17 +51,6 @@ def test_undistorted_images_agree_with_opencv(lens: Camera) -> None:
     assert difference.max() <= 2
 
 
-def test_a_point_keeps_its_ray(scene: ExportedScene) -> None:
-    flat = undistorted(scene)
-    torch.testing.assert_close(
-        flat.camera.unproject(flat.pixels), scene.camera.unproject(scene.pixels), atol=1e-9, rtol=0
-    )
-
-
-def test_only_a_pinhole_camera_is_unchanged(scene: ExportedScene) -> None:
-    assert (undistorted(scene) is scene) == (scene.camera.model == "pinhole")
-
-
 def test_the_size_of_an_undistorted_image_is_bounded() -> None:
     """The left and right edges are 100 degrees from the axis, where a pinhole camera sees nothing."""
     wide = pinhole_within(Camera.fisheye(90.0, 90.0, 159.5, 119.5, 0.0, 0.0, 0.0, 0.0, size=(320, 240)))

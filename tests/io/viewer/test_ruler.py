@@ -14,12 +14,17 @@ import numpy as np
 import pytest
 import torch
 
-from tests.io.viewer.test_page import array, browse, data_of, kept
+from tests.io.viewer.test_page import array, browse, data_of, decoded, kept
 from torchslam.geometry import se3_exp
 from torchslam.io.results import Results
-from torchslam.io.viewer.arrays import decoded
-from torchslam.io.viewer.page import page, write_view
-from torchslam.io.viewer.ruler import FACTOR_STEPS, PIXEL_STEPS, clearest_observations, error_factors
+from torchslam.io.viewer.page import (
+    FACTOR_STEPS,
+    STEPS,
+    clearest_observations,
+    error_factors,
+    page,
+    write_view,
+)
 from torchslam.map.map import Map
 from torchslam.map.unit import MetricUnit, UnitSource
 from torchslam.metric.distances import parse_distance
@@ -37,7 +42,7 @@ UNIT = MetricUnit(
 
 
 def pixels_of(submap: dict[str, Any]) -> np.ndarray:
-    return array(submap["seen_pixel"], 2) / PIXEL_STEPS * (np.array(SIZE) - 1)
+    return array(submap["seen_pixel"], 2) / STEPS * (np.array(SIZE) - 1)
 
 
 def spread(submap: dict[str, Any], row: int, direction: np.ndarray) -> float:
@@ -245,12 +250,7 @@ def test_a_browser_takes_fingers_that_do_not_move(tmp_path: Path, kept: Results)
     said.missed = [words(), ruler.rows.length];
     """
     said = handled(write_view(kept, tmp_path), script)
-    assert said == {
-        "dragged": [0, True],
-        "pinched": 0,
-        "tapped": 1,
-        "missed": ["There is no point.", 1],
-    }
+    assert said == {"dragged": [0, True], "pinched": 0, "tapped": 1, "missed": ["There is no point.", 1]}
 
 
 def test_a_browser_gives_no_option_for_points_of_another_session(tmp_path: Path, kept: Results) -> None:

@@ -1,21 +1,29 @@
-"""A sparse model in COLMAP's files, binary and text: cameras, images, points3D.
+"""COLMAP's files: a sparse model, binary and text, and the workspace of a dense reconstruction.
 
-The formats: https://colmap.github.io/format.html. Identifiers begin at 1; the order is that of the frames and points.
+The formats: https://colmap.github.io/format.html. Identifiers begin at 1; the order is that of the frames and points. A
+depth map is a line `width&height&channels&` and then float32 numbers, of which those along a row of the image are
+neighbors, and channels come last.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from jaxtyping import Float
+from torch import Tensor
 
+from torchslam.dense.cloud import PointCloud
+from torchslam.dense.depth_maps import DepthMaps
 from torchslam.geometry import Camera
 from torchslam.geometry.transforms import corner_camera, corner_pixels, quaternion_wxyz
-from torchslam.io.export.scene import ExportedScene
+from torchslam.io.export.ply import write_cloud
+from torchslam.io.export.scene import ExportedScene, Images, write_images
 
 CAMERA_ID = 1
 """Number of the one camera; COLMAP counts from 1."""
@@ -23,25 +31,6 @@ MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 """COLMAP's numbers of camera models (src/colmap/sensor/models.h)."""
 POINT_IN_IMAGE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
 TRACK = np.dtype([("image", "<u4"), ("index", "<u4")])  # which image, and the how many-th of its points
-
-
-@dataclass(frozen=True)
-class _Image:
-    """pose: quaternion w first, translation, world to camera; points: of POINT_IN_IMAGE."""
-
-    name: str
-    pose: list[float]
-    points: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Point:
-    """track: of TRACK."""
-
-    position: list[float]
-    color: list[int]
-    error: float
-    track: np.ndarray
 
 
 def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
@@ -53,82 +42,90 @@ def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
         return "OPENCV_FISHEYE", params
     if not any(params[8:]):
         return "OPENCV", params[:8]
-    return "FULL_OPENCV", [*params, 0.0, 0.0, 0.0][
-        :12
-    ]  # k4, k5, k6 of a denominator are zero without a rational model
+    return "FULL_OPENCV", [*params, 0.0, 0.0, 0.0][:12]  # k4, k5, k6: zero without a rational model
 
 
-def write_colmap(folder: Path, scene: ExportedScene) -> None:
-    """Write the model, binary and text, into a folder that is made if need be."""
+def write_colmap(folder: Path, scene: ExportedScene, names: Sequence[str] | None = None) -> None:
+    """Write the model, binary and text, into a folder that is made if need be.
+
+    Args:
+        folder: of the files.
+        scene: what is written.
+        names: of the images of its frames; None: `scene.image_names`.
+    """
     folder.mkdir(parents=True, exist_ok=True)
-    images, points = _images(scene), _points(scene)
-    (folder / "cameras.bin").write_bytes(_binary_camera(scene.camera))
-    (folder / "images.bin").write_bytes(_counted(_binary_image(*item) for item in enumerate(images, 1)))
-    (folder / "points3D.bin").write_bytes(_counted(_binary_point(*item) for item in enumerate(points, 1)))
     model, params = colmap_camera(scene.camera)
-    lines = {
-        "cameras.txt": [_line(CAMERA_ID, model, *scene.camera.size, *params)],
-        "images.txt": [_text_image(*item) for item in enumerate(images, 1)],
-        "points3D.txt": [_text_point(*item) for item in enumerate(points, 1)],
-    }
-    for name, content in lines.items():
-        (folder / name).write_text("".join(content), encoding="utf-8")
-
-
-def _images(scene: ExportedScene) -> list[_Image]:
-    points = np.zeros(len(scene.pixels), POINT_IN_IMAGE)
-    points["x"], points["y"] = corner_pixels(scene.pixels).numpy().T
-    points["point"] = scene.point_index.numpy() + 1
-    counts = np.bincount(scene.frame_index.numpy(), minlength=len(scene.T_cw))
-    per_image = np.split(points, counts.cumsum())[:-1]  # the rest is empty
-    quaternions = quaternion_wxyz(scene.T_cw[:, :3, :3]).tolist()
-    poses = [q + t for q, t in zip(quaternions, scene.T_cw[:, :3, 3].tolist(), strict=True)]
-    return [_Image(*row) for row in zip(scene.image_names, poses, per_image, strict=True)]
-
-
-def _points(scene: ExportedScene) -> list[_Point]:
+    camera = struct.pack(f"<IiQQ{len(params)}d", CAMERA_ID, MODEL_IDS[model], *scene.camera.size, *params)
+    _write(folder / "cameras", [camera], [[CAMERA_ID, model, *scene.camera.size, *params]])
     frame, point = scene.frame_index.numpy(), scene.point_index.numpy()
-    first = np.searchsorted(frame, np.arange(len(scene.T_cw)))
+    seen = np.zeros(len(frame), POINT_IN_IMAGE)
+    seen["x"], seen["y"] = corner_pixels(scene.pixels).numpy().T
+    seen["point"] = point + 1
+    ends = np.bincount(frame, minlength=len(scene.T_cw)).cumsum()
+    quaternions, translations = quaternion_wxyz(scene.T_cw[:, :3, :3]), scene.T_cw[:, :3, 3]
+    poses = torch.cat((quaternions, translations), dim=1).tolist()
+    binary, lines = list[bytes](), list[Iterable[Any]]()
+    for number, (name, pose, points) in enumerate(
+        zip(names or scene.image_names, poses, np.split(seen, ends)[:-1], strict=True), 1
+    ):
+        header = struct.pack("<I7dI", number, *pose, CAMERA_ID) + name.encode() + b"\0"
+        binary.append(header + struct.pack("<Q", len(points)) + points.tobytes())
+        lines += [[number, *pose, CAMERA_ID, name], chain.from_iterable(points.tolist())]
+    _write(folder / "images", binary, lines)
     tracks = np.zeros(len(frame), TRACK)
-    tracks["image"], tracks["index"] = frame + 1, np.arange(len(frame)) - first[frame]
+    tracks["image"] = frame + 1
+    tracks["index"] = np.arange(len(frame)) - np.searchsorted(frame, np.arange(len(scene.T_cw)))[frame]
     ends = np.bincount(point, minlength=len(scene.points_w)).cumsum()
     per_point = np.split(tracks[np.argsort(point, kind="stable")], ends)[:-1]
     columns = (scene.points_w.tolist(), scene.colors.tolist(), scene.point_errors().tolist(), per_point)
-    return [_Point(*row) for row in zip(*columns, strict=True)]
+    binary, lines = [], []
+    for number, (position, color, error, track) in enumerate(zip(*columns, strict=True), 1):
+        header = struct.pack("<Q3d3BdQ", number, *position, *color, error, len(track))
+        binary.append(header + track.tobytes())
+        lines.append([number, *position, *color, error, *chain.from_iterable(track.tolist())])
+    _write(folder / "points3D", binary, lines)
 
 
-def _counted(items: Iterable[bytes]) -> bytes:
-    parts = list(items)
-    return struct.pack("<Q", len(parts)) + b"".join(parts)
+def _write(path: Path, binary: list[bytes], lines: Iterable[Iterable[Any]]) -> None:
+    """Write a file of entries, and the same as text that reads back as the same numbers."""
+    path.with_suffix(".bin").write_bytes(struct.pack("<Q", len(binary)) + b"".join(binary))
+    text = "".join(" ".join(map(str, line)) + "\n" for line in lines)
+    path.with_suffix(".txt").write_text(text, encoding="utf-8")
 
 
-def _binary_camera(camera: Camera) -> bytes:
-    model, params = colmap_camera(camera)
-    header = struct.pack("<IiQQ", CAMERA_ID, MODEL_IDS[model], *camera.size)
-    return _counted([header + struct.pack(f"<{len(params)}d", *params)])
+def write_workspace(
+    folder: Path, scene: ExportedScene, path: Path, cloud: PointCloud | None, images: Images | None
+) -> None:
+    """Write COLMAP's workspace of a dense reconstruction, as after `patch_match_stereo` and `stereo_fusion`.
+
+    Args:
+        folder: the workspace, created if missing.
+        scene: the frames of the depth maps, for their camera.
+        path: the file of the depth maps.
+        cloud: the fused cloud in the map's world, if there is one.
+        images: of the size of the depth maps; None: no images.
+    """
+    stereo, names = folder / "stereo", dict(zip(scene.frame_ids.tolist(), scene.image_names, strict=True))
+    for kind in ("depth_maps", "normal_maps", "consistency_graphs"):
+        (stereo / kind).mkdir(parents=True, exist_ok=True)
+        for old in (stereo / kind).glob("[0-9]" * 6 + ".png.*"):
+            old.unlink()
+    for maps in DepthMaps.blocks(path, 1):
+        name = f"{names[int(maps.frame_index)]}.geometric.bin"
+        (stereo / "depth_maps" / name).write_bytes(colmap_map(maps.depth))
+        (stereo / "normal_maps" / name).write_bytes(colmap_map(maps.normal[0]))
+    (stereo / "fusion.cfg").write_text("".join(f"{name}\n" for name in names.values()), encoding="utf-8")
+    # COLMAP's default: a depth map is compared with 20 images.
+    neighbors = "".join(f"{name}\n__auto__, 20\n" for name in names.values())
+    (stereo / "patch-match.cfg").write_text(neighbors, encoding="utf-8")
+    write_colmap(folder / "sparse", scene)
+    if images is not None:
+        write_images(folder / "images", scene, images)
+    if cloud is not None:
+        write_cloud(folder / "fused.ply", cloud)
 
 
-def _binary_image(number: int, image: _Image) -> bytes:
-    header = struct.pack("<I7dI", number, *image.pose, CAMERA_ID) + image.name.encode() + b"\0"
-    return header + struct.pack("<Q", len(image.points)) + image.points.tobytes()
-
-
-def _binary_point(number: int, point: _Point) -> bytes:
-    header = struct.pack("<Q3d3BdQ", number, *point.position, *point.color, point.error, len(point.track))
-    return header + point.track.tobytes()
-
-
-def _text_image(number: int, image: _Image) -> str:
-    """Two lines: the pose, and the points, which may be none."""
-    points = [value for point in image.points.tolist() for value in point]
-    return _line(number, *image.pose, CAMERA_ID, image.name) + _line(*points)
-
-
-def _text_point(number: int, point: _Point) -> str:
-    track = [value for seen in point.track.tolist() for value in seen]
-    return _line(number, *point.position, *point.color, point.error, *track)
-
-
-def _line(*values: Any) -> str:
-    """Values as text that reads back as the same numbers."""
-    return " ".join(map(str, values)) + "\n"
+def colmap_map(values: Float[Tensor, "C H W"]) -> bytes:
+    """Encode a map as COLMAP does: the numbers of a row are neighbors, then rows, then channels."""
+    channels, height, width = values.shape
+    return f"{width}&{height}&{channels}&".encode() + values.cpu().numpy().astype("<f4").tobytes()

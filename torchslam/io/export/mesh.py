@@ -7,10 +7,9 @@ which the mesh is the zero level (marching cubes).
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -32,19 +31,14 @@ DEPTH_STD = 0.01
 BLOCK = 8  # voxels to a side: memory is taken in blocks
 MAX_BLOCKS = 50_000
 """Blocks with a surface: about 2 GB with the blocks beside it. In a larger scene, voxels are wider."""
-FIRST_BLOCKS = 10_000  # that memory is taken for at once; there may be more
 BLOCK_STRIDE = 4  # pixels, of the depth that the blocks are counted from
-WIDENING = 1.25  # of the voxels, while there are too many blocks
 TRUNCATION = 4.0  # voxels to either side of a surface
 FARTHEST = 5.0  # median depths: what is farther has no detail
-MIN_MAPS = 2  # that see a voxel, if there are as many
 MIN_TRIANGLES = 100  # of a connected part: smaller ones are errors of depth
-UNPAINTED = 180  # gray, without images
 
 
-@dataclass(frozen=True)
-class MeshSize:
-    """voxel: width of a voxel, map units; vertices, triangles: numbers in the file."""
+class MeshSize(NamedTuple):
+    """Width of a voxel in map units, and numbers in the file."""
 
     voxel: float
     vertices: int
@@ -56,9 +50,8 @@ def import_open3d() -> ModuleType:
     try:
         import open3d
     except ImportError as error:
-        raise ResultsError(
-            f"Open3D is required for a mesh: pip install 'torchslam[mesh]' ({error})"
-        ) from None
+        hint = "Open3D is required for a mesh: pip install 'torchslam[mesh]'"
+        raise ResultsError(f"{hint} ({error})") from None
     return open3d
 
 
@@ -76,26 +69,29 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
     """
     o3d = import_open3d()
     turn = rigid(R_up.double(), torch.zeros(3, dtype=torch.float64, device="cpu"))
-    middle = _median_depth(depths)
-    voxel = _voxel(depths, middle)
+    middle, voxel = _middle_and_voxel(depths)
     grid = o3d.t.geometry.VoxelBlockGrid(
         attr_names=("tsdf", "weight", "color"),
         attr_dtypes=(o3d.core.float32,) * 3,
         attr_channels=(1, 1, 3),
         voxel_size=voxel,
         block_resolution=BLOCK,
-        block_count=FIRST_BLOCKS,
+        block_count=10_000,  # that memory is taken for at once; there may be more
         device=o3d.core.Device("CPU:0"),
     )
     for maps in DepthMaps.blocks(depths, 1):
         depth = o3d.t.geometry.Image(o3d.core.Tensor(_sure_depth(maps, middle).numpy()))
-        color = o3d.t.geometry.Image(o3d.core.Tensor(_color(maps, images)))
+        pixels = np.full((*maps.depth.shape[1:], 3), 180 / 255, np.float32)  # gray
+        if images is not None:
+            rgb = cv2.cvtColor(images.bgr(int(maps.frame_index)), cv2.COLOR_BGR2RGB)
+            pixels = rgb.astype(np.float32) / 255
+        color = o3d.t.geometry.Image(o3d.core.Tensor(pixels))
         K = o3d.core.Tensor(maps.camera.K.double().numpy())
         T_cu = o3d.core.Tensor((maps.T_cw[0].double() @ turn.mT).numpy())
         limits = (1.0, FARTHEST * middle, TRUNCATION)  # scale and largest depth
         blocks = grid.compute_unique_block_coordinates(depth, K, T_cu, *limits)
         grid.integrate(blocks, depth, color, K, T_cu, *limits)
-    weight = min(MIN_MAPS, len(read_frames(depths)[0]))
+    weight = min(2, len(read_frames(depths)[0]))  # maps that see a voxel
     mesh = grid.extract_triangle_mesh(weight_threshold=weight - 0.5).to_legacy()  # weights are whole
     part, counts, _ = mesh.cluster_connected_triangles()
     mesh.remove_triangles_by_mask(np.asarray(counts)[np.asarray(part)] < MIN_TRIANGLES)
@@ -115,9 +111,8 @@ def _ordered(o3d: ModuleType, mesh: Any) -> Any:
     order = np.lexsort((*colors.T, *vertices.T))
     triangles = np.argsort(order)[np.asarray(mesh.triangles)]
     first = triangles.argmin(axis=1)[:, None]
-    triangles = np.take_along_axis(
-        triangles, (first + np.arange(3)) % 3, axis=1
-    )  # keeps the side that is outside
+    # Turning the corners keeps the side that is outside.
+    triangles = np.take_along_axis(triangles, (first + np.arange(3)) % 3, axis=1)
     triangles = triangles[np.lexsort(triangles.T)]
     vector = o3d.utility.Vector3dVector
     ordered = o3d.geometry.TriangleMesh(vector(vertices[order]), o3d.utility.Vector3iVector(triangles))
@@ -131,18 +126,16 @@ def _sure_depth(maps: DepthMaps, middle: float = math.inf) -> Float[Tensor, "H W
     return torch.where((maps.confidence[0] >= MIN_CONFIDENCE) & (depth < FARTHEST * middle), depth, 0.0)
 
 
-def _median_depth(depths: Path) -> float:
-    """The median over the maps of their median depths. Raises ResultsError without any depth."""
+def _middle_and_voxel(depths: Path) -> tuple[float, float]:
+    """The median over the maps of their median depths, and the width of a voxel: what they resolve, or memory allows.
+
+    Raises ResultsError without any depth.
+    """
     seen = [depth[depth > 0] for depth in map(_sure_depth, DepthMaps.blocks(depths, 1))]
     medians = [each.median() for each in seen if len(each)]
     if not medians:
         raise ResultsError(f"{depths}: no depth of a confidence of {MIN_CONFIDENCE} or more")
-    return float(torch.stack(medians).median())
-
-
-def _voxel(depths: Path, middle: float) -> float:
-    """The width of a voxel: what the depth maps resolve, or what memory allows."""
-    points = []
+    middle, points = float(torch.stack(medians).median()), []
     for maps in DepthMaps.blocks(depths, 1):
         depth = _sure_depth(maps, middle)[::BLOCK_STRIDE, ::BLOCK_STRIDE].double()
         v, u = (BLOCK_STRIDE * index for index in torch.nonzero(depth).T)
@@ -151,12 +144,5 @@ def _voxel(depths: Path, middle: float) -> float:
         points.append(transform(se3_inverse(maps.T_cw[0].double()), points_c))
     voxel = middle * max(DEPTH_STD, VOXEL_PX / float(maps.camera.params[0]))
     while len(torch.unique((torch.cat(points) / (BLOCK * voxel)).floor(), dim=0)) > MAX_BLOCKS:
-        voxel *= WIDENING
-    return voxel
-
-
-def _color(maps: DepthMaps, images: Images | None) -> Float[np.ndarray, "H W 3"]:
-    """The image of a map: red, green, blue, 0 to 1."""
-    if images is None:
-        return np.full((*maps.depth.shape[1:], 3), UNPAINTED / 255, np.float32)
-    return cv2.cvtColor(images.bgr(int(maps.frame_index)), cv2.COLOR_BGR2RGB).astype(np.float32) / 255
+        voxel *= 1.25
+    return middle, voxel

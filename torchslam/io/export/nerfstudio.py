@@ -14,6 +14,8 @@ import json
 from pathlib import Path
 from typing import Any
 
+import cv2
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -24,15 +26,14 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import Camera
 from torchslam.geometry.distortion import MODELS
 from torchslam.geometry.transforms import corner_camera, opengl
-from torchslam.io.export.depths import MAX_POINTS, depth_png
-from torchslam.io.export.ply import write_cloud, write_ply
+from torchslam.io.export.ply import MAX_DRAWN, write_cloud, write_ply
 from torchslam.io.export.scene import ExportedScene
 
-TRANSFORMS = "transforms.json"
 POINT_CLOUD = "sparse_pc.ply"
 DENSE_CLOUD = "dense_pc.ply"
 IMAGES = "images"
 DEPTHS = "depths"
+UNIT = 1e-3  # of the numbers of a depth image, in map units
 NAMES = {"pinhole": "PINHOLE", "radial_tangential": "OPENCV", "fisheye": "OPENCV_FISHEYE"}
 """Names of camera models; the formulas and names of their coefficients are OpenCV's."""
 
@@ -48,6 +49,13 @@ def nerfstudio_camera(camera: Camera) -> dict[str, Any]:
     params = corner_camera(camera).params.tolist()
     about = {"camera_model": NAMES[camera.model], "w": camera.width, "h": camera.height}
     return about | dict(zip(names, params, strict=True))
+
+
+def depth_png(depth: Float[Tensor, "H W"]) -> bytes:
+    """Encode depth as a 16-bit PNG image in UNIT; 0 where it is unknown."""
+    units = (depth.double() / UNIT).round()
+    units = torch.where(units <= 65535, units, 0.0)  # what is farther counts as unknown
+    return cv2.imencode(".png", units.cpu().numpy().astype(np.uint16))[1].tobytes()
 
 
 def write_nerfstudio(
@@ -71,27 +79,18 @@ def write_nerfstudio(
         for name, T in zip(upright.image_names, opengl(upright.T_wc).tolist(), strict=True)
     ]
     if depths is not None:
-        for frame, name in zip(frames, upright.image_names, strict=True):
+        (folder / DEPTHS).mkdir(exist_ok=True)
+        names = dict(zip(scene.frame_ids.tolist(), scene.image_names, strict=True))
+        for frame, name in zip(frames, names.values(), strict=True):
             frame["depth_file_path"] = f"{DEPTHS}/{name}"
-        _write_depths(folder / DEPTHS, upright, depths)
+        for maps in DepthMaps.blocks(depths, 1):
+            (folder / DEPTHS / names[int(maps.frame_index)]).write_bytes(depth_png(maps.depth[0]))
     content = nerfstudio_camera(scene.camera) | {
         "ply_file_path": POINT_CLOUD if cloud is None else DENSE_CLOUD,
         "upright_from_map": R_up.tolist(),  # for the reader: nerfstudio does not know it
         "frames": frames,
     }
-    (folder / TRANSFORMS).write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    write_ply(
-        folder / POINT_CLOUD,
-        upright.points_w,
-        upright.colors,
-        centers_w=torch.zeros(0, 3, dtype=torch.float32, device="cpu"),
-    )
+    (folder / "transforms.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_ply(folder / POINT_CLOUD, upright.points_w, upright.colors, centers_w=upright.points_w[:0])
     if cloud is not None:
-        write_cloud(folder / DENSE_CLOUD, cloud.thinned(MAX_POINTS), R_up)
-
-
-def _write_depths(folder: Path, scene: ExportedScene, depths: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    names = dict(zip(scene.frame_ids.tolist(), scene.image_names, strict=True))
-    for maps in DepthMaps.blocks(depths, 1):
-        (folder / names[int(maps.frame_index)]).write_bytes(depth_png(maps.depth[0]))
+        write_cloud(folder / DENSE_CLOUD, cloud.thinned(MAX_DRAWN), R_up)

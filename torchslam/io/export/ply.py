@@ -26,11 +26,10 @@ COLORED = [*((name, "<f4") for name in POSITION + NORMAL), *((name, "u1") for na
 # COLMAP refuses a file with integers of more than a byte.
 VERTEX = np.dtype([*COLORED, ("observations", "<f4")])
 DENSE_VERTEX = np.dtype([*COLORED, ("confidence", "<f4")])
-PROPERTY_TYPES = {"<f4": "float", "|u1": "uchar"}
 CAMERA_COLOR = (213, 73, 63)
 """Red, green, blue of the trajectory in the cloud."""
+MAX_DRAWN = 500_000  # of a dense cloud that a program draws, or starts a splat from
 MAX_BYTES = 1 << 33  # of a cloud that is read: 270 million points
-UNIT_TOLERANCE = 1e-3  # of the length of a normal
 
 
 def upright_from_map(slam_map: Map, unit: MetricUnit | None = None) -> Float[Tensor, "3 3"]:
@@ -77,18 +76,15 @@ def write_ply(
         normals_w: direction from each point to the cameras that observed it; None: zero.
         observations: number of keyframes that observe each point; None: 0.
     """
-    vertices = np.zeros(len(points_w) + len(centers_w), VERTEX)
-    points, cameras = vertices[: len(points_w)], vertices[len(points_w) :]
-    _fill(points, POSITION, points_w)
-    _fill(points, COLOR, colors)
-    _fill(cameras, POSITION, centers_w)
-    if normals_w is not None:
-        _fill(points, NORMAL, normals_w)
-    if observations is not None:
-        points["observations"] = observations.detach().cpu().numpy()
-    for name, value in zip(COLOR, CAMERA_COLOR, strict=True):
-        cameras[name] = value
-    write_whole(path, [_header(vertices.dtype, len(vertices)), vertices.tobytes()])
+    red = torch.tensor(CAMERA_COLOR, dtype=torch.uint8, device=colors.device).expand(len(centers_w), 3)
+    nothing, none = torch.zeros_like(centers_w), centers_w.new_zeros(len(centers_w))
+    columns = (
+        torch.cat((points_w, centers_w)),
+        torch.cat((torch.zeros_like(points_w) if normals_w is None else normals_w, nothing)),
+        torch.cat((colors, red)),
+        torch.cat((points_w.new_zeros(len(points_w)) if observations is None else observations, none)),
+    )
+    _write(path, VERTEX, *columns)
 
 
 def write_cloud(path: str | Path, cloud: PointCloud, R: Float[Tensor, "3 3"] | None = None) -> None:
@@ -100,12 +96,7 @@ def write_cloud(path: str | Path, cloud: PointCloud, R: Float[Tensor, "3 3"] | N
         R: rotation from the map's world to that of the file, as `upright_from_map`; None: the same.
     """
     cloud = cloud if R is None else cloud.turned(R)
-    vertices = np.zeros(len(cloud), DENSE_VERTEX)
-    _fill(vertices, POSITION, cloud.points_w)
-    _fill(vertices, NORMAL, cloud.normals_w)
-    _fill(vertices, COLOR, cloud.colors)
-    vertices["confidence"] = cloud.confidence.detach().cpu().numpy()
-    write_whole(path, [_header(vertices.dtype, len(vertices)), vertices.tobytes()])
+    _write(path, DENSE_VERTEX, cloud.points_w, cloud.normals_w, cloud.colors, cloud.confidence)
 
 
 def read_cloud(path: str | Path, R: Float[Tensor, "3 3"] | None = None) -> PointCloud:
@@ -125,14 +116,14 @@ def read_cloud(path: str | Path, R: Float[Tensor, "3 3"] | None = None) -> Point
     except OSError as error:
         raise ResultsError(f"{path}: cannot be read: {error.strerror}") from None
     try:
-        cloud = _cloud(_vertices(content))
+        cloud = _cloud(content)
     except ValueError as error:
         raise ResultsError(f"{path}: not a dense cloud of torchslam: {error}") from None
     return cloud if R is None else cloud.turned(R.mT)
 
 
-def _vertices(content: bytes) -> np.ndarray:
-    """The rows (N,) of DENSE_VERTEX of a file. Raises ValueError for any other content."""
+def _cloud(content: bytes) -> PointCloud:
+    """The cloud of a file. Raises ValueError for any other content and for impossible numbers."""
     found = re.match(rb"ply\nformat binary_little_endian 1\.0\nelement vertex (\d{1,10})\n", content)
     if found is None:
         raise ValueError("no header of a binary PLY file")
@@ -142,36 +133,29 @@ def _vertices(content: bytes) -> np.ndarray:
         raise ValueError(f"its properties are not {', '.join(DENSE_VERTEX.names or ())}")
     if len(content) != len(header) + count * DENSE_VERTEX.itemsize:
         raise ValueError(f"{count} points and a file of {len(content)} bytes")
-    return np.frombuffer(content, DENSE_VERTEX, offset=len(header))
-
-
-def _cloud(vertices: np.ndarray) -> PointCloud:
-    """The cloud of rows of DENSE_VERTEX. Raises ValueError for impossible numbers."""
-    cloud = PointCloud(
-        points_w=_columns(vertices, POSITION),
-        normals_w=_columns(vertices, NORMAL),
-        colors=_columns(vertices, COLOR),
-        confidence=torch.from_numpy(vertices["confidence"].copy()),
-    )
+    rows = np.frombuffer(content, DENSE_VERTEX, offset=len(header))
+    columns = (np.stack([rows[name] for name in names], axis=1) for names in (POSITION, NORMAL, COLOR))
+    cloud = PointCloud(*map(torch.from_numpy, (*columns, rows["confidence"].copy())))
     if not bool(torch.isfinite(cloud.points_w).all()):
         raise ValueError("positions are not finite")
-    if not bool(((cloud.normals_w.norm(dim=-1) - 1).abs() < UNIT_TOLERANCE).all()):
+    if not bool(((cloud.normals_w.norm(dim=-1) - 1).abs() < 1e-3).all()):
         raise ValueError("normals are not of unit length")
     if not bool(((cloud.confidence >= 0) & (cloud.confidence <= 1)).all()):
         raise ValueError("confidence is not between 0 and 1")
     return cloud
 
 
-def _columns(vertices: np.ndarray, names: tuple[str, ...]) -> Tensor:
-    return torch.from_numpy(np.stack([vertices[name] for name in names], axis=1))
-
-
-def _fill(vertices: np.ndarray, names: tuple[str, ...], values: Tensor) -> None:
-    for name, column in zip(names, values.detach().cpu().numpy().T, strict=True):
-        vertices[name] = column
+def _write(path: str | Path, types: np.dtype[np.void], *columns: Tensor) -> None:
+    """Write the properties of a kind of vertex: columns of a property, or of three."""
+    vertices = np.zeros(len(columns[0]), types)
+    values = [row for column in columns for row in np.atleast_2d(column.detach().cpu().numpy().T)]
+    for name, row in zip(types.names or (), values, strict=True):
+        vertices[name] = row
+    write_whole(path, [_header(types, len(vertices)), vertices.tobytes()])
 
 
 def _header(types: np.dtype[np.void], count: int) -> bytes:
-    properties = [f"property {PROPERTY_TYPES[types[name].str]} {name}" for name in types.names or ()]
+    kinds = {"<f4": "float", "|u1": "uchar"}
+    properties = [f"property {kinds[types[name].str]} {name}" for name in types.names or ()]
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}", *properties, "end_header"]
     return ("\n".join(lines) + "\n").encode("ascii")

@@ -15,19 +15,16 @@ from torch import Tensor
 from torchslam.dense.cloud import PointCloud
 from torchslam.dense.depth_maps import DepthMaps, read_frames
 from torchslam.errors import ResultsError
-from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry import Camera, rigid, se3_inverse
 from torchslam.geometry.transforms import corner_camera, corner_pixels
-from torchslam.io.export.depths import MAX_POINTS, UNIT, depth_png
+from torchslam.io.export.nerfstudio import UNIT, depth_png
+from torchslam.io.export.ply import MAX_DRAWN
 from torchslam.io.export.scene import ExportedScene, Images
 
 APPLICATION = "torchslam"
-JPEG_QUALITY = 90
-"""Of images in the recording, percent. Tried at this value only."""
 CAMERA = "world/camera"
 KEYFRAME = "world/keyframe"
 DEPTH = "world/depth"
-UNPAINTED = (125, 135, 148)  # points before images have colored them
-TRACKED = (87, 190, 65)  # keypoints
 GAP = 5  # usual intervals without a pose that break the line of the path
 
 
@@ -71,10 +68,8 @@ class Recorder:
         entity: str = "world/points",
     ) -> None:
         """Replace the points of the map, or another cloud, with or without colors."""
-        content = self._rr.Points3D(
-            _numpy(points_w), colors=UNPAINTED if colors is None else colors.cpu().numpy()
-        )
-        self._log(entity, content, static=True)
+        painted = (125, 135, 148) if colors is None else _numpy(colors)
+        self._log(entity, self._rr.Points3D(_numpy(points_w), colors=painted), static=True)
 
     def path(self, positions_w: Float[Tensor, "K 3"], breaks: list[int]) -> None:
         """Replace the path, interrupted before some rows."""
@@ -95,16 +90,13 @@ class Recorder:
         self, entity: str, pixels: Float[Tensor, "N 2"], colors: UInt8[Tensor, "N 3"] | None = None
     ) -> None:
         """Log the keypoints of a camera."""
-        content = self._rr.Points2D(
-            _numpy(corner_pixels(pixels)),
-            colors=TRACKED if colors is None else colors.cpu().numpy(),
-            radii=2.0,
-        )
+        painted = (87, 190, 65) if colors is None else _numpy(colors)
+        content = self._rr.Points2D(_numpy(corner_pixels(pixels)), colors=painted, radii=2.0)
         self._log(f"{entity}/keypoints", content)
 
     def image(self, entity: str, image: UInt8[np.ndarray, "H W *channels"]) -> None:
         """Log the image of a camera, gray or BGR."""
-        _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY))
+        _, content = cv2.imencode(".jpg", image, (cv2.IMWRITE_JPEG_QUALITY, 90))
         self._log(entity, self._rr.EncodedImage(contents=content.tobytes(), media_type="image/jpeg"))
 
     def depth(self, entity: str, depth: Float[Tensor, "H W"]) -> None:
@@ -147,7 +139,7 @@ def write_recording(
     recorder.world("RIGHT_HAND_Z_UP")
     recorder.points(upright.points_w, scene.colors)
     if cloud is not None:
-        dense = cloud.thinned(MAX_POINTS).turned(R_up)
+        dense = cloud.thinned(MAX_DRAWN).turned(R_up)
         recorder.points(dense.points_w, dense.colors, "world/dense")
     recorder.path(upright.T_wc[:, :3, 3], gaps(scene.frame_ids))
     for entity in (CAMERA, KEYFRAME):
@@ -162,23 +154,16 @@ def write_recording(
             if images is not None:
                 recorder.image(KEYFRAME, images.bgr(int(scene.frame_ids[row])))
     if depths is not None:
-        _record_depths(recorder, scene, R_up, depths)
+        frame_ids, camera = read_frames(depths)
+        seconds = scene.of_frames(frame_ids).timestamps - scene.timestamps[0]
+        turn = rigid(R_up.double(), torch.zeros(3, dtype=torch.float64, device="cpu"))
+        recorder.camera(DEPTH, camera)
+        for maps, time in zip(DepthMaps.blocks(depths, 1), seconds.tolist(), strict=True):
+            recorder.at(int(maps.frame_index), time)
+            recorder.pose(DEPTH, turn @ se3_inverse(maps.T_cw[0].double()))
+            recorder.depth(DEPTH, maps.depth[0])
     recording.flush()
     recording.disconnect()
-
-
-def _record_depths(
-    recorder: Recorder, scene: ExportedScene, R_up: Float[Tensor, "3 3"], depths: Path
-) -> None:
-    frame_ids, camera = read_frames(depths)
-    seconds = scene.of_frames(frame_ids).timestamps - scene.timestamps[0]
-    turn = torch.eye(4, dtype=torch.float64, device="cpu")
-    turn[:3, :3] = R_up
-    recorder.camera(DEPTH, camera)
-    for maps, time in zip(DepthMaps.blocks(depths, 1), seconds.tolist(), strict=True):
-        recorder.at(int(maps.frame_index), time)
-        recorder.pose(DEPTH, turn @ se3_inverse(maps.T_cw[0].double()))
-        recorder.depth(DEPTH, maps.depth[0])
 
 
 def _numpy(values: Tensor) -> np.ndarray:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -21,7 +22,7 @@ from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.data.formats.image_file import write_image
 from torchslam.data.readers.live import is_live
 from torchslam.data.sequence import Sequence
-from torchslam.data.transforms import resize
+from torchslam.data.transforms import resize, scale_camera
 from torchslam.errors import FrameError, ResultsError, SequenceError
 from torchslam.geometry import Camera, SensorModel, se3_inverse, squared_reprojection_errors, transform
 from torchslam.geometry.rolling_shutter import Readout
@@ -30,6 +31,12 @@ from torchslam.map.atlas import Submap
 SAME_PX = 0.01
 """Difference of two parameters of a camera, in pixels, below which images need no undistortion."""
 MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees from the axis
+SAME_PICTURE = 0.9
+"""Correlation from which on an image is that of the run, by another decoder or in other colors: less than that of two
+frames between which anything moves."""
+NOISE = 4 / 255
+"""Difference that a codec may make in an image without contrast."""
+WITHOUT = "use --sequence for its new location, or --no-images"
 
 
 @dataclass(frozen=True)
@@ -78,11 +85,17 @@ class ExportedScene:
         if missing:
             raise ResultsError(f"frame {missing[0]} has no pose in this map")
         rows = torch.nonzero(torch.isin(self.frame_ids, frame_ids))[:, 0]
-        slot = torch.full((len(self.T_cw),), -1, device="cpu").index_copy(
-            0, rows, torch.arange(len(rows), device="cpu")
-        )
-        is_kept = _of_tracks(slot[self.frame_index] >= 0, self.point_index, len(self.points_w))
-        points, point_index = torch.unique(self.point_index[is_kept], return_inverse=True)
+        return self._part(rows, torch.ones_like(self.frame_index, dtype=torch.bool))
+
+    def _part(self, rows: Int[Tensor, " R"], is_seen: Bool[Tensor, " O"]) -> ExportedScene:
+        """The scene of rows of frames, in their order, and of points in two or more of the observations that count."""
+        slot = torch.full((len(self.T_cw),), -1, device="cpu")
+        slot[rows] = torch.arange(len(rows), device="cpu")
+        is_seen = is_seen & (slot[self.frame_index] >= 0)
+        tracks = torch.bincount(self.point_index[is_seen], minlength=len(self.points_w))
+        seen = torch.nonzero(is_seen & (tracks[self.point_index] >= 2))[:, 0]
+        seen = seen[torch.argsort(slot[self.frame_index[seen]], stable=True)]
+        points, point_index = torch.unique(self.point_index[seen], return_inverse=True)
         return replace(
             self,
             frame_ids=self.frame_ids[rows],
@@ -91,9 +104,9 @@ class ExportedScene:
             T_cw=self.T_cw[rows],
             points_w=self.points_w[points],
             colors=self.colors[points],
-            frame_index=slot[self.frame_index[is_kept]],
+            frame_index=slot[self.frame_index[seen]],
             point_index=point_index,
-            pixels=self.pixels[is_kept],
+            pixels=self.pixels[seen],
         )
 
     def errors(self) -> Float[Tensor, " O"]:
@@ -128,35 +141,20 @@ def scene_of(
             f"submap {submap.number} holds no frames of this run: it was only localized, or all of it is elsewhere"
         )
     rows = rows[torch.argsort(graph.timestamps[rows], stable=True)]
-    slot = torch.full((len(graph.T_cw),), -1, device="cpu").index_copy(
-        0, rows, torch.arange(len(rows), device="cpu")
-    )
     points_c = transform(graph.T_cw[graph.frame_index], graph.points_w[graph.point_index][:, None])
-    is_kept = (slot[graph.frame_index] >= 0) & camera.project(points_c[:, 0])[1]
-    is_kept = _of_tracks(is_kept, graph.point_index, len(graph.points_w))
-    seen = torch.nonzero(is_kept)[:, 0]
-    seen = seen[torch.argsort(slot[graph.frame_index[seen]], stable=True)]
-    points, point_index = torch.unique(graph.point_index[seen], return_inverse=True)
-    return ExportedScene(
+    scene = ExportedScene(
         camera=camera.to(torch.float64),
-        frame_ids=graph.frame_ids[rows],
-        timestamps=graph.timestamps[rows],
-        is_keyframe=graph.is_keyframe[rows],
-        T_cw=graph.T_cw[rows].double(),
-        points_w=graph.points_w[points].double(),
-        colors=submap.map.points["colors"][graph.point_ids[points]],
-        frame_index=slot[graph.frame_index[seen]],
-        point_index=point_index,
-        pixels=graph.pixels[seen].double(),
+        frame_ids=graph.frame_ids,
+        timestamps=graph.timestamps,
+        is_keyframe=graph.is_keyframe,
+        T_cw=graph.T_cw.double(),
+        points_w=graph.points_w.double(),
+        colors=submap.map.points["colors"][graph.point_ids],
+        frame_index=graph.frame_index,
+        point_index=graph.point_index,
+        pixels=graph.pixels.double(),
     )
-
-
-def _of_tracks(
-    is_kept: Bool[Tensor, " O"], point_index: Int[Tensor, " O"], points: int
-) -> Bool[Tensor, " O"]:
-    """Return the kept observations without those of points that fewer than two of them see."""
-    tracks = torch.bincount(point_index[is_kept], minlength=points)
-    return is_kept & (tracks[point_index] >= 2)
+    return scene._part(rows, camera.project(points_c[:, 0])[1])
 
 
 def pinhole_within(camera: Camera) -> Camera:
@@ -168,9 +166,12 @@ def pinhole_within(camera: Camera) -> Camera:
     if camera.model == "pinhole":
         return camera
     x, y = (torch.arange(size, dtype=camera.params.dtype, device="cpu") for size in camera.size)
-    left, right = (camera.normalize(_line(at, y))[:, 0] for at in (0, camera.width - 1))
-    top, bottom = (camera.normalize(_line(at, x).flip(1))[:, 1] for at in (0, camera.height - 1))
-    low, high = torch.stack((left.max(), top.max())), torch.stack((right.min(), bottom.min()))
+
+    def edge(u: Tensor, v: Tensor, axis: int) -> Tensor:
+        return camera.normalize(torch.stack(torch.broadcast_tensors(u, v), dim=-1))[:, axis]
+
+    low = torch.stack((edge(x[0], y, 0).max(), edge(x, y[0], 1).max()))
+    high = torch.stack((edge(x[-1], y, 0).min(), edge(x, y[-1], 1).min()))
     focal = camera.params[:2]
     extent, size = (high - low) * focal, torch.tensor(camera.size, device="cpu")
     if not bool((extent >= 1).all()):
@@ -179,6 +180,13 @@ def pinhole_within(camera: Camera) -> Camera:
     width, height = (int(side) + 1 for side in scale * extent)
     params = torch.cat((scale * focal, -scale * focal * low))
     return Camera("pinhole", params, (width, height))
+
+
+def enlarged(pinhole: Camera, camera: Camera) -> Camera:
+    """The camera of a depth map, for images as large as those of the camera that it was made from."""
+    factor = max(1.0, float(camera.params[0] / pinhole.params[0]))
+    size = (round(factor * pinhole.width), round(factor * pinhole.height))
+    return scale_camera(pinhole, size)
 
 
 def undistorted(scene: ExportedScene, pinhole: Camera | None = None) -> ExportedScene:
@@ -208,9 +216,8 @@ class Undistorter:
             (torch.arange(factor * side, device="cpu").double() + 0.5) / factor - 0.5 for side in pinhole.size
         )
         grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
-        rays = torch.nn.functional.pad(
-            pinhole.to(torch.float64).normalize(grid.flatten(0, 1)), (0, 1), value=1.0
-        )
+        slopes = pinhole.to(torch.float64).normalize(grid.flatten(0, 1))
+        rays = torch.nn.functional.pad(slopes, (0, 1), value=1.0)
         pixels = camera.project(rays)[0].reshape(grid.shape)
         self._x, self._y = (pixels[..., axis].float().numpy() for axis in (0, 1))
 
@@ -224,19 +231,8 @@ class Undistorter:
 
 def _is_same(camera: Camera, other: Camera) -> bool:
     """Whether two cameras have the same images, to within a hundredth of a pixel."""
-    return (
-        camera.model == other.model
-        and camera.size == other.size
-        and bool(((camera.params - other.params).abs() < SAME_PX).all())
-    )
-
-
-def _line(at: int, values: Tensor) -> Tensor:
-    """Return (N, 2) pixels (at, values)."""
-    return torch.stack((torch.full_like(values, at), values), dim=-1)
-
-
-WITHOUT = "use --sequence for its new location, or --no-images"
+    is_alike = camera.model == other.model and camera.size == other.size
+    return is_alike and bool(((camera.params - other.params).abs() < SAME_PX).all())
 
 
 class Images:
@@ -271,21 +267,13 @@ class Images:
 
     def bgr(self, frame_id: int) -> UInt8[np.ndarray, "H W 3"]:
         """Return an image as OpenCV writes it: blue, green, red. Raises FrameError if it cannot be read."""
-        image = cv2.cvtColor(
-            self._sequence.color(self._rows[frame_id]).contiguous().numpy(), cv2.COLOR_RGB2BGR
-        )
+        rgb = self._sequence.color(self._rows[frame_id]).contiguous().numpy()
+        image = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
         return image if self._undistort is None else self._undistort(image)
 
 
-@dataclass(frozen=True)
-class ExampleFrame:
-    """A frame whose image is kept with the results.
-
-    Attributes:
-        frame_id: index of the frame in the run.
-        timestamp: seconds.
-        image: gray in [0, 1].
-    """
+class ExampleFrame(NamedTuple):
+    """A frame of a run whose image, gray in [0, 1], is kept with the results."""
 
     frame_id: int
     timestamp: float
@@ -312,10 +300,7 @@ class ImageSource:
 
 
 def open_images(
-    source: ImageSource,
-    scene: ExportedScene,
-    pinhole: Camera | None = None,
-    otherwise: str = WITHOUT,
+    source: ImageSource, scene: ExportedScene, pinhole: Camera | None = None, otherwise: str = WITHOUT
 ) -> Images:
     """Open the images of a scene, in the size of the run.
 
@@ -343,8 +328,17 @@ def open_images(
             sequence = resize(sequence, "{}x{}".format(*scene.camera.size))
     except SequenceError as error:
         raise ResultsError(f"the sequence of this run cannot be read: {error}; {otherwise}") from None
-    rows = _image_rows(sequence, source, times, otherwise)
-    _check_example(sequence, source, rows, otherwise)
+    rows, example = _image_rows(sequence, source, times, otherwise), source.example
+    if example is not None and example.frame_id in rows:
+        try:
+            found = sequence.image(rows[example.frame_id])
+        except FrameError:  # reported when it is needed
+            found = example.image
+        if found.shape != example.image.shape or not _is_same_picture(found, example.image):
+            raise ResultsError(
+                f"{source.path}: not the sequence of this run: frame {example.frame_id} shows something else than it "
+                f"did; {otherwise}"
+            )
     return Images(sequence, rows, scene.camera, pinhole)
 
 
@@ -352,7 +346,7 @@ def _image_rows(
     sequence: Sequence, source: ImageSource, times: Mapping[int, float], otherwise: str
 ) -> dict[int, int]:
     """The index in a sequence of each frame, and of the example if it is there. Raises ResultsError otherwise."""
-    example, wanted = source.example, dict(times)
+    wanted, example = dict(times), source.example
     if example is not None:
         wanted.setdefault(example.frame_id, example.timestamp)
     present = [sequence.file_name(index) for index in range(len(sequence))]
@@ -362,9 +356,8 @@ def _image_rows(
             f"{source.path}: the results do not state the image of each frame: run again, or --no-images"
         )
     if source.files and not is_of_files:
-        raise ResultsError(
-            f"{start}, whose frames are files such as {next(iter(source.files.values()))}; {otherwise}"
-        )
+        name = next(iter(source.files.values()))
+        raise ResultsError(f"{start}, whose frames are files such as {name}; {otherwise}")
     if is_of_files:
         ids = [frame_id for frame_id in wanted if frame_id in source.files]
         found = rows_by_name([source.files[frame_id] for frame_id in ids], present).tolist()
@@ -382,29 +375,6 @@ def _image_rows(
             f"{missing[0]}, {name}; {otherwise}"
         )
     return rows
-
-
-SAME_PICTURE = 0.9
-"""Correlation from which on an image is that of the run, by another decoder or in other colors: less than that of two
-frames between which anything moves."""
-NOISE = 4 / 255
-"""Difference that a codec may make in an image without contrast."""
-
-
-def _check_example(sequence: Sequence, source: ImageSource, rows: Mapping[int, int], otherwise: str) -> None:
-    """Raise ResultsError where the image that is kept with the results is another one in the sequence."""
-    example = source.example
-    if example is None or example.frame_id not in rows:
-        return
-    try:
-        found = sequence.image(rows[example.frame_id])
-    except FrameError:  # reported when it is needed
-        return
-    if found.shape != example.image.shape or not _is_same_picture(found, example.image):
-        raise ResultsError(
-            f"{source.path}: not the sequence of this run: frame {example.frame_id} shows something else "
-            f"than it did; {otherwise}"
-        )
 
 
 def _is_same_picture(image: Float[Tensor, "1 1 H W"], other: Float[Tensor, "1 1 H W"]) -> bool:

@@ -1,24 +1,21 @@
-"""Plots of the path and the map: two 3-D views, a top view with covariance ellipses, and the features of an image."""
+"""Plots of the path and the map: two 3-D views, and a top view with covariance ellipses."""
 
 from __future__ import annotations
 
 import textwrap
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.io.export.recording import gaps
-from torchslam.io.plots import style
+from torchslam.io.plots import charts as style
 from torchslam.types import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-    from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d import Axes3D
 
 
@@ -27,24 +24,66 @@ MAX_POINTS = 25_000
 MAX_CAMERAS = 30
 """Cameras that are drawn, evenly chosen; more hide each other."""
 MAX_ELLIPSES = 1500  # of points; more hide the picture
-POINT_ELLIPSE = "#cdc6c9"
+SIGMAS = 3.0  # size of an ellipse in standard deviations
 TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
 """Style of the true trajectory."""
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """Everything drawn, as numpy arrays in upright axes (z up)."""
+def upright_axes(T_wc: Float[np.ndarray, "K 4 4"]) -> tuple[Float[np.ndarray, "3 3"], tuple[str, str, str]]:
+    """The signed axis permutation that brings the cameras' mean up direction closest to +z, and its names.
 
-    path: np.ndarray
-    rotations: np.ndarray
-    cameras: np.ndarray
-    camera_covariances: np.ndarray  # of their positions; zero where unknown
-    points: np.ndarray
-    point_covariances: np.ndarray
-    groundtruth: np.ndarray
-    labels: tuple[str, str, str]
-    gaps: list[int]
+    The names are labels such as ("x", "z", "-y"). The world's own axes are kept, so the labels stay true: a world
+    whose y points down (cameras, KITTI) is drawn over its x-z plane.
+    """
+    up = -T_wc[:, :3, 1].mean(axis=0) if len(T_wc) else np.array([0.0, 0.0, 1.0])
+    vertical = int(np.abs(up).argmax())
+    sign = 1.0 if up[vertical] >= 0 else -1.0
+    first, second = [axis for axis in range(3) if axis != vertical]
+    rows = np.zeros((3, 3))
+    rows[0, first], rows[1, second], rows[2, vertical] = 1.0, 1.0, sign
+    names = ["xyz"[first], "xyz"[second], ("-" if sign < 0 else "") + "xyz"[vertical]]
+    if np.linalg.det(rows) < 0:  # keep the picture right-handed, not mirrored
+        rows[1] *= -1
+        names[1] = "-" + names[1]
+    return rows, (names[0], names[1], names[2])
+
+
+def inside(points: Float[np.ndarray, "N D"], box: Float[np.ndarray, "D 2"]) -> Bool[np.ndarray, " N"]:
+    """True for points within the limits."""
+    return np.all((points >= box[:, 0]) & (points <= box[:, 1]), axis=1)
+
+
+class _Scene:
+    """Everything drawn, as numpy arrays in upright axes (z up); covariances are zero where unknown."""
+
+    def __init__(
+        self,
+        trajectory: Trajectory,
+        points_w: Tensor,
+        groundtruth: Trajectory | None,
+        keyframes: Trajectory | None,
+        keyframe_covariances_w: Tensor | None = None,
+        point_covariances_w: Tensor | None = None,
+    ) -> None:
+        T_wc = style.to_numpy(trajectory.T_wc)
+        upright, self.labels = upright_axes(T_wc)
+        shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
+        rows = style.thin(len(shown), MAX_CAMERAS)
+        points = style.to_numpy(points_w).reshape(-1, 3)
+        finite = np.isfinite(points).all(axis=1)
+        truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
+
+        def turned(covariances_w: Tensor | None, count: int) -> np.ndarray:
+            if covariances_w is None:
+                return np.zeros((count, 3, 3))
+            return upright @ style.to_numpy(covariances_w) @ upright.T
+
+        self.path, self.gaps = T_wc[:, :3, 3] @ upright.T, gaps(trajectory.timestamps)
+        self.rotations, self.cameras = upright @ shown[rows, :3, :3], shown[rows, :3, 3] @ upright.T
+        self.camera_covariances = turned(keyframe_covariances_w, len(shown))[rows]
+        self.points = points[finite] @ upright.T
+        self.point_covariances = turned(point_covariances_w, len(points))[finite]
+        self.groundtruth = truth @ upright.T
 
 
 def plot_scene(
@@ -63,7 +102,7 @@ def plot_scene(
         keyframes: frames to draw axes for: red x, green y, blue z (the viewing direction); default: all
         unit: unit of length; "" if the scale is unknown
     """
-    scene = _scene(trajectory, points_w, groundtruth, keyframes)
+    scene = _Scene(trajectory, points_w, groundtruth, keyframes)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth]), scene.points)
     with style.house_style():
         figure = style.new_figure(11.0, 4.7)
@@ -71,7 +110,7 @@ def plot_scene(
         figure.set_layout_engine("none")
         for column, azimuth in enumerate((-62.0, 28.0)):
             axes = figure.add_axes((0.52 * column, 0.07, 0.48, 0.87), projection="3d", computed_zorder=False)
-            _draw_3d(axes, scene, box, azimuth, style.length_label(unit))
+            _draw_3d(axes, scene, box, azimuth, unit or "map units")
         handles, labels = figure.axes[0].get_legend_handles_labels()
         figure.legend(handles, labels, loc="lower center", ncols=len(labels))
         figure.suptitle(_title(title, scene, box), x=0.015, y=0.98, ha="left", fontsize=10.5)
@@ -94,7 +133,7 @@ def plot_top_view(
         keyframe_covariances_w, point_covariances_w: covariances of the positions, drawn as ellipses of three
             standard deviations, those of keyframes magnified by the power of ten in the legend; none where zero
     """
-    scene = _scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
+    scene = _Scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
     span = box[:, 1] - box[:, 0]
     width = float(np.clip(6.2 * span[0] / span[1], 4.5, 11.0))
@@ -102,54 +141,21 @@ def plot_top_view(
         figure = style.new_figure(width, float(np.clip(width * span[1] / span[0], 3.2, 7.0)) + 0.7)
         axes = figure.add_subplot()
         _draw_above(axes, scene, box)
-        label = style.length_label(unit)
+        label = unit or "map units"
         axes.set(xlim=box[0], ylim=box[1], aspect="equal")
         axes.set(xlabel=f"{scene.labels[0]} ({label})", ylabel=f"{scene.labels[1]} ({label})")
-        figure.suptitle(_wrapped(_title(title, scene, box), width), x=0.02, ha="left", fontsize=10.5)
+        lines = textwrap.wrap(_title(title, scene, box), int(12 * width))
+        figure.suptitle("\n".join(lines), x=0.02, ha="left", fontsize=10.5)
         figure.legend(loc="outside lower center", ncols=4 if width > 8.0 else 2)
     return figure
 
 
-def _scene(
-    trajectory: Trajectory,
-    points_w: Tensor,
-    groundtruth: Trajectory | None,
-    keyframes: Trajectory | None,
-    keyframe_covariances_w: Tensor | None = None,
-    point_covariances_w: Tensor | None = None,
-) -> _Scene:
-    T_wc = style.to_numpy(trajectory.T_wc)
-    upright, labels = style.upright_axes(T_wc)
-    shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
-    rows = style.thin(len(shown), MAX_CAMERAS)
-    points = style.to_numpy(points_w).reshape(-1, 3)
-    finite = np.isfinite(points).all(axis=1)
-    truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
-    return _Scene(
-        path=T_wc[:, :3, 3] @ upright.T,
-        rotations=upright @ shown[rows, :3, :3],
-        cameras=shown[rows, :3, 3] @ upright.T,
-        camera_covariances=_turned(keyframe_covariances_w, len(shown), upright)[rows],
-        points=points[finite] @ upright.T,
-        point_covariances=_turned(point_covariances_w, len(points), upright)[finite],
-        groundtruth=truth @ upright.T,
-        labels=labels,
-        gaps=gaps(trajectory.timestamps),
-    )
-
-
-def _turned(covariances_w: Tensor | None, count: int, upright: np.ndarray) -> np.ndarray:
-    """Covariances (count, 3, 3) in upright axes, zero where there are none."""
-    if covariances_w is None:
-        return np.zeros((count, 3, 3))
-    return upright @ style.to_numpy(covariances_w) @ upright.T
-
-
 def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit: str) -> None:
+    from matplotlib.ticker import MaxNLocator
     from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
-    points = _drawn_points(scene.points, box)
-    axes.scatter(*points.T, c=points[:, 2], depthshade=False, zorder=1, **_dots(points))
+    points, dots = _drawn_points(scene.points, box)
+    axes.scatter(*points.T, depthshade=False, zorder=1, **dots)
     for index, part in enumerate(np.split(scene.path, scene.gaps)):
         axes.plot(*part.T, color=style.ESTIMATE, lw=2.4, zorder=3, label="_" * (index > 0) + "estimate")
     if len(scene.groundtruth):
@@ -167,7 +173,7 @@ def _draw_3d(axes: Axes3D, scene: _Scene, box: np.ndarray, azimuth: float, unit:
         axis.set_pane_color((1.0, 1.0, 1.0, 0.0))
         axis.set_label_text(f"{name} ({unit})")
         axis.labelpad = 0.0 if axis is axes.zaxis else 6.0
-        axis.set_major_locator(_few_ticks())
+        axis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 5, 10]))
 
 
 def _fit(axes: Axes3D, box: np.ndarray) -> None:
@@ -188,86 +194,48 @@ def _fit(axes: Axes3D, box: np.ndarray) -> None:
 def _draw_above(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
     from matplotlib.collections import LineCollection
 
-    points = _drawn_points(scene.points, box)
-    label = "map point (lighter: higher)"
-    axes.scatter(points[:, 0], points[:, 1], c=points[:, 2], label=label, **_dots(points))
+    points, dots = _drawn_points(scene.points, box)
+    axes.scatter(points[:, 0], points[:, 1], label="map point (lighter: higher)", **dots)
     for index, part in enumerate(np.split(scene.path, scene.gaps)):
         axes.plot(*part[:, :2].T, color=style.ESTIMATE, lw=2.4, label="_" * (index > 0) + "estimate")
     if len(scene.groundtruth):
         axes.plot(*scene.groundtruth[:, :2].T, label="ground truth", **TRUTH_LINE)
-    length = 0.035 * float((box[:, 1] - box[:, 0]).max())
-    tips = scene.cameras + length * scene.rotations[:, :, 2]
-    lines = LineCollection(
-        list(np.stack([scene.cameras, tips], axis=1)[:, :, :2]), colors=style.AXES_RGB[2], lw=0.9
-    )
+    width = float((box[:, 1] - box[:, 0]).max())
+    tips = scene.cameras + 0.035 * width * scene.rotations[:, :, 2]
+    ahead = np.stack([scene.cameras, tips], axis=1)[:, :, :2]
+    lines = LineCollection(list(ahead), colors=style.AXES_RGB[2], lw=0.9)
     lines.set_label("viewing direction")
     axes.add_collection(lines)
     rows = style.thin(len(scene.points), MAX_ELLIPSES)
-    draw_ellipses(
-        axes,
-        scene.points[rows, :2],
-        scene.point_covariances[rows, :2, :2],
-        "map point",
-        POINT_ELLIPSE,
-        linewidth=0.5,
-        zorder=0.5,
-    )
-    width = float((box[:, 1] - box[:, 0]).max())
-    draw_ellipses(
-        axes,
-        scene.cameras[:, :2],
-        scene.camera_covariances[:, :2, :2],
-        "keyframe",
-        style.ACCENT,
-        magnified_in=width,
-    )
+    centers, covariances = scene.points[rows, :2], scene.point_covariances[rows, :2, :2]
+    draw_ellipses(axes, centers, covariances, "map point", "#cdc6c9", linewidth=0.5, zorder=0.5)
+    centers, covariances = scene.cameras[:, :2], scene.camera_covariances[:, :2, :2]
+    draw_ellipses(axes, centers, covariances, "keyframe", style.ACCENT, magnified_in=width)
     if len(scene.path):
         axes.plot(*scene.path[0, :2], "o", ms=6, mfc="white", mec=style.ESTIMATE, mew=1.5, label="start")
         axes.plot(*scene.path[-1, :2], "s", ms=5, color=style.ESTIMATE, label="end")
 
 
-def _drawn_points(points: np.ndarray, box: np.ndarray) -> np.ndarray:
-    """The points (L, 3) inside the picture, thinned where there are very many."""
-    points = points[style.inside(points[:, : len(box)], box)]
-    return points[style.thin(len(points), MAX_POINTS)]
+def _drawn_points(points: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, dict[str, Any]]:
+    """The points (L, 3) inside the picture, thinned where there are very many, and their style.
 
-
-def _dots(points: np.ndarray) -> dict[str, Any]:
-    """Return the style of points: larger if there are few, in muted colors unlike those of the path."""
+    They are larger if there are few, and in muted colors unlike those of the path.
+    """
     from matplotlib.colors import LinearSegmentedColormap
 
+    points = points[inside(points[:, : len(box)], box)]
+    points = points[style.thin(len(points), MAX_POINTS)]
     heights = LinearSegmentedColormap.from_list("heights", ["#4d4463", "#8f7f86", "#cfa274"])
-    return {
-        "cmap": heights,
-        "s": float(np.clip(8e3 / max(len(points), 1), 1.5, 5.0)),
-        "alpha": 0.75,
-        "linewidths": 0,
-    }
-
-
-def _few_ticks() -> MaxNLocator:
-    from matplotlib.ticker import MaxNLocator
-
-    return MaxNLocator(nbins=5, steps=[1, 2, 5, 10])
-
-
-def _wrapped(title: str, width_inches: float) -> str:
-    """The title in lines that fit a narrow picture."""
-    return "\n".join(textwrap.wrap(title, int(12 * width_inches)))
+    size = float(np.clip(8e3 / max(len(points), 1), 1.5, 5.0))
+    return points, {"c": points[:, 2], "cmap": heights, "s": size, "alpha": 0.75, "linewidths": 0}
 
 
 def _title(title: str, scene: _Scene, box: np.ndarray) -> str:
     """The caption with the figures behind the picture: points, and how many of them lie outside of it."""
-    dimensions = len(box)
-    outside = len(scene.points) - int(style.inside(scene.points[:, :dimensions], box).sum())
+    outside = len(scene.points) - int(inside(scene.points[:, : len(box)], box).sum())
     figures = f"{len(scene.path)} poses, {len(scene.points)} points"
     figures += f" ({outside} outside the picture)" if outside else ""
     return f"{title}: {figures}" if title else figures
-
-
-SIGMAS = 3.0
-"""Size of an ellipsoid in standard deviations."""
-_SIZE = 0.06  # of the largest ellipse in the picture, when magnified
 
 
 def draw_ellipses(
@@ -294,7 +262,7 @@ def draw_ellipses(
     if not known.any():
         return
     radii, directions = radii[known], directions[known]
-    largest = max(1.0, _SIZE * magnified_in / radii.max())
+    largest = max(1.0, 0.06 * magnified_in / radii.max())
     magnification = 10.0 ** int(np.floor(np.log10(largest)))
     diameters = 2 * magnification * radii
     label = f"{what}, {SIGMAS:g} sigma" + (f" x {magnification:g}" if magnification > 1.0 else "")
@@ -313,74 +281,3 @@ def draw_ellipses(
     axes.add_collection(ellipses)
     # A legend cannot show a collection of ellipses.
     axes.plot([], [], "o", ms=8, mfc="none", mec=color, mew=linewidth, label=label)
-
-
-def plot_features(
-    image: Float[Tensor, "H W"],
-    keypoints: Float[Tensor, "N 2"],
-    matched: Bool[Tensor, " N"],
-    previous: Float[Tensor, "N 2"],
-    lengths: Int[Tensor, " N"],
-    title: str = "",
-) -> Figure:
-    """Keypoints on an image: map points as dots with a tail to where they were before, the others as rings.
-
-    Args:
-        image: gray in [0, 1].
-        keypoints: pixels.
-        matched: keypoints of map points.
-        previous: pixels of the same map points in an earlier frame, NaN if it did not observe them.
-        lengths: number of keyframes that observe the point, for the color.
-    """
-    from matplotlib.ticker import MaxNLocator
-
-    gray = style.to_numpy(image)
-    height, width = gray.shape
-    is_matched = matched.cpu().numpy()
-    x, y = style.to_numpy(keypoints).T
-    with style.house_style():
-        figure = style.new_figure(8.0, 6.9 * height / width + 0.75)
-        axes = figure.add_subplot()
-        axes.imshow(0.25 + 0.75 * gray, cmap="gray", vmin=0.0, vmax=1.0)
-        axes.plot(
-            x[~is_matched],
-            y[~is_matched],
-            "o",
-            ms=2.6,
-            mfc="none",
-            mec="#f2ede2",
-            mew=0.6,
-            alpha=0.85,
-            zorder=1,
-        )
-        _draw_tails(axes, keypoints[matched], previous[matched])
-        counts = lengths.cpu().numpy()[is_matched]
-        dots = axes.scatter(
-            x[is_matched],
-            y[is_matched],
-            12,
-            counts,
-            cmap="viridis",
-            linewidths=0.3,
-            edgecolors="#10222e",
-            zorder=3,
-        )
-        if is_matched.any():
-            ticks = MaxNLocator(integer=True)
-            figure.colorbar(
-                dots, ax=axes, shrink=0.7, pad=0.015, ticks=ticks, label="keyframes that saw the point"
-            )
-        axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="x (px)", ylabel="y (px)")
-        axes.grid(visible=False)
-        figures = f"{len(keypoints)} features, {int(is_matched.sum())} of them map points"
-        axes.set_title(f"{title}: {figures}" if title else figures)
-        axes.set_title("tails lead back to the keyframe before", loc="right", fontsize=8.5, color=style.MUTED)
-    return figure
-
-
-def _draw_tails(axes: Axes, pixels: Tensor, previous: Tensor) -> None:
-    from matplotlib.collections import LineCollection
-
-    tails = style.to_numpy(torch.stack([previous, pixels], dim=1))
-    known = np.isfinite(tails).all(axis=(1, 2))
-    axes.add_collection(LineCollection(list(tails[known]), colors=style.ACCENT, lw=0.9, alpha=0.9, zorder=2))

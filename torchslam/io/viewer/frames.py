@@ -6,9 +6,8 @@ import shutil
 import sys
 import warnings
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -29,27 +28,16 @@ from torchslam.types import State, StepResult, Trajectory
 VIDEO = "tracked.mp4"
 MAX_WIDTH = 960  # pixels of the film: it is to stay small
 BAR = 26  # pixels, for the text under the image
-USUAL_RATE = 30.0  # frames per second of a video of unknown rate
 COLORS = {  # blue, green, red
     State.INITIALIZING: (170, 200, 215),
     State.TRACKING: (65, 190, 87),
     State.UNCERTAIN: (225, 130, 190),
     State.LOST: (61, 85, 200),
 }
-UNMATCHED = (150, 150, 150)
-"""Red, green, blue of keypoints without a map point."""
-FLUSH_SECONDS = 5.0  # that a viewer that was closed is waited for
 
 
-@dataclass(frozen=True)
-class FrameSnapshot:
-    """One frame and its tracking result.
-
-    Attributes:
-        image: gray.
-        keypoints: all keypoints, in pixels.
-        tracked: keypoints of the map points that support a reliable pose.
-    """
+class FrameSnapshot(NamedTuple):
+    """One frame, gray, and its tracking result: all keypoints, and those of map points that support a reliable pose."""
 
     result: StepResult
     image: UInt8[np.ndarray, "H W"]
@@ -57,8 +45,8 @@ class FrameSnapshot:
     tracked: Float[Tensor, "M 2"]
 
 
-class FrameViewer(Protocol):
-    """Interface of a viewer: shows frames one after the other."""
+class FrameViewer:
+    """A viewer, which shows frames one after the other."""
 
     def show(self, snapshot: FrameSnapshot) -> None:
         """Show a processed frame."""
@@ -70,34 +58,27 @@ class FrameViewer(Protocol):
         """Release files and connections."""
 
 
-class FrameViewers:
-    """Passes every processed frame on to the viewers.
+class FrameViewers(ExitStack):
+    """Passes every processed frame on to the viewers, and closes them at its exit.
 
-    Args:
-        sequence: wrapper to run instead of the original sequence; it keeps the last image, so no image is
-            read twice
+    Attributes:
+        sequence: to run instead of the original sequence; it keeps the last image, so no image is read twice.
     """
 
     def __init__(self, slam: SLAM, sequence: Sequence, screens: list[FrameViewer]) -> None:
+        super().__init__()
         self._slam, self._screens = slam, screens
-        self._closing = ExitStack()
         for screen in screens:
-            self._closing.callback(screen.close)
+            self.callback(screen.close)
         self._memory = _Memory(sequence) if screens else None
         self.sequence = self._memory or sequence
-
-    def __enter__(self) -> FrameViewers:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self._closing.close()
 
     def show(self, result: StepResult) -> None:
         """After a frame."""
         if self._memory is None:
             return
-        assert self._memory.last is not None  # the frame's own
         seen = self._slam.last_features
+        assert self._memory.last is not None  # the frame's own
         assert seen is not None
         snapshot = FrameSnapshot(
             result,
@@ -133,7 +114,7 @@ def tracked_pixels(slam: SLAM, index: int) -> Float[Tensor, "M 2"]:
     return seen["pixels"][torch.isin(seen["frame_row"], torch.nonzero(is_it)[:, 0])]
 
 
-class LiveView:
+class LiveView(FrameViewer):
     """A viewer of rerun that follows a run: camera, image and keypoints of every frame, the map at every keyframe.
 
     The world is that of the map, y down. Images and keypoints are shown without distortion.
@@ -187,7 +168,7 @@ class LiveView:
 
     def close(self) -> None:
         try:
-            self._recording.flush(timeout_sec=FLUSH_SECONDS)
+            self._recording.flush(timeout_sec=5.0)  # a viewer may have been closed
         except RuntimeError as error:  # the window was closed; the run goes on
             warnings.warn(f"the viewer of rerun did not get everything: {error}", stacklevel=2)
         self._recording.disconnect()
@@ -198,7 +179,7 @@ class LiveView:
         self._recorder.path(path.positions_w, gaps(path.timestamps))
 
 
-class VideoRecorder:
+class VideoRecorder(FrameViewer):
     """tracked.mp4: every frame with its keypoints, those that hold the pose in the color of the state."""
 
     def __init__(self, path: Path, size: tuple[int, int], rate: float) -> None:
@@ -215,23 +196,16 @@ class VideoRecorder:
 
     def show(self, snapshot: FrameSnapshot) -> None:
         result = snapshot.result
-        image = cv2.cvtColor(
-            cv2.resize(snapshot.image, self._size, interpolation=cv2.INTER_AREA), cv2.COLOR_GRAY2BGR
-        )
-        for pixels, color, radius in (
-            (snapshot.keypoints, UNMATCHED, 1),
-            (snapshot.tracked, COLORS[result.state], 3),
-        ):
+        small = cv2.resize(snapshot.image, self._size, interpolation=cv2.INTER_AREA)
+        image, own = cv2.cvtColor(small, cv2.COLOR_GRAY2BGR), COLORS[result.state]
+        for pixels, color, radius in ((snapshot.keypoints, (150, 150, 150), 1), (snapshot.tracked, own, 3)):
             for x, y in (pixels * self._scale).round().int().tolist():
                 cv2.circle(image, (x, y), radius, color, 1, cv2.LINE_AA)
         image = cv2.copyMakeBorder(image, 0, BAR, 0, 0, cv2.BORDER_CONSTANT, value=(24, 21, 19))
         words = f"{result.index}  {result.state.value}  {result.inliers or ''}  {result.reason}"
         place = (8, image.shape[0] - 8)
-        cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, COLORS[result.state], 1, cv2.LINE_AA)
+        cv2.putText(image, words, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, own, 1, cv2.LINE_AA)
         self._writer.write(image)
-
-    def end(self, run: Run) -> None:
-        """Do nothing: later optimization does not change the video."""
 
     def close(self) -> None:
         self._writer.release()
@@ -240,4 +214,4 @@ class VideoRecorder:
 def film_of(sequence: Sequence, directory: Path) -> VideoRecorder:
     """Create the video of a run in the results folder, at the frame rate of the sequence."""
     rate = sequence.frame_rate if sequence.known_length is not None and len(sequence.timestamps) > 1 else 0.0
-    return VideoRecorder(directory / VIDEO, sequence.size, rate or USUAL_RATE)
+    return VideoRecorder(directory / VIDEO, sequence.size, rate or 30.0)

@@ -1,36 +1,48 @@
-"""view.html: map, path, cameras and errors of a run as a self-contained page."""
+"""view.html: map, path, cameras and errors of a run as a self-contained page; and the data of its ruler."""
 
 from __future__ import annotations
 
+import base64
 import html
 import json
+import re
+import sys
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Num
 from torch import Tensor
 
 from torchslam.data.trajectories import nearest
 from torchslam.dense.cloud import PointCloud
-from torchslam.errors import TrajectoryError
-from torchslam.evaluation import Evaluation, evaluate
 from torchslam.geometry import Camera, se3_inverse, sim3_scale, transform
 from torchslam.geometry.transforms import upright_rotation
 from torchslam.io.export.ply import upright_from_map
 from torchslam.io.export.recording import gaps
-from torchslam.io.plots.style import robust_box, thin
+from torchslam.io.plots.charts import robust_box, thin
 from torchslam.io.report import unit_words
-from torchslam.io.results import Results, aligned, aligned_poses, readout_of
-from torchslam.io.viewer.arrays import encoded
-from torchslam.io.viewer.ruler import of_points
+from torchslam.io.results import Results, aligned, aligned_poses
 from torchslam.map.atlas import Submap
+from torchslam.map.map import NO_POINT, Map
+from torchslam.map.observation_index import first_of_each
 from torchslam.types import State, Trajectory
 from torchslam.utils.console import printable
 
 VIEW = "view.html"
 SCRIPTS = ("draw.js", "orbit.js", "scene.js", "ruler.js", "view.js")  # in this order, all in one script
+MAX_POINTS = 150_000  # of all submaps together: 42 bytes each in the page
+MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
+DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
+STEPS = (
+    65535  # of 16 bits: of the dense cloud over its extent, of pixels over the image, hundredths of a pixel
+)
+FACTOR_STEPS = 127
+"""Steps of an entry of the factor of a covariance, over the largest one of the point: half a percent is enough."""
+MAX_FRAMES = 20_000  # 100 bytes each in the page
+MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
 
 
 def write_view(results: Results, directory: Path) -> Path:
@@ -42,35 +54,18 @@ def write_view(results: Results, directory: Path) -> Path:
 
 def page(results: Results) -> str:
     """Return the page with style, scripts and data."""
-    data = page_data(results)
+    data, folder = page_data(results), files("torchslam.io.viewer")
+    asset = {
+        name: (folder / name).read_text(encoding="utf-8") for name in (*SCRIPTS, "view.css", "view.html")
+    }
     parts = {
         "title": html.escape(data["title"]),
-        "css": _asset("view.css"),
+        "css": asset["view.css"],
         # The data must not contain `</script>`.
         "data": json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"),
-        "script": "".join(map(_asset, SCRIPTS)),
+        "script": "".join(asset[name] for name in SCRIPTS),
     }
-    text = _asset("view.html")
-    before, *rest = text.split("{{")
-    pieces = [before]
-    for part in rest:
-        name, after = part.split("}}", 1)
-        pieces += [parts[name], after]
-    return "".join(pieces)
-
-
-def _asset(name: str) -> str:
-    return (files("torchslam.io.viewer") / name).read_text(encoding="utf-8")
-
-
-MAX_POINTS = 150_000  # of all submaps together: 42 bytes each in the page
-MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
-DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
-STEPS = 65535  # of a coordinate of the dense cloud, over the extent of the cloud
-MAX_FRAMES = 20_000  # 100 bytes each in the page
-MAX_SLOPE = 2.0  # tangent of the widest half angle of view that is drawn: a fisheye has no pyramid
-FRUSTUM = 0.035  # its depth, in radii of the scene
-STATES = tuple(State)
+    return re.sub(r"\{\{(\w+)\}\}", lambda found: parts[found[1]], asset["view.html"])
 
 
 def page_data(results: Results) -> dict[str, Any]:
@@ -79,7 +74,7 @@ def page_data(results: Results) -> dict[str, Any]:
     `frames` has a row per displayed frame: index, seconds since the first one, state and so on. `submaps` has
     those with frames of the run, the main one first, see `_submap`.
     """
-    metrics = results.metrics
+    metrics, states = results.metrics, list(State)
     frames = [results.frames[row] for row in thin(len(results.frames), MAX_FRAMES)]
     times = torch.tensor([frame.timestamp for frame in frames], dtype=torch.float64, device="cpu")
     reasons = list(dict.fromkeys(frame.reason for frame in frames))
@@ -90,8 +85,7 @@ def page_data(results: Results) -> dict[str, Any]:
     budget = MAX_POINTS / max(sum(submap.map.num_points for submap in shown), 1)
     accuracy = f" · ATE {metrics['ate_m']:.3g} m" if "ate_m" in metrics else ""
     unit = f" · {unit_words(metrics)}" if metrics.get("metric") else ""
-    readout = readout_of(metrics)
-    shutter = "" if readout is None else f" · readout {readout.description()}"
+    shutter = "" if results.readout is None else f" · readout {results.readout.description()}"
     return {
         "title": printable(Path(metrics.get("source") or "torchslam").name),
         "facts": f"{len(results.frames)} frames, {metrics['posed']} posed{accuracy}{unit}{shutter}",
@@ -102,7 +96,7 @@ def page_data(results: Results) -> dict[str, Any]:
         "frames": {
             "index": encoded([frame.index for frame in frames], "int32"),
             "seconds": encoded(times - times[:1], "float64"),
-            "state": encoded([STATES.index(frame.state) for frame in frames], "uint8"),
+            "state": encoded([states.index(frame.state) for frame in frames], "uint8"),
             "keyframe": encoded([frame.is_keyframe for frame in frames], "uint8"),
             "inliers": encoded([frame.inliers for frame in frames], "int32"),
             "reason": encoded([number_of[frame.reason] for frame in frames], "int32"),
@@ -137,14 +131,10 @@ def _submap(
     """
     is_main = submap.number == results.metrics["submap"]
     cloud = results.cloud if is_main else None
-    evaluation = _evaluation(path, results)
-    S = (
-        torch.eye(4, dtype=torch.float64, device="cpu")
-        if evaluation is None
-        else evaluation.S_groundtruth_estimate.clone()
-    )
-    keyframes = submap.map.keyframe_trajectory(results.session)
+    evaluation = results.evaluation(path)
     up = torch.eye(4, dtype=torch.float64, device="cpu")
+    S = up.clone() if evaluation is None else evaluation.S_groundtruth_estimate
+    keyframes = submap.map.keyframe_trajectory(results.session)
     level = submap.metric is not None and submap.metric.is_level
     if evaluation is None:
         up[:3, :3] = upright_from_map(submap.map, submap.metric)
@@ -154,9 +144,8 @@ def _submap(
         up[:3, :3] = upright_rotation(aligned_poses(se3_inverse(submap.map.T_cw), S))
     S = up @ S
     points_w, ids = _points(submap)
-    box = torch.from_numpy(
-        robust_box(aligned(path, S).positions_w.numpy(), transform(S, points_w).numpy()).T.copy()
-    )
+    limits = robust_box(aligned(path, S).positions_w.numpy(), transform(S, points_w).numpy())
+    box = torch.from_numpy(limits.T.copy())
     S[:3, 3] -= box.mean(dim=0)
     box = box - box.mean(dim=0)
     errors = torch.full((len(path),), torch.nan, dtype=torch.float64, device="cpu")
@@ -164,7 +153,8 @@ def _submap(
     if evaluation is not None:
         errors[nearest(evaluation.matched.timestamps, path.timestamps)[0]] = evaluation.errors_m
         to_shown = S @ torch.linalg.inv(evaluation.S_groundtruth_estimate)
-        truth = transform(to_shown, _during(results, path).positions_w)
+        during = results.truth(*path.timestamps[[0, -1]].tolist())
+        truth = transform(to_shown, during.positions_w)
         truth = truth[thin(len(truth), MAX_FRAMES)]
     frame, rows = _shown_rows(path.timestamps, times)
     keyframe, keyframe_rows = _shown_rows(keyframes.timestamps, times)
@@ -173,6 +163,7 @@ def _submap(
     breaks = gaps(frame)
     steps = shown[:, :3, 3].diff(dim=0).norm(dim=-1)
     steps[[row - 1 for row in breaks]] = 0.0
+    radius = float((box[1] - box[0]).norm()) / 2
     return {
         "name": f"{submap.number}" + (", the main one" if is_main else ""),
         "unit": "" if evaluation is None and submap.metric is None else "m",
@@ -193,8 +184,8 @@ def _submap(
         **of_points(submap.map, ids[kept], S, results.session, results.camera.size),
         "dense": None if cloud is None else _dense(cloud, S, box),
         "box": box.tolist(),
-        "radius": float((box[1] - box[0]).norm()) / 2,
-        "frustum": FRUSTUM * float((box[1] - box[0]).norm()) / 2,
+        "radius": radius,
+        "frustum": 0.035 * radius,
     }
 
 
@@ -223,24 +214,6 @@ def _dense(cloud: PointCloud, S: Float[Tensor, "4 4"], box: Float[Tensor, "2 3"]
     }
 
 
-def _evaluation(path: Trajectory, results: Results) -> Evaluation | None:
-    """Return the errors of the poses in a submap; None without ground truth."""
-    if results.groundtruth is None:
-        return None
-    try:
-        return evaluate(path, results.groundtruth)
-    except TrajectoryError:
-        return None
-
-
-def _during(results: Results, path: Trajectory) -> Trajectory:
-    """Return the ground truth from the first to the last pose of a submap."""
-    truth = results.groundtruth
-    assert truth is not None  # else there is no evaluation
-    during = (truth.timestamps >= path.timestamps[0]) & (truth.timestamps <= path.timestamps[-1])
-    return Trajectory(truth.timestamps[during], truth.T_wc[during])
-
-
 def _points(submap: Submap) -> tuple[Float[Tensor, "N 3"], Int[Tensor, " N"]]:
     """Return positions and rows of the valid points."""
     if submap.map.num_points == 0:
@@ -257,9 +230,8 @@ def _shown_rows(
 ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Return the displayed frames that have a pose, ascending, and the rows of their poses."""
     if len(timestamps) == 0 or len(times) == 0:
-        return torch.zeros(0, dtype=torch.int64, device="cpu"), torch.zeros(
-            0, dtype=torch.int64, device="cpu"
-        )
+        nothing = torch.zeros(0, dtype=torch.int64, device="cpu")
+        return nothing, nothing
     row, distance = nearest(times, timestamps)
     frame = torch.nonzero(distance < 1e-6)[:, 0]  # files keep nanoseconds
     return frame, row[frame]
@@ -272,3 +244,78 @@ def _corners(camera: Camera) -> Float[Tensor, "4 3"]:
     y = (torch.tensor([0.0, 0, 1, 1], dtype=torch.float32, device="cpu") * (camera.height - 1) - cy) / fy
     slopes = torch.stack((x, y), dim=-1).clamp(-MAX_SLOPE, MAX_SLOPE)
     return torch.nn.functional.pad(slopes, (0, 1), value=1.0)
+
+
+def of_points(
+    slam_map: Map,
+    point_ids: Int[Tensor, " P"],
+    S_shown_map: Float[Tensor, "4 4"],
+    session: int,
+    size: tuple[int, int],
+) -> dict[str, Any]:
+    """Return what the ruler knows of each shown point: an image point of a session, and the error of its position.
+
+    Returns:
+        seen_frame, seen_pixel: (P,), (P, 2) as by `clearest_observations`, pixels in steps
+        error_step, error_factor: (P,), (P, 6) as by `error_factors`; of the float32 of a step, the upper 16 bits
+    """
+    values: list[Any] = [[], [], [], []]
+    if len(point_ids):  # else the table may have no columns yet
+        frames, pixels = clearest_observations(slam_map, point_ids, session, size)
+        steps = STEPS / (torch.tensor(size, dtype=torch.float64, device="cpu") - 1).clamp(min=1)
+        sR = S_shown_map[:3, :3]
+        step, factor = error_factors(sR @ slam_map.points["covariances_w"][point_ids].double() @ sR.mT)
+        upper = step.bfloat16().view(torch.int16).numpy().view(np.uint16)
+        values = [frames, (pixels * steps).round().clamp(0, STEPS), upper, factor]
+    names = {"seen_frame": "int32", "seen_pixel": "uint16", "error_step": "uint16", "error_factor": "int8"}
+    return {name: encoded(each, kind) for (name, kind), each in zip(names.items(), values, strict=True)}
+
+
+def clearest_observations(
+    slam_map: Map, point_ids: Int[Tensor, " N"], session: int, size: tuple[int, int]
+) -> tuple[Int[Tensor, " N"], Float[Tensor, "N 2"]]:
+    """Return one observation of each point by a keyframe of a session: of a fine scale, and far from the border.
+
+    Returns:
+        Index of the frame in the sequence, -1 for points that the session does not observe; and pixels.
+    """
+    seen = slam_map.observations(slam_map.keyframe_rows(session).to(slam_map.T_cw.device))
+    half = torch.tensor(size, dtype=seen.pixels.dtype, device=seen.pixels.device) / 2
+    off_center = ((seen.pixels + 0.5) / half - 1).square().sum(dim=-1) / 2  # 1 in the corners
+    order = torch.argsort(seen.scales * (1 + off_center), stable=True)
+    chosen = order[first_of_each(seen.point_index[order])]
+    row = point_ids.new_full((len(slam_map.points),), NO_POINT)
+    row[seen.point_index[chosen]] = chosen
+    row = row[point_ids]
+    known = row != NO_POINT
+    frames, pixels = torch.full_like(row, -1), seen.pixels.new_zeros(len(row), 2)
+    frames[known] = slam_map.keyframes["frame_index"][seen.keyframe_index[row[known]]]
+    pixels[known] = seen.pixels[row[known]]
+    return frames, pixels
+
+
+def error_factors(covariances: Float[Tensor, "N 3 3"]) -> tuple[Float[Tensor, " N"], Int[Tensor, "N 6"]]:
+    """Return covariances as numbers of steps, of their Cholesky factors L.
+
+    Returns:
+        Length of a step, 0 where the covariance is unknown; and the entries of L on and below the diagonal, row by row.
+    """
+    largest = covariances.diagonal(dim1=-2, dim2=-1).amax(dim=-1)
+    known = (largest > 0) & covariances.isfinite().all(dim=-1).all(dim=-1)
+    eye = torch.eye(3, dtype=covariances.dtype, device=covariances.device)
+    scaled = torch.where(known[:, None, None], covariances / largest[:, None, None], eye)
+    # A depth that is much less certain than the rest leaves rounding errors in the other directions.
+    L, failed = torch.linalg.cholesky_ex(scaled + 1e-9 * eye)
+    known = known & (failed == 0)
+    steps = (L.clamp(-1, 1) * FACTOR_STEPS).round().to(torch.int64)
+    low, column = torch.tril_indices(3, 3, device="cpu").unbind()
+    length = torch.where(known, largest.clamp(min=0).sqrt() / FACTOR_STEPS, 0.0)
+    return length, torch.where(known[:, None], steps[:, low, column], 0)
+
+
+def encoded(values: Num[Tensor, "*shape"] | np.ndarray | list[Any], kind: str) -> dict[str, str]:
+    """Encode numbers as base64 of their little-endian bytes, row by row."""
+    array = np.ascontiguousarray(np.asarray(values, dtype=kind))
+    if sys.byteorder == "big":
+        array = array.byteswap()
+    return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
