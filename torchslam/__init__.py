@@ -1,7 +1,7 @@
 """Monocular visual SLAM as a PyTorch program.
 
 sequence = torchslam.open_sequence(path)
-run = torchslam.SLAM(sequence.camera).run(sequence)
+run = torchslam.run(sequence)
 torchslam.evaluate(run.trajectory, sequence.groundtruth).ate_m
 """
 
@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     from torchslam.learning.clip_slam import ClipGraph, ClipPoses, ClipSLAM, clip_loss
     from torchslam.optim import BundleProblem, SolverOptions, solve_bundle, solve_least_squares, solve_pose
     from torchslam.optim.run_graph import GraphSolution, ObservationGraph, solve_graph
+    from torchslam.recording import run
     from torchslam.system.run import Run
     from torchslam.system.slam import SLAM
     from torchslam.types import Features, Frame, Matches, State, StepResult, Trajectory
@@ -77,6 +78,7 @@ __all__ = [
     "match",
     "match_by_projection",
     "open_sequence",
+    "run",
     "solve_bundle",
     "solve_graph",
     "solve_least_squares",
@@ -93,6 +95,7 @@ _HOMES = {
     "torchslam.evaluation": "evaluate",
     "torchslam.features": "ALIKED ORB OpenCVORB SIFT XFeat match match_by_projection",
     "torchslam.geometry": "Camera estimate_absolute_pose estimate_relative_pose triangulate umeyama",
+    "torchslam.recording": "run",
     "torchslam.learning.clip_slam": "ClipGraph ClipPoses ClipSLAM clip_loss",
     "torchslam.system.run": "Run",
     "torchslam.system.slam": "SLAM",

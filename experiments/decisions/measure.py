@@ -175,7 +175,7 @@ def check_columns(run: Run, check: MapCheck | None) -> Columns | None:
     """What the check found, and the numbers of frames with a pose and of those that are uncertain, before and after."""
     if check is None:
         return None
-    doubted = with_doubts(run, check).results
+    doubted = with_doubts(run.results, check)
     return {
         "is_right": check.is_right,
         "score": check.score,

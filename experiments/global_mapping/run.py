@@ -35,7 +35,7 @@ from torchslam.data.trajectories import nearest, write_trajectory
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import MIN_POSES, evaluate
 from torchslam.geometry import umeyama
-from torchslam.global_mapping.recording import MappedRecording, Mapping, map_recording
+from torchslam.global_mapping.recording import MappedRun, Mapping, map_recording
 from torchslam.system.run import Run
 from torchslam.system.slam import SLAM
 from torchslam.types import Trajectory
@@ -129,22 +129,20 @@ def mapped(case: Columns, folder: Path) -> list[Columns]:
         start = time.process_time()
         made = map_recording(sequence, online, config, sequence.camera, mode)
         seconds = before + time.process_time() - start
-        if not made.run.failure:
-            write_trajectory(folder / f"{mode.value}.txt", made.run.trajectory)
+        if not made.failure:
+            write_trajectory(folder / f"{mode.value}.txt", made.trajectory)
         outcomes.append(outcome_of(mode, made, seconds, sequence.groundtruth))
     if sequence.groundtruth is not None:
         write_trajectory(folder / GROUNDTRUTH, sequence.groundtruth)
     return outcomes
 
 
-def outcome_of(
-    mode: Mapping, made: MappedRecording, seconds: float, groundtruth: Trajectory | None
-) -> Columns:
+def outcome_of(mode: Mapping, run: MappedRun, seconds: float, groundtruth: Trajectory | None) -> Columns:
     """The figures of a mapping as JSON values; `ate_m` is None without ground truth or map."""
-    run, checked = made.run, made.check
+    checked = run.check
     return {
         "mapping": mode.value,
-        "kept": made.kept.value,
+        "kept": (run.kept or mode).value,
         "posed": len(run.trajectory),
         "frames": len(run.results) + len(run.skipped),
         "failure": run.failure,

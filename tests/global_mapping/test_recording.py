@@ -16,7 +16,7 @@ from torchslam.config import Config, load_config
 from torchslam.geometry import SensorModel
 from torchslam.global_mapping import recording
 from torchslam.global_mapping.check import Break, BreakKind, MapCheck
-from torchslam.global_mapping.recording import MappedRecording, Mapping, check_run, map_recording, with_doubts
+from torchslam.global_mapping.recording import MappedRun, Mapping, check_run, map_recording, with_doubts
 from torchslam.system.run import Run
 from torchslam.types import Reason, State, StepResult, Trajectory
 
@@ -119,7 +119,7 @@ class World:
         mapping: Mapping = Mapping.AUTO,
         *overrides: str,
         go_on: Callable[[], Run] | None = None,
-    ) -> MappedRecording:
+    ) -> MappedRun:
         """Map a recording with this online run."""
         return map_recording(
             None,  # type: ignore[arg-type]
@@ -140,7 +140,8 @@ def world(monkeypatch: pytest.MonkeyPatch) -> World:
 def test_a_complete_run_that_the_check_calls_right_is_kept(world: World) -> None:
     online = a_run()
     kept = world.map(online)
-    assert (kept.run, kept.check, kept.kept, kept.why) == (online, world.online_check, Mapping.ONLINE, "")
+    assert kept.results is online.results
+    assert (kept.check, kept.kept, kept.why) == (world.online_check, Mapping.ONLINE, "")
     assert world.mapped == []
     assert world.stages == ["check"]
     world.online_check = None  # nothing to check by
@@ -163,7 +164,7 @@ def test_a_recording_with_lost_frames_is_mapped_as_a_whole(world: World, online:
     assert kept.why == why
     assert world.mapped == ([online.results] if why else [])
     assert (kept.kept is Mapping.GLOBAL) == bool(why)
-    assert (kept.run is world.whole) == bool(why)
+    assert (kept.results is world.whole.results) == bool(why)
     assert world.checked_online == (not why)
 
 
@@ -213,8 +214,8 @@ def test_the_map_that_predicts_the_held_out_pairs_better_is_kept(
     online = a_run(posed=posed, frames=300)
     made = world.map(online, Mapping.GLOBAL)
     assert made.kept is kept
-    assert made.run is (world.whole if kept is Mapping.GLOBAL else online)
-    assert made.online is online
+    assert made.results is (world.whole if kept is Mapping.GLOBAL else online).results
+    assert made.by_frame is (online if kept is Mapping.GLOBAL else None)
     assert made.check == world.checks[kept is Mapping.GLOBAL]
 
 
@@ -222,7 +223,8 @@ def test_without_any_map_the_whole_one_must_be_right(world: World) -> None:
     failed = a_run(posed=0, failure="the camera only turns")
     world.checks = {True: a_check(0.7), False: a_check(0.0)}
     made = world.map(failed)
-    assert (made.run, made.check, made.kept) == (failed, None, Mapping.ONLINE)
+    assert made.results is failed.results
+    assert (made.check, made.kept) == (None, Mapping.ONLINE)
     assert made.why == "the camera only turns"
     world.checks[True] = a_check(0.9)
     assert world.map(failed).kept is Mapping.GLOBAL
@@ -233,7 +235,8 @@ def test_a_recording_without_a_whole_map_keeps_the_online_run(world: World) -> N
     world.whole = a_run(posed=0, failure="no map: 2 images are too few")
     online = a_run(posed=50)
     kept = world.map(online)
-    assert (kept.run, kept.kept, kept.check) == (online, Mapping.ONLINE, world.online_check)
+    assert kept.results is online.results
+    assert (kept.kept, kept.check) == (Mapping.ONLINE, world.online_check)
     assert kept.why == "50 of 100 frames are posed in one map"
     assert world.checked_online == 1
     world.map(a_run(), Mapping.GLOBAL)
@@ -252,20 +255,24 @@ def test_a_run_that_was_lost_goes_on_only_where_the_whole_map_is_not_right(world
         return ended
 
     kept = world.map(begun, go_on=go_on)
-    assert (kept.run, kept.check, kept.kept) == (world.whole, world.checks[True], Mapping.GLOBAL)
+    assert kept.results is world.whole.results
+    assert (kept.check, kept.kept) == (world.checks[True], Mapping.GLOBAL)
     assert kept.why == "tracking was lost at frame 9"
     assert (asked, world.mapped, world.checked_online) == ([], [begun.results], 0)
     world.whole = a_run(posed=99)
     kept = world.map(begun, go_on=go_on)
-    assert (kept.run, kept.why) == (world.whole, "60 of 100 frames are posed in one map")
+    assert kept.results is world.whole.results
+    assert kept.why == "60 of 100 frames are posed in one map"
     assert asked == [ended]
     world.whole = a_run()
     world.checks = {True: a_check(0.7, predicted=0), False: a_check(0.9)}
     kept = world.map(begun, go_on=go_on)
-    assert (kept.run, kept.check, kept.kept) == (ended, world.checks[False], Mapping.ONLINE)
+    assert kept.results is ended.results
+    assert (kept.check, kept.kept) == (world.checks[False], Mapping.ONLINE)
     world.whole = a_run(posed=0, failure="no map: 2 images are too few")
     kept = world.map(begun, go_on=go_on)
-    assert (kept.run, kept.check) == (ended, world.online_check)
+    assert kept.results is ended.results
+    assert kept.check == world.online_check
     assert len(asked) == 3
 
 
@@ -273,7 +280,7 @@ def test_frames_that_the_mapper_doubts_are_uncertain(world: World) -> None:
     world.doubtful, world.checks[False] = frozenset({7, 8}), a_check(0.5, predicted=0)
     made = world.map(a_run(lost=3))
     assert made.kept is Mapping.GLOBAL
-    states = [result.state for result in made.run.results]
+    states = [result.state for result in made.results]
     assert [row for row, state in enumerate(states) if state is State.UNCERTAIN] == [7, 8]
     assert made.check is not None
     assert made.check.uncertain == (7, 8)
@@ -283,19 +290,19 @@ def test_doubted_frames_are_uncertain() -> None:
     """Up to the next checked one that is certain; lost ones stay lost, and nothing else changes."""
     online = a_run(frames=12, lost=1)
     check = replace(a_check(uncertain=(4, 6)), certain=(0, 2, 8, 10))
-    doubted = with_doubts(online, check).results
+    doubted = with_doubts(online.results, check)
     assert [row for row, each in enumerate(doubted) if each.state is State.UNCERTAIN] == [4, 5, 6, 7]
     assert {each.reason for each in doubted if each.state is State.UNCERTAIN} == {Reason.WEAK_LINK.value}
     assert [each.reason for each in doubted if each.state is not State.UNCERTAIN] == [""] * 8
-    first = with_doubts(online, replace(check, uncertain=(0,), certain=(3,))).results
+    first = with_doubts(online.results, replace(check, uncertain=(0,), certain=(3,)))
     assert [each.state for each in first[:4]] == [
         State.LOST,
         State.UNCERTAIN,
         State.UNCERTAIN,
         State.TRACKING,
     ]
-    assert with_doubts(online, None) is online
-    assert with_doubts(online, a_check()) is online
+    assert with_doubts(online.results, None) is online.results
+    assert with_doubts(online.results, a_check()) is online.results
 
 
 @pytest.mark.usefixtures("without_shape_checks")

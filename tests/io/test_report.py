@@ -10,7 +10,7 @@ from torchslam.evaluation import evaluate
 from torchslam.geometry import transform
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.check import Break, BreakKind, MapCheck
-from torchslam.global_mapping.recording import MappedRecording, Mapping
+from torchslam.global_mapping.recording import MappedRun, Mapping
 from torchslam.io.report import (
     check_metrics,
     quality,
@@ -86,7 +86,7 @@ def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
     check = MapCheck(
         9, 4, 3, 10, 9, 0.8, 0.5, torch.zeros(4), (Break(3, 4, BreakKind.SCALE, 1.2),), (0, 1, 2), (4, 5)
     )
-    mapped = MappedRecording(run, run, check, Mapping.GLOBAL, "tracking was lost in 3 frames")
+    mapped = MappedRun.of(run, Mapping.GLOBAL, check, "tracking was lost in 3 frames", run)
     found = check_metrics(mapped)
     assert found["mapping"] == "global"
     assert found["mapping_reason"] == "tracking was lost in 3 frames"
@@ -96,8 +96,8 @@ def test_the_check_is_reported_in_numbers_and_in_a_sentence(run: Run) -> None:
     assert found["check"]["breaks"] == ["between frames 3 and 4 the scale differs by 20%"]
     row = summary(run_metrics(run) | found)["check"]
     assert row.startswith("global mapping: 75% of 4 held-out image pairs agree, and 90% of 10")
-    assert check_metrics(None) == {}
-    assert check_metrics(MappedRecording(run, run, None, Mapping.ONLINE, ""))["check"] is None
+    assert check_metrics(run) == check_metrics(MappedRun.of(run)) == {}
+    assert check_metrics(MappedRun.of(run, Mapping.ONLINE))["check"] is None
 
 
 def test_a_readout_is_a_row_of_the_summary(run: Run) -> None:
@@ -191,7 +191,7 @@ def test_times_and_online_poses_are_of_the_run_frame_by_frame(run: Run) -> None:
     timed = [replace(result, stage_ms=each) for result, each in zip(run.results, times, strict=True)]
     online = replace(run, results=timed[:20])
     whole = replace(run, results=[replace(result, stage_ms={}) for result in run.results])
-    figures = run_metrics(whole, online=online)
+    figures = run_metrics(MappedRun.of(whole, Mapping.GLOBAL, by_frame=online))
     assert figures["ms_longest"] == 19.0  # not of frame 2, which came before the map
     assert figures["ms_median"] == 10.5
     assert figures["online_posed"] == len(online.online) < run_metrics(run)["online_posed"]

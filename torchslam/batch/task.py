@@ -153,18 +153,17 @@ def _run(task: Task, folder: Path) -> Columns:
     unmeasured = replace(config, metric=MetricConfig(own=False))
     slam = SLAM(sequence.camera.to(device), unmeasured)
     online = OnlineRun(slam, source(sequence, unmeasured, slam.camera), processes=1)
-    finished, mapped = run_recording(online, sequence, sources=sources, device=device)
+    finished = run_recording(online, sequence, sources=sources, device=device)
     if finished.interrupted:
         raise KeyboardInterrupt
     finished = replace(finished, config=replace(finished.config, metric=config.metric))
     seconds = time.process_time() - start
-    metrics = compute_metrics(finished, sequence, camera_remark(finished, camera), mapped=mapped)
+    metrics = compute_metrics(finished, sequence, camera_remark(finished, camera))
     times = {"cpu_s": seconds} | {name: metrics.pop(name) for name in TIMED}
     (folder / TIMES).write_text(json.dumps(times, indent=2) + "\n", encoding="utf-8")
     metrics |= source_of(row.resolve(row.sequence), row.fps, sequence)
     timeless = replace(finished, results=[replace(result, stage_ms={}) for result in finished.results])
-    before = None if mapped is None else mapped.online
-    write_run(timeless, sequence, metrics, folder, online=before, plots=task.plots, viewer=task.plots)
+    write_run(timeless, sequence, metrics, folder, plots=task.plots, viewer=task.plots)
     flat = {key: each for key, each in metrics.items() if each is None or isinstance(each, int | float | str)}
     return {
         "sequence": without_credentials(row.sequence),

@@ -164,18 +164,18 @@ def _solve(pairs: list[tuple[Tensor, Tensor, Tensor]], camera: Camera, scale: fl
 def find_camera(
     sequence: Sequence,
     config: Config,
-    output: Path,
-    device: torch.device,
+    output: Path | None,
+    device: torch.device | str,
     resume: bool = False,
     on_progress: Callable[[str], None] = lambda words: None,
     extract: Extractor | None = None,
 ) -> tuple[Sequence, str]:
-    """Find the focal length of an unknown camera from pairs of images, and write the calibration file.
+    """Find the focal length of an unknown camera from pairs of images.
 
     Args:
         sequence: With a guessed camera to start from, or none.
         config: Of the run.
-        output: Folder of the calibration file.
+        output: Folder into which the calibration file is written; None: no file is written.
         device: Of torch.
         resume: Use the camera of the resumed run, if there is one.
         on_progress: Receives messages.
@@ -185,9 +185,10 @@ def find_camera(
     """
     if config.features.kind == "simulated":
         raise ConfigError("simulated features are made with the camera, so it cannot be estimated")
-    path = output / CALIBRATION
-    check_replaceable(path)
-    if resume and path.exists():
+    path = None if output is None else output / CALIBRATION
+    if path is not None:
+        check_replaceable(path)
+    if path is not None and resume and path.exists():
         known = read_numbers(path)
         return sequence.with_camera(known.camera(sequence.size), std=known.std), f"from {path}"
     sequence = sequence.with_guess()
@@ -198,7 +199,8 @@ def find_camera(
         camera = camera.with_params(torch.cat([ratio * camera.params[:2], camera.params[2:]]))
         std = max(LEAST_STD, STD_FACTOR * float(search.std))
     description = describe_search(search, camera)
-    write_calibration(path, camera, [description], std)
+    if path is not None:
+        write_calibration(path, camera, [description], std)
     on_progress(description)
     return sequence.with_camera(camera, std=std), description
 

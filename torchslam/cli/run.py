@@ -227,16 +227,15 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         processes = 1 if screens else options.processes  # with viewers this process needs the images
         online = OnlineRun(slam, watching.sequence, so_far, processes, bars)
         stages = options.output / STAGES if options.checkpoint else None
-        finished, mapped = run_recording(
+        finished = run_recording(
             online, sequence, mode, sources, options.device, stages, kept, all_frames=bool(screens)
         )
-        if mapped is not None and mapped.why:
-            say(f"ran global mapping because {mapped.why}; kept the {mapped.kept} map")
+        if finished.why:
+            say(f"ran global mapping because {finished.why}; kept the {finished.kept} map")
         stop_signals.begin("when the results are written")
-        metrics = compute_metrics(finished, sequence, camera_remark(finished, camera), warn, mapped)
+        metrics = compute_metrics(finished, sequence, camera_remark(finished, camera), warn)
         metrics |= _latency(latencies) | _usage(before_s) | source_of(options.path, options.fps, sequence)
-        before = None if mapped is None else mapped.online
-        write_run(finished, sequence, metrics, options.output, online=before)
+        write_run(finished, sequence, metrics, options.output)
         watching.end(finished)
     rows = summary(metrics) | {"results": str(options.output), "view": str(options.output / VIEW)}
     rows |= {"video": str(options.output / VIDEO)} if options.video else {}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from enum import StrEnum
 from pathlib import Path
 
@@ -25,7 +25,7 @@ from torchslam.system.metric_run import run_in_meters
 from torchslam.system.online_run import OnlineRun
 from torchslam.system.run import Run
 from torchslam.tracking.matcher import make_matcher
-from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
+from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult, Trajectory
 
 FEW_POSED = 0.98
 """Share of the frames with a pose in the main submap below which a recording is mapped as a whole as well."""
@@ -53,23 +53,50 @@ class Mapping(StrEnum):
 
 
 @dataclass(frozen=True)
-class MappedRecording:
-    """The run that was kept.
+class MappedRun(Run):
+    """The run of a recording, and how its map was chosen.
 
     Attributes:
-        run: the run.
-        online: the run frame by frame, which is `run` itself, or came before it; shorter if it stopped when tracking
-            was lost.
-        check: the check of the map of `run`; None without a map, or without image pairs.
-        kept: which mapping it is from.
+        kept: the mapping that the map is from; None: without a choice, as of a live source or an interrupted run.
+        check: the check of the map; None without a map, or without image pairs.
         why: why the recording was mapped as a whole; empty if it was not.
+        by_frame: the run frame by frame, where the map is of the recording as a whole; shorter if it stopped when
+            tracking was lost.
     """
 
-    run: Run
-    online: Run
-    check: MapCheck | None
-    kept: Mapping
-    why: str
+    kept: Mapping | None = None
+    check: MapCheck | None = None
+    why: str = ""
+    by_frame: Run | None = None
+
+    @classmethod
+    def of(
+        cls,
+        run: Run,
+        kept: Mapping | None = None,
+        check: MapCheck | None = None,
+        why: str = "",
+        by_frame: Run | None = None,
+    ) -> MappedRun:
+        """The same run, with the frames that the check doubts called uncertain."""
+        columns = {column.name: getattr(run, column.name) for column in fields(Run)}
+        return cls(
+            **columns | {"results": with_doubts(run.results, check)},
+            kept=kept,
+            check=check,
+            why=why,
+            by_frame=by_frame,
+        )
+
+    @property
+    def online(self) -> Trajectory:
+        """The poses that were returned frame by frame."""
+        return super().online if self.by_frame is None else self.by_frame.online
+
+    @property
+    def online_parts(self) -> list[Trajectory]:
+        """As of the run frame by frame, see `Run.online_parts`."""
+        return super().online_parts if self.by_frame is None else self.by_frame.online_parts
 
 
 def run_recording(
@@ -81,7 +108,7 @@ def run_recording(
     stages: Path | None = None,
     features: KeptFeatures | None = None,
     all_frames: bool = False,
-) -> tuple[Run, MappedRecording | None]:
+) -> MappedRun:
     """Process the frames of a recording, check the map, map the recording as a whole where needed, measure its unit.
 
     An interrupt keeps what there is: the run of the frames so far, or the online map, or a map in an arbitrary unit.
@@ -94,32 +121,28 @@ def run_recording(
         device: of torch.
         stages, features: as in `map_recording`.
         all_frames: whether all frames are processed online, even after tracking was lost.
-
-    Returns:
-        The run that was kept, and how it was chosen; None for an interrupted run, and without a check.
     """
     config, observer, sources = online.slam.config, online.observer, list(sources)
-    length, mapped = sequence.known_length, None
+    length = sequence.known_length
     are_all_mapped = length is not None and length <= config.global_mapping.max_images
     may_map = mapping in (Mapping.AUTO, Mapping.GLOBAL)
-    run = online.run(until_lost=may_map and are_all_mapped and not all_frames)
+    run = MappedRun.of(online.run(until_lost=may_map and are_all_mapped and not all_frames))
     if mapping is not None and not run.interrupted:
         go_on = None if online.is_finished else online.run
         try:
             with observer.whole():
                 camera = sequence.camera
-                mapped = map_recording(
+                run = map_recording(
                     sequence, run, config, camera, mapping, device, observer.stage, stages, go_on, features
                 )
-            run = mapped.run
         except KeyboardInterrupt:
-            run = replace(online.end(), interrupted=True)
-    if run.interrupted and sources:
-        return replace(run, unmeasured=(UNMEASURED,)), mapped
-    try:
-        return run_in_meters(run, sequence, sources), mapped
-    except KeyboardInterrupt:
-        return replace(run, interrupted=True, unmeasured=(UNMEASURED,)), mapped
+            run = replace(MappedRun.of(online.end()), interrupted=True)
+    if not run.interrupted:
+        try:
+            return run_in_meters(run, sequence, sources)
+        except KeyboardInterrupt:
+            run = replace(run, interrupted=True)
+    return replace(run, unmeasured=(UNMEASURED,) if sources else ())
 
 
 def map_recording(
@@ -133,7 +156,7 @@ def map_recording(
     stages: Path | None = None,
     go_on: Callable[[], Run] | None = None,
     features: KeptFeatures | None = None,
-) -> MappedRecording:
+) -> MappedRun:
     """Check an online run, and map its recording as a whole where that is wanted or needed.
 
     Args:
@@ -158,7 +181,7 @@ def map_recording(
         if check is not None and not check.is_right:
             why = f"the check of the online map failed: {check.sentence()}"
     if mapping is Mapping.ONLINE or (mapping is Mapping.AUTO and not why):
-        return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, "")
+        return MappedRun.of(online, Mapping.ONLINE, check)
     given = CameraMeasurement.of(camera.to(torch.float64), config.camera.std) if config.camera.std else None
     saved = SavedStages(stages, sequence, config, device)
     mapper = GlobalMapper(
@@ -178,22 +201,24 @@ def map_recording(
     if go_on is not None:
         is_whole = len(made.run.trajectory) == len(made.run.results)
         if whole is not None and whole.is_right and is_whole:
-            return MappedRecording(with_doubts(made.run, whole), online, whole, Mapping.GLOBAL, why)
+            return MappedRun.of(made.run, Mapping.GLOBAL, whole, why, online)
         online = go_on()
         why = _loss(online) or why
     if whole is None:
         check = check_run(online) if check is None else check
-        return MappedRecording(with_doubts(online, check), online, check, Mapping.ONLINE, why)
+        return MappedRun.of(online, Mapping.ONLINE, check, why)
     before = checked(online)
     if online.failure and not whole.is_right:
         # A camera that only turns, with a wrong focal length, makes maps that contradict themselves.
-        return MappedRecording(online, online, None, Mapping.ONLINE, why)
+        return MappedRun.of(online, Mapping.ONLINE, None, why)
     gain = predictive_gain(whole.evidence, before.evidence, made.held_back_times)
     is_better = len(made.run.trajectory) >= len(online.trajectory)
     if abs(gain.sigmas) > SURE:
         is_better = gain.total > 0
-    run, check, kept = (made.run, whole, Mapping.GLOBAL) if is_better else (online, before, Mapping.ONLINE)
-    return MappedRecording(with_doubts(run, check), online, check, kept, why or "it was asked for")
+    why = why or "it was asked for"
+    if is_better:
+        return MappedRun.of(made.run, Mapping.GLOBAL, whole, why, online)
+    return MappedRun.of(online, Mapping.ONLINE, before, why)
 
 
 def _loss(run: Run) -> str:
@@ -236,15 +261,17 @@ def keyframe_pairs(run: Run) -> KeyframePairs | None:
     return views, pairs
 
 
-def with_doubts(run: Run, check: MapCheck | None) -> Run:
-    """The run with the frames that the check doubts, and those up to the next checked one, called uncertain."""
+def with_doubts(results: list[StepResult], check: MapCheck | None) -> list[StepResult]:
+    """The results with the frames that the check doubts, and those up to the next checked one, called uncertain."""
     if check is None or not check.uncertain:
-        return run
-    doubted, results = False, list[StepResult]()
-    doubts = dict.fromkeys(check.certain, False) | dict.fromkeys(check.uncertain, True)
-    for result in run.results:
-        doubted = doubts.get(result.index, doubted)
+        return results
+    doubted, found = False, list[StepResult]()
+    uncertain = set(check.uncertain)
+    certain = set(check.certain)
+    for result in results:
+        if result.index in uncertain or result.index in certain:
+            doubted = result.index in uncertain
         if doubted and result.state is State.TRACKING:
             result = replace(result, state=State.UNCERTAIN, reasons=(Explanation(Reason.WEAK_LINK),))
-        results.append(result)
-    return replace(run, results=results)
+        found.append(result)
+    return found

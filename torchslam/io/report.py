@@ -13,7 +13,7 @@ from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, ate_apart, evaluate
 from torchslam.geometry import transform
-from torchslam.global_mapping.recording import MappedRecording
+from torchslam.global_mapping.recording import MappedRun
 from torchslam.metric.options import KINDS
 from torchslam.system.run import Run
 from torchslam.types import State, StepResult, Trajectory
@@ -26,7 +26,6 @@ def compute_metrics(
     sequence: Sequence,
     camera: str,
     log: Callable[[str], None] = lambda words: None,
-    mapped: MappedRecording | None = None,
 ) -> dict[str, Any]:
     """Compute the content of metrics.json, with the errors if there are ground truth and poses to compare.
 
@@ -35,9 +34,7 @@ def compute_metrics(
         sequence: its images, with the ground truth if known.
         camera: remark on the camera, as of `camera_remark`.
         log: receives the reason if the evaluation is impossible.
-        mapped: how the recording was mapped, and the check of its map.
     """
-    online = finished if mapped is None else mapped.online
 
     def measured(run: Run, measure: Callable[[Trajectory], Errors]) -> Errors | None:
         if sequence.groundtruth is None or run.failure:
@@ -51,8 +48,7 @@ def compute_metrics(
     metrics = run_metrics(
         finished,
         measured(finished, lambda truth: evaluate(finished.trajectory, truth)),
-        measured(online, lambda truth: ate_apart(online.online_parts, truth)),
-        online,
+        measured(by_frame(finished), lambda truth: ate_apart(finished.online_parts, truth)),
     )
     metrics |= {
         "camera": camera,
@@ -64,7 +60,7 @@ def compute_metrics(
         | ({} if change.readout is None else {"readout_ms": 1e3 * float(change.readout.seconds)})
         for change in finished.camera_changes
     ]
-    return metrics | check_metrics(mapped) | {"camera_changes": changes, "dropped": sequence.dropped}
+    return metrics | check_metrics(finished) | {"camera_changes": changes, "dropped": sequence.dropped}
 
 
 def readout_metrics(finished: Run) -> dict[str, float] | None:
@@ -87,15 +83,20 @@ def shake_remark(finished: Run) -> str:
     )
 
 
-def check_metrics(mapped: MappedRecording | None) -> dict[str, Any]:
-    """The mapping that was kept, and the check of its map; empty where it was not checked."""
-    if mapped is None:
+def by_frame(run: Run) -> Run:
+    """The run frame by frame, which is the run itself unless its recording was mapped as a whole."""
+    return run.by_frame if isinstance(run, MappedRun) and run.by_frame is not None else run
+
+
+def check_metrics(run: Run) -> dict[str, Any]:
+    """The mapping that was kept, and the check of its map; empty where there was no choice."""
+    if not isinstance(run, MappedRun) or run.kept is None:
         return {}
-    check, found = mapped.check, None
+    check, found = run.check, None
     if check is not None:
         found = {name: getattr(check, name) for name in ("pairs", "agreeing", "triplets", "consistent")}
         found |= {"score": check.score, "breaks": list(map(str, check.breaks)), "sentence": check.sentence()}
-    return {"mapping": mapped.kept.value, "mapping_reason": mapped.why, "check": found}
+    return {"mapping": run.kept.value, "mapping_reason": run.why, "check": found}
 
 
 FEW = 10
@@ -106,7 +107,6 @@ def run_metrics(
     run: Run,
     evaluation: Evaluation | None = None,
     online_ate_m: float | None = None,
-    online: Run | None = None,
 ) -> dict[str, Any]:
     """Compute the metrics of a run, the content of metrics.json.
 
@@ -124,9 +124,9 @@ def run_metrics(
     - With ground truth: the errors of the evaluation, and `online_ate_m`, that of the poses as reported online
       (see `evaluation.ate_apart`).
 
-    `online_posed`, `online_ate_m` and the times are of `online`, the run frame by frame, if `run` is a global map.
+    `online_posed`, `online_ate_m` and the times are of the run frame by frame.
     """
-    online = run if online is None else online
+    online = by_frame(run)
     first = None if online.failure else _start(online.results)
     timed = [result for result in online.results if "total" in result.stage_ms]
     totals = [result.stage_ms["total"] for result in timed]

@@ -44,7 +44,6 @@ def write_run(
     metrics: dict[str, Any],
     folder: Path,
     *,
-    online: Run | None = None,
     plots: bool = True,
     viewer: bool = True,
 ) -> None:
@@ -55,11 +54,10 @@ def write_run(
         sequence: the images of the run.
         metrics: the content of metrics.json, as by `compute_metrics`.
         folder: the results folder.
-        online: the run frame by frame, if `run` is a global map.
         plots, viewer: whether to draw the plots and to write the viewer page.
     """
     colorize_points([submap.map for submap in run.submaps], sequence, run.session)
-    write_results(run, sequence, metrics, folder, online)
+    write_results(run, sequence, metrics, folder)
     redraw(folder, plots, viewer)
 
 
@@ -99,9 +97,7 @@ def colorize_points(maps: Iterable[Map], sequence: Sequence, session: int) -> No
         slam_map.points["colors"][seen] = ((total[seen, :3] + count // 2) // count).to(torch.uint8)
 
 
-def write_results(
-    run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path, online: Run | None = None
-) -> None:
+def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path) -> None:
     """Write the results of a run as `write_run`, but no colors, plots and viewer; existing results are replaced."""
     directory.mkdir(parents=True, exist_ok=True)
     stale = [directory / name for name in (files.GROUND_TRUTH, files.EXAMPLE_IMAGE, GEOJSON, GPX)]
@@ -111,7 +107,7 @@ def write_results(
     write_trajectory(directory / files.TRAJECTORY, run.trajectory)
     if run.metric is not None:
         write_earth(directory, run.trajectory, run.metric)
-    write_trajectory(directory / files.ONLINE, (run if online is None else online).online)
+    write_trajectory(directory / files.ONLINE, run.online)
     for submap in run.submaps:
         if submap is not run.main and submap.posed_frames.count(run.session):
             path = directory / files.OTHER_TRAJECTORY.format(submap.number)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import replace
+from typing import TypeVar
 
 from jaxtyping import Float
 from torch import Tensor
@@ -16,8 +17,10 @@ from torchslam.metric.source import Images, MetricSource, SubmapView
 from torchslam.system.run import Run
 from torchslam.types import StepResult
 
+AnyRun = TypeVar("AnyRun", bound=Run)
 
-def run_in_meters(run: Run, sequence: Images | None, sources: Iterable[MetricSource]) -> Run:
+
+def run_in_meters(run: AnyRun, sequence: Images | None, sources: Iterable[MetricSource]) -> AnyRun:
     """Bring every submap with measurements into meters; the others keep their unit.
 
     The submaps are changed in place, the poses that were returned frame by frame follow the submap that they are in. A

@@ -1,0 +1,94 @@
+"""`torchslam.run`: from a recording to a result without the command line."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+
+import torchslam
+from tests.walks import Walk, arc
+from torchslam import SLAM, Frame, State, StepResult, load_config, recording
+from torchslam.data.sequence import Calibrated
+from torchslam.global_mapping.recording import Mapping
+from torchslam.map.unit import MetricUnit
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView
+from torchslam.system.online_run import Observer
+
+SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
+CONFIG = load_config(None, [*SETTINGS, "simulated.noise_px=0.05"])
+FRAMES = 26
+WALK = Walk(arc(45)[:FRAMES])
+
+
+class Twice:
+    """A source that says that a unit is two meters."""
+
+    def measure(self, view: SubmapView) -> ScaleMeasurement:
+        return ScaleMeasurement(ScaleSource.DISTANCE, 2.0, 0.01, 1, "lengths")
+
+
+def test_frames_the_check_and_meters_are_one_call() -> None:
+    seen: list[int] = []
+    run = torchslam.run(
+        WALK, CONFIG, measurements=[Twice()], observer=Observer(lambda result: seen.append(result.index))
+    )
+    assert seen == list(range(FRAMES))
+    assert len(run.trajectory) == FRAMES
+    assert (run.kept, run.why, run.by_frame) == (Mapping.ONLINE, "", None)
+    assert isinstance(run.metric, MetricUnit)
+    alone = SLAM(WALK.camera, CONFIG).run(WALK)
+    centers = [each.trajectory.T_wc[:, :3, 3] for each in (run, alone)]
+    torch.testing.assert_close(centers[0].diff(dim=0), 2 * centers[1].diff(dim=0))
+
+
+def test_a_lost_recording_is_mapped_as_a_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    step = SLAM.step
+
+    def lose(slam: SLAM, frame: Frame) -> StepResult:
+        result = step(slam, frame)
+        return replace(result, state=State.LOST) if frame.index == 17 else result
+
+    monkeypatch.setattr(SLAM, "step", lose)
+    run = torchslam.run(WALK, CONFIG)
+    assert (run.kept, run.why) == (Mapping.GLOBAL, "tracking was lost at frame 17")
+    assert run.by_frame is not None
+    assert len(run.trajectory) == FRAMES > len(run.online)
+    online = torchslam.run(WALK, CONFIG, mapping="online")
+    assert (online.kept, online.by_frame, len(online.results)) == (Mapping.ONLINE, None, FRAMES)
+
+
+def test_an_interrupt_keeps_what_there_is() -> None:
+    def stop(result: StepResult) -> None:
+        if result.index == 20:
+            raise KeyboardInterrupt
+
+    run = torchslam.run(WALK, CONFIG, measurements=[Twice()], observer=Observer(stop))
+    assert run.interrupted
+    assert (run.kept, run.check, run.metric) == (None, None, None)
+    assert len(run.results) == 21
+    assert run.unmeasured == ("interrupted; `torchslam align` measures later",)
+
+
+@pytest.mark.parametrize("calibrated", list(Calibrated))
+def test_an_unknown_camera_is_estimated_first(
+    monkeypatch: pytest.MonkeyPatch, calibrated: Calibrated
+) -> None:
+    searched: list[Any] = []
+
+    def find(sequence: Walk, config: Any, output: None, device: str, **rest: Any) -> tuple[Walk, str]:
+        searched.append(output)
+        return sequence, "found"
+
+    monkeypatch.setattr(recording, "find_camera", find)
+    sequence = Walk(arc(45)[:FRAMES])
+    sequence.calibrated = calibrated
+    torchslam.run(sequence, CONFIG, mapping="online")
+    assert searched == ([] if calibrated is Calibrated.GIVEN else [None])
+
+
+def test_an_unknown_mapping_is_named() -> None:
+    with pytest.raises(ValueError, match="'whole' is not a valid Mapping"):
+        torchslam.run(WALK, CONFIG, mapping="whole")
