@@ -133,8 +133,7 @@ class Shard:
 def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
     """Parse `i/n` with i from 0 to n - 1, or `auto`, the index of a Slurm array or a Kubernetes indexed job.
 
-    Raises:
-        ConfigError: Anything else, or the environment lacks the index.
+    Raises ConfigError for anything else, or if the environment lacks the index.
     """
     if text == "auto":
         return _of_system(environment)

@@ -29,11 +29,6 @@ MAX_SECONDS = 1e11
 MAX_LINE = 1 << 16
 """Maximum length of a line of numbers."""
 
-LEAP_SECONDS = (
-    (1999, 1, 13), (2006, 1, 14), (2009, 1, 15), (2012, 7, 16), (2015, 7, 17), (2017, 1, 18),
-)  # fmt: skip
-"""From a year and month on, seconds by which GPS time is ahead of UTC (IERS Bulletin C; none since 2017)."""
-
 
 def float64(values: Any) -> Tensor:
     """Return numbers, or lists of them, as a float64 tensor on the CPU, whatever the default device is."""
@@ -164,7 +159,9 @@ def check_rising(times: Sequence[float], places: Sequence[str], error: type[Torc
 def utc_from_gps(seconds: float) -> float:
     """Seconds since 1970, UTC, of seconds of GPS time since 1980."""
     unix = seconds + 315964800  # the beginning of GPS time, 1980-01-06 (IS-GPS-200)
-    starts = ((datetime.datetime(y, m, 1, tzinfo=datetime.UTC).timestamp(), s) for y, m, s in LEAP_SECONDS)
+    # From a year and month on, seconds by which GPS time is ahead (IERS Bulletin C; none since 2017).
+    leaps = ((1999, 1, 13), (2006, 1, 14), (2009, 1, 15), (2012, 7, 16), (2015, 7, 17), (2017, 1, 18))
+    starts = ((datetime.datetime(y, m, 1, tzinfo=datetime.UTC).timestamp(), s) for y, m, s in leaps)
     return unix - max((leap for start, leap in starts if unix - leap >= start), default=0)
 
 

@@ -181,11 +181,7 @@ class Clips(Dataset[Clip]):
         return len(self.chosen)
 
     def __getitem__(self, number: int) -> Clip:
-        """Read a clip.
-
-        Raises:
-            FrameError: An image cannot be read.
-        """
+        """Read a clip. Raises FrameError."""
         sequence, start, stride = self.chosen[number]
         return Clip.of(self.sequences[sequence], start, self.frames, stride, number)
 

@@ -25,9 +25,6 @@ Log = Callable[[str, float, int], None]
 MAX_NORM = 1.0
 """Of the gradient: one step through a poorly determined pose must not undo a hundred others."""
 
-# A prime: the 32-bit seeds of steps and epochs rarely collide with those of other seeds.
-_SEED_STRIDE = 1_000_003
-
 
 class Training:
     """A number of optimizer steps with a schedule and clipped gradients that can be stopped and resumed.
@@ -159,8 +156,8 @@ class Training:
 
 
 def seed_of(seed: int, number: int) -> int:
-    """Derive the seed of a step or an epoch."""
-    return (seed * _SEED_STRIDE + number) % 2**32
+    """Derive the seed of a step or an epoch, which rarely collides with those of other seeds."""
+    return (seed * 1_000_003 + number) % 2**32  # a prime
 
 
 def _plain(state: Any) -> Any:

@@ -23,12 +23,9 @@ SINCE_1970 = 1e8
 """Seconds: times from here on (1973) count from 1970 or 1980, smaller ones from the start of a recording or a day."""
 MAX_GAP = 0.5
 """Seconds between two poses up to which the path between them is known in any case. Cars turn within a second."""
-GAP_INTERVALS = 3.0
-"""The same for slow recordings, in median intervals of the poses."""
-SEARCH_LIMIT = 20.0
-"""Seconds by which a clock may be off; GPS time is ahead of UTC by 18."""
-SEARCH_SHARE = 0.25
-"""Of the recording's duration: the most by which a clock may be off, so that most of a file has a pose with any."""
+SEARCH_LIMIT, SEARCH_SHARE = 20.0, 0.25
+"""Seconds, and share of the recording's duration, by which a clock may be off: GPS time is ahead of UTC by 18, and most
+of a file has a pose with any clock."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +89,7 @@ class CameraPath:
         """The row of the pose before, the part of the interval that has passed, and whether it is short enough."""
         left, part = between_rows(self.timestamps, times)
         interval = self.timestamps.diff()
-        longest = max(MAX_GAP, GAP_INTERVALS * float(interval.median()))
+        longest = max(MAX_GAP, 3 * float(interval.median()))  # for slow recordings
         known = (part >= 0) & (part <= 1) & (interval[left] <= longest)
         return left, part.clamp(0, 1), known
 

@@ -30,8 +30,6 @@ REFINED = 65
 """Hypotheses of the second search, over `AGREEING` steps of the first to either side."""
 BESIDE = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
 """Directions of the clicks beside that of the user; two and two are opposite."""
-LAYER_EVERY = 2
-"""Every n-th hypothesis, with this n, is tried for the windows that have the pixel on their border."""
 FRAMES = 12
 """Other frames that are compared at most, spread over those with a fitting parallax."""
 ANGLES_DEG = (1.5, 15.0)
@@ -69,10 +67,7 @@ def sample_windows(
     window = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
     window -= window.mean(axis=-1, keepdims=True)
     least = CONTRAST * math.sqrt(window.shape[-1])
-    normalized: Float[np.ndarray, "W P"] = window / np.maximum(
-        np.linalg.norm(window, axis=-1, keepdims=True), least
-    )
-    return normalized
+    return np.asarray(window / np.maximum(np.linalg.norm(window, axis=-1, keepdims=True), least))
 
 
 def correlate(
@@ -82,17 +77,9 @@ def correlate(
     image: Float[np.ndarray, "H W2"],
     border: float = 0.0,
 ) -> tuple[Float[np.ndarray, " W"], Bool[np.ndarray, " W"]]:
-    """Correlate sampled windows with those of another image that shows their points.
+    """Correlate sampled windows with those of another image that shows their points, which are in its camera's frame.
 
-    Args:
-        own: the sampled windows.
-        points_o: their points in the camera of the other image.
-        camera: of that image.
-        image: its gray levels.
-        border: within which an image does not count, pixels.
-
-    Returns:
-        Correlations, and whether all points of a window are in the image.
+    Returns the correlations, and whether all points of a window are in the image, `border` pixels from its edge.
     """
     pixels, seen = camera.project(points_o)
     inside = (seen & camera.in_image(pixels, border)).all(dim=-1).numpy()
@@ -102,27 +89,15 @@ def correlate(
 
 @dataclass(frozen=True)
 class LocatedPixel:
-    """A pixel in the world.
-
-    Attributes:
-        point_w: where it is.
-        covariance_w: by the error of the depth and of the click.
-    """
+    """A pixel in the world; the covariance is that of the error of the depth and of the click."""
 
     point_w: Float[Tensor, " 3"]
     covariance_w: Float[Tensor, "3 3"]
 
 
 def locate_pixel(view: SubmapView, frame_index: int, pixel: tuple[float, float]) -> LocatedPixel | str:
-    """Find the point of the scene that a pixel shows; or say why it was not found.
-
-    Args:
-        view: the submap, with images.
-        frame_index: of the frame in its sequence.
-        pixel: x and y.
-    """
-    frames = view.frame_index
-    row = torch.nonzero(frames == frame_index)[:, 0]
+    """Find the point of the scene that a pixel (x, y) of a frame of the sequence shows; or say why it was not found."""
+    row = torch.nonzero(view.frame_index == frame_index)[:, 0]
     where = f"{pixel[0]:g},{pixel[1]:g} of frame {frame_index}"
     if not len(row):
         return f"frame {frame_index} has no pose in this submap"
@@ -161,8 +136,10 @@ def _search(sweep: _Sweep, low: float, high: float, where: str) -> tuple[float, 
     best = int(scores.argmax())
     if float(scores[best]) < LEAST_SCORE:
         return f"the window around {where} looks different in every other frame"
-    elsewhere = (torch.arange(PLANES, device="cpu") - best).abs() > AGREEING
-    if float(torch.where(elsewhere & _is_peak(scores), scores, -1.0).max()) > RIVAL * float(scores[best]):
+    padded = torch.nn.functional.pad(scores, (1, 1), value=-1.0)
+    is_rival = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+    is_rival &= (torch.arange(PLANES, device="cpu") - best).abs() > AGREEING
+    if float(torch.where(is_rival, scores, -1.0).max()) > RIVAL * float(scores[best]):
         return f"the depth at {where} is ambiguous: click where the image has more texture"
     near = (single.argmax(dim=1) - best).abs() <= AGREEING
     if int(near.sum()) < max(LEAST_FRAMES, AGREEING_SHARE * len(single)):
@@ -181,7 +158,7 @@ def _search(sweep: _Sweep, low: float, high: float, where: str) -> tuple[float, 
     match = MATCH_STD_PX / sweep.pixels_per_inverse_depth(inverse_depth)
     single_std = math.hypot(match, float(np.std(np.array(own))))
     clicked = float(np.std(np.array([inverse_depth, *beside])))
-    layers = _layer_std(sweep, coarse[::LAYER_EVERY], inverse_depth)
+    layers = _layer_std(sweep, coarse[::2], inverse_depth)
     return inverse_depth, math.hypot(clicked, layers, single_std / math.sqrt(LEAST_FRAMES))
 
 
@@ -220,12 +197,6 @@ def _joint(single: Float[Tensor, "F D"]) -> Float[Tensor, " D"]:
     """Mean of the scores of the frames that match best."""
     count = min(max(LEAST_FRAMES, math.ceil(BEST_SHARE * len(single))), len(single))
     return single.topk(count, dim=0).values.mean(dim=0)
-
-
-def _is_peak(scores: Float[Tensor, " N"]) -> Tensor:
-    """Where a score is larger than its neighbors."""
-    padded = torch.nn.functional.pad(scores, (1, 1), value=-1.0)
-    return (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
 
 
 def _maximum(at: Float[Tensor, " N"], scores: Float[Tensor, " N"]) -> float:

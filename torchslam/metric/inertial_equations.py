@@ -17,14 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples
-from torchslam.geometry import (
-    Increments,
-    compose_increments,
-    se3_inverse,
-    skew,
-    so3_exp,
-    so3_log,
-)
+from torchslam.geometry import Increments, compose_increments, se3_inverse, skew, so3_exp, so3_log
 from torchslam.metric.inertial_rotation import InertialRotation, increments, thinned
 
 STRETCH = 4.0
@@ -54,8 +47,6 @@ LEVER_STD, UNKNOWN_LEVER_STD = 2e-3, 0.05
 ATTENUATION_STD = 0.5
 """Relative error of the share of noise in the scale. In a simulated motion of 3 cm with positions good to 2 mm and no
 drift, the share is taken to be 65 %, which makes the scale 56 % too large: it then counts as not determined."""
-NEWTON_STEPS = 10
-"""Steps to the minimum; on a drone's recording the fourth one no longer changes the scale."""
 
 
 class Stretches(NamedTuple):
@@ -103,9 +94,8 @@ def stretch_rows(timestamps: Tensor, samples: InertialSamples, offset: float) ->
     for begin, end in itertools.pairwise(ends):
         duration = float(times[end] - times[begin + 1])
         count = max(1, round(duration / STRETCH))
-        limits = times[begin + 1] + duration / count * torch.arange(
-            1, count, dtype=times.dtype, device="cpu"
-        ).to(times)
+        steps = torch.arange(1, count, dtype=times.dtype, device=times.device)
+        limits = times[begin + 1] + duration / count * steps
         cuts = (torch.searchsorted(times[begin + 1 : end + 1], limits) + begin + 1).tolist()
         for first, last in zip([begin + 1, *cuts], [*cuts, end], strict=True):
             if float(times[last] - times[first]) >= SHORTEST_STRETCH and last + 1 - first >= FEWEST_NODES:
@@ -264,8 +254,8 @@ def minimum(total: Equations) -> Float[Tensor, " 13"] | None:
     if not bool(x[0] > 0):
         return None
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    for step in range(NEWTON_STEPS):
-        is_last = step == NEWTON_STEPS - 1
+    for step in range(10):  # on a drone's recording the fourth one no longer changes the scale
+        is_last = step == 9
         length = x[1:4].norm()
         down = x[1:4] / length
         gradient = hessian @ x - right - _in_scale(attenuation / x[0])

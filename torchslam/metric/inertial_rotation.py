@@ -28,8 +28,6 @@ OFFSET_STEP = 0.01
 """Seconds between offsets that are tried; the search by derivatives finds offsets that are 0.1 s away."""
 CONVINCING = 0.7
 """Correlation of angular speeds from which another offset than the given one is believed. On a drone, 0.96 to 0.98."""
-LARGEST_RATIO = 10.0
-"""Of the speeds with which camera and sensor turn: radians and degrees differ by 57, a bias by less than 2."""
 OFFSET_STD = 0.01
 """Seconds, of the offset before it is measured: a camera that hardly turns leaves it where it was."""
 BIAS_STD = 0.1
@@ -86,17 +84,11 @@ def align_rotations(
 ) -> InertialRotation:
     """The bias of the gyroscope, the offset of the clocks and, if it is unknown, the rotation from camera to body.
 
-    The minimum is differentiable in rotations and samples.
+    The minimum is differentiable in rotations and samples. Raises MeasurementError if the rates are in another unit.
 
     Args:
         timestamps: seconds, ascending, at least four that are `TURN_INTERVAL` apart, within the times of the samples.
-        R_cw: rotations of the camera.
-        samples: of the sensor.
-        calibration: what is known.
         turn_std: rad, of a turn over `TURN_INTERVAL`; None: that of the residuals, which has no gradient.
-
-    Raises:
-        MeasurementError: the rates are in another unit.
     """
     nodes = thinned(timestamps, TURN_INTERVAL)
     times, R_cw = timestamps[nodes], R_cw[nodes]
@@ -146,7 +138,7 @@ def _start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, give
     best = int(correlation.argmax())
     if float(correlation[best]) < CONVINCING:
         return given
-    if not 1 / LARGEST_RATIO < float(slope[best]) < LARGEST_RATIO:
+    if not 0.1 < float(slope[best]) < 10:  # radians and degrees differ by 57, a bias by less than 2
         raise MeasurementError(
             f"{samples.source}: the sensor turns {float(slope[best]):.2g} times as fast as the camera; state the unit "
             "of its rates, as in gyro_x [deg/s]"

@@ -55,12 +55,7 @@ ROUNDS = 30
 
 @dataclass(frozen=True)
 class SpeedSource:
-    """The speeds of one file: their integral is the length of the camera's path.
-
-    Attributes:
-        speeds: the speeds.
-        clock: the clock of the file as given by the user.
-    """
+    """The speeds of one file: their integral is the length of the camera's path. The clock is given by the user."""
 
     speeds: Speeds
     clock: Clock = field(default_factory=Clock)
@@ -85,13 +80,7 @@ class SpeedSource:
 
 @dataclass(frozen=True)
 class OdometrySource:
-    """The odometry of one file: motions of another sensor, rigidly mounted to the camera.
-
-    Attributes:
-        path: of the file.
-        odometry: poses of the sensor, in meters.
-        clock: the clock of the file as given by the user.
-    """
+    """The odometry of one file: poses of another sensor, in meters, rigidly mounted to the camera."""
 
     path: Path
     odometry: Trajectory
@@ -138,33 +127,18 @@ class OdometrySource:
 
 
 def speeds_from_options(given: Given) -> list[MetricSource]:
-    """The sources of `--speed FILE`, with `--speed-clock` for each file or for all.
-
-    Raises MeasurementError for a file that is wrong.
-    """
+    """The sources of `--speed FILE`, with `--speed-clock` for each file or for all."""
     return [SpeedSource(read_speeds(file), clock) for file, clock in clocks_of(given, "speed")]
 
 
 def from_options(given: Given) -> list[MetricSource]:
-    """The sources of `--odometry FILE`, with `--odometry-clock` for each file or for all.
-
-    Raises TrajectoryError for a file that is wrong.
-    """
-    return [
-        OdometrySource(Path(file), read_trajectory(file), clock)
-        for file, clock in clocks_of(given, "odometry")
-    ]
+    """The sources of `--odometry FILE`, with `--odometry-clock` for each file or for all."""
+    files = clocks_of(given, "odometry")
+    return [OdometrySource(Path(file), read_trajectory(file), clock) for file, clock in files]
 
 
 class Stretches(NamedTuple):
-    """S stretches of time, each with its length in the map and in meters.
-
-    Attributes:
-        times: of their middles, seconds.
-        lengths_w: in the unit of the map.
-        lengths: in meters.
-        known: where both are.
-    """
+    """S stretches of time by their middles, seconds, and their lengths in units of the map and in meters."""
 
     times: Float[Tensor, " S"]
     lengths_w: Float[Tensor, " S"]
@@ -174,9 +148,8 @@ class Stretches(NamedTuple):
 
 def _stretch_ends(path: CameraPath) -> Float[Tensor, " E"]:
     """Times a stretch apart."""
-    return path.timestamps[0] + STRETCH * torch.arange(
-        int(path.duration / STRETCH) + 1, dtype=torch.float64, device="cpu"
-    )
+    count = int(path.duration / STRETCH) + 1
+    return path.timestamps[0] + STRETCH * torch.arange(count, dtype=torch.float64, device="cpu")
 
 
 def _camera_lengths(
@@ -227,10 +200,7 @@ def hand_eye(
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, " 3"], Bool[Tensor, " S"]]:
     """Rotation with scale and lever arm between a sensor and a camera, from their motions, up to half of them wrong.
 
-    Args:
-        motions: of the sensor, meters.
-        camera_motions: of the camera, in the unit of the map.
-        known: rows that count.
+    Motions of the sensor are in meters, those of the camera in units of the map.
 
     Returns:
         The camera's translations in the frame of the sensor, meters; its center there; rows whose turns agree.

@@ -26,8 +26,6 @@ SAMPLES = 512
 them are of right ones, and the best of many is near. Tried at 512 only."""
 ROUNDS = 10
 """Fits of the start, each to the positions that the one before explains; they settle in two to four."""
-TOLERANCE = 1e-6
-"""Relative change of the cost at which a fit ends: a thousandth of a standard error."""
 CAMERA_UP_STD = 1.0
 """Radians: how far the cameras' up may be from the true one. A line leaves the turn about it to this; elsewhere, where
 positions know their up to a degree, a camera that looks to the ground moves it by less than a hundredth of that."""
@@ -93,11 +91,9 @@ class PositionPairs:
 
 
 def fit_positions(pairs: PositionPairs, camera_up_w: Float[Tensor, " 3"]) -> PositionFit | None:
-    """Fit a similarity to positions, up to half of them wrong; None where they do not determine one.
+    """Fit a similarity to `MIN_POSITIONS` or more, up to half of them wrong; None where they do not determine one.
 
-    Args:
-        pairs: `MIN_POSITIONS` or more.
-        camera_up_w: mean direction in the map that is up in the images, a unit vector.
+    `camera_up_w` is the mean direction in the map that is up in the images, a unit vector.
     """
 
     def residuals_of(S_ew: Tensor) -> Float[Tensor, "N 3"]:
@@ -206,7 +202,7 @@ def _average(
         (start.S_ew.expand(B, 4, 4), eye.new_zeros(B, 1)),
         inputs,
         ("sim3", "euclidean"),
-        options=LEAST_SQUARES_OPTIONS.replace(tolerance=TOLERANCE),
+        options=LEAST_SQUARES_OPTIONS.replace(tolerance=1e-6),  # a thousandth of a standard error
     )
     if not bool(solution.success.all()):
         return None

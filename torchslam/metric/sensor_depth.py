@@ -30,10 +30,8 @@ from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource,
 IMAGES = 60
 """Depth images that are read at most, evenly over the recording; with 20 and with 100 redkitchen's scale is the same to
 .1 %."""
-LEAST_IMAGES = 3
-"""Fewest images whose scatter is estimated."""
-LEAST_POINTS = 10
-"""Fewest points of an image that give a scale."""
+LEAST_IMAGES, LEAST_POINTS = 3, 10
+"""Fewest images whose scatter is estimated, and points of an image that give a scale."""
 PATCH = 5
 """Pixels of the side of the patch around a point, of which all must have depth, and one depth."""
 NOISE = 1.5e-3
@@ -88,9 +86,8 @@ class SensorDepth:
         pairs = self._pairs(view)
         if isinstance(pairs, str):
             return Unmeasured(ScaleSource.DEPTH, pairs)
-        chosen = sorted(
-            {round(place) for place in np.linspace(0, len(pairs) - 1, min(IMAGES, len(pairs))).tolist()}
-        )
+        places = np.linspace(0, len(pairs) - 1, min(IMAGES, len(pairs))).tolist()
+        chosen = sorted(set(map(round, places)))
         rows, logs, unreadable = list[int](), list[float](), list[str]()
         for row, path in (pairs[place] for place in chosen):
             try:

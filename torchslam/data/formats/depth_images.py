@@ -29,8 +29,6 @@ DEPTH_LIST = "depth.txt"
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm"})
 """Of images that can have 16 bits."""
 SEVEN_SCENES_DEPTH = "frame-*.depth.png"
-FIVE_THOUSANDTHS, MILLIMETERS = 5000.0, 1000.0
-"""Units per meter, of TUM and ICL-NUIM, and of most others."""
 BOUNDS_M = 0.05, 200.0
 """Meters that the middle depth of an image may have; beyond, its unit is another one. Sensors see .2 to 20 m, rendered
 scenes more."""
@@ -94,7 +92,7 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
         places, seconds, paths = zip(*listed_files(found, MeasurementError), strict=True)
         _check_number(len(paths), found)
         check_rising(seconds, places, MeasurementError)
-        return DepthImages(found, paths, float64(seconds), units_per_meter or FIVE_THOUSANDTHS)
+        return DepthImages(found, paths, float64(seconds), units_per_meter or 5000.0)
     files = _files(path)
     if not files and (path / "depth").is_dir():
         path = path / "depth"
@@ -103,7 +101,7 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
         raise MeasurementError(f"{path}: no depth images: no {DEPTH_LIST} and no .png, .tif or .pgm")
     is_icl = next(path.parent.glob("*.gt.freiburg"), None) is not None
     is_known = is_icl or files[0].match(SEVEN_SCENES_DEPTH) or units_per_meter is not None
-    units = units_per_meter or (FIVE_THOUSANDTHS if is_icl else MILLIMETERS)
+    units = units_per_meter or (5000.0 if is_icl else 1000.0)
     times = times_in_names(files)
     rising = times is not None and all(after > before for before, after in itertools.pairwise(times))
     return DepthImages(path, tuple(files), float64(times) if rising else None, units, is_known)

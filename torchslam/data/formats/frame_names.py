@@ -8,7 +8,7 @@ import re
 import statistics
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
@@ -24,17 +24,11 @@ FOLDERS = ("images", "rgb", "image", "color", "colour", "frames", "imgs", "img",
 # Words in the name of an image that is not a frame, separated by anything but letters.
 OTHER_KINDS = {
     "depth": "depth images",
-    "disp": "disparities",
-    "disparity": "disparities",
-    "mask": "masks",
-    "masks": "masks",
-    "seg": "labels",
-    "semantic": "labels",
-    "label": "labels",
-    "labels": "labels",
-    "normal": "normals",
-    "normals": "normals",
     "flow": "optical flow",
+    **dict.fromkeys(("disp", "disparity"), "disparities"),
+    **dict.fromkeys(("mask", "masks"), "masks"),
+    **dict.fromkeys(("seg", "semantic", "label", "labels"), "labels"),
+    **dict.fromkeys(("normal", "normals"), "normals"),
 }
 
 
@@ -50,10 +44,6 @@ class Found:
     frames: list[Path]
     left_out: Counter[str]
 
-    def without(self, count: int, kind: str) -> Found:
-        """Return the same frames, with images elsewhere that were left out."""
-        return replace(self, left_out=self.left_out + Counter({kind: count}))
-
     @property
     def notes(self) -> list[str]:
         """Notes on the images that were ignored."""
@@ -65,8 +55,6 @@ NUMBER = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)|\d+)")
 """A run of digits, or two with a dot between them; more dots separate parts of a version or a date."""
 UNIX_DIGITS = range(9, 11)
 """Digits of the seconds since 1970, from 1973 to 2286."""
-FLOAT_DIGITS = 7
-"""The most digits after the dot of the shortest text that is a float of seconds since 1970."""
 SHORTEST = 1e-3
 """Seconds between images, below which decimals in names count something else."""
 
@@ -112,7 +100,7 @@ def _has_fractions(files: list[Path]) -> bool:
         parts = 10 ** max(by_length)
         counted = [int(whole) + int(fraction) / parts for whole, _, fraction in numbers]
         decimal = [float(f"{whole}.{fraction}") for whole, _, fraction in numbers]
-        is_long = max(by_length) > FLOAT_DIGITS
+        is_long = max(by_length) > 7  # the shortest text that is a float has at most so many
         is_counted = has_ends or is_long or _irregularity(counted) < _irregularity(decimal)
     if is_counted:
         raise SequenceError(
@@ -123,7 +111,6 @@ def _has_fractions(files: list[Path]) -> bool:
 
 
 def _irregularity(times: list[float]) -> float:
-    """Return the standard deviation of the intervals between times, seconds."""
     return statistics.pstdev(after - before for before, after in itertools.pairwise(sorted(times)))
 
 
@@ -169,7 +156,11 @@ def sort_out(files: Iterable[Path], where: Path) -> Found:
             frames.append(file)
         else:
             left_out[kind] += 1
-    series = _series(frames)
+    series: dict[str, set[str]] = {}  # of names with `#` for each number: the numbers that occur
+    for file in frames:
+        name = re.sub(r"\d+", "#", file.stem) + file.suffix
+        if "#" in name:
+            series.setdefault(name, set()).add("-".join(str(int(n)) for n in re.findall(r"\d+", file.stem)))
     shared = Counter(number for numbers in series.values() for number in numbers)
     rivals = [name for name, numbers in series.items() if any(shared[number] > 1 for number in numbers)]
     if len(rivals) > 1:
@@ -204,23 +195,10 @@ def subfolder(folder: Path) -> Path | None:
 
 def _files(folder: Path) -> list[Path]:
     """The files of a folder with an image's suffix, also one that is not read."""
-    files: list[Path] = []
-    for number, file in enumerate(folder.iterdir()):
-        if number >= MAX_FILES:
-            raise SequenceError(f"{folder}: more than {MAX_FILES} files; give a folder with the images alone")
-        if file.suffix.lower() in SUFFIXES | FOREIGN and file.is_file():
-            files.append(file)
-    return files
-
-
-def _series(files: list[Path]) -> dict[str, set[str]]:
-    """Names with `#` for each number -> the numbers that occur."""
-    series: dict[str, set[str]] = {}
-    for file in files:
-        name = re.sub(r"\d+", "#", file.stem) + file.suffix
-        if "#" in name:
-            series.setdefault(name, set()).add("-".join(str(int(n)) for n in re.findall(r"\d+", file.stem)))
-    return series
+    entries = list(itertools.islice(folder.iterdir(), MAX_FILES + 1))
+    if len(entries) > MAX_FILES:
+        raise SequenceError(f"{folder}: more than {MAX_FILES} files; give a folder with the images alone")
+    return [file for file in entries if file.suffix.lower() in SUFFIXES | FOREIGN and file.is_file()]
 
 
 def is_pattern(path: str) -> bool:

@@ -27,23 +27,8 @@ from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
 TRANSFORMS = "transforms.json"
-MODEL_NAMES = (
-    *(
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "OPENCV_FISHEYE",
-        "FULL_OPENCV",
-        "FOV",
-    ),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
-)
-"""By their numbers in binary files: COLMAP, src/colmap/sensor/models.h."""
 _MAX_BYTES = 1 << 30
 """Largest model that is read; a frame with 10,000 keypoints takes 240 kB of it."""
-_ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
 
 
 @dataclass(frozen=True)
@@ -102,9 +87,8 @@ class GivenPoses:
                     "times are counted: with one image more or less, the others have wrong poses; name the images "
                     "by their times, or list them in rgb.txt"
                 )
-        for frame in (
-            frames if times is None else ()
-        ):  # COLMAP, and what builds on it, sees images as they are stored
+        # COLMAP, and what builds on it, sees images as they are stored.
+        for frame in frames if times is None else ():
             with contextlib.suppress(FrameError):  # said when the frame is read
                 if sequence.is_turned(frame):
                     raise TrajectoryError(
@@ -218,7 +202,9 @@ def _binary_camera(path: Path) -> Calibration:
         if count != 1:
             raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
         number, model, width, height = struct.unpack_from("<IiQQ", data, 8)
-        name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else str(model)
+        # By its number (src/colmap/sensor/models.h); 7, FOV, is not modeled.
+        names = dict(zip((*range(7), *range(8, 10)), COLMAP_MODELS, strict=True))
+        name = names.get(model, "FOV" if model == 7 else str(model))
         keys = COLMAP_MODELS.get(name, "").split()
         params = struct.unpack_from(f"<{len(keys)}d", data, 32)
     except (OSError, struct.error) as cause:
@@ -240,7 +226,7 @@ def _read_transforms(path: Path) -> GivenPoses:
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
     R = T_wc[:, :3, :3]
-    if not bool(T_wc.isfinite().all() & (orthogonality_error(R) < _ORTHOGONAL).all()):
+    if not bool(T_wc.isfinite().all() & (orthogonality_error(R) < 1e-3).all()):
         raise TrajectoryError(f"{path}: a transform_matrix is not a rigid transformation")
     T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
     is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it

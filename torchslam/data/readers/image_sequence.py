@@ -222,8 +222,10 @@ def _find(path: str, base: Path) -> tuple[Found, Path]:
         return found, base
     inside = find_frames(inner)
     if len(inside.frames) > len(found.frames):  # a preview beside them, or nothing
-        return inside.without(len(found.frames), f"images beside {inner.name}/"), inner
-    return found.without(len(inside.frames), f"images in {inner.name}/"), base
+        inside.left_out[f"images beside {inner.name}/"] += len(found.frames)
+        return Found(inside.frames, +inside.left_out), inner
+    found.left_out[f"images in {inner.name}/"] += len(inside.frames)
+    return Found(found.frames, +found.left_out), base
 
 
 FOLDER = Reader(f"images, or a folder {'/, '.join(FOLDERS)}/ with images", _is_folder, _open_folder)

@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,6 +20,7 @@ from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.video import SUFFIXES, Capture, Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
+from torchslam.data.text_file import float64
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.console import without_credentials
 from torchslam.utils.forks import forget_in_forks, never_release
@@ -32,8 +32,6 @@ BACKLOG = 10
 """Maximum number of queued frames; then the oldest one is dropped."""
 STEADY = 1.0
 """Maximum drift of the source's clock from ours in seconds, before it is ignored."""
-EXIT_PATIENCE = 2.0
-"""Seconds for which a process waits for the threads of sources when it exits."""
 STALE = 0.5
 """Age in seconds above which the frame read on opening is discarded."""
 
@@ -81,14 +79,7 @@ class LiveSequence(Sequence):
         first = self._arrived[0][1]
         size = (first.shape[1], first.shape[0])
         aspect = pixel_aspect(capture, name)
-        super().__init__(
-            name,
-            "live",
-            camera,
-            torch.zeros(0, dtype=torch.float64, device="cpu"),
-            size=size,
-            pixel_aspect=aspect,
-        )
+        super().__init__(name, "live", camera, float64([]), size=size, pixel_aspect=aspect)
 
     def __len__(self) -> int:
         if self._limit is None:
@@ -214,10 +205,10 @@ _SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()
 """Those that there are; a thread keeps its source."""
 
 
-def close_sources(patience: float = EXIT_PATIENCE) -> bool:
-    """Close all sources, and return whether their threads have ended after some seconds at most."""
+def close_sources() -> bool:
+    """Close all sources, and return whether their threads have ended after two seconds at most."""
     sources = list(_SOURCES)
-    end = time.monotonic() + patience
+    end = time.monotonic() + 2.0
     for source in sources:
         source.close()
     return all(source.has_ended(end - time.monotonic()) for source in sources)
@@ -254,10 +245,8 @@ def is_address(path: str) -> bool:
 
 def is_live(path: str) -> bool:
     """Return True for an address, and for the number of a camera that is not a file."""
-    if is_address(path):
-        return (
-            not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
-        )  # a file does not drop frames
+    if is_address(path):  # a file does not drop frames
+        return not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
     return re.fullmatch(r"\d{1,2}", path) is not None and not Path(path).exists()
 
 

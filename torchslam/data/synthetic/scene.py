@@ -13,8 +13,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-FINEST = 0.02
-"""Meters: about the smallest shape drawn."""
 COVERAGE = 0.25
 """The part of a surface that the largest shapes cover."""
 KINDS = ("polygon", "bar", "ellipse", "letter")
@@ -38,14 +36,11 @@ def surface(
         texel: maximum size, meters
         multiple: divides the numbers of rows and columns
         coverage: fraction of the surface that the largest shapes cover
-
-    Returns:
-        (rows, columns) uint8.
     """
     columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
     image = _noise(rng, rows, columns, texel)
     extent = largest = min(size) / 3
-    while extent > FINEST:
+    while extent > 0.02:
         # The small ones leave more room, so that what is below them stays visible.
         share = coverage * (extent / largest) ** 0.5
         count = int(share * size[0] * size[1] / (0.3 * extent**2)) + 1
@@ -78,10 +73,15 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
     jitters = rng.uniform(-0.35, 0.35, (count, 6))
     for i in range(count):
         x, y = centers[i]
-        gray = _standing_out(int(image[int(y), int(x)]), contrasts[i])
+        below = int(image[int(y), int(x)])
+        gray = int(np.clip(below + contrasts[i], 0, 255))
+        if abs(gray - below) < MIN_CONTRAST:  # the other way, since this one is cut off
+            gray = int(np.clip(below - contrasts[i], 0, 255))
         kind, radius = KINDS[kinds[i]], radii[i]
         if kind == "letter":
-            _draw_letter(image, chr(letters[i]), (x, y), radius, gray)
+            corner, font = (int(x - 0.6 * radius), int(y + 0.7 * radius)), cv2.FONT_HERSHEY_SIMPLEX
+            thickness = max(1, round(radius / 4))
+            cv2.putText(image, chr(letters[i]), corner, font, radius / 14, gray, thickness, cv2.LINE_AA)
         elif kind == "ellipse":
             axes = (max(1.0, 2 * radius), max(1.0, 2 * radius * aspects[i]))
             cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), gray, -1, cv2.LINE_AA)
@@ -89,31 +89,10 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
             sides = 4 if kind == "bar" else corners[i]
             angles = 2 * np.pi * (np.arange(sides) + (0 if kind == "bar" else jitters[i, :sides])) / sides
             outline = np.stack((np.cos(angles), np.sin(angles) * aspects[i]), axis=-1) * radius
-            _fill(image, outline, turns[i], (x, y), gray)
-
-
-def _standing_out(below: int, contrast: float) -> int:
-    """A gray level apart from what is below: lighter or darker, the other way where that would be cut off."""
-    gray = int(np.clip(below + contrast, 0, 255))
-    return gray if abs(gray - below) >= MIN_CONTRAST else int(np.clip(below - contrast, 0, 255))
-
-
-def _draw_letter(
-    image: np.ndarray, letter: str, center: tuple[float, float], radius: float, gray: int
-) -> None:
-    corner = (int(center[0] - 0.6 * radius), int(center[1] + 0.7 * radius))
-    thickness = max(1, round(radius / 4))
-    cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, radius / 14, gray, thickness, cv2.LINE_AA)
-
-
-def _fill(
-    image: np.ndarray, outline: np.ndarray, turn: float, center: tuple[float, float], gray: int
-) -> None:
-    """Fill a polygon, turned about its center."""
-    cosine, sine = math.cos(turn), math.sin(turn)
-    points = outline @ np.array(((cosine, sine), (-sine, cosine))) + center
-    fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
-    cv2.fillPoly(image, [fixed], gray, cv2.LINE_AA, FRACTION_BITS)
+            cosine, sine = math.cos(turns[i]), math.sin(turns[i])
+            points = outline @ np.array(((cosine, sine), (-sine, cosine))) + (x, y)
+            fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
+            cv2.fillPoly(image, [fixed], gray, cv2.LINE_AA, FRACTION_BITS)
 
 
 Vector = tuple[float, float, float]
@@ -225,10 +204,8 @@ ROOMS_DOOR = (-3.4, -1.95)
 """Begin and end of the door along x."""
 ROOMS_DOOR_TOP = -0.7
 """y of the upper edge of the doors, meters."""
-SIZE_SPREAD = 0.12
-"""Furniture is up to that share larger or smaller ..."""
-TURN_SPREAD = 0.15
-"""... and turned by up to that many radians from its place."""
+SIZE_SPREAD, TURN_SPREAD = 0.12, 0.15
+"""Furniture is up to that share larger or smaller, and turned by up to that many radians from its place."""
 QUARTER_TURN = np.array(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))
 """About y, to the right: z becomes x."""
 
