@@ -113,8 +113,8 @@ def align_inertial(
 ) -> InertialAlignment:
     """Scale and gravity of poses in an arbitrary unit, at ascending times in seconds.
 
-    Differentiable in poses and samples. The stated errors contain the noise of both sensors, the disagreement of stretches, and `SENSOR_STD`. Raises
-    MeasurementError if the rates are in another unit.
+    Differentiable in poses and samples. The stated errors contain the noise of both sensors, the disagreement of
+    stretches, and `SENSOR_STD`. Raises MeasurementError if the rates are in another unit.
 
     Args:
         turn_std: rad, of the camera's turns over `TURN_INTERVAL`.

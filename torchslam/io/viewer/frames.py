@@ -61,8 +61,7 @@ class FrameViewer:
 class FrameViewers(ExitStack):
     """Passes every processed frame on to the viewers, and closes them at its exit.
 
-    Attributes:
-        sequence: to run instead of the original sequence; it keeps the last image, so no image is read twice.
+    `sequence` is to be run instead of the original one; it keeps the last image, so that no image is read twice.
     """
 
     def __init__(self, slam: SLAM, sequence: Sequence, screens: list[FrameViewer]) -> None:
