@@ -184,8 +184,7 @@ def run_batch(
     Returns:
         The columns of the shard's tasks in the order of the tasks; `is_new`: whether they were run now.
 
-    Raises:
-        ConfigError: The engine is not available.
+    Raises ConfigError if the engine is not available.
     """
     engine, shard = engine or Engine(), shard or Shard()
     mine = tasks[shard.index :: shard.count]

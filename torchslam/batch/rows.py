@@ -70,10 +70,7 @@ def read_list(path: str | Path) -> list[Row]:
     """Read a list: a CSV file with a header of `COLUMNS`, or a text file with a path per line and `#` for comments.
 
     Paths are relative to the folder of the list. A row without a name is named by the last part of its path, with a
-    number if that is taken.
-
-    Raises:
-        SequenceError: The list is not valid; the message has file and line.
+    number if that is taken. Raises SequenceError if the list is not valid; the message has file and line.
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
@@ -94,8 +91,7 @@ def read_list(path: str | Path) -> list[Row]:
 def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
     """Give each row without a name a unique one.
 
-    Raises:
-        SequenceError: Two rows have the same name; `where` is in the message.
+    Raises SequenceError if two rows have the same name; `where` is in the message.
     """
     rows = list(rows)
     # Folders that differ only in case are the same on some systems.

@@ -184,8 +184,7 @@ def _first_line(path: Path) -> tuple[str, str]:
     raise CalibrationError(f"{path}: no numbers; expected {NUMBERS}")
 
 
-VGA = (640, 480)
-"""Image size of several datasets, pixels."""
+VGA = (640, 480)  # image size of several datasets, pixels
 
 
 def _published(size: Size, *numbers: float) -> Calibration:

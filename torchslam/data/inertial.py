@@ -61,13 +61,9 @@ DENSITIES = {
 
 @dataclass(frozen=True)
 class InertialSamples:
-    """What an inertial sensor measures, in its own frame, which is called the body's.
+    """What an inertial sensor measures in its own frame, which is called the body's, at strictly increasing seconds.
 
-    Attributes:
-        timestamps: seconds, strictly increasing.
-        gyroscope: angular rates, rad/s.
-        accelerometer: specific forces, m/s^2; at rest they point up.
-        source: the file, for messages.
+    Angular rates are in rad/s; specific forces, which point up at rest, in m/s^2.
     """
 
     timestamps: Float[Tensor, " M"]
@@ -154,13 +150,9 @@ def read_imu(path: str | Path) -> InertialSamples:
 def read_inertial_calibration(path: str | Path | None, imu: str | Path | None = None) -> InertialCalibration:
     """Read how a sensor is mounted on the camera, and its noise.
 
-    Args:
-        path: Kalibr's camchain-imucam, EuRoC's sensor.yaml of the camera, or ORB-SLAM3's or VINS' settings; None: the
-            mounting is unknown.
-        imu: the file or folder of the samples, beside which a sensor.yaml or imu.yaml may have the noise.
-
-    Raises:
-        MeasurementError: no mounting in it, or one that is no rigid transformation in meters.
+    Files are Kalibr's camchain-imucam, EuRoC's sensor.yaml of the camera, or ORB-SLAM3's or VINS' settings; None leaves
+    the mounting unknown. Beside the file or folder of the samples, a sensor.yaml or imu.yaml may have the noise. Raises
+    MeasurementError for no mounting in the file, or one that is no rigid transformation in meters.
     """
     T_bc, offset = None, 0.0
     densities: dict[str, float] = {}
@@ -172,10 +164,8 @@ def read_inertial_calibration(path: str | Path | None, imu: str | Path | None = 
             densities = _densities(keys)
         if imu is not None and not densities:
             folder = Path(imu) if Path(imu).is_dir() else Path(imu).parent
-            beside = next(
-                (file for file in (folder / "sensor.yaml", folder / "imu.yaml") if file.is_file()), None
-            )
-            densities = _densities(list(read_keys(beside))) if beside is not None else {}
+            beside = [file for file in (folder / "sensor.yaml", folder / "imu.yaml") if file.is_file()]
+            densities = _densities(list(read_keys(beside[0]))) if beside else {}
     except CalibrationError as error:
         raise MeasurementError(str(error)) from error
     return InertialCalibration(T_bc, offset=offset, **densities)

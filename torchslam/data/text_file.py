@@ -218,13 +218,11 @@ TIMES = {
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table.
+    """A line of a table at a file and line; the error is raised for a wrong cell.
 
     Attributes:
-        where: file and line, for messages.
         cells: text of each known column that is not empty.
         units: of each known column in the header, the factor of its unit; NaN without a unit.
-        error: what is raised for a wrong cell.
     """
 
     where: str

@@ -32,14 +32,7 @@ SMALLEST = 32
 
 
 class Selection(NamedTuple):
-    """Which frames of a sequence are used.
-
-    Attributes:
-        start, stop: first frame and end of the range, as numbers or as times such as `12.5s` and `1:30`.
-        rate: maximum number of frames per second, by their timestamps.
-        limit: maximum number of frames.
-        stride: use every `stride`-th frame.
-    """
+    """Which frames of a sequence are used, as for `open_sequence`; `rate` is by their timestamps."""
 
     start: str | int = 0
     stop: str | int | None = None

@@ -84,8 +84,7 @@ class Views:
 def readable(views: Views, images: Images) -> tuple[Views, list[str]]:
     """Leave out the views whose image cannot be read; also return what is wrong with each of these images.
 
-    Raises:
-        ResultsError: fewer than three views are left.
+    Raises ResultsError if fewer than three views are left.
     """
     wrong: dict[int, str] = {}
     for view, frame in enumerate(views.frame_index.tolist()):

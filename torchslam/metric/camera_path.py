@@ -130,11 +130,9 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class Clock:
-    """A clock as given by the user.
+    """A clock as given by the user: the seconds that are added to the file's times to give those of the images.
 
-    Attributes:
-        seconds: that are added to the file's times to give those of the images.
-        start: when the first image was taken, seconds since 1970; the other way to say it.
+    The other way to say it is when the first image was taken, seconds since 1970.
     """
 
     seconds: float | None = None

@@ -76,13 +76,9 @@ class InertialAlignment:
     """Scale, gravity and the sensor's parameters. Without a gradient, and not to be used, unless it is `MEASURED`.
 
     Attributes:
-        reason: whether it was measured.
-        meters_per_unit: of the map.
-        relative_std: its standard error.
-        gravity_w: in the frame of the map, m/s^2, pointing down.
-        gravity_std: standard error of its direction, rad.
+        meters_per_unit, relative_std: of the map, and its standard error.
+        gravity_w, gravity_std: in the frame of the map, m/s^2, pointing down; standard error of its direction, rad.
         accelerometer_bias: m/s^2.
-        rotation: bias of the gyroscope, offset of the clocks, rotation from camera to body.
         lever_c: the body's origin in the frame of the camera, meters.
         position_std: standard error of the map's positions, meters.
         stretches: how many count.

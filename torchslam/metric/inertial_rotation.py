@@ -46,12 +46,9 @@ class InertialRotation(NamedTuple):
     """What the turns of a camera say about a gyroscope.
 
     Attributes:
-        R_bc: rotation from camera to body.
-        bias: of the gyroscope, rad/s.
-        offset: seconds to add to times of the camera for those of the sensor.
-        R_std: standard errors of the rotation, rad.
-        bias_std: standard errors of the bias.
-        offset_std: standard error of the offset.
+        R_bc, R_std: rotation from camera to body, and its standard errors, rad.
+        bias, bias_std: of the gyroscope, rad/s.
+        offset, offset_std: seconds to add to times of the camera for those of the sensor.
         turn_std: rad, of a turn over `TURN_INTERVAL`.
     """
 

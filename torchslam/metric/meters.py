@@ -46,10 +46,7 @@ def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
     """Average the logarithms of the scales, weighted by their information.
 
     Where measurements contradict each other, the error grows by their disagreement (the Birge ratio, 1932), and each
-    contradiction is listed.
-
-    Raises:
-        MeasurementError: there is no measurement.
+    contradiction is listed. Raises MeasurementError if there is no measurement.
     """
     if not measurements:
         raise MeasurementError("there is no measurement of the scale")

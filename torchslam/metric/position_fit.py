@@ -37,15 +37,12 @@ CLOCK_STD = 0.3
 
 @dataclass(frozen=True)
 class PositionFit:
-    """The similarity from a map to measured positions.
+    """The similarity S_ew from a map to measured positions, and the relative standard error of its scale.
 
     Attributes:
-        S_ew: from the map to the frame of the positions.
-        relative_std: relative standard error of the scale.
-        up_w: up in the map, a unit vector.
-        up_std: its standard error, radians.
-        offset: seconds that the clock of the images is ahead of that of the positions, beyond what was removed before.
-        offset_std: its standard error.
+        up_w, up_std: up in the map, a unit vector, and its standard error, radians.
+        offset, offset_std: seconds that the clock of the images is ahead of that of the positions, beyond what was
+            removed before, and its standard error.
         inliers: positions that agree.
         distances: of each position from the path, meters, by the coordinates that were measured.
         noise: standard deviations along one axis, horizontal and vertical, that the path leaves over, meters.

@@ -51,9 +51,7 @@ and 0 %), of its place and of its axis."""
 def from_options(given: Given) -> list[MetricSource]:
     """The sources of `--depth FOLDER[:SCALE]`, with `--depth-camera` for all.
 
-    Raises:
-        MeasurementError: there are no depth images, or a list is wrong.
-        CalibrationError: the camera is none.
+    Raises MeasurementError if there are no depth images, or a list is wrong, CalibrationError for a wrong camera.
     """
     cameras = [words[0] for words in given.get("depth_camera", ())]
     if len(cameras) > 1:
@@ -80,8 +78,7 @@ class SensorDepth:
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """The unit of a submap by the depths of its points.
 
-        Raises:
-            MeasurementError: a file has no depth, or in another unit.
+        Raises MeasurementError if a file has no depth, or in another unit.
         """
         pairs = self._pairs(view)
         if isinstance(pairs, str):

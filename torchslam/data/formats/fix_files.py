@@ -49,15 +49,11 @@ MAX_FIXES = 1_000_000
 
 
 class Fix(NamedTuple):
-    """One position as a file has it.
+    """One position as a file has it, at a file and line, of a time in seconds or of the name of an image.
 
     Attributes:
-        where: file and line, for messages.
-        latitude: degrees; NaN where the receiver had no position.
-        longitude: degrees.
+        latitude, longitude: degrees; NaN where the receiver had no position.
         altitude: meters, above the sea or the ellipsoid or the start; NaN if unknown.
-        time: seconds; None where `name` identifies the image.
-        name: of an image.
         std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
     """
 
@@ -72,14 +68,11 @@ class Fix(NamedTuple):
 
 @dataclass(frozen=True)
 class Fixes:
-    """N positions, each at a time or of an image.
+    """N positions, each at a time, seconds, increasing, on the clock of the file, or of an image of some name.
 
     Attributes:
-        path: where they come from.
-        geodetic: latitude and longitude, degrees, and altitude, meters; the altitude is NaN if it is unknown.
-        std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
-        timestamps: seconds, increasing, on the clock of the file; None where they are known by names.
-        names: N names of image files, or empty.
+        geodetic: latitude, longitude and altitude, as in `Fix`.
+        std: as in `Fix`.
         notes: remarks for the user, one line each.
     """
 

@@ -8,9 +8,9 @@ import re
 import statistics
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
 from torchslam.data.text_file import UNIX_UNITS
@@ -32,14 +32,8 @@ OTHER_KINDS = {
 }
 
 
-@dataclass(frozen=True)
-class Found:
-    """The images of a folder.
-
-    Attributes:
-        frames: in natural order of their names
-        left_out: number of files left out, by kind
-    """
+class Found(NamedTuple):
+    """The frames of a folder, in natural order of their names, and the number of files left out, by kind."""
 
     frames: list[Path]
     left_out: Counter[str]

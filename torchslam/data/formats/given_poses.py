@@ -33,14 +33,12 @@ _MAX_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class GivenPoses:
-    """N poses, each of an image known by its time or by its name.
+    """N poses, each of an image known by its time, seconds, or by its name.
 
     Attributes:
         kind: "tum", "colmap" or "nerfstudio"
         path: the file, or the folder of a COLMAP model
         T_cw: world to camera, camera axes x right, y down, z forward
-        timestamps: seconds, if the file identifies images by times
-        names: N names of image files, if the file identifies images by names
         calibration: of the images, if known
     """
 

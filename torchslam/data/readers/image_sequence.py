@@ -55,13 +55,7 @@ ATTEMPTS = 20
 
 @dataclass(frozen=True)
 class ImageEntry:
-    """One image of a list.
-
-    Attributes:
-        timestamp: seconds
-        path: of the image file
-        where: the list's file and line that name it, or the image itself, for messages
-    """
+    """One image of a list, at a time in seconds; `where` is file and line that name it, or the image, for messages."""
 
     timestamp: float
     path: Path

@@ -49,8 +49,7 @@ class Renderer:
     def render(self, T_cw: np.ndarray) -> np.ndarray:
         """The image seen from T_cw, (H, W) float32 in [0, 255]; black where no rectangle is hit.
 
-        Args:
-            T_cw: (4, 4), or (H, 4, 4): a pose for each row, as of a rolling shutter.
+        T_cw is (4, 4), or (H, 4, 4): a pose for each row, as of a rolling shutter.
         """
         T_cw = T_cw.reshape(-1, 4, 4)
         forms = self._linear_forms(T_cw)
@@ -137,12 +136,7 @@ class Renderer:
         return np.concatenate((start, end), axis=1).astype(np.int64)
 
     def _sample(self, tile: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Bilinear lookup of the atlas, (H, W) float32.
-
-        Args:
-            tile: (H, W) row of `_tiles`
-            u, v: (H, W) texels of level 0 from the texture's corner
-        """
+        """Bilinear lookup of the atlas, (H, W), at texels u, v of level 0 from the corner of a row of `_tiles`."""
         shrink, x, y = (column[tile] for column in self._tiles)
         return cv2.remap(self._atlas, u * shrink + x, v * shrink + y, cv2.INTER_LINEAR).astype(np.float32)
 

@@ -31,11 +31,8 @@ def surface(
 ) -> np.ndarray:
     """A painted surface: shapes of every size from a third of it down to two centimeters, over smooth noise.
 
-    Args:
-        size: (width, height) meters
-        texel: maximum size, meters
-        multiple: divides the numbers of rows and columns
-        coverage: fraction of the surface that the largest shapes cover
+    Size, width and height, and texels, at most so large, are in meters; `multiple` divides the numbers of rows and
+    columns; the largest shapes cover a fraction of the surface.
     """
     columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
     image = _noise(rng, rows, columns, texel)
@@ -106,13 +103,9 @@ MIP_LEVELS = 6
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A textured rectangle in the world, meters.
+    """A textured rectangle in the world, meters: its corner where the texture starts (3,) and its size along u and v.
 
-    Attributes:
-        origin: (3,) the corner where the texture starts
-        axis_u, axis_v: (3,) unit vectors along the texture's columns and rows
-        size: (along u, along v)
-        texture: (rows, columns) uint8
+    The unit vectors u and v (3,) are along the columns and rows of the texture (rows, columns), uint8.
     """
 
     origin: np.ndarray
@@ -124,13 +117,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Painter:
-    """Builds rectangles with individual textures, lit from above and slightly from the front.
-
-    Attributes:
-        rng: source of the textures
-        texel: maximum size, meters
-        coverage: fraction of a surface that the largest shapes cover
-    """
+    """Builds rectangles with individual textures, as `surface`, lit from above and slightly from the front."""
 
     rng: np.random.Generator
     texel: float = TEXEL

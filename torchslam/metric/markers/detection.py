@@ -107,11 +107,7 @@ class Target:
 
 
 def parse_target(text: str) -> Target:
-    """Read the description of a target.
-
-    Raises:
-        MeasurementError: it is none, or a size is impossible.
-    """
+    """Read the description of a target. Raises MeasurementError if it is none, or a size is impossible."""
     if found := re.fullmatch(SINGLE, text):
         dictionary(found["family"], text)
         others = [other.split("=") for other in found["others"].split(",") if other]
@@ -160,8 +156,7 @@ def _length(text: str, whole: str) -> float:
 def dictionary(family: str, text: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of a family of markers; `text` is the description that a message names.
 
-    Raises:
-        MeasurementError: there is no such family.
+    Raises MeasurementError if there is no such family.
     """
     kind, _, rest = family.partition("-")
     name = f"DICT_APRILTAG_{rest.lower()}" if kind == "apriltag" else f"DICT_{rest.upper().replace('-', '_')}"

@@ -50,8 +50,7 @@ MAX_ERROR_PX = 5.0
 def from_options(given: Given) -> list[Markers]:
     """The source of all `--marker`.
 
-    Raises:
-        MeasurementError: a description is wrong, or a kind of marker is given twice.
+    Raises MeasurementError if a description is wrong, or a kind of marker is given twice.
     """
     targets = [parse_target(text) for (text,) in given["marker"]]
     for number, target in enumerate(targets):
