@@ -156,8 +156,7 @@ def _only_sequence(archive: Path, folder: Path) -> str:
     raise SequenceError(f"{archive}: {what}")
 
 
-SHOWN = 6
-"""Names in a message, which stays short."""
+SHOWN = 6  # names in a message, which stays short
 
 
 def _not_found_message(path: str) -> str:

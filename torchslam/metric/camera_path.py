@@ -30,12 +30,9 @@ of a file has a pose with any clock."""
 
 @dataclass(frozen=True)
 class CameraPath:
-    """The posed frames of a submap in the order of time.
+    """The posed frames of a submap at ascending seconds, float64 on the CPU.
 
-    Attributes:
-        timestamps: seconds, ascending.
-        T_wc: camera to world, float64 on the CPU.
-        first_image: time of the first image of the recording, if images come at an even rate.
+    `first_image` is the time of the first image of the recording, if images come at an even rate.
     """
 
     timestamps: Float[Tensor, " K"]

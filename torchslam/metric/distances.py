@@ -21,12 +21,7 @@ MAX_RELATIVE_STD = 0.5
 
 @dataclass(frozen=True)
 class Click:
-    """An image point.
-
-    Attributes:
-        frame: index of the frame.
-        pixel: x and y; (0, 0) is the center of the top left pixel.
-    """
+    """An image point by the index of its frame, and x and y; (0, 0) is the center of the top left pixel."""
 
     frame: int
     pixel: tuple[float, float]

@@ -190,8 +190,6 @@ def _csv_rows(path: Path) -> Iterator[Fix]:
         )
 
 
-# --- DJI's subtitles -----------------------------------------------------------------------------------------
-
 _NUMBER = r"([-+]?\d{1,9}(?:\.\d{1,12})?)"
 BRACKETS = [
     re.compile(rf"\b{word}\s*:\s*{_NUMBER}")  # some models write `longtitude`
@@ -257,9 +255,6 @@ def _srt_position(text: str) -> tuple[float, float, float] | None:
     return second, first, float(height[1]) if height else float(found[3] or "nan")
 
 
-# --- GPX -----------------------------------------------------------------------------------------------------
-
-
 def _gpx_rows(path: Path) -> Iterator[Fix]:
     """The points of all tracks, with their times. Source: GPX 1.1, www.topografix.com/GPX/1/1."""
     # Half a million points, of which the parser makes objects of ten times the size.
@@ -286,9 +281,6 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
         )
         yield Fix(where, latitude, longitude, altitude, time=time)
-
-
-# --- NMEA ----------------------------------------------------------------------------------------------------
 
 
 def _read_nmea(path: Path, text: str) -> Fixes:
@@ -347,9 +339,6 @@ def _degrees(text: str, hemisphere: str, expected: str, where: str) -> float:
     return degrees if hemisphere == expected[0] else -degrees
 
 
-# --- EXIF ----------------------------------------------------------------------------------------------------
-
-
 def read_image_fixes(folder: Path) -> Fixes:
     """The positions in the EXIF blocks of the images of a folder, by their names; others have none.
 
@@ -390,9 +379,6 @@ def _exif_degrees(parts: tuple[float, ...], hemisphere: str) -> float:
     """Degrees of degrees, minutes and seconds."""
     degrees = sum(float(part) / 60**power for power, part in enumerate(parts))
     return -degrees if str(hemisphere).strip("\0 ").upper() in ("S", "W") else degrees
-
-
-# --- KITTI ---------------------------------------------------------------------------------------------------
 
 
 def _oxts_rows(folder: Path) -> Iterator[Fix]:

@@ -56,18 +56,16 @@ SHORTEST = 1e-3
 def in_order(files: Iterable[Path]) -> list[Path]:
     """Sort files by name, such that runs of digits compare as numbers and a dot between digits starts a fraction."""
     files = list(files)
-    has_fractions = _has_fractions(files)
-    return sorted(files, key=lambda file: (natural(file.name, has_fractions), file.name))
+    number = NUMBER if _has_fractions(files) else re.compile(r"(\d+)")
 
+    def key(file: Path) -> tuple[list[tuple[bool, int, str]], str]:
+        parts = []
+        for place, part in enumerate(number.split(file.name.lower())):
+            whole, _, fraction = part.partition(".")
+            parts.append((True, int(whole), fraction) if place % 2 else (False, 0, part))
+        return parts, file.name
 
-def natural(name: str, has_fractions: bool) -> list[tuple[bool, int, str]]:
-    """A sort key under which runs of digits compare as numbers, and those after a dot as fractions if they are some."""
-    parts = NUMBER.split(name.lower()) if has_fractions else re.split(r"(\d+)", name.lower())
-    key = []
-    for place, part in enumerate(parts):
-        whole, _, fraction = part.partition(".")
-        key.append((True, int(whole), fraction) if place % 2 else (False, 0, part))
-    return key
+    return sorted(files, key=key)
 
 
 def _has_fractions(files: list[Path]) -> bool:
@@ -135,17 +133,17 @@ def _times(is_bare: bool, numbers: tuple[str, ...]) -> list[float] | None:
     return times if intervals and statistics.median(intervals) >= SHORTEST else None
 
 
-def find_frames(folder: Path) -> Found:
-    """The frames among the files of a folder. Raises SequenceError where there are too many files, or two series."""
-    return sort_out(_files(folder), folder)
+def find_frames(folder: Path, pattern: str = "*") -> Found:
+    """The frames among the files of a folder whose names fit a pattern.
 
-
-def sort_out(files: Iterable[Path], where: Path) -> Found:
-    """The frames among files. Raises SequenceError at `where` for two series that count alike: `left_7`, `right_7`."""
+    Raises SequenceError where there are too many files, or two series that count alike: `left_7`, `right_7`.
+    """
     frames: list[Path] = []
     left_out: Counter[str] = Counter()
-    for file in files:
+    for file in _files(folder):
         kind = other_kind(file)
+        if not fnmatch.fnmatchcase(file.name, pattern):
+            continue
         if kind is None:
             frames.append(file)
         else:
@@ -158,8 +156,8 @@ def sort_out(files: Iterable[Path], where: Path) -> Found:
     shared = Counter(number for numbers in series.values() for number in numbers)
     rivals = [name for name, numbers in series.items() if any(shared[number] > 1 for number in numbers)]
     if len(rivals) > 1:
-        globs = " or ".join(f"'{where / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
-        raise SequenceError(f"{where}: several series of images that count alike; which one? Give {globs}")
+        globs = " or ".join(f"'{folder / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
+        raise SequenceError(f"{folder}: several series of images that count alike; which one? Give {globs}")
     return Found(in_order(frames), left_out)
 
 
@@ -201,7 +199,6 @@ def is_pattern(path: str) -> bool:
 
 
 def match_pattern(path: str) -> Found:
-    """The frames that a pattern names. Raises SequenceError where they are several series."""
-    pattern, folder = Path(path).name, Path(path).parent
-    files = _files(folder) if folder.is_dir() else []
-    return sort_out((file for file in files if fnmatch.fnmatchcase(file.name, pattern)), folder)
+    """The frames that a pattern names, see `find_frames`."""
+    folder = Path(path).parent
+    return find_frames(folder, Path(path).name) if folder.is_dir() else Found([], Counter())

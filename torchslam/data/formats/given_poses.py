@@ -141,9 +141,6 @@ def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
     return torch.full((len(images),), -1, device="cpu")
 
 
-# --- COLMAP --------------------------------------------------------------------------------------------------
-
-
 def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
     """Source: https://colmap.github.io/format.html."""
     read = _binary_images if binary else _text_images
@@ -208,9 +205,6 @@ def _binary_camera(path: Path) -> Calibration:
     except (OSError, struct.error) as cause:
         raise CalibrationError(f"{path}: not COLMAP's cameras: {cause}") from cause
     return from_colmap(path, [" ".join(map(str, (number, name, width, height, *params)))])
-
-
-# --- transforms.json -----------------------------------------------------------------------------------------
 
 
 def _read_transforms(path: Path) -> GivenPoses:

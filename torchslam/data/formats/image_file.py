@@ -203,23 +203,16 @@ def _is_truncated(data: bytes) -> bool:
     """Return True for a JPEG or PNG file without its end marker; other formats are left to the decoder."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-64:] and b"IEND\xaeB`\x82" not in data
-    if data.startswith(b"\xff\xd8"):
-        return data.rfind(b"\xff\xd9") < _start_of_scan(data)
-    return False
-
-
-def _start_of_scan(data: bytes) -> int:
-    """Return the offset of the pixels of a JPEG, after any embedded thumbnail; the length of the file without them."""
-    position = 2
+    if not data.startswith(b"\xff\xd8"):
+        return False
+    position = 2  # to the pixels of a JPEG, after any embedded thumbnail
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
         if marker == 0xDA:
-            return position
-        if marker == 0xFF:  # a fill byte
-            position += 1
-            continue
-        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    return len(data)
+            return data.rfind(b"\xff\xd9") < position
+        # 0xFF is a fill byte.
+        position += 1 if marker == 0xFF else 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return True
 
 
 CHANNELS = {

@@ -85,12 +85,9 @@ def read_day_times(path: Path, error: type[TorchslamError]) -> list[float]:
 
 @dataclass(frozen=True)
 class Speeds:
-    """N speeds of a vehicle.
+    """N speeds of a vehicle, meters per second along the path, without the sign of one that backs up.
 
-    Attributes:
-        path: where they come from.
-        timestamps: seconds, increasing, on the clock of the file.
-        speeds: meters per second along the path, without the sign of a vehicle that backs up.
+    Times are seconds, increasing, on the clock of the file.
     """
 
     path: Path

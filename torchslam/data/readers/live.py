@@ -114,7 +114,10 @@ class LiveSequence(Sequence):
                 f"{self.image_name(index)}: is gone; a live source gives each frame once, in order"
             )
         if not self._is_watched and not self._ended:
-            self._begin()
+            self._is_watched = True
+            if time.time() - self._arrived[0][0] > STALE:
+                self._arrived.clear()
+            self._thread = self._watch_until(lambda: False)
         with self._fresh:
             self._fresh.wait_for(lambda: self._arrived or self._ended, self._patience)
             if not self._arrived:
@@ -146,18 +149,6 @@ class LiveSequence(Sequence):
         self._closing = True
         if not self._thread.is_alive():
             self._end()
-
-    def has_ended(self, patience: float) -> bool:
-        """Return whether the thread that watches has ended, after some seconds at most."""
-        self._thread.join(max(0.0, patience))
-        return not self._thread.is_alive()
-
-    def _begin(self) -> None:
-        """Watch from now on, without what was seen long ago."""
-        self._is_watched = True
-        if time.time() - self._arrived[0][0] > STALE:
-            self._arrived.clear()
-        self._thread = self._watch_until(lambda: False)
 
     def _watch_until(self, is_enough: Callable[[], bool]) -> threading.Thread:
         """A thread that keeps the newest frames until that is enough, the source ends or it is closed."""
@@ -211,7 +202,9 @@ def close_sources() -> bool:
     end = time.monotonic() + 2.0
     for source in sources:
         source.close()
-    return all(source.has_ended(end - time.monotonic()) for source in sources)
+    for source in sources:
+        source._thread.join(max(0.0, end - time.monotonic()))
+    return not any(source._thread.is_alive() for source in sources)
 
 
 # Threads that end on their own before the interpreter does are not ended by it, in the middle of OpenCV.

@@ -176,13 +176,7 @@ def dictionary(family: str, text: str) -> cv2.aruco.Dictionary:
 
 @dataclass(frozen=True)
 class Detection:
-    """A target in an image.
-
-    Attributes:
-        identity: id of a marker; 0 for a board.
-        rows: of the detected corners, in `Target.corners`.
-        pixels: where they are.
-    """
+    """A target in an image: the id of a marker, 0 for a board, and its detected corners as rows of `Target.corners`."""
 
     identity: int
     rows: Int[np.ndarray, " C"]

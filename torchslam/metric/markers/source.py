@@ -104,13 +104,7 @@ class Markers:
 
 @dataclass(frozen=True)
 class Sighting:
-    """A target in a frame.
-
-    Attributes:
-        frame: row of the graph.
-        target: which of the user's targets.
-        detection: where it is.
-    """
+    """One of the user's targets in a frame, a row of the graph."""
 
     frame: int
     target: int
@@ -173,13 +167,7 @@ class PlacedTarget:
 
 @dataclass(frozen=True)
 class GraphWithCorners:
-    """An observation graph with the corners of targets as its last points.
-
-    Attributes:
-        graph: the whole.
-        targets: those that have a place.
-        dropped: one line for each target that has none.
-    """
+    """An observation graph with the corners of targets as its last points, and lines about those without a place."""
 
     graph: ObservationGraph
     targets: tuple[PlacedTarget, ...]
