@@ -24,8 +24,7 @@ MAX_BYTES = 1 << 27
 """Size limit of text files; a million poses are smaller."""
 UNIX_UNITS = {13: 10**3, 16: 10**6, 19: 10**9}
 """Parts of a second that a number with this many digits counts since 1970, from 2001 to 2286."""
-MAX_SECONDS = 1e11
-"""The year 5138."""
+MAX_SECONDS = 1e11  # the year 5138
 MAX_LINE = 1 << 16
 """Maximum length of a line of numbers."""
 

@@ -297,9 +297,8 @@ def _is_readout(value: Any) -> bool:
 
 
 def _are_submaps(value: object) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(submap, dict) and _is_count(submap.get("submap")) for submap in value
-    )
+    submaps = value if isinstance(value, list) else [None]
+    return all(isinstance(submap, dict) and _is_count(submap.get("submap")) for submap in submaps)
 
 
 # Validation of the entries that are read from metrics.json.

@@ -119,7 +119,12 @@ def stretches_of(
     valid = torch.arange(size, device=device) < lengths[:, None]
     chained = _chained(timestamps[padded] + rotation.offset, samples, calibration, rotation.bias)
     T_wc = se3_inverse(T_cw)[padded]
-    R_bw = _attitudes(T_wc[..., :3, :3] @ rotation.R_bc.mT, chained.R_ij, valid).mT[:, None]
+    # The attitude of the body at the start: the mean over the nodes, by the map.
+    apart = T_wc[..., :3, :3] @ rotation.R_bc.mT @ chained.R_ij.mT
+    R_wb, weights = apart[:, 0], valid[..., None] / valid.sum(-1)[:, None, None]
+    for _ in range(3):  # the mean on the manifold; the rotations are within a degree
+        R_wb = so3_exp((weights * so3_log(apart @ R_wb.mT[:, None])).sum(1)) @ R_wb
+    R_bw = R_wb.mT[:, None]
     times, P = chained.duration, chained.position
     positions, arms = R_bw @ T_wc[..., :3, 3:], R_bw @ T_wc[..., :3, :3]
     eye = torch.eye(3, dtype=T_cw.dtype, device=device).expand(*valid.shape, 3, 3)
@@ -145,16 +150,6 @@ def _chained(
         total = compose_increments(total, Increments(*(x[:, node] for x in each)))
         chain.append(total)
     return Increments(*(torch.stack(x, dim=1) for x in zip(*chain, strict=True)))
-
-
-def _attitudes(R_wb: Tensor, chained: Tensor, valid: Tensor) -> Float[Tensor, "S 3 3"]:
-    """Attitude of the body at the start of each stretch: the mean over its nodes, by the map."""
-    apart = R_wb @ chained.mT
-    middle = apart[:, 0]
-    weights = valid[..., None] / valid.sum(-1)[:, None, None]
-    for _ in range(3):  # the mean on the manifold; the rotations are within a degree
-        middle = so3_exp((weights * so3_log(apart @ middle.mT[:, None])).sum(1)) @ middle
-    return middle
 
 
 def _noise(chained: Increments) -> Float[Tensor, "S N 3 N 3"]:

@@ -69,7 +69,11 @@ class GivenPoses:
             found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
             how = f"no image has one of its names, such as {self.names[0]}"
         else:
-            found = _by_time(times, sequence.timestamps)
+            # The nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn.
+            nearest_row, distances = nearest(sequence.timestamps, times)
+            back, _ = nearest(times, sequence.timestamps)
+            is_pair = back[nearest_row] == torch.arange(len(nearest_row), device="cpu")
+            found = torch.where((distances <= GROUNDTRUTH_TOLERANCE) & is_pair, nearest_row, -1)
             own, others = (
                 f"from {each[0]} to {each[-1]} s" for each in (times.tolist(), sequence.timestamps.tolist())
             )
@@ -114,14 +118,6 @@ def read_poses(path: str | Path) -> GivenPoses:
         return _read_transforms(path)
     trajectory = read_trajectory(path)
     return GivenPoses(TUM, path, se3_inverse(trajectory.T_wc), trajectory.timestamps)
-
-
-def _by_time(times: Float[Tensor, " N"], frames: Float[Tensor, " F"]) -> Int[Tensor, " F"]:
-    """The nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn."""
-    rows, distances = nearest(frames, times)
-    back, _ = nearest(times, frames)
-    mutual = back[rows] == torch.arange(len(frames), device="cpu")
-    return torch.where((distances <= GROUNDTRUTH_TOLERANCE) & mutual, rows, -1)
 
 
 def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:

@@ -26,7 +26,6 @@ MAX_YAML = 1 << 17
 """Characters of YAML, which takes seconds; calibrations with all their image points are smaller."""
 MAX_ALIASES = 20
 """References to other parts of a file; those of references take exponential time."""
-LARGEST = 1e12  # JSON numbers may have any number of digits
 NOTHING = ("", "none", "null", "~")
 
 
@@ -204,7 +203,7 @@ def _numbers(value: Any, where: str, depth: int = 0) -> list[float]:
     if isinstance(value, bool | dict | list):
         raise CalibrationError(f"{where}: expected numbers, got {str(value)[:40]}")
     if isinstance(value, int | float):
-        if not abs(value) < LARGEST:  # not so NaN either
+        if not abs(value) < 1e12:  # JSON numbers may have any number of digits; NaN
             raise CalibrationError(f"{where}: {str(value)[:40]} is not finite")
         return [float(value)]
     return parse_floats(value, where, CalibrationError)

@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import sys
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
@@ -195,7 +195,8 @@ class Recording:
         self._reader.open()
         weakref.finalize(self, self._reader.close)  # when no sequence needs it anymore
         self.connections, self.messages = self._reader.connections, self._reader.messages
-        self.deserialize = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
+        read = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
+        self.deserialize: Callable[[bytes, str], Any] = read
 
     def check_definition(self, connection: Connection) -> None:
         """Raise ValueError if the messages of a topic are not as ROS defines them, by the digest of a definition."""

@@ -28,10 +28,6 @@ from torchslam.utils.forks import forget_in_forks, never_release
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
 PATIENCE = 15.0
 """Seconds without a frame after which a stream has ended."""
-BACKLOG = 10
-"""Maximum number of queued frames; then the oldest one is dropped."""
-STEADY = 1.0
-"""Maximum drift of the source's clock from ours in seconds, before it is ignored."""
 STALE = 0.5
 """Age in seconds above which the frame read on opening is discarded."""
 
@@ -52,9 +48,12 @@ class LiveSequence(Sequence):
         capture: Capture,
         camera: GivenCamera | None,
         patience: float = PATIENCE,
-        backlog: int = BACKLOG,
+        backlog: int = 10,
     ) -> None:
-        """Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit."""
+        """Drop the oldest of more than `backlog` queued frames; after `patience` seconds the source has ended.
+
+        Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit.
+        """
         self._capture = capture
         self._retriever = Retriever(capture, name, "recording.mp4")
         self._refusal: FrameError | None = None  # of a frame that cannot be converted
@@ -212,7 +211,7 @@ atexit.register(close_sources)
 
 
 class CaptureClock:
-    """Capture times on our clock: by the source's own clock, from the first frame on, as long as that runs with ours.
+    """Capture times on our clock: by the source's own clock, from the first frame on, as long as both stay within 1 s.
 
     Arrival times jitter with the network and the load of the machine; the source's clock does not.
     """
@@ -224,7 +223,7 @@ class CaptureClock:
     def at(self, own: float, now: float) -> float:
         """Seconds since 1970 of a frame that has the time `own` and came at `now`; it never goes back."""
         stands = own <= self._own  # a source without a clock reports a constant time
-        if self._offset is None or stands or abs(own + self._offset - now) > STEADY:
+        if self._offset is None or stands or abs(own + self._offset - now) > 1:
             self._offset = now - own
         self._own = own
         self._last = max(own + self._offset, self._last + 1e-6)

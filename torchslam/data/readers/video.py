@@ -44,8 +44,6 @@ QUIET = 2.0
 """Seconds of decoding before a progress bar appears."""
 MANY = 100
 """Frames that are skipped with a progress bar."""
-MAX_ASPECT_ERROR = 0.02
-"""Relative error of fy / fx of a given camera before a note reports that the file contradicts it."""
 MAX_ASPECT = 4.0
 """Largest ratio of the sides of a pixel; anamorphic lenses have 2."""
 _LOCK = threading.Lock()
@@ -213,7 +211,7 @@ class VideoSequence(Sequence):
             pixel_aspect=aspect,
         )
         ratio = aspect if self._camera is None else float(self._camera.fy / self._camera.fx)
-        if abs(ratio / aspect - 1) > MAX_ASPECT_ERROR:
+        if abs(ratio / aspect - 1) > 0.02:
             contradiction = (
                 f"the file declares pixels of {aspect_text(aspect)}, width to height, so fy should be "
                 f"{aspect:.4g} fx; the given camera has {ratio:.4g}"

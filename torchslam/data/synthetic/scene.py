@@ -174,23 +174,12 @@ def wall(seed: int) -> list[Rectangle]:
     return [painter.rectangle(np.array((-4.5, -3.0, 2.5)), X, Y, (9.0, 6.0))]
 
 
-HEIGHT = 2.8
-"""Meters from floor to ceiling."""
-FLOOR = HEIGHT / 2
-"""y points down, and is 0 half-way up."""
-PARTITION = 0.1
-"""Thickness of a wall with a door."""
-BUILDING_TEXEL = 0.004
-"""Meters: walls and furniture are hardly ever nearer than two pixels to that."""
-
-ROOMS_HALF = 3.9
-"""Meters from the center to the outer walls."""
-ROOMS_CORE = 1.3
-"""Meters from the center to the inner walls."""
-ROOMS_DOOR = (-3.4, -1.95)
-"""Begin and end of the door along x."""
-ROOMS_DOOR_TOP = -0.7
-"""y of the upper edge of the doors, meters."""
+HEIGHT = 2.8  # meters from floor to ceiling, as all below
+FLOOR = HEIGHT / 2  # y points down, and is 0 half-way up
+PARTITION = 0.1  # thickness of a wall with a door
+BUILDING_TEXEL = 0.004  # walls and furniture are hardly ever nearer than two pixels to that
+ROOMS_HALF, ROOMS_CORE = 3.9, 1.3  # from the center to the outer and the inner walls
+ROOMS_DOOR = (-3.4, -1.95)  # begin and end along x
 SIZE_SPREAD, TURN_SPREAD = 0.12, 0.15
 """Furniture is up to that share larger or smaller, and turned by up to that many radians from its place."""
 QUARTER_TURN = np.array(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))
@@ -240,7 +229,7 @@ def _quarter(painter: Painter) -> list[Rectangle]:
     for start, end, bottom in (  # of the wall in the plane z = 0: on each side of the door, and above it
         (-ROOMS_HALF, ROOMS_DOOR[0], FLOOR),
         (ROOMS_DOOR[1], -ROOMS_CORE, FLOOR),
-        (*ROOMS_DOOR, ROOMS_DOOR_TOP),
+        (*ROOMS_DOOR, -0.7),
     ):
         center = ((start + end) / 2, (bottom - FLOOR) / 2, 0.0)
         rectangles += painter.box(center, (end - start, bottom + FLOOR, PARTITION), 0.0)

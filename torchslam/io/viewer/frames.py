@@ -26,7 +26,6 @@ from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult, Trajectory
 
 VIDEO = "tracked.mp4"
-MAX_WIDTH = 960  # pixels of the film: it is to stay small
 BAR = 26  # pixels, for the text under the image
 COLORS = {  # blue, green, red
     State.INITIALIZING: (170, 200, 215),
@@ -183,7 +182,7 @@ class VideoRecorder(FrameViewer):
 
     def __init__(self, path: Path, size: tuple[int, int], rate: float) -> None:
         """size: (width, height) of the images. Raises ResultsError where no film can be written."""
-        self._scale = min(1.0, MAX_WIDTH / size[0])
+        self._scale = min(1.0, 960 / size[0])  # a small film
         # Codecs ask for even sides.
         self._size = (int(size[0] * self._scale) // 2 * 2, int(size[1] * self._scale) // 2 * 2)
         # An absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
