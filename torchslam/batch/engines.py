@@ -20,8 +20,7 @@ from torchslam.errors import ConfigError
 
 Work = Callable[[Columns], Columns]
 ENGINES = ("in-process", "ray")
-RETRIES = 2
-"""Of a row whose worker died, for example for lack of memory; Ray would retry forever."""
+RETRIES = 2  # of a row whose worker died, for example for lack of memory; Ray would retry forever
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,7 @@ COLUMNS: dict[str, type] = {
     "camera": str,
     "configuration": str,
 }
-LARGEST = 1 << 62
-"""Of a value: larger ones are invalid."""
+LARGEST = 1 << 62  # of a value: larger ones are invalid
 TIME_COLUMNS: dict[str, type] = {"name": str, **dict.fromkeys(("cpu_s", "fps", "ms_median", "ms_p95"), float)}
 
 

@@ -17,10 +17,8 @@ from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, pars
 from torchslam.errors import ConfigError, SequenceError
 from torchslam.utils.console import without_credentials
 
-MAX_BYTES = 1 << 26
-"""Of a list: about half a million rows of a hundred characters."""
-MAX_NAME = 100
-"""Characters of a name; folders are named by it."""
+MAX_BYTES = 1 << 26  # of a list: about half a million rows of a hundred characters
+MAX_NAME = 100  # characters of a name; folders are named by it
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+=-]*")
 
 

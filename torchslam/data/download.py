@@ -33,18 +33,12 @@ from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular, write_whole
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
-TIMEOUT = 60.0
-"""Seconds without a byte before a transfer is given up."""
-ATTEMPTS = 5
-"""Maximum number of attempts of an interrupted transfer; each one must get further than the last."""
-MAX_BYTES = 1 << 34
-"""An archive above this size is not fetched or opened: the largest of ETH3D have 3 GB."""
-SLOWEST = 4096
-"""Bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up."""
-MARGIN = 1 << 30
-"""Bytes that unpacking leaves free on the disk."""
-SMALL = 1 << 28
-"""Bytes that an archive may unpack to at any ratio: they do no harm."""
+TIMEOUT = 60.0  # seconds without a byte before a transfer is given up
+ATTEMPTS = 5  # maximum number of attempts of an interrupted transfer; each one must get further than the last
+MAX_BYTES = 1 << 34  # an archive above this size is not fetched or opened: the largest of ETH3D have 3 GB
+SLOWEST = 4096  # bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up
+MARGIN = 1 << 30  # bytes that unpacking leaves free on the disk
+SMALL = 1 << 28  # bytes that an archive may unpack to at any ratio: they do no harm
 MAX_RATIO = 100
 """Maximum ratio of unpacked to packed bytes, above `SMALL` bytes: images hardly shrink, zeros 1000 times."""
 

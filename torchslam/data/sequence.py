@@ -31,8 +31,7 @@ def exhaust(times: Iterable[float]) -> None:
         pass
 
 
-GROUNDTRUTH_TOLERANCE = 0.02
-"""Maximum time in seconds between an image and its ground-truth pose."""
+GROUNDTRUTH_TOLERANCE = 0.02  # maximum time in seconds between an image and its ground-truth pose
 
 
 class EndOfSequence(IndexError):

@@ -20,13 +20,11 @@ from torch import Tensor
 from torchslam.errors import TorchslamError
 from torchslam.utils import files
 
-MAX_BYTES = 1 << 27
-"""Size limit of text files; a million poses are smaller."""
+MAX_BYTES = 1 << 27  # size limit of text files; a million poses are smaller
 UNIX_UNITS = {13: 10**3, 16: 10**6, 19: 10**9}
 """Parts of a second that a number with this many digits counts since 1970, from 2001 to 2286."""
 MAX_SECONDS = 1e11  # the year 5138
-MAX_LINE = 1 << 16
-"""Maximum length of a line of numbers."""
+MAX_LINE = 1 << 16  # maximum length of a line of numbers
 
 
 def float64(values: Any) -> Tensor:
@@ -206,8 +204,7 @@ class Column(NamedTuple):
         return None
 
 
-TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-"""Factors to seconds."""
+TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}  # factors to seconds
 TIMES = {
     "time": Column(("time", "timestamp", "t"), TIME_UNITS),
     "gps_time": Column(("gpstime",), TIME_UNITS),

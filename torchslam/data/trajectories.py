@@ -16,8 +16,7 @@ from torchslam.types import Trajectory
 
 ORTHOGONAL = 0.05
 """Tolerated deviation of R R^T from the identity, and of quaternions from length one; some files have few digits."""
-FARTHEST = 1e12
-"""Maximum coordinate of a position, in meters."""
+FARTHEST = 1e12  # maximum coordinate of a position, in meters
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 

@@ -23,12 +23,10 @@ from torchslam.errors import FrameError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.types import Trajectory
 
-TOLERANCE = 0.25
-"""Tolerated earliness of a frame when frames are thinned out, as a ratio of the interval."""
+TOLERANCE = 0.25  # tolerated earliness of a frame when frames are thinned out, as a ratio of the interval
 DARK = 32
 """Gray level of 255 below which the darkest pixels of a mask with white ones are meant to be black: 16 in videos."""
-SMALLEST = 32
-"""Minimum width and height in pixels."""
+SMALLEST = 32  # minimum width and height in pixels
 
 
 class Selection(NamedTuple):

@@ -24,8 +24,7 @@ from torchslam.learning.clip_slam import ClipGraph, ClipSLAM
 from torchslam.learning.training import seed_of
 from torchslam.types import Features
 
-MIN_MATCHES = 50
-"""Between the first and the last frame of a clip; with fewer they hardly overlap."""
+MIN_MATCHES = 50  # between the first and the last frame of a clip; with fewer they hardly overlap
 MIN_PARALLAX = 0.05
 """Radians, three degrees, between these frames. With it the system poses 45 of 48 clips of redkitchen, machine_hall,
 kitti07 and fr2_desk_20; with two degrees 3 of 8 of redkitchen, but a car shows no more than that."""

@@ -22,8 +22,7 @@ from torchslam.utils.files import write_whole
 Log = Callable[[str, float, int], None]
 """Called with name, value and step, like `SummaryWriter.add_scalar` of TensorBoard."""
 
-MAX_NORM = 1.0
-"""Of the gradient: one step through a poorly determined pose must not undo a hundred others."""
+MAX_NORM = 1.0  # of the gradient: one step through a poorly determined pose must not undo a hundred others
 
 
 class Training:

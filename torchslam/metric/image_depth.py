@@ -18,42 +18,31 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.metric.source import SubmapView
 
-CONTRAST = 2.0 / 255
-"""Minimum standard deviation of the gray levels of a window; flatter ones count as noise."""
-NEAREST = 30
-"""Observed points nearest to the pixel, whose depths bound the search."""
+CONTRAST = 2.0 / 255  # minimum standard deviation of the gray levels of a window; flatter ones count as noise
+NEAREST = 30  # observed points nearest to the pixel, whose depths bound the search
 NEARER, FARTHER = 0.5, 2.0
 """The search reaches from so much of the least of these depths to so much of the largest."""
 PLANES = 128
 """Hypotheses over the range, equally far in inverse depth: a step is about a pixel for a parallax of ten degrees."""
-REFINED = 65
-"""Hypotheses of the second search, over `AGREEING` steps of the first to either side."""
+REFINED = 65  # hypotheses of the second search, over `AGREEING` steps of the first to either side
 BESIDE = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
 """Directions of the clicks beside that of the user; two and two are opposite."""
-FRAMES = 12
-"""Other frames that are compared at most, spread over those with a fitting parallax."""
+FRAMES = 12  # other frames that are compared at most, spread over those with a fitting parallax
 ANGLES_DEG = (1.5, 15.0)
 """Parallax of these frames: less determines depth poorly, more makes the window look different."""
 RADII = 4, 8, 12
 """Of the windows, in samples: a larger one where a smaller one finds nothing, or several places."""
-SAMPLE_SHARE = 1 / 500
-"""Distance of the samples of the window in widths of the image; at least a pixel."""
-BEST_SHARE = 0.6
-"""Share of the frames that must match; the others may not see the point."""
-LEAST_FRAMES = 3
-"""Frames without which there is no depth."""
-LEAST_SCORE = 0.6
-"""Correlation below which a search has failed."""
-AGREEING = 3
-"""Steps of the first search by which the best depth of a single frame may differ."""
+SAMPLE_SHARE = 1 / 500  # distance of the samples of the window in widths of the image; at least a pixel
+BEST_SHARE = 0.6  # share of the frames that must match; the others may not see the point
+LEAST_FRAMES = 3  # frames without which there is no depth
+LEAST_SCORE = 0.6  # correlation below which a search has failed
+AGREEING = 3  # steps of the first search by which the best depth of a single frame may differ
 AGREEING_SHARE = 0.4
 """Least share of the frames whose own best depth is there: repeated and weak texture has others elsewhere."""
-RIVAL = 0.95
-"""A second maximum of so much of the correlation makes the depth ambiguous."""
+RIVAL = 0.95  # a second maximum of so much of the correlation makes the depth ambiguous
 MATCH_STD_PX = 0.3
 """Standard deviation of where a window matches in one image, pixels; noise and the slant of surfaces."""
-CLICK_STD_PX = 1.0
-"""Standard deviation of a click, pixels."""
+CLICK_STD_PX = 1.0  # standard deviation of a click, pixels
 
 
 def sample_windows(

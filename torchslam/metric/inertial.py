@@ -51,8 +51,7 @@ WEIGHINGS = 5
 SENSOR_STD = 1e-2
 """Relative error of the accelerometer's scale factor, which nothing here can find. Data sheets allow up to 3 % (initial
 calibration tolerance of the MPU-6050). With the true poses of a drone, the scale of its sensor is off by 0.5 %."""
-WORST = 0.1
-"""Relative standard error from which on a scale counts as not determined."""
+WORST = 0.1  # relative standard error from which on a scale counts as not determined
 STILL_INTERVAL = 0.25
 """Seconds over which rates and forces are averaged: a drone's motors shake it by 0.8 m/s^2 while it stands."""
 STILL_TURN, STILL_FORCE = 0.02, 0.1

@@ -28,10 +28,8 @@ LONGEST_INTERVAL = 1.0
 """Seconds between two posed frames from which on a stretch ends: the map knows nothing of the way in between."""
 LONGEST_GAP = 0.1
 """Seconds between two samples from which on some are missing: an order of magnitude above the period of any sensor."""
-SHORTEST_STRETCH = 1.0
-"""Seconds; below, an acceleration is lost in the velocity that is not known."""
-FEWEST_NODES = 8
-"""Positions of a stretch: six numbers of each coordinate go to the motion that is not known."""
+SHORTEST_STRETCH = 1.0  # seconds; below, an acceleration is lost in the velocity that is not known
+FEWEST_NODES = 8  # positions of a stretch: six numbers of each coordinate go to the motion that is not known
 ATTITUDE_STD = 1e-3
 """rad, by which the attitude of a stretch differs from that of the map. With 0, 1e-3 and 3e-3 gravity of a drone's
 recording is off by 0.48, 0.23 and 0.23 degrees, and the scale by the same."""

@@ -30,8 +30,7 @@ CONVINCING = 0.7
 """Correlation of angular speeds from which another offset than the given one is believed. On a drone, 0.96 to 0.98."""
 OFFSET_STD = 0.01
 """Seconds, of the offset before it is measured: a camera that hardly turns leaves it where it was."""
-BIAS_STD = 0.1
-"""rad/s, of the gyroscope's bias before it is measured: three times that of cheap sensors."""
+BIAS_STD = 0.1  # rad/s, of the gyroscope's bias before it is measured: three times that of cheap sensors
 ROBUST_SCALE = 2.0
 """Of Cauchy's kernel, in standard errors of a turn, which leaves Gaussian errors 95 % of their information."""
 ROUNDS, WIDE_ROUNDS = 6, 3

@@ -35,12 +35,10 @@ drift."""
 PARTS = 5
 """Straight parts of a stretch over which the path of the camera is measured: a car turns by less than 10 degrees in
 one."""
-MIN_STRETCHES = 4
-"""From fewer, their scatter cannot be estimated."""
+MIN_STRETCHES = 4  # from fewer, their scatter cannot be estimated
 STANDING = 0.15
 """Part of the typical length of a stretch below which it is not used: the vehicle stands, or nearly."""
-SEARCH_STEP = 0.1
-"""Seconds between the clocks that are tried."""
+SEARCH_STEP = 0.1  # seconds between the clocks that are tried
 SEARCH_GAIN = 18.0
 """Logarithm of the likelihood ratio from which on another clock is believed, as for a difference of six standard
 deviations. Of 20 trials over 15 s, 12.5 believed a wrong one with slipping wheels, and 25 missed one of .8 s."""
@@ -49,8 +47,7 @@ MAX_GAP = 2.5
 theirs evenly by 3 m/s in one."""
 LEVER_STD = 1.0
 """Meters that the sensor may be from the camera, as a prior: motion without turns leaves the lever arm open."""
-ROUNDS = 30
-"""Alternations between rotation with scale, and lever arm; they gain two digits in ten."""
+ROUNDS = 30  # alternations between rotation with scale, and lever arm; they gain two digits in ten
 
 
 @dataclass(frozen=True)

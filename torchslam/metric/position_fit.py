@@ -31,8 +31,7 @@ CAMERA_UP_STD = 1.0
 positions know their up to a degree, a camera that looks to the ground moves it by less than a hundredth of that."""
 LEVEL = 0.05
 """Where heights were not measured the path is taken for level, with this part of its extent as standard deviation."""
-CLOCK_STD = 0.3
-"""Seconds by which two clocks of one device may differ, delays of a receiver included."""
+CLOCK_STD = 0.3  # seconds by which two clocks of one device may differ, delays of a receiver included
 
 
 @dataclass(frozen=True)

@@ -22,12 +22,9 @@ STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
 """Standard deviations of slow noise, in those of white noise; beyond the last one the white noise does not matter."""
 DURATIONS = (0.1, 0.3, 3.0)
 """After these parts of the recording the slow noise is forgotten; the last one is a walk without an end."""
-GATE = 4.0
-"""Standard deviations beyond which a value is wrong: 6e-5 of right ones are. Tried at 4 only."""
-ROUNDS = 20
-"""Rejections until nothing changes; two to four are usual."""
-MAX_RELATIVE_STD = 0.25
-"""Relative standard error from which on a scale is no measurement."""
+GATE = 4.0  # standard deviations beyond which a value is wrong: 6e-5 of right ones are. Tried at 4 only
+ROUNDS = 20  # rejections until nothing changes; two to four are usual
+MAX_RELATIVE_STD = 0.25  # relative standard error from which on a scale is no measurement
 
 
 def slow_correlations(

@@ -44,8 +44,7 @@ COLUMNS = {
     "std_horizontal": Column(("stdhorizontal",), METERS),
     "std_vertical": Column(("stdvertical",), METERS),
 }
-MAX_FIXES = 1_000_000
-"""Maximum number of positions of a file: more than a day at 10 Hz."""
+MAX_FIXES = 1_000_000  # maximum number of positions of a file: more than a day at 10 Hz
 
 
 class Fix(NamedTuple):
@@ -198,8 +197,7 @@ BRACKETS = [
 """`[latitude: 59.30] [longitude: 18.20] [rel_alt: 1.3 abs_alt: 132.9]`, altitudes in the order in which they count."""
 TUPLE = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*(M)?\s*)?\)")
 """`GPS(longitude,latitude,satellites or altitude)`; the Matrice's has latitude first and its altitude ends with M."""
-HEIGHT = re.compile(rf"\b(?:BAROMETER\s*:|H\s)\s*{_NUMBER}")
-"""Height over the start in those lines."""
+HEIGHT = re.compile(rf"\b(?:BAROMETER\s*:|H\s)\s*{_NUMBER}")  # height over the start in those lines
 
 
 def _srt_rows(path: Path) -> Iterator[Fix]:

@@ -16,8 +16,7 @@ from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
 from torchslam.data.text_file import UNIX_UNITS
 from torchslam.errors import SequenceError
 
-MAX_FILES = 1_000_000
-"""Maximum number of files in a folder."""
+MAX_FILES = 1_000_000  # maximum number of files in a folder
 FOLDERS = ("images", "rgb", "image", "color", "colour", "frames", "imgs", "img", "image_0", "image_2")
 """Subfolders that are searched for frames."""
 
@@ -47,10 +46,8 @@ class Found(NamedTuple):
 
 NUMBER = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)|\d+)")
 """A run of digits, or two with a dot between them; more dots separate parts of a version or a date."""
-UNIX_DIGITS = range(9, 11)
-"""Digits of the seconds since 1970, from 1973 to 2286."""
-SHORTEST = 1e-3
-"""Seconds between images, below which decimals in names count something else."""
+UNIX_DIGITS = range(9, 11)  # digits of the seconds since 1970, from 1973 to 2286
+SHORTEST = 1e-3  # seconds between images, below which decimals in names count something else
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:

@@ -27,8 +27,7 @@ from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
 TRANSFORMS = "transforms.json"
-_MAX_BYTES = 1 << 30
-"""Largest model that is read; a frame with 10,000 keypoints takes 240 kB of it."""
+_MAX_BYTES = 1 << 30  # largest model that is read; a frame with 10,000 keypoints takes 240 kB of it
 
 
 @dataclass(frozen=True)

@@ -31,10 +31,8 @@ FOREIGN = frozenset(
 """Suffixes of images that are not read."""
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-MAX_BYTES = 1 << 29
-"""Size limit of image files."""
-MAX_PIXELS = 1 << 26
-"""Maximum number of pixels; a small file may declare any number."""
+MAX_BYTES = 1 << 29  # size limit of image files
+MAX_PIXELS = 1 << 26  # maximum number of pixels; a small file may declare any number
 
 
 def write_image(path: Path, pixels: UInt8[np.ndarray, "H W *channels"]) -> None:
@@ -140,8 +138,7 @@ def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
     return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 
-SAMPLES = 20
-"""Number of images in which the brightest pixel of a 16-bit sequence is searched."""
+SAMPLES = 20  # number of images in which the brightest pixel of a 16-bit sequence is searched
 
 
 def bit_depth(images: Iterable[np.ndarray]) -> int:

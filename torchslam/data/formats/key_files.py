@@ -18,14 +18,11 @@ from torchslam.utils.files import JSON_BYTES, parse_json
 
 Tree = dict[str, Any]
 """Keys to text, lists or trees."""
-MAX_BYTES = 1 << 18
-"""Largest file that is read, but of JSON; those of calibration programs have kilobytes."""
-MAX_DEPTH = 20
-"""Levels of nesting that are read, which bounds the recursion."""
+MAX_BYTES = 1 << 18  # largest file that is read, but of JSON; those of calibration programs have kilobytes
+MAX_DEPTH = 20  # levels of nesting that are read, which bounds the recursion
 MAX_YAML = 1 << 17
 """Characters of YAML, which takes seconds; calibrations with all their image points are smaller."""
-MAX_ALIASES = 20
-"""References to other parts of a file; those of references take exponential time."""
+MAX_ALIASES = 20  # references to other parts of a file; those of references take exponential time
 NOTHING = ("", "none", "null", "~")
 
 

@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-MAX_MESSAGES = 2_000_000
-"""Largest number of images: more than a day at 20 Hz."""
+MAX_MESSAGES = 2_000_000  # largest number of images: more than a day at 20 Hz
 
 # https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them gray.
 GRAY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}

@@ -44,13 +44,11 @@ from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 from torchslam.utils.console import printable
 
-DEFAULT_RATE = 30.0
-"""Frame rate of images without timestamps."""
+DEFAULT_RATE = 30.0  # frame rate of images without timestamps
 SHORTEST, LONGEST = 2e-4, 1e4
 """Seconds from image to image, beyond which times are taken to have another unit: microseconds read as nanoseconds, or
 nanoseconds since the system was started as seconds."""
-ATTEMPTS = 20
-"""Number of unreadable images after which opening a sequence fails."""
+ATTEMPTS = 20  # number of unreadable images after which opening a sequence fails
 
 
 @dataclass(frozen=True)

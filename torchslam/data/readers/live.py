@@ -26,10 +26,8 @@ from torchslam.utils.console import without_credentials
 from torchslam.utils.forks import forget_in_forks, never_release
 
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
-PATIENCE = 15.0
-"""Seconds without a frame after which a stream has ended."""
-STALE = 0.5
-"""Age in seconds above which the frame read on opening is discarded."""
+PATIENCE = 15.0  # seconds without a frame after which a stream has ended
+STALE = 0.5  # age in seconds above which the frame read on opening is discarded
 
 
 class LiveSequence(Sequence):
@@ -191,8 +189,7 @@ class LiveSequence(Sequence):
             self._fresh.notify_all()
 
 
-_SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()
-"""Those that there are; a thread keeps its source."""
+_SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()  # those that there are; a thread keeps its source
 
 
 def close_sources() -> bool:

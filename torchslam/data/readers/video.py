@@ -38,14 +38,10 @@ SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
 )
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
-MAX_FRAMES = 2_000_000
-"""Maximum number of frames: 18 hours at 30 frames per second."""
-QUIET = 2.0
-"""Seconds of decoding before a progress bar appears."""
-MANY = 100
-"""Frames that are skipped with a progress bar."""
-MAX_ASPECT = 4.0
-"""Largest ratio of the sides of a pixel; anamorphic lenses have 2."""
+MAX_FRAMES = 2_000_000  # maximum number of frames: 18 hours at 30 frames per second
+QUIET = 2.0  # seconds of decoding before a progress bar appears
+MANY = 100  # frames that are skipped with a progress bar
+MAX_ASPECT = 4.0  # largest ratio of the sides of a pixel; anamorphic lenses have 2
 _LOCK = threading.Lock()
 
 

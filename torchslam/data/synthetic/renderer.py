@@ -11,15 +11,12 @@ import numpy as np
 
 from torchslam.data.synthetic.scene import MIP_LEVELS, Rectangle
 
-NEAR = 0.05
-"""Meters: what is nearer to the camera is not drawn."""
+NEAR = 0.05  # meters: what is nearer to the camera is not drawn
 ROWS_OF_BOUNDS = 9
 """Rows whose poses bound where a rectangle may be seen, of an image with a pose for each row. Between them the camera
 moves by less than a pixel. Tried at this value only."""
-PADDING = 2
-"""Texels that repeat the border of a texture, so that interpolation does not reach the next one."""
-SHARPNESS = 0.7
-"""Choice of the mip level: 1 takes one texel per pixel; less is sharper, with some aliasing."""
+PADDING = 2  # texels that repeat the border of a texture, so that interpolation does not reach the next one
+SHARPNESS = 0.7  # choice of the mip level: 1 takes one texel per pixel; less is sharper, with some aliasing
 
 
 class Renderer:

@@ -13,13 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-COVERAGE = 0.25
-"""The part of a surface that the largest shapes cover."""
+COVERAGE = 0.25  # the part of a surface that the largest shapes cover
 KINDS = ("polygon", "bar", "ellipse", "letter")
-MIN_CONTRAST = 30
-"""Gray levels between a shape and what is below its center."""
-FRACTION_BITS = 4
-"""Factor of the coordinates of polygons, so that their corners lie off the pixel grid."""
+MIN_CONTRAST = 30  # gray levels between a shape and what is below its center
+FRACTION_BITS = 4  # factor of the coordinates of polygons, so that their corners lie off the pixel grid
 
 
 def surface(
@@ -93,12 +90,9 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
 
 
 Vector = tuple[float, float, float]
-X, Y, Z = np.eye(3)
-"""Axes of the world: right, down, forward."""
-TEXEL = 0.003
-"""Meters: finer than a pixel sees from a meter away."""
-MIP_LEVELS = 6
-"""Sizes a texture is kept at; its sides halve without remainder that often."""
+X, Y, Z = np.eye(3)  # axes of the world: right, down, forward
+TEXEL = 0.003  # meters: finer than a pixel sees from a meter away
+MIP_LEVELS = 6  # sizes a texture is kept at; its sides halve without remainder that often
 
 
 @dataclass(frozen=True)
@@ -182,8 +176,7 @@ ROOMS_HALF, ROOMS_CORE = 3.9, 1.3  # from the center to the outer and the inner 
 ROOMS_DOOR = (-3.4, -1.95)  # begin and end along x
 SIZE_SPREAD, TURN_SPREAD = 0.12, 0.15
 """Furniture is up to that share larger or smaller, and turned by up to that many radians from its place."""
-QUARTER_TURN = np.array(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))
-"""About y, to the right: z becomes x."""
+QUARTER_TURN = np.array(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # about y, to the right: z becomes x
 
 ROOMS_FURNITURE = (
     ((-3.65, 0.95, 1.0), (0.4, 0.9, 0.9), 0.0),  # along the wall to the left: a chest with a box on it, ...

@@ -27,10 +27,8 @@ from torchslam.types import Trajectory
 FRAME_RATE = 20.0  # frames per second
 SIZE = (640, 480)  # width and height of the images, pixels
 FOCAL = 500.0  # pixels: 65 degrees over the width
-RADIUS = 2.87
-"""Meters: the length of the walk around the core by 2 pi."""
-OUTWARD = 0.5
-"""Radians from the heading to where the camera looks."""
+RADIUS = 2.87  # meters: the length of the walk around the core by 2 pi
+OUTWARD = 0.5  # radians from the heading to where the camera looks
 HARMONICS = ((1, 0.98444), (-3, -0.04134), (5, -0.02481), (-7, -0.00111), (9, 0.00086))
 """Fourier series of the integral of exp(i (phase - sin(4 phase) / 4)): orders 1 - 4 n,
 weights J_n(1 / 4) / (1 - 4 n)."""

@@ -25,8 +25,7 @@ from torchslam.geometry.transforms import corner_camera, corner_pixels, quaterni
 from torchslam.io.export.ply import write_cloud
 from torchslam.io.export.scene import ExportedScene, Images, write_images
 
-CAMERA_ID = 1
-"""Number of the one camera; COLMAP counts from 1."""
+CAMERA_ID = 1  # number of the one camera; COLMAP counts from 1
 MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 """COLMAP's numbers of camera models (src/colmap/sensor/models.h)."""
 

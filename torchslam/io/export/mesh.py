@@ -22,8 +22,7 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, se3_inverse, transform
 from torchslam.io.export.scene import Images
 
-MIN_CONFIDENCE = 0.5
-"""Depth of less confidence is left out."""
+MIN_CONFIDENCE = 0.5  # depth of less confidence is left out
 VOXEL_PX = 2.0
 """Least width of a voxel in pixels at the median depth: what is finer, a depth map does not show."""
 DEPTH_STD = 0.01
