@@ -84,8 +84,7 @@ class InertialCalibration:
 
     Attributes:
         T_bc: camera to body, meters; None: neither the rotation nor the lever arm is known.
-        gyroscope_density: white noise of the gyroscope, rad/s/sqrt(Hz).
-        accelerometer_density: white noise of the accelerometer, m/s^2/sqrt(Hz).
+        gyroscope_density, accelerometer_density: white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
         offset: seconds to add to times of the camera for those of the sensor, as far as they are known.
     """
 

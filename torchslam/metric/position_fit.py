@@ -60,11 +60,9 @@ class PositionFit:
 
 @dataclass(frozen=True)
 class PositionPairs:
-    """N positions of the camera in the map and as they were measured.
+    """N positions of the camera at ascending seconds, in the map and as they were measured.
 
     Attributes:
-        times: seconds, ascending.
-        positions_w: in the map.
         velocities_w: units of the map per second, zero where the times of both are the same by construction.
         positions_e: as measured, meters: east, north, up.
         std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.

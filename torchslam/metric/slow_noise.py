@@ -92,12 +92,9 @@ class SlowMean(NamedTuple):
 
 
 def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Float[Tensor, " N"]) -> SlowMean:
-    """The mean of a series with white and slow noise, up to half of it wrong.
+    """The mean of three or more values at ascending times with white and slow noise, up to half of them wrong.
 
-    Args:
-        times: ascending.
-        values: three or more.
-        stds: relative to each other.
+    Standard deviations are relative to each other.
     """
 
     def inliers_of(mean: Tensor) -> Tensor:
