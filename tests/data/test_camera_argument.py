@@ -13,7 +13,6 @@ from PIL import Image
 
 from torchslam.data import Calibrated, open_sequence, parse_camera, read_calibration
 from torchslam.data.calibration import PRESETS, size_text
-from torchslam.data.formats.calibration_files import EXIF_BLOCK, FOCAL_LENGTH_35MM
 from torchslam.errors import CalibrationError
 
 VGA = (640, 480)
@@ -99,7 +98,7 @@ def test_presets_are_those_of_the_sequences(data_dir: Path, preset: str, folder:
 def test_exif(tmp_path: Path) -> None:
     """28 mm on a 3:2 image, 36 mm wide on film, is 28/36 of the width."""
     exif = Image.Exif()
-    exif.get_ifd(EXIF_BLOCK)[FOCAL_LENGTH_35MM] = 28
+    exif.get_ifd(0x8769)[0xA405] = 28  # focal length, 35 mm film
     noise = np.random.default_rng(0).integers(0, 255, (64, 96), np.uint8)
     for index in range(2):
         Image.fromarray(noise).save(tmp_path / f"{index}.jpg", exif=exif)

@@ -115,20 +115,20 @@ def _entries(**entries: bytes) -> bytes:
 
 def test_download_unpack_open(server: Server, archive: bytes, tmp_path: Path) -> None:
     server.files["/plant_1_mono.zip"] = archive
-    folder = download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+    folder = download("eth3d/plant_1", tmp_path / "data", server.url)
     assert folder == tmp_path / "data" / "plant_1"
     sequence = open_sequence(folder)
     assert (len(sequence), sequence.size) == (3, (64, 48))
     assert sequence[2].T_cw_groundtruth is not None
     assert [path.name for path in folder.parent.iterdir()] == ["plant_1"]  # nothing left over
-    assert download("eth3d/plant_1", tmp_path / "data", server.url, progress=False) == folder
+    assert download("eth3d/plant_1", tmp_path / "data", server.url) == folder
     assert server.requests == [None]  # not fetched again
 
 
 def test_a_broken_transfer_resumes_in_the_same_call(server: Server, archive: bytes, tmp_path: Path) -> None:
     server.files["/plant_1_mono.zip"] = archive
     server.cut, server.cuts_left = 1000, 2
-    folder = download("eth3d/plant_1", tmp_path, server.url, progress=False)
+    folder = download("eth3d/plant_1", tmp_path, server.url)
     assert server.requests == [None, "bytes=1000-", "bytes=2000-"]
     assert len(open_sequence(folder)) == 3
 
@@ -137,10 +137,10 @@ def test_a_broken_transfer_resumes_in_the_next_call(server: Server, archive: byt
     server.files["/plant_1_mono.zip"] = archive
     server.cut, server.cuts_left = 500, 5
     with pytest.raises(DownloadError, match=rf"broke off after 2500 of {len(archive)} bytes; run the same"):
-        download("eth3d/plant_1", tmp_path, server.url, progress=False)
+        download("eth3d/plant_1", tmp_path, server.url)
     assert (tmp_path / "plant_1_mono.zip.part").stat().st_size == 2500
     assert not (tmp_path / "plant_1").exists()
-    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url))) == 3
     assert server.requests[-1] == "bytes=2500-"
 
 
@@ -152,7 +152,7 @@ def test_leftovers_are_resumed_used_or_discarded(
     server.ranges = not left.startswith("a part")
     part = {"a": archive[:700], "all": archive, "more": archive + b"more"}[left.split()[0]]
     (tmp_path / "plant_1_mono.zip.part").write_bytes(part)
-    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url, progress=False))) == 3
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path, server.url))) == 3
 
 
 def test_checksum(server: Server, archive: bytes, tmp_path: Path) -> None:
@@ -163,11 +163,9 @@ def test_checksum(server: Server, archive: bytes, tmp_path: Path) -> None:
         ("12", "64 hexa"),
     ):
         with pytest.raises(DownloadError, match=message):
-            download("eth3d/plant_1", tmp_path / "data", server.url, progress=False, sha256=wrong)
+            download("eth3d/plant_1", tmp_path / "data", server.url, sha256=wrong)
         assert list((tmp_path / "data").iterdir()) == []
-    assert download(
-        "eth3d/plant_1", tmp_path / "data", server.url, progress=False, sha256=digest.upper()
-    ).is_dir()
+    assert download("eth3d/plant_1", tmp_path / "data", server.url, sha256=digest.upper()).is_dir()
 
 
 def test_the_size_of_a_download_is_bounded(
@@ -180,7 +178,7 @@ def test_the_size_of_a_download_is_bounded(
         with pytest.raises(
             DownloadError, match=f"more than {len(archive) - 1} bytes, the most that is fetched"
         ):
-            download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+            download("eth3d/plant_1", tmp_path / "data", server.url)
         assert not (tmp_path / "data" / "plant_1").exists()
 
 
@@ -192,7 +190,7 @@ def test_a_slow_body_times_out(
     monkeypatch.setattr(downloads, "TIMEOUT", 0.1)
     monkeypatch.setattr(downloads, "ATTEMPTS", 1)
     with pytest.raises(DownloadError, match="slower than 4096 bytes a second; run the same command again"):
-        download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+        download("eth3d/plant_1", tmp_path / "data", server.url)
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
@@ -217,7 +215,7 @@ def test_a_full_disk_is_reported_as_such(
     server.files["/plant_1_mono.zip"] = archive
     monkeypatch.setattr(downloads, "MARGIN", 1 << 62)
     with pytest.raises(DownloadError, match="do not fit into"):
-        download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+        download("eth3d/plant_1", tmp_path / "data", server.url)
     assert [path.name for path in (tmp_path / "data").iterdir()] == ["plant_1_mono.zip"]
 
 
@@ -235,12 +233,12 @@ def test_archive_entries_without_a_name_are_refused(tmp_path: Path) -> None:
 
 def test_unknown_names(server: Server, tmp_path: Path) -> None:
     with pytest.raises(DownloadError, match="404"):
-        download("eth3d/nothing", tmp_path, server.url, progress=False)
+        download("eth3d/nothing", tmp_path, server.url)
     with pytest.raises(DownloadError, match="run the same command again"):
-        download("eth3d/plant_1", tmp_path, "http://127.0.0.1:9", progress=False)  # no server
+        download("eth3d/plant_1", tmp_path, "http://127.0.0.1:9")  # no server
     for name in ("plant_1", "tum/desk", "eth3d/../up", "eth3d/"):
         with pytest.raises(DownloadError, match="unknown name"):
-            download(name, tmp_path, server.url, progress=False)
+            download(name, tmp_path, server.url)
 
 
 def test_damaged_archive_leaves_nothing(server: Server, archive: bytes, tmp_path: Path) -> None:
@@ -249,10 +247,10 @@ def test_damaged_archive_leaves_nothing(server: Server, archive: bytes, tmp_path
     for content in (bytes(damaged), b"<html>sorry</html>"):
         server.files["/plant_1_mono.zip"] = content
         with pytest.raises(DownloadError, match=r"plant_1_mono\.zip: not a zip archive.* it was deleted"):
-            download("eth3d/plant_1", tmp_path / "data", server.url, progress=False)
+            download("eth3d/plant_1", tmp_path / "data", server.url)
         assert list((tmp_path / "data").iterdir()) == []
     server.files["/plant_1_mono.zip"] = archive  # nothing is in the way of a whole one
-    assert len(open_sequence(download("eth3d/plant_1", tmp_path / "data", server.url, progress=False))) == 3
+    assert len(open_sequence(download("eth3d/plant_1", tmp_path / "data", server.url))) == 3
 
 
 @pytest.mark.parametrize(

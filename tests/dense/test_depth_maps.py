@@ -67,8 +67,8 @@ def test_joined_parts_have_the_bytes_of_a_whole(tmp_path: Path) -> None:
     for path, some in zip(parts, rows, strict=True):
         fields = ("frame_index", "depth", "normal", "confidence", "T_cw")
         replace(whole, **{name: getattr(whole, name)[some] for name in fields}).save(path)
-    join(tmp_path / "joined", parts, {"a": 1})
-    whole.save(tmp_path / "whole", {"a": 1})
+    join(tmp_path / "joined", parts)
+    whole.save(tmp_path / "whole")
     assert (tmp_path / "joined").read_bytes() == (tmp_path / "whole").read_bytes()
     blocks = list(DepthMaps.blocks(tmp_path / "joined", 2))
     assert [len(block) for block in blocks] == [2, 2, 1]

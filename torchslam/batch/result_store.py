@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import torchslam
+from torchslam.data.formats.frame_names import MAX_FILES
 from torchslam.data.synthetic import is_synthetic
 from torchslam.data.text_file import read_object
 from torchslam.errors import ResultsError, SequenceError, TorchslamError
@@ -52,8 +53,7 @@ def run_or_reuse(
         work: Writes into a temporary folder, which is moved into place when complete, and returns JSON columns.
         overwrite: Replace results with other fingerprints; otherwise they are an error.
 
-    Returns:
-        The columns, with `is_new` for whether the work was done now.
+    Returns the columns, with `is_new` for whether the work was done now.
     """
     known: Columns = {"name": name, "configuration": ""}
     place = output / RUNS / name
@@ -120,10 +120,7 @@ def _describe(error: Exception) -> str:
     return f"{type(error).__name__}: {text[:1000]} ({Path(place.filename).name}:{place.lineno})"
 
 
-MAX_FILES = 1_000_000
-"""Below the path of a sequence; a folder with more is not a sequence."""
-DIGITS = 16
-"""Hexadecimal digits of a hash."""
+DIGITS = 16  # hexadecimal, of a hash
 
 
 @cache

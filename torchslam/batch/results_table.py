@@ -35,8 +35,7 @@ COLUMNS: dict[str, type] = {
     "camera": str,
     "configuration": str,
 }
-LARGEST = 1 << 62
-"""Of a value: larger ones are invalid."""
+LARGEST = 1 << 62  # of a value: larger ones are invalid
 TIME_COLUMNS: dict[str, type] = {"name": str, **dict.fromkeys(("cpu_s", "fps", "ms_median", "ms_p95"), float)}
 
 
@@ -46,7 +45,12 @@ def write_table(tasks: Sequence[Task], output: Path) -> list[Columns]:
     Unfinished rows have the status `open`. Each process reads all results again after writing, so the table is complete
     in the end whichever process writes last. Raises ResultsError for damaged times of a run.
     """
-    configurations = [_configuration(task) for task in tasks]
+    configurations = []
+    for task in tasks:
+        try:
+            configurations.append(configuration(task))
+        except TorchslamError:
+            configurations.append("")  # the row reports the error
     rows: list[Columns] | None = None
     while (found := collect_rows(tasks, configurations, output)) != rows:
         rows = found
@@ -80,13 +84,6 @@ def collect_rows(tasks: Sequence[Task], configurations: Sequence[str], output: P
         record |= {"name": name, "sequence": without_credentials(task.row.sequence)}
         rows.append({column: _typed(record.get(column), kind) for column, kind in COLUMNS.items()})
     return rows
-
-
-def _configuration(task: Task) -> str:
-    try:
-        return configuration(task)
-    except TorchslamError:
-        return ""  # the row reports the error
 
 
 def _typed(value: object, kind: type) -> Any:

@@ -17,10 +17,8 @@ from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, pars
 from torchslam.errors import ConfigError, SequenceError
 from torchslam.utils.console import without_credentials
 
-MAX_BYTES = 1 << 26
-"""Of a list: about half a million rows of a hundred characters."""
-MAX_NAME = 100
-"""Characters of a name; folders are named by it."""
+MAX_BYTES = 1 << 26  # of a list: about half a million rows of a hundred characters
+MAX_NAME = 100  # characters of a name; folders are named by it
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+=-]*")
 
 
@@ -70,10 +68,7 @@ def read_list(path: str | Path) -> list[Row]:
     """Read a list: a CSV file with a header of `COLUMNS`, or a text file with a path per line and `#` for comments.
 
     Paths are relative to the folder of the list. A row without a name is named by the last part of its path, with a
-    number if that is taken.
-
-    Raises:
-        SequenceError: The list is not valid; the message has file and line.
+    number if that is taken. Raises SequenceError if the list is not valid; the message has file and line.
     """
     path = Path(path)
     if path.suffix.lower() == ".csv":
@@ -94,8 +89,7 @@ def read_list(path: str | Path) -> list[Row]:
 def assign_names(rows: Iterable[Row], where: str = "rows") -> list[Row]:
     """Give each row without a name a unique one.
 
-    Raises:
-        SequenceError: Two rows have the same name; `where` is in the message.
+    Raises SequenceError if two rows have the same name; `where` is in the message.
     """
     rows = list(rows)
     # Folders that differ only in case are the same on some systems.

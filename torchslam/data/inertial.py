@@ -24,36 +24,32 @@ from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.geometry.lie import rigid, se3_inverse
 
 AXES = ("x", "y", "z")
-GYROSCOPES = ("wrss", "gyro", "gyroscope", "gyr", "g", "w", "omega", "angularvelocity", "rotationrate")
-ACCELEROMETERS = ("arss", "acc", "accel", "accelerometer", "acceleration", "a", "linearacceleration")
-"""Names of columns without their axis, in lower case, letters alone."""
-RATE_UNITS = {
-    **dict.fromkeys(("rads", "radsec", "rads1", "rad"), 1.0),
-    **dict.fromkeys(("degs", "degsec", "degs1", "deg", "dps", "°s"), np.pi / 180),
-}
-"""Units of rates by their letters and digits, in rad/s."""
 STANDARD_GRAVITY = 9.80665
 """m/s^2, of which accelerometers in g count multiples, by definition (3rd CGPM, 1901)."""
-FORCE_UNITS = {
-    **dict.fromkeys(("ms2", "mss", "msec2"), 1.0),
-    "g": STANDARD_GRAVITY,
-    "mg": 1e-3 * STANDARD_GRAVITY,
+SENSORS = {
+    "gyro": (
+        ("wrss", "gyro", "gyroscope", "gyr", "g", "w", "omega", "angularvelocity", "rotationrate"),
+        dict.fromkeys(("rads", "radsec", "rads1", "rad"), 1.0)
+        | dict.fromkeys(("degs", "degsec", "degs1", "deg", "dps", "°s"), np.pi / 180),
+    ),
+    "acc": (
+        ("arss", "acc", "accel", "accelerometer", "acceleration", "a", "linearacceleration"),
+        dict.fromkeys(("ms2", "mss", "msec2"), 1.0) | {"g": STANDARD_GRAVITY, "mg": 1e-3 * STANDARD_GRAVITY},
+    ),
 }
-"""Units by their letters and digits, in m/s^2."""
+"""Names of columns without their axis, in lower case, letters alone; and their units, in rad/s and m/s^2."""
 COLUMNS = {
     "time": Column(("timestamp", "time", "t", "secondselapsed", "elapsed", "seconds"), TIME_UNITS),
-    **{f"gyro_{axis}": Column(tuple(word + axis for word in GYROSCOPES), RATE_UNITS) for axis in AXES},
-    **{f"acc_{axis}": Column(tuple(word + axis for word in ACCELEROMETERS), FORCE_UNITS) for axis in AXES},
+    **{
+        f"{kind}_{axis}": Column(tuple(word + axis for word in words), units)
+        for kind, (words, units) in SENSORS.items()
+        for axis in AXES
+    },
 }
-"""Kinds of columns."""
 SHORTEST_PERIOD = 2e-4
 """Seconds; with a thousand times of it, 0.2 s, one unit of time alone is possible. Sensors have 1e-3 to 0.1 s."""
 FORCE_RANGE = (7.0, 13.0)
 """m/s^2, of the median length of forces: gravity, with the worst bias and shaking. Tried on drones and at rest: 9.8."""
-FASTEST = 100.0
-"""rad/s, the fastest turn that is believed; the range of usual gyroscopes ends at 35."""
-LONGEST_LEVER = 10.0
-"""Meters between camera and sensor; more is a mistake of units."""
 # Keys in lower case, letters and digits alone.
 T_CAMERA_TO_BODY = ("tbscam0", "timucam", "bodytcam0", "imutbc1", "imutbc", "tbc1", "tbc", "tbs")
 T_BODY_TO_CAMERA = ("tcamimu", "tic", "tcb")
@@ -65,13 +61,9 @@ DENSITIES = {
 
 @dataclass(frozen=True)
 class InertialSamples:
-    """What an inertial sensor measures, in its own frame, which is called the body's.
+    """What an inertial sensor measures in its own frame, which is called the body's, at strictly increasing seconds.
 
-    Attributes:
-        timestamps: seconds, strictly increasing.
-        gyroscope: angular rates, rad/s.
-        accelerometer: specific forces, m/s^2; at rest they point up.
-        source: the file, for messages.
+    Angular rates are in rad/s; specific forces, which point up at rest, in m/s^2.
     """
 
     timestamps: Float[Tensor, " M"]
@@ -92,8 +84,7 @@ class InertialCalibration:
 
     Attributes:
         T_bc: camera to body, meters; None: neither the rotation nor the lever arm is known.
-        gyroscope_density: white noise of the gyroscope, rad/s/sqrt(Hz).
-        accelerometer_density: white noise of the accelerometer, m/s^2/sqrt(Hz).
+        gyroscope_density, accelerometer_density: white noise, rad/s/sqrt(Hz) and m/s^2/sqrt(Hz).
         offset: seconds to add to times of the camera for those of the sensor, as far as they are known.
     """
 
@@ -109,14 +100,10 @@ class InertialCalibration:
 
 
 def read_imu(path: str | Path) -> InertialSamples:
-    """Read the samples of an inertial sensor.
+    """Read the samples of an inertial sensor from a CSV with a header, or a folder with a `data.csv` (EuRoC's `imu0`).
 
-    Args:
-        path: a CSV with a header, or a folder with a `data.csv`, such as EuRoC's `imu0`.
-
-    Raises:
-        MeasurementError: naming the file and, where it has one, the line: unknown columns or units, times that do not
-            increase, no gravity in the forces.
+    Raises MeasurementError naming the file and, where it has one, the line: for unknown columns or units, times that do
+    not increase, no gravity in the forces.
     """
     path = Path(path) / "data.csv" if Path(path).is_dir() else Path(path)
     places, rows, units = list[str](), list[list[float]](), dict[str, float]()
@@ -126,7 +113,7 @@ def read_imu(path: str | Path) -> InertialSamples:
         rows.append([row.number(column) for column in COLUMNS])
     if len(rows) < 2:
         raise MeasurementError(f"{path}: {len(rows)} samples; at least two are needed")
-    for kind in ("gyro", "acc"):
+    for kind in SENSORS:
         if len({str(units[f"{kind}_{axis}"]) for axis in AXES}) > 1:
             raise MeasurementError(f"{path}: the axes of a sensor have different units")
     table = np.array(rows)
@@ -137,9 +124,16 @@ def read_imu(path: str | Path) -> InertialSamples:
     late = np.nonzero(periods <= 0)[0]
     if len(late):
         raise MeasurementError(f"{places[late[0] + 1]}: the sample is not later than the one before")
-    unit = _unit_of_times(float(np.median(periods)), path) if math.isnan(units["time"]) else 1.0
+    period, unit = float(np.median(periods)), 1.0
+    if math.isnan(units["time"]):  # the one with which samples come at the rate of a sensor
+        possible = [u for u in TIME_UNITS.values() if SHORTEST_PERIOD <= period * u < 1e3 * SHORTEST_PERIOD]
+        if not possible:
+            raise MeasurementError(
+                f"{path}: times are {period:g} apart, in no unit that a sensor has; write time [ms], for instance"
+            )
+        unit = min(possible)
     gyroscope, accelerometer = table[:, 1:4], table[:, 4:]
-    if np.abs(gyroscope).max() > FASTEST:
+    if np.abs(gyroscope).max() > 100:  # the range of usual gyroscopes ends at 35 rad/s
         raise MeasurementError(
             f"{path}: a rate of {np.abs(gyroscope).max():.0f} rad/s is too fast; state the unit, as in gyro_x [deg/s]"
         )
@@ -152,26 +146,12 @@ def read_imu(path: str | Path) -> InertialSamples:
     return InertialSamples(float64(table[:, 0] * unit), float64(gyroscope), float64(accelerometer), str(path))
 
 
-def _unit_of_times(period: float, path: Path) -> float:
-    """The unit with which samples come at the rate of a sensor."""
-    for unit in sorted(set(TIME_UNITS.values())):
-        if SHORTEST_PERIOD <= period * unit < 1e3 * SHORTEST_PERIOD:
-            return unit
-    raise MeasurementError(
-        f"{path}: times are {period:g} apart, in no unit that a sensor has; write time [ms], for instance"
-    )
-
-
 def read_inertial_calibration(path: str | Path | None, imu: str | Path | None = None) -> InertialCalibration:
     """Read how a sensor is mounted on the camera, and its noise.
 
-    Args:
-        path: Kalibr's camchain-imucam, EuRoC's sensor.yaml of the camera, or ORB-SLAM3's or VINS' settings; None: the
-            mounting is unknown.
-        imu: the file or folder of the samples, beside which a sensor.yaml or imu.yaml may have the noise.
-
-    Raises:
-        MeasurementError: no mounting in it, or one that is no rigid transformation in meters.
+    Files are Kalibr's camchain-imucam, EuRoC's sensor.yaml of the camera, or ORB-SLAM3's or VINS' settings; None leaves
+    the mounting unknown. Beside the file or folder of the samples, a sensor.yaml or imu.yaml may have the noise. Raises
+    MeasurementError for no mounting in the file, or one that is no rigid transformation in meters.
     """
     T_bc, offset = None, 0.0
     densities: dict[str, float] = {}
@@ -183,10 +163,8 @@ def read_inertial_calibration(path: str | Path | None, imu: str | Path | None = 
             densities = _densities(keys)
         if imu is not None and not densities:
             folder = Path(imu) if Path(imu).is_dir() else Path(imu).parent
-            beside = next(
-                (file for file in (folder / "sensor.yaml", folder / "imu.yaml") if file.is_file()), None
-            )
-            densities = _densities(list(read_keys(beside))) if beside is not None else {}
+            beside = [file for file in (folder / "sensor.yaml", folder / "imu.yaml") if file.is_file()]
+            densities = _densities(list(read_keys(beside[0]))) if beside else {}
     except CalibrationError as error:
         raise MeasurementError(str(error)) from error
     return InertialCalibration(T_bc, offset=offset, **densities)
@@ -230,7 +208,7 @@ def _rigid(numbers: list[float], path: Path) -> Float[Tensor, "4 4"]:
     is_rotation = float(orthogonality_error(R)) <= ORTHOGONAL and float(torch.linalg.det(R)) > 0
     if not is_rotation or T[3].tolist() != [0, 0, 0, 1]:
         raise MeasurementError(f"{path}: the transformation between camera and body is not rigid")
-    if lever > LONGEST_LEVER:
+    if lever > 10:
         raise MeasurementError(f"{path}: {lever:g} m between camera and body; is it in meters?")
     U, _, Vh = torch.linalg.svd(R)
     return rigid(U @ Vh, T[:3, 3])

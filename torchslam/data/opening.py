@@ -102,13 +102,10 @@ def _open(path: str, camera: GivenCamera | None, rate: float | None, needed: Nee
     reader = find_reader(path)
     if reader is None:
         raise SequenceError(_not_found_message(path))
-    if reader.open_needed is not None:
-        return reader.open_needed(path, camera, rate, needed)
-    return reader.open(path, camera, rate)
+    return reader.open(path, camera, rate, *((needed,) if reader.takes_need else ()))
 
 
 def _is_archive(path: str) -> bool:
-    """True for a file with the suffix of a zip archive."""
     return Path(path).suffix.lower() == ".zip" and Path(path).is_file()
 
 
@@ -159,12 +156,7 @@ def _only_sequence(archive: Path, folder: Path) -> str:
     raise SequenceError(f"{archive}: {what}")
 
 
-MAX_ENTRIES = 10_000
-"""Maximum number of folder entries searched for suggestions."""
-MAX_FOLDERS = 200
-"""Maximum number of subfolders searched for suggestions."""
-SHOWN = 6
-"""Names in a message, which stays short."""
+SHOWN = 6  # names in a message, which stays short
 
 
 def _not_found_message(path: str) -> str:
@@ -191,7 +183,7 @@ def _not_found_message(path: str) -> str:
 def _why_no_folder(folder: Path) -> str:
     entries = _entries(folder)
     files = [entry for entry in entries if entry.is_file()]
-    folders = [entry for entry in entries if entry.is_dir() and not entry.name.startswith(".")][:MAX_FOLDERS]
+    folders = [entry for entry in entries if entry.is_dir() and not entry.name.startswith(".")][:200]
     images = [file for file in files if file.suffix.lower() in SUFFIXES | FOREIGN]
     below = [entry for entry in folders if find_reader(str(entry))]
     readable = [file for file in files if find_reader(str(file)) or _is_archive(str(file))]
@@ -230,6 +222,6 @@ def _meant(proposals: list[Path]) -> str:
 
 def _entries(folder: Path) -> list[Path]:
     try:
-        return sorted(itertools.islice(folder.iterdir(), MAX_ENTRIES))
+        return sorted(itertools.islice(folder.iterdir(), 10_000))
     except OSError:  # an unreadable folder gives no suggestions
         return []

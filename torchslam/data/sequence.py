@@ -31,8 +31,7 @@ def exhaust(times: Iterable[float]) -> None:
         pass
 
 
-GROUNDTRUTH_TOLERANCE = 0.02
-"""Maximum time in seconds between an image and its ground-truth pose."""
+GROUNDTRUTH_TOLERANCE = 0.02  # maximum time in seconds between an image and its ground-truth pose
 
 
 class EndOfSequence(IndexError):
@@ -280,7 +279,9 @@ class Sequence(ABC):
     def describe(self) -> dict[str, str]:
         """Return the rows that `torchslam info` prints."""
         about = {"name": self.name, "kind": self.kind}
-        seen = {"size": self._describe_size(), "camera": self._describe_camera()}
+        aspect = aspect_text(self.pixel_aspect)
+        of_pixels = "" if aspect == "1:1" else f", pixels of {aspect}, wide to high"
+        seen = {"size": f"{size_text(self.size)}{of_pixels}", "camera": self._describe_camera()}
         if self.is_live:
             return about | {"frames": "as they come"} | seen
         duration = float(self.timestamps[-1] - self.timestamps[0])
@@ -292,11 +293,6 @@ class Sequence(ABC):
         rate = f"{self.frame_rate:.2f} Hz over {duration:.2f} s"
         frames = {"frames": str(len(self)), "size": seen["size"], "rate": rate}
         return about | frames | seen | {"ground truth": truth}
-
-    def _describe_size(self) -> str:
-        aspect = aspect_text(self.pixel_aspect)
-        of_pixels = "" if aspect == "1:1" else f", pixels of {aspect}, wide to high"
-        return f"{self.size[0]}x{self.size[1]}{of_pixels}"
 
     def _describe_camera(self) -> str:
         if self._camera is None:
@@ -417,11 +413,11 @@ class Reader(NamedTuple):
         matches: whether a path is of this kind.
         open: opens a path; the arguments are the path, the camera that overrides its own, and the frame rate for kinds
             without timestamps. Raises SequenceError, CalibrationError or TrajectoryError, naming file and line.
-        open_needed: as `open`, for kinds whose times take long to find; the last argument takes them as far as they are
-            needed, and later frames are left out.
+        takes_need: whether `open` takes a fourth argument, a `Need`, since the times take long to find; later frames
+            are left out.
     """
 
     looks_for: str
     matches: Callable[[str], bool]
-    open: Callable[[str, GivenCamera | None, float | None], Sequence]
-    open_needed: Callable[[str, GivenCamera | None, float | None, Need], Sequence] | None = None
+    open: Callable[..., Sequence]
+    takes_need: bool = False

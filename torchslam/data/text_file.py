@@ -20,19 +20,11 @@ from torch import Tensor
 from torchslam.errors import TorchslamError
 from torchslam.utils import files
 
-MAX_BYTES = 1 << 27
-"""Size limit of text files; a million poses are smaller."""
+MAX_BYTES = 1 << 27  # size limit of text files; a million poses are smaller
 UNIX_UNITS = {13: 10**3, 16: 10**6, 19: 10**9}
 """Parts of a second that a number with this many digits counts since 1970, from 2001 to 2286."""
-MAX_SECONDS = 1e11
-"""The year 5138."""
-MAX_LINE = 1 << 16
-"""Maximum length of a line of numbers."""
-
-LEAP_SECONDS = (
-    (1999, 1, 13), (2006, 1, 14), (2009, 1, 15), (2012, 7, 16), (2015, 7, 17), (2017, 1, 18),
-)  # fmt: skip
-"""From a year and month on, seconds by which GPS time is ahead of UTC (IERS Bulletin C; none since 2017)."""
+MAX_SECONDS = 1e11  # the year 5138
+MAX_LINE = 1 << 16  # maximum length of a line of numbers
 
 
 def float64(values: Any) -> Tensor:
@@ -164,7 +156,9 @@ def check_rising(times: Sequence[float], places: Sequence[str], error: type[Torc
 def utc_from_gps(seconds: float) -> float:
     """Seconds since 1970, UTC, of seconds of GPS time since 1980."""
     unix = seconds + 315964800  # the beginning of GPS time, 1980-01-06 (IS-GPS-200)
-    starts = ((datetime.datetime(y, m, 1, tzinfo=datetime.UTC).timestamp(), s) for y, m, s in LEAP_SECONDS)
+    # From a year and month on, seconds by which GPS time is ahead (IERS Bulletin C; none since 2017).
+    leaps = ((1999, 1, 13), (2006, 1, 14), (2009, 1, 15), (2012, 7, 16), (2015, 7, 17), (2017, 1, 18))
+    starts = ((datetime.datetime(y, m, 1, tzinfo=datetime.UTC).timestamp(), s) for y, m, s in leaps)
     return unix - max((leap for start, leap in starts if unix - leap >= start), default=0)
 
 
@@ -210,8 +204,7 @@ class Column(NamedTuple):
         return None
 
 
-TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}
-"""Factors to seconds."""
+TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}  # factors to seconds
 TIMES = {
     "time": Column(("time", "timestamp", "t"), TIME_UNITS),
     "gps_time": Column(("gpstime",), TIME_UNITS),
@@ -221,13 +214,11 @@ TIMES = {
 
 @dataclass(frozen=True)
 class Row:
-    """A line of a table.
+    """A line of a table at a file and line; the error is raised for a wrong cell.
 
     Attributes:
-        where: file and line, for messages.
         cells: text of each known column that is not empty.
         units: of each known column in the header, the factor of its unit; NaN without a unit.
-        error: what is raised for a wrong cell.
     """
 
     where: str

@@ -15,11 +15,8 @@ from torchslam.geometry.lie import matrix_from_quaternion, quaternion_from_matri
 from torchslam.types import Trajectory
 
 ORTHOGONAL = 0.05
-"""Tolerated deviation of R R^T from the identity; some files have few digits."""
-UNIT_LENGTH = 0.05
-"""Tolerated deviation of the length of a quaternion from one."""
-FARTHEST = 1e12
-"""Maximum coordinate of a position, in meters."""
+"""Tolerated deviation of R R^T from the identity, and of quaternions from length one; some files have few digits."""
+FARTHEST = 1e12  # maximum coordinate of a position, in meters
 COLUMNS = "timestamp tx ty tz qx qy qz qw"
 
 
@@ -41,7 +38,7 @@ def poses_from_rows(rows: Float[Tensor, "N 7"], places: Sequence[str]) -> Float[
     Raises TrajectoryError, at the place of the row, for a quaternion far from unit length, and as `checked_poses`.
     """
     lengths = rows[:, 3:].norm(dim=-1, keepdim=True)
-    _check((lengths[:, 0] - 1).abs() <= UNIT_LENGTH, places, "a quaternion does not have unit length")
+    _check((lengths[:, 0] - 1).abs() <= ORTHOGONAL, places, "a quaternion does not have unit length")
     return checked_poses(rigid(matrix_from_quaternion(rows[:, 3:] / lengths), rows[:, :3]), places)
 
 
@@ -83,12 +80,7 @@ def nearest(
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, " N"]]:
     """Find the nearest reference time of each timestamp; of two equally near ones, the earlier.
 
-    Args:
-        timestamps: seconds.
-        reference: seconds, sorted, at least one.
-
-    Returns:
-        Indices into `reference`, and distances in seconds.
+    `reference` is sorted and not empty. Returns indices into it, and distances, seconds.
     """
     right = _next(timestamps, reference)
     left = (right - 1).clamp(min=0)
@@ -101,13 +93,7 @@ def interpolate_poses(
 ) -> tuple[Float[Tensor, "N 4 4"], Bool[Tensor, " N"]]:
     """Interpolate a trajectory along the geodesic between the two neighboring poses; constant beyond its ends.
 
-    Args:
-        trajectory: the poses.
-        timestamps: seconds.
-        tolerance: seconds to the nearest pose up to which the result is valid.
-
-    Returns:
-        T_wc, finite also where invalid, and validity.
+    Returns T_wc, finite also where invalid, and validity: `tolerance` seconds or less to the nearest pose.
     """
     times = trajectory.timestamps
     _, distances = nearest(timestamps, times)

@@ -23,26 +23,14 @@ from torchslam.errors import FrameError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.types import Trajectory
 
-TOLERANCE = 0.25
-"""Tolerated earliness of a frame when frames are thinned out, as a ratio of the interval."""
-ROUNDING = 5e-7
-"""Seconds by which a time given as text may be later than its frame: it is rounded, and no frame is that short."""
-LOSSY = frozenset({".jpg", ".jpeg"})
+TOLERANCE = 0.25  # tolerated earliness of a frame when frames are thinned out, as a ratio of the interval
 DARK = 32
 """Gray level of 255 below which the darkest pixels of a mask with white ones are meant to be black: 16 in videos."""
-SMALLEST = 32
-"""Minimum width and height in pixels."""
+SMALLEST = 32  # minimum width and height in pixels
 
 
 class Selection(NamedTuple):
-    """Which frames of a sequence are used.
-
-    Attributes:
-        start, stop: first frame and end of the range, as numbers or as times such as `12.5s` and `1:30`.
-        rate: maximum number of frames per second, by their timestamps.
-        limit: maximum number of frames.
-        stride: use every `stride`-th frame.
-    """
+    """Which frames of a sequence are used, as for `open_sequence`; `rate` is by their timestamps."""
 
     start: str | int = 0
     stop: str | int | None = None
@@ -78,12 +66,9 @@ class Selection(NamedTuple):
                     f"{sequence.name}: {what} needs timestamps known in advance, which a live source does not have"
                 )
         last = last if self.limit is None else self.limit * self.stride
-        is_whole = (first, last, self.stride) == (0, None, 1)
-        return (
-            sequence
-            if is_whole
-            else sequence.part(int(first), None if last is None else int(last), self.stride)
-        )
+        if (first, last, self.stride) == (0, None, 1):
+            return sequence
+        return sequence.part(int(first), None if last is None else int(last), self.stride)
 
 
 def _between(times: Iterable[float], begin: int | float, end: int | float) -> Iterator[tuple[int, float]]:
@@ -91,8 +76,9 @@ def _between(times: Iterable[float], begin: int | float, end: int | float) -> It
     first: float | None = None
     for index, time in enumerate(times):
         first = time if first is None else first
+        # A time given as text is rounded, by less than the duration of a frame.
         begun, ended = (
-            time - first >= place - ROUNDING if isinstance(place, float) else index >= place
+            time - first >= place - 5e-7 if isinstance(place, float) else index >= place
             for place in (begin, end)
         )
         if ended:
@@ -231,7 +217,7 @@ class Masked(Transformed):
             raise SequenceError(
                 f"{path}: the mask is in the alpha channel, which is not read: save it as a black and white image"
             )
-        if path.suffix.lower() in LOSSY:  # in which black is not exactly 0
+        if path.suffix.lower() in (".jpg", ".jpeg"):  # in which black is not exactly 0
             return gray > 0.5 * float(gray.max())
         darkest = round(255 * float(gray.min()))
         if 0 < darkest < DARK and gray.max() > 1 - DARK / 255:

@@ -101,17 +101,14 @@ class DepthMaps:
         lengths = self.normal.norm(dim=1)
         for is_wrong, what in (
             (
-                (self.frame_index < 0).any() or (self.frame_index.diff() <= 0).any(),
-                "frame_index: not ascending from 0",
+                (self.frame_index.diff(prepend=self.frame_index.new_tensor([-1])) <= 0),
+                "frame_index: not ascending",
             ),
-            ((self.depth < 0).any(), "depth: negative"),
-            ((self.confidence < 0).any() or (self.confidence > 1).any(), "confidence: not between 0 and 1"),
-            (
-                ((lengths - 1).abs().minimum(lengths) > 1e-3).any(),
-                "normal: neither of unit length nor 0",
-            ),
+            ((self.depth < 0), "depth: negative"),
+            ((self.confidence < 0) | (self.confidence > 1), "confidence: not between 0 and 1"),
+            ((lengths - 1).abs().minimum(lengths) > 1e-3, "normal: neither of unit length nor 0"),
         ):
-            if bool(is_wrong):
+            if bool(is_wrong.any()):
                 raise ValueError(what)
 
 
@@ -134,13 +131,12 @@ def read_about(path: str | Path) -> dict[str, Any]:
         return dict(about["about"])
 
 
-def join(path: str | Path, parts: Sequence[str | Path], about: dict[str, Any] | None = None) -> None:
+def join(path: str | Path, parts: Sequence[str | Path]) -> None:
     """Write the maps of several files, in their order, as one, reading them one at a time.
 
     Args:
         path: the file to write.
         parts: files of `DepthMaps.save`, of one camera and size; at least one.
-        about: as for `save`.
 
     Raises:
         ResultsError: a part is missing or damaged, or has another camera.
@@ -162,7 +158,7 @@ def join(path: str | Path, parts: Sequence[str | Path], about: dict[str, Any] | 
             with _opened(part) as (file, _):
                 yield file.get_tensor(name)
 
-    write_whole(path, _content(shapes, rows, camera, about or {}))
+    write_whole(path, _content(shapes, rows, camera, {}))
 
 
 def _content(

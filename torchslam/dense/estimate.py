@@ -33,8 +33,8 @@ REFINEMENT = 0.5
 """Step at full size, in steps at half size."""
 BEST_VIEWS = 3
 """Views that must match; the others may not see the surface."""
-HALF_RADIUS, FULL_RADIUS = 3, 3
-"""Radii of the windows, pixels."""
+RADIUS = 3
+"""Of the windows, pixels."""
 BEST_ANGLE_DEG = 5.0
 """Parallax that is sought: less makes depth imprecise, more makes windows look different (MVSNet, Yao 2018)."""
 BELOW_DEG, ABOVE_DEG = 1.0, 10.0
@@ -130,7 +130,7 @@ def estimate_depth(
         small, small_sources = F.avg_pool2d(reference[:, None], 2)[:, 0], F.avg_pool2d(sources, 2)
         best = min(BEST_VIEWS, sources.shape[1])
         hypotheses = inverse_depths[..., None, None]
-        cost = matching_cost(small, small_sources, halved(camera), T_sr, hypotheses, HALF_RADIUS, best)
+        cost = matching_cost(small, small_sources, halved(camera), T_sr, hypotheses, RADIUS, best)
         coarse = find_minimum(aggregate(cost, small))
         surface = inverse_depths[:, :1, None] + step[:, None, None] * coarse.position
         surface = F.interpolate(surface[:, None], size=reference.shape[-2:], mode="bilinear")[:, 0]
@@ -173,7 +173,7 @@ def refine_depth(
     offsets = torch.arange(-STEPS, STEPS + 1, dtype=surface.dtype, device=surface.device)[:, None, None]
     hypotheses = torch.maximum(surface[:, None] + offsets * step[:, None], least[:, None])
     cost = matching_cost(
-        reference, sources, camera, T_sr, hypotheses, FULL_RADIUS, min(BEST_VIEWS, sources.shape[1])
+        reference, sources, camera, T_sr, hypotheses, RADIUS, min(BEST_VIEWS, sources.shape[1])
     )
     found = find_minimum(aggregate(cost, reference))
     return torch.maximum(surface + (found.position - STEPS) * step, least), found

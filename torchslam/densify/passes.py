@@ -135,15 +135,7 @@ class Pass(Enum):
 
 
 class DenseJob:
-    """What the passes compute with, in each of the processes.
-
-    Args:
-        views: of the run.
-        images: theirs.
-        parts: folder of the results of views.
-        device: to compute on.
-        is_learned: let the network of the package rate the depth of each view.
-    """
+    """What the passes compute with, in each of the processes; `parts` is the folder of the results of views."""
 
     def __init__(
         self, views: Views, images: ViewImages, parts: Path, device: torch.device, is_learned: bool
@@ -162,8 +154,7 @@ class DenseJob:
 
 def _do(job: DenseJob, result: Pass, view: int) -> None:
     """Compute one view in one pass and write it."""
-    write = _write_alone if result is Pass.ALONE else _write_merged
-    write(job, view)
+    (_write_alone if result is Pass.ALONE else _write_merged)(job, view)
 
 
 def _write_alone(job: DenseJob, view: int) -> None:
@@ -242,19 +233,14 @@ def _fuse(path: Path, images: ViewImages, spreads: Float[Tensor, " K"], skipped:
     )
 
 
-QUANTILES = (0.02, 0.98)
-"""Of inverse depth, between which the colors reach from far (blue) to near (red)."""
-
-
 def depth_colors(depth: Float[Tensor, "H W"]) -> UInt8[np.ndarray, "H W 3"]:
-    """Colors of depth, blue, green, red; black where unknown."""
+    """Colors of depth, blue, green, red, from far (blue) to near (red); black where unknown."""
     is_known = depth > 0
     if not bool(is_known.any()):
         return np.zeros((*depth.shape, 3), np.uint8)
     inverse = torch.where(is_known, 1 / torch.where(is_known, depth, 1.0), 0.0)
-    far, near = (
-        inverse[is_known].quantile(torch.tensor(QUANTILES, dtype=inverse.dtype, device="cpu")).tolist()
-    )
+    limits = torch.tensor((0.02, 0.98), dtype=inverse.dtype, device="cpu")
+    far, near = inverse[is_known].quantile(limits).tolist()
     scaled = ((inverse - far) / max(near - far, 1e-12)).clamp(0, 1)
     colors = cv2.applyColorMap((scaled * 255).round().to(torch.uint8).numpy(), cv2.COLORMAP_TURBO)
     colors[~is_known.numpy()] = 0

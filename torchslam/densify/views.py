@@ -71,9 +71,8 @@ class Views:
         kept = [view for view in range(len(self)) if view not in left_out]
         while True:  # a view that is left out is no neighbor of others
             place = {view: row for row, view in enumerate(kept)}
-            neighbors = [
-                tuple(place[other] for other in self.neighbors[view] if other in place) for view in kept
-            ]
+            near = (self.neighbors[view] for view in kept)
+            neighbors = [tuple(place[other] for other in mine if other in place) for mine in near]
             enough = [len(mine) >= LEAST_NEIGHBORS for mine in neighbors]
             if all(enough):
                 break
@@ -85,8 +84,7 @@ class Views:
 def readable(views: Views, images: Images) -> tuple[Views, list[str]]:
     """Leave out the views whose image cannot be read; also return what is wrong with each of these images.
 
-    Raises:
-        ResultsError: fewer than three views are left.
+    Raises ResultsError if fewer than three views are left.
     """
     wrong: dict[int, str] = {}
     for view, frame in enumerate(views.frame_index.tolist()):
@@ -166,9 +164,7 @@ def views_of(scene: ExportedScene, size: tuple[int, int], every: int | None = No
         neighbors.append(order[is_there].tolist())
         ranges.append(depth.quantile(torch.tensor(QUANTILES, dtype=depth.dtype, device="cpu")))
     place = {view: row for row, view in enumerate(kept)}
-    limits = (
-        torch.stack(ranges) if ranges else torch.empty(0, len(QUANTILES), dtype=torch.float32, device="cpu")
-    )
+    limits = torch.stack(ranges) if ranges else torch.empty(0, 2, dtype=torch.float32, device="cpu")
     rows = frames[kept]
     views = Views(
         frame_index=scene.frame_ids[rows],

@@ -52,8 +52,7 @@ DENSE_CLOUD = "dense.ply"  # of the main submap, z up as in POINT_CLOUD
 MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
 DEPTHS = Path("dense") / "depths.safetensors"  # of keyframes of the main submap
 PICTURES = Path("dense") / "pictures"
-PICTURE_NAMES = "[0-9]" * 6 + ".png"
-"""Pattern of the names of depth pictures: six digits of the frame."""
+PICTURE_NAMES = "[0-9]" * 6 + ".png"  # pattern of depth pictures: the digits of the frame
 CONFIG = "config.toml"
 METRICS = "metrics.json"
 FRAMES = "frames.csv"
@@ -61,19 +60,13 @@ EXAMPLE_IMAGE = "example.png"
 PLOTS = "plots"
 STAGE_SUFFIX = "_ms"  # of the columns of frames.csv that have times
 MAX_COUNT = 1 << 31  # of indices, counts and numbers of submaps in files
-MAX_FRAMES_BYTES = 1 << 28
-"""Size limit of frames.csv, enough for two million frames."""
 
 
 @dataclass(frozen=True)
 class SavedRun:
-    """Metrics and map of a results folder, read by `open_run`.
+    """The content of metrics.json and the map of a results folder, read by `open_run`.
 
-    Attributes:
-        directory: the folder.
-        metrics: the content of metrics.json.
-        submaps, camera: all submaps and their camera.
-        sessions: number of runs over the map that changed it.
+    `sessions` is the number of runs over the map that changed it.
     """
 
     directory: Path
@@ -115,8 +108,7 @@ class SavedRun:
     ) -> Images:
         """Open the images of a scene, see `open_images`; `elsewhere` is their location if they were moved.
 
-        Raises:
-            ResultsError: the images are missing or other ones, or frames.csv is missing or damaged.
+        Raises ResultsError if the images are missing or other ones, or frames.csv is missing or damaged.
         """
         path = elsewhere or self.metrics.get("source")
         if path is None:
@@ -219,14 +211,9 @@ def example_keyframe(slam_map: Map, session: int) -> int | None:
 def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
     """Create the results folder and check that it can be written to, before the run.
 
-    Args:
-        folder: the results folder.
-        overwrite: replace existing results; their checkpoint and saved stages are deleted at once.
-        resume: continue from the checkpoint and the saved stages in the folder.
-
-    Raises:
-        ResultsError: if the folder has results that would be lost, or a name with which they could not be read again.
-        OSError: if the folder cannot be written to.
+    To overwrite deletes the checkpoint and the saved stages of existing results at once; to resume continues from them.
+    Raises ResultsError if the folder has results that would be lost, or a name with which they could not be read again,
+    OSError if it cannot be written to.
     """
     if not is_unicode(str(folder.absolute())):
         raise ResultsError(
@@ -305,15 +292,13 @@ def _is_number(value: object) -> bool:
 
 
 def _is_readout(value: Any) -> bool:
-    """Whether a value is none, or what `readout_of` reads."""
     numbers: list[Any] = [value.get("ms"), value.get("std_ms")] if isinstance(value, dict) else [None]
     return value is None or all(_is_number(each) and abs(each) <= 1e3 * MAX_READOUT for each in numbers)
 
 
 def _are_submaps(value: object) -> bool:
-    return isinstance(value, list) and all(
-        isinstance(submap, dict) and _is_count(submap.get("submap")) for submap in value
-    )
+    submaps = value if isinstance(value, list) else [None]
+    return all(isinstance(submap, dict) and _is_count(submap.get("submap")) for submap in submaps)
 
 
 # Validation of the entries that are read from metrics.json.
@@ -335,7 +320,7 @@ def read_frames(path: str | Path) -> list[StepResult]:
 
 def _read_rows(path: str | Path) -> list[tuple[StepResult, str]]:
     """The frames and their files, empty if frames are no files."""
-    rows = read_cells(path, ResultsError, MAX_FRAMES_BYTES, ",")
+    rows = read_cells(path, ResultsError, 1 << 28, ",")  # enough for two million frames
     header = next(rows, ("", []))[1]
     cells = ((where, dict(zip(header, each, strict=True))) for where, each in rows)
     # Folders that earlier versions wrote have no files.

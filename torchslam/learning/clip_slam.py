@@ -81,16 +81,12 @@ class ClipGraph:
 
     def halves(self) -> tuple[ClipGraph, ClipGraph]:
         """The same clips with every other point: two problems that share no observation, for `clip_halves`."""
-        even, odd = (
-            replace(
-                self,
-                runs=tuple(
-                    run and _with_observations(run, run.point_index % 2 == first) for run in self.runs
-                ),
-            )
-            for first in (0, 1)
-        )
-        return even, odd
+
+        def half(first: int) -> ClipGraph:
+            runs = (run and _with_observations(run, run.point_index % 2 == first) for run in self.runs)
+            return replace(self, runs=tuple(runs))
+
+        return half(0), half(1)
 
 
 @dataclass(frozen=True)

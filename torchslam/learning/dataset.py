@@ -6,9 +6,10 @@ import copy
 import itertools
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from collections.abc import Sequence as Several
 from dataclasses import dataclass, replace
+from functools import cache
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -23,8 +24,7 @@ from torchslam.learning.clip_slam import ClipGraph, ClipSLAM
 from torchslam.learning.training import seed_of
 from torchslam.types import Features
 
-MIN_MATCHES = 50
-"""Between the first and the last frame of a clip; with fewer they hardly overlap."""
+MIN_MATCHES = 50  # between the first and the last frame of a clip; with fewer they hardly overlap
 MIN_PARALLAX = 0.05
 """Radians, three degrees, between these frames. With it the system poses 45 of 48 clips of redkitchen, machine_hall,
 kitti07 and fr2_desk_20; with two degrees 3 of 8 of redkitchen, but a car shows no more than that."""
@@ -163,14 +163,14 @@ class Clips(Dataset[Clip]):
         """Select the clips."""
         self.sequences, self.frames = list(sequences), frames
         self.chosen: list[tuple[int, int, int]] = []
-        generator = torch.Generator().manual_seed(seed)
+        generator, orb = torch.Generator().manual_seed(seed), ORB(500)
         for number, sequence in enumerate(self.sequences):
-            seen = _Seen(sequence)
+            features_of = cache(lambda index, images=sequence: orb(images.image(index)))  # each is read once
             found: dict[int, int] = {}
             for start in torch.randperm(len(sequence), generator=generator, device="cpu").tolist():
                 if len(found) == per_sequence:
                     break
-                stride = seen.stride(start, frames - 1, min_parallax, max_stride)
+                stride = _stride(sequence, features_of, start, frames - 1, min_parallax, max_stride)
                 clip = range(start, start + frames * stride, stride) if stride else ()
                 if clip and not (supervised and any(sequence.pose(index) is None for index in clip)):
                     found[start] = stride
@@ -181,11 +181,7 @@ class Clips(Dataset[Clip]):
         return len(self.chosen)
 
     def __getitem__(self, number: int) -> Clip:
-        """Read a clip.
-
-        Raises:
-            FrameError: An image cannot be read.
-        """
+        """Read a clip. Raises FrameError."""
         sequence, start, stride = self.chosen[number]
         return Clip.of(self.sequences[sequence], start, self.frames, stride, number)
 
@@ -314,27 +310,21 @@ def parallax(
     return float(torch.atan2(sines, (ray_1 * ray_2).sum(-1)).median())
 
 
-class _Seen:
-    """Features and poses of a sequence for selecting clips; every image is read once."""
-
-    def __init__(self, sequence: Sequence) -> None:
-        self._sequence = sequence
-        self._orb = ORB(500)
-        self._features: dict[int, Features] = {}
-
-    def stride(self, start: int, steps: int, least: float, most: int) -> int:
-        """The least of 1, 2, 4, ..., `most` with enough parallax to the frame `steps` strides later; 0 for none."""
-        stride = 1
-        while stride <= most and start + steps * stride < len(self._sequence):
-            second = start + steps * stride
-            T_1, T_2 = self._sequence.pose(start), self._sequence.pose(second)
-            R_21 = None if T_1 is None or T_2 is None else (T_2 @ se3_inverse(T_1))[:3, :3]
-            if parallax(self._of(start), self._of(second), self._sequence.camera, R_21) >= least:
-                return stride
-            stride *= 2
-        return 0
-
-    def _of(self, index: int) -> Features:
-        if index not in self._features:
-            self._features[index] = self._orb(self._sequence.image(index))
-        return self._features[index]
+def _stride(
+    sequence: Sequence,
+    features_of: Callable[[int], Features],
+    start: int,
+    steps: int,
+    least: float,
+    most: int,
+) -> int:
+    """The least of 1, 2, 4, ..., `most` with enough parallax to the frame `steps` strides later; 0 for none."""
+    stride = 1
+    while stride <= most and start + steps * stride < len(sequence):
+        second = start + steps * stride
+        T_1, T_2 = sequence.pose(start), sequence.pose(second)
+        R_21 = None if T_1 is None or T_2 is None else (T_2 @ se3_inverse(T_1))[:3, :3]
+        if parallax(features_of(start), features_of(second), sequence.camera, R_21) >= least:
+            return stride
+        stride *= 2
+    return 0

@@ -22,11 +22,7 @@ from torchslam.utils.files import write_whole
 Log = Callable[[str, float, int], None]
 """Called with name, value and step, like `SummaryWriter.add_scalar` of TensorBoard."""
 
-MAX_NORM = 1.0
-"""Of the gradient: one step through a poorly determined pose must not undo a hundred others."""
-
-# A prime: the 32-bit seeds of steps and epochs rarely collide with those of other seeds.
-_SEED_STRIDE = 1_000_003
+MAX_NORM = 1.0  # of the gradient: one step through a poorly determined pose must not undo a hundred others
 
 
 class Training:
@@ -159,8 +155,8 @@ class Training:
 
 
 def seed_of(seed: int, number: int) -> int:
-    """Derive the seed of a step or an epoch."""
-    return (seed * _SEED_STRIDE + number) % 2**32
+    """Derive the seed of a step or an epoch, which rarely collides with those of other seeds."""
+    return (seed * 1_000_003 + number) % 2**32  # a prime
 
 
 def _plain(state: Any) -> Any:

@@ -45,8 +45,6 @@ RANGE, STEPS = 2.0, 32
 """The search reaches from the guess by sparse points divided by RANGE to that times RANGE, in this number of steps."""
 GUESS_QUANTILE = 0.85
 """Of the heights of the map points below the camera: most of them lie between the ground and the camera."""
-LEAST_POINTS = 5
-"""Map points below the camera without which a frame gives no guess."""
 ROUNDS = 4
 """Of the refinement, each with half the steps of the one before."""
 ROLL_STEP = 0.02
@@ -140,7 +138,7 @@ def _guess(view: SubmapView, T_cw: Float[Tensor, "R 4 4"]) -> float | None:
     heights = [
         float(points[near, 1].quantile(GUESS_QUANTILE))
         for points, near in zip(points_c, below, strict=True)
-        if int(near.sum()) >= LEAST_POINTS
+        if int(near.sum()) >= 5
     ]
     return float(np.median(heights)) if heights else None
 

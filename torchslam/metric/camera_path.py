@@ -23,22 +23,16 @@ SINCE_1970 = 1e8
 """Seconds: times from here on (1973) count from 1970 or 1980, smaller ones from the start of a recording or a day."""
 MAX_GAP = 0.5
 """Seconds between two poses up to which the path between them is known in any case. Cars turn within a second."""
-GAP_INTERVALS = 3.0
-"""The same for slow recordings, in median intervals of the poses."""
-SEARCH_LIMIT = 20.0
-"""Seconds by which a clock may be off; GPS time is ahead of UTC by 18."""
-SEARCH_SHARE = 0.25
-"""Of the recording's duration: the most by which a clock may be off, so that most of a file has a pose with any."""
+SEARCH_LIMIT, SEARCH_SHARE = 20.0, 0.25
+"""Seconds, and share of the recording's duration, by which a clock may be off: GPS time is ahead of UTC by 18, and most
+of a file has a pose with any clock."""
 
 
 @dataclass(frozen=True)
 class CameraPath:
-    """The posed frames of a submap in the order of time.
+    """The posed frames of a submap at ascending seconds, float64 on the CPU.
 
-    Attributes:
-        timestamps: seconds, ascending.
-        T_wc: camera to world, float64 on the CPU.
-        first_image: time of the first image of the recording, if images come at an even rate.
+    `first_image` is the time of the first image of the recording, if images come at an even rate.
     """
 
     timestamps: Float[Tensor, " K"]
@@ -92,7 +86,7 @@ class CameraPath:
         """The row of the pose before, the part of the interval that has passed, and whether it is short enough."""
         left, part = between_rows(self.timestamps, times)
         interval = self.timestamps.diff()
-        longest = max(MAX_GAP, GAP_INTERVALS * float(interval.median()))
+        longest = max(MAX_GAP, 3 * float(interval.median()))  # for slow recordings
         known = (part >= 0) & (part <= 1) & (interval[left] <= longest)
         return left, part.clamp(0, 1), known
 
@@ -133,11 +127,9 @@ class CameraPath:
 
 @dataclass(frozen=True)
 class Clock:
-    """A clock as given by the user.
+    """A clock as given by the user: the seconds that are added to the file's times to give those of the images.
 
-    Attributes:
-        seconds: that are added to the file's times to give those of the images.
-        start: when the first image was taken, seconds since 1970; the other way to say it.
+    The other way to say it is when the first image was taken, seconds since 1970.
     """
 
     seconds: float | None = None

@@ -21,12 +21,7 @@ MAX_RELATIVE_STD = 0.5
 
 @dataclass(frozen=True)
 class Click:
-    """An image point.
-
-    Attributes:
-        frame: index of the frame.
-        pixel: x and y; (0, 0) is the center of the top left pixel.
-    """
+    """An image point by the index of its frame, and x and y; (0, 0) is the center of the top left pixel."""
 
     frame: int
     pixel: tuple[float, float]
@@ -48,20 +43,12 @@ class Distance:
 
 
 def from_options(given: Given) -> list[Distances]:
-    """The source of all `--distance`.
-
-    Raises:
-        MeasurementError: a click or a length is none.
-    """
+    """The source of all `--distance`. Raises MeasurementError for a wrong click or length."""
     return [Distances([parse_distance(words) for words in given["distance"]])]
 
 
 def parse_distance(words: Sequence[str]) -> Distance:
-    """Read `FRAME:X,Y FRAME:X,Y METERS`.
-
-    Raises:
-        MeasurementError: it is something else.
-    """
+    """Read `FRAME:X,Y FRAME:X,Y METERS`. Raises MeasurementError for anything else."""
     whole = f"--distance {' '.join(words)}"
     first, second = (_click(word, whole) for word in words[:2])
     try:
@@ -95,11 +82,7 @@ class Distances:
     distances: Sequence[Distance]
 
     def check(self, size: tuple[int, int]) -> None:
-        """Check that all clicks are in images of (width, height).
-
-        Raises:
-            MeasurementError: a click is outside.
-        """
+        """Check that all clicks are in images of (width, height). Raises MeasurementError if a click is outside."""
         width, height = size
         for click in (click for each in self.distances for click in (each.first, each.second)):
             x, y = click.pixel
@@ -111,8 +94,7 @@ class Distances:
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """Locate the clicked points of a submap, and compare their distances with the known ones.
 
-        Raises:
-            MeasurementError: a click is outside of the image.
+        Raises MeasurementError if a click is outside of the image.
         """
         if not view.has_images:
             return Unmeasured(ScaleSource.DISTANCE, "there are no images to find the points in")

@@ -18,44 +18,31 @@ from torch import Tensor
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.metric.source import SubmapView
 
-CONTRAST = 2.0 / 255
-"""Minimum standard deviation of the gray levels of a window; flatter ones count as noise."""
-NEAREST = 30
-"""Observed points nearest to the pixel, whose depths bound the search."""
+CONTRAST = 2.0 / 255  # minimum standard deviation of the gray levels of a window; flatter ones count as noise
+NEAREST = 30  # observed points nearest to the pixel, whose depths bound the search
 NEARER, FARTHER = 0.5, 2.0
 """The search reaches from so much of the least of these depths to so much of the largest."""
 PLANES = 128
 """Hypotheses over the range, equally far in inverse depth: a step is about a pixel for a parallax of ten degrees."""
-REFINED = 65
-"""Hypotheses of the second search, over `AGREEING` steps of the first to either side."""
+REFINED = 65  # hypotheses of the second search, over `AGREEING` steps of the first to either side
 BESIDE = (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)
 """Directions of the clicks beside that of the user; two and two are opposite."""
-LAYER_EVERY = 2
-"""Every n-th hypothesis, with this n, is tried for the windows that have the pixel on their border."""
-FRAMES = 12
-"""Other frames that are compared at most, spread over those with a fitting parallax."""
+FRAMES = 12  # other frames that are compared at most, spread over those with a fitting parallax
 ANGLES_DEG = (1.5, 15.0)
 """Parallax of these frames: less determines depth poorly, more makes the window look different."""
 RADII = 4, 8, 12
 """Of the windows, in samples: a larger one where a smaller one finds nothing, or several places."""
-SAMPLE_SHARE = 1 / 500
-"""Distance of the samples of the window in widths of the image; at least a pixel."""
-BEST_SHARE = 0.6
-"""Share of the frames that must match; the others may not see the point."""
-LEAST_FRAMES = 3
-"""Frames without which there is no depth."""
-LEAST_SCORE = 0.6
-"""Correlation below which a search has failed."""
-AGREEING = 3
-"""Steps of the first search by which the best depth of a single frame may differ."""
+SAMPLE_SHARE = 1 / 500  # distance of the samples of the window in widths of the image; at least a pixel
+BEST_SHARE = 0.6  # share of the frames that must match; the others may not see the point
+LEAST_FRAMES = 3  # frames without which there is no depth
+LEAST_SCORE = 0.6  # correlation below which a search has failed
+AGREEING = 3  # steps of the first search by which the best depth of a single frame may differ
 AGREEING_SHARE = 0.4
 """Least share of the frames whose own best depth is there: repeated and weak texture has others elsewhere."""
-RIVAL = 0.95
-"""A second maximum of so much of the correlation makes the depth ambiguous."""
+RIVAL = 0.95  # a second maximum of so much of the correlation makes the depth ambiguous
 MATCH_STD_PX = 0.3
 """Standard deviation of where a window matches in one image, pixels; noise and the slant of surfaces."""
-CLICK_STD_PX = 1.0
-"""Standard deviation of a click, pixels."""
+CLICK_STD_PX = 1.0  # standard deviation of a click, pixels
 
 
 def sample_windows(
@@ -69,10 +56,7 @@ def sample_windows(
     window = cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
     window -= window.mean(axis=-1, keepdims=True)
     least = CONTRAST * math.sqrt(window.shape[-1])
-    normalized: Float[np.ndarray, "W P"] = window / np.maximum(
-        np.linalg.norm(window, axis=-1, keepdims=True), least
-    )
-    return normalized
+    return np.asarray(window / np.maximum(np.linalg.norm(window, axis=-1, keepdims=True), least))
 
 
 def correlate(
@@ -82,17 +66,9 @@ def correlate(
     image: Float[np.ndarray, "H W2"],
     border: float = 0.0,
 ) -> tuple[Float[np.ndarray, " W"], Bool[np.ndarray, " W"]]:
-    """Correlate sampled windows with those of another image that shows their points.
+    """Correlate sampled windows with those of another image that shows their points, which are in its camera's frame.
 
-    Args:
-        own: the sampled windows.
-        points_o: their points in the camera of the other image.
-        camera: of that image.
-        image: its gray levels.
-        border: within which an image does not count, pixels.
-
-    Returns:
-        Correlations, and whether all points of a window are in the image.
+    Returns the correlations, and whether all points of a window are in the image, `border` pixels from its edge.
     """
     pixels, seen = camera.project(points_o)
     inside = (seen & camera.in_image(pixels, border)).all(dim=-1).numpy()
@@ -102,27 +78,15 @@ def correlate(
 
 @dataclass(frozen=True)
 class LocatedPixel:
-    """A pixel in the world.
-
-    Attributes:
-        point_w: where it is.
-        covariance_w: by the error of the depth and of the click.
-    """
+    """A pixel in the world; the covariance is that of the error of the depth and of the click."""
 
     point_w: Float[Tensor, " 3"]
     covariance_w: Float[Tensor, "3 3"]
 
 
 def locate_pixel(view: SubmapView, frame_index: int, pixel: tuple[float, float]) -> LocatedPixel | str:
-    """Find the point of the scene that a pixel shows; or say why it was not found.
-
-    Args:
-        view: the submap, with images.
-        frame_index: of the frame in its sequence.
-        pixel: x and y.
-    """
-    frames = view.frame_index
-    row = torch.nonzero(frames == frame_index)[:, 0]
+    """Find the point of the scene that a pixel (x, y) of a frame of the sequence shows; or say why it was not found."""
+    row = torch.nonzero(view.frame_index == frame_index)[:, 0]
     where = f"{pixel[0]:g},{pixel[1]:g} of frame {frame_index}"
     if not len(row):
         return f"frame {frame_index} has no pose in this submap"
@@ -161,8 +125,10 @@ def _search(sweep: _Sweep, low: float, high: float, where: str) -> tuple[float, 
     best = int(scores.argmax())
     if float(scores[best]) < LEAST_SCORE:
         return f"the window around {where} looks different in every other frame"
-    elsewhere = (torch.arange(PLANES, device="cpu") - best).abs() > AGREEING
-    if float(torch.where(elsewhere & _is_peak(scores), scores, -1.0).max()) > RIVAL * float(scores[best]):
+    padded = torch.nn.functional.pad(scores, (1, 1), value=-1.0)
+    is_rival = (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
+    is_rival &= (torch.arange(PLANES, device="cpu") - best).abs() > AGREEING
+    if float(torch.where(is_rival, scores, -1.0).max()) > RIVAL * float(scores[best]):
         return f"the depth at {where} is ambiguous: click where the image has more texture"
     near = (single.argmax(dim=1) - best).abs() <= AGREEING
     if int(near.sum()) < max(LEAST_FRAMES, AGREEING_SHARE * len(single)):
@@ -181,7 +147,7 @@ def _search(sweep: _Sweep, low: float, high: float, where: str) -> tuple[float, 
     match = MATCH_STD_PX / sweep.pixels_per_inverse_depth(inverse_depth)
     single_std = math.hypot(match, float(np.std(np.array(own))))
     clicked = float(np.std(np.array([inverse_depth, *beside])))
-    layers = _layer_std(sweep, coarse[::LAYER_EVERY], inverse_depth)
+    layers = _layer_std(sweep, coarse[::2], inverse_depth)
     return inverse_depth, math.hypot(clicked, layers, single_std / math.sqrt(LEAST_FRAMES))
 
 
@@ -220,12 +186,6 @@ def _joint(single: Float[Tensor, "F D"]) -> Float[Tensor, " D"]:
     """Mean of the scores of the frames that match best."""
     count = min(max(LEAST_FRAMES, math.ceil(BEST_SHARE * len(single))), len(single))
     return single.topk(count, dim=0).values.mean(dim=0)
-
-
-def _is_peak(scores: Float[Tensor, " N"]) -> Tensor:
-    """Where a score is larger than its neighbors."""
-    padded = torch.nn.functional.pad(scores, (1, 1), value=-1.0)
-    return (padded[1:-1] >= padded[:-2]) & (padded[1:-1] >= padded[2:])
 
 
 def _maximum(at: Float[Tensor, " N"], scores: Float[Tensor, " N"]) -> float:

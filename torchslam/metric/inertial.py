@@ -24,12 +24,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.data.inertial import (
-    InertialCalibration,
-    InertialSamples,
-    read_imu,
-    read_inertial_calibration,
-)
+from torchslam.data.inertial import InertialCalibration, InertialSamples, read_imu, read_inertial_calibration
 from torchslam.errors import MeasurementError
 from torchslam.metric.inertial_equations import (
     equations_of,
@@ -56,8 +51,7 @@ WEIGHINGS = 5
 SENSOR_STD = 1e-2
 """Relative error of the accelerometer's scale factor, which nothing here can find. Data sheets allow up to 3 % (initial
 calibration tolerance of the MPU-6050). With the true poses of a drone, the scale of its sensor is off by 0.5 %."""
-WORST = 0.1
-"""Relative standard error from which on a scale counts as not determined."""
+WORST = 0.1  # relative standard error from which on a scale counts as not determined
 STILL_INTERVAL = 0.25
 """Seconds over which rates and forces are averaged: a drone's motors shake it by 0.8 m/s^2 while it stands."""
 STILL_TURN, STILL_FORCE = 0.02, 0.1
@@ -81,13 +75,9 @@ class InertialAlignment:
     """Scale, gravity and the sensor's parameters. Without a gradient, and not to be used, unless it is `MEASURED`.
 
     Attributes:
-        reason: whether it was measured.
-        meters_per_unit: of the map.
-        relative_std: its standard error.
-        gravity_w: in the frame of the map, m/s^2, pointing down.
-        gravity_std: standard error of its direction, rad.
+        meters_per_unit, relative_std: of the map, and its standard error.
+        gravity_w, gravity_std: in the frame of the map, m/s^2, pointing down; standard error of its direction, rad.
         accelerometer_bias: m/s^2.
-        rotation: bias of the gyroscope, offset of the clocks, rotation from camera to body.
         lever_c: the body's origin in the frame of the camera, meters.
         position_std: standard error of the map's positions, meters.
         stretches: how many count.
@@ -116,22 +106,14 @@ def align_inertial(
     turn_std: float | None = None,
     position_std: float | None = None,
 ) -> InertialAlignment:
-    """Scale and gravity of poses in an arbitrary unit. Differentiable in poses and samples.
+    """Scale and gravity of poses in an arbitrary unit, at ascending times in seconds.
+
+    Differentiable in poses and samples. The stated errors contain the noise of both sensors, the disagreement of
+    stretches, and `SENSOR_STD`. Raises MeasurementError if the rates are in another unit.
 
     Args:
-        timestamps: seconds, ascending.
-        T_cw: poses of the camera.
-        samples: of the sensor.
-        calibration: what is known of it.
         turn_std: rad, of the camera's turns over `TURN_INTERVAL`.
         position_std: meters, of its positions. None: those of the residuals, which have no gradient.
-
-    Returns:
-        The alignment, or why there is none. The stated errors contain the noise of both sensors, the disagreement of
-        stretches, and `SENSOR_STD`.
-
-    Raises:
-        MeasurementError: the rates are in another unit.
     """
     inside = (timestamps + calibration.offset > samples.timestamps[0] + EDGE) & (
         timestamps + calibration.offset < samples.timestamps[-1] - EDGE
@@ -210,12 +192,7 @@ def _nothing(
 
 @dataclass(frozen=True)
 class InertialSource:
-    """Samples of an inertial sensor that moves with the camera.
-
-    Attributes:
-        samples: of the sensor.
-        calibration: how it is mounted, as far as that is known.
-    """
+    """Samples of an inertial sensor that moves with the camera."""
 
     samples: InertialSamples
     calibration: InertialCalibration = field(default_factory=InertialCalibration)
@@ -223,8 +200,7 @@ class InertialSource:
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """Measure the unit of a submap and its vertical.
 
-        Raises:
-            MeasurementError: images and samples have no time in common, or the rates another unit.
+        Raises MeasurementError if images and samples have no time in common, or the rates another unit.
         """
         timestamps, T_cw = view.timestamps.cpu().double(), view.T_cw.cpu().double()
         if len(timestamps):
@@ -260,11 +236,7 @@ class InertialSource:
 
 
 def from_options(given: Given) -> list[InertialSource]:
-    """The source of `--imu FILE --imu-camera FILE`.
-
-    Raises:
-        MeasurementError: a file is wrong, or there are two sensors.
-    """
+    """The source of `--imu FILE --imu-camera FILE`. Raises MeasurementError if there are two sensors."""
     if len(given["imu"]) > 1:
         raise MeasurementError("--imu is given twice; one sensor can be used")
     imu = given["imu"][0][0]

@@ -17,14 +17,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples
-from torchslam.geometry import (
-    Increments,
-    compose_increments,
-    se3_inverse,
-    skew,
-    so3_exp,
-    so3_log,
-)
+from torchslam.geometry import Increments, compose_increments, se3_inverse, skew, so3_exp, so3_log
 from torchslam.metric.inertial_rotation import InertialRotation, increments, thinned
 
 STRETCH = 4.0
@@ -35,10 +28,8 @@ LONGEST_INTERVAL = 1.0
 """Seconds between two posed frames from which on a stretch ends: the map knows nothing of the way in between."""
 LONGEST_GAP = 0.1
 """Seconds between two samples from which on some are missing: an order of magnitude above the period of any sensor."""
-SHORTEST_STRETCH = 1.0
-"""Seconds; below, an acceleration is lost in the velocity that is not known."""
-FEWEST_NODES = 8
-"""Positions of a stretch: six numbers of each coordinate go to the motion that is not known."""
+SHORTEST_STRETCH = 1.0  # seconds; below, an acceleration is lost in the velocity that is not known
+FEWEST_NODES = 8  # positions of a stretch: six numbers of each coordinate go to the motion that is not known
 ATTITUDE_STD = 1e-3
 """rad, by which the attitude of a stretch differs from that of the map. With 0, 1e-3 and 3e-3 gravity of a drone's
 recording is off by 0.48, 0.23 and 0.23 degrees, and the scale by the same."""
@@ -54,8 +45,6 @@ LEVER_STD, UNKNOWN_LEVER_STD = 2e-3, 0.05
 ATTENUATION_STD = 0.5
 """Relative error of the share of noise in the scale. In a simulated motion of 3 cm with positions good to 2 mm and no
 drift, the share is taken to be 65 %, which makes the scale 56 % too large: it then counts as not determined."""
-NEWTON_STEPS = 10
-"""Steps to the minimum; on a drone's recording the fourth one no longer changes the scale."""
 
 
 class Stretches(NamedTuple):
@@ -103,9 +92,8 @@ def stretch_rows(timestamps: Tensor, samples: InertialSamples, offset: float) ->
     for begin, end in itertools.pairwise(ends):
         duration = float(times[end] - times[begin + 1])
         count = max(1, round(duration / STRETCH))
-        limits = times[begin + 1] + duration / count * torch.arange(
-            1, count, dtype=times.dtype, device="cpu"
-        ).to(times)
+        steps = torch.arange(1, count, dtype=times.dtype, device=times.device)
+        limits = times[begin + 1] + duration / count * steps
         cuts = (torch.searchsorted(times[begin + 1 : end + 1], limits) + begin + 1).tolist()
         for first, last in zip([begin + 1, *cuts], [*cuts, end], strict=True):
             if float(times[last] - times[first]) >= SHORTEST_STRETCH and last + 1 - first >= FEWEST_NODES:
@@ -129,7 +117,12 @@ def stretches_of(
     valid = torch.arange(size, device=device) < lengths[:, None]
     chained = _chained(timestamps[padded] + rotation.offset, samples, calibration, rotation.bias)
     T_wc = se3_inverse(T_cw)[padded]
-    R_bw = _attitudes(T_wc[..., :3, :3] @ rotation.R_bc.mT, chained.R_ij, valid).mT[:, None]
+    # The attitude of the body at the start: the mean over the nodes, by the map.
+    apart = T_wc[..., :3, :3] @ rotation.R_bc.mT @ chained.R_ij.mT
+    R_wb, weights = apart[:, 0], valid[..., None] / valid.sum(-1)[:, None, None]
+    for _ in range(3):  # the mean on the manifold; the rotations are within a degree
+        R_wb = so3_exp((weights * so3_log(apart @ R_wb.mT[:, None])).sum(1)) @ R_wb
+    R_bw = R_wb.mT[:, None]
     times, P = chained.duration, chained.position
     positions, arms = R_bw @ T_wc[..., :3, 3:], R_bw @ T_wc[..., :3, :3]
     eye = torch.eye(3, dtype=T_cw.dtype, device=device).expand(*valid.shape, 3, 3)
@@ -155,16 +148,6 @@ def _chained(
         total = compose_increments(total, Increments(*(x[:, node] for x in each)))
         chain.append(total)
     return Increments(*(torch.stack(x, dim=1) for x in zip(*chain, strict=True)))
-
-
-def _attitudes(R_wb: Tensor, chained: Tensor, valid: Tensor) -> Float[Tensor, "S 3 3"]:
-    """Attitude of the body at the start of each stretch: the mean over its nodes, by the map."""
-    apart = R_wb @ chained.mT
-    middle = apart[:, 0]
-    weights = valid[..., None] / valid.sum(-1)[:, None, None]
-    for _ in range(3):  # the mean on the manifold; the rotations are within a degree
-        middle = so3_exp((weights * so3_log(apart @ middle.mT[:, None])).sum(1)) @ middle
-    return middle
 
 
 def _noise(chained: Increments) -> Float[Tensor, "S N 3 N 3"]:
@@ -264,8 +247,8 @@ def minimum(total: Equations) -> Float[Tensor, " 13"] | None:
     if not bool(x[0] > 0):
         return None
     eye = torch.eye(3, dtype=x.dtype, device=x.device)
-    for step in range(NEWTON_STEPS):
-        is_last = step == NEWTON_STEPS - 1
+    for step in range(10):  # on a drone's recording the fourth one no longer changes the scale
+        is_last = step == 9
         length = x[1:4].norm()
         down = x[1:4] / length
         gradient = hessian @ x - right - _in_scale(attenuation / x[0])

@@ -28,12 +28,9 @@ OFFSET_STEP = 0.01
 """Seconds between offsets that are tried; the search by derivatives finds offsets that are 0.1 s away."""
 CONVINCING = 0.7
 """Correlation of angular speeds from which another offset than the given one is believed. On a drone, 0.96 to 0.98."""
-LARGEST_RATIO = 10.0
-"""Of the speeds with which camera and sensor turn: radians and degrees differ by 57, a bias by less than 2."""
 OFFSET_STD = 0.01
 """Seconds, of the offset before it is measured: a camera that hardly turns leaves it where it was."""
-BIAS_STD = 0.1
-"""rad/s, of the gyroscope's bias before it is measured: three times that of cheap sensors."""
+BIAS_STD = 0.1  # rad/s, of the gyroscope's bias before it is measured: three times that of cheap sensors
 ROBUST_SCALE = 2.0
 """Of Cauchy's kernel, in standard errors of a turn, which leaves Gaussian errors 95 % of their information."""
 ROUNDS, WIDE_ROUNDS = 6, 3
@@ -48,12 +45,9 @@ class InertialRotation(NamedTuple):
     """What the turns of a camera say about a gyroscope.
 
     Attributes:
-        R_bc: rotation from camera to body.
-        bias: of the gyroscope, rad/s.
-        offset: seconds to add to times of the camera for those of the sensor.
-        R_std: standard errors of the rotation, rad.
-        bias_std: standard errors of the bias.
-        offset_std: standard error of the offset.
+        R_bc, R_std: rotation from camera to body, and its standard errors, rad.
+        bias, bias_std: of the gyroscope, rad/s.
+        offset, offset_std: seconds to add to times of the camera for those of the sensor.
         turn_std: rad, of a turn over `TURN_INTERVAL`.
     """
 
@@ -86,17 +80,11 @@ def align_rotations(
 ) -> InertialRotation:
     """The bias of the gyroscope, the offset of the clocks and, if it is unknown, the rotation from camera to body.
 
-    The minimum is differentiable in rotations and samples.
+    The minimum is differentiable in rotations and samples. Raises MeasurementError if the rates are in another unit.
 
     Args:
         timestamps: seconds, ascending, at least four that are `TURN_INTERVAL` apart, within the times of the samples.
-        R_cw: rotations of the camera.
-        samples: of the sensor.
-        calibration: what is known.
         turn_std: rad, of a turn over `TURN_INTERVAL`; None: that of the residuals, which has no gradient.
-
-    Raises:
-        MeasurementError: the rates are in another unit.
     """
     nodes = thinned(timestamps, TURN_INTERVAL)
     times, R_cw = timestamps[nodes], R_cw[nodes]
@@ -146,7 +134,7 @@ def _start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, give
     best = int(correlation.argmax())
     if float(correlation[best]) < CONVINCING:
         return given
-    if not 1 / LARGEST_RATIO < float(slope[best]) < LARGEST_RATIO:
+    if not 0.1 < float(slope[best]) < 10:  # radians and degrees differ by 57, a bias by less than 2
         raise MeasurementError(
             f"{samples.source}: the sensor turns {float(slope[best]):.2g} times as fast as the camera; state the unit "
             "of its rates, as in gyro_x [deg/s]"

@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchslam.data.text_file import float64
 from torchslam.errors import MeasurementError
 from torchslam.geometry import se3_inverse, sim3_scale
 from torchslam.geometry.transforms import level_rotation
@@ -45,17 +46,12 @@ def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
     """Average the logarithms of the scales, weighted by their information.
 
     Where measurements contradict each other, the error grows by their disagreement (the Birge ratio, 1932), and each
-    contradiction is listed.
-
-    Raises:
-        MeasurementError: there is no measurement.
+    contradiction is listed. Raises MeasurementError if there is no measurement.
     """
     if not measurements:
         raise MeasurementError("there is no measurement of the scale")
-    logs = torch.tensor(
-        [math.log(m.meters_per_unit) for m in measurements], dtype=torch.float64, device="cpu"
-    )
-    information = torch.tensor([m.relative_std**-2 for m in measurements], dtype=torch.float64, device="cpu")
+    logs = float64([math.log(m.meters_per_unit) for m in measurements])
+    information = float64([m.relative_std**-2 for m in measurements])
     mean = (information * logs).sum() / information.sum()
     birge = 1.0
     if len(measurements) > 1:
@@ -102,9 +98,8 @@ def bring_into_meters(
     if measurements and submap.metric is not None:
         before = ScaleMeasurement(ScaleSource.MAP, 1.0, submap.metric.relative_std, 1, "map in meters")
         contradictions = combine_scales([before, *measurements]).contradictions
-        submap.metric = replace(
-            submap.metric, contradictions=(*submap.metric.contradictions, *contradictions)
-        )
+        contradictions = (*submap.metric.contradictions, *contradictions)
+        submap.metric = replace(submap.metric, contradictions=contradictions)
     elif measurements:
         S_mw, submap.metric = _similarity_to_meters(view, combine_scales(measurements))
         submap.transform(S_mw.to(submap.map.T_cw))

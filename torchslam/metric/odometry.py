@@ -35,12 +35,10 @@ drift."""
 PARTS = 5
 """Straight parts of a stretch over which the path of the camera is measured: a car turns by less than 10 degrees in
 one."""
-MIN_STRETCHES = 4
-"""From fewer, their scatter cannot be estimated."""
+MIN_STRETCHES = 4  # from fewer, their scatter cannot be estimated
 STANDING = 0.15
 """Part of the typical length of a stretch below which it is not used: the vehicle stands, or nearly."""
-SEARCH_STEP = 0.1
-"""Seconds between the clocks that are tried."""
+SEARCH_STEP = 0.1  # seconds between the clocks that are tried
 SEARCH_GAIN = 18.0
 """Logarithm of the likelihood ratio from which on another clock is believed, as for a difference of six standard
 deviations. Of 20 trials over 15 s, 12.5 believed a wrong one with slipping wheels, and 25 missed one of .8 s."""
@@ -49,18 +47,12 @@ MAX_GAP = 2.5
 theirs evenly by 3 m/s in one."""
 LEVER_STD = 1.0
 """Meters that the sensor may be from the camera, as a prior: motion without turns leaves the lever arm open."""
-ROUNDS = 30
-"""Alternations between rotation with scale, and lever arm; they gain two digits in ten."""
+ROUNDS = 30  # alternations between rotation with scale, and lever arm; they gain two digits in ten
 
 
 @dataclass(frozen=True)
 class SpeedSource:
-    """The speeds of one file: their integral is the length of the camera's path.
-
-    Attributes:
-        speeds: the speeds.
-        clock: the clock of the file as given by the user.
-    """
+    """The speeds of one file: their integral is the length of the camera's path. The clock is given by the user."""
 
     speeds: Speeds
     clock: Clock = field(default_factory=Clock)
@@ -85,13 +77,7 @@ class SpeedSource:
 
 @dataclass(frozen=True)
 class OdometrySource:
-    """The odometry of one file: motions of another sensor, rigidly mounted to the camera.
-
-    Attributes:
-        path: of the file.
-        odometry: poses of the sensor, in meters.
-        clock: the clock of the file as given by the user.
-    """
+    """The odometry of one file: poses of another sensor, in meters, rigidly mounted to the camera."""
 
     path: Path
     odometry: Trajectory
@@ -138,33 +124,18 @@ class OdometrySource:
 
 
 def speeds_from_options(given: Given) -> list[MetricSource]:
-    """The sources of `--speed FILE`, with `--speed-clock` for each file or for all.
-
-    Raises MeasurementError for a file that is wrong.
-    """
+    """The sources of `--speed FILE`, with `--speed-clock` for each file or for all."""
     return [SpeedSource(read_speeds(file), clock) for file, clock in clocks_of(given, "speed")]
 
 
 def from_options(given: Given) -> list[MetricSource]:
-    """The sources of `--odometry FILE`, with `--odometry-clock` for each file or for all.
-
-    Raises TrajectoryError for a file that is wrong.
-    """
-    return [
-        OdometrySource(Path(file), read_trajectory(file), clock)
-        for file, clock in clocks_of(given, "odometry")
-    ]
+    """The sources of `--odometry FILE`, with `--odometry-clock` for each file or for all."""
+    files = clocks_of(given, "odometry")
+    return [OdometrySource(Path(file), read_trajectory(file), clock) for file, clock in files]
 
 
 class Stretches(NamedTuple):
-    """S stretches of time, each with its length in the map and in meters.
-
-    Attributes:
-        times: of their middles, seconds.
-        lengths_w: in the unit of the map.
-        lengths: in meters.
-        known: where both are.
-    """
+    """S stretches of time by their middles, seconds, and their lengths in units of the map and in meters."""
 
     times: Float[Tensor, " S"]
     lengths_w: Float[Tensor, " S"]
@@ -174,9 +145,8 @@ class Stretches(NamedTuple):
 
 def _stretch_ends(path: CameraPath) -> Float[Tensor, " E"]:
     """Times a stretch apart."""
-    return path.timestamps[0] + STRETCH * torch.arange(
-        int(path.duration / STRETCH) + 1, dtype=torch.float64, device="cpu"
-    )
+    count = int(path.duration / STRETCH) + 1
+    return path.timestamps[0] + STRETCH * torch.arange(count, dtype=torch.float64, device="cpu")
 
 
 def _camera_lengths(
@@ -227,10 +197,7 @@ def hand_eye(
 ) -> tuple[Float[Tensor, "S 3"], Float[Tensor, " 3"], Bool[Tensor, " S"]]:
     """Rotation with scale and lever arm between a sensor and a camera, from their motions, up to half of them wrong.
 
-    Args:
-        motions: of the sensor, meters.
-        camera_motions: of the camera, in the unit of the map.
-        known: rows that count.
+    Motions of the sensor are in meters, those of the camera in units of the map.
 
     Returns:
         The camera's translations in the frame of the sensor, meters; its center there; rows whose turns agree.

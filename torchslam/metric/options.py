@@ -121,8 +121,7 @@ def given_options(config: MetricConfig, brought: Mapping[str, str] | None = None
 def given_files(config: MetricConfig) -> list[tuple[str, str]]:
     """The names of options that a configuration sets, each with a word that may be the name of a file.
 
-    Raises:
-        ConfigError: an option has another number of words than it needs.
+    Raises ConfigError if an option has another number of words than it needs.
     """
     found = []
     for option in (option for kind in KINDS for option in kind.options):
@@ -163,11 +162,7 @@ def _times(option: Option, text: str) -> tuple[tuple[str, ...], ...]:
 
 
 def sources_of(given: Given) -> list[MetricSource]:
-    """Make all sources that are given.
-
-    Raises:
-        TorchslamError: an option or a file that it names is wrong.
-    """
+    """Make all sources that are given. Raises TorchslamError if an option or a file that it names is wrong."""
     made = []
     for kind in KINDS:
         if kind.options[0].name in given:

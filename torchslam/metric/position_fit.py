@@ -26,28 +26,22 @@ SAMPLES = 512
 them are of right ones, and the best of many is near. Tried at 512 only."""
 ROUNDS = 10
 """Fits of the start, each to the positions that the one before explains; they settle in two to four."""
-TOLERANCE = 1e-6
-"""Relative change of the cost at which a fit ends: a thousandth of a standard error."""
 CAMERA_UP_STD = 1.0
 """Radians: how far the cameras' up may be from the true one. A line leaves the turn about it to this; elsewhere, where
 positions know their up to a degree, a camera that looks to the ground moves it by less than a hundredth of that."""
 LEVEL = 0.05
 """Where heights were not measured the path is taken for level, with this part of its extent as standard deviation."""
-CLOCK_STD = 0.3
-"""Seconds by which two clocks of one device may differ, delays of a receiver included."""
+CLOCK_STD = 0.3  # seconds by which two clocks of one device may differ, delays of a receiver included
 
 
 @dataclass(frozen=True)
 class PositionFit:
-    """The similarity from a map to measured positions.
+    """The similarity S_ew from a map to measured positions, and the relative standard error of its scale.
 
     Attributes:
-        S_ew: from the map to the frame of the positions.
-        relative_std: relative standard error of the scale.
-        up_w: up in the map, a unit vector.
-        up_std: its standard error, radians.
-        offset: seconds that the clock of the images is ahead of that of the positions, beyond what was removed before.
-        offset_std: its standard error.
+        up_w, up_std: up in the map, a unit vector, and its standard error, radians.
+        offset, offset_std: seconds that the clock of the images is ahead of that of the positions, beyond what was
+            removed before, and its standard error.
         inliers: positions that agree.
         distances: of each position from the path, meters, by the coordinates that were measured.
         noise: standard deviations along one axis, horizontal and vertical, that the path leaves over, meters.
@@ -66,11 +60,9 @@ class PositionFit:
 
 @dataclass(frozen=True)
 class PositionPairs:
-    """N positions of the camera in the map and as they were measured.
+    """N positions of the camera at ascending seconds, in the map and as they were measured.
 
     Attributes:
-        times: seconds, ascending.
-        positions_w: in the map.
         velocities_w: units of the map per second, zero where the times of both are the same by construction.
         positions_e: as measured, meters: east, north, up.
         std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
@@ -93,11 +85,9 @@ class PositionPairs:
 
 
 def fit_positions(pairs: PositionPairs, camera_up_w: Float[Tensor, " 3"]) -> PositionFit | None:
-    """Fit a similarity to positions, up to half of them wrong; None where they do not determine one.
+    """Fit a similarity to `MIN_POSITIONS` or more, up to half of them wrong; None where they do not determine one.
 
-    Args:
-        pairs: `MIN_POSITIONS` or more.
-        camera_up_w: mean direction in the map that is up in the images, a unit vector.
+    `camera_up_w` is the mean direction in the map that is up in the images, a unit vector.
     """
 
     def residuals_of(S_ew: Tensor) -> Float[Tensor, "N 3"]:
@@ -206,7 +196,7 @@ def _average(
         (start.S_ew.expand(B, 4, 4), eye.new_zeros(B, 1)),
         inputs,
         ("sim3", "euclidean"),
-        options=LEAST_SQUARES_OPTIONS.replace(tolerance=TOLERANCE),
+        options=LEAST_SQUARES_OPTIONS.replace(tolerance=1e-6),  # a thousandth of a standard error
     )
     if not bool(solution.success.all()):
         return None

@@ -34,17 +34,11 @@ UPSIDE_DOWN = -0.5
 level fits if it is turned over."""
 SEARCH_STEP = 0.25
 """Seconds between the clocks that are tried: less than the time in which a vehicle changes its motion."""
-SEARCH_POSITIONS = 100
-"""Positions that clocks are tried with."""
 SEARCH_GAIN = 12.5
 """Logarithm of the likelihood ratio from which on another clock is believed, as for a difference of five standard
 deviations."""
-SAID = 3.0
-"""Standard errors from which on a difference of clocks is mentioned."""
 SECOND_PASS = 0.1
 """Seconds of a clock's error from which on the path is looked up again: it is straight for less."""
-LISTED = 3
-"""Most positions off the path that are listed one by one."""
 
 
 class _NoFit(Exception):
@@ -53,12 +47,7 @@ class _NoFit(Exception):
 
 @dataclass(frozen=True)
 class PositionSource:
-    """The positions of one file.
-
-    Attributes:
-        fixes: the positions.
-        clock: the clock of the file as given by the user.
-    """
+    """The positions of one file, and its clock as given by the user."""
 
     fixes: Fixes
     clock: Clock = field(default_factory=Clock)
@@ -69,14 +58,13 @@ class PositionSource:
         try:
             if len(path.timestamps) < MIN_POSITIONS:
                 raise _NoFit(f"only {len(path.timestamps)} frames have a pose")
-            pairs, fit, shift = (self._by_names if self.fixes.timestamps is None else self._by_times)(
-                view, path
-            )
+            find = self._by_names if self.fixes.timestamps is None else self._by_times
+            pairs, fit, shift = find(view, path)
         except _NoFit as error:
             return Unmeasured(ScaleSource.POSITION, str(error))
         is_line = fit.up_std > LINE_UP_STD
         notes, offset = list(self.fixes.notes), shift + fit.offset
-        if abs(offset) > SAID * fit.offset_std:
+        if abs(offset) > 3 * fit.offset_std:
             notes += clock_notes(self.fixes.path, offset, fit.offset_std)
         if is_line:
             notes.append(
@@ -166,7 +154,7 @@ class PositionSource:
         inside = torch.nonzero(path.at(times)[2])[:, 0]
         if len(inside) < 2 * MIN_POSITIONS:
             return 0.0
-        rows = inside[:: max(1, len(inside) // SEARCH_POSITIONS)]
+        rows = inside[:: max(1, len(inside) // 100)]
         nan = torch.full((len(rows), 2), math.nan, dtype=torch.float64, device="cpu")
 
         def cost_at(shift: float) -> float | None:
@@ -221,7 +209,7 @@ class PositionSource:
 def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:
     """What does not agree, in a few lines."""
     wrong = torch.nonzero(~fit.inliers)[:, 0]
-    if len(wrong) <= LISTED:
+    if len(wrong) <= 3:
         return [
             f"the position at {float(pairs.times[row]):.1f} s is {float(fit.distances[row]):.1f} m from the path"
             for row in wrong.tolist()
@@ -234,8 +222,5 @@ def _rejected(pairs: PositionPairs, fit: PositionFit) -> list[str]:
 
 
 def from_options(given: Given) -> list[MetricSource]:
-    """The sources of `--gps FILE`, with `--gps-clock` for each file or for all.
-
-    Raises MeasurementError for a file that is wrong.
-    """
+    """The sources of `--gps FILE`, with `--gps-clock` for each file or for all."""
     return [PositionSource(read_fixes(file), clock) for file, clock in clocks_of(given, "gps")]

@@ -30,10 +30,8 @@ from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource,
 IMAGES = 60
 """Depth images that are read at most, evenly over the recording; with 20 and with 100 redkitchen's scale is the same to
 .1 %."""
-LEAST_IMAGES = 3
-"""Fewest images whose scatter is estimated."""
-LEAST_POINTS = 10
-"""Fewest points of an image that give a scale."""
+LEAST_IMAGES, LEAST_POINTS = 3, 10
+"""Fewest images whose scatter is estimated, and points of an image that give a scale."""
 PATCH = 5
 """Pixels of the side of the patch around a point, of which all must have depth, and one depth."""
 NOISE = 1.5e-3
@@ -53,9 +51,7 @@ and 0 %), of its place and of its axis."""
 def from_options(given: Given) -> list[MetricSource]:
     """The sources of `--depth FOLDER[:SCALE]`, with `--depth-camera` for all.
 
-    Raises:
-        MeasurementError: there are no depth images, or a list is wrong.
-        CalibrationError: the camera is none.
+    Raises MeasurementError if there are no depth images, or a list is wrong, CalibrationError for a wrong camera.
     """
     cameras = [words[0] for words in given.get("depth_camera", ())]
     if len(cameras) > 1:
@@ -82,15 +78,13 @@ class SensorDepth:
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """The unit of a submap by the depths of its points.
 
-        Raises:
-            MeasurementError: a file has no depth, or in another unit.
+        Raises MeasurementError if a file has no depth, or in another unit.
         """
         pairs = self._pairs(view)
         if isinstance(pairs, str):
             return Unmeasured(ScaleSource.DEPTH, pairs)
-        chosen = sorted(
-            {round(place) for place in np.linspace(0, len(pairs) - 1, min(IMAGES, len(pairs))).tolist()}
-        )
+        places = np.linspace(0, len(pairs) - 1, min(IMAGES, len(pairs))).tolist()
+        chosen = sorted(set(map(round, places)))
         rows, logs, unreadable = list[int](), list[float](), list[str]()
         for row, path in (pairs[place] for place in chosen):
             try:

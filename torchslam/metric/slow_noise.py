@@ -19,18 +19,12 @@ from torchslam.geometry.robust import fit_inliers, median_scale
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, Unmeasured
 
 STRENGTHS = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""Standard deviations of the slow noise, in those of the white noise; beyond the last one the white noise does not
-matter."""
+"""Standard deviations of slow noise, in those of white noise; beyond the last one the white noise does not matter."""
 DURATIONS = (0.1, 0.3, 3.0)
 """After these parts of the recording the slow noise is forgotten; the last one is a walk without an end."""
-MAX_GROUPS = 120
-"""Values that covariances are made for; of more, successive ones are averaged, which loses no slow noise."""
-GATE = 4.0
-"""Standard deviations beyond which a value is wrong: 6e-5 of right ones are. Tried at 4 only."""
-ROUNDS = 20
-"""Rejections until nothing changes; two to four are usual."""
-MAX_RELATIVE_STD = 0.25
-"""Relative standard error from which on a scale is no measurement."""
+GATE = 4.0  # standard deviations beyond which a value is wrong: 6e-5 of right ones are. Tried at 4 only
+ROUNDS = 20  # rejections until nothing changes; two to four are usual
+MAX_RELATIVE_STD = 0.25  # relative standard error from which on a scale is no measurement
 
 
 def slow_correlations(
@@ -45,12 +39,7 @@ def slow_correlations(
 
 
 class Averaged(NamedTuple):
-    """Estimates of several models as one.
-
-    Attributes:
-        weights: of the models.
-        variance_factors: by which each model's covariance is to be multiplied.
-    """
+    """Estimates of several models as one: their weights, and factors by which to multiply their covariances."""
 
     weights: Float[Tensor, " B"]
     variance_factors: Float[Tensor, " B"]
@@ -80,9 +69,9 @@ def averaged(
     return Averaged(torch.softmax(log_likelihood, 0), chi_squares / max(freedom - 2, 1))
 
 
-def group_rows(count: int, limit: int = MAX_GROUPS) -> tuple[Tensor, Tensor]:
-    """The group of each of `count` successive rows, at most `limit` of them, and their sizes."""
-    groups = min(count, limit)
+def group_rows(count: int) -> tuple[Tensor, Tensor]:
+    """The group of each of `count` successive rows, and the sizes of groups: their means lose no slow noise."""
+    groups = min(count, 120)
     group = torch.arange(count, device="cpu") * groups // count
     return group, torch.bincount(group, minlength=groups).double()
 
@@ -94,14 +83,7 @@ def group_means(values: Float[Tensor, "N ..."], group: Tensor, size: Tensor) -> 
 
 
 class SlowMean(NamedTuple):
-    """The mean of a series.
-
-    Attributes:
-        mean: of the values that agree.
-        std: its standard error.
-        scatter: standard deviation of the values that agree.
-        inliers: values that agree.
-    """
+    """The mean of the values of a series that agree (inliers), its standard error, and their standard deviation."""
 
     mean: float
     std: float
@@ -110,12 +92,9 @@ class SlowMean(NamedTuple):
 
 
 def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Float[Tensor, " N"]) -> SlowMean:
-    """The mean of a series with white and slow noise, up to half of it wrong.
+    """The mean of three or more values at ascending times with white and slow noise, up to half of them wrong.
 
-    Args:
-        times: ascending.
-        values: three or more.
-        stds: relative to each other.
+    Standard deviations are relative to each other.
     """
 
     def inliers_of(mean: Tensor) -> Tensor:
@@ -126,7 +105,10 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
         weights = inliers / stds.square()
         return (weights * values).sum() / weights.sum()
 
-    found = fit_inliers(_densest(values), inliers_of, mean_of, ROUNDS)
+    # From the middle of the shortest interval with half of the values: wrong ones may all lie on one side.
+    ordered, half = values.sort().values, len(values) // 2
+    start = (ordered[half:] - ordered[: len(values) - half]).argmin()
+    found = fit_inliers((ordered[start] + ordered[start + half]) / 2, inliers_of, mean_of, ROUNDS)
     assert found is not None  # a mean is always determined
     inliers = found[1]
     group, size = group_rows(int(inliers.sum()))
@@ -153,14 +135,6 @@ def slow_mean(times: Float[Tensor, " N"], values: Float[Tensor, " N"], stds: Flo
     )
 
 
-def _densest(values: Float[Tensor, " N"]) -> Float[Tensor, ""]:
-    """The middle of the shortest interval with half of the values: wrong ones may all lie on one side."""
-    ordered = values.sort().values
-    half = len(values) // 2
-    start = (ordered[half:] - ordered[: len(values) - half]).argmin()
-    return (ordered[start] + ordered[start + half]) / 2
-
-
 def scale_of_series(
     source: ScaleSource,
     times: Float[Tensor, " N"],
@@ -177,8 +151,6 @@ def scale_of_series(
     """Average a series of logarithms of meters per unit, up to half of them wrong; see `slow_mean`.
 
     Args:
-        source, unit, notes: of the measurement.
-        times, logs, stds: as for `slow_mean`.
         name_of: the name of a row, such as "at 3.2 s".
         disagreement: message where they determine no scale, with `{}` for their relative standard deviation.
         cause: end of the message about rejected ones.

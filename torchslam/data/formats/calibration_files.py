@@ -35,19 +35,11 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.distortion import MODELS
 from torchslam.geometry.transforms import HALF_PIXEL
 
-EXIF_BLOCK = 0x8769
-"""Tag of the block of camera data (EXIF 2.32)."""
-FOCAL_LENGTH_35MM = 0xA405
-"""Tag of the focal length of a 35 mm film camera with the same diagonal field of view, mm (EXIF 2.32)."""
-
 
 def read_focal(path: Path) -> Calibration:
-    """Read the 35 mm equivalent focal length of an image file (EXIF 2.32, tag 0xA405), relative to the diagonal.
-
-    Raises CalibrationError for a file without one.
-    """
+    """Read the 35 mm equivalent focal length of an image file, relative to the diagonal. Raises CalibrationError."""
     try:
-        found = exif_block(path, EXIF_BLOCK).get(FOCAL_LENGTH_35MM)
+        found = exif_block(path, 0x8769).get(0xA405)  # camera data; the focal length, mm (EXIF 2.32)
     except FrameError as cause:
         raise CalibrationError(str(cause)) from cause
     if not isinstance(found, int | float) or not 0 < found < math.inf:
@@ -132,31 +124,24 @@ DISTORTION = (
     *("distcoefficients", "distcoeffs", "distcoeff", "distcoefs", "distcoef", "dist", "coeffs", "d"),
 )
 WIDTH, HEIGHT = ("imagewidth", "width", "w", "cols"), ("imageheight", "height", "h", "rows")
-DISTORTION_MODEL = ("distortionmodel", "distortiontype")
 CAMERA_MODEL = ("cameramodel", "modeltype", "cameratype", "projectionmodel")
-IS_FISHEYE = ("fisheyemodel", "isfisheye", "usefisheye", "fisheye")
 INTRINSICS = (("fx", "fu"), ("fy", "fv"), ("cx", "cu", "ppx"), ("cy", "cv", "ppy"))
-OF_A_CAMERA = (
-    *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2", "is_fisheye"),
-)
-"""Keys of a transforms.json that a frame may have, too."""
 LOOKS_LIKE_DISTORTION = re.compile(r"dist(?!an)|coef|fisheye|^(camera1?)?(k[1-9]|p[1-9])$|^xi$")
 """Of keys that were not used."""
 
-# COLMAP, src/colmap/sensor/models.h: where each parameter goes among fx fy cx cy and the distortion, of a fisheye where
-# the name ends so.
+# COLMAP, src/colmap/sensor/models.h, in the order of its numbers without 7 (FOV): where each parameter goes among
+# fx fy cx cy and the distortion, of a fisheye where the name ends so.
 COLMAP_MODELS = {
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
     "SIMPLE_RADIAL": "f cx cy k1",
     "RADIAL": "f cx cy k1 k2",
     "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
     "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 k4 k5 k6",
     "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
     "RADIAL_FISHEYE": "f cx cy k1 k2",
-    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
 }
-COLMAP_LINE = re.compile(r"\d+\s+[A-Z][A-Z_0-9]+\s+\d{1,9}\s+\d{1,9}\s", re.ASCII)
 
 
 def read_calibration(path: str | Path) -> Calibration:
@@ -174,7 +159,7 @@ def read_calibration(path: str | Path) -> Calibration:
     if tree is not None:
         return _from_tree(path, tree)
     lines = [line for _, line in numbered_lines(path, CalibrationError)]
-    if lines and COLMAP_LINE.match(lines[0]):
+    if lines and re.match(r"(?a)\d+\s+[A-Z][A-Z_0-9]+\s+\d{1,9}\s+\d{1,9}\s", lines[0]):
         return from_colmap(path, lines)
     return read_numbers(path)
 
@@ -292,9 +277,9 @@ def _with_distortion(
     `intrinsics` are fx fy cx cy, `prefix` is that of keys of single coefficients, `model_keys` may name the model, too.
     """
     # All keys are looked at, and are used then.
-    flags = [keys.flag(key) for key in IS_FISHEYE]
+    flags = [keys.flag(key) for key in ("fisheyemodel", "isfisheye", "usefisheye", "fisheye")]
     flags.append(_has_fisheye_model(keys, "camera", (*CAMERA_MODEL, *model_keys)))
-    flags.append(_has_fisheye_model(keys, "distortion", DISTORTION_MODEL))
+    flags.append(_has_fisheye_model(keys, "distortion", ("distortionmodel", "distortiontype")))
     if keys.number("xi"):
         raise CalibrationError(f"{keys.source}: camera model `omnidirectional` (xi) is not known")
     kind = "fisheye" if any(flags) else ""
@@ -380,7 +365,25 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
 def _from_transforms(keys: Keys) -> Calibration:
     """The camera that all frames of a transforms.json share; its pixels count from the corner of the top left one."""
     source = keys.source
-    _check_shared(keys)
+    shared = (
+        "camera_model",
+        "w",
+        "h",
+        "fl_x",
+        "fl_y",
+        "cx",
+        "cy",
+        "is_fisheye",
+        *MODELS["rational"].coefficients,
+    )
+    frames: Any = keys.value("frames")
+    for frame in frames if isinstance(frames, list) else ():
+        for key in shared if isinstance(frame, dict) else ():
+            if key in frame and frame[key] != (keys.value(normal(key)) if (normal(key),) in keys else 0):
+                raise CalibrationError(
+                    f"{source}: frame {str(frame.get('file_path', ''))[:80]} has a {key} of its own; "
+                    "only one camera for all frames is read"
+                )
     size = _size(keys, ("",))
     focal, angle = keys.number("flx"), keys.number("cameraanglex")
     if focal is None and size is not None and angle is not None:
@@ -399,15 +402,3 @@ def _from_transforms(keys: Keys) -> Calibration:
             f"{source}: k4 is not modeled as nerfstudio means it, the fourth term of a polynomial"
         )
     return replace(found, as_stored=True)
-
-
-def _check_shared(keys: Keys) -> None:
-    """Raise CalibrationError for a frame with a camera of its own."""
-    frames: Any = keys.value("frames")
-    for frame in frames if isinstance(frames, list) else ():
-        for key in OF_A_CAMERA if isinstance(frame, dict) else ():
-            if key in frame and frame[key] != (keys.value(normal(key)) if (normal(key),) in keys else 0):
-                raise CalibrationError(
-                    f"{keys.source}: frame {str(frame.get('file_path', ''))[:80]} has a {key} of its own; "
-                    "only one camera for all frames is read"
-                )

@@ -29,8 +29,6 @@ DEPTH_LIST = "depth.txt"
 SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm"})
 """Of images that can have 16 bits."""
 SEVEN_SCENES_DEPTH = "frame-*.depth.png"
-FIVE_THOUSANDTHS, MILLIMETERS = 5000.0, 1000.0
-"""Units per meter, of TUM and ICL-NUIM, and of most others."""
 BOUNDS_M = 0.05, 200.0
 """Meters that the middle depth of an image may have; beyond, its unit is another one. Sensors see .2 to 20 m, rendered
 scenes more."""
@@ -58,8 +56,7 @@ class DepthImages:
 def parse_depth_folder(text: str) -> tuple[str, float | None]:
     """Read `FOLDER` or `FOLDER:SCALE`, with the units per meter; a folder whose name has a colon is one.
 
-    Raises:
-        MeasurementError: the scale is none.
+    Raises MeasurementError for another scale than a positive number.
     """
     folder, colon, scale = text.rpartition(":")
     if not colon or Path(text).exists() or not folder or re.search(r"[/\\]", scale):
@@ -76,14 +73,10 @@ def parse_depth_folder(text: str) -> tuple[str, float | None]:
 
 
 def find_depth_images(path: str | Path, units_per_meter: float | None = None) -> DepthImages:
-    """The depth images of a list, of a folder, or of a dataset whose folder has them.
+    """The depth images of a list (`depth.txt`), of a folder, or of a dataset whose folder has them.
 
-    Args:
-        path: `depth.txt`, a folder of images, or the folder of a dataset.
-        units_per_meter: of their values; None: those of the dataset, or millimeters.
-
-    Raises:
-        MeasurementError: there are none, or a list is wrong, naming file and line.
+    Without `units_per_meter`, values are in the unit of the dataset, or millimeters. Raises MeasurementError if there
+    are none, or a list is wrong, naming file and line.
     """
     path = Path(path)
     if not path.exists():
@@ -92,9 +85,8 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
     found = next((each for each in listed if each.is_file()), None if path.is_dir() else path)
     if found is not None:
         places, seconds, paths = zip(*listed_files(found, MeasurementError), strict=True)
-        _check_number(len(paths), found)
         check_rising(seconds, places, MeasurementError)
-        return DepthImages(found, paths, float64(seconds), units_per_meter or FIVE_THOUSANDTHS)
+        return DepthImages(found, paths, float64(seconds), units_per_meter or 5000.0)
     files = _files(path)
     if not files and (path / "depth").is_dir():
         path = path / "depth"
@@ -103,7 +95,7 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
         raise MeasurementError(f"{path}: no depth images: no {DEPTH_LIST} and no .png, .tif or .pgm")
     is_icl = next(path.parent.glob("*.gt.freiburg"), None) is not None
     is_known = is_icl or files[0].match(SEVEN_SCENES_DEPTH) or units_per_meter is not None
-    units = units_per_meter or (FIVE_THOUSANDTHS if is_icl else MILLIMETERS)
+    units = units_per_meter or (5000.0 if is_icl else 1000.0)
     times = times_in_names(files)
     rising = times is not None and all(after > before for before, after in itertools.pairwise(times))
     return DepthImages(path, tuple(files), float64(times) if rising else None, units, is_known)
@@ -111,11 +103,10 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
 
 def _files(folder: Path) -> list[Path]:
     """The depth images in a folder: those of 7-Scenes are beside the color images."""
-    found: list[Path] = []
-    for file in folder.iterdir():
-        if file.suffix.lower() in SUFFIXES and not file.name.startswith("."):
-            found.append(file)
-            _check_number(len(found), folder)
+    entries = list(itertools.islice(folder.iterdir(), MAX_FILES + 1))
+    if len(entries) > MAX_FILES:
+        raise MeasurementError(f"{folder}: more than {MAX_FILES} files")
+    found = [file for file in entries if file.suffix.lower() in SUFFIXES and not file.name.startswith(".")]
     beside = [file for file in found if file.match(SEVEN_SCENES_DEPTH)]
     try:
         return in_order(beside or found)
@@ -123,17 +114,10 @@ def _files(folder: Path) -> list[Path]:
         raise MeasurementError(str(error)) from None
 
 
-def _check_number(count: int, where: Path) -> None:
-    if count > MAX_FILES:
-        raise MeasurementError(f"{where}: more than {MAX_FILES} depth images")
-
-
 def read_depth(path: Path, units_per_meter: float) -> Float[np.ndarray, "H W"]:
     """Depth along the optical axis in meters, float32; 0 where it was not measured.
 
-    Raises:
-        FrameError: the file cannot be read.
-        MeasurementError: it has no 16 bits, or another unit.
+    Raises FrameError if the file cannot be read, MeasurementError if it has no 16 bits, or another unit.
     """
     values = read_pixels(path, str(path), as_stored=True)
     if values.dtype != np.uint16 or values.ndim != 2:

@@ -33,8 +33,6 @@ from torchslam.errors import FrameError, MeasurementError
 
 LATITUDE, LONGITUDE, ALTITUDE = 2, 4, 6
 """Tags in that block; the hemisphere, or whether it is below the sea, is the tag before each."""
-XML_BYTES = 1 << 26
-"""Size limit of GPX files; half a million points, of which the parser makes objects of ten times the size."""
 DEGREES, METERS = {"deg": 1.0, "degrees": 1.0, "°": 1.0}, {"m": 1.0, "meters": 1.0}
 """Units that headings may state."""
 COLUMNS = {
@@ -46,23 +44,15 @@ COLUMNS = {
     "std_horizontal": Column(("stdhorizontal",), METERS),
     "std_vertical": Column(("stdvertical",), METERS),
 }
-"""Kinds of columns."""
-MAX_FIXES = 1_000_000
-"""Maximum number of positions of a file: more than a day at 10 Hz."""
-MAX_ALTITUDE = 1e5
-"""Meters: the farthest from the ground that a position may be; balloons and rockets of amateurs stay below."""
+MAX_FIXES = 1_000_000  # maximum number of positions of a file: more than a day at 10 Hz
 
 
 class Fix(NamedTuple):
-    """One position as a file has it.
+    """One position as a file has it, at a file and line, of a time in seconds or of the name of an image.
 
     Attributes:
-        where: file and line, for messages.
-        latitude: degrees; NaN where the receiver had no position.
-        longitude: degrees.
+        latitude, longitude: degrees; NaN where the receiver had no position.
         altitude: meters, above the sea or the ellipsoid or the start; NaN if unknown.
-        time: seconds; None where `name` identifies the image.
-        name: of an image.
         std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
     """
 
@@ -77,14 +67,11 @@ class Fix(NamedTuple):
 
 @dataclass(frozen=True)
 class Fixes:
-    """N positions, each at a time or of an image.
+    """N positions, each at a time, seconds, increasing, on the clock of the file, or of an image of some name.
 
     Attributes:
-        path: where they come from.
-        geodetic: latitude and longitude, degrees, and altitude, meters; the altitude is NaN if it is unknown.
-        std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
-        timestamps: seconds, increasing, on the clock of the file; None where they are known by names.
-        names: N names of image files, or empty.
+        geodetic: latitude, longitude and altitude, as in `Fix`.
+        std: as in `Fix`.
         notes: remarks for the user, one line each.
     """
 
@@ -151,7 +138,7 @@ def _check(row: Fix) -> None:
         what = f"a latitude of {row.latitude:g} degrees is beyond the poles{hint}"
     elif not abs(row.longitude) <= 360:
         what = f"a longitude of {row.longitude:g} degrees is beyond 180"
-    elif abs(row.altitude) > MAX_ALTITUDE:  # NaN is not
+    elif abs(row.altitude) > 1e5:  # NaN is not; balloons and rockets of amateurs stay below
         what = f"an altitude of {row.altitude:g} is no altitude in meters above the ground of the Earth"
     for std in row.std:
         if not (math.isnan(std) or 0 < std < math.inf):
@@ -202,25 +189,15 @@ def _csv_rows(path: Path) -> Iterator[Fix]:
         )
 
 
-# --- DJI's subtitles -----------------------------------------------------------------------------------------
-
-CUE = re.compile(r"(\d{1,3}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->")
 _NUMBER = r"([-+]?\d{1,9}(?:\.\d{1,12})?)"
-BRACKETS = {
-    name: re.compile(rf"\b{word}\s*:\s*{_NUMBER}")
-    for name, word in (
-        ("latitude", "latitude"),
-        ("longitude", "longt?itude"),  # as some models write it
-        ("absolute", "abs_alt"),
-        ("altitude", "altitude"),
-        ("relative", "rel_alt"),
-    )
-}
-"""`[latitude: 59.30] [longitude: 18.20] [rel_alt: 1.3 abs_alt: 132.9]`."""
+BRACKETS = [
+    re.compile(rf"\b{word}\s*:\s*{_NUMBER}")  # some models write `longtitude`
+    for word in ("latitude", "longt?itude", "abs_alt", "altitude", "rel_alt")
+]
+"""`[latitude: 59.30] [longitude: 18.20] [rel_alt: 1.3 abs_alt: 132.9]`, altitudes in the order in which they count."""
 TUPLE = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*(M)?\s*)?\)")
 """`GPS(longitude,latitude,satellites or altitude)`; the Matrice's has latitude first and its altitude ends with M."""
-HEIGHT = re.compile(rf"\b(?:BAROMETER\s*:|H\s)\s*{_NUMBER}")
-"""Height over the start in those lines."""
+HEIGHT = re.compile(rf"\b(?:BAROMETER\s*:|H\s)\s*{_NUMBER}")  # height over the start in those lines
 
 
 def _srt_rows(path: Path) -> Iterator[Fix]:
@@ -246,7 +223,7 @@ def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
             if len(text) > MAX_LINE:
                 raise MeasurementError(f"{path}:{number}: a subtitle of more than {MAX_LINE} characters")
             continue
-        time = CUE.search(line)
+        time = re.search(r"(\d{1,3}):(\d\d):(\d\d)[,.](\d{1,3})\s*-->", line)
         if time is None:
             raise MeasurementError(
                 f"{path}:{number}: expected `00:00:01,000 --> 00:00:02,000`, got `{line[:100]}`"
@@ -262,10 +239,10 @@ def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
 
 def _srt_position(text: str) -> tuple[float, float, float] | None:
     """Latitude, longitude and altitude of a cue; None where it has none."""
-    values = {name: float(m[1]) for name, pattern in BRACKETS.items() if (m := pattern.search(text))}
-    if "latitude" in values and "longitude" in values:
-        altitude = next((values[n] for n in ("absolute", "altitude", "relative") if n in values), math.nan)
-        return values["latitude"], values["longitude"], altitude
+    matches = (pattern.search(text) for pattern in BRACKETS)
+    latitude, longitude, *altitudes = (None if match is None else float(match[1]) for match in matches)
+    if latitude is not None and longitude is not None:
+        return latitude, longitude, next((each for each in altitudes if each is not None), math.nan)
     found = TUPLE.search(text)
     if found is None:
         return None
@@ -276,12 +253,10 @@ def _srt_position(text: str) -> tuple[float, float, float] | None:
     return second, first, float(height[1]) if height else float(found[3] or "nan")
 
 
-# --- GPX -----------------------------------------------------------------------------------------------------
-
-
 def _gpx_rows(path: Path) -> Iterator[Fix]:
     """The points of all tracks, with their times. Source: GPX 1.1, www.topografix.com/GPX/1/1."""
-    text = read_text(path, MeasurementError, XML_BYTES)
+    # Half a million points, of which the parser makes objects of ten times the size.
+    text = read_text(path, MeasurementError, 1 << 26)
     if "<!DOCTYPE" in text or "<!ENTITY" in text:  # entities may expand to any size
         raise MeasurementError(f"{path}: a GPX file has no DOCTYPE")
     try:
@@ -304,9 +279,6 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
             for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
         )
         yield Fix(where, latitude, longitude, altitude, time=time)
-
-
-# --- NMEA ----------------------------------------------------------------------------------------------------
 
 
 def _read_nmea(path: Path, text: str) -> Fixes:
@@ -365,9 +337,6 @@ def _degrees(text: str, hemisphere: str, expected: str, where: str) -> float:
     return degrees if hemisphere == expected[0] else -degrees
 
 
-# --- EXIF ----------------------------------------------------------------------------------------------------
-
-
 def read_image_fixes(folder: Path) -> Fixes:
     """The positions in the EXIF blocks of the images of a folder, by their names; others have none.
 
@@ -378,8 +347,7 @@ def read_image_fixes(folder: Path) -> Fixes:
         raise MeasurementError(
             f"{folder}: neither images nor oxts/ of KITTI in it; positions are read from .srt, .gpx, .nmea and .csv"
         )
-    rows = [_image_fix(image) for image in images]
-    found = [row for row in rows if row is not None]
+    found = [row for row in map(_image_fix, images) if row is not None]
     if not found:
         raise MeasurementError(f"{folder}: no image of {len(images)} has a position in its EXIF block")
     missing = len(images) - len(found)
@@ -411,15 +379,10 @@ def _exif_degrees(parts: tuple[float, ...], hemisphere: str) -> float:
     return -degrees if str(hemisphere).strip("\0 ").upper() in ("S", "W") else degrees
 
 
-# --- KITTI ---------------------------------------------------------------------------------------------------
-
-
 def _oxts_rows(folder: Path) -> Iterator[Fix]:
     """On the clock of KITTI's raw images, with the accuracy that the receiver states."""
     for packet in read_oxts(folder):
-        accuracy = (
-            packet.numbers[23] if len(packet.numbers) > 23 else math.nan
-        )  # `pos_accuracy` (dataformat.txt)
-        std = accuracy if accuracy > 0 else math.nan
+        accuracy = packet.numbers[23:24]  # `pos_accuracy` (dataformat.txt)
+        std = accuracy[0] if accuracy and accuracy[0] > 0 else math.nan
         latitude, longitude, altitude = packet.numbers[:3]
         yield Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std))

@@ -8,51 +8,34 @@ import re
 import statistics
 from collections import Counter
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from torchslam.data.formats.image_file import FOREIGN, SUFFIXES
 from torchslam.data.text_file import UNIX_UNITS
 from torchslam.errors import SequenceError
 
-MAX_FILES = 1_000_000
-"""Maximum number of files in a folder."""
+MAX_FILES = 1_000_000  # maximum number of files in a folder
 FOLDERS = ("images", "rgb", "image", "color", "colour", "frames", "imgs", "img", "image_0", "image_2")
 """Subfolders that are searched for frames."""
 
 # Words in the name of an image that is not a frame, separated by anything but letters.
 OTHER_KINDS = {
     "depth": "depth images",
-    "disp": "disparities",
-    "disparity": "disparities",
-    "mask": "masks",
-    "masks": "masks",
-    "seg": "labels",
-    "semantic": "labels",
-    "label": "labels",
-    "labels": "labels",
-    "normal": "normals",
-    "normals": "normals",
     "flow": "optical flow",
+    **dict.fromkeys(("disp", "disparity"), "disparities"),
+    **dict.fromkeys(("mask", "masks"), "masks"),
+    **dict.fromkeys(("seg", "semantic", "label", "labels"), "labels"),
+    **dict.fromkeys(("normal", "normals"), "normals"),
 }
 
 
-@dataclass(frozen=True)
-class Found:
-    """The images of a folder.
-
-    Attributes:
-        frames: in natural order of their names
-        left_out: number of files left out, by kind
-    """
+class Found(NamedTuple):
+    """The frames of a folder, in natural order of their names, and the number of files left out, by kind."""
 
     frames: list[Path]
     left_out: Counter[str]
-
-    def without(self, count: int, kind: str) -> Found:
-        """Return the same frames, with images elsewhere that were left out."""
-        return replace(self, left_out=self.left_out + Counter({kind: count}))
 
     @property
     def notes(self) -> list[str]:
@@ -63,29 +46,23 @@ class Found:
 
 NUMBER = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)|\d+)")
 """A run of digits, or two with a dot between them; more dots separate parts of a version or a date."""
-UNIX_DIGITS = range(9, 11)
-"""Digits of the seconds since 1970, from 1973 to 2286."""
-FLOAT_DIGITS = 7
-"""The most digits after the dot of the shortest text that is a float of seconds since 1970."""
-SHORTEST = 1e-3
-"""Seconds between images, below which decimals in names count something else."""
+UNIX_DIGITS = range(9, 11)  # digits of the seconds since 1970, from 1973 to 2286
+SHORTEST = 1e-3  # seconds between images, below which decimals in names count something else
 
 
 def in_order(files: Iterable[Path]) -> list[Path]:
     """Sort files by name, such that runs of digits compare as numbers and a dot between digits starts a fraction."""
     files = list(files)
-    has_fractions = _has_fractions(files)
-    return sorted(files, key=lambda file: (natural(file.name, has_fractions), file.name))
+    number = NUMBER if _has_fractions(files) else re.compile(r"(\d+)")
 
+    def key(file: Path) -> tuple[list[tuple[bool, int, str]], str]:
+        parts = []
+        for place, part in enumerate(number.split(file.name.lower())):
+            whole, _, fraction = part.partition(".")
+            parts.append((True, int(whole), fraction) if place % 2 else (False, 0, part))
+        return parts, file.name
 
-def natural(name: str, has_fractions: bool) -> list[tuple[bool, int, str]]:
-    """A sort key under which runs of digits compare as numbers, and those after a dot as fractions if they are some."""
-    parts = NUMBER.split(name.lower()) if has_fractions else re.split(r"(\d+)", name.lower())
-    key = []
-    for place, part in enumerate(parts):
-        whole, _, fraction = part.partition(".")
-        key.append((True, int(whole), fraction) if place % 2 else (False, 0, part))
-    return key
+    return sorted(files, key=key)
 
 
 def _has_fractions(files: list[Path]) -> bool:
@@ -112,7 +89,7 @@ def _has_fractions(files: list[Path]) -> bool:
         parts = 10 ** max(by_length)
         counted = [int(whole) + int(fraction) / parts for whole, _, fraction in numbers]
         decimal = [float(f"{whole}.{fraction}") for whole, _, fraction in numbers]
-        is_long = max(by_length) > FLOAT_DIGITS
+        is_long = max(by_length) > 7  # the shortest text that is a float has at most so many
         is_counted = has_ends or is_long or _irregularity(counted) < _irregularity(decimal)
     if is_counted:
         raise SequenceError(
@@ -123,7 +100,6 @@ def _has_fractions(files: list[Path]) -> bool:
 
 
 def _irregularity(times: list[float]) -> float:
-    """Return the standard deviation of the intervals between times, seconds."""
     return statistics.pstdev(after - before for before, after in itertools.pairwise(sorted(times)))
 
 
@@ -154,27 +130,31 @@ def _times(is_bare: bool, numbers: tuple[str, ...]) -> list[float] | None:
     return times if intervals and statistics.median(intervals) >= SHORTEST else None
 
 
-def find_frames(folder: Path) -> Found:
-    """The frames among the files of a folder. Raises SequenceError where there are too many files, or two series."""
-    return sort_out(_files(folder), folder)
+def find_frames(folder: Path, pattern: str = "*") -> Found:
+    """The frames among the files of a folder whose names fit a pattern.
 
-
-def sort_out(files: Iterable[Path], where: Path) -> Found:
-    """The frames among files. Raises SequenceError at `where` for two series that count alike: `left_7`, `right_7`."""
+    Raises SequenceError where there are too many files, or two series that count alike: `left_7`, `right_7`.
+    """
     frames: list[Path] = []
     left_out: Counter[str] = Counter()
-    for file in files:
+    for file in _files(folder):
         kind = other_kind(file)
+        if not fnmatch.fnmatchcase(file.name, pattern):
+            continue
         if kind is None:
             frames.append(file)
         else:
             left_out[kind] += 1
-    series = _series(frames)
+    series: dict[str, set[str]] = {}  # of names with `#` for each number: the numbers that occur
+    for file in frames:
+        name = re.sub(r"\d+", "#", file.stem) + file.suffix
+        if "#" in name:
+            series.setdefault(name, set()).add("-".join(str(int(n)) for n in re.findall(r"\d+", file.stem)))
     shared = Counter(number for numbers in series.values() for number in numbers)
     rivals = [name for name, numbers in series.items() if any(shared[number] > 1 for number in numbers)]
     if len(rivals) > 1:
-        globs = " or ".join(f"'{where / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
-        raise SequenceError(f"{where}: several series of images that count alike; which one? Give {globs}")
+        globs = " or ".join(f"'{folder / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
+        raise SequenceError(f"{folder}: several series of images that count alike; which one? Give {globs}")
     return Found(in_order(frames), left_out)
 
 
@@ -204,23 +184,10 @@ def subfolder(folder: Path) -> Path | None:
 
 def _files(folder: Path) -> list[Path]:
     """The files of a folder with an image's suffix, also one that is not read."""
-    files: list[Path] = []
-    for number, file in enumerate(folder.iterdir()):
-        if number >= MAX_FILES:
-            raise SequenceError(f"{folder}: more than {MAX_FILES} files; give a folder with the images alone")
-        if file.suffix.lower() in SUFFIXES | FOREIGN and file.is_file():
-            files.append(file)
-    return files
-
-
-def _series(files: list[Path]) -> dict[str, set[str]]:
-    """Names with `#` for each number -> the numbers that occur."""
-    series: dict[str, set[str]] = {}
-    for file in files:
-        name = re.sub(r"\d+", "#", file.stem) + file.suffix
-        if "#" in name:
-            series.setdefault(name, set()).add("-".join(str(int(n)) for n in re.findall(r"\d+", file.stem)))
-    return series
+    entries = list(itertools.islice(folder.iterdir(), MAX_FILES + 1))
+    if len(entries) > MAX_FILES:
+        raise SequenceError(f"{folder}: more than {MAX_FILES} files; give a folder with the images alone")
+    return [file for file in entries if file.suffix.lower() in SUFFIXES | FOREIGN and file.is_file()]
 
 
 def is_pattern(path: str) -> bool:
@@ -229,7 +196,6 @@ def is_pattern(path: str) -> bool:
 
 
 def match_pattern(path: str) -> Found:
-    """The frames that a pattern names. Raises SequenceError where they are several series."""
-    pattern, folder = Path(path).name, Path(path).parent
-    files = _files(folder) if folder.is_dir() else []
-    return sort_out((file for file in files if fnmatch.fnmatchcase(file.name, pattern)), folder)
+    """The frames that a pattern names, see `find_frames`."""
+    folder = Path(path).parent
+    return find_frames(folder, Path(path).name) if folder.is_dir() else Found([], Counter())

@@ -27,35 +27,17 @@ from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
 TUM, COLMAP, NERFSTUDIO = "tum", "colmap", "nerfstudio"
 TRANSFORMS = "transforms.json"
-MODEL_NAMES = (
-    *(
-        "SIMPLE_PINHOLE",
-        "PINHOLE",
-        "SIMPLE_RADIAL",
-        "RADIAL",
-        "OPENCV",
-        "OPENCV_FISHEYE",
-        "FULL_OPENCV",
-        "FOV",
-    ),
-    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"),
-)
-"""By their numbers in binary files: COLMAP, src/colmap/sensor/models.h."""
-_MAX_BYTES = 1 << 30
-"""Largest model that is read; a frame with 10,000 keypoints takes 240 kB of it."""
-_ORTHOGONAL = 1e-3  # how far a rotation in a text may be from one
+_MAX_BYTES = 1 << 30  # largest model that is read; a frame with 10,000 keypoints takes 240 kB of it
 
 
 @dataclass(frozen=True)
 class GivenPoses:
-    """N poses, each of an image known by its time or by its name.
+    """N poses, each of an image known by its time, seconds, or by its name.
 
     Attributes:
         kind: "tum", "colmap" or "nerfstudio"
         path: the file, or the folder of a COLMAP model
         T_cw: world to camera, camera axes x right, y down, z forward
-        timestamps: seconds, if the file identifies images by times
-        names: N names of image files, if the file identifies images by names
         calibration: of the images, if known
     """
 
@@ -86,7 +68,11 @@ class GivenPoses:
             found = rows_by_name(self.names, [sequence.image_name(i) for i in range(len(sequence))])
             how = f"no image has one of its names, such as {self.names[0]}"
         else:
-            found = _by_time(times, sequence.timestamps)
+            # The nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn.
+            nearest_row, distances = nearest(sequence.timestamps, times)
+            back, _ = nearest(times, sequence.timestamps)
+            is_pair = back[nearest_row] == torch.arange(len(nearest_row), device="cpu")
+            found = torch.where((distances <= GROUNDTRUTH_TOLERANCE) & is_pair, nearest_row, -1)
             own, others = (
                 f"from {each[0]} to {each[-1]} s" for each in (times.tolist(), sequence.timestamps.tolist())
             )
@@ -102,9 +88,8 @@ class GivenPoses:
                     "times are counted: with one image more or less, the others have wrong poses; name the images "
                     "by their times, or list them in rgb.txt"
                 )
-        for frame in (
-            frames if times is None else ()
-        ):  # COLMAP, and what builds on it, sees images as they are stored
+        # COLMAP, and what builds on it, sees images as they are stored.
+        for frame in frames if times is None else ():
             with contextlib.suppress(FrameError):  # said when the frame is read
                 if sequence.is_turned(frame):
                     raise TrajectoryError(
@@ -134,14 +119,6 @@ def read_poses(path: str | Path) -> GivenPoses:
     return GivenPoses(TUM, path, se3_inverse(trajectory.T_wc), trajectory.timestamps)
 
 
-def _by_time(times: Float[Tensor, " N"], frames: Float[Tensor, " F"]) -> Int[Tensor, " F"]:
-    """The nearest pose of each frame, if near enough, and if the frame is the nearest of the pose in turn."""
-    rows, distances = nearest(frames, times)
-    back, _ = nearest(times, frames)
-    mutual = back[rows] == torch.arange(len(frames), device="cpu")
-    return torch.where((distances <= GROUNDTRUTH_TOLERANCE) & mutual, rows, -1)
-
-
 def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
     """The row of each image's name, with most in common from its end: `0/a.png` is that of `rgb/0/a.png`; -1 for none.
 
@@ -157,9 +134,6 @@ def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
             if max(found, default=-1) >= 0:
                 return torch.tensor(found, device="cpu")
     return torch.full((len(images),), -1, device="cpu")
-
-
-# --- COLMAP --------------------------------------------------------------------------------------------------
 
 
 def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
@@ -218,15 +192,14 @@ def _binary_camera(path: Path) -> Calibration:
         if count != 1:
             raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
         number, model, width, height = struct.unpack_from("<IiQQ", data, 8)
-        name = MODEL_NAMES[model] if 0 <= model < len(MODEL_NAMES) else str(model)
+        # By its number (src/colmap/sensor/models.h); 7, FOV, is not modeled.
+        names = dict(zip((*range(7), *range(8, 10)), COLMAP_MODELS, strict=True))
+        name = names.get(model, "FOV" if model == 7 else str(model))
         keys = COLMAP_MODELS.get(name, "").split()
         params = struct.unpack_from(f"<{len(keys)}d", data, 32)
     except (OSError, struct.error) as cause:
         raise CalibrationError(f"{path}: not COLMAP's cameras: {cause}") from cause
     return from_colmap(path, [" ".join(map(str, (number, name, width, height, *params)))])
-
-
-# --- transforms.json -----------------------------------------------------------------------------------------
 
 
 def _read_transforms(path: Path) -> GivenPoses:
@@ -240,7 +213,7 @@ def _read_transforms(path: Path) -> GivenPoses:
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
     R = T_wc[:, :3, :3]
-    if not bool(T_wc.isfinite().all() & (orthogonality_error(R) < _ORTHOGONAL).all()):
+    if not bool(T_wc.isfinite().all() & (orthogonality_error(R) < 1e-3).all()):
         raise TrajectoryError(f"{path}: a transform_matrix is not a rigid transformation")
     T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
     is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it

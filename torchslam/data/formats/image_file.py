@@ -29,22 +29,16 @@ FOREIGN = frozenset(
     | {".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2"}
 )
 """Suffixes of images that are not read."""
-WIDTH, HEIGHT = 256, 257  # tags of a TIFF
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
-MAX_BYTES = 1 << 29
-"""Size limit of image files."""
-MAX_PIXELS = 1 << 26
-"""Maximum number of pixels; a small file may declare any number."""
+MAX_BYTES = 1 << 29  # size limit of image files
+MAX_PIXELS = 1 << 26  # maximum number of pixels; a small file may declare any number
 
 
 def write_image(path: Path, pixels: UInt8[np.ndarray, "H W *channels"]) -> None:
     """Write gray or BGR pixels in the format that the suffix names; any name of a folder will do.
 
-    OpenCV's own writer takes UTF-8 names only, and reports a failure by its return value.
-
-    Raises:
-        ResultsError: If the file cannot be written.
+    OpenCV's own writer takes UTF-8 names only, and reports a failure by its return value. Raises ResultsError.
     """
     is_encoded, content = cv2.imencode(path.suffix, pixels)
     try:
@@ -60,12 +54,8 @@ def read_gray(
 ) -> Float[Tensor, "1 1 H W"]:
     """An image file as gray in [0, 1].
 
-    Args:
-        bits: number of significant bits in files of 16 bits (`bit_depth`)
-        as_stored: ignore the orientation in the EXIF block
-
-    Raises:
-        FrameError: at `where` for a file that is missing, truncated, too large or not an image.
+    `bits` are those of files of 16 bits that carry something (`bit_depth`); `as_stored` ignores the orientation in the
+    EXIF block. Raises FrameError at `where` for a file that is missing, truncated, too large or not an image.
     """
     return gray_to_tensor(read_pixels(path, where, as_stored), bits)
 
@@ -148,8 +138,7 @@ def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
     return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
 
 
-SAMPLES = 20
-"""Number of images in which the brightest pixel of a 16-bit sequence is searched."""
+SAMPLES = 20  # number of images in which the brightest pixel of a 16-bit sequence is searched
 
 
 def bit_depth(images: Iterable[np.ndarray]) -> int:
@@ -168,7 +157,6 @@ def gray_to_tensor(gray: Shaped[np.ndarray, "H W"], bits: int = 8) -> Float[Tens
 
 
 def _white(bits: int) -> int:
-    """The brightest value in an image of 16 bits of which some carry something."""
     return (1 << bits) - 1 if bits > 8 else 65535
 
 
@@ -201,34 +189,27 @@ def _tiff_pixels(data: bytes) -> int:
         return int.from_bytes(data[at : at + size], order)
 
     start = number(4, 4)
-    sides = {WIDTH: 0, HEIGHT: 0}
+    sides = {256: 0, 257: 0}  # tags: width and height
     for at in range(start + 2, start + 2 + 12 * number(start, 2), 12):
         if number(at, 2) in sides:  # entries: tag, type (3: two bytes, 4: four), count, value
             sides[number(at, 2)] = number(at + 8, 2 if number(at + 2, 2) == 3 else 4)
-    return sides[WIDTH] * sides[HEIGHT] or MAX_PIXELS + 1
+    return sides[256] * sides[257] or MAX_PIXELS + 1
 
 
 def _is_truncated(data: bytes) -> bool:
     """Return True for a JPEG or PNG file without its end marker; other formats are left to the decoder."""
     if data.startswith(b"\x89PNG"):
         return b"IEND" not in data[-64:] and b"IEND\xaeB`\x82" not in data
-    if data.startswith(b"\xff\xd8"):
-        return data.rfind(b"\xff\xd9") < _start_of_scan(data)
-    return False
-
-
-def _start_of_scan(data: bytes) -> int:
-    """Return the offset of the pixels of a JPEG, after any embedded thumbnail; the length of the file without them."""
-    position = 2
+    if not data.startswith(b"\xff\xd8"):
+        return False
+    position = 2  # to the pixels of a JPEG, after any embedded thumbnail
     while position + 4 <= len(data) and data[position] == 0xFF:
         marker = data[position + 1]
         if marker == 0xDA:
-            return position
-        if marker == 0xFF:  # a fill byte
-            position += 1
-            continue
-        position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
-    return len(data)
+            return data.rfind(b"\xff\xd9") < position
+        # 0xFF is a fill byte.
+        position += 1 if marker == 0xFF else 2 + int.from_bytes(data[position + 2 : position + 4], "big")
+    return True
 
 
 CHANNELS = {
@@ -246,11 +227,8 @@ def image_tensor(
 ) -> Float[Tensor, "1 1 H W"]:
     """Convert an array, uint8 or floats in [0, 1], to gray in [0, 1].
 
-    Args:
-        channels: order of the C channels, one of CHANNELS; ignored for an image with one channel
-
-    Raises:
-        FrameError: for another shape or type, and for floats that are not in [0, 1].
+    `channels` is their order, one of CHANNELS; ignored for an image with one channel. Raises FrameError for another
+    shape or type, and for floats that are not in [0, 1].
     """
     array = np.asarray(image)
     if channels not in CHANNELS:
@@ -281,9 +259,6 @@ def image_tensor(
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 PNG_MAX_CHUNKS = 1 << 17
 """Largest number of chunks of a file: libpng writes one for 8 kB of pixels, which are at most 1 GB."""
-PNG_PLAIN_CHUNKS = frozenset({b"IHDR", b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME"})
-"""Chunks before the pixels that change none of them. Others (of gamma, transparency, animation) are left to OpenCV."""
-PNG_GRAY, PNG_COLOR = 0, 2  # color types
 TO_GRAY = np.array([[9797, 19234, 3737, 0.5 - 16384]], np.float32) / 32768
 """Red, green, blue to gray as OpenCV has libpng do it: 0.299, 0.587 and the rest of 32768, rounded down. Half of a
 32768th more than -1/2 makes the rounding of `cv2.transform` that; all sums are whole in float32."""
@@ -303,20 +278,23 @@ def decode_png_gray(data: bytes) -> Shaped[np.ndarray, "H W"] | None:
         and any(data[16:20])
         and any(data[20:24])
     )
-    first = next((name for name, _ in _png_chunks(data) if name not in PNG_PLAIN_CHUNKS), b"")
+    # Chunks before the pixels that change none of them. Others (of gamma, transparency, animation) are left to OpenCV.
+    plain = (b"IHDR", b"pHYs", b"tEXt", b"zTXt", b"iTXt", b"tIME")
+    first = next((name for name, _ in _png_chunks(data) if name not in plain), b"")
     if not is_sound or header[-1] or first != b"IDAT":  # the last byte of the header: interlaced
         return None
     size = int.from_bytes(data[20:24], "big"), int.from_bytes(data[16:20], "big")
-    kind = data[24], data[25]
     try:
-        if kind == (16, PNG_GRAY):
-            return kornia_rs.io.decode_image_png_u16(data, size, "mono")[..., 0]
-        if kind == (8, PNG_GRAY):
-            return kornia_rs.io.decode_image_png_u8(data, size, "mono")[..., 0]
-        if kind == (8, PNG_COLOR):
-            return cv2.transform(kornia_rs.io.decode_image_png_u8(data, size, "rgb"), TO_GRAY).reshape(size)
+        match data[24], data[25]:  # bits, and type of color
+            case 16, 0:
+                return kornia_rs.io.decode_image_png_u16(data, size, "mono")[..., 0]
+            case 8, 0:
+                return kornia_rs.io.decode_image_png_u8(data, size, "mono")[..., 0]
+            case 8, 2:
+                rgb = kornia_rs.io.decode_image_png_u8(data, size, "rgb")
+                return cv2.transform(rgb, TO_GRAY).reshape(size)
     except Exception:  # the decoder has no exception type
-        return None
+        pass
     return None
 
 

@@ -5,6 +5,7 @@ OpenCV's dialect of YAML (`%YAML:1.0`, `!!opencv-matrix`, `key:value`) is read a
 
 from __future__ import annotations
 
+import contextlib
 import re
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
@@ -17,17 +18,11 @@ from torchslam.utils.files import JSON_BYTES, parse_json
 
 Tree = dict[str, Any]
 """Keys to text, lists or trees."""
-MAX_BYTES = 1 << 18
-"""Largest file that is read, but of JSON; those of calibration programs have kilobytes."""
-MAX_DEPTH = 20
-"""Levels of nesting that are read, which bounds the recursion."""
+MAX_BYTES = 1 << 18  # largest file that is read, but of JSON; those of calibration programs have kilobytes
+MAX_DEPTH = 20  # levels of nesting that are read, which bounds the recursion
 MAX_YAML = 1 << 17
 """Characters of YAML, which takes seconds; calibrations with all their image points are smaller."""
-MAX_ALIASES = 20
-"""References to other parts of a file; those of references take exponential time."""
-TIGHT_KEY = re.compile(r"^( *(?:- +)?[A-Za-z_][\w.]*):(?=[^\s/:])", re.MULTILINE)
-"""A key without a space before its value, as OpenCV writes it."""
-LARGEST = 1e12  # JSON numbers may have any number of digits
+MAX_ALIASES = 20  # references to other parts of a file; those of references take exponential time
 NOTHING = ("", "none", "null", "~")
 
 
@@ -43,23 +38,18 @@ def read_tree(path: Path) -> Tree | None:
         if start.startswith("{"):
             tree = parse_json(text)
         elif start.startswith("<"):
-            tree = _parse_xml(text)
+            if "<!ENTITY" in text:
+                raise ValueError("entities are not read")
+            tree = _from_element(ET.fromstring(text), 0)
         elif suffix in (".yaml", ".yml") or start.startswith("%YAML"):
             tree = parse_yaml(text)
         else:
             return None
+    except ET.ParseError as cause:
+        raise CalibrationError(f"{path}: not valid XML: {cause}") from cause
     except ValueError as cause:
         raise CalibrationError(f"{path}: {'not valid JSON: ' * start.startswith('{')}{cause}") from cause
     return tree if isinstance(tree, dict) else {}
-
-
-def _parse_xml(text: str) -> Any:
-    if "<!ENTITY" in text:
-        raise ValueError("entities are not read")
-    try:
-        return _from_element(ET.fromstring(text), 0)
-    except ET.ParseError as cause:
-        raise ValueError(f"not valid XML: {cause}") from cause
 
 
 def _from_element(element: ET.Element, depth: int) -> Any:
@@ -94,8 +84,10 @@ def parse_yaml(text: str) -> Any:
             return node
 
     lines = ("" if line.startswith("%") else line.expandtabs() for line in text.splitlines())
+    # OpenCV writes keys without a space before the value.
+    spaced = re.sub(r"(?m)^( *(?:- +)?[A-Za-z_][\w.]*):(?=[^\s/:])", r"\1: ", "\n".join(lines))
     try:
-        return Loader(TIGHT_KEY.sub(r"\1: ", "\n".join(lines))).get_data() or {}
+        return Loader(spaced).get_data() or {}
     except yaml.YAMLError as cause:
         mark = getattr(cause, "problem_mark", None)
         where = "" if mark is None else f"line {mark.line + 1}: "
@@ -176,7 +168,10 @@ class Keys:
     def unused(self, pattern: re.Pattern[str]) -> str | None:
         """The first key, as it is written, that fits a pattern, was not asked for and is neither empty nor zeros."""
         for key, (name, value) in self._values.items():
-            if key not in self._used and pattern.search(key) and not _is_nothing(value):
+            if key not in self._used and pattern.search(key):
+                with contextlib.suppress(CalibrationError):
+                    if not any(_numbers(value, "")):
+                        continue
                 return name
         return None
 
@@ -194,13 +189,6 @@ def normal(key: str) -> str:
     return re.sub(r"[^a-z0-9]", "", str(key).lower())
 
 
-def _is_nothing(value: Any) -> bool:
-    try:
-        return not any(_numbers(value, ""))
-    except CalibrationError:
-        return False
-
-
 def _numbers(value: Any, where: str, depth: int = 0) -> list[float]:
     """The numbers of text, of lists in lists, or of a matrix's `data`."""
     if isinstance(value, dict) and "data" in value:
@@ -212,7 +200,7 @@ def _numbers(value: Any, where: str, depth: int = 0) -> list[float]:
     if isinstance(value, bool | dict | list):
         raise CalibrationError(f"{where}: expected numbers, got {str(value)[:40]}")
     if isinstance(value, int | float):
-        if not abs(value) < LARGEST:  # not so NaN either
+        if not abs(value) < 1e12:  # JSON numbers may have any number of digits; NaN
             raise CalibrationError(f"{where}: {str(value)[:40]} is not finite")
         return [float(value)]
     return parse_floats(value, where, CalibrationError)

@@ -28,13 +28,7 @@ from torchslam.data.text_file import (
 )
 from torchslam.errors import MeasurementError, TorchslamError, TrajectoryError
 
-MAX_SPEED = 1000.0
-"""Meters per second that a speed may be at most: airplanes fly at 250."""
-COLUMNS = {
-    **TIMES,
-    "speed": Column(("speed", "velocity"), {"ms": 1.0, "mps": 1.0, "kmh": 1 / 3.6, "kph": 1 / 3.6}),
-}
-"""Kinds of columns."""
+SPEED = Column(("speed", "velocity"), {"ms": 1.0, "mps": 1.0, "kmh": 1 / 3.6, "kph": 1 / 3.6})  # m/s
 
 
 class Packet(NamedTuple):
@@ -91,12 +85,9 @@ def read_day_times(path: Path, error: type[TorchslamError]) -> list[float]:
 
 @dataclass(frozen=True)
 class Speeds:
-    """N speeds of a vehicle.
+    """N speeds of a vehicle, meters per second along the path, without the sign of one that backs up.
 
-    Attributes:
-        path: where they come from.
-        timestamps: seconds, increasing, on the clock of the file.
-        speeds: meters per second along the path, without the sign of a vehicle that backs up.
+    Times are seconds, increasing, on the clock of the file.
     """
 
     path: Path
@@ -115,7 +106,7 @@ def read_speeds(path: str | Path) -> Speeds:
         raise MeasurementError(f"{path}: {len(rows)} speeds, two are needed")
     places, times, speeds = zip(*rows, strict=True)
     for where, speed in zip(places, speeds, strict=True):
-        if not abs(speed) <= MAX_SPEED:
+        if not abs(speed) <= 1000:  # airplanes fly at 250
             raise MeasurementError(f"{where}: {speed:g} is no speed in meters per second")
     check_rising(times, places, MeasurementError)
     return Speeds(path, float64(times), float64(speeds).abs())
@@ -128,7 +119,7 @@ def _speed_rows(path: Path) -> Iterator[tuple[str, float, float]]:
         for where, (time, speed) in number_rows(path, "time speed", MeasurementError):
             yield where, in_seconds(time, where, MeasurementError), speed
         return
-    for row in read_table(path, COLUMNS, MeasurementError):
+    for row in read_table(path, TIMES | {"speed": SPEED}, MeasurementError):
         moment = row.time()
         if moment is None or "speed" not in row.cells:
             raise MeasurementError(

@@ -9,7 +9,7 @@ import contextlib
 import itertools
 import sys
 import weakref
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl
@@ -33,8 +33,7 @@ if TYPE_CHECKING:
 
 SUFFIXES = frozenset({".bag", ".mcap", ".db3"})
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-MAX_MESSAGES = 2_000_000
-"""Largest number of images: more than a day at 20 Hz."""
+MAX_MESSAGES = 2_000_000  # largest number of images: more than a day at 20 Hz
 
 # https://docs.ros.org/en/api/sensor_msgs/html/image__encodings_8h_source.html: bytes per pixel, how to make them gray.
 GRAY = {"mono8": np.uint8, "8UC1": np.uint8, "mono16": np.uint16}
@@ -60,13 +59,7 @@ COLORS = {
 class BagSequence(Sequence):
     """Images of one topic, read in order; seeking backwards reads from the start again.
 
-    Args:
-        path: the recording.
-        reader: of it.
-        connection: the topic.
-        times: of its messages, seconds since 1970: the stamps of the images, or when one without it was recorded.
-        camera: of the images, if known.
-
+    `times` are those of its messages, seconds since 1970: stamps of the images, or when one without it was recorded.
     Raises SequenceError if no image can be read, CalibrationError for a camera of another size.
     """
 
@@ -200,20 +193,9 @@ class Recording:
         self._reader: Reader1 | Reader2 = Reader1(path) if self._is_ros1 else Reader2(path)
         self._reader.open()
         weakref.finalize(self, self._reader.close)  # when no sequence needs it anymore
-
-    @property
-    def connections(self) -> list[Connection]:
-        """The topics, each with the type of its messages."""
-        return self._reader.connections
-
-    def messages(self, connections: list[Connection]) -> Iterator[tuple[Connection, int, bytes]]:
-        """Yield connection, time of recording in nanoseconds and content of each message of some topics."""
-        return self._reader.messages(connections)
-
-    def deserialize(self, content: bytes, kind: str) -> Any:
-        """Return a message of a type."""
+        self.connections, self.messages = self._reader.connections, self._reader.messages
         read = self._types.deserialize_ros1 if self._is_ros1 else self._types.deserialize_cdr
-        return read(content, kind)
+        self.deserialize: Callable[[bytes, str], Any] = read
 
     def check_definition(self, connection: Connection) -> None:
         """Raise ValueError if the messages of a topic are not as ROS defines them, by the digest of a definition."""
@@ -293,27 +275,21 @@ def _open_bag(path: str, camera: GivenCamera | None, rate: float | None) -> BagS
 def _read_calibration(reader: Recording, path: str, topic: str) -> Calibration | None:
     """Read the first camera_info beside an image topic; None without one."""
     info_topic = topic.removesuffix("/compressed").rpartition("/")[0] + "/camera_info"
-    infos = [
-        each
-        for each in reader.connections
-        if each.msgtype == "sensor_msgs/msg/CameraInfo" and each.topic == info_topic
-    ]
+    kind, name = "sensor_msgs/msg/CameraInfo", f"{path}{info_topic}"
+    infos = [each for each in reader.connections if each.msgtype == kind and each.topic == info_topic]
     is_rectified = "rect" in topic.rpartition("/")[2] or "_rect" in topic
     with _errors(path):
         for info in infos[:1]:
             reader.check_definition(info)
-        for info, _, raw in reader.messages(infos) if infos else ():
-            return from_camera_info(
-                reader.deserialize(raw, info.msgtype), f"{path}{info_topic}", is_rectified
-            )
+        for _, _, raw in reader.messages(infos) if infos else ():
+            return from_camera_info(reader.deserialize(raw, kind), name, is_rectified)
     return None
 
 
 def from_camera_info(message: Any, source: str, rectified: bool) -> Calibration | None:
     """The calibration in a sensor_msgs/CameraInfo; None if it is all zero, as drivers without a calibration send it.
 
-    Args:
-        rectified: the images are rectified, so the projection P applies, without distortion
+    The projection P, without distortion, is that of rectified images.
     """
     # ROS 1 has upper-case names.
     K, D, P = (getattr(message, name if hasattr(message, name) else name.lower()) for name in "KDP")

@@ -57,14 +57,7 @@ from torchslam.geometry.similarity import nearest_rotation
 from torchslam.types import Trajectory
 
 ICL_TRUTH = "*.gt.freiburg"
-ICL_MIRROR = (1.0, -1.0, 1.0, 1.0)
-"""Frames are numbered, in place of times. The published camera has a negative fy, since its y axis points up; here it
-points down, so that camera and world are mirrored."""
 SEVEN_SCENES_COLOR = "frame-*.color.png"
-SEVEN_SCENES_DEPTH_CAMERA = "585,585,320,240"
-"""Of the depth images, which are not registered to the color images; the page of the dataset has it."""
-TARTANAIR_AXES = ((0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0))
-"""The axes of our cameras, right, down, forward, as columns in the dataset's: forward, right, down."""
 
 
 def _open_tum(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -93,7 +86,11 @@ def _with_depth(sequence: ImageSequence, path: Path, camera: str = "") -> ImageS
 
 
 def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
-    """A trajectory of the living room or the office."""
+    """A trajectory of the living room or the office, whose frames are numbered, in place of times.
+
+    The published camera has a negative fy, since its y axis points up; here it points down, so that camera and world
+    are mirrored.
+    """
     folder = Path(path)
     rate = rate or DEFAULT_RATE
     found = find_frames(folder / "rgb")
@@ -102,7 +99,7 @@ def _open_icl_nuim(path: str, camera: GivenCamera | None, rate: float | None) ->
         raise SequenceError(f"{unnumbered[0]}: frames of ICL-NUIM are named by their number")
     entries = [ImageEntry(int(file.stem) / rate, file, str(file)) for file in found.frames]
     numbered = read_trajectory(sorted(folder.glob(ICL_TRUTH))[0])
-    mirror = torch.diag(float64(ICL_MIRROR))
+    mirror = torch.diag(float64((1, -1, 1, 1)))
     groundtruth = Trajectory(numbered.timestamps / rate, mirror @ numbered.T_wc @ mirror)
     camera = camera or PRESETS["icl"]
     sequence = ImageSequence(folder.name, "ICL-NUIM folder", entries, camera, groundtruth, found.notes)
@@ -127,8 +124,9 @@ def _open_seven_scenes(path: str, camera: GivenCamera | None, rate: float | None
     camera = camera or PRESETS["7-scenes"]
     name = f"{folder.resolve().parent.name}/{folder.name}" if folder.name.startswith("seq-") else folder.name
     sequence = ImageSequence(name, "7-Scenes folder", entries, camera, groundtruth, found.notes)
+    # The depth images are not registered to the color images; the page of the dataset has their camera.
     has_depth = next(folder.glob(SEVEN_SCENES_DEPTH), None) is not None
-    return _with_depth(sequence, folder, SEVEN_SCENES_DEPTH_CAMERA) if has_depth else sequence
+    return _with_depth(sequence, folder, "585,585,320,240") if has_depth else sequence
 
 
 def _read_pose(path: Path) -> Float[Tensor, "4 4"] | None:
@@ -157,7 +155,8 @@ def _open_tartanair(path: str, camera: GivenCamera | None, rate: float | None) -
     if len(rows) != len(entries):
         raise TrajectoryError(f"{truth}: {len(rows)} poses for {len(entries)} images")
     T_wc = poses_from_rows(float64(rows), places)
-    T_wc = rigid(T_wc[:, :3, :3] @ float64(TARTANAIR_AXES), T_wc[:, :3, 3])
+    # Our axes, right, down, forward, as columns in the dataset's: forward, right, down.
+    T_wc = rigid(T_wc[:, :3, :3] @ float64(((0, 0, 1), (1, 0, 0), (0, 1, 0))), T_wc[:, :3, 3])
     groundtruth = Trajectory(float64([entry.timestamp for entry in entries]), T_wc)
     camera = camera or PRESETS["tartanair"]
     return ImageSequence(folder.name, "TartanAir folder", entries, camera, groundtruth, found.notes)

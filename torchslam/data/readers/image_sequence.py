@@ -44,24 +44,16 @@ from torchslam.errors import FrameError, SequenceError
 from torchslam.types import Trajectory
 from torchslam.utils.console import printable
 
-DEFAULT_RATE = 30.0
-"""Frame rate of images without timestamps."""
+DEFAULT_RATE = 30.0  # frame rate of images without timestamps
 SHORTEST, LONGEST = 2e-4, 1e4
 """Seconds from image to image, beyond which times are taken to have another unit: microseconds read as nanoseconds, or
 nanoseconds since the system was started as seconds."""
-ATTEMPTS = 20
-"""Number of unreadable images after which opening a sequence fails."""
+ATTEMPTS = 20  # number of unreadable images after which opening a sequence fails
 
 
 @dataclass(frozen=True)
 class ImageEntry:
-    """One image of a list.
-
-    Attributes:
-        timestamp: seconds
-        path: of the image file
-        where: the list's file and line that name it, or the image itself, for messages
-    """
+    """One image of a list, at a time in seconds; `where` is file and line that name it, or the image, for messages."""
 
     timestamp: float
     path: Path
@@ -222,8 +214,10 @@ def _find(path: str, base: Path) -> tuple[Found, Path]:
         return found, base
     inside = find_frames(inner)
     if len(inside.frames) > len(found.frames):  # a preview beside them, or nothing
-        return inside.without(len(found.frames), f"images beside {inner.name}/"), inner
-    return found.without(len(inside.frames), f"images in {inner.name}/"), base
+        inside.left_out[f"images beside {inner.name}/"] += len(found.frames)
+        return Found(inside.frames, +inside.left_out), inner
+    found.left_out[f"images in {inner.name}/"] += len(inside.frames)
+    return Found(found.frames, +found.left_out), base
 
 
 FOLDER = Reader(f"images, or a folder {'/, '.join(FOLDERS)}/ with images", _is_folder, _open_folder)

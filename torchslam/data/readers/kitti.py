@@ -27,7 +27,6 @@ from torchslam.types import Trajectory
 
 RAW_CAMERAS = ("image_00", "image_02")
 """The left cameras, gray and color; those of the odometry benchmark have one digit."""
-EARTH_RADIUS = 6378137.0  # meters
 
 
 def _odometry_camera(base: Path) -> Path | None:
@@ -39,10 +38,8 @@ def _is_kitti(path: str) -> bool:
     base, calibration = Path(path), Path(path) / "calib.txt"
     if _odometry_camera(base) is None:
         return False
-    is_calibrated = calibration.is_file() and read_text(calibration, CalibrationError).lstrip().startswith(
-        "P0:"
-    )
-    return is_calibrated or (base / "times.txt").is_file()
+    text = read_text(calibration, CalibrationError) if calibration.is_file() else ""
+    return text.lstrip().startswith("P0:") or (base / "times.txt").is_file()
 
 
 def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> ImageSequence:
@@ -72,9 +69,8 @@ def _open_kitti(path: str, camera: GivenCamera | None, rate: float | None) -> Im
     T_0c = torch.eye(4, dtype=torch.float64, device="cpu")
     if camera is None:
         calibration = base / "calib.txt"
-        P = _row(
-            _read_rows(calibration), f"P{folder.name[-1]}", 12, calibration
-        )  # K [I | t] of a rectified camera
+        # K [I | t] of a rectified camera.
+        P = _row(_read_rows(calibration), f"P{folder.name[-1]}", 12, calibration)
         camera = Calibration.from_numbers([P[0], P[5], P[2], P[6]], str(calibration))
         T_0c[0, 3] = -((P[3] - P[2] * P[11]) / P[0])  # meters
     resolved = base.resolve()
@@ -126,10 +122,8 @@ def _open_kitti_raw(path: str, camera: GivenCamera | None, rate: float | None) -
 
 
 def _raw_camera(drive: Path) -> Path | None:
-    for name in RAW_CAMERAS:
-        if (drive / name / "data").is_dir() and (drive / name / "timestamps.txt").is_file():
-            return drive / name
-    return None
+    folders = (drive / name for name in RAW_CAMERAS)
+    return next((f for f in folders if (f / "data").is_dir() and (f / "timestamps.txt").is_file()), None)
 
 
 def _find_file(drive: Path, name: str) -> Path | None:
@@ -163,9 +157,8 @@ def _read_truth(drive: Path, side: str, calibration: Path | None) -> Trajectory 
         return None
     rows = _read_rows(calibration)
     P, R = _row(rows, f"P_rect_{side}", 12, calibration), _row(rows, "R_rect_00", 9, calibration)
-    T_rect = rigid(
-        float64(R).view(3, 3), float64([P[3] / P[0], 0.0, 0.0])
-    )  # meters from camera 0 to this one
+    # Meters from camera 0 to this one.
+    T_rect = rigid(float64(R).view(3, 3), float64([P[3] / P[0], 0.0, 0.0]))
     T_ci = T_rect @ _read_rigid(velo_to_cam) @ _read_rigid(imu_to_velo)
     packets = read_oxts(oxts)
     T_wc = checked_poses(_poses_of(packets) @ se3_inverse(T_ci), oxts / "data")
@@ -181,7 +174,7 @@ def _poses_of(packets: list[Packet]) -> Float[Tensor, "N 4 4"]:
     """T_wi of the GPS/INS: east, north, up, by a Mercator projection, from the first one."""
     table = float64([packet.numbers[:6] for packet in packets])
     latitude, longitude = table[:, 0].deg2rad(), table[:, 1].deg2rad()
-    scale = EARTH_RADIUS * math.cos(latitude[0])
+    scale = 6378137.0 * math.cos(latitude[0])
     north = scale * (math.pi / 4 + latitude / 2).tan().log()
     positions = torch.stack((scale * longitude, north, table[:, 2]), dim=-1)
     axes = torch.eye(3, dtype=torch.float64, device="cpu")

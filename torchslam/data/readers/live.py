@@ -13,7 +13,6 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import torch
 from jaxtyping import Float
 from torch import Tensor
 
@@ -21,21 +20,14 @@ from torchslam.data.calibration import GivenCamera
 from torchslam.data.formats.image_file import gray_to_tensor
 from torchslam.data.readers.video import SUFFIXES, Capture, Retriever, open_capture, pixel_aspect
 from torchslam.data.sequence import EndOfSequence, Reader, Sequence
+from torchslam.data.text_file import float64
 from torchslam.errors import FrameError, SequenceError
 from torchslam.utils.console import without_credentials
 from torchslam.utils.forks import forget_in_forks, never_release
 
 ADDRESS = re.compile(r"(rtsps?|rtmp|udp|tcp|https?)://\S+")
-PATIENCE = 15.0
-"""Seconds without a frame after which a stream has ended."""
-BACKLOG = 10
-"""Maximum number of queued frames; then the oldest one is dropped."""
-STEADY = 1.0
-"""Maximum drift of the source's clock from ours in seconds, before it is ignored."""
-EXIT_PATIENCE = 2.0
-"""Seconds for which a process waits for the threads of sources when it exits."""
-STALE = 0.5
-"""Age in seconds above which the frame read on opening is discarded."""
+PATIENCE = 15.0  # seconds without a frame after which a stream has ended
+STALE = 0.5  # age in seconds above which the frame read on opening is discarded
 
 
 class LiveSequence(Sequence):
@@ -54,9 +46,12 @@ class LiveSequence(Sequence):
         capture: Capture,
         camera: GivenCamera | None,
         patience: float = PATIENCE,
-        backlog: int = BACKLOG,
+        backlog: int = 10,
     ) -> None:
-        """Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit."""
+        """Drop the oldest of more than `backlog` queued frames; after `patience` seconds the source has ended.
+
+        Raises SequenceError where no frame comes, CalibrationError for a camera that does not fit.
+        """
         self._capture = capture
         self._retriever = Retriever(capture, name, "recording.mp4")
         self._refusal: FrameError | None = None  # of a frame that cannot be converted
@@ -81,14 +76,7 @@ class LiveSequence(Sequence):
         first = self._arrived[0][1]
         size = (first.shape[1], first.shape[0])
         aspect = pixel_aspect(capture, name)
-        super().__init__(
-            name,
-            "live",
-            camera,
-            torch.zeros(0, dtype=torch.float64, device="cpu"),
-            size=size,
-            pixel_aspect=aspect,
-        )
+        super().__init__(name, "live", camera, float64([]), size=size, pixel_aspect=aspect)
 
     def __len__(self) -> int:
         if self._limit is None:
@@ -123,7 +111,10 @@ class LiveSequence(Sequence):
                 f"{self.image_name(index)}: is gone; a live source gives each frame once, in order"
             )
         if not self._is_watched and not self._ended:
-            self._begin()
+            self._is_watched = True
+            if time.time() - self._arrived[0][0] > STALE:
+                self._arrived.clear()
+            self._thread = self._watch_until(lambda: False)
         with self._fresh:
             self._fresh.wait_for(lambda: self._arrived or self._ended, self._patience)
             if not self._arrived:
@@ -155,18 +146,6 @@ class LiveSequence(Sequence):
         self._closing = True
         if not self._thread.is_alive():
             self._end()
-
-    def has_ended(self, patience: float) -> bool:
-        """Return whether the thread that watches has ended, after some seconds at most."""
-        self._thread.join(max(0.0, patience))
-        return not self._thread.is_alive()
-
-    def _begin(self) -> None:
-        """Watch from now on, without what was seen long ago."""
-        self._is_watched = True
-        if time.time() - self._arrived[0][0] > STALE:
-            self._arrived.clear()
-        self._thread = self._watch_until(lambda: False)
 
     def _watch_until(self, is_enough: Callable[[], bool]) -> threading.Thread:
         """A thread that keeps the newest frames until that is enough, the source ends or it is closed."""
@@ -210,17 +189,18 @@ class LiveSequence(Sequence):
             self._fresh.notify_all()
 
 
-_SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()
-"""Those that there are; a thread keeps its source."""
+_SOURCES: weakref.WeakSet[LiveSequence] = weakref.WeakSet()  # those that there are; a thread keeps its source
 
 
-def close_sources(patience: float = EXIT_PATIENCE) -> bool:
-    """Close all sources, and return whether their threads have ended after some seconds at most."""
+def close_sources() -> bool:
+    """Close all sources, and return whether their threads have ended after two seconds at most."""
     sources = list(_SOURCES)
-    end = time.monotonic() + patience
+    end = time.monotonic() + 2.0
     for source in sources:
         source.close()
-    return all(source.has_ended(end - time.monotonic()) for source in sources)
+    for source in sources:
+        source._thread.join(max(0.0, end - time.monotonic()))
+    return not any(source._thread.is_alive() for source in sources)
 
 
 # Threads that end on their own before the interpreter does are not ended by it, in the middle of OpenCV.
@@ -228,7 +208,7 @@ atexit.register(close_sources)
 
 
 class CaptureClock:
-    """Capture times on our clock: by the source's own clock, from the first frame on, as long as that runs with ours.
+    """Capture times on our clock: by the source's own clock, from the first frame on, as long as both stay within 1 s.
 
     Arrival times jitter with the network and the load of the machine; the source's clock does not.
     """
@@ -240,7 +220,7 @@ class CaptureClock:
     def at(self, own: float, now: float) -> float:
         """Seconds since 1970 of a frame that has the time `own` and came at `now`; it never goes back."""
         stands = own <= self._own  # a source without a clock reports a constant time
-        if self._offset is None or stands or abs(own + self._offset - now) > STEADY:
+        if self._offset is None or stands or abs(own + self._offset - now) > 1:
             self._offset = now - own
         self._own = own
         self._last = max(own + self._offset, self._last + 1e-6)
@@ -254,10 +234,8 @@ def is_address(path: str) -> bool:
 
 def is_live(path: str) -> bool:
     """Return True for an address, and for the number of a camera that is not a file."""
-    if is_address(path):
-        return (
-            not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
-        )  # a file does not drop frames
+    if is_address(path):  # a file does not drop frames
+        return not path.startswith("http") or Path(path).suffix.lower() not in SUFFIXES
     return re.fullmatch(r"\d{1,2}", path) is not None and not Path(path).exists()
 
 

@@ -38,27 +38,10 @@ SUFFIXES = frozenset(
     {".mp4", ".avi", ".mov", ".mkv", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".3gp", ".wmv"}
 )
 MP4 = (".mp4", ".mov", ".m4v", ".3gp")
-MAX_FRAMES = 2_000_000
-"""Maximum number of frames: 18 hours at 30 frames per second."""
-QUIET = 2.0
-"""Seconds of decoding before a progress bar appears."""
-MANY = 100
-"""Frames that are skipped with a progress bar."""
-MAX_ASPECT_ERROR = 0.02
-"""Relative error of fy / fx of a given camera before a note reports that the file contradicts it."""
-
-
-SAMPLED = 16
-"""Step of the rows that are compared with the previous frame."""
-FAILURE = re.compile(rb"(Cannot convert interlaced)|: fmt:\S+ csp:")
-"""Line of FFmpeg's log about a failed conversion: from which format to which, and why."""
-
-SILENCING = ("OPENCV_FFMPEG_DEBUG", "OPENCV_FFMPEG_LOGLEVEL")
-"""Variables that send FFmpeg's log elsewhere, or silence it. OpenCV looks at them when it first opens a video."""
-
-MAX_ASPECT = 4.0
-"""Largest ratio of the sides of a pixel; anamorphic lenses have 2."""
-
+MAX_FRAMES = 2_000_000  # maximum number of frames: 18 hours at 30 frames per second
+QUIET = 2.0  # seconds of decoding before a progress bar appears
+MANY = 100  # frames that are skipped with a progress bar
+MAX_ASPECT = 4.0  # largest ratio of the sides of a pixel; anamorphic lenses have 2
 _LOCK = threading.Lock()
 
 
@@ -80,7 +63,9 @@ class Capture(Protocol):
 
 def open_capture(source: str) -> cv2.VideoCapture:
     """Open a video or a stream; FFmpeg's errors go to the error stream, whatever the environment variables are."""
-    hidden = {name: os.environ.pop(name) for name in SILENCING if name in os.environ}
+    # These send FFmpeg's log elsewhere, or silence it. OpenCV looks at them when it first opens a video.
+    names = ("OPENCV_FFMPEG_DEBUG", "OPENCV_FFMPEG_LOGLEVEL")
+    hidden = {name: os.environ.pop(name) for name in names if name in os.environ}
     try:
         return cv2.VideoCapture(source)
     finally:
@@ -113,13 +98,13 @@ class Retriever:
     the one before.
 
     Args:
-        capture: where frames were grabbed.
-        source: name of the video, for messages.
+        capture, source: where frames were grabbed, and its name for messages.
         progressive: name of a video without interlaced frames that it can be converted to.
     """
 
     def __init__(self, capture: Capture, source: str, progressive: str) -> None:
         self._capture = capture
+        # It writes whole frames, at the same times.
         self._command = f'ffmpeg -i "{source}" -vf bwdif=send_frame -crf 16 "{progressive}"'
         self._before: np.ndarray | None = None
 
@@ -132,7 +117,7 @@ class Retriever:
             decoded, image = self._capture.retrieve()
         if not decoded or image is None:  # both happen
             return None
-        sample = image[::SAMPLED].copy()
+        sample = image[::16].copy()  # some of the rows
         if self._before is not None and np.array_equal(sample, self._before):
             _, _, failure = _retrieve_with_log(self._capture)
         if failure is not None:
@@ -159,7 +144,8 @@ def _retrieve_with_log(capture: Capture) -> tuple[bool, np.ndarray, re.Match[byt
                 os.dup2(kept, stderr)
             log.seek(0)
             written = log.read()
-            failure = FAILURE.search(written)
+            # The line about a failed conversion: from which format to which, and why.
+            failure = re.search(rb"(Cannot convert interlaced)|: fmt:\S+ csp:", written)
             if failure is None and written:
                 os.write(kept, written)
         finally:
@@ -221,7 +207,7 @@ class VideoSequence(Sequence):
             pixel_aspect=aspect,
         )
         ratio = aspect if self._camera is None else float(self._camera.fy / self._camera.fx)
-        if abs(ratio / aspect - 1) > MAX_ASPECT_ERROR:
+        if abs(ratio / aspect - 1) > 0.02:
             contradiction = (
                 f"the file declares pixels of {aspect_text(aspect)}, width to height, so fy should be "
                 f"{aspect:.4g} fx; the given camera has {ratio:.4g}"
@@ -257,7 +243,6 @@ class VideoSequence(Sequence):
         # As an absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.
         self._capture = open_capture(str(self._path.absolute()))
         self._capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
-        # It writes whole frames, at the same times.
         progressive = f"{self._path.stem}-progressive.mp4"
         self._retriever = Retriever(self._capture, str(self._path.absolute()), progressive)
         self._position = 0  # of the decoder, among all frames that can be decoded
@@ -279,7 +264,8 @@ class VideoSequence(Sequence):
                 yield times[-1]
             ended = True
 
-        with self._bar("times of the frames", promised if 0 < promised <= MAX_FRAMES else None) as bar:
+        total = promised if 0 < promised <= MAX_FRAMES else None
+        with self._bar("times of the frames", total) as bar:
             need(times[frame] for frame in _rising(grabbed()))
         return first, times, ended
 
@@ -317,13 +303,6 @@ class VideoSequence(Sequence):
         return self._retrieve(where, FrameError) if self._capture.grab() else None
 
 
-def _open_video(
-    path: str, camera: GivenCamera | None, rate: float | None, need: Need = exhaust
-) -> VideoSequence:
-    """A video file; its times are its own. Raises SequenceError or CalibrationError."""
-    return VideoSequence(Path(path), camera, need)
-
-
 def _check(path: Path) -> None:
     """Raise SequenceError for a special file, a name that OpenCV crashes on, and an MP4 with more frames than bytes."""
     try:
@@ -354,8 +333,6 @@ def _rising(times: Iterable[float]) -> Iterator[int]:
 CONTAINERS = (b"moov", b"trak", b"edts", b"mdia", b"minf", b"stbl", b"moof", b"traf")
 HEADER, LARGE_HEADER = 8, 16
 """Bytes of the header of a box, with a size of 32 and of 64 bits (ISO/IEC 14496-12, 4.2)."""
-RUNS_AT_ONCE = 1 << 16
-"""Runs of equal durations that are read at once, 8 bytes each."""
 
 
 def claimed_samples(path: Path) -> int:
@@ -399,17 +376,16 @@ def _samples(file: BinaryIO, kind: bytes, start: int, end: int) -> int:
     (count,) = struct.unpack(">I", file.read(4))
     if kind not in (b"stts", b"ctts"):
         return int(count)
-    samples, runs = 0, min(count, (end - file.tell()) // 8)
-    while runs > 0:
-        some = file.read(8 * min(runs, RUNS_AT_ONCE))
+    samples, at_once = 0, 1 << 16  # runs of equal durations, 8 bytes each
+    for runs in range(min(count, (end - file.tell()) // 8), 0, -at_once):
+        some = file.read(8 * min(runs, at_once))
         samples += sum(run for run, _ in struct.iter_unpack(">II", some[: len(some) // 8 * 8]))
-        runs -= RUNS_AT_ONCE
     return samples
 
 
 VIDEO = Reader(
     f"a video ({', '.join(sorted(SUFFIXES))})",
     lambda path: Path(path).suffix.lower() in SUFFIXES and Path(path).is_file(),
-    _open_video,
-    _open_video,
+    lambda path, camera, rate, need: VideoSequence(Path(path), camera, need),
+    takes_need=True,
 )

@@ -11,15 +11,12 @@ import numpy as np
 
 from torchslam.data.synthetic.scene import MIP_LEVELS, Rectangle
 
-NEAR = 0.05
-"""Meters: what is nearer to the camera is not drawn."""
+NEAR = 0.05  # meters: what is nearer to the camera is not drawn
 ROWS_OF_BOUNDS = 9
 """Rows whose poses bound where a rectangle may be seen, of an image with a pose for each row. Between them the camera
 moves by less than a pixel. Tried at this value only."""
-PADDING = 2
-"""Texels that repeat the border of a texture, so that interpolation does not reach the next one."""
-SHARPNESS = 0.7
-"""Choice of the mip level: 1 takes one texel per pixel; less is sharper, with some aliasing."""
+PADDING = 2  # texels that repeat the border of a texture, so that interpolation does not reach the next one
+SHARPNESS = 0.7  # choice of the mip level: 1 takes one texel per pixel; less is sharper, with some aliasing
 
 
 class Renderer:
@@ -49,8 +46,7 @@ class Renderer:
     def render(self, T_cw: np.ndarray) -> np.ndarray:
         """The image seen from T_cw, (H, W) float32 in [0, 255]; black where no rectangle is hit.
 
-        Args:
-            T_cw: (4, 4), or (H, 4, 4): a pose for each row, as of a rolling shutter.
+        T_cw is (4, 4), or (H, 4, 4): a pose for each row, as of a rolling shutter.
         """
         T_cw = T_cw.reshape(-1, 4, 4)
         forms = self._linear_forms(T_cw)
@@ -137,12 +133,7 @@ class Renderer:
         return np.concatenate((start, end), axis=1).astype(np.int64)
 
     def _sample(self, tile: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
-        """Bilinear lookup of the atlas, (H, W) float32.
-
-        Args:
-            tile: (H, W) row of `_tiles`
-            u, v: (H, W) texels of level 0 from the texture's corner
-        """
+        """Bilinear lookup of the atlas, (H, W), at texels u, v of level 0 from the corner of a row of `_tiles`."""
         shrink, x, y = (column[tile] for column in self._tiles)
         return cv2.remap(self._atlas, u * shrink + x, v * shrink + y, cv2.INTER_LINEAR).astype(np.float32)
 

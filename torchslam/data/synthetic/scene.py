@@ -13,15 +13,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-FINEST = 0.02
-"""Meters: about the smallest shape drawn."""
-COVERAGE = 0.25
-"""The part of a surface that the largest shapes cover."""
+COVERAGE = 0.25  # the part of a surface that the largest shapes cover
 KINDS = ("polygon", "bar", "ellipse", "letter")
-MIN_CONTRAST = 30
-"""Gray levels between a shape and what is below its center."""
-FRACTION_BITS = 4
-"""Factor of the coordinates of polygons, so that their corners lie off the pixel grid."""
+MIN_CONTRAST = 30  # gray levels between a shape and what is below its center
+FRACTION_BITS = 4  # factor of the coordinates of polygons, so that their corners lie off the pixel grid
 
 
 def surface(
@@ -33,19 +28,13 @@ def surface(
 ) -> np.ndarray:
     """A painted surface: shapes of every size from a third of it down to two centimeters, over smooth noise.
 
-    Args:
-        size: (width, height) meters
-        texel: maximum size, meters
-        multiple: divides the numbers of rows and columns
-        coverage: fraction of the surface that the largest shapes cover
-
-    Returns:
-        (rows, columns) uint8.
+    Size, width and height, and texels, at most so large, are in meters; `multiple` divides the numbers of rows and
+    columns; the largest shapes cover a fraction of the surface.
     """
     columns, rows = (multiple * math.ceil(length / texel / multiple) for length in size)
     image = _noise(rng, rows, columns, texel)
     extent = largest = min(size) / 3
-    while extent > FINEST:
+    while extent > 0.02:
         # The small ones leave more room, so that what is below them stays visible.
         share = coverage * (extent / largest) ** 0.5
         count = int(share * size[0] * size[1] / (0.3 * extent**2)) + 1
@@ -78,10 +67,15 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
     jitters = rng.uniform(-0.35, 0.35, (count, 6))
     for i in range(count):
         x, y = centers[i]
-        gray = _standing_out(int(image[int(y), int(x)]), contrasts[i])
+        below = int(image[int(y), int(x)])
+        gray = int(np.clip(below + contrasts[i], 0, 255))
+        if abs(gray - below) < MIN_CONTRAST:  # the other way, since this one is cut off
+            gray = int(np.clip(below - contrasts[i], 0, 255))
         kind, radius = KINDS[kinds[i]], radii[i]
         if kind == "letter":
-            _draw_letter(image, chr(letters[i]), (x, y), radius, gray)
+            corner, font = (int(x - 0.6 * radius), int(y + 0.7 * radius)), cv2.FONT_HERSHEY_SIMPLEX
+            thickness = max(1, round(radius / 4))
+            cv2.putText(image, chr(letters[i]), corner, font, radius / 14, gray, thickness, cv2.LINE_AA)
         elif kind == "ellipse":
             axes = (max(1.0, 2 * radius), max(1.0, 2 * radius * aspects[i]))
             cv2.ellipse(image, ((x, y), axes, math.degrees(turns[i])), gray, -1, cv2.LINE_AA)
@@ -89,51 +83,23 @@ def _draw_shapes(rng: np.random.Generator, image: np.ndarray, count: int, extent
             sides = 4 if kind == "bar" else corners[i]
             angles = 2 * np.pi * (np.arange(sides) + (0 if kind == "bar" else jitters[i, :sides])) / sides
             outline = np.stack((np.cos(angles), np.sin(angles) * aspects[i]), axis=-1) * radius
-            _fill(image, outline, turns[i], (x, y), gray)
-
-
-def _standing_out(below: int, contrast: float) -> int:
-    """A gray level apart from what is below: lighter or darker, the other way where that would be cut off."""
-    gray = int(np.clip(below + contrast, 0, 255))
-    return gray if abs(gray - below) >= MIN_CONTRAST else int(np.clip(below - contrast, 0, 255))
-
-
-def _draw_letter(
-    image: np.ndarray, letter: str, center: tuple[float, float], radius: float, gray: int
-) -> None:
-    corner = (int(center[0] - 0.6 * radius), int(center[1] + 0.7 * radius))
-    thickness = max(1, round(radius / 4))
-    cv2.putText(image, letter, corner, cv2.FONT_HERSHEY_SIMPLEX, radius / 14, gray, thickness, cv2.LINE_AA)
-
-
-def _fill(
-    image: np.ndarray, outline: np.ndarray, turn: float, center: tuple[float, float], gray: int
-) -> None:
-    """Fill a polygon, turned about its center."""
-    cosine, sine = math.cos(turn), math.sin(turn)
-    points = outline @ np.array(((cosine, sine), (-sine, cosine))) + center
-    fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
-    cv2.fillPoly(image, [fixed], gray, cv2.LINE_AA, FRACTION_BITS)
+            cosine, sine = math.cos(turns[i]), math.sin(turns[i])
+            points = outline @ np.array(((cosine, sine), (-sine, cosine))) + (x, y)
+            fixed = (points * 2**FRACTION_BITS).round().astype(np.int32)
+            cv2.fillPoly(image, [fixed], gray, cv2.LINE_AA, FRACTION_BITS)
 
 
 Vector = tuple[float, float, float]
-X, Y, Z = np.eye(3)
-"""Axes of the world: right, down, forward."""
-TEXEL = 0.003
-"""Meters: finer than a pixel sees from a meter away."""
-MIP_LEVELS = 6
-"""Sizes a texture is kept at; its sides halve without remainder that often."""
+X, Y, Z = np.eye(3)  # axes of the world: right, down, forward
+TEXEL = 0.003  # meters: finer than a pixel sees from a meter away
+MIP_LEVELS = 6  # sizes a texture is kept at; its sides halve without remainder that often
 
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A textured rectangle in the world, meters.
+    """A textured rectangle in the world, meters: its corner where the texture starts (3,) and its size along u and v.
 
-    Attributes:
-        origin: (3,) the corner where the texture starts
-        axis_u, axis_v: (3,) unit vectors along the texture's columns and rows
-        size: (along u, along v)
-        texture: (rows, columns) uint8
+    The unit vectors u and v (3,) are along the columns and rows of the texture (rows, columns), uint8.
     """
 
     origin: np.ndarray
@@ -145,13 +111,7 @@ class Rectangle:
 
 @dataclass(frozen=True)
 class Painter:
-    """Builds rectangles with individual textures, lit from above and slightly from the front.
-
-    Attributes:
-        rng: source of the textures
-        texel: maximum size, meters
-        coverage: fraction of a surface that the largest shapes cover
-    """
+    """Builds rectangles with individual textures, as `surface`, lit from above and slightly from the front."""
 
     rng: np.random.Generator
     texel: float = TEXEL
@@ -208,29 +168,15 @@ def wall(seed: int) -> list[Rectangle]:
     return [painter.rectangle(np.array((-4.5, -3.0, 2.5)), X, Y, (9.0, 6.0))]
 
 
-HEIGHT = 2.8
-"""Meters from floor to ceiling."""
-FLOOR = HEIGHT / 2
-"""y points down, and is 0 half-way up."""
-PARTITION = 0.1
-"""Thickness of a wall with a door."""
-BUILDING_TEXEL = 0.004
-"""Meters: walls and furniture are hardly ever nearer than two pixels to that."""
-
-ROOMS_HALF = 3.9
-"""Meters from the center to the outer walls."""
-ROOMS_CORE = 1.3
-"""Meters from the center to the inner walls."""
-ROOMS_DOOR = (-3.4, -1.95)
-"""Begin and end of the door along x."""
-ROOMS_DOOR_TOP = -0.7
-"""y of the upper edge of the doors, meters."""
-SIZE_SPREAD = 0.12
-"""Furniture is up to that share larger or smaller ..."""
-TURN_SPREAD = 0.15
-"""... and turned by up to that many radians from its place."""
-QUARTER_TURN = np.array(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))
-"""About y, to the right: z becomes x."""
+HEIGHT = 2.8  # meters from floor to ceiling, as all below
+FLOOR = HEIGHT / 2  # y points down, and is 0 half-way up
+PARTITION = 0.1  # thickness of a wall with a door
+BUILDING_TEXEL = 0.004  # walls and furniture are hardly ever nearer than two pixels to that
+ROOMS_HALF, ROOMS_CORE = 3.9, 1.3  # from the center to the outer and the inner walls
+ROOMS_DOOR = (-3.4, -1.95)  # begin and end along x
+SIZE_SPREAD, TURN_SPREAD = 0.12, 0.15
+"""Furniture is up to that share larger or smaller, and turned by up to that many radians from its place."""
+QUARTER_TURN = np.array(((0.0, 0, 1), (0, 1, 0), (-1, 0, 0)))  # about y, to the right: z becomes x
 
 ROOMS_FURNITURE = (
     ((-3.65, 0.95, 1.0), (0.4, 0.9, 0.9), 0.0),  # along the wall to the left: a chest with a box on it, ...
@@ -276,7 +222,7 @@ def _quarter(painter: Painter) -> list[Rectangle]:
     for start, end, bottom in (  # of the wall in the plane z = 0: on each side of the door, and above it
         (-ROOMS_HALF, ROOMS_DOOR[0], FLOOR),
         (ROOMS_DOOR[1], -ROOMS_CORE, FLOOR),
-        (*ROOMS_DOOR, ROOMS_DOOR_TOP),
+        (*ROOMS_DOOR, -0.7),
     ):
         center = ((start + end) / 2, (bottom - FLOOR) / 2, 0.0)
         rectangles += painter.box(center, (end - start, bottom + FLOOR, PARTITION), 0.0)

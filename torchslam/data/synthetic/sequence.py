@@ -24,18 +24,11 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.types import Trajectory
 
-FRAME_RATE = 20.0
-"""Frames per second."""
-SIZE = (640, 480)
-"""Width and height of the images, pixels."""
-FOCAL = 500.0
-"""Focal length, pixels: 65 degrees over the width."""
-
-
-RADIUS = 2.87
-"""Meters: the length of the walk around the core by 2 pi."""
-OUTWARD = 0.5
-"""Radians from the heading to where the camera looks."""
+FRAME_RATE = 20.0  # frames per second
+SIZE = (640, 480)  # width and height of the images, pixels
+FOCAL = 500.0  # pixels: 65 degrees over the width
+RADIUS = 2.87  # meters: the length of the walk around the core by 2 pi
+OUTWARD = 0.5  # radians from the heading to where the camera looks
 HARMONICS = ((1, 0.98444), (-3, -0.04134), (5, -0.02481), (-7, -0.00111), (9, 0.00086))
 """Fourier series of the integral of exp(i (phase - sin(4 phase) / 4)): orders 1 - 4 n,
 weights J_n(1 / 4) / (1 - 4 n)."""
@@ -107,13 +100,9 @@ def poses(x: Tensor, y: Tensor, z: Tensor, yaw: Tensor, pitch: Tensor, roll: Ten
 
 @dataclass(frozen=True)
 class Scene:
-    """A scene and the path of the camera in it.
+    """A scene, built from a seed, and the path of the camera in it, T_wc from the phase of each frame.
 
-    Attributes:
-        build: rectangles from a seed
-        path: T_wc from the phase of each frame
-        frames_per_round: frames in a phase of 2 pi
-        frames: default number of frames
+    A phase of 2 pi has a number of frames, and the sequence another one by default.
     """
 
     build: Callable[[int], list[Rectangle]]

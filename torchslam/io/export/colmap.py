@@ -25,12 +25,9 @@ from torchslam.geometry.transforms import corner_camera, corner_pixels, quaterni
 from torchslam.io.export.ply import write_cloud
 from torchslam.io.export.scene import ExportedScene, Images, write_images
 
-CAMERA_ID = 1
-"""Number of the one camera; COLMAP counts from 1."""
+CAMERA_ID = 1  # number of the one camera; COLMAP counts from 1
 MODEL_IDS = {"PINHOLE": 1, "OPENCV": 4, "OPENCV_FISHEYE": 5, "FULL_OPENCV": 6}
 """COLMAP's numbers of camera models (src/colmap/sensor/models.h)."""
-POINT_IN_IMAGE = np.dtype([("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
-TRACK = np.dtype([("image", "<u4"), ("index", "<u4")])  # which image, and the how many-th of its points
 
 
 def colmap_camera(camera: Camera) -> tuple[str, list[float]]:
@@ -58,7 +55,7 @@ def write_colmap(folder: Path, scene: ExportedScene, names: Sequence[str] | None
     camera = struct.pack(f"<IiQQ{len(params)}d", CAMERA_ID, MODEL_IDS[model], *scene.camera.size, *params)
     _write(folder / "cameras", [camera], [[CAMERA_ID, model, *scene.camera.size, *params]])
     frame, point = scene.frame_index.numpy(), scene.point_index.numpy()
-    seen = np.zeros(len(frame), POINT_IN_IMAGE)
+    seen = np.zeros(len(frame), [("x", "<f8"), ("y", "<f8"), ("point", "<u8")])
     seen["x"], seen["y"] = corner_pixels(scene.pixels).numpy().T
     seen["point"] = point + 1
     ends = np.bincount(frame, minlength=len(scene.T_cw)).cumsum()
@@ -72,7 +69,8 @@ def write_colmap(folder: Path, scene: ExportedScene, names: Sequence[str] | None
         binary.append(header + struct.pack("<Q", len(points)) + points.tobytes())
         lines += [[number, *pose, CAMERA_ID, name], chain.from_iterable(points.tolist())]
     _write(folder / "images", binary, lines)
-    tracks = np.zeros(len(frame), TRACK)
+    # Which image, and the how many-th of its points.
+    tracks = np.zeros(len(frame), [("image", "<u4"), ("index", "<u4")])
     tracks["image"] = frame + 1
     tracks["index"] = np.arange(len(frame)) - np.searchsorted(frame, np.arange(len(scene.T_cw)))[frame]
     ends = np.bincount(point, minlength=len(scene.points_w)).cumsum()

@@ -22,8 +22,7 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import rigid, se3_inverse, transform
 from torchslam.io.export.scene import Images
 
-MIN_CONFIDENCE = 0.5
-"""Depth of less confidence is left out."""
+MIN_CONFIDENCE = 0.5  # depth of less confidence is left out
 VOXEL_PX = 2.0
 """Least width of a voxel in pixels at the median depth: what is finer, a depth map does not show."""
 DEPTH_STD = 0.01
@@ -32,9 +31,7 @@ BLOCK = 8  # voxels to a side: memory is taken in blocks
 MAX_BLOCKS = 50_000
 """Blocks with a surface: about 2 GB with the blocks beside it. In a larger scene, voxels are wider."""
 BLOCK_STRIDE = 4  # pixels, of the depth that the blocks are counted from
-TRUNCATION = 4.0  # voxels to either side of a surface
 FARTHEST = 5.0  # median depths: what is farther has no detail
-MIN_TRIANGLES = 100  # of a connected part: smaller ones are errors of depth
 
 
 class MeshSize(NamedTuple):
@@ -88,13 +85,13 @@ def write_mesh(path: Path, depths: Path, R_up: Float[Tensor, "3 3"], images: Ima
         color = o3d.t.geometry.Image(o3d.core.Tensor(pixels))
         K = o3d.core.Tensor(maps.camera.K.double().numpy())
         T_cu = o3d.core.Tensor((maps.T_cw[0].double() @ turn.mT).numpy())
-        limits = (1.0, FARTHEST * middle, TRUNCATION)  # scale and largest depth
+        limits = (1.0, FARTHEST * middle, 4.0)  # scale, largest depth, voxels to either side of a surface
         blocks = grid.compute_unique_block_coordinates(depth, K, T_cu, *limits)
         grid.integrate(blocks, depth, color, K, T_cu, *limits)
     weight = min(2, len(read_frames(depths)[0]))  # maps that see a voxel
     mesh = grid.extract_triangle_mesh(weight_threshold=weight - 0.5).to_legacy()  # weights are whole
     part, counts, _ = mesh.cluster_connected_triangles()
-    mesh.remove_triangles_by_mask(np.asarray(counts)[np.asarray(part)] < MIN_TRIANGLES)
+    mesh.remove_triangles_by_mask(np.asarray(counts)[np.asarray(part)] < 100)  # errors of depth
     mesh.remove_unreferenced_vertices()
     if not mesh.triangles:
         raise ResultsError(f"{depths}: no surface that {weight} depth maps agree on")

@@ -26,8 +26,7 @@ COLORED = [*((name, "<f4") for name in POSITION + NORMAL), *((name, "u1") for na
 # COLMAP refuses a file with integers of more than a byte.
 VERTEX = np.dtype([*COLORED, ("observations", "<f4")])
 DENSE_VERTEX = np.dtype([*COLORED, ("confidence", "<f4")])
-CAMERA_COLOR = (213, 73, 63)
-"""Red, green, blue of the trajectory in the cloud."""
+CAMERA_COLOR = (213, 73, 63)  # red, green, blue of the trajectory in the cloud
 MAX_DRAWN = 500_000  # of a dense cloud that a program draws, or starts a splat from
 MAX_BYTES = 1 << 33  # of a cloud that is read: 270 million points
 

@@ -25,7 +25,6 @@ APPLICATION = "torchslam"
 CAMERA = "world/camera"
 KEYFRAME = "world/keyframe"
 DEPTH = "world/depth"
-GAP = 5  # usual intervals without a pose that break the line of the path
 
 
 def import_rerun() -> ModuleType:
@@ -171,8 +170,8 @@ def _numpy(values: Tensor) -> np.ndarray:
 
 
 def gaps(times: Num[Tensor, " K"]) -> list[int]:
-    """Return the rows before which the path is interrupted; `times` are ascending frames or seconds."""
+    """Return the rows before which the path is interrupted, for five usual intervals of ascending frames or seconds."""
     if len(times) < 3:
         return []
     steps = times.diff()
-    return (torch.nonzero(steps > GAP * steps.median())[:, 0] + 1).tolist()
+    return (torch.nonzero(steps > 5 * steps.median())[:, 0] + 1).tolist()

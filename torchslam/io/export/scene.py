@@ -28,8 +28,6 @@ from torchslam.geometry import Camera, SensorModel, se3_inverse, squared_reproje
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.map.atlas import Submap
 
-SAME_PX = 0.01
-"""Difference of two parameters of a camera, in pixels, below which images need no undistortion."""
 MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees from the axis
 SAME_PICTURE = 0.9
 """Correlation from which on an image is that of the run, by another decoder or in other colors: less than that of two
@@ -212,9 +210,8 @@ class Undistorter:
         pinhole = pinhole_within(camera) if pinhole is None else pinhole
         self._size = pinhole.size
         factor = max(1, int(camera.params[0] / pinhole.params[0] + 1e-6))
-        u, v = (
-            (torch.arange(factor * side, device="cpu").double() + 0.5) / factor - 0.5 for side in pinhole.size
-        )
+        sides = (torch.arange(factor * side, device="cpu").double() for side in pinhole.size)
+        u, v = ((side + 0.5) / factor - 0.5 for side in sides)
         grid = torch.stack(torch.meshgrid(u, v, indexing="xy"), dim=-1)
         slopes = pinhole.to(torch.float64).normalize(grid.flatten(0, 1))
         rays = torch.nn.functional.pad(slopes, (0, 1), value=1.0)
@@ -232,7 +229,7 @@ class Undistorter:
 def _is_same(camera: Camera, other: Camera) -> bool:
     """Whether two cameras have the same images, to within a hundredth of a pixel."""
     is_alike = camera.model == other.model and camera.size == other.size
-    return is_alike and bool(((camera.params - other.params).abs() < SAME_PX).all())
+    return is_alike and bool(((camera.params - other.params).abs() < 0.01).all())
 
 
 class Images:

@@ -71,13 +71,8 @@ def _scenes(results: Results) -> Iterator[tuple[str, Figure]]:
     unit = "" if truth is None and not results.metrics.get("metric") else "m"
     ids, rows = results.map.valid_points(), results.map.keyframe_rows(results.session)
     points_w = transform(S, results.map.positions_w[ids])
-    of_keyframes, of_points = (
-        S[:3, :3] @ covariances_w @ S[:3, :3].mT
-        for covariances_w in (
-            results.map.center_covariances_w()[rows],
-            results.map.points["covariances_w"][ids],
-        )
-    )
+    both = (results.map.center_covariances_w()[rows], results.map.points["covariances_w"][ids])
+    of_keyframes, of_points = (S[:3, :3] @ covariances_w @ S[:3, :3].mT for covariances_w in both)
     shown = keyframes if len(keyframes) else None  # a run that only localized shows the axes of its frames
     yield "scene", plot_scene(trajectory, points_w, truth, shown, unit, title)
     certainty = of_keyframes if len(keyframes) else None

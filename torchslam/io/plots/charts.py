@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 ESTIMATE = "#3f7aa6"
 GROUND_TRUTH = "#2f2f2f"
 ACCENT = "#c8553d"
-LOST = "#f3d9d2"
-UNCERTAIN = "#e2d2ec"
-INITIALIZING = "#f1ecdf"
 MUTED = "#7a7a7a"
 AXES_RGB = ("#d5493f", "#57a145", "#3f8fe8")  # the camera's x, y, z
 
@@ -78,9 +75,7 @@ def to_numpy(values: Shaped[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:
     return values.detach().cpu().double().numpy()
 
 
-def robust_box(
-    path: Float[np.ndarray, "K D"], points: Float[np.ndarray, "N D"], margin: float = 0.06
-) -> Float[np.ndarray, "D 2"]:
+def robust_box(path: Float[np.ndarray, "K D"], points: Float[np.ndarray, "N D"]) -> Float[np.ndarray, "D 2"]:
     """Limits that hold the whole path and the bulk of the points, but no far outliers.
 
     Points count between their 3rd and 97th percentile, and only as far from the path's center as 4 times
@@ -92,14 +87,12 @@ def robust_box(
     low, high = anchor.min(axis=0), anchor.max(axis=0)
     if len(points):
         center = (low + high) / 2
-        reach = max(
-            4.0 * float(np.median(np.linalg.norm(points - center, axis=1))),
-            1.5 * float(np.linalg.norm(high - low)),
-        )
+        usual = float(np.median(np.linalg.norm(points - center, axis=1)))
+        reach = max(4.0 * usual, 1.5 * float(np.linalg.norm(high - low)))
         point_low, point_high = np.percentile(points, [3.0, 97.0], axis=0)
         low = np.minimum(low, np.maximum(point_low, center - reach))
         high = np.maximum(high, np.minimum(point_high, center + reach))
-    pad = margin * max(float((high - low).max()), 1e-6)
+    pad = 0.06 * max(float((high - low).max()), 1e-6)
     return np.stack([low - pad, high + pad], axis=1)
 
 
@@ -109,9 +102,9 @@ def thin(count: int, limit: int) -> Int[np.ndarray, " R"]:
 
 
 _SHADES = {
-    State.LOST: (LOST, "lost"),
-    State.UNCERTAIN: (UNCERTAIN, "uncertain"),
-    State.INITIALIZING: (INITIALIZING, "initializing"),
+    State.LOST: ("#f3d9d2", "lost"),
+    State.UNCERTAIN: ("#e2d2ec", "uncertain"),
+    State.INITIALIZING: ("#f1ecdf", "initializing"),
 }
 
 
@@ -122,13 +115,9 @@ def plot_errors(
     results: Sequence[StepResult] = (),
     title: str = "",
 ) -> Figure:
-    """The error of every posed frame over time, colored by its size; spans without a pose shaded.
+    """The error of every posed frame with ground truth over time, colored by its size; spans without a pose shaded.
 
-    Args:
-        timestamps: seconds of the posed frames that have ground truth.
-        errors_m: meters between the aligned and the true camera center.
-        errors_rad: radians between the aligned and the true orientation.
-        results: results of all frames, for the shading.
+    The shading is by the results of all frames.
     """
     seconds = to_numpy(timestamps)
     origin = results[0].timestamp if results else float(seconds[0]) if len(seconds) else 0.0
@@ -222,7 +211,6 @@ def plot_features(
 
     Args:
         image: gray in [0, 1].
-        keypoints: pixels.
         matched: keypoints of map points.
         previous: pixels of the same map points in an earlier frame, NaN if it did not observe them.
         lengths: number of keyframes that observe the point, for the color.

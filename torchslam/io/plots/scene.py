@@ -19,11 +19,6 @@ if TYPE_CHECKING:
     from mpl_toolkits.mplot3d import Axes3D
 
 
-MAX_POINTS = 25_000
-"""Points that are drawn; more hide each other."""
-MAX_CAMERAS = 30
-"""Cameras that are drawn, evenly chosen; more hide each other."""
-MAX_ELLIPSES = 1500  # of points; more hide the picture
 SIGMAS = 3.0  # size of an ellipse in standard deviations
 TRUTH_LINE: dict[str, Any] = {"color": style.GROUND_TRUTH, "lw": 1.0, "ls": (0, (4, 2))}
 """Style of the true trajectory."""
@@ -68,7 +63,7 @@ class _Scene:
         T_wc = style.to_numpy(trajectory.T_wc)
         upright, self.labels = upright_axes(T_wc)
         shown = T_wc if keyframes is None else style.to_numpy(keyframes.T_wc)
-        rows = style.thin(len(shown), MAX_CAMERAS)
+        rows = style.thin(len(shown), 30)  # more hide each other
         points = style.to_numpy(points_w).reshape(-1, 3)
         finite = np.isfinite(points).all(axis=1)
         truth = np.zeros((0, 3)) if groundtruth is None else style.to_numpy(groundtruth.positions_w)
@@ -96,11 +91,8 @@ def plot_scene(
 ) -> Figure:
     """The path, the map and the camera axes from two sides, equal scales on all axes.
 
-    Args:
-        trajectory: every posed frame, aligned to the ground truth if there is one
-        points_w: points in the same frame
-        keyframes: frames to draw axes for: red x, green y, blue z (the viewing direction); default: all
-        unit: unit of length; "" if the scale is unknown
+    Axes, red x, green y, blue z (the viewing direction), are those of keyframes, by default of all frames. `unit` is ""
+    if the scale is unknown.
     """
     scene = _Scene(trajectory, points_w, groundtruth, keyframes)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth]), scene.points)
@@ -129,9 +121,8 @@ def plot_top_view(
 ) -> Figure:
     """The path and the map seen against the cameras' mean up direction, equal scales. As `plot_scene`.
 
-    Args:
-        keyframe_covariances_w, point_covariances_w: covariances of the positions, drawn as ellipses of three
-            standard deviations, those of keyframes magnified by the power of ten in the legend; none where zero
+    Covariances of positions are drawn as ellipses of three standard deviations, those of keyframes magnified by the
+    power of ten in the legend; none where zero.
     """
     scene = _Scene(trajectory, points_w, groundtruth, keyframes, keyframe_covariances_w, point_covariances_w)
     box = style.robust_box(np.concatenate([scene.path, scene.groundtruth])[:, :2], scene.points[:, :2])
@@ -206,7 +197,7 @@ def _draw_above(axes: Axes, scene: _Scene, box: np.ndarray) -> None:
     lines = LineCollection(list(ahead), colors=style.AXES_RGB[2], lw=0.9)
     lines.set_label("viewing direction")
     axes.add_collection(lines)
-    rows = style.thin(len(scene.points), MAX_ELLIPSES)
+    rows = style.thin(len(scene.points), 1500)
     centers, covariances = scene.points[rows, :2], scene.point_covariances[rows, :2, :2]
     draw_ellipses(axes, centers, covariances, "map point", "#cdc6c9", linewidth=0.5, zorder=0.5)
     centers, covariances = scene.cameras[:, :2], scene.camera_covariances[:, :2, :2]
@@ -224,7 +215,7 @@ def _drawn_points(points: np.ndarray, box: np.ndarray) -> tuple[np.ndarray, dict
     from matplotlib.colors import LinearSegmentedColormap
 
     points = points[inside(points[:, : len(box)], box)]
-    points = points[style.thin(len(points), MAX_POINTS)]
+    points = points[style.thin(len(points), 25_000)]
     heights = LinearSegmentedColormap.from_list("heights", ["#4d4463", "#8f7f86", "#cfa274"])
     size = float(np.clip(8e3 / max(len(points), 1), 1.5, 5.0))
     return points, {"c": points[:, 2], "cmap": heights, "s": size, "alpha": 0.75, "linewidths": 0}
@@ -250,9 +241,8 @@ def draw_ellipses(
 ) -> None:
     """Draw covariances (L, 2, 2) around centers (L, 2), with an entry in the legend; skip those that are zero.
 
-    Args:
-        magnified_in: width of the plot. Ellipses are magnified by the largest power of ten that keeps them
-            small in it; 0: not magnified
+    Ellipses are magnified by the largest power of ten that keeps them small in a plot of the width `magnified_in`, if
+    that is not 0.
     """
     from matplotlib.collections import EllipseCollection
 

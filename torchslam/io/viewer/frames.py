@@ -26,7 +26,6 @@ from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult, Trajectory
 
 VIDEO = "tracked.mp4"
-MAX_WIDTH = 960  # pixels of the film: it is to stay small
 BAR = 26  # pixels, for the text under the image
 COLORS = {  # blue, green, red
     State.INITIALIZING: (170, 200, 215),
@@ -61,8 +60,7 @@ class FrameViewer:
 class FrameViewers(ExitStack):
     """Passes every processed frame on to the viewers, and closes them at its exit.
 
-    Attributes:
-        sequence: to run instead of the original sequence; it keeps the last image, so no image is read twice.
+    `sequence` is to be run instead of the original one; it keeps the last image, so that no image is read twice.
     """
 
     def __init__(self, slam: SLAM, sequence: Sequence, screens: list[FrameViewer]) -> None:
@@ -184,7 +182,7 @@ class VideoRecorder(FrameViewer):
 
     def __init__(self, path: Path, size: tuple[int, int], rate: float) -> None:
         """size: (width, height) of the images. Raises ResultsError where no film can be written."""
-        self._scale = min(1.0, MAX_WIDTH / size[0])
+        self._scale = min(1.0, 960 / size[0])  # a small film
         # Codecs ask for even sides.
         self._size = (int(size[0] * self._scale) // 2 * 2, int(size[1] * self._scale) // 2 * 2)
         # An absolute path: FFmpeg takes what stands before a colon for a protocol, unless a slash comes first.

@@ -35,10 +35,7 @@ VIEW = "view.html"
 SCRIPTS = ("draw.js", "orbit.js", "scene.js", "ruler.js", "view.js")  # in this order, all in one script
 MAX_POINTS = 150_000  # of all submaps together: 42 bytes each in the page
 MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
-DENSE_REACH = 4.0  # radii of the scene, to either side of its center: the dense cloud is cut off there
-STEPS = (
-    65535  # of 16 bits: of the dense cloud over its extent, of pixels over the image, hundredths of a pixel
-)
+STEPS = 65535  # of 16 bits: of the dense cloud over its extent, of pixels over the image
 FACTOR_STEPS = 127
 """Steps of an entry of the factor of a covariance, over the largest one of the point: half a percent is enough."""
 MAX_FRAMES = 20_000  # 100 bytes each in the page
@@ -55,9 +52,8 @@ def write_view(results: Results, directory: Path) -> Path:
 def page(results: Results) -> str:
     """Return the page with style, scripts and data."""
     data, folder = page_data(results), files("torchslam.io.viewer")
-    asset = {
-        name: (folder / name).read_text(encoding="utf-8") for name in (*SCRIPTS, "view.css", "view.html")
-    }
+    names = (*SCRIPTS, "view.css", "view.html")
+    asset = {name: (folder / name).read_text(encoding="utf-8") for name in names}
     parts = {
         "title": html.escape(data["title"]),
         "css": asset["view.css"],
@@ -192,13 +188,9 @@ def _submap(
 def _dense(cloud: PointCloud, S: Float[Tensor, "4 4"], box: Float[Tensor, "2 3"]) -> dict[str, Any]:
     """Return the data of the dense cloud, whose points are whole numbers of steps from the lowest corner.
 
-    Returns:
-        low, step: (3,) lowest corner and length of a step
-        points, colors: (P, 3)
-        total: number of points before thinning
-        spacing: usual distance between neighbors
+    `total` is the number of points before thinning, `spacing` the usual distance between neighbors.
     """
-    reach = DENSE_REACH * float((box[1] - box[0]).norm()) / 2
+    reach = 4.0 * float((box[1] - box[0]).norm()) / 2  # the dense cloud is cut off there
     near = (transform(S, cloud.points_w.double()).abs() <= reach).all(dim=-1)
     kept = cloud[near].thinned(MAX_DENSE_POINTS)
     points = transform(S, kept.points_w.double())

@@ -23,21 +23,14 @@ from jaxtyping import Bool, Float, Int, UInt8
 from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera
 
-MAX_METERS = 100.0
-"""Longest side of a marker that is believed; a larger number is meant in millimeters."""
-MIN_METERS = 0.001
-"""Shortest side of a marker that a camera resolves."""
+MIN_METERS, MAX_METERS = 0.001, 100.0
+"""Sides of a marker: one that a camera resolves, and one that is believed; a larger number is meant in millimeters."""
 MAX_SQUARES = 100
 """Most squares along a side of a board."""
 ARUCO_COUNT = 250
 """Markers of a family aruco-NxN without a number: more of 4x4 would let other squares look like markers."""
-
-SINGLE = re.compile(
-    r"(?P<family>apriltag-\w+|aruco-\w+(?:-\d+)?):(?P<size>[^:,]+)(?P<others>(?:,\d+=[^:,]+)*)"
-)
-BOARD = re.compile(r"(?P<kind>charuco|chessboard)-(?P<columns>\d+)x(?P<rows>\d+):(?P<lengths>[^,]+)")
-BOARD_FAMILIES = ("aruco-4x4", "aruco-5x5", "aruco-6x6", "aruco-7x7", "apriltag-36h11")
-"""Families of the markers in a ChArUco board, of which its description does not say the one."""
+SINGLE = r"(?P<family>apriltag-\w+|aruco-\w+(?:-\d+)?):(?P<size>[^:,]+)(?P<others>(?:,\d+=[^:,]+)*)"
+BOARD = r"(?P<kind>charuco|chessboard)-(?P<columns>\d+)x(?P<rows>\d+):(?P<lengths>[^,]+)"
 MAX_SHIFT_PX = 3.0
 """Largest distance between the corners by a threshold and those by the edges: else the edges are others."""
 MIN_SIDE_PX = 12.0
@@ -54,10 +47,8 @@ STEP_PX = 0.25
 """Distance of the samples of a profile, pixels."""
 ENDS = 0.08
 """Share of a side at either end that is left out: there the other side blurs into it. Tried from .05 to .15."""
-MAX_PROFILES = 64
-"""Most profiles of a side, about one a pixel: the error of longer ones is far below a tenth of a pixel."""
-MIN_PROFILES = 8
-"""Least profiles of a side."""
+MIN_PROFILES, MAX_PROFILES = 8, 64
+"""Of a side, about one a pixel: the error of more is far below a tenth of a pixel."""
 ROUNDS = 2
 """Of a fit around the corners of the round before. With one, squares are .1 % smaller, a third changes nothing."""
 MIN_CONTRAST = 15.0
@@ -116,12 +107,8 @@ class Target:
 
 
 def parse_target(text: str) -> Target:
-    """Read the description of a target.
-
-    Raises:
-        MeasurementError: it is none, or a size is impossible.
-    """
-    if found := SINGLE.fullmatch(text):
+    """Read the description of a target. Raises MeasurementError if it is none, or a size is impossible."""
+    if found := re.fullmatch(SINGLE, text):
         dictionary(found["family"], text)
         others = [other.split("=") for other in found["others"].split(",") if other]
         sizes = tuple((int(identity), _length(size, text)) for identity, size in others)
@@ -129,7 +116,7 @@ def parse_target(text: str) -> Target:
         if twice:
             raise MeasurementError(f"--marker {text}: marker {twice[0]} has two sizes")
         return Target(text, TargetKind.MARKER, found["family"], _length(found["size"], text), sizes)
-    if found := BOARD.fullmatch(text):
+    if found := re.fullmatch(BOARD, text):
         squares = int(found["columns"]), int(found["rows"])
         if not all(3 <= count <= MAX_SQUARES for count in squares):
             raise MeasurementError(
@@ -169,8 +156,7 @@ def _length(text: str, whole: str) -> float:
 def dictionary(family: str, text: str) -> cv2.aruco.Dictionary:
     """OpenCV's dictionary of a family of markers; `text` is the description that a message names.
 
-    Raises:
-        MeasurementError: there is no such family.
+    Raises MeasurementError if there is no such family.
     """
     kind, _, rest = family.partition("-")
     name = f"DICT_APRILTAG_{rest.lower()}" if kind == "apriltag" else f"DICT_{rest.upper().replace('-', '_')}"
@@ -190,13 +176,7 @@ def dictionary(family: str, text: str) -> cv2.aruco.Dictionary:
 
 @dataclass(frozen=True)
 class Detection:
-    """A target in an image.
-
-    Attributes:
-        identity: id of a marker; 0 for a board.
-        rows: of the detected corners, in `Target.corners`.
-        pixels: where they are.
-    """
+    """A target in an image: the id of a marker, 0 for a board, and its detected corners as rows of `Target.corners`."""
 
     identity: int
     rows: Int[np.ndarray, " C"]
@@ -273,7 +253,7 @@ class CharucoDetector:
         board = (target.squares, target.size, target.marker_size)
         self._boards = {
             family: cv2.aruco.CharucoDetector(cv2.aruco.CharucoBoard(*board, dictionary(family, target.text)))
-            for family in BOARD_FAMILIES
+            for family in ("aruco-4x4", "aruco-5x5", "aruco-6x6", "aruco-7x7", "apriltag-36h11")
         }
         self._seen = dict.fromkeys(self._boards, 0)
 
@@ -281,10 +261,8 @@ class CharucoDetector:
         """The board in an image, or nothing. The family is settled by the first image that shows it."""
         settled = max(self._seen, key=lambda family: self._seen[family])
         families = [settled] if self._seen[settled] else list(self._boards)
-        found = {family: self._boards[family].detectBoard(image)[:2] for family in families}
-        family, (pixels, rows) = max(
-            found.items(), key=lambda item: 0 if item[1][1] is None else len(item[1][1])
-        )
+        found = [(family, *self._boards[family].detectBoard(image)[:2]) for family in families]
+        family, pixels, rows = max(found, key=lambda each: 0 if each[2] is None else len(each[2]))
         if rows is None or len(rows) < 4:
             return []
         self._seen[family] += len(rows)
@@ -369,9 +347,12 @@ def _fit_sides(
     height, width = image.shape
     is_inside = (points >= 0).all(axis=(2, 3, 4)) & (points <= (width - 1, height - 1)).all(axis=(2, 3, 4))
     x, y = points.astype(np.float32).reshape(-1, len(offsets), 2).transpose(2, 0, 1)
-    rise = np.diff(outward[..., None, None] * _sampled(image, x, y).reshape(points.shape[:-1]), axis=-1).clip(
-        0
-    )
+    # Gray levels between pixels; OpenCV rounds those of an image of whole numbers.
+    left, top = np.floor((x.min(), y.min())).astype(int).clip(0)
+    right, bottom = np.ceil((x.max(), y.max())).astype(int) + 2
+    part = image[top:bottom, left:right].astype(np.float32)
+    gray = cv2.remap(part, x - np.float32(left), y - np.float32(top), cv2.INTER_LINEAR).astype(float)
+    rise = np.diff(outward[..., None, None] * gray.reshape(points.shape[:-1]), axis=-1).clip(0)
     total = rise.sum(axis=-1)
     contrast = np.median(total, axis=-1)
     shifts = (rise * (offsets[:-1] + STEP_PX / 2)).sum(axis=-1) / np.maximum(total, 1e-6)
@@ -385,18 +366,6 @@ def _fit_sides(
     spread = np.sqrt((counts * residuals**2).sum(axis=-1) / np.maximum(count, 1))
     clear = is_inside & (contrast >= MIN_CONTRAST) & (2 * count >= len(places)) & (spread <= MAX_SPREAD_PX)
     return intercepts, slopes, clear
-
-
-def _sampled(
-    image: UInt8[np.ndarray, "H W"], x: Float[np.ndarray, "N S"], y: Float[np.ndarray, "N S"]
-) -> Float[np.ndarray, "N S"]:
-    """Gray levels between pixels; OpenCV rounds those of an image of whole numbers."""
-    low, high = (
-        np.floor((x.min(), y.min())).astype(int).clip(0),
-        np.ceil((x.max(), y.max())).astype(int) + 1,
-    )
-    part = image[low[1] : high[1] + 1, low[0] : high[0] + 1].astype(np.float32)
-    return cv2.remap(part, x - np.float32(low[0]), y - np.float32(low[1]), cv2.INTER_LINEAR).astype(float)
 
 
 def _lines(
@@ -428,7 +397,6 @@ def _meet(
     # start + a * leaving = end + b * arriving
     crossed = leaving[..., 0] * arriving[..., 1] - leaving[..., 1] * arriving[..., 0]
     apart = end - start
-    share = (apart[..., 0] * arriving[..., 1] - apart[..., 1] * arriving[..., 0]) / np.where(
-        crossed == 0, np.nan, crossed
-    )
+    share = apart[..., 0] * arriving[..., 1] - apart[..., 1] * arriving[..., 0]
+    share /= np.where(crossed == 0, np.nan, crossed)
     return start + share[..., None] * leaving

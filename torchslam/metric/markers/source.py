@@ -45,15 +45,12 @@ MIN_ANGLE_DEG = 1.0
 """Least parallax of a corner: below, the size of a marker is unknown to a few percent."""
 MAX_ERROR_PX = 5.0
 """Largest median reprojection error of a marker's corners in the poses of the run: else it moves, or appears twice."""
-MIN_CORNERS = 3
-"""Least corners of a target, so that its size is no single edge."""
 
 
 def from_options(given: Given) -> list[Markers]:
     """The source of all `--marker`.
 
-    Raises:
-        MeasurementError: a description is wrong, or a kind of marker is given twice.
+    Raises MeasurementError if a description is wrong, or a kind of marker is given twice.
     """
     targets = [parse_target(text) for (text,) in given["marker"]]
     for number, target in enumerate(targets):
@@ -107,13 +104,7 @@ class Markers:
 
 @dataclass(frozen=True)
 class Sighting:
-    """A target in a frame.
-
-    Attributes:
-        frame: row of the graph.
-        target: which of the user's targets.
-        detection: where it is.
-    """
+    """One of the user's targets in a frame, a row of the graph."""
 
     frame: int
     target: int
@@ -176,13 +167,7 @@ class PlacedTarget:
 
 @dataclass(frozen=True)
 class GraphWithCorners:
-    """An observation graph with the corners of targets as its last points.
-
-    Attributes:
-        graph: the whole.
-        targets: those that have a place.
-        dropped: one line for each target that has none.
-    """
+    """An observation graph with the corners of targets as its last points, and lines about those without a place."""
 
     graph: ObservationGraph
     targets: tuple[PlacedTarget, ...]
@@ -215,9 +200,8 @@ def add_corners(
         weight = weight * torch.eye(2, dtype=weight.dtype, device=weight.device)
     added = len(columns["pixels"]) - len(graph.pixels)
     columns["weights"] = torch.cat([graph.weights, weight.expand(added, *weight.shape)])
-    columns["is_keyframe"] = graph.is_keyframe.index_fill(
-        0, torch.cat([part.frame_index for part in placed]), True
-    )
+    seeing = torch.cat([part.frame_index for part in placed])
+    columns["is_keyframe"] = graph.is_keyframe.index_fill(0, seeing, True)
     whole = ObservationGraph(camera=graph.camera, calibration=graph.calibration, **columns)
     return GraphWithCorners(whole, tuple(placed), tuple(dropped))
 
@@ -262,7 +246,7 @@ def _place(
     mask = pixels.isfinite().all(dim=-1)
     found = triangulate_many(pixels, T_cw=graph.T_cw[frames], camera=graph.camera, mask=mask)
     good = found.mask & (found.angles >= math.radians(MIN_ANGLE_DEG))
-    if int(good.sum()) < MIN_CORNERS:
+    if int(good.sum()) < 3:  # its size would be a single edge
         return "is seen from too few places"
     if float(found.errors[good][mask[good]].median()) > MAX_ERROR_PX:
         return "moves"
@@ -289,10 +273,8 @@ def log_sizes(targets: Sequence[PlacedTarget], points_w: Float[Tensor, "N 3"]) -
     """
     logs = []
     for target in targets:
-        corners_w = points_w[target.points]
-        true, found = (
-            (corners - corners.mean(dim=0)).square().sum() for corners in (target.corners, corners_w)
-        )
+        both = (target.corners, points_w[target.points])
+        true, found = ((corners - corners.mean(dim=0)).square().sum() for corners in both)
         logs.append(0.5 * (true.log() - found.log()))
     return torch.stack(logs)
 
@@ -321,10 +303,7 @@ def scale_of_targets(
 ) -> ScaleMeasurement:
     """The unit by all targets of an adjusted graph; a target that contradicts the others does not count and is listed.
 
-    Args:
-        with_corners: the graph and its targets.
-        solution: its minimum, differentiable in the pixels.
-        pixels: of the graph, the leaf of the gradient.
+    The solution is the minimum of the graph, differentiable in its pixels, the leaf of the gradient.
     """
     targets = with_corners.targets
     logs = log_sizes(targets, solution.points_w)
@@ -379,9 +358,8 @@ def _agreeing(targets: Sequence[PlacedTarget], sizes: _Sizes) -> tuple[Bool[Tens
             break
         deviation = math.expm1(float(sizes.mean(others).detach() - logs[row]))
         larger = "larger" if deviation > 0 else "smaller"
-        size = (
-            f"{targets[row].name} is {abs(deviation):.1%} ± {error:.1%} {larger} than stated, by the size of"
-        )
+        off_by = f"{abs(deviation):.1%} ± {error:.1%} {larger}"
+        size = f"{targets[row].name} is {off_by} than stated, by the size of"
         if int(used.sum()) == 2:
             lines.append(f"{size} {targets[int(others.nonzero())].name}: one of both is wrong")
             break
