@@ -11,6 +11,8 @@ from torch import Tensor
 from torchslam.dense.depth_maps import DepthMaps
 from torchslam.geometry import se3_inverse, transform
 
+MERGE_AT = 1 << 20
+"""Points that are collected before equal voxels are summed."""
 MAX_CELL = 1 << 20
 """Of a voxel's coordinates, so that three of them fit into 63 bits."""
 
@@ -73,7 +75,8 @@ class CloudFusion:
     A point of the cloud is the mean of all points in its voxel, weighted by confidence. Memory grows with the number of
     voxels, not with that of the maps.
 
-    The edge of a voxel, in map units, is as large as the depth is uncertain.
+    Args:
+        voxel: edge of the voxels, map units: as large as the depth is uncertain.
     """
 
     def __init__(self, voxel: float) -> None:
@@ -113,12 +116,9 @@ class CloudFusion:
         confidence = maps.confidence[row].double()[y, x, None]
         values = torch.cat((points_w, normals_w, colors[y, x].to(depth), confidence), dim=1)
         sums = torch.cat((confidence, confidence * values), dim=1)
-        # A number for the voxel of each point; far from the origin, voxels share the last one.
-        cell = (points_w / self._voxel).floor().clamp(-MAX_CELL, MAX_CELL - 1).long() + MAX_CELL
-        keys = (cell[:, 0] * (2 * MAX_CELL) + cell[:, 1]) * (2 * MAX_CELL) + cell[:, 2]
-        self._pending.append(_sum_equal(keys, sums))
+        self._pending.append(_sum_equal(_voxel_keys(points_w, self._voxel), sums))
         # Not every time, so that the cost of all is that of sorting a few times as many.
-        if sum(len(part) for part, _ in self._pending[1:]) > max(1 << 20, len(self._pending[0][0])):
+        if sum(len(keys) for keys, _ in self._pending[1:]) > max(MERGE_AT, len(self._pending[0][0])):
             self._merge()
 
     def _merge(self) -> None:
@@ -132,3 +132,9 @@ def _sum_equal(
     """Sum the rows of equal keys; the keys are ascending."""
     unique, place = torch.unique(keys, return_inverse=True)
     return unique, rows.new_zeros(len(unique), rows.shape[1]).index_add(0, place, rows)
+
+
+def _voxel_keys(points_w: Float[Tensor, "N 3"], voxel: float) -> Int[Tensor, " N"]:
+    """A number for the voxel of each point; far from the origin, voxels share the last one."""
+    cell = (points_w / voxel).floor().clamp(-MAX_CELL, MAX_CELL - 1).long() + MAX_CELL
+    return (cell[:, 0] * (2 * MAX_CELL) + cell[:, 1]) * (2 * MAX_CELL) + cell[:, 2]

@@ -27,8 +27,10 @@ ALONE = (-1.67, 7.88, -1.03, 2.27, 0.97)
 TOGETHER = (1.15, -0.66, -0.45, 0.40, 0.68)
 """Weights of the logarithm of the support, of the relative spread in percent, of the conflicts and of the view's own
 log-odds where it agrees, and the constant."""
-LEAST_SUPPORT, LEAST_ALONE = 1e-3, 1e-4
-"""Support, and confidence of a view alone, below which evidence does not count any further."""
+LEAST_SUPPORT = 1e-3
+"""Least support that counts, as `LEAST_ALONE`."""
+LEAST_ALONE = 1e-4
+"""Below these, evidence does not count any further."""
 LEAST_KEPT = 0.72
 """Least confidence of depth that is kept: then about nine in ten of all kept pixels are right."""
 SPECK = 2
@@ -142,6 +144,7 @@ def merge(
     other_confidences: Float[Tensor, "V H W"],
     camera: Camera,
     T_sr: Float[Tensor, "V 4 4"],
+    tolerance: float = TOLERANCE,
 ) -> Merged:
     """Merge the depth map of a view with those of its neighbors.
 
@@ -153,6 +156,7 @@ def merge(
         confidence: of its depth alone, 0 to 1: the weight of its votes.
         others, other_confidences: of its neighbors.
         camera, T_sr: pinhole of all views; poses from the camera of the view to those of the neighbors.
+        tolerance: relative difference of depths at which one gives half a vote to another.
     """
     rendered = render(others, camera, se3_inverse(T_sr))
     maps = torch.cat((inverse_depth[None], as_seen_by(rendered, others, camera, T_sr)))
@@ -162,7 +166,7 @@ def merge(
 
     def votes(candidate: Tensor) -> tuple[Tensor, Tensor]:
         relative = maps / torch.where(candidate > 0, candidate, 1.0) - 1
-        square = (relative / TOLERANCE).square()
+        square = (relative / tolerance).square()
         is_agreeing = (square <= 4) & (candidate > 0)
         return relative, torch.where(is_agreeing, weights / (1 + square), 0.0)
 
@@ -174,7 +178,7 @@ def merge(
     total = support.clamp(min=torch.finfo(maps.dtype).eps)
     mean = (given * relative).sum(0) / total
     spread = ((given * (relative - mean).square()).sum(0) / total).sqrt()
-    is_in_front = (relative > 2 * TOLERANCE) & (best > 0)
+    is_in_front = (relative > 2 * tolerance) & (best > 0)
     return Merged(
         inverse_depth=best * (1 + mean),
         support=support,
@@ -218,22 +222,24 @@ def _logistic(features: Tensor, weights: tuple[float, ...]) -> Tensor:
     return torch.sigmoid(features @ slope + weights[-1])
 
 
-def depth_normals(depth: Float[Tensor, "B H W"], camera: Camera) -> Float[Tensor, "B 3 H W"]:
+def depth_normals(
+    depth: Float[Tensor, "B H W"], camera: Camera, radius: int = NORMAL_RADIUS
+) -> Float[Tensor, "B 3 H W"]:
     """Compute unit normals in the camera frame, facing the camera; 0 where they or the depth are unknown.
 
     Differentiable with respect to depth and camera.
     """
     is_known = depth > 0
     q = torch.where(is_known, 1 / torch.where(is_known, depth, 1.0), 0.0)
-    size = 2 * NORMAL_RADIUS + 1
+    size = 2 * radius + 1
     height, width = depth.shape[-2:]
 
     def windows(values: Tensor) -> Tensor:
-        return F.unfold(values[:, None], size, padding=NORMAL_RADIUS).unflatten(-1, (height, width))
+        return F.unfold(values[:, None], size, padding=radius).unflatten(-1, (height, width))
 
     around = windows(q)
     weight = ((around > 0) & ((around - q[:, None]).abs() <= EDGE * q[:, None])).to(q.dtype)
-    offset = torch.arange(-NORMAL_RADIUS, NORMAL_RADIUS + 1, dtype=q.dtype, device=q.device)
+    offset = torch.arange(-radius, radius + 1, dtype=q.dtype, device=q.device)
     y, x = (each.flatten() for each in torch.meshgrid(offset, offset, indexing="ij"))
     # Least squares of q - q0 = a x + b y + c: the three moments of the window, centered.
     moments = torch.stack((torch.ones_like(x), x, y, x * x, y * y, x * y))
