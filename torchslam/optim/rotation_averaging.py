@@ -37,8 +37,14 @@ from torchslam.optim._core.levenberg_marquardt import (
     check_minimum,
 )
 from torchslam.optim._core.linear import factorize_sparse
-from torchslam.optim._pose_graph_problem import PoseGraphLayout, build_pose_graph_layout
-from torchslam.optim.pose_graph import PoseGraph, PoseGraphSolution, is_similarity, solve_pose_graph
+from torchslam.optim.pose_graph import (
+    PoseGraph,
+    PoseGraphLayout,
+    PoseGraphSolution,
+    build_pose_graph_layout,
+    is_similarity,
+    solve_pose_graph,
+)
 from torchslam.utils.indexing import connected_parts
 
 # Edges from one view are compared with this number of following ones, ascending by the other view: in a complete graph
