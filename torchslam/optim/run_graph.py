@@ -33,8 +33,9 @@ from torchslam.geometry.precision import check_dtypes, full_precision, without_a
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, Progress, SolverOptions, check_minimum
 from torchslam.optim._core.tangent import CameraPrior
-from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
+from torchslam.optim.bundle._problem import BundleProblem
+from torchslam.optim.bundle._solve import BundleSolution, solve_bundle
 from torchslam.optim.pose import solve_pose
 from torchslam.types import Trajectory
 from torchslam.utils.files import check_regular

@@ -10,7 +10,6 @@ an error of the image's diagonal and has no gradient: no step gains by pushing a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -48,15 +47,6 @@ class ReprojectionData:
     def factors(self) -> Float[Tensor, "*batch N"]:
         """Factors of squared residuals: the weights, or one where residuals are whitened."""
         return has_weight(self.weights).to(self.weights.dtype) if self.has_matrices else self.weights
-
-    def tensors(self) -> list[Tensor]:
-        """All that gradients may flow to: pixels, weights, camera parameters, scale."""
-        return [self.pixels, self.weights, self.camera.params, self.scale]
-
-    def replaced(self, tensors: Sequence[Tensor]) -> ReprojectionData:
-        """The same observations with other tensors, in the order of `tensors`."""
-        pixels, weights, params, scale = tensors
-        return ReprojectionData(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
 ROUNDINGS = 16.0

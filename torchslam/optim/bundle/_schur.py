@@ -398,14 +398,14 @@ class FactorizedEquations:
 
     def marginals(self) -> Marginals:
         """The diagonal blocks of H^-1."""
-        inverse = self.reduced.inverse()
         eye = torch.eye(3, dtype=self.points_root.dtype, device=self.points_root.device)
         blocks = []
         for tile, (points, rows, A) in zip(self.equations.structure.tiles, self.tiles, strict=True):
-            moved = (A @ inverse.among(tile.frames.members, rows)).unflatten(0, (-1, 3))
+            moved = (A @ self.reduced.inverse_among(tile.frames.members, rows)).unflatten(0, (-1, 3))
             root = self.points_root[points]
             blocks.append(root.mT @ (eye + moved @ A.unflatten(0, (-1, 3)).mT) @ root)
-        return Marginals(inverse.frames, torch.cat(blocks) if blocks else self.points_root, inverse.cameras)
+        points_w = torch.cat(blocks) if blocks else self.points_root
+        return Marginals(self.reduced.inverse_frames, points_w, self.reduced.inverse_cameras)
 
 
 class Marginals(NamedTuple):

@@ -16,9 +16,9 @@ from torch import Tensor
 from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import Linearization, flatness, variance_factor
-from torchslam.optim.bundle._minimization import BundleMinimization
 from torchslam.optim.bundle._problem import BundleData, BundleEstimate, BundleProblem, sanitized
 from torchslam.optim.bundle._schur import BundleTangent, FactorizedEquations
+from torchslam.optim.bundle._solve import BundleMinimization
 from torchslam.optim.bundle._sparse import SparseBundle
 
 
