@@ -110,12 +110,8 @@ def solve_pose_graph(graph: PoseGraph, *, options: SolverOptions = POSE_GRAPH_OP
     Source: Strasdat, Montiel and Davison, "Scale drift-aware large scale monocular SLAM", 2010.
 
     Args:
-        graph: the pose graph, or a batch.
         options: how to minimize; gradients reach S_ji, information, scale and fixed nodes, but not the start of free
             ones.
-
-    Returns:
-        The nodes at the minimum, differentiable.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.

@@ -110,15 +110,11 @@ def solve_rotations(
     Args:
         edges: views (i, j).
         R_ji: measured rotations from camera i to camera j: R_j = R_ji R_i.
-        num_views: K.
         weights: inverse variances per axis, in rad^-2; one if None.
         start: rotations to begin with in place of the forest. First views stay there, with a gradient to it.
         options: how to minimize, in the end; None: `ROTATION_OPTIONS`, or without weights
             `UNWEIGHTED_ROTATION_OPTIONS`. The scale of the kernels is in radians times the root of the weight.
             Gradients reach R_ji, weights, scale and the start of first views.
-
-    Returns:
-        Rotations, differentiable.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.

@@ -40,13 +40,6 @@ from torchslam.optim.pose import solve_pose
 from torchslam.types import Trajectory
 from torchslam.utils.files import check_regular
 
-POSE_ITERATIONS = 30
-"""Enough where no gradient is wanted: poses settle long before the choice of outliers that gradients depend on."""
-
-_FRAMES_AT_ONCE = 64
-"""Frames whose poses are refined in one batch, which bounds the memory."""
-# Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
-_MAX_SIZE_RATIO = 2.0
 _CALIBRATION = "calibration.params", "calibration.directions"
 """Tensors of a file that has them."""
 _VARIANCE = "observation_variance"
@@ -61,9 +54,6 @@ FIRST_TOLERANCE = 1e-6
 only."""
 GRADIENT_ROUNDS = 8
 """Rounds with a rolling shutter that gradients pass: each leaves a tenth to a third of the gradient's error."""
-
-_UNREADABLE = OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RuntimeError
-"""What reading another file raises."""
 
 
 @dataclass(frozen=True)
@@ -189,7 +179,15 @@ class ObservationGraph:
             graph = cls(camera=camera, calibration=calibration, readout=readout, **columns)
             graph._check()
             return graph
-        except _UNREADABLE as error:
+        except (
+            OSError,
+            SafetensorError,
+            KeyError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            RuntimeError,
+        ) as error:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
 
     def _check(self) -> None:
@@ -501,7 +499,7 @@ def _pose_other_frames(
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
     starts, converged = counts.cumsum(0) - counts, torch.ones_like(success)
-    for frames in others.split(_FRAMES_AT_ONCE) if len(others) else ():
+    for frames in others.split(64) if len(others) else ():  # in batches, which bounds the memory
         slot = torch.arange(int(counts[frames].max()), device=frames.device)
         mask = slot < counts[frames, None]
         seen = in_rank[torch.where(mask, starts[frames, None] + slot, 0)]
@@ -631,7 +629,7 @@ def _adjust_together(submaps: Sequence[_GraphSubmap], options: SolverOptions) ->
     cells = [len(submap.problem.T_cw) * len(submap.points) for submap in submaps]
     groups: list[list[int]] = []
     for row in sorted(range(len(submaps)), key=lambda row: cells[row]):
-        if groups and cells[row] <= _MAX_SIZE_RATIO * cells[groups[-1][0]]:
+        if groups and cells[row] <= 2 * cells[groups[-1][0]]:  # limits the padding to the largest
             groups[-1].append(row)
         else:
             groups.append([row])

@@ -93,9 +93,6 @@ def huber(squared: Array, scale: float) -> tuple[Array, Array]:
     return root * (2 * scale) + np.minimum(squared, limit) - 2 * limit, scale / root
 
 
-ROBUST_KERNELS = {"cauchy": cauchy, "huber": huber}
-
-
 def retract_pose(pose: Array, step: Array) -> Array:
     """A pose (3, 4) moved by a left perturbation [rho, omega] (6,), as in `_core.tangent.retract`."""
     x, y, z = (0.5 * step[3:]).tolist()

@@ -55,10 +55,7 @@ def displacement_error(
 ) -> Float[Tensor, "*#batch 3"]:
     """Difference between the displacement of an antenna and the measured one.
 
-    Args:
-        T_1w: first poses.
-        T_2w: second poses.
-        measured: the displacement in the world, then the position of the antenna in the camera, its lever arm.
+    `measured` is the displacement in the world, then the position of the antenna in the camera, its lever arm.
     """
     displacement_w, lever_c = measured.unbind(-2)
     first, second = (

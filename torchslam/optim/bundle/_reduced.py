@@ -200,13 +200,9 @@ def factorize_blocks(
     gauge: Float[Tensor, "R g"] | None,
     strict: bool,
 ) -> BlockReduced:
-    """Factorize a reduced system.
+    """Factorize a reduced system of blocks as `pairs` numbers them, and of cameras with columns against the frames.
 
-    Args:
-        blocks: of the frames and of the pairs, as `pairs` numbers them.
-        camera_columns: of the cameras against the frames; cameras: their own block.
-        gauge: directions of the frames whose products with themselves are added to the matrix.
-        strict: count the matrix as definite only if it is clearly so, beyond rounding.
+    gauge: directions of the frames whose products with themselves are added to the matrix; strict: as of `factorize`
     """
     structure = pairs.structure
     diagonal, across = blocks[: structure.num_nodes], blocks[structure.num_nodes :][: len(pairs.keys) - 1]

@@ -143,12 +143,9 @@ def build_structure(
     num_cameras: int,
     joined: Int[Tensor, "M 2"] | None = None,
 ) -> Structure:
-    """The structure of observations in the order of `Structure`.
+    """The structure of observations in the order of `Structure`, by the slots of their frames, K for all fixed ones.
 
-    Args:
-        frame_slots: slot of the observing frame, K for all fixed ones.
-        cameras: of the free frames; camera_of: of the observations
-        joined: free frames that factors join
+    cameras: of the free frames; camera_of: of the observations; joined: free frames that factors join
     """
     num_frames = len(cameras)
     frame_ends = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames].cumsum(0).tolist()

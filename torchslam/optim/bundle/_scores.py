@@ -52,13 +52,8 @@ def camera_scores(
     observations reach the camera by nothing else, to first order.
     Source: Bickel et al., "Efficient and adaptive estimation for semiparametric models", 1993, section 2.4.
 
-    Args:
-        problem: one bundle adjustment with one camera; what it has of priors and factors is left out.
-        directions: in which the camera's parameters may move.
-        options: its kernel and scale.
-
-    Returns:
-        The scores; None where the observations do not determine the directions.
+    Priors and factors of the problem are left out. None where the observations do not determine the directions, in
+    which the camera's parameters may move.
     """
     bundle, estimate = observations_alone(problem, directions, options)
     lin, J, rays_w, factorized = bundle.linear_system(estimate)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -17,8 +17,6 @@ from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
     BUNDLE_OPTIONS,
     Convergence,
-    LeastSquares,
-    M,
     Outcome,
     Progress,
     SolverOptions,
@@ -103,7 +101,6 @@ class BundleSolution(Outcome):
             Frames (n, 6, 6) of the left perturbation (translation, rotation), points (m, 3, 3), and camera (P, P), or
             (C P, C P) of several cameras.
         """
-        marginals = self._covariance
 
         def some(name: str, rows: Tensor | Sequence[int] | None, of_all: Tensor) -> Tensor:
             if rows is None:
@@ -111,11 +108,8 @@ class BundleSolution(Outcome):
             rows = torch.as_tensor(rows, device=of_all.device)
             return of_all[..., row_numbers(name, rows, of_all.shape[-3]), :, :]
 
-        return Marginals(
-            some("frames", frames, marginals.frames),
-            some("points", points, marginals.points),
-            marginals.camera,
-        )
+        of_frames, of_points, camera = self._covariance
+        return Marginals(some("frames", frames, of_frames), some("points", points, of_points), camera)
 
     def element(self, row: int, num_frames: int, num_points: int) -> BundleSolution:
         """One problem of a batch, without the frames and points that came after its own to fill it up."""
@@ -236,26 +230,6 @@ class BatchPart(NamedTuple):
     layout: SparseLayout | DenseLayout
 
 
-class BundleFormulation(LeastSquares[BundleEstimate, M], Protocol[M]):
-    """Solver of one element (`SparseBundle`) or of many (`DenseBundle`), in an order of its own."""
-
-    @property
-    def start(self) -> BundleEstimate: ...
-
-    def definite(self, model: M) -> Tensor:
-        """Whether (B,) all that moves is determined, up to the gauge."""
-        ...
-
-    def ordered(self, estimate: BundleEstimate) -> BundleEstimate: ...
-
-    def in_order(self, estimate: BundleEstimate) -> BundleEstimate: ...
-
-    # Both in the order of the problems.
-    def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]: ...
-
-    def marginals(self, estimate: BundleEstimate) -> Marginals: ...
-
-
 class BundleMinimization:
     """Bundle adjustments of inputs `BundleData`.
 
@@ -295,22 +269,21 @@ class BundleMinimization:
     def _minimize(self, given: BundleData, moving: MovingParts, part: BatchPart) -> BundleMinimum:
         bundle, moving = self._bundle(given, part), MovingParts(*(mask[part.rows] for mask in moving))
         iterations, tolerance, report = self.options.iterations, self.options.tolerance, self.progress
-        before, batch = (
-            iterations * part.rows.start,
-            len(given.T_cw),
-        )  # as if one element came after the other
+        # As if one element came after the other.
+        before, batch = iterations * part.rows.start, len(given.T_cw)
         progress = None if report is None else lambda now, most: report(before + now, most * batch)
         model, convergence = minimize_batch(bundle, bundle.start, iterations, tolerance, progress)
+        estimate: BundleEstimate = bundle.in_order(model.estimate)
         with torch.no_grad():
             success = bundle.solvable & given.finite[part.rows]
             with_parallax = moving.points
             if self.check:
                 success = success & bundle.definite(model)
                 of_part = given.part(part.rows)
-                with_parallax = points_with_parallax(of_part, moving.counted, bundle.in_order(model.estimate))
+                with_parallax = points_with_parallax(of_part, moving.counted, estimate)
                 success = success & frames_are_determined(of_part, moving, with_parallax, self.kinds)
         return BundleMinimum(
-            *bundle.in_order(model.estimate),
+            *estimate,
             success,
             moving.frames,
             moving.points,
@@ -436,11 +409,11 @@ class BundleMinimization:
             parts = [bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles]
             return Marginals(*_concatenated(parts))
 
-    def formulations(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any]]]:
-        """The parts of a batch and their solvers."""
+    def formulations(self, given: BundleData) -> list[tuple[BatchPart, Any]]:
+        """The parts of a batch and the solver of each, a `DenseBundle` or a `SparseBundle`."""
         return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
 
-    def _bundle(self, given: BundleData, part: BatchPart) -> BundleFormulation[Any]:
+    def _bundle(self, given: BundleData, part: BatchPart) -> Any:
         given, layout, kernel = given.part(part.rows), part.layout, self.options.kernel
         directions = self._directions(given.params)
         if isinstance(layout, DenseLayout):

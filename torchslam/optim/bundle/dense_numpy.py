@@ -2,7 +2,7 @@
 
 `_dense` is the same formulation by PyTorch, for batches and with gradients: frames move along the axes of the world,
 the free ones come first, and the Schur complement on the points is one dense matrix, since most of a local window of a
-dozen frames is filled. `tests/optim/bundle/test_dense_numpy.py` compares minima and steps. NumPy takes half of the time
+dozen frames is filled. NumPy takes half of the time
 for one problem, and has neither gradients nor covariances.
 
 They differ in the residual of a distorted camera: as in `frame_pose`, errors here are taken in undistorted coordinates
@@ -51,14 +51,9 @@ def solve_bundle_numpy(
 ) -> NumpyBundleSolution:
     """Minimize Huber costs of reprojection errors over all points and the poses that are not fixed.
 
-    Args:
-        problem: a single one, finite, with one camera, and without mask, priors and fixed points.
-        scale: of the kernel, in units of the whitened error.
-        iterations: maximum number of steps.
-        tolerance: stop after a step with a predicted reduction of at most this share of the cost.
-
-    Raises:
-        ValueError: an index is out of range, or the problem has a part that is not supported.
+    problem: a single one, finite, with one camera, and without mask, priors and fixed points; scale: of the kernel, in
+    units of the whitened error; iterations and tolerance as of `minimize_model`. Raises ValueError where an index is
+    out of range, or the problem has a part that is not supported.
     """
     bundle = _Bundle(problem, scale)
     model = minimize_model(bundle.evaluate(bundle.start), bundle.evaluate, iterations, tolerance)
