@@ -56,12 +56,6 @@ _NARROWING = 1.4
 # Turn of a view, in radians, below which the views have settled. From there one of Newton's steps, which follow, is
 # enough; from 1e-3 it takes 4, each as long as 20 of the steps here in a graph that fills in; 1e-6 gains nothing.
 _SETTLED = 1e-5
-# Limit of the steps for that; 5 to 15 are usual.
-_SETTLING_STEPS = 30
-# Limit of the rounds of votes, and the share of the cost that one has to gain; 1 or 2 are usual.
-_VOTES, _GAIN = 5, 1e-4
-# Edges of a view whose rotations are put to the vote: with half of them wrong, the chance that all are is 2^-32.
-_CANDIDATES = 32
 
 
 @dataclass(frozen=True)
@@ -353,10 +347,10 @@ def robust_start(
         added = added / _NARROWING
     R_cw = graph.settled(R_cw, wide, scale)
     cost = costs(R_cw)
-    for _ in range(_VOTES):
+    for _ in range(5):  # 1 or 2 are usual
         voted = graph.settled(graph.voted(R_cw, scale), wide, scale)
         voted_cost = costs(voted)
-        is_better = voted_cost < (1 - _GAIN) * cost
+        is_better = voted_cost < (1 - 1e-4) * cost
         if not is_better.any():
             break
         R_cw = torch.where(is_better[component, None, None], voted, R_cw)
@@ -405,7 +399,7 @@ class _Graph:
         self, R_cw: Float[Tensor, "K 3 3"], kernel: Kernel, scale: Float[Tensor, ""]
     ) -> Float[Tensor, "K 3 3"]:
         """The views after as many steps as they turn."""
-        for _ in range(_SETTLING_STEPS):
+        for _ in range(30):  # 5 to 15 are usual
             R_cw, turn = self.step(R_cw, kernel, scale, self.edges.weights)
             if turn.abs().max() < _SETTLED:
                 break
@@ -432,8 +426,8 @@ class _Graph:
         most = scale.square() * counts  # as an edge costs the squared scale at most
         doubtful = ~fixed & (now >= 0.5 * most)
 
-        # All pairs of a candidate and an end of its view.
-        candidate = (doubtful[view] & (rank < _CANDIDATES)).nonzero().squeeze(-1)
+        # All pairs of a candidate and an end of its view; with half of 32 wrong, the chance that all are is 2^-32.
+        candidate = (doubtful[view] & (rank < 32)).nonzero().squeeze(-1)
         voters = counts[view[candidate]]
         row = torch.repeat_interleave(voters)
         within = torch.arange(len(row), device=row.device) - (voters.cumsum(0) - voters)[row]

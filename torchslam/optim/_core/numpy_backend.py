@@ -32,21 +32,19 @@ RobustKernel = Literal["cauchy", "huber"]
 MIN_DEPTH = float(np.finfo(np.float64).eps)
 """A point at a smaller depth counts as behind the camera."""
 
-X = TypeVar("X", covariant=True)
 
-
-class LocalModel(Protocol[X]):
+class LocalModel(Protocol):
     """A quadratic model of the cost around a state."""
 
     @property
     def cost(self) -> float: ...
 
-    def step(self, damping: float, use_curvature: bool) -> tuple[X, float] | None:
+    def step(self, damping: float, use_curvature: bool) -> tuple[Any, float] | None:
         """The state at the minimum of the damped model and the predicted reduction of the cost; None if singular."""
         ...
 
 
-M = TypeVar("M", bound=LocalModel[Any])
+M = TypeVar("M", bound=LocalModel)
 
 
 def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tolerance: float) -> M:
