@@ -166,10 +166,8 @@ class PoseProblem:
         result = G.flatten(-3, -2).mT @ (hessian @ G).flatten(-3, -2)
         # The curvature of the rotation itself: half of gradient . (omega x (omega x p)).
         outer = gradient.mT @ points_c
-        curvature_term = (
-            0.5 * (outer + outer.mT)
-            - outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * self.eye[:3, :3]
-        )
+        trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        curvature_term = 0.5 * (outer + outer.mT) - trace * self.eye[:3, :3]
         result = result + torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
         return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
 

@@ -354,11 +354,9 @@ class PoseGraphProblem:
     def evaluate(self, S_cw: Tensor, use_curvature: Tensor) -> PoseGraphModel:
         lin = self._linearize(S_cw)
         _, weight, curvature = lin.kernel
-        curvature_term = flat_along(weight, 2 * curvature, lin.squared, use_curvature[:, None])[
-            ..., None, None
-        ]
+        along = flat_along(weight, 2 * curvature, lin.squared, use_curvature[:, None])
         outer = lin.weighted_residual[..., :, None] * lin.weighted_residual[..., None, :]
-        curve = weight[..., None, None] * self.inputs.information + curvature_term * outer
+        curve = weight[..., None, None] * self.inputs.information + along[..., None, None] * outer
         return self._assemble(S_cw, lin, lin.J.mT @ curve @ lin.J, None)
 
     def step(self, model: PoseGraphModel, damping: Tensor) -> tuple[Tensor, Tensor]:

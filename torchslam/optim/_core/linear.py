@@ -106,6 +106,16 @@ def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0
     return [xp.where(is_definite, entry, 0.0) for entry in root]
 
 
+def lower_times(q: Any, v: Any) -> list[Any]:
+    """Q v of lower triangles with entries `LOWER_3X3`, tensors or arrays, and vectors of three such entries."""
+    return [q[0] * v[0], q[1] * v[0] + q[2] * v[1], q[3] * v[0] + q[4] * v[1] + q[5] * v[2]]
+
+
+def upper_times(q: Any, v: Any) -> list[Any]:
+    """Q^T v, as `lower_times`."""
+    return [q[0] * v[0] + q[1] * v[1] + q[3] * v[2], q[2] * v[1] + q[4] * v[2], q[5] * v[2]]
+
+
 # Parts this small are dense fronts: less work than the calls for splitting them further.
 _LEAF_NODES = 40
 

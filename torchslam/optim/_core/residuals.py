@@ -235,11 +235,9 @@ def exact_expansion(
     gradient_wrt_residual = lin.gradient_wrt_residual[..., None]
     along = (lin.residual[..., None, :] @ lin.J) * (lin.curvature_term[..., None] * lin.residual)[..., None]
     hessian = lin.J.mT @ (lin.weight[..., None, None] * lin.J + along)
-    pull = (
-        whitening(observations.weights).mT @ gradient_wrt_residual
-        if observations.has_matrices
-        else gradient_wrt_residual
-    )
+    pull = gradient_wrt_residual
+    if observations.has_matrices:
+        pull = whitening(observations.weights).mT @ pull
     hessian = hessian + _projection_curvature(observations.camera, points_c, pull.detach(), free_camera)
     return Expansion((lin.J.mT @ gradient_wrt_residual).squeeze(-1), hessian)
 
