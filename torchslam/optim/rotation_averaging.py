@@ -47,9 +47,6 @@ from torchslam.optim.pose_graph import (
 )
 from torchslam.utils.indexing import connected_parts
 
-# Edges from one view are compared with this number of following ones, ascending by the other view: in a complete graph
-# of K views there are K^3 / 6 triangles. Neighbors in a sequence have neighboring numbers.
-_TRIANGLE_REACH = 32
 # Of the squared width from one kernel to the next, as in Yang et al. With 1.1 (2.5 times slower) a few more of the
 # graphs with 40 % of wrong edges end at the best minimum, with 2.0 fewer.
 _NARROWING = 1.4
@@ -297,7 +294,9 @@ def _triangle_support(edges: RotationEdges, num_views: int, scale: Float[Tensor,
     i, j, R_ji, weights = edges
     keys = i * num_views + j
     support = torch.zeros_like(weights)
-    for reach in range(1, min(_TRIANGLE_REACH + 1, len(i))):
+    # Edges from one view are compared with 32 following ones, ascending by the other view: in a complete graph of K
+    # views there are K^3 / 6 triangles. Neighbors in a sequence have neighboring numbers.
+    for reach in range(1, min(33, len(i))):
         first = (i[:-reach] == i[reach:]).nonzero().squeeze(-1)
         if len(first) == 0:
             break

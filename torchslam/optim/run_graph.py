@@ -42,10 +42,6 @@ from torchslam.utils.files import check_regular
 
 _CALIBRATION = "calibration.params", "calibration.directions"
 """Tensors of a file that has them."""
-_VARIANCE = "observation_variance"
-"""Of the calibration, in the metadata of a file; earlier versions wrote none."""
-_READOUT = "readout"
-"""Tensor of a file of a rolling shutter: readout, standard error, prior and its standard deviation, in seconds."""
 MAX_ROUNDS, SETTLED_PX = 12, 2e-3
 """Most rounds with a rolling shutter, and the change of the keypoints, as a root mean square, that ends them. A round
 leaves a tenth to a third of the change of the one before."""
@@ -144,9 +140,9 @@ class ObservationGraph:
         if (given := self.calibration) is not None:
             parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
             tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
-            metadata[_VARIANCE] = repr(given.observation_variance)
+            metadata["observation_variance"] = repr(given.observation_variance)
         if self.readout is not None:
-            tensors[_READOUT] = self.readout.numbers
+            tensors["readout"] = self.readout.numbers
         safetensors.torch.save_file(tensors, path, metadata)
 
     @classmethod
@@ -165,17 +161,18 @@ class ObservationGraph:
                     cls = RunGraph  # type: ignore[assignment]
                 names = [name for name in cls.columns() if name in known or name != "submap"]
                 given = _CALIBRATION if set(_CALIBRATION) <= known else ()
-                shutter = (_READOUT,) if _READOUT in known else ()
+                shutter = ("readout",) if "readout" in known else ()
                 tensors = {name: file.get_tensor(name) for name in (*names, "camera", *given, *shutter)}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
             calibration = None
             if given:
                 params, directions = (tensors[name] for name in given)
-                variance = float(metadata.get(_VARIANCE, OBSERVATION_VARIANCE))
+                # Earlier versions wrote none.
+                variance = float(metadata.get("observation_variance", OBSERVATION_VARIANCE))
                 calibration = CameraMeasurement(camera.with_params(params), directions, variance)
             columns = {name: tensors[name] for name in names}
-            readout = Readout.from_numbers(tensors[_READOUT]) if shutter else None
+            readout = Readout.from_numbers(tensors["readout"]) if shutter else None
             graph = cls(camera=camera, calibration=calibration, readout=readout, **columns)
             graph._check()
             return graph
@@ -349,8 +346,24 @@ def solve_graph(
     strict, options = options.strict, options.replace(strict=False)
     _check_factors(graph, frame_factors)
 
+    free, prior = (False, None) if free_camera is None else (free_camera, None)
+    if free_camera is None and graph.calibration is not None:
+        free, prior = graph.calibration.directions, camera_prior(graph.calibration)
+
     def solved(graph: ObservationGraph, options: SolverOptions) -> GraphSolution:
-        return _solve_global_shutter(graph, free_camera, options, progress, frame_factors, depth_prior)
+        """The minimum of a graph whose keypoints are those of a global shutter."""
+
+        def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
+            solve = partial(solve_bundle, options=options, progress=progress)
+            main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
+            problems = [_with_factors(submap, graph, frame_factors, depth_prior) for submap in submaps]
+            first = solve(replace(problems[main], camera_prior=prior), free_camera=free)
+            return [
+                first if row == main else solve(replace(problem, camera=first.camera))
+                for row, problem in enumerate(problems)
+            ]
+
+        return _solve([graph], adjust, options)[0]
 
     solution = solved(graph, options) if graph.readout is None else _solve_in_rounds(graph, solved, options)
     if strict:
@@ -379,35 +392,6 @@ def _solve_in_rounds(
         if not passes_gradient and not is_rough and bool(change < SETTLED_PX):
             break
         before = corrected.pixels
-    return solution
-
-
-def _solve_global_shutter(
-    graph: ObservationGraph,
-    free_camera: bool | Float[Tensor, "P n"] | None,
-    options: SolverOptions,
-    progress: Progress | None,
-    frame_factors: Sequence[FrameFactors],
-    depth_prior: DepthPrior | None,
-) -> GraphSolution:
-    """The minimum of a graph whose keypoints are those of a global shutter; arguments as of `solve_graph`."""
-    free, prior = (False, None) if free_camera is None else (free_camera, None)
-    if free_camera is None and graph.calibration is not None:
-        free, prior = graph.calibration.directions, camera_prior(graph.calibration)
-
-    def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
-        def solved(problem: BundleProblem, free: bool | Tensor) -> BundleSolution:
-            return solve_bundle(problem, free_camera=free, options=options, progress=progress)
-
-        main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
-        problems = [_with_factors(submap, graph, frame_factors, depth_prior) for submap in submaps]
-        first = solved(replace(problems[main], camera_prior=prior), free)
-        return [
-            first if row == main else solved(replace(problem, camera=first.camera), False)
-            for row, problem in enumerate(problems)
-        ]
-
-    (solution,) = _solve([graph], adjust, options)
     return solution
 
 
