@@ -188,10 +188,13 @@ class PoseMinimization:
         self.ndims: tuple[Ndims, Ndims, Ndims] = (1,), (2, 0, 0, 0, 0, 0), (*ndims[:4], 1, 1, *ndims[6:])
 
     def problem(self, inputs: Tensors) -> PoseProblem:
+        return PoseProblem(*self._given(inputs))
+
+    def _given(self, inputs: Tensors) -> tuple[Tensor, ReprojectionData, PosePrior | None]:
         _, points_w, pixels, weights, params, scale, *prior = inputs
         camera = self.camera.with_params(params)
         observations = ReprojectionData(pixels, weights, camera, self.options.kernel, scale)
-        return PoseProblem(points_w, observations, PosePrior(*prior) if prior else None)
+        return points_w, observations, PosePrior(*prior) if prior else None
 
     def minimize(self, inputs: Tensors) -> Tensors:
         T_cw, problem = inputs[0], self.problem(inputs)
@@ -217,13 +220,13 @@ class PoseMinimization:
         return solve
 
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
-        T_cw, (xi,), problem = found[0], direction, self.problem(inputs)
-        points_c = transform(T_cw, problem.points_w)
-        lin = linearize(problem.observations, points_c)
+        T_cw, (xi,), (points_w, observations, prior) = found[0], direction, self._given(inputs)
+        points_c = transform(T_cw, points_w)
+        lin = linearize(observations, points_c)
         velocity = lin.J @ move(points_c, xi[:, None])[..., None]
         slope = (lin.gradient_wrt_residual[..., None, :] @ velocity).sum()
-        if problem.prior is not None:
-            slope = slope + (prior_expansion(problem.prior, T_cw)[1] * xi).sum()
+        if prior is not None:
+            slope = slope + (prior_expansion(prior, T_cw)[1] * xi).sum()
         return slope
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
