@@ -13,7 +13,7 @@ from torch.func import vmap
 from tests.optim.conftest import adjusted
 from torchslam.geometry import se3_exp
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, CameraPrior, PosePrior, solve_bundle
-from torchslam.optim.bundle import _minimization as minimization
+from torchslam.optim.bundle import _solve as minimization
 from torchslam.optim.bundle._dense import DenseBundle
 from torchslam.optim.bundle._problem import sanitized, select_moving
 

@@ -20,8 +20,7 @@ from torchslam.geometry import (
 )
 from torchslam.optim import PoseGraph, solve_pose_graph
 from torchslam.optim._core.linear import build_block_structure, dissect, factorize_sparse
-from torchslam.optim._pose_graph_problem import PoseGraphProblem, build_pose_graph_layout
-from torchslam.optim.pose_graph import _sanitized
+from torchslam.optim.pose_graph import PoseGraphProblem, _sanitized, build_pose_graph_layout
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-26}
 SIGMAS = torch.tensor([0.02, 0.02, 0.02, 0.005, 0.005, 0.005, 0.01], dtype=torch.float64)
@@ -118,8 +117,9 @@ def test_derivatives_of_an_edge_agree_with_autograd(angle: float, sigma: float, 
         fixed=(2,),
         with_scale=dims == 7,
     )
-    counted, fixed, inputs = _sanitized(graph, 2.0)
-    problem = PoseGraphProblem(build_pose_graph_layout(graph.edges, counted, fixed, dims), inputs, "cauchy")
+    inputs = _sanitized(graph, 2.0)
+    layout = build_pose_graph_layout(inputs.edges, inputs.counted, inputs.fixed, dims)
+    problem = PoseGraphProblem(layout, inputs, "cauchy")
 
     def cost(xi: Tensor) -> Tensor:
         moves = sim3_exp(torch.nn.functional.pad(xi.view(2, dims), (0, 7 - dims)))

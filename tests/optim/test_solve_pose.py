@@ -8,7 +8,7 @@ from torchslam.geometry import Camera, se3_exp, se3_inverse, se3_log, transform
 from torchslam.optim import POSE_OPTIONS, PosePrior, solve_pose
 from torchslam.optim._core.residuals import ReprojectionData
 from torchslam.optim._core.tangent import retract
-from torchslam.optim.pose import PoseInputs, PoseProblem
+from torchslam.optim.pose import PoseProblem
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
 
@@ -202,7 +202,7 @@ def scene(camera: Camera, generator: torch.Generator) -> tuple[Tensor, PoseProbl
     weights = 0.5 + torch.rand(2, 30, generator=generator, dtype=torch.float64)
     scale = torch.tensor([2.0], dtype=torch.float64)
     observations = ReprojectionData(pixels, weights, camera, "cauchy", scale)
-    return T_cw, PoseProblem(PoseInputs(points_w, observations, None))
+    return T_cw, PoseProblem(points_w, observations, None)
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
@@ -252,12 +252,12 @@ def test_the_pinhole_shortcut_equals_the_general_expansion(generator: torch.Gene
     T_cw, short = scene(PINHOLE, generator)
     inputs = short.observations
     straight = ReprojectionData(inputs.pixels, inputs.weights, STRAIGHT, inputs.kernel, inputs.scale)
-    general = PoseProblem(PoseInputs(short.points_w, straight, None))
+    general = PoseProblem(short.points_w, straight, None)
     moved = se3_exp(torch.tensor([0.05, 0, -0.1, 0.01, 0.02, 0.0], dtype=torch.float64)) @ T_cw
     for T in (T_cw, moved):
         torch.testing.assert_close(short.expand(T, ALL), general.expand(T, ALL))
     batch = Camera("pinhole", PINHOLE.params * torch.tensor([[1.0], [1.1]], dtype=torch.float64), (640, 480))
     two = ReprojectionData(inputs.pixels, inputs.weights, batch, inputs.kernel, inputs.scale)
-    pair = PoseProblem(PoseInputs(short.points_w, two, None))
+    pair = PoseProblem(short.points_w, two, None)
     torch.testing.assert_close(pair.expand(T_cw, ALL).hessian[0], short.expand(T_cw, ALL).hessian[0])
     assert not torch.allclose(pair.expand(T_cw, ALL).hessian[1], short.expand(T_cw, ALL).hessian[1])

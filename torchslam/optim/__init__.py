@@ -16,7 +16,6 @@ from torchslam.optim._core.levenberg_marquardt import (
 )
 from torchslam.optim._core.tangent import CameraPrior, PosePrior
 from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, solve_least_squares
-from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import (
     DepthPrior,
     FrameFactors,
@@ -24,8 +23,10 @@ from torchslam.optim.bundle._factors import (
     log_distance_error,
     relative_pose_error,
 )
+from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.bundle._scores import pose_covariance
+from torchslam.optim.bundle._solve import BundleSolution, solve_bundle
 from torchslam.optim.pose import RefinedPose, solve_pose
 from torchslam.optim.pose_graph import PoseGraph, PoseGraphSolution, solve_pose_graph
 from torchslam.optim.rotation_averaging import RotationAverage, solve_rotations

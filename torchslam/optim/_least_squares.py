@@ -10,7 +10,7 @@ from typing import Literal, NamedTuple, get_args
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
-from torch.func import grad, jvp, vmap
+from torch.func import grad, jvp
 
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale, robustify
@@ -83,11 +83,9 @@ class Product:
             for name, x in zip(self.manifolds, unknowns, strict=True)
         ), finite
 
-    def basis(self, unknowns: Tensors) -> Tensor:
-        """(n, B, n) unit steps, each for the whole batch."""
-        size = sum(prod(shape) for shape in self.step_shapes)
-        eye = torch.eye(size, dtype=unknowns[0].dtype, device=unknowns[0].device)
-        return eye[:, None].expand(size, len(unknowns[0]), size)
+    def no_step(self, unknowns: Tensors) -> Tensor:
+        """(B, n) zeros."""
+        return unknowns[0].new_zeros(len(unknowns[0]), sum(prod(shape) for shape in self.step_shapes))
 
     def retract(self, unknowns: Tensors, step: Tensor) -> Tensors:
         """The unknowns moved along a step (B, n)."""
@@ -256,11 +254,8 @@ class _Problem:
         return _Problem(self.residual, self.product, self.kernel, *tensors)
 
     def evaluate(self, unknowns: Tensors, use_curvature: Tensor) -> _Model:
-        basis, moved = self.product.basis(unknowns), self._moved(unknowns)
-        zero = torch.zeros_like(basis[0])
-        r = moved(zero)
-        J = vmap(lambda step: jvp(moved, (zero,), (step,))[1], out_dims=-1)(basis)
-        lin = self._weighed(r, J)
+        zero, moved = self.product.no_step(unknowns), self._moved(unknowns)
+        lin = self._weighed(moved(zero), tangent.row_jacobian(moved, zero))
         # As in `gauss_newton_expansion`.
         residual, squared = lin.residual, lin.residual.square().sum(-1)
         curvature_term = flat_along(lin.weight, lin.curvature_term, squared, use_curvature[:, None])
@@ -294,13 +289,8 @@ class _Problem:
 
     def exact_factor(self, unknowns: Tensors) -> DefiniteFactor:
         """Of the exact Hessians (B, n, n)."""
-        basis = self.product.basis(unknowns)
-
-        def gradient(step: Tensor) -> Tensor:
-            return grad(lambda step: self.cost(self.product.retract(unknowns, step)).sum())(step)
-
-        zero = torch.zeros_like(basis[0])
-        return factorize(vmap(lambda step: jvp(gradient, (zero,), (step,))[1], out_dims=-1)(basis))
+        gradient = grad(lambda step: self.cost(self.product.retract(unknowns, step)).sum())
+        return factorize(tangent.row_jacobian(gradient, self.product.no_step(unknowns)))
 
     def _moved(self, unknowns: Tensors) -> Callable[[Tensor], Tensor]:
         """The residuals as a function of a step (B, n)."""

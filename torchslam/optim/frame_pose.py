@@ -18,9 +18,10 @@ from torch import Tensor
 from torchslam.geometry import UndistortedKeypoints
 from torchslam.optim._core.numpy_backend import (
     MIN_DEPTH,
-    ROBUST_KERNELS,
     Array,
     RobustKernel,
+    cauchy,
+    huber,
     is_definite,
     minimize_model,
     retract_pose,
@@ -153,14 +154,7 @@ def nearby_pose(
 ) -> Float[Tensor, "4 4"] | None:
     """Refine an expected pose without RANSAC, by all matches under a robust kernel, then by those that agree.
 
-    Args:
-        expected_T_cw: start.
-        points_w: matched points.
-        undistorted: their keypoints.
-        threshold: maximum error of a match that agrees, px.
-
-    Returns:
-        The pose, or None where less than `MIN_AGREEING` of the matches agree with it.
+    threshold: maximum error of a match that agrees, px. Returns None where less than `MIN_AGREEING` of them do.
     """
     problem = FrameProblem(points_w, undistorted.xy, undistorted.slope / threshold)
     ones = torch.ones_like(points_w[:, 0])
@@ -189,7 +183,7 @@ class _Model:
     @classmethod
     def of(cls, linearization: PoseLinearization, weights: Array, kernel: RobustKernel) -> _Model:
         squared = linearization.squares * weights
-        rho, influence = ROBUST_KERNELS[kernel](squared, SCALE)
+        rho, influence = (cauchy if kernel == "cauchy" else huber)(squared, SCALE)
         weighted = linearization.rows * (influence * weights)
         normal = weighted.reshape(7, -1) @ linearization.rows.reshape(7, -1).T
         return cls(linearization, kernel, weights, squared, influence, 0.5 * float(rho.sum()), normal)

@@ -6,9 +6,9 @@ matrix product per problem makes Hessian and gradient, and every operation befor
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -62,31 +62,12 @@ class PoseModel(NamedTuple):
     curvature_term: Float[Tensor, "B 6 6"]
 
 
-@dataclass(frozen=True)
-class PoseInputs:
-    """What a pose problem is made of: finite tensors, rows that do not count having weight zero."""
-
-    points_w: Tensor
-    observations: ReprojectionData
-    prior: PosePrior | None
-
-    def tensors(self) -> list[Tensor]:
-        """All that gradients may flow to."""
-        prior = () if self.prior is None else (self.prior.T_cw, self.prior.information)
-        return [self.points_w, *self.observations.tensors(), *prior]
-
-    def replaced(self, tensors: Sequence[Tensor]) -> PoseInputs:
-        """The same problem with other tensors, in the order of `tensors`."""
-        points_w, *rest = tensors
-        prior = None if self.prior is None else PosePrior(*rest[4:])
-        return PoseInputs(points_w, self.observations.replaced(rest[:4]), prior)
-
-
 class PoseProblem:
     """The least-squares problem of `solve_pose` for `minimize_batch`, with covariances and the exact Hessian."""
 
-    def __init__(self, inputs: PoseInputs) -> None:
-        self.points_w, self.observations, self.prior = inputs.points_w, inputs.observations, inputs.prior
+    def __init__(self, points_w: Tensor, observations: ReprojectionData, prior: PosePrior | None) -> None:
+        """Take finite tensors; rows that do not count have weight zero."""
+        self.points_w, self.observations, self.prior = points_w, observations, prior
         self.eye = torch.eye(6, dtype=self.points_w.dtype, device=self.points_w.device)
         counted = (self.observations.factors > 0).sum(-1)
         self.solvable = counted >= (3 if self.prior is None else 0)  # two equations each for six unknowns
@@ -185,35 +166,43 @@ class PoseProblem:
         result = G.flatten(-3, -2).mT @ (hessian @ G).flatten(-3, -2)
         # The curvature of the rotation itself: half of gradient . (omega x (omega x p)).
         outer = gradient.mT @ points_c
-        curvature_term = (
-            0.5 * (outer + outer.mT)
-            - outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * self.eye[:3, :3]
-        )
+        trace = outer.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None]
+        curvature_term = 0.5 * (outer + outer.mT) - trace * self.eye[:3, :3]
         result = result + torch.nn.functional.pad(curvature_term, (3, 0, 3, 0))
         return result if self.prior is None else result + prior_hessian(self.prior, T_cw)
 
 
 class PoseMinimization:
-    """`solve_pose` for `find_minimum`: found are the poses, and `success`, `cost` and how it went."""
+    """`solve_pose` for `find_minimum`: found are the poses, `success`, and how it went.
+
+    Inputs are the start, points, pixels, weights, camera.params, scale, and where there is a prior its two tensors.
+    """
 
     num_unknowns = 1
     num_vectors = 1
 
-    def __init__(self, inputs: PoseInputs, iterations: int, tolerance: float) -> None:
-        self.inputs, self.iterations, self.tolerance = inputs, iterations, tolerance
-        weights, prior = inputs.observations.weights.ndim - 1, () if inputs.prior is None else (2, 2)
-        self.ndims: tuple[Ndims, Ndims, Ndims] = (
-            (1,),
-            (2, 0, 0, 0, 0, 0),
-            (2, 2, 2, weights, 1, 1, *prior),
-        )
+    def __init__(self, camera: Camera, options: SolverOptions, inputs: Tensors) -> None:
+        self.camera, self.options = camera, options
+        ndims = tuple(tensor.ndim - 1 for tensor in inputs)
+        # The camera's parameters and the scale may have no batch.
+        self.ndims: tuple[Ndims, Ndims, Ndims] = (1,), (2, 0, 0, 0, 0, 0), (*ndims[:4], 1, 1, *ndims[6:])
+
+    def problem(self, inputs: Tensors) -> PoseProblem:
+        return PoseProblem(*self._given(inputs))
+
+    def _given(self, inputs: Tensors) -> tuple[Tensor, ReprojectionData, PosePrior | None]:
+        _, points_w, pixels, weights, params, scale, *prior = inputs
+        camera = self.camera.with_params(params)
+        observations = ReprojectionData(pixels, weights, camera, self.options.kernel, scale)
+        return points_w, observations, PosePrior(*prior) if prior else None
 
     def minimize(self, inputs: Tensors) -> Tensors:
-        T_cw, problem = inputs[0], PoseProblem(self.inputs.replaced(inputs[1:]))
+        T_cw, problem = inputs[0], self.problem(inputs)
         finite = torch.isfinite(T_cw).flatten(1).all(-1)
         identity = torch.eye(4, dtype=T_cw.dtype, device=T_cw.device)
         start = torch.where(finite[:, None, None], T_cw, identity)
-        model, convergence = minimize_batch(problem, start, self.iterations, self.tolerance)
+        options = self.options
+        model, convergence = minimize_batch(problem, start, options.iterations, options.tolerance)
         with torch.no_grad():
             success = problem.solvable & factorize(model.hessian).definite & finite
         refined = torch.where(success[:, None, None], model.T_cw, start.detach())
@@ -222,7 +211,7 @@ class PoseMinimization:
     def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
         T_cw, success, *_ = found
         with torch.no_grad():
-            factor = factorize(PoseProblem(self.inputs.replaced(inputs[1:])).hessian(T_cw))
+            factor = factorize(self.problem(inputs).hessian(T_cw))
 
         def solve(right: Tensors) -> Tensors:
             right_of_successes = torch.where(success[:, None], right[0], 0.0)
@@ -231,13 +220,13 @@ class PoseMinimization:
         return solve
 
     def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
-        T_cw, (xi,), problem = found[0], direction, self.inputs.replaced(inputs[1:])
-        points_c = transform(T_cw, problem.points_w)
-        lin = linearize(problem.observations, points_c)
+        T_cw, (xi,), (points_w, observations, prior) = found[0], direction, self._given(inputs)
+        points_c = transform(T_cw, points_w)
+        lin = linearize(observations, points_c)
         velocity = lin.J @ move(points_c, xi[:, None])[..., None]
         slope = (lin.gradient_wrt_residual[..., None, :] @ velocity).sum()
-        if problem.prior is not None:
-            slope = slope + (prior_expansion(problem.prior, T_cw)[1] * xi).sum()
+        if prior is not None:
+            slope = slope + (prior_expansion(prior, T_cw)[1] * xi).sum()
         return slope
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
@@ -265,7 +254,7 @@ class RefinedPose(Outcome):
     cost: Float[Tensor, " B"]
     success: Bool[Tensor, " B"]
     convergence: Convergence
-    _inputs: PoseInputs = field(repr=False)
+    _problem: Callable[[], PoseProblem] = field(repr=False)
 
     @cached_property
     def covariance(self) -> Float[Tensor, "B 6 6"]:
@@ -274,7 +263,7 @@ class RefinedPose(Outcome):
         Calibrated by the residuals themselves, so the weights need to be right only up to a factor.
         """
         with torch.no_grad():
-            covariance = PoseProblem(self._inputs).covariance(self.T_cw)
+            covariance = self._problem().covariance(self.T_cw)
             return torch.where(self.success[:, None, None], covariance, 0.0)
 
 
@@ -318,23 +307,21 @@ def solve_pose(
     use = usable(pixels, points_w, weights)
     use = use if mask is None else use & mask
     rows, scale = use[..., None], kernel_scale(options.scale, T_cw)[..., None]
+    priors: Tensors = ()
     if prior is not None:
-        prior = PosePrior(prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6))
-    pixels, weights = torch.where(rows, pixels, 0.0), only(use, weights)
+        priors = prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6)
+    points_w, pixels = torch.where(rows, points_w, 0.0), torch.where(rows, pixels, 0.0)
     # A copy, as of the others: parameters may move in place before the covariance is asked for.
-    camera = camera.with_params(camera.params.clone())
-    observations = ReprojectionData(pixels, weights, camera, options.kernel, scale)
-    inputs = PoseInputs(torch.where(rows, points_w, 0.0), observations, prior)
-    minimization = PoseMinimization(inputs, options.iterations, options.tolerance)
-    tensors = (T_cw, *inputs.tensors())
-    found = find_minimum(minimization, tensors, options.backward)
+    inputs = T_cw, points_w, pixels, only(use, weights), camera.params.clone(), scale, *priors
+    minimization = PoseMinimization(camera, options, inputs)
+    found = find_minimum(minimization, inputs, options.backward)
     refined, success, *how = found
     convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
         check_minimum(success, convergence.converged, "poses")
     if options.backward == "truncated":
-        problem = PoseProblem(inputs)
+        problem = minimization.problem(inputs)
         at_minimum = problem.evaluate(refined, ~success)
         last, _ = problem.step(at_minimum, torch.zeros_like(convergence.cost))
         refined = torch.where(success[:, None, None], last, refined)
-    return RefinedPose(refined, convergence.cost, success, convergence, inputs)
+    return RefinedPose(refined, convergence.cost, success, convergence, partial(minimization.problem, inputs))

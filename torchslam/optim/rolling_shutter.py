@@ -158,7 +158,6 @@ def find_rolling_shutter(
     A readout that the graph has already is the point of linearization, so that repeated tests are Gauss-Newton steps.
 
     Args:
-        graph: of the run.
         max_frames: most frames of the test, evenly distributed.
         for_shaking: whether functions of the row are tested as well, which takes half of the time.
 

@@ -37,25 +37,22 @@ from torchslam.optim._core.levenberg_marquardt import (
     check_minimum,
 )
 from torchslam.optim._core.linear import factorize_sparse
-from torchslam.optim._pose_graph_problem import PoseGraphLayout, build_pose_graph_layout
-from torchslam.optim.pose_graph import PoseGraph, PoseGraphSolution, is_similarity, solve_pose_graph
+from torchslam.optim.pose_graph import (
+    PoseGraph,
+    PoseGraphLayout,
+    PoseGraphSolution,
+    build_pose_graph_layout,
+    is_similarity,
+    solve_pose_graph,
+)
 from torchslam.utils.indexing import connected_parts
 
-# Edges from one view are compared with this number of following ones, ascending by the other view: in a complete graph
-# of K views there are K^3 / 6 triangles. Neighbors in a sequence have neighboring numbers.
-_TRIANGLE_REACH = 32
 # Of the squared width from one kernel to the next, as in Yang et al. With 1.1 (2.5 times slower) a few more of the
 # graphs with 40 % of wrong edges end at the best minimum, with 2.0 fewer.
 _NARROWING = 1.4
 # Turn of a view, in radians, below which the views have settled. From there one of Newton's steps, which follow, is
 # enough; from 1e-3 it takes 4, each as long as 20 of the steps here in a graph that fills in; 1e-6 gains nothing.
 _SETTLED = 1e-5
-# Limit of the steps for that; 5 to 15 are usual.
-_SETTLING_STEPS = 30
-# Limit of the rounds of votes, and the share of the cost that one has to gain; 1 or 2 are usual.
-_VOTES, _GAIN = 5, 1e-4
-# Edges of a view whose rotations are put to the vote: with half of them wrong, the chance that all are is 2^-32.
-_CANDIDATES = 32
 
 
 @dataclass(frozen=True)
@@ -104,15 +101,11 @@ def solve_rotations(
     Args:
         edges: views (i, j).
         R_ji: measured rotations from camera i to camera j: R_j = R_ji R_i.
-        num_views: K.
         weights: inverse variances per axis, in rad^-2; one if None.
         start: rotations to begin with in place of the forest. First views stay there, with a gradient to it.
         options: how to minimize, in the end; None: `ROTATION_OPTIONS`, or without weights
             `UNWEIGHTED_ROTATION_OPTIONS`. The scale of the kernels is in radians times the root of the weight.
             Gradients reach R_ji, weights, scale and the start of first views.
-
-    Returns:
-        Rotations, differentiable.
 
     Raises:
         ValueError: a shape or an index does not fit, or a name is unknown.
@@ -301,7 +294,9 @@ def _triangle_support(edges: RotationEdges, num_views: int, scale: Float[Tensor,
     i, j, R_ji, weights = edges
     keys = i * num_views + j
     support = torch.zeros_like(weights)
-    for reach in range(1, min(_TRIANGLE_REACH + 1, len(i))):
+    # Edges from one view are compared with 32 following ones, ascending by the other view: in a complete graph of K
+    # views there are K^3 / 6 triangles. Neighbors in a sequence have neighboring numbers.
+    for reach in range(1, min(33, len(i))):
         first = (i[:-reach] == i[reach:]).nonzero().squeeze(-1)
         if len(first) == 0:
             break
@@ -351,10 +346,10 @@ def robust_start(
         added = added / _NARROWING
     R_cw = graph.settled(R_cw, wide, scale)
     cost = costs(R_cw)
-    for _ in range(_VOTES):
+    for _ in range(5):  # 1 or 2 are usual
         voted = graph.settled(graph.voted(R_cw, scale), wide, scale)
         voted_cost = costs(voted)
-        is_better = voted_cost < (1 - _GAIN) * cost
+        is_better = voted_cost < (1 - 1e-4) * cost
         if not is_better.any():
             break
         R_cw = torch.where(is_better[component, None, None], voted, R_cw)
@@ -403,7 +398,7 @@ class _Graph:
         self, R_cw: Float[Tensor, "K 3 3"], kernel: Kernel, scale: Float[Tensor, ""]
     ) -> Float[Tensor, "K 3 3"]:
         """The views after as many steps as they turn."""
-        for _ in range(_SETTLING_STEPS):
+        for _ in range(30):  # 5 to 15 are usual
             R_cw, turn = self.step(R_cw, kernel, scale, self.edges.weights)
             if turn.abs().max() < _SETTLED:
                 break
@@ -430,8 +425,8 @@ class _Graph:
         most = scale.square() * counts  # as an edge costs the squared scale at most
         doubtful = ~fixed & (now >= 0.5 * most)
 
-        # All pairs of a candidate and an end of its view.
-        candidate = (doubtful[view] & (rank < _CANDIDATES)).nonzero().squeeze(-1)
+        # All pairs of a candidate and an end of its view; with half of 32 wrong, the chance that all are is 2^-32.
+        candidate = (doubtful[view] & (rank < 32)).nonzero().squeeze(-1)
         voters = counts[view[candidate]]
         row = torch.repeat_interleave(voters)
         within = torch.arange(len(row), device=row.device) - (voters.cumsum(0) - voters)[row]

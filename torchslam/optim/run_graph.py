@@ -33,25 +33,15 @@ from torchslam.geometry.precision import check_dtypes, full_precision, without_a
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, Progress, SolverOptions, check_minimum
 from torchslam.optim._core.tangent import CameraPrior
-from torchslam.optim.bundle._api import BundleProblem, BundleSolution, solve_bundle
 from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
+from torchslam.optim.bundle._problem import BundleProblem
+from torchslam.optim.bundle._solve import BundleSolution, solve_bundle
 from torchslam.optim.pose import solve_pose
 from torchslam.types import Trajectory
 from torchslam.utils.files import check_regular
 
-POSE_ITERATIONS = 30
-"""Enough where no gradient is wanted: poses settle long before the choice of outliers that gradients depend on."""
-
-_FRAMES_AT_ONCE = 64
-"""Frames whose poses are refined in one batch, which bounds the memory."""
-# Bundle adjustments that are solved together are padded to the largest of them: limits the padding.
-_MAX_SIZE_RATIO = 2.0
 _CALIBRATION = "calibration.params", "calibration.directions"
 """Tensors of a file that has them."""
-_VARIANCE = "observation_variance"
-"""Of the calibration, in the metadata of a file; earlier versions wrote none."""
-_READOUT = "readout"
-"""Tensor of a file of a rolling shutter: readout, standard error, prior and its standard deviation, in seconds."""
 MAX_ROUNDS, SETTLED_PX = 12, 2e-3
 """Most rounds with a rolling shutter, and the change of the keypoints, as a root mean square, that ends them. A round
 leaves a tenth to a third of the change of the one before."""
@@ -60,9 +50,6 @@ FIRST_TOLERANCE = 1e-6
 only."""
 GRADIENT_ROUNDS = 8
 """Rounds with a rolling shutter that gradients pass: each leaves a tenth to a third of the gradient's error."""
-
-_UNREADABLE = OSError, SafetensorError, KeyError, ValueError, TypeError, AttributeError, RuntimeError
-"""What reading another file raises."""
 
 
 @dataclass(frozen=True)
@@ -153,9 +140,9 @@ class ObservationGraph:
         if (given := self.calibration) is not None:
             parts = zip(_CALIBRATION, (given.camera.params, given.directions), strict=True)
             tensors |= {name: part.detach().cpu().clone() for name, part in parts}  # no memory is shared
-            metadata[_VARIANCE] = repr(given.observation_variance)
+            metadata["observation_variance"] = repr(given.observation_variance)
         if self.readout is not None:
-            tensors[_READOUT] = self.readout.numbers
+            tensors["readout"] = self.readout.numbers
         safetensors.torch.save_file(tensors, path, metadata)
 
     @classmethod
@@ -174,21 +161,30 @@ class ObservationGraph:
                     cls = RunGraph  # type: ignore[assignment]
                 names = [name for name in cls.columns() if name in known or name != "submap"]
                 given = _CALIBRATION if set(_CALIBRATION) <= known else ()
-                shutter = (_READOUT,) if _READOUT in known else ()
+                shutter = ("readout",) if "readout" in known else ()
                 tensors = {name: file.get_tensor(name) for name in (*names, "camera", *given, *shutter)}
             width, height = metadata["camera_size"].split()
             camera = Camera(metadata["camera_model"], tensors["camera"], (int(width), int(height)))
             calibration = None
             if given:
                 params, directions = (tensors[name] for name in given)
-                variance = float(metadata.get(_VARIANCE, OBSERVATION_VARIANCE))
+                # Earlier versions wrote none.
+                variance = float(metadata.get("observation_variance", OBSERVATION_VARIANCE))
                 calibration = CameraMeasurement(camera.with_params(params), directions, variance)
             columns = {name: tensors[name] for name in names}
-            readout = Readout.from_numbers(tensors[_READOUT]) if shutter else None
+            readout = Readout.from_numbers(tensors["readout"]) if shutter else None
             graph = cls(camera=camera, calibration=calibration, readout=readout, **columns)
             graph._check()
             return graph
-        except _UNREADABLE as error:
+        except (
+            OSError,
+            SafetensorError,
+            KeyError,
+            ValueError,
+            TypeError,
+            AttributeError,
+            RuntimeError,
+        ) as error:
             raise TorchslamError(f"{path} is not an observation graph: {error}") from error
 
     def _check(self) -> None:
@@ -350,8 +346,24 @@ def solve_graph(
     strict, options = options.strict, options.replace(strict=False)
     _check_factors(graph, frame_factors)
 
+    free, prior = (False, None) if free_camera is None else (free_camera, None)
+    if free_camera is None and graph.calibration is not None:
+        free, prior = graph.calibration.directions, camera_prior(graph.calibration)
+
     def solved(graph: ObservationGraph, options: SolverOptions) -> GraphSolution:
-        return _solve_global_shutter(graph, free_camera, options, progress, frame_factors, depth_prior)
+        """The minimum of a graph whose keypoints are those of a global shutter."""
+
+        def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
+            solve = partial(solve_bundle, options=options, progress=progress)
+            main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
+            problems = [_with_factors(submap, graph, frame_factors, depth_prior) for submap in submaps]
+            first = solve(replace(problems[main], camera_prior=prior), free_camera=free)
+            return [
+                first if row == main else solve(replace(problem, camera=first.camera))
+                for row, problem in enumerate(problems)
+            ]
+
+        return _solve([graph], adjust, options)[0]
 
     solution = solved(graph, options) if graph.readout is None else _solve_in_rounds(graph, solved, options)
     if strict:
@@ -380,35 +392,6 @@ def _solve_in_rounds(
         if not passes_gradient and not is_rough and bool(change < SETTLED_PX):
             break
         before = corrected.pixels
-    return solution
-
-
-def _solve_global_shutter(
-    graph: ObservationGraph,
-    free_camera: bool | Float[Tensor, "P n"] | None,
-    options: SolverOptions,
-    progress: Progress | None,
-    frame_factors: Sequence[FrameFactors],
-    depth_prior: DepthPrior | None,
-) -> GraphSolution:
-    """The minimum of a graph whose keypoints are those of a global shutter; arguments as of `solve_graph`."""
-    free, prior = (False, None) if free_camera is None else (free_camera, None)
-    if free_camera is None and graph.calibration is not None:
-        free, prior = graph.calibration.directions, camera_prior(graph.calibration)
-
-    def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
-        def solved(problem: BundleProblem, free: bool | Tensor) -> BundleSolution:
-            return solve_bundle(problem, free_camera=free, options=options, progress=progress)
-
-        main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
-        problems = [_with_factors(submap, graph, frame_factors, depth_prior) for submap in submaps]
-        first = solved(replace(problems[main], camera_prior=prior), free)
-        return [
-            first if row == main else solved(replace(problem, camera=first.camera), False)
-            for row, problem in enumerate(problems)
-        ]
-
-    (solution,) = _solve([graph], adjust, options)
     return solution
 
 
@@ -500,7 +483,7 @@ def _pose_other_frames(
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
     starts, converged = counts.cumsum(0) - counts, torch.ones_like(success)
-    for frames in others.split(_FRAMES_AT_ONCE) if len(others) else ():
+    for frames in others.split(64) if len(others) else ():  # in batches, which bounds the memory
         slot = torch.arange(int(counts[frames].max()), device=frames.device)
         mask = slot < counts[frames, None]
         seen = in_rank[torch.where(mask, starts[frames, None] + slot, 0)]
@@ -630,7 +613,7 @@ def _adjust_together(submaps: Sequence[_GraphSubmap], options: SolverOptions) ->
     cells = [len(submap.problem.T_cw) * len(submap.points) for submap in submaps]
     groups: list[list[int]] = []
     for row in sorted(range(len(submaps)), key=lambda row: cells[row]):
-        if groups and cells[row] <= _MAX_SIZE_RATIO * cells[groups[-1][0]]:
+        if groups and cells[row] <= 2 * cells[groups[-1][0]]:  # limits the padding to the largest
             groups[-1].append(row)
         else:
             groups.append([row])

@@ -17,8 +17,8 @@ from torch import Tensor
 
 from torchslam.geometry.lie import skew, transform
 from torchslam.geometry.precision import full_precision
-from torchslam.geometry.robust import robustify
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
+from torchslam.optim._core.residuals import ReprojectionData, linearize
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.run_graph import RunGraph, keyframe_problem
 
@@ -64,10 +64,7 @@ def scale_stds(
     Both sides are rigid, so it is a lower bound where frames near the moment are loose themselves. A side of a single
     frame has no scale: its moment has zero.
 
-    Args:
-        problem: one bundle adjustment with one camera, at its minimum.
-        rank: place of each frame in the order of time.
-        options: kernel and scale of that minimum.
+    problem: at its minimum with the kernel and scale of options; rank: place of each frame in the order of time
     """
     T_cw, frame, point = problem.T_cw, problem.frame_index, problem.point_index
     frames, points_w = len(T_cw), problem.points_w
@@ -80,9 +77,8 @@ def scale_stds(
     order, ends = torch.argsort(when, stable=True), torch.bincount(when, minlength=frames).cumsum(0).tolist()
     centers_w = -(T_cw[:, :3, :3].mT @ T_cw[:, :3, 3:])[torch.argsort(rank), :, 0]
     found = points_w.new_zeros(frames - 1)
-    is_known = (
-        total.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
-    )  # else the kernel leaves its observations no weight
+    # Else the kernel leaves its observations no weight.
+    is_known = total.diagonal(dim1=-2, dim2=-1).sum(-1) > 0
     begin = 0
     for moment in range(frames - 1):
         rows, begin = order[begin : ends[moment]], ends[moment]
@@ -95,18 +91,15 @@ def scale_stds(
 
 def _point_information(problem: BundleProblem, options: SolverOptions) -> Float[Tensor, "O 3 3"]:
     """Information of each observation about its point with its frame fixed, weighted by the kernel."""
-    T_cw, frame = problem.T_cw[problem.frame_index], problem.frame_index
+    T_cw = problem.T_cw[problem.frame_index]
     points_c = transform(T_cw, problem.points_w[problem.point_index][:, None])[:, 0]
-    pixels, is_valid, J, _ = problem.camera.project_with_jacobians(points_c)
-    weights = problem.weights
-    assert weights is not None
-    if weights.ndim == 1:
-        weights = weights[:, None, None] * torch.eye(2, dtype=J.dtype, device=frame.device)
-    off = (problem.pixels - pixels)[..., None]
-    squared = (off.mT @ weights @ off)[:, 0, 0]
-    factor = robustify(squared, options.kernel, squared.new_tensor(options.scale)).weight
-    J = J @ T_cw[:, :3, :3]
-    return J.mT @ (torch.where(is_valid, factor, 0.0)[:, None, None] * weights) @ J
+    assert problem.weights is not None
+    scale = points_c.new_tensor(options.scale)
+    lin = linearize(
+        ReprojectionData(problem.pixels, problem.weights, problem.camera, options.kernel, scale), points_c
+    )
+    J = lin.J @ T_cw[:, :3, :3]
+    return J.mT @ (lin.weight[:, None, None] * J)
 
 
 def _scale_std(

@@ -27,9 +27,9 @@ from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial
 from torchslam.geometry.precision import full_precision
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
-from torchslam.optim.bundle._api import solve_bundle
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._scores import camera_scores
+from torchslam.optim.bundle._solve import solve_bundle
 from torchslam.optim.model_choice import Gain
 from torchslam.optim.rolling_shutter import MAX_FRAMES, RollingShutter, find_rolling_shutter, readout_by
 from torchslam.optim.run_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem

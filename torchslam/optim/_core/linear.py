@@ -63,11 +63,8 @@ class DefiniteFactor:
 
 
 def factorize(matrix: Float[Tensor, "*batch D D"], strict: bool = True) -> DefiniteFactor:
-    """Cholesky factorization of symmetric (..., D, D) matrices that never raises.
-
-    Args:
-        strict: count a matrix as definite only if it is clearly so, beyond rounding.
-    """
+    """Cholesky factorization that never raises; strict: a matrix is definite only if it is clearly so, beyond
+    rounding."""
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(diagonal > 0, diagonal, 1.0).rsqrt()
     scaled = scale[..., :, None] * matrix * scale[..., None, :]
@@ -85,13 +82,8 @@ def factorize(matrix: Float[Tensor, "*batch D D"], strict: bool = True) -> Defin
 def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0.0) -> list[Any]:
     """Lower triangular Q with Q^T Q = block^-1 of many symmetric 3x3 blocks, by a written-out Cholesky factorization.
 
-    Args:
-        lower: six tensors or NumPy arrays of one shape, the entries `LOWER_3X3` of the blocks.
-        mask: bool of that shape, which blocks to invert.
-        smallest: a block counts as definite where the pivots of the block scaled to a unit diagonal exceed this.
-
-    Returns:
-        The same entries of Q, zero where a block is not definite or not in the mask.
+    lower: the entries `LOWER_3X3`, tensors or NumPy arrays of one shape; smallest: what the pivots of a block scaled to
+    a unit diagonal exceed where it counts as definite. The entries of Q are zero elsewhere, and outside of the mask.
     """
     b00, b10, b11, b20, b21, b22 = lower
     xp: Any = np if isinstance(b00, np.ndarray) else torch
@@ -112,6 +104,16 @@ def inverse_root_3x3(lower: Iterable[Any], mask: Any = True, smallest: float = 0
     q10, q20 = -l10 * s0 * i1, -(l20 - l21 * l10 * i1) * s0 * i2
     root = s0, q10, s1 * i1, q20, -l21 * s1 * i1 * i2, s2 * i2
     return [xp.where(is_definite, entry, 0.0) for entry in root]
+
+
+def lower_times(q: Any, v: Any) -> list[Any]:
+    """Q v of lower triangles with entries `LOWER_3X3`, tensors or arrays, and vectors of three such entries."""
+    return [q[0] * v[0], q[1] * v[0] + q[2] * v[1], q[3] * v[0] + q[4] * v[1] + q[5] * v[2]]
+
+
+def upper_times(q: Any, v: Any) -> list[Any]:
+    """Q^T v, as `lower_times`."""
+    return [q[0] * v[0] + q[1] * v[1] + q[3] * v[2], q[2] * v[1] + q[4] * v[2], q[5] * v[2]]
 
 
 # Parts this small are dense fronts: less work than the calls for splitting them further.
@@ -370,13 +372,9 @@ def factorize_sparse(
     damping: Float[Tensor, " B"] | None = None,
     strict: bool = True,
 ) -> SparseFactor:
-    """Cholesky factorization of symmetric block systems that never raises.
+    """As `factorize`, of blocks at the nodes and across, at (pairs[p, 0], pairs[p, 1]).
 
-    Args:
-        diagonal: blocks of the nodes
-        across: blocks at (pairs[p, 0], pairs[p, 1])
-        damping: relative increase of the diagonal
-        strict: count a matrix as definite only if it is clearly so, beyond rounding
+    damping: relative increase of the diagonal
     """
     d = diagonal.diagonal(dim1=-2, dim2=-1)
     scale = torch.where(d > 0, d, 1.0).rsqrt()

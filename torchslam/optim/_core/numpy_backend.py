@@ -32,21 +32,19 @@ RobustKernel = Literal["cauchy", "huber"]
 MIN_DEPTH = float(np.finfo(np.float64).eps)
 """A point at a smaller depth counts as behind the camera."""
 
-X = TypeVar("X", covariant=True)
 
-
-class LocalModel(Protocol[X]):
+class LocalModel(Protocol):
     """A quadratic model of the cost around a state."""
 
     @property
     def cost(self) -> float: ...
 
-    def step(self, damping: float, use_curvature: bool) -> tuple[X, float] | None:
+    def step(self, damping: float, use_curvature: bool) -> tuple[Any, float] | None:
         """The state at the minimum of the damped model and the predicted reduction of the cost; None if singular."""
         ...
 
 
-M = TypeVar("M", bound=LocalModel[Any])
+M = TypeVar("M", bound=LocalModel)
 
 
 def minimize_model(model: M, evaluate: Callable[[Any], M], iterations: int, tolerance: float) -> M:
@@ -91,9 +89,6 @@ def huber(squared: Array, scale: float) -> tuple[Array, Array]:
     limit = scale**2
     root = np.sqrt(np.maximum(squared, limit))
     return root * (2 * scale) + np.minimum(squared, limit) - 2 * limit, scale / root
-
-
-ROBUST_KERNELS = {"cauchy": cauchy, "huber": huber}
 
 
 def retract_pose(pose: Array, step: Array) -> Array:

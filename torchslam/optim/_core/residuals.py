@@ -10,7 +10,6 @@ an error of the image's diagonal and has no gradient: no step gains by pushing a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -48,15 +47,6 @@ class ReprojectionData:
     def factors(self) -> Float[Tensor, "*batch N"]:
         """Factors of squared residuals: the weights, or one where residuals are whitened."""
         return has_weight(self.weights).to(self.weights.dtype) if self.has_matrices else self.weights
-
-    def tensors(self) -> list[Tensor]:
-        """All that gradients may flow to: pixels, weights, camera parameters, scale."""
-        return [self.pixels, self.weights, self.camera.params, self.scale]
-
-    def replaced(self, tensors: Sequence[Tensor]) -> ReprojectionData:
-        """The same observations with other tensors, in the order of `tensors`."""
-        pixels, weights, params, scale = tensors
-        return ReprojectionData(pixels, weights, self.camera.with_params(params), self.kernel, scale)
 
 
 ROUNDINGS = 16.0
@@ -245,11 +235,9 @@ def exact_expansion(
     gradient_wrt_residual = lin.gradient_wrt_residual[..., None]
     along = (lin.residual[..., None, :] @ lin.J) * (lin.curvature_term[..., None] * lin.residual)[..., None]
     hessian = lin.J.mT @ (lin.weight[..., None, None] * lin.J + along)
-    pull = (
-        whitening(observations.weights).mT @ gradient_wrt_residual
-        if observations.has_matrices
-        else gradient_wrt_residual
-    )
+    pull = gradient_wrt_residual
+    if observations.has_matrices:
+        pull = whitening(observations.weights).mT @ pull
     hessian = hessian + _projection_curvature(observations.camera, points_c, pull.detach(), free_camera)
     return Expansion((lin.J.mT @ gradient_wrt_residual).squeeze(-1), hessian)
 

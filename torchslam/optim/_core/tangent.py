@@ -6,12 +6,13 @@ e^T information e, with e = (t, log R) of T_cw @ T_prior^-1 for a pose.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.func import jvp, vmap
 
 from torchslam.geometry.lie import se3_inverse, sim3_exp, skew, so3_left_jacobian, so3_log
 
@@ -152,3 +153,12 @@ def prior_hessian(prior: PosePrior, T_cw: Float[Tensor, "B 4 4"]) -> Float[Tenso
         (gradient,) = torch.autograd.grad(cost.sum(), xi, create_graph=True)
         (rows,) = torch.autograd.grad(gradient.unflatten(0, (6, -1)).movedim(-1, 0).diagonal().sum(), xi)
     return rows.unflatten(0, (6, -1)).movedim(0, -2)
+
+
+def row_jacobian(
+    function: Callable[[Tensor], Tensor], zero: Float[Tensor, "B n"]
+) -> Float[Tensor, "B *value n"]:
+    """Derivatives at zero of each row of a function in its own n numbers."""
+    size = zero.shape[1]
+    basis = torch.eye(size, dtype=zero.dtype, device=zero.device)[:, None].expand(size, *zero.shape)
+    return vmap(lambda step: jvp(function, (zero,), (step,))[1], out_dims=-1)(basis)

@@ -26,6 +26,7 @@ from torchslam.optim._core.linear import (
     diagonal_floor,
     factorize,
     inverse_root_3x3,
+    lower_times,
 )
 from torchslam.optim._core.residuals import (
     Expansion,
@@ -397,13 +398,9 @@ class DenseBundle:
         """The equations of the observations, with the expansion in the points in the camera frames and the n directions
         of the frame's camera: (B, K, 3 + n, N) and (B, K, 3 + n, 3 + n, N)."""
         free, camera_of = self.layout.free, self.given.camera_index
-        R_cw, t_cw, num_cameras = (
-            estimate.T_cw[..., :3, :3],
-            estimate.T_cw[..., :3, 3:],
-            estimate.params.shape[1],
-        )
-        leading, R_wc = free.shape[1], R_cw.mT
-        rays_w = estimate.points_w[:, None] + R_wc @ t_cw
+        leading, num_cameras = free.shape[1], estimate.params.shape[1]
+        R_wc = estimate.T_cw[..., :3, :3].mT
+        rays_w = estimate.points_w[:, None] + R_wc @ estimate.T_cw[..., :3, 3:]
         upper = expansion.hessian[:, :, :3]
         curve = _times(R_wc, R_wc[:, :, None] @ upper[:, :, :, :3])  # (B, K, 3, 3, N): R^T C R
         slope, across = R_wc @ expansion.gradient[:, :, :3], _times(R_wc, upper[:, :, :, 3:])
@@ -462,13 +459,7 @@ class DenseBundle:
         frames = 6 * free.shape[1]
         more = reduced.shape[-1] - frames
         root = _inverse_root(equations.points, self.layout.free_points, damping)
-        c0, c1, c2 = equations.coupling.unbind(2)
-        q0, q1, q2 = root[:, None].unbind(2)
-        rows = (
-            q0[:, :, 0] * c0,
-            q1[:, :, 0] * c0 + q1[:, :, 1] * c1,
-            q2[:, :, 0] * c0 + q2[:, :, 1] * c1 + q2[:, :, 2] * c2,
-        )
+        rows = lower_times([root[:, None, i, j] for i, j in LOWER_3X3], equations.coupling.unbind(2))
         whitened = torch.stack(rows, dim=2).flatten(2)
         if damping is not None:  # a frame that lost all its observations stays solvable: its step is zero
             growth = damping[:, None] * reduced.diagonal(dim1=-2, dim2=-1)

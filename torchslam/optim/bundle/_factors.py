@@ -16,12 +16,12 @@ from typing import NamedTuple
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
-from torch.func import grad, jvp, vmap
+from torch.func import grad, jvp
 
 from torchslam.geometry.lie import se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.residuals import Expansion
-from torchslam.optim._core.tangent import retract
+from torchslam.optim._core.tangent import retract, row_jacobian
 
 FrameError = Callable[[Tensor, Tensor, Tensor], Tensor]
 """error(T_1w, T_2w, measured) -> (..., F, D), of poses (..., F, 4, 4), each row from its own rows alone."""
@@ -55,10 +55,7 @@ def displacement_error(
 ) -> Float[Tensor, "*#batch 3"]:
     """Difference between the displacement of an antenna and the measured one.
 
-    Args:
-        T_1w: first poses.
-        T_2w: second poses.
-        measured: the displacement in the world, then the position of the antenna in the camera, its lever arm.
+    `measured` is the displacement in the world, then the position of the antenna in the camera, its lever arm.
     """
     displacement_w, lever_c = measured.unbind(-2)
     first, second = (
@@ -248,10 +245,10 @@ def factor_terms(
         T_1w, T_2w = T_cw[first], T_cw[second]
         moved = _moved(kind, T_1w, T_2w, own)
         zero = T_cw.new_zeros(len(first), 12)
-        error, J = moved(zero), _jacobian(moved, zero)
+        error, J = moved(zero), row_jacobian(moved, zero)
         pulled = J.mT @ matrix
         slope = (pulled @ error[..., None]).squeeze(-1)
-        hessian = _jacobian(grad(partial(_cost_at, moved, matrix)), zero) if exact else pulled @ J
+        hessian = row_jacobian(grad(partial(_cost_at, moved, matrix)), zero) if exact else pulled @ J
         cost = cost + _cost(error, matrix)
         gradient = gradient.index_add(0, first, slope[:, :6]).index_add(0, second, slope[:, 6:])
         diagonal = diagonal.index_add(0, first, hessian[:, :6, :6])
@@ -260,12 +257,6 @@ def factor_terms(
         blocks.append(hessian[:, :6, 6:])
     ends = torch.cat(pairs)
     return cost, gradient, diagonal, FrameBlocks(ends[:, 0], ends[:, 1], torch.cat(blocks))
-
-
-def _jacobian(function: Callable[[Tensor], Tensor], zero: Float[Tensor, "F 12"]) -> Float[Tensor, "F D 12"]:
-    """Derivatives of each row in its own 12 numbers."""
-    basis = torch.eye(12, dtype=zero.dtype, device=zero.device)[:, None].expand(12, *zero.shape)
-    return vmap(lambda step: jvp(function, (zero,), (step,))[1], out_dims=-1)(basis)
 
 
 def factor_slope(

@@ -63,36 +63,26 @@ class DenseReduced:
         """matrix^-1 right, zero where the matrix is not definite."""
         return self.factor.solve(right)
 
-    def inverse(self) -> DenseInverse:
-        """The inverse."""
-        return DenseInverse(
-            self.factor.solve(_eye(len(self.factor.factor), self.factor.factor)), self.num_frames
-        )
+    @cached_property
+    def _inverse(self) -> Float[Tensor, "R R"]:
+        return self.solve(_eye(len(self.factor.factor), self.factor.factor))
 
-
-@dataclass(frozen=True)
-class DenseInverse:
-    """The inverse of a reduced system, all of it."""
-
-    matrix: Float[Tensor, "R R"]
-    num_frames: int
-
-    def among(self, frames: Int[Tensor, " F"], rows: Int[Tensor, " R"]) -> Float[Tensor, "R R"]:
-        """At the rows of frames, then of cameras."""
-        return self.matrix[rows[:, None], rows[None, :]]
+    def inverse_among(self, frames: Int[Tensor, " F"], rows: Int[Tensor, " r"]) -> Float[Tensor, "r r"]:
+        """The inverse at the rows of frames that share points, then of cameras."""
+        return self._inverse[rows[:, None], rows[None, :]]
 
     @property
-    def frames(self) -> Float[Tensor, "K D D"]:
-        """The blocks of the frames."""
+    def inverse_frames(self) -> Float[Tensor, "K D D"]:
+        """The blocks of the inverse at the frames."""
         split = FRAME_DIMS * self.num_frames
-        frames = self.matrix[:split, :split].unflatten(0, (-1, FRAME_DIMS)).unflatten(-1, (-1, FRAME_DIMS))
+        frames = self._inverse[:split, :split].unflatten(0, (-1, FRAME_DIMS)).unflatten(-1, (-1, FRAME_DIMS))
         return frames.diagonal(dim1=0, dim2=2).movedim(-1, 0)
 
     @property
-    def cameras(self) -> Float[Tensor, "n n"]:
-        """The block of the cameras."""
+    def inverse_cameras(self) -> Float[Tensor, "n n"]:
+        """The block of the inverse at the cameras."""
         split = FRAME_DIMS * self.num_frames
-        return self.matrix[split:, split:]
+        return self._inverse[split:, split:]
 
 
 @dataclass(frozen=True)
@@ -169,45 +159,36 @@ class BlockReduced:
         x = torch.cat((x - self.solved @ y, self.camera_units[:, None] * y[: len(self.camera_units)]))
         return torch.where(self.definite, x, 0.0)
 
-    def inverse(self) -> BlockInverse:
-        """Parts of the inverse."""
+    @cached_property
+    def _inverse(self) -> tuple[Float[Tensor, "M D D"], Float[Tensor, "R b"]]:
+        """The inverse of the frames' blocks at covisible pairs, and L: the border adds L rest L^T."""
         diagonal, across = (part[0] for part in self.factor.inverse_blocks())
         blocks = torch.cat((diagonal, across, across.mT, torch.zeros_like(diagonal[:1])))
         unused = self.border.shape[1] - len(self.camera_units)
         of_cameras = torch.nn.functional.pad(torch.diag_embed(-self.camera_units), (0, unused))
         lifted = torch.cat((self.solved, of_cameras))
-        blocks, lifted = (torch.where(self.definite, part, 0.0) for part in (blocks, lifted))
-        return BlockInverse(self.pairs, blocks, lifted, self.rest)
+        return torch.where(self.definite, blocks, 0.0), torch.where(self.definite, lifted, 0.0)
 
-
-@dataclass(frozen=True)
-class BlockInverse:
-    """The inverse of a reduced system at covisible pairs: that of the frames' blocks, and lifted rest lifted^T, which
-    the border adds."""
-
-    pairs: CovisiblePairs
-    blocks: Float[Tensor, "M D D"]
-    lifted: Float[Tensor, "R b"]
-    rest: Float[Tensor, "b b"]
-
-    def among(self, frames: Tensor, rows: Tensor) -> Tensor:
-        """At the rows of frames that share points, then of cameras; zero where frames share none."""
+    def inverse_among(self, frames: Tensor, rows: Tensor) -> Tensor:
+        """As of `DenseReduced`; zero where frames share no points."""
+        blocks, lifted = self._inverse
         numbers = self.pairs.number(*torch.meshgrid(frames, frames, indexing="ij"))
-        own = self.blocks[numbers].transpose(1, 2).flatten(2).flatten(0, 1)
-        more, lifted = len(rows) - len(own), self.lifted[rows]
+        own = blocks[numbers].transpose(1, 2).flatten(2).flatten(0, 1)
+        more, lifted = len(rows) - len(own), lifted[rows]
         return torch.nn.functional.pad(own, (0, more, 0, more)) + lifted @ self.rest @ lifted.mT
 
-    @cached_property
-    def frames(self) -> Tensor:
-        """The blocks of the frames."""
-        count, dims = self.pairs.structure.num_nodes, self.pairs.structure.dims
-        lifted = self.lifted[: count * dims].unflatten(0, (count, dims))
-        return self.blocks[:count] + lifted @ self.rest @ lifted.mT
+    @property
+    def inverse_frames(self) -> Tensor:
+        """As of `DenseReduced`."""
+        blocks, lifted = self._inverse
+        count = self.pairs.structure.num_nodes
+        lifted = lifted[: len(self.border)].unflatten(0, (count, FRAME_DIMS))
+        return blocks[:count] + lifted @ self.rest @ lifted.mT
 
-    @cached_property
-    def cameras(self) -> Tensor:
-        """The block of the cameras."""
-        lifted = self.lifted[self.pairs.structure.num_nodes * self.pairs.structure.dims :]
+    @property
+    def inverse_cameras(self) -> Tensor:
+        """As of `DenseReduced`."""
+        lifted = self._inverse[1][len(self.border) :]
         return lifted @ self.rest @ lifted.mT
 
 
@@ -219,13 +200,9 @@ def factorize_blocks(
     gauge: Float[Tensor, "R g"] | None,
     strict: bool,
 ) -> BlockReduced:
-    """Factorize a reduced system.
+    """Factorize a reduced system of blocks as `pairs` numbers them, and of cameras with columns against the frames.
 
-    Args:
-        blocks: of the frames and of the pairs, as `pairs` numbers them.
-        camera_columns: of the cameras against the frames; cameras: their own block.
-        gauge: directions of the frames whose products with themselves are added to the matrix.
-        strict: count the matrix as definite only if it is clearly so, beyond rounding.
+    gauge: directions of the frames whose products with themselves are added to the matrix; strict: as of `factorize`
     """
     structure = pairs.structure
     diagonal, across = blocks[: structure.num_nodes], blocks[structure.num_nodes :][: len(pairs.keys) - 1]

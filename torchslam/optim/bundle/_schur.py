@@ -143,12 +143,9 @@ def build_structure(
     num_cameras: int,
     joined: Int[Tensor, "M 2"] | None = None,
 ) -> Structure:
-    """The structure of observations in the order of `Structure`.
+    """The structure of observations in the order of `Structure`, by the slots of their frames, K for all fixed ones.
 
-    Args:
-        frame_slots: slot of the observing frame, K for all fixed ones.
-        cameras: of the free frames; camera_of: of the observations
-        joined: free frames that factors join
+    cameras: of the free frames; camera_of: of the observations; joined: free frames that factors join
     """
     num_frames = len(cameras)
     frame_ends = torch.bincount(frame_slots, minlength=num_frames + 1)[:num_frames].cumsum(0).tolist()
@@ -398,14 +395,14 @@ class FactorizedEquations:
 
     def marginals(self) -> Marginals:
         """The diagonal blocks of H^-1."""
-        inverse = self.reduced.inverse()
         eye = torch.eye(3, dtype=self.points_root.dtype, device=self.points_root.device)
         blocks = []
         for tile, (points, rows, A) in zip(self.equations.structure.tiles, self.tiles, strict=True):
-            moved = (A @ inverse.among(tile.frames.members, rows)).unflatten(0, (-1, 3))
+            moved = (A @ self.reduced.inverse_among(tile.frames.members, rows)).unflatten(0, (-1, 3))
             root = self.points_root[points]
             blocks.append(root.mT @ (eye + moved @ A.unflatten(0, (-1, 3)).mT) @ root)
-        return Marginals(inverse.frames, torch.cat(blocks) if blocks else self.points_root, inverse.cameras)
+        points_w = torch.cat(blocks) if blocks else self.points_root
+        return Marginals(self.reduced.inverse_frames, points_w, self.reduced.inverse_cameras)
 
 
 class Marginals(NamedTuple):

@@ -16,9 +16,9 @@ from torch import Tensor
 from torchslam.geometry.precision import full_precision
 from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, SolverOptions
 from torchslam.optim._core.residuals import Linearization, flatness, variance_factor
-from torchslam.optim.bundle._minimization import BundleMinimization
 from torchslam.optim.bundle._problem import BundleData, BundleEstimate, BundleProblem, sanitized
 from torchslam.optim.bundle._schur import BundleTangent, FactorizedEquations
+from torchslam.optim.bundle._solve import BundleMinimization
 from torchslam.optim.bundle._sparse import SparseBundle
 
 
@@ -52,13 +52,8 @@ def camera_scores(
     observations reach the camera by nothing else, to first order.
     Source: Bickel et al., "Efficient and adaptive estimation for semiparametric models", 1993, section 2.4.
 
-    Args:
-        problem: one bundle adjustment with one camera; what it has of priors and factors is left out.
-        directions: in which the camera's parameters may move.
-        options: its kernel and scale.
-
-    Returns:
-        The scores; None where the observations do not determine the directions.
+    Priors and factors of the problem are left out. None where the observations do not determine the directions, in
+    which the camera's parameters may move.
     """
     bundle, estimate = observations_alone(problem, directions, options)
     lin, J, rays_w, factorized = bundle.linear_system(estimate)

@@ -22,7 +22,7 @@ from torchslam.geometry.lie import se3_inverse
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Tensors
 from torchslam.optim._core.levenberg_marquardt import select_models
-from torchslam.optim._core.linear import LOWER_3X3, inverse_root_3x3
+from torchslam.optim._core.linear import LOWER_3X3, inverse_root_3x3, lower_times, upper_times
 from torchslam.optim._core.residuals import (
     Expansion,
     Linearization,
@@ -298,13 +298,8 @@ class SparseBundle:
     ) -> Float[Tensor, "N 3"]:
         """What to subtract from the points, zero where they are fixed or not determined."""
         grown = [hessian[row, column] * (1 + damping * (row == column)) for row, column in LOWER_3X3]
-        q00, q10, q11, q20, q21, q22 = inverse_root_3x3(grown, self.layout.free_points)
-        first = q00 * gradient[0]
-        second = q10 * gradient[0] + q11 * gradient[1]
-        third = q20 * gradient[0] + q21 * gradient[1] + q22 * gradient[2]
-        return torch.stack(
-            (q00 * first + q10 * second + q20 * third, q11 * second + q21 * third, q22 * third), dim=-1
-        )
+        root = inverse_root_3x3(grown, self.layout.free_points)
+        return torch.stack(upper_times(root, lower_times(root, gradient)), dim=-1)
 
     select = staticmethod(select_models)
 

@@ -2,7 +2,7 @@
 
 `_dense` is the same formulation by PyTorch, for batches and with gradients: frames move along the axes of the world,
 the free ones come first, and the Schur complement on the points is one dense matrix, since most of a local window of a
-dozen frames is filled. `tests/optim/bundle/test_dense_numpy.py` compares minima and steps. NumPy takes half of the time
+dozen frames is filled. NumPy takes half of the time
 for one problem, and has neither gradients nor covariances.
 
 They differ in the residual of a distorted camera: as in `frame_pose`, errors here are taken in undistorted coordinates
@@ -23,7 +23,7 @@ from torch import Tensor
 
 from torchslam.geometry import UndistortedKeypoints
 from torchslam.geometry.gating import whitening
-from torchslam.optim._core.linear import LOWER_3X3, diagonal_floor, inverse_root_3x3
+from torchslam.optim._core.linear import LOWER_3X3, diagonal_floor, inverse_root_3x3, lower_times, upper_times
 from torchslam.optim._core.numpy_backend import (
     MIN_DEPTH,
     Array,
@@ -51,14 +51,9 @@ def solve_bundle_numpy(
 ) -> NumpyBundleSolution:
     """Minimize Huber costs of reprojection errors over all points and the poses that are not fixed.
 
-    Args:
-        problem: a single one, finite, with one camera, and without mask, priors and fixed points.
-        scale: of the kernel, in units of the whitened error.
-        iterations: maximum number of steps.
-        tolerance: stop after a step with a predicted reduction of at most this share of the cost.
-
-    Raises:
-        ValueError: an index is out of range, or the problem has a part that is not supported.
+    problem: a single one, finite, with one camera, and without mask, priors and fixed points; scale: of the kernel, in
+    units of the whitened error; iterations and tolerance as of `minimize_model`. Raises ValueError where an index is
+    out of range, or the problem has a part that is not supported.
     """
     bundle = _Bundle(problem, scale)
     model = minimize_model(bundle.evaluate(bundle.start), bundle.evaluate, iterations, tolerance)
@@ -280,10 +275,10 @@ class _Equations:
         damped = self.points.copy()
         damped[[0, 2, 5]] *= 1 + damping
         root = np.stack(inverse_root_3x3(damped))
-        halves = _lower_times(root, self.points_gradient)
+        halves = np.stack(lower_times(root, self.points_gradient))
         num_free = len(self.frames)
         if not num_free:
-            points = _upper_times(root, halves)
+            points = np.stack(upper_times(root, halves))
             return _Step(np.zeros((0, 6)), points, 0.5 * float((points * self.points_gradient).sum()))
         coupling = self._coupling(root)
         reduced = -(coupling @ coupling.T)
@@ -298,7 +293,7 @@ class _Equations:
         frames = solve_symmetric(reduced, right)
         if frames is None:
             return None
-        points = _upper_times(root, halves - (frames @ coupling).reshape(3, -1))
+        points = np.stack(upper_times(root, halves - (frames @ coupling).reshape(3, -1)))
         slope = frames @ self.frames_gradient.reshape(-1) + (points * self.points_gradient).sum()
         return _Step(frames.reshape(-1, 6), points, 0.5 * float(slope))
 
@@ -306,19 +301,8 @@ class _Equations:
         """Blocks (6 K', 3 N) of frames against points, times the inverse roots of the points' blocks."""
         q, blocks = root.take(self.bundle.point[: self.bundle.linked], axis=1), self.blocks
         whitened = np.empty(blocks.shape)
-        whitened[:, 0] = q[0] * blocks[:, 0]
-        whitened[:, 1] = q[1] * blocks[:, 0] + q[2] * blocks[:, 1]
-        whitened[:, 2] = q[3] * blocks[:, 0] + q[4] * blocks[:, 1] + q[5] * blocks[:, 2]
+        for row, entry in enumerate(lower_times(q, blocks.transpose(1, 0, 2))):
+            whitened[:, row] = entry
         shape = 6 * len(self.frames), 3 * root.shape[1]
         coupling: Array = np.bincount(self.bundle.cells, whitened.reshape(-1), shape[0] * shape[1])
         return coupling.reshape(shape)
-
-
-def _lower_times(q: Array, v: Array) -> Array:
-    """Q v of lower triangles (6, N) and vectors (3, N)."""
-    return np.stack((q[0] * v[0], q[1] * v[0] + q[2] * v[1], q[3] * v[0] + q[4] * v[1] + q[5] * v[2]))
-
-
-def _upper_times(q: Array, v: Array) -> Array:
-    """Q^T v of lower triangles (6, N) and vectors (3, N)."""
-    return np.stack((q[0] * v[0] + q[1] * v[1] + q[3] * v[2], q[2] * v[1] + q[4] * v[2], q[5] * v[2]))

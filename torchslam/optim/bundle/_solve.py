@@ -1,20 +1,26 @@
-"""Bundle adjustments as `find_minimum` takes them: batches in the order of the problem, for either solver."""
+"""Bundle adjustment of poses, points and optionally cameras: sparse, robust, batched, differentiable."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple, Protocol
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
 
 import torch
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.optim._core.implicit import Ndims, Tensors
+from torchslam.geometry.precision import full_precision
+from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
 from torchslam.optim._core.levenberg_marquardt import (
-    LeastSquares,
-    M,
+    BUNDLE_OPTIONS,
+    Convergence,
+    Outcome,
     Progress,
     SolverOptions,
+    check_minimum,
     minimize_batch,
 )
 from torchslam.optim._core.residuals import ReprojectionData, linearize, only
@@ -26,22 +32,174 @@ from torchslam.optim.bundle._dense import (
     dense_data,
     suits_dense,
 )
-from torchslam.optim.bundle._factors import FactorKind, depth_terms, factor_slope
+from torchslam.optim.bundle._factors import FactorKind, depth_terms, factor_kinds, factor_slope
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
+    BundleProblem,
     MovingParts,
     flat_rows,
     frames_are_determined,
     points_with_parallax,
     prior_terms,
+    sanitized,
     select_moving,
 )
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout, build_sparse_layout
+from torchslam.utils.indexing import row_numbers
 
 # Frame-point pairs of the dense problems solved at once: they fit the cache of a CPU, or keep a GPU busy.
 _MAX_CELLS_CPU, _MAX_CELLS_GPU = 1 << 14, 1 << 20
+
+
+@dataclass(frozen=True)
+class BundleSolution(Outcome):
+    """The minimum of a bundle adjustment; for a batch, everything leads with B.
+
+    Attributes:
+        T_cw: world to camera.
+        camera: the cameras of the problem, with refined parameters where they were free.
+        cost: half the sum of robustified squared whitened residuals and priors, detached.
+        success: all observing frames start finite, all free unknowns are determined, up to the gauge, and every free
+            frame sees three points with a parallax, or has a prior. If False, the estimate is the best one found, but
+            it has no gradient.
+        moved_frames: False for fixed frames, and for frames with fewer than three points and no prior, which stayed at
+            their start; observations of the latter did not count.
+        moved_points: False for fixed points, and for points seen by fewer than two frames.
+        convergence: iterations and convergence per element of the batch.
+    """
+
+    T_cw: Float[Tensor, "*batch K 4 4"]
+    points_w: Float[Tensor, "*batch N 3"]
+    camera: Camera
+    cost: Float[Tensor, "*batch"]
+    success: Bool[Tensor, "*batch"]
+    moved_frames: Bool[Tensor, "*batch K"]
+    moved_points: Bool[Tensor, "*batch N"]
+    convergence: Convergence
+    _marginals: Callable[[], Marginals] = field(repr=False)
+
+    @cached_property
+    def _covariance(self) -> Marginals:
+        return self._marginals()
+
+    def covariance(
+        self,
+        frames: Int[Tensor, " n"] | Sequence[int] | None = None,
+        points: Int[Tensor, " m"] | Sequence[int] | None = None,
+    ) -> Marginals:
+        """Marginal covariances, detached, zero for what did not move; computed on the first call.
+
+        Calibrated by the residuals, so the weights need to be right only up to a factor; priors count as they are.
+
+        Args:
+            frames: indices (n,) of frames, all if None.
+            points: indices (m,) of points, all if None.
+
+        Returns:
+            Frames (n, 6, 6) of the left perturbation (translation, rotation), points (m, 3, 3), and camera (P, P), or
+            (C P, C P) of several cameras.
+        """
+
+        def some(name: str, rows: Tensor | Sequence[int] | None, of_all: Tensor) -> Tensor:
+            if rows is None:
+                return of_all
+            rows = torch.as_tensor(rows, device=of_all.device)
+            return of_all[..., row_numbers(name, rows, of_all.shape[-3]), :, :]
+
+        of_frames, of_points, camera = self._covariance
+        return Marginals(some("frames", frames, of_frames), some("points", points, of_points), camera)
+
+    def element(self, row: int, num_frames: int, num_points: int) -> BundleSolution:
+        """One problem of a batch, without the frames and points that came after its own to fill it up."""
+        frames, points = slice(num_frames), slice(num_points)
+
+        def marginals() -> Marginals:
+            of_all = self._covariance
+            blocks = of_all.frames[row, frames], of_all.points[row, points], of_all.camera[row]
+            return Marginals(*blocks)
+
+        return BundleSolution(
+            self.T_cw[row, frames],
+            self.points_w[row, points],
+            self.camera[row],
+            self.cost[row],
+            self.success[row],
+            self.moved_frames[row, frames],
+            self.moved_points[row, points],
+            self.convergence.of(row),
+            marginals,
+        )
+
+
+@full_precision
+def solve_bundle(
+    problem: BundleProblem,
+    *,
+    free_camera: bool | Float[Tensor, "P n"] = False,
+    options: SolverOptions = BUNDLE_OPTIONS,
+    progress: Progress | None = None,
+    check: bool = True,
+) -> BundleSolution:
+    """Minimize robust reprojection errors over poses, points and, if `free_camera`, the cameras' parameters.
+
+    Observations that are not finite, or of points behind the camera, do not count. The implicit gradient is zero where
+    the exact Hessian is not positive definite; a point whose own block is not positive definite counts as fixed, and
+    one without parallax, whose depth nothing determines, has none. With an open gauge the gradient is right for losses
+    that do not depend on it.
+
+    A batch gives what its problems alone would give, by dense algebra over many of them at once. Where a frame sees
+    less than an eighth of the points, or one of them twice, they are solved one after the other.
+
+    Args:
+        problem: one bundle adjustment, or a batch.
+        free_camera: True frees all P parameters of every camera. A tensor (P, n) frees steps along its n columns, of
+            which the covariances then are. Every problem of a batch finds its own parameters.
+        options: how to minimize; gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed
+            poses and fixed points, and depths and what factors measure, with their information. Nothing flows to the
+            start of free unknowns.
+        progress: called before each iteration with its number and the maximum; its exceptions end the minimization.
+        check: test whether all that moves is determined. Without, `success` is that of the start; saves a tenth.
+
+    Returns:
+        The minimum, differentiable, with covariances on demand.
+
+    Raises:
+        ValueError: a shape or an index does not fit, or a name is unknown.
+        ConvergenceError: with `options.strict`.
+    """
+    given = sanitized(problem, options.scale)
+    matrices, kinds = given.weights.ndim > 2, factor_kinds(problem.frame_factors)
+    minimization = BundleMinimization(problem.camera, free_camera, options, progress, check, matrices, kinds)
+    found = BundleMinimum(*find_minimum(minimization, given, options.backward))
+    if options.strict:
+        check_minimum(found.success, found.converged, "bundle adjustments")
+    detached = [x.detach() for x in given]
+    solution = found.estimate
+    if options.backward == "implicit":
+        points_w = torch.where(found.with_depth[..., None], found.points_w, found.points_w.detach())
+        solution = minimization.at_minimum(found._replace(points_w=points_w), given)
+    if options.backward == "truncated":
+        solution = minimization.last_step(found, given)
+    params = solution.params if problem.camera_index is not None else solution.params[:, 0]
+
+    def marginals() -> Marginals:
+        of_all = minimization.marginals(found, detached)
+        return of_all if problem.is_batch else Marginals(*(blocks[0] for blocks in of_all))
+
+    row = slice(None) if problem.is_batch else 0
+    return BundleSolution(
+        solution.T_cw[row],
+        solution.points_w[row],
+        problem.camera.with_params(params[row]),
+        found.cost[row],
+        found.success[row],
+        found.moved_frames[row],
+        found.moved_points[row],
+        Convergence(*found[-4:], limit=options.iterations),
+        marginals,
+    )
 
 
 class BundleMinimum(NamedTuple):
@@ -70,26 +228,6 @@ class BatchPart(NamedTuple):
 
     rows: slice
     layout: SparseLayout | DenseLayout
-
-
-class BundleFormulation(LeastSquares[BundleEstimate, M], Protocol[M]):
-    """Solver of one element (`SparseBundle`) or of many (`DenseBundle`), in an order of its own."""
-
-    @property
-    def start(self) -> BundleEstimate: ...
-
-    def definite(self, model: M) -> Tensor:
-        """Whether (B,) all that moves is determined, up to the gauge."""
-        ...
-
-    def ordered(self, estimate: BundleEstimate) -> BundleEstimate: ...
-
-    def in_order(self, estimate: BundleEstimate) -> BundleEstimate: ...
-
-    # Both in the order of the problems.
-    def exact_solver(self, estimate: BundleEstimate) -> Callable[[Tensors], Tensors]: ...
-
-    def marginals(self, estimate: BundleEstimate) -> Marginals: ...
 
 
 class BundleMinimization:
@@ -131,22 +269,21 @@ class BundleMinimization:
     def _minimize(self, given: BundleData, moving: MovingParts, part: BatchPart) -> BundleMinimum:
         bundle, moving = self._bundle(given, part), MovingParts(*(mask[part.rows] for mask in moving))
         iterations, tolerance, report = self.options.iterations, self.options.tolerance, self.progress
-        before, batch = (
-            iterations * part.rows.start,
-            len(given.T_cw),
-        )  # as if one element came after the other
+        # As if one element came after the other.
+        before, batch = iterations * part.rows.start, len(given.T_cw)
         progress = None if report is None else lambda now, most: report(before + now, most * batch)
         model, convergence = minimize_batch(bundle, bundle.start, iterations, tolerance, progress)
+        estimate: BundleEstimate = bundle.in_order(model.estimate)
         with torch.no_grad():
             success = bundle.solvable & given.finite[part.rows]
             with_parallax = moving.points
             if self.check:
                 success = success & bundle.definite(model)
                 of_part = given.part(part.rows)
-                with_parallax = points_with_parallax(of_part, moving.counted, bundle.in_order(model.estimate))
+                with_parallax = points_with_parallax(of_part, moving.counted, estimate)
                 success = success & frames_are_determined(of_part, moving, with_parallax, self.kinds)
         return BundleMinimum(
-            *bundle.in_order(model.estimate),
+            *estimate,
             success,
             moving.frames,
             moving.points,
@@ -272,11 +409,11 @@ class BundleMinimization:
             parts = [bundle.marginals(_part(found.estimate, part)) for part, bundle in bundles]
             return Marginals(*_concatenated(parts))
 
-    def formulations(self, given: BundleData) -> list[tuple[BatchPart, BundleFormulation[Any]]]:
-        """The parts of a batch and their solvers."""
+    def formulations(self, given: BundleData) -> list[tuple[BatchPart, Any]]:
+        """The parts of a batch and the solver of each, a `DenseBundle` or a `SparseBundle`."""
         return [(part, self._bundle(given, part)) for part in self._laid_out(given)[1]]
 
-    def _bundle(self, given: BundleData, part: BatchPart) -> BundleFormulation[Any]:
+    def _bundle(self, given: BundleData, part: BatchPart) -> Any:
         given, layout, kernel = given.part(part.rows), part.layout, self.options.kernel
         directions = self._directions(given.params)
         if isinstance(layout, DenseLayout):
