@@ -245,13 +245,3 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
     T_cw[4, 0, 3] = torch.nan
     success = solve_graph(replace(graph, T_cw=T_cw)).success
     assert success.tolist() == [row != 4 for row in range(len(T_cw))]
-
-
-def test_a_camera_follows_the_dtype_of_the_data(bundle_scene):
-    problem = bundle_scene().problem
-    single = problem.camera.to(torch.float32)
-    found, wanted = (
-        solve_bundle(replace(problem, camera=each)) for each in (single, single.to(torch.float64))
-    )
-    assert torch.equal(found.T_cw, wanted.T_cw)
-    assert found.T_cw.dtype is torch.float64

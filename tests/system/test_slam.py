@@ -564,20 +564,6 @@ def test_a_lost_camera_leaves_no_pending_adjustment(monkeypatch: pytest.MonkeyPa
     assert [what for what, _ in events if what == "applied"]
 
 
-def test_a_delay_costs_no_accuracy(monkeypatch: pytest.MonkeyPatch) -> None:
-    walk = Walk(arc(80, 6.0)[:35])
-    noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1")
-    errors = []
-    for is_at_once in (False, True):
-        if is_at_once:
-            monkeypatch.setattr(StateMachine, "_apply_at", lambda _: ApplyAt.NOW)
-        run = run_walk(walk, *noisy)
-        assert len(run.trajectory) == 35
-        result = evaluate(run.trajectory, walk.groundtruth)
-        errors.append(result.ate_m / result.path_length_m)
-    assert max(errors) < 0.005
-
-
 def test_the_system_keeps_its_camera_when_parameters_move_in_place() -> None:
     params = torch.tensor([400.0, 400.0, 319.5, 239.5], dtype=torch.float64).requires_grad_()
     slam = SLAM(Camera("pinhole", params, (640, 480)))
