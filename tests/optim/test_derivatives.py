@@ -15,10 +15,7 @@ from tests.optim.conftest import adjusted, optimized, solved_graph
 from tests.optim.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
-from torchslam.optim import (
-    PosePrior,
-    solve_bundle,
-)
+from torchslam.optim import PosePrior, solve_bundle
 from torchslam.optim.run_graph import solve_graph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}

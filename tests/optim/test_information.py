@@ -103,8 +103,7 @@ def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, gene
 
     def loss(weights):
         return aligned_error(
-            solved_graph(replace(graph, weights=weights), kernel="cauchy", scale=2.0, **CONVERGED),
-            truth,
+            solved_graph(replace(graph, weights=weights), kernel="cauchy", scale=2.0, **CONVERGED), truth
         )
 
     leaf = graph.weights.clone().requires_grad_()

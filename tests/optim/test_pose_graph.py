@@ -8,14 +8,7 @@ import torch
 from torch import Tensor
 
 from tests.optim.conftest import draw, optimized
-from torchslam.geometry import (
-    sim3_adjoint,
-    sim3_exp,
-    sim3_inverse,
-    sim3_log,
-    sim3_scale,
-    so3_exp,
-)
+from torchslam.geometry import sim3_adjoint, sim3_exp, sim3_inverse, sim3_log, sim3_scale, so3_exp
 from torchslam.optim import PoseGraph, solve_pose_graph
 from torchslam.optim._core.linear import build_block_structure, dissect, factorize_sparse
 

@@ -129,9 +129,7 @@ def test_loss_is_reported_and_tracking_recovers() -> None:
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
 
 
-def test_frames_pending_at_the_end_have_uncertain_poses(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_frames_pending_at_the_end_have_uncertain_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Gap(arc(60)[:42])
     with monkeypatch.context() as patch:
         patch.setattr(SLAM, "finalize", SLAM.confirm_map)
@@ -187,11 +185,7 @@ def test_an_initialization_must_explain_the_frames_since_its_reference(
         lambda founder, submap, view: explains(founder, submap, view) and view.index == 0,
     )
     walk = Walk(arc(40)[[0, 3]])
-    run = run_walk(
-        walk,
-        "simulated.depth_near=7",
-        "simulated.depth_far=25",
-    )
+    run = run_walk(walk, "simulated.depth_near=7", "simulated.depth_far=25")
     assert (len(run.submaps) == 1) is believed
     assert believed or run.results[-1].reason == "bad start: it explains 1 of 2 frames"
 
@@ -524,9 +518,7 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
 
 
 @pytest.mark.slow
-def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_in_a_small_map_adjustment_is_applied_before_the_next_frame(monkeypatch: pytest.MonkeyPatch) -> None:
     walk, runs, begun = Walk(arc(80, 6.0)[:40]), [], []
     start = AsyncBundleAdjustment.start
 
