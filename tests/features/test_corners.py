@@ -155,6 +155,11 @@ def test_harris_agrees_with_opencv() -> None:
     np.testing.assert_allclose(ours.numpy() / (4 * 7) ** 4, expected, rtol=1e-4)
 
 
+def test_harris_gradcheck() -> None:
+    patches = torch.rand(2, 10, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(harris_responses, (patches.requires_grad_(),))
+
+
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.3, -0.2), (-0.45, 0.4)])
 def test_quadratic_peak_of_a_paraboloid(x: float, y: float) -> None:
     torch.testing.assert_close(

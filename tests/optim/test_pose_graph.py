@@ -8,12 +8,31 @@ import torch
 from torch import Tensor
 
 from tests.optim.conftest import draw, optimized
-from torchslam.geometry import sim3_adjoint, sim3_exp, sim3_inverse, sim3_scale, so3_exp
+from torchslam.geometry import (
+    sim3_adjoint,
+    sim3_exp,
+    sim3_inverse,
+    sim3_left_jacobian,
+    sim3_left_jacobian_inverse,
+    sim3_log,
+    sim3_scale,
+    so3_exp,
+)
 from torchslam.optim import PoseGraph, solve_pose_graph
 from torchslam.optim._core.linear import build_block_structure, dissect, factorize_sparse
+from torchslam.optim._pose_graph_problem import PoseGraphProblem, build_pose_graph_layout
+from torchslam.optim.pose_graph import _sanitized
 
 CONVERGED = {"iterations": 200, "tolerance": 1e-26}
 SIGMAS = torch.tensor([0.02, 0.02, 0.02, 0.005, 0.005, 0.005, 0.01], dtype=torch.float64)
+
+
+def rotation_of(angle: float, sigma: float, seed: int = 0) -> Tensor:
+    """A tangent vector (7,) with this angle and log scale."""
+    xi = draw(seed, 7)
+    xi[3:6] *= angle / xi[3:6].norm()
+    xi[6] = sigma
+    return xi
 
 
 @dataclass
@@ -57,6 +76,62 @@ def make_scene(
     information = torch.diag(SIGMAS[:dims] ** -2).expand(len(edges), dims, dims)
     fields = {"information": information, "with_scale": with_scale} | options
     return Scene(S_cw, PoseGraph(sim3_exp(start) @ S_cw, edges, S_ji, **fields))
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-4, 1.0, math.pi - 1e-6, 4.0])
+@pytest.mark.parametrize("sigma", [0.0, 1e-7, -0.7, 3.0])
+def test_left_jacobian_of_sim3_agrees_with_autograd(angle: float, sigma: float) -> None:
+    """Against the integral of exp(s ad) over s, as the corner of an exponential of twice the size."""
+    xi = rotation_of(angle, sigma)
+    at_zero = torch.zeros(7, dtype=torch.float64)
+    # ad is the derivative of the adjoint at the identity.
+    ad = torch.autograd.functional.jvp(lambda x: sim3_adjoint(sim3_exp(x)), at_zero, xi)[1]
+    big = torch.nn.functional.pad(ad, (0, 7, 0, 7))
+    big[:7, 7:] = torch.eye(7)
+    expected = torch.linalg.matrix_exp(big)[:7, 7:]
+    torch.testing.assert_close(sim3_left_jacobian(xi), expected, rtol=1e-12, atol=1e-12)
+    product = sim3_left_jacobian_inverse(xi) @ expected
+    torch.testing.assert_close(product, torch.eye(7).double(), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.5, math.pi - 1e-3])
+@pytest.mark.parametrize("sigma", [0.0, 2.5])
+@pytest.mark.parametrize("dims", [6, 7])
+def test_derivatives_of_an_edge_agree_with_autograd(angle: float, sigma: float, dims: int) -> None:
+    """Gradient and exact Hessian over both ends of one edge, for a large residual and a robust kernel."""
+    S_cw = sim3_exp(torch.stack((rotation_of(1.0, 0.4), rotation_of(2.0, -0.3, seed=1))))
+    S_ji = sim3_exp(-rotation_of(angle, sigma, seed=2)) @ S_cw[1] @ sim3_inverse(S_cw[0])
+    A = draw(3, 7, 7)[:dims, :dims]
+    graph = PoseGraph(
+        torch.cat((S_cw, S_cw[:1])),
+        torch.tensor([(0, 1), (0, 2)]),
+        torch.stack((S_ji, torch.eye(4).double())),
+        torch.stack((A @ A.T, torch.eye(dims).double())),
+        fixed=(2,),
+        with_scale=dims == 7,
+    )
+    counted, fixed, inputs = _sanitized(graph, 2.0)
+    problem = PoseGraphProblem(build_pose_graph_layout(graph.edges, counted, fixed, dims), inputs, "cauchy")
+
+    def cost(xi: Tensor) -> Tensor:
+        moves = sim3_exp(torch.nn.functional.pad(xi.view(2, dims), (0, 7 - dims)))
+        S = torch.cat((moves @ graph.S_cw[:2], graph.S_cw[2:]))
+        e = sim3_log(S[graph.edges[:, 1]] @ sim3_inverse(S[graph.edges[:, 0]]) @ sim3_inverse(graph.S_ji))
+        squared = torch.einsum("ed,edf,ef->e", e[:, :dims], graph.information, e[:, :dims])
+        return 2.0 * torch.log1p(squared / 4).sum()
+
+    at = torch.zeros(2 * dims, dtype=torch.float64)
+    gradient = torch.autograd.functional.jacobian(cost, at)
+    hessian = torch.autograd.functional.hessian(cost, at)
+    model = problem.exact_model(inputs.S_cw)
+    scale = float(hessian.abs().max())
+    torch.testing.assert_close(model.cost[0], cost(at))
+    torch.testing.assert_close(model.gradient[0, :2].flatten(), gradient, rtol=1e-9, atol=1e-9 * scale)
+    for row, diagonal in enumerate(model.diagonal[0, :2]):
+        rows = slice(dims * row, dims * (row + 1))
+        torch.testing.assert_close(diagonal, hessian[rows, rows], rtol=1e-8, atol=1e-8 * scale)
+    assert problem.layout.structure.pairs.tolist() == [[0, 1]]
+    torch.testing.assert_close(model.across[0, 0], hessian[:dims, dims:], rtol=1e-8, atol=1e-8 * scale)
 
 
 def test_rotations_are_rigid_poses_without_translation() -> None:
