@@ -165,6 +165,13 @@ def test_gradients_and_batches() -> None:
             torch.testing.assert_close(one, all_of_them[row])
 
 
+def test_device_and_dtype_are_those_of_the_input(device: torch.device, dtype: torch.dtype) -> None:
+    moved = carry_points(*(tensor.to(device, dtype) for tensor in problem()))
+    for one, expected in zip(moved, carry_points(*problem()), strict=True):
+        assert one.dtype == dtype
+        torch.testing.assert_close(one.cpu().double(), expected, atol=1e-4, rtol=1e-4)
+
+
 def looking(*rotations: tuple[float, float, float]) -> torch.Tensor:
     R_wc = so3_exp(torch.tensor(rotations, dtype=torch.float64))
     return rigid(R_wc, torch.ones(len(rotations), 3, dtype=torch.float64))

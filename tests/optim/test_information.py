@@ -94,6 +94,17 @@ def test_gradients_reach_the_matrices(pose_scene, bundle_scene, generator):
     assert torch.autograd.gradcheck(moved_by, leaves, eps=1e-6, atol=1e-5, rtol=1e-4, fast_mode=True)
 
 
+def test_vmap_over_matrices_is_the_same_as_a_loop(pose_scene, generator):
+    scene = pose_scene(batch=2, count=15)
+    weights = matrices(generator, 3, 2, 15)
+
+    def refined(weights):
+        return scene.solved(weights=weights).T_cw
+
+    wanted = torch.stack([refined(each) for each in weights])
+    torch.testing.assert_close(torch.func.vmap(refined)(weights), wanted, atol=1e-10, rtol=0)
+
+
 def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, generator):
     truth, graph = simulated(noise=1.0)
     graph = replace(graph, weights=matrices(generator, len(graph.pixels)))
@@ -103,7 +114,8 @@ def test_a_graph_with_matrices_is_saved_solved_and_differentiated(tmp_path, gene
 
     def loss(weights):
         return aligned_error(
-            solved_graph(replace(graph, weights=weights), kernel="cauchy", scale=2.0, **CONVERGED), truth
+            solved_graph(replace(graph, weights=weights), kernel="cauchy", scale=2.0, **CONVERGED),
+            truth,
         )
 
     leaf = graph.weights.clone().requires_grad_()
