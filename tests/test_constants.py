@@ -8,8 +8,6 @@ import re
 import tokenize
 from pathlib import Path
 
-import pytest
-
 import torchslam
 
 PACKAGE = Path(torchslam.__file__).parent
@@ -60,21 +58,3 @@ def test_every_number_with_a_name_has_a_reason() -> None:
         if bare := unexplained(path.read_text(encoding="utf-8")):
             found[str(name)] = bare
     assert not found
-
-
-@pytest.mark.parametrize(
-    ("source", "names"),
-    [
-        ("A = 1\n", ["1: A"]),
-        ("A, _B2 = 1.0, 2\nC = -1\n", ["1: A, _B2", "2: C"]),
-        ("A: int = 1 << 20\n", ["1: A"]),
-        ("A = {'a': (1,)}\n", ["1: A"]),
-        ("B = 1  # meters\nA = 2\n", ["2: A"]),
-        ("# meters\n\nA = 2\n", ["3: A"]),
-        ("A = 1\nB = 2\n'''Meters.'''\n", ["1: A"]),
-        ("A = 1  # m\n# seconds\nB = 2\nC = 3\n'''Pixels.'''\nD = (\n    4,  # px\n)\n", []),
-        ("NAME = 'a.txt'\nON = True\nlower = 3\nclass A:\n    B = 1\n", []),
-    ],
-)
-def test_what_counts_as_a_reason(source: str, names: list[str]) -> None:
-    assert unexplained(source) == names

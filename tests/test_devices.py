@@ -22,6 +22,14 @@ NOISY = ["features.kind=simulated", "simulated.noise_px=0.3", "simulated.outlier
 TOLERANCE = {"rtol": 1e-4, "atol": 1e-6}
 
 
+@pytest.fixture
+def device(device: torch.device) -> torch.device:
+    """Another one than the CPU, which is compared with."""
+    if device.type == "cpu":
+        pytest.skip("other tests run on the CPU")
+    return device
+
+
 def gradients(walk: Walk, device: torch.device) -> dict[str, Tensor]:
     """What a run on a device finds, and the gradient of its error."""
     config = load_config(None, NOISY)
@@ -97,8 +105,6 @@ def test_the_command_names_unusable_devices(tmp_path: Path, capsys: pytest.Captu
 
 def test_the_simulated_accelerator_does_not_mix_devices(device: torch.device) -> None:
     """It is worth something only as far as it refuses what CUDA refuses."""
-    if device.type == "cpu":
-        pytest.skip("one device alone mixes with nothing")
     there, here = torch.ones(3, device=device), torch.ones(3)
     assert device.type != "sim" or isinstance(there, SimulatedTensor)
     for mixed in (

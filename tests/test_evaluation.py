@@ -133,14 +133,6 @@ def test_a_path_that_stands_still_is_finite() -> None:
     assert (evaluation.ate_m, evaluation.scale, evaluation.path_length_m) == (0.0, 1.0, 0.0)
 
 
-def test_as_dict_is_plain(generator: torch.Generator) -> None:
-    T_wc = _poses(generator, 10)
-    figures = evaluate(Trajectory(_times(10), T_wc), Trajectory(_times(10), T_wc)).as_dict()
-    assert {"ate_m", "ate_se3_m", "rpe", "scale", "path_length_m"} <= figures.keys()
-    assert isinstance(figures["rpe"], dict)
-    assert all(isinstance(value, int | float | dict) for value in figures.values())
-
-
 def test_errors_are_differentiable(generator: torch.Generator) -> None:
     T_cw, truth = _poses(generator, 8), _poses(generator, 8)
     mask = torch.tensor([True] * 6 + [False, True])

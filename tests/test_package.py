@@ -92,16 +92,6 @@ def test_a_checkout_has_no_copy_of_the_configurations() -> None:
     assert config.FOLDER == ROOT / "configs"
 
 
-def test_the_metadata_have_classifiers_and_links(unpacked: Path) -> None:
-    (file,) = unpacked.glob("*.dist-info/METADATA")
-    text = file.read_text(encoding="utf-8")
-    for extra in ("bags", "docs", "mesh", "ray", "rerun"):
-        assert f"Provides-Extra: {extra}\n" in text
-    for line in ("Classifier: Typing :: Typed", "Classifier: Programming Language :: Python :: 3.14"):
-        assert f"{line}\n" in text
-    assert re.search("^Project-URL: Issues, ", text, re.MULTILINE)
-
-
 def test_the_version_is_that_of_the_metadata(capsys: pytest.CaptureFixture[str]) -> None:
     declared = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
     assert torchslam.__version__ in (

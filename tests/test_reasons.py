@@ -42,8 +42,7 @@ def test_the_text_of_every_reason_gives_it_back(reason: Reason, number: float) -
 
 
 @pytest.mark.parametrize(
-    "text",
-    ["", "; ", "x; ", "moved by far of the scene depth", "turned by 1e400 degrees", "a\nb", "took a"],
+    "text", ["", "; ", "x; ", "moved by far of the scene depth", "turned by 1e400 degrees", "a\nb", "took a"]
 )
 def test_other_texts_stay_as_they_are(text: str) -> None:
     found = Explanation.parsed(text)

@@ -13,9 +13,9 @@ import pytest
 import torch
 
 from tests.box_room import box_cloud, box_depths
-from tests.cli.conftest import FAST, ROOM
+from tests.cli.conftest import ROOM
 from torchslam.cli.main import main
-from torchslam.data import open_sequence, read_trajectory
+from torchslam.data import read_trajectory
 from torchslam.dense import DepthMaps
 from torchslam.geometry import Camera, squared_reprojection_errors, transform
 from torchslam.io.export.ply import read_cloud, upright_from_map, write_cloud
@@ -212,26 +212,6 @@ def test_missing_images_are_reported(copy: Path, tmp_path: Path, capsys: pytest.
     change(copy, source=None)
     assert export(copy, "nerfstudio", tmp_path / "c") == 2
     assert "the location of the images is unknown" in capsys.readouterr().err
-
-
-def test_a_deleted_image_moves_no_other(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Images without times: after one was deleted, the others are still those of their frames."""
-    room, folder, run = open_sequence(ROOM), tmp_path / "room", tmp_path / "run"
-    folder.mkdir()
-    for index in range(len(room)):
-        cv2.imwrite(str(folder / f"{index}.png"), room.color(index).numpy())
-    numbers = ",".join(map(str, room.camera.params.tolist()))
-    assert main(["run", str(folder), "--camera", numbers, "--output", str(run), *FAST]) == 0
-    posed = set(read_map(run / "map.safetensors")[0].keyframes["frame_index"].tolist())
-    between = min(set(range(1, len(room))) - posed)
-    (folder / f"{between}.png").unlink()
-    assert export(run, "colmap", tmp_path / "model") == 0
-    for index in posed:
-        written = cv2.imread(str(tmp_path / "model" / "images" / f"{index:06d}.png"))
-        np.testing.assert_array_equal(written, room.color(index).numpy())
-    capsys.readouterr()
-    assert export(run, "colmap", tmp_path / "all", "--frames", "all") == 2
-    assert f"the first is that of frame {between}, {between}.png; use --seq" in capsys.readouterr().err
 
 
 def test_other_submaps_can_be_exported(

@@ -12,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from torchslam.config import (
-    CHOICES,
     Config,
     FeaturesConfig,
     KeyframesConfig,
@@ -121,14 +120,7 @@ def test_the_commented_toml_reads_back(tmp_path: Path) -> None:
     (tmp_path / "c.toml").write_text(text)
     assert load_config(tmp_path / "c.toml") == config
     assert len((tmp_path / "c.toml").read_bytes()) < MAX_BYTES / 2
-    assert (
-        """
-# Number of pixels to which much larger images are reduced before extraction; 0 disables the reduction.
-#   0 or at least 1024 and at most 67108864; default 307200
-max_image_pixels = 0
-"""
-        in text
-    )
+    assert "#   0 or at least 1024 and at most 67108864; default 307200\nmax_image_pixels = 0\n" in text
     assert "#   default true\nenabled = true" in text
 
 
@@ -161,15 +153,6 @@ def test_a_slow_or_large_file_is_refused(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ConfigError, match="pipe cannot be read: not a regular file"):
         load_config(tmp_path / "pipe")
-
-
-def test_the_choices_of_settings() -> None:
-    assert CHOICES == {
-        "scale": ("unit", "groundtruth"),
-        "dense.aggregation": ("classical", "learned"),
-        "features.kind": ("orb", "opencv-orb", "sift", "simulated", "xfeat", "aliked"),
-        "matching.matcher": ("descriptors", "lightglue"),
-    }
 
 
 @pytest.mark.parametrize(

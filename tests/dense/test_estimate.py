@@ -23,9 +23,7 @@ from torchslam.dense.cost_volume import (
     box_sum,
     correlation,
     find_minimum,
-    inverse_depth_planes,
     matching_cost,
-    mean_of_best,
     position_std,
     semi_global,
     warp,
@@ -109,11 +107,6 @@ def test_behind_a_camera_nothing_is_seen() -> None:
     assert torch.isfinite(samples).all()
 
 
-def test_planes_are_even_in_inverse_depth() -> None:
-    found = inverse_depth_planes(torch.tensor(1.0), torch.tensor(4.0), 4)
-    torch.testing.assert_close(found, torch.tensor([0.25, 0.5, 0.75, 1.0]))
-
-
 @given(radius=st.integers(0, 3), height=st.integers(4, 9), width=st.integers(4, 9), seed=st.integers(0, 99))
 @settings(max_examples=25, deadline=None)
 def test_box_sums_are_those_of_a_convolution(radius: int, height: int, width: int, seed: int) -> None:
@@ -133,19 +126,6 @@ def test_correlation_does_not_see_a_change_of_light(gain: float, offset: float) 
     assert float(correlation(image, -image, 2).max()) < -0.99
 
 
-def test_nothing_correlates_without_texture() -> None:
-    flat = torch.full((12, 14), 0.5, dtype=torch.float64)
-    assert float(correlation(flat, flat, 2).abs().max()) < 1e-6
-
-
-@given(scores=st.lists(st.floats(-1, 1), min_size=1, max_size=6), count=st.integers(1, 6))
-@settings(max_examples=40, deadline=None)
-def test_mean_of_the_best(scores: list[float], count: int) -> None:
-    count = min(count, len(scores))
-    found = mean_of_best(torch.tensor(scores, dtype=torch.float64)[:, None], count)
-    assert float(found) == pytest.approx(sum(sorted(scores)[-count:]) / count)
-
-
 @given(at=st.floats(1, 6), curvature=st.floats(0.1, 2))
 @settings(max_examples=30, deadline=None)
 def test_the_minimum_of_a_parabola_is_found_between_hypotheses(at: float, curvature: float) -> None:
@@ -154,12 +134,6 @@ def test_the_minimum_of_a_parabola_is_found_between_hypotheses(at: float, curvat
     assert float(found.position) == pytest.approx(at)
     assert float(found.curvature) == pytest.approx(curvature)
     assert float(found.margin) > 0
-
-
-def test_a_minimum_at_the_end_stays_there() -> None:
-    found = find_minimum(torch.arange(5.0)[:, None, None])
-    assert float(found.position) == 0
-    assert float(found.curvature) == 0
 
 
 def test_aggregation_fills_what_has_no_information() -> None:

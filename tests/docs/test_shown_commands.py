@@ -57,10 +57,3 @@ def test_documented_commands_parse(page: Path) -> None:
     parts = PART.findall(text)
     wrong += [f"{home}:{name}" for home, name in parts if not hasattr(import_module(home), name)]
     assert not wrong
-
-
-def test_invalid_commands_are_detected() -> None:
-    text = "```sh\nPYTHONPATH=. torchslam run a.mp4 \\\n  --outptu b  # why\n```\n    torchslam eval a b > c"
-    first, second = shown(text)
-    assert "--outptu" in why_not(first)
-    assert why_not(second) == ""

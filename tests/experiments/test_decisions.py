@@ -25,21 +25,13 @@ from experiments.decisions.cases import (
 )
 from experiments.decisions.measure import bent, deformation_of
 from experiments.decisions.rendered import MOTIONS, Path, RenderedSequence
-from experiments.decisions.run import groups, records, run_group
+from experiments.decisions.run import records, run_group
 from experiments.decisions.table import ROWS, Counted
 from tests.walks import arc
 from torchslam.data import open_sequence
 from torchslam.geometry import Camera, se3_inverse, so3_log
 
 # --- cases ---------------------------------------------------------------------------------------------------
-
-
-def test_rendered_cases_are_the_same_each_time() -> None:
-    assert rendered_cases() == rendered_cases()
-    assert len(rendered_cases()) >= 200
-    assert len({name_of(case) for case in [*rendered_cases(), *part_cases()]}) == len(rendered_cases()) + len(
-        part_cases()
-    )
 
 
 def test_halves_share_no_scene_and_have_the_same_mixture() -> None:
@@ -52,16 +44,6 @@ def test_halves_share_no_scene_and_have_the_same_mixture() -> None:
         assert len(mixture) == 4
         assert max(mixture.values()) == min(mixture.values()) == len(some) // 4
         assert set(Counter(case.motion for case in some)) == set(MOTIONS)
-
-
-def test_rendered_cases_are_within_their_ranges() -> None:
-    for case in rendered_cases():
-        assert isinstance(case, RenderedCase)
-        fov = 2 * np.degrees(np.arctan(case.size[0] / 2 / case.focal))
-        assert 50 <= fov <= 100
-        assert case.readout_ms == 0 or 10 <= case.readout_ms <= 33
-        assert case.given == 1 or 0.01 <= abs(case.given - 1) <= 0.05
-        assert 70 <= case.frames <= 120
 
 
 def test_parts_of_each_recording_are_in_both_halves_and_the_first_ones_are_a_mixture() -> None:
@@ -205,13 +187,6 @@ def test_a_bent_map_has_moved_cameras_and_points_and_is_as_before_afterwards() -
 
 
 # --- running -------------------------------------------------------------------------------------------------
-
-
-def test_cases_of_a_scene_are_run_together() -> None:
-    found = list(groups(rendered_cases()[:44]))
-    assert [case.number for some in found for case in some][:4] == [0, 20, 40, 1]
-    assert sorted(case.number for some in found for case in some) == list(range(44))
-    assert all(len({case.group for case in some}) == 1 for some in found)
 
 
 def test_a_case_that_fails_is_recorded_and_the_last_line_of_a_case_counts(

@@ -83,17 +83,6 @@ def test_pure_noise_is_never_a_success(name: str, count: int, threshold: float) 
     assert not ESTIMATORS[name](inputs, threshold=threshold, max_samples=500).success.any()
 
 
-def test_dtype_and_device(name: str, device: torch.device, dtype: torch.dtype) -> None:
-    estimate = ESTIMATORS[name]
-    inputs = {key: x.to(device, dtype) for key, x in estimate.inputs(2).items()}
-    found = estimate(inputs, CAMERA.to(device, dtype))
-    pose = getattr(found, estimate.pose)
-    assert found.success.all()
-    assert (pose.dtype, pose.device.type) == (dtype, device.type)
-    expected = getattr(estimate(estimate.inputs(2)), estimate.pose)
-    torch.testing.assert_close(pose.double().cpu(), expected, atol=estimate.tolerance, rtol=0)
-
-
 @pytest.mark.parametrize(("batch", "count"), [(0, 10), (2, 0), (2, 2)])
 def test_too_few_rows_have_no_pose_and_a_gradient_of_zero(name: str, batch: int, count: int) -> None:
     estimate = ESTIMATORS[name]

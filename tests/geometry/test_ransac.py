@@ -3,7 +3,6 @@ import math
 import pytest
 import torch
 
-from torchslam.geometry.estimate_gradients import implicit_step
 from torchslam.geometry.lie import cayley_rotation, so3_exp
 from torchslam.geometry.ransac import (
     is_significant,
@@ -119,29 +118,6 @@ def test_cayley_rotation_is_a_rotation_close_to_exp() -> None:
     R = cayley_rotation(omega)
     torch.testing.assert_close(R @ R.mT, torch.eye(3, dtype=R.dtype).expand(10, 3, 3))
     torch.testing.assert_close(R, so3_exp(omega), atol=1e-5, rtol=0)
-
-
-def test_implicit_step_has_the_gradient_of_the_minimizer() -> None:
-    data = torch.tensor((0.3, -0.7), dtype=torch.float64, requires_grad=True)
-    minimizer = torch.stack((data, data.exp()), dim=-1).detach()  # of the function below
-
-    def objective(step: torch.Tensor) -> torch.Tensor:
-        x = minimizer + step
-        return (x[:, 0] - data).square() + (x[:, 1] - x[:, 0].exp()).square()
-
-    step = implicit_step(objective, minimizer)
-    assert float(step.detach().abs().max()) == 0
-    (gradient,) = torch.autograd.grad(step[:, 1].sum(), data)
-    torch.testing.assert_close(gradient, data.detach().exp())
-
-
-def test_implicit_step_without_a_minimum_has_zero_gradient() -> None:
-    data = torch.ones(2, dtype=torch.float64, requires_grad=True)
-    step = implicit_step(
-        lambda x: torch.stack((0 * x[0].sum(), (x[1] - data[1]).sum() ** 2)) * data, torch.zeros(2, 2)
-    )
-    step.sum().backward()
-    assert torch.isfinite(data.grad).all()
 
 
 @pytest.mark.parametrize(("count", "expected"), [(4, False), (8, False), (12, True), (30, True)])

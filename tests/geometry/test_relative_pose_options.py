@@ -9,13 +9,7 @@ from geometry_scenes import CAMERA, Scene, direction_error, rotation_error, two_
 from torchslam.geometry import RelativePose, estimate_relative_pose, so3_exp
 from torchslam.geometry.motion_models import Fits, PlaneMotions, goes_both_ways, plane_holds
 from torchslam.geometry.robust import Kernel
-from torchslam.geometry.two_view import (
-    TwoViews,
-    ahead_and_parallax,
-    best_in_front,
-    possible_matches,
-    twisted,
-)
+from torchslam.geometry.two_view import TwoViews, ahead_and_parallax, best_in_front, possible_matches, twisted
 
 THRESHOLDS = (0.5, 1.0, 2.0, 4.0, 8.0)
 

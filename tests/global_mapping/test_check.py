@@ -574,23 +574,6 @@ def test_the_score_is_a_product_of_shares() -> None:
     assert not a_check(agreeing=10, certain=10, consistent=6).is_right
 
 
-def test_a_check_in_words() -> None:
-    assert a_check(triplets=0).sentence() == "90% of 10 held-out image pairs agree"
-    words = "90% of 10 held-out image pairs agree, and 50% of 8 ratios of scales"
-    assert a_check(consistent=4).sentence() == words
-    first = "between frames 0 and 1 the scale differs by 25%"
-    rest = "between frames 1 and 2 the scale differs by 25%; between frames 2 and 3 the scale differs by 25%"
-    assert a_check(consistent=4, breaks=1).sentence() == f"{words}; {first}"
-    assert a_check(consistent=4, breaks=3).sentence() == f"{words}; {first}; {rest}"
-    assert a_check(consistent=4, breaks=5).sentence() == f"{words}; {first}; {rest}; and at 2 more"
-    assert str(Break(3, 5, BreakKind.POSE)) == "between frames 3 and 5 image pairs contradict the poses"
-    assert (
-        str(Break(3, 5, BreakKind.LOOP)) == "between frames 3 and 5 images of one place contradict the poses"
-    )
-    unknown = "between frames 3 and 5 weak link: the map does not determine the scale"
-    assert str(Break(3, 5, BreakKind.UNKNOWN)) == unknown
-
-
 def test_frames_can_be_doubted() -> None:
     check = MapCheck(5, 4, 4, 3, 3, 1.0, 0.2, torch.zeros(4), (), (0, 2, 4, 6), (8,))
     doubted = check.doubting({4, 8, 10})

@@ -11,16 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.global_mapping.synthetic import (
-    CAMERA,
-    Recording,
-    apart,
-    arc,
-    ball,
-    rand,
-    randn,
-    view_pair,
-)
+from tests.global_mapping.synthetic import CAMERA, Recording, apart, arc, ball, rand, randn, view_pair
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, still, turn
 from tests.walks import arc as walk_arc

@@ -312,9 +312,7 @@ def test_a_track_that_joins_two_points_becomes_the_one_that_most_see() -> None:
     track = torch.where(joined, 0, torch.where(also, 2, tracks.track))[kept]
     order = torch.argsort(track * 10 + view[kept])
     joined_tracks = Tracks(
-        torch.unique(track[order], return_inverse=True)[1],
-        view[kept][order],
-        tracks.keypoint[kept][order],
+        torch.unique(track[order], return_inverse=True)[1], view[kept][order], tracks.keypoint[kept][order]
     )
     observed = ObservedTracks.of(joined_tracks, SCENE.views)
     found = adjust_in_rounds(observed, disturbed(SCENE.T_cw, 0.05, 0.3), None, CAMERA)

@@ -15,10 +15,7 @@ from tests.optim.conftest import adjusted, optimized, solved_graph
 from tests.optim.test_pose_graph import make_scene
 from tests.optim.test_run_graph import simulated
 from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
-from torchslam.optim import (
-    PosePrior,
-    solve_bundle,
-)
+from torchslam.optim import PosePrior, solve_bundle
 from torchslam.optim.run_graph import solve_graph
 
 CONVERGED = {"iterations": 25, "tolerance": 0.0}
@@ -245,13 +242,3 @@ def test_a_start_that_is_not_finite_is_no_success(bundle_scene):
     T_cw[4, 0, 3] = torch.nan
     success = solve_graph(replace(graph, T_cw=T_cw)).success
     assert success.tolist() == [row != 4 for row in range(len(T_cw))]
-
-
-def test_a_camera_follows_the_dtype_of_the_data(bundle_scene):
-    problem = bundle_scene().problem
-    single = problem.camera.to(torch.float32)
-    found, wanted = (
-        solve_bundle(replace(problem, camera=each)) for each in (single, single.to(torch.float64))
-    )
-    assert torch.equal(found.T_cw, wanted.T_cw)
-    assert found.T_cw.dtype is torch.float64

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from scipy import stats
 from torch import Tensor
 
-from torchslam.optim.model_choice import LEAST_GAIN, LEAST_UPDATE, STRETCHES, SURE, Gain, predictive_gain
+from torchslam.optim.model_choice import LEAST_GAIN, LEAST_UPDATE, STRETCHES, Gain, predictive_gain
 
 
 def sums(*values: float) -> Tensor:
@@ -33,25 +33,12 @@ def test_one_stretch_has_no_scatter() -> None:
         assert not found.is_sure
 
 
-def test_equal_stretches_are_sure() -> None:
-    assert Gain.of_stretches(sums(1.0, 1.0)).sigmas == math.inf
-    assert Gain.of_stretches(sums(-1.0, -1.0)).sigmas == -math.inf
-    assert Gain.of_stretches(sums(0.0, 0.0)).sigmas == 0.0
-
-
 @pytest.mark.parametrize("stretches", [3, 5, 10, 20])
 @pytest.mark.parametrize("t", [0.5, 2.0, 4.0, 8.0])
 def test_sigmas_are_as_improbable_as_the_t_statistic(t: float, stretches: int) -> None:
     """Within what the bound of Wallace is off, which is 3 % from two degrees of freedom on."""
     expected = stats.norm.isf(stats.t.sf(t, stretches - 1))
     assert Gain(t, 1.0, stretches).sigmas == pytest.approx(expected, rel=0.03)
-
-
-def test_few_stretches_say_less() -> None:
-    found = [Gain(6.0, 1.5, count).sigmas for count in (2, 3, 5, 10, 1000)]
-    assert found == sorted(found)
-    assert found[0] < SURE < found[-1] < 4.0
-    assert found[-1] == pytest.approx(4.0, rel=0.01)
 
 
 def test_two_stretches_that_agree_within_a_third_are_not_sure() -> None:

@@ -27,22 +27,6 @@ def make_observations(make_camera, generator):
     return make
 
 
-@pytest.mark.parametrize("free_camera", [False, True])
-def test_jacobians_agree_with_autograd(make_observations, model, free_camera):
-    observations, points_c = make_observations(model)
-    lin = linearize(observations, points_c, free_camera)
-
-    def residual(points_c, params):
-        camera = observations.camera.with_params(params)
-        return linearize(replace(observations, camera=camera), points_c).residual
-
-    J_points, J_params = torch.autograd.functional.jacobian(residual, (points_c, observations.camera.params))
-    rows = torch.arange(len(points_c))
-    torch.testing.assert_close(lin.J[..., :3], J_points[rows, :, rows])
-    if free_camera:
-        torch.testing.assert_close(lin.J[..., 3:], J_params)
-
-
 @pytest.mark.parametrize("kernel", ["none", "huber", "cauchy", "geman_mcclure"])
 @pytest.mark.parametrize("free_camera", [False, True])
 def test_the_exact_expansion_agrees_with_autograd(make_observations, model, kernel, free_camera):

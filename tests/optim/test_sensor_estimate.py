@@ -13,12 +13,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import RunGraph, solve_graph
-from torchslam.optim.sensor_estimate import (
-    SensorEstimate,
-    SensorPrior,
-    estimate_sensor,
-    keyframe_evidence,
-)
+from torchslam.optim.sensor_estimate import SensorEstimate, SensorPrior, estimate_sensor, keyframe_evidence
 
 OPTIONS = GRAPH_OPTIONS.replace(backward="detached", tolerance=1e-8)
 SOUGHT, EXCLUDED = Readout.known(0.0, 0.03), Readout.known(0.0, 0.0)

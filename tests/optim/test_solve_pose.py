@@ -206,14 +206,6 @@ def scene(camera: Camera, generator: torch.Generator) -> tuple[Tensor, PoseProbl
 
 
 @pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
-def test_the_gradient_agrees_with_autograd(camera: Camera, generator: torch.Generator) -> None:
-    T_cw, observations = scene(camera, generator)
-    xi = torch.zeros(2, 6, dtype=torch.float64, requires_grad=True)
-    (expected,) = torch.autograd.grad(observations.expand(retract(T_cw, xi), NONE).cost.sum(), xi)
-    torch.testing.assert_close(observations.expand(T_cw, ALL).gradient, expected)
-
-
-@pytest.mark.parametrize("camera", [PINHOLE, BENT], ids=["pinhole", "bent"])
 def test_the_curvature_is_exact_for_linear_residuals(camera: Camera, generator: torch.Generator) -> None:
     """Hessian and curvature term make the Hessian of the cost, with the residual in its place linear in xi."""
     T_cw, observations = scene(camera, generator)
@@ -237,15 +229,6 @@ def test_the_curvature_is_exact_for_linear_residuals(camera: Camera, generator: 
         torch.testing.assert_close((found.hessian + found.curvature_term)[row], exact[row, :, row])
     assert (torch.linalg.eigvalsh(found.hessian) > 0).all()
     assert (torch.linalg.eigvalsh(found.curvature_term) < 1e-6).all()
-
-
-def test_second_order_curvature_is_added_on_request(generator: torch.Generator) -> None:
-    T_cw, observations = scene(PINHOLE, generator)
-    everywhere = observations.expand(T_cw, ALL)
-    somewhere = observations.expand(T_cw, torch.tensor([True, False]))
-    assert torch.equal(somewhere.curvature_term[0], everywhere.curvature_term[0])
-    assert (somewhere.curvature_term[1] == 0).all()
-    assert (observations.expand(T_cw, NONE).curvature_term == 0).all()
 
 
 def test_the_pinhole_shortcut_equals_the_general_expansion(generator: torch.Generator) -> None:

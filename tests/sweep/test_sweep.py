@@ -12,9 +12,13 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from tests.sweep.calls import B, Call, N, calls
+from tests.optim.conftest import camera_of
+from tests.optim.test_run_graph import simulated
+from tests.sweep.calls import B, Call, N, binary_features, calls, rand
 from torchslam import evaluation, features, geometry, optim
 from torchslam.errors import TorchslamError
+from torchslam.geometry import Camera
+from torchslam.optim.run_graph import solve_graph
 
 pytestmark = pytest.mark.usefixtures("without_shape_checks")
 
@@ -243,7 +247,7 @@ def test_inference_mode_gives_the_same_bytes(call: Call) -> None:
 
 
 def with_gradient(call: Call, arguments: dict[str, Any]) -> tuple[list[Tensor], list[Tensor]]:
-    """Results that carry a gradient, and the tensors that they carry it to."""
+    """Results, and the tensors of floats among the arguments, which have a gradient."""
     to: list[Tensor] = []
 
     def leaf(tensor: Tensor) -> Tensor:
@@ -252,26 +256,70 @@ def with_gradient(call: Call, arguments: dict[str, Any]) -> tuple[list[Tensor], 
         to.append(tensor.detach().clone().requires_grad_())
         return to[-1]
 
-    found = run(call, mapped(arguments, leaf))
-    return [x for x in found if x.requires_grad], to
+    return run(call, mapped(arguments, leaf)), to
+
+
+def gradients_of(found: list[Tensor], to: list[Tensor]) -> tuple[Tensor | None, ...]:
+    """The gradients of the sum of all results that have one."""
+    attached = [x.nan_to_num(0, 0, 0).sum() for x in found if x.requires_grad]
+    return torch.autograd.grad(sum(attached), to, allow_unused=True) if attached else ()
 
 
 def test_gradients_under_detect_anomaly(call: Call) -> None:
     if not call.gradient:
         return
-    found, to = with_gradient(call, call.arguments)
-    assert found
-    expected = torch.autograd.grad(sum(x.nan_to_num(0, 0, 0).sum() for x in found), to, allow_unused=True)
+    expected = gradients_of(*with_gradient(call, call.arguments))
+    assert expected
     with torch.autograd.set_detect_anomaly(True):
-        found, to = with_gradient(call, call.arguments)
-        gradients = torch.autograd.grad(
-            sum(x.nan_to_num(0, 0, 0).sum() for x in found), to, allow_unused=True
-        )
+        gradients = gradients_of(*with_gradient(call, call.arguments))
     for a, b in zip(gradients, expected, strict=True):
         assert (a is None) == (b is None)
         if a is not None and b is not None:
             assert a.isfinite().all()
             torch.testing.assert_close(a, b)
+
+
+def assert_autocast_changes_no_byte(call: Call, in_backward: bool = False) -> None:
+    """Of float32 results and gradients, with the forward pass within it; of solvers the backward pass as well."""
+
+    def single(tensor: Tensor) -> Tensor:
+        return tensor.float() if tensor.is_floating_point() else tensor
+
+    expected: list[Tensor] = []
+    for forward, backward in ((False, False), (True, False), (False, in_backward)):
+        with torch.autocast("cpu", torch.bfloat16, enabled=forward):
+            results, to = with_gradient(call, mapped(call.arguments, single))
+        with torch.autocast("cpu", torch.bfloat16, enabled=backward):
+            found = results + [x for x in gradients_of(results, to) if x is not None]
+        expected = expected or found
+        assert_same(found, expected)
+
+
+def test_autocast_changes_no_byte(call: Call) -> None:
+    # Trajectories are of float64, and keypoints of ORB move by a hundredth of a pixel.
+    if all(call is not CALLS[name] for name in ("evaluate", "ate_apart", "ORB")):
+        assert_autocast_changes_no_byte(call, in_backward=any(call is CALLS[name] for name in SOLVERS))
+
+
+def test_autocast_changes_no_byte_of_other_cameras_graphs_and_soft_matches() -> None:
+    points, pixels = (
+        CALLS["Camera.project"].arguments["points_c"],
+        CALLS["Camera.normalize"].arguments["pixels"],
+    )
+    for model in ("pinhole", "fisheye"):
+        for name in ("project", "project_with_jacobians", "project_with_point_jacobians"):
+            method = getattr(Camera, name)
+            assert_autocast_changes_no_byte(Call(method, {"self": camera_of(model), "points_c": points}))
+        for name in ("normalize", "unproject"):
+            method = getattr(Camera, name)
+            assert_autocast_changes_no_byte(Call(method, {"self": camera_of(model), "pixels": pixels}))
+    _, graph = simulated(frames=4, points=20)
+    assert_autocast_changes_no_byte(Call(solve_graph, {"graph": graph}), in_backward=True)
+    bits = binary_features()
+    soft = replace(bits, descriptors=torch.nn.functional.normalize(rand(1, N, 64).float(), dim=-1))
+    other = replace(soft, descriptors=soft.descriptors.flip(2).contiguous())
+    arguments = {"features_1": soft, "features_2": other, "temperature": 0.1}
+    assert_autocast_changes_no_byte(Call(features.match, arguments))
 
 
 @contextmanager

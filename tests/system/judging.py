@@ -24,7 +24,7 @@ from torchslam.tracking.pose_validation import Verdict
 from torchslam.tracking.tracker import Tracker
 from torchslam.types import FrameFeatures, PoseEstimate, Reason, Rejection, StepResult
 
-SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
+SIMULATED = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
 DOUBT = Rejection.of(Reason.LOW_COVERAGE_RATIO, ratio=0.1)
 WRONG = Rejection.of(Reason.LOW_INLIER_RATIO, ratio=0.1, matches=9)
 

@@ -145,9 +145,7 @@ def test_culled_keyframes_leave_the_keyframe_database(monkeypatch: pytest.Monkey
     recorded, removed = Recorded(monkeypatch, is_pending=False), list[int]()
     keys = recorded.submap.map.keys.clone()
     remap = RowRemap(
-        torch.tensor([0, -1, 1, 2]),
-        torch.arange(len(recorded.submap.map.points)),
-        torch.tensor([0, 0, 1, 2]),
+        torch.tensor([0, -1, 1, 2]), torch.arange(len(recorded.submap.map.points)), torch.tensor([0, 0, 1, 2])
     )
     monkeypatch.setattr(recorded.slam.mapper, "cull_and_compact", lambda _: remap)
     monkeypatch.setattr(recorded.slam.loop_closer, "remove", lambda gone: removed.extend(gone.tolist()))

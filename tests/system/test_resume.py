@@ -18,7 +18,6 @@ from typing import Any
 
 import pytest
 import torch
-from safetensors.torch import load_file
 
 from tests.walks import Walk, arc
 from torchslam import SLAM, Config, State, StepResult, load_config
@@ -460,31 +459,6 @@ class Slow(Walk):
 arguments.sequence = lambda options: Slow(PATH)
 sys.exit(main(sys.argv[2:]))
 """
-
-
-@pytest.mark.slow
-def test_a_killed_run_can_be_resumed(tmp_path: Path) -> None:
-    folder = tmp_path / "out"
-    line = ["run", "walk", "--output", str(folder), *SET, "--checkpoint", "2"]
-    env = os.environ | {"OMP_NUM_THREADS": "1"}
-    child = subprocess.Popen([sys.executable, "-c", CHILD, "0.2", *line], env=env, stderr=subprocess.DEVNULL)
-    until = time.monotonic() + 120
-    while not (folder / "checkpoint.safetensors").exists():
-        assert child.poll() is None
-        assert time.monotonic() < until
-        time.sleep(0.02)
-    time.sleep(0.5)
-    child.send_signal(signal.SIGKILL)
-    assert child.wait() == -signal.SIGKILL
-    kept = load_file(str(folder / "checkpoint.safetensors"))  # whole
-    assert 0 < len(kept["run.counts"]) < FRAMES
-    again = [sys.executable, "-c", CHILD, "0", *line, "--resume"]
-    done = subprocess.run(again, env=env, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    assert "resuming at frame" in done.stderr
-    assert [frame.index for frame in read_frames(folder / "frames.csv")] == list(range(FRAMES))
-    assert len(read_trajectory(folder / "trajectory.txt")) == FRAMES
-    assert not (folder / "checkpoint.safetensors").exists()
 
 
 SIGNALED = CHILD.replace(

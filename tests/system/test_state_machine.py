@@ -57,35 +57,6 @@ def slam() -> SLAM:
     )
 
 
-def test_states_change_with_the_frames(slam: SLAM) -> None:
-    sequence = open_sequence("synthetic:room?frames=40")
-    assert slam.state is State.INITIALIZING
-    results = [slam.step(sequence[index]) for index in range(25)]
-    assert results[0].reason == Reason.NEW_REFERENCE
-    started = next(index for index, each in enumerate(results) if each.reason == Reason.STARTED)
-    assert all(each.state is State.INITIALIZING and each.T_cw is None for each in results[:started])
-    assert all(each.state is not State.INITIALIZING and each.T_cw is not None for each in results[started:])
-    assert slam.submap is not None
-    slam.reset()
-    assert slam.state is State.INITIALIZING
-    assert slam.submap is None
-
-
-def test_a_camera_without_view_is_lost_and_relocalized(slam: SLAM) -> None:
-    sequence = open_sequence("synthetic:room?frames=60")
-    frames = [sequence[index] for index in range(46)]
-    for index in range(35, 39):
-        frames[index] = replace(frames[index], image=torch.full_like(frames[index].image, 0.5))
-    results = [slam.step(frame) for frame in frames]
-    lost = [each for each in results if each.state is State.LOST]
-    assert lost
-    assert {each.reason for each in lost} == {Reason.LOST}
-    again = [each for each in results if each.reason == Reason.RELOCALIZED]
-    assert len(again) == 1
-    assert again[0].state is State.UNCERTAIN
-    assert slam.state is State.TRACKING
-
-
 def test_frames_lost_before_the_last_relocalization_are_tracked_backward(
     slam: SLAM, monkeypatch: pytest.MonkeyPatch
 ) -> None:

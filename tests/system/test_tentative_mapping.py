@@ -9,12 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.system.judging import DOUBT, SIMULATED, WRONG, judge
+from tests.system.judging import DOUBT, SIMULATED, judge
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, evaluate, load_config
-from torchslam.system import local_mapping, state_machine
 from torchslam.system import savepoint as savepoints
+from torchslam.system import state_machine
 from torchslam.system.front_end import Simulated
 from torchslam.system.local_mapping import LocalMapping
 from torchslam.system.modes import Mode
@@ -130,17 +130,6 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(
     assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
 
-def test_many_frames_that_are_held_back_are_kept_when_the_camera_is_lost(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    leaves = 75
-    slam = doubting(monkeypatch, range(22, 200))
-    states = states_of(slam, Leaving(arc(120)[: leaves + 3], leaves))
-    assert states[leaves - 1] is State.UNCERTAIN
-    assert states[leaves + 1] is State.LOST
-    assert len(slam.trajectory()) == leaves
-
-
 def test_tentative_frames_at_the_end_keep_their_poses(monkeypatch: pytest.MonkeyPatch) -> None:
     walk = Walk(arc(60)[:36])
     slam = doubting(monkeypatch, range(22, 60))
@@ -159,39 +148,6 @@ def starting_late(monkeypatch: pytest.MonkeyPatch, slam: SLAM) -> None:
     map_start = slam._state_machine.map_start
     step = map_start.step
     monkeypatch.setattr(map_start, "step", lambda view: DOUBT if view.index < LATE else step(view))
-
-
-def test_uncertain_frames_of_backward_tracking_are_mapped_tentatively_and_committed(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
-    starting_late(monkeypatch, slam)
-    judge(monkeypatch, local_mapping, lambda _: DOUBT)
-    states_of(slam, walk)
-    assert len(slam.trajectory()) == len(walk)
-    assert int(slam.map.keyframes["frame_index"].min()) < LATE
-    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
-    assert walk.groundtruth is not None
-    assert evaluate(slam.trajectory(), walk.groundtruth).ate_m < 1e-3
-
-
-def test_unconfirmed_backward_tracking_is_rolled_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    slam, walk = doubting(monkeypatch, ()), Walk(arc(60)[:50])
-    starting_late(monkeypatch, slam)
-    grown: list[int] = []
-
-    def rejection_of(index: int) -> Rejection:
-        grown.append(slam.map.num_keyframes)
-        return WRONG if len(grown) > LATE // 2 else DOUBT
-
-    judge(monkeypatch, local_mapping, rejection_of)
-    states_of(slam, walk)
-    assert grown[-1] > grown[0]
-    first = int(slam.map.keyframes["frame_index"][0])
-    assert first >= LATE
-    assert int(slam.map.keyframes["frame_index"].min()) == first
-    assert int(slam.posed_frames.frames["frame_index"].min()) == first
-    assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
 
 
 @pytest.mark.parametrize("end", [SLAM.finalize, SLAM.confirm_map])

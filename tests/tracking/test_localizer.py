@@ -13,7 +13,7 @@ from tests.scene import CAMERA, Scene, pose, rows_of, sideways, submap_of_scene
 from torchslam.config import Config
 from torchslam.geometry import KeypointNoise, SharedCamera, UndistortedKeypoints, transform
 from torchslam.map.atlas import Submap
-from torchslam.optim.pose.frame_pose import FramePose
+from torchslam.optim.frame_pose import FramePose
 from torchslam.tracking import localizer as localizer_module
 from torchslam.tracking.localizer import Localizer
 from torchslam.tracking.tracker import Tracker

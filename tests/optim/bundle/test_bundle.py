@@ -6,7 +6,6 @@ import torch
 from tests.optim.conftest import adjusted, only
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, umeyama
 from torchslam.optim import solve_bundle
-from torchslam.optim.bundle import _schur as schur
 from torchslam.optim.bundle import _sparse
 from torchslam.optim.bundle._sparse import SparseBundle
 
@@ -64,16 +63,6 @@ def test_robust_kernel_survives_outliers(bundle_scene, generator):
 
     assert error("cauchy") < 0.3 * error("none")
     assert error("huber") < 0.6 * error("none")
-
-
-def test_tiles_are_smaller_where_many_frames_share_points(monkeypatch):
-    monkeypatch.setattr(schur, "_MANY_FRAMES", 4)
-    for frames, height in ((4, schur._TILE_POINTS), (5, schur._TILE_POINTS_OF_MANY)):
-        slots = torch.arange(frames).repeat_interleave(1000)
-        cameras, points = torch.zeros(frames, dtype=torch.int64), torch.arange(1000).repeat(frames)
-        structure = schur.build_structure(slots, points, 1000, cameras, cameras[slots], 1)
-        assert structure.tiles[0].points.stop == height
-        assert structure.tiles[-1].points.stop == 1000
 
 
 def test_order_of_the_observations_does_not_matter(bundle_scene, generator):
