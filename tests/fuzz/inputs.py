@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
-from tests.fuzz import valid_inputs
+from tests.fuzz import conventions, valid_inputs
 from tests.fuzz.mutators import Mutated, mutate, write
 from tests.fuzz.readers import Reader
 from torchslam.errors import TorchslamError
@@ -47,9 +47,13 @@ class Outcome:
 def mutated(reader: Reader, number: int) -> Mutated:
     """Return the input of a number; it depends on the number alone."""
     rng = random.Random(f"{reader.name} {number}")
+    if reader.generate is not None:
+        return dict(reader.generate(rng))
     files = dict(reader.files)
     if reader.name == "settings of a run":
         return {"argument": valid_inputs.extreme_setting(rng).encode()}
+    if reader.name == "calibration conventions":
+        return dict(conventions.example(rng))
     if "argument" in files:
         examples = valid_inputs.OVERRIDES if reader.name == "--set" else valid_inputs.CAMERA_ARGUMENTS
         files["argument"] = rng.choice(examples).encode()
@@ -103,6 +107,8 @@ def _judged(reader: Reader, message: str, root: Path) -> tuple[str, str]:
         return "unclear", f"not one line: {message[:200]!r}"
     places = {root.name, "--", "passwd", *(part for name in reader.files for part in Path(name).parts)}
     places |= {Path(name).stem for name in reader.files}
+    if reader.generate is not None:
+        places.add(str(root))
     if not any(place in message for place in places):
         return "unclear", f"no place: {message[:200]}"
     return "refused", ""

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import random
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
@@ -15,7 +16,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from tests.fuzz import valid_inputs
+from tests.fuzz import conventions, named_images, valid_inputs
 from tests.fuzz.mutators import Files
 from tests.fuzz.sample_files import CONFIG, OVERRIDES, WALK, sample_files
 from tests.walks import T_cw
@@ -71,12 +72,14 @@ FRAMES = 4
 
 @dataclass(frozen=True)
 class Reader:
-    """make: good input, by names in a folder; read: reads that folder; inputs: how many of 30,000 are for it"""
+    """make: good input, by names in a folder; read: reads that folder; inputs: how many of 30,000 are for it; generate:
+    makes an input that is valid and says what it means, in place of a damaged one"""
 
     name: str
     make: Callable[[], Files]
     read: Callable[[Path], object]
     inputs: int
+    generate: Callable[[random.Random], Files] | None = None
 
     @cached_property
     def files(self) -> Files:
@@ -103,6 +106,12 @@ def readers() -> dict[str, Reader]:
         Reader("camera argument", lambda: {"argument": b""}, _camera_argument, 700),
         Reader("frame arguments", valid_inputs.folder, _frame_arguments, 700),
         Reader("trajectory", lambda: {"t.txt": valid_inputs.trajectory_text(6).encode()}, _trajectory, 1000),
+        Reader(
+            "calibration conventions",
+            lambda: conventions.example(random.Random("calibration conventions")),
+            conventions.check,
+            1500,
+        ),
         Reader("zip of a video", valid_inputs.zipped_video, partial(_sequence, name="v.zip"), 300),
         Reader("colmap binary", partial(_some, "colmap", "cameras.bin", "images.bin"), read_poses, 600),
         Reader("colmap text", partial(_some, "colmap", "cameras.txt", "images.txt"), read_poses, 600),
@@ -132,6 +141,14 @@ def readers() -> dict[str, Reader]:
             300,
         ),
         Reader("batch record", _row_and_times, _record, 400),
+    ]
+    found += [
+        Reader(name, partial(generate, random.Random(0)), read, inputs, generate)
+        for name, generate, read, inputs in (
+            ("names of images", named_images.named_folder, named_images.read_named_folder, 1500),
+            ("times of images", named_images.listed_images, named_images.read_listed_images, 600),
+            ("images of results", named_images.changed_folder, named_images.read_changed_folder, 900),
+        )
     ]
     found += [
         Reader(f"image {kind}", partial(_kind, valid_inputs.images, kind), _image, 250) for kind in IMAGES
