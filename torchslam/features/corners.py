@@ -70,7 +70,8 @@ def fast_scores(pixels: UInt8[Tensor, " A"], stride: int, bands: Bands | None = 
     scores, end = [], 0
     for start, count in parts:
         scores += [torch.zeros_like(pixels[end:start])] * (start > end)
-        scores.append(torch.as_tensor(_chunk_scores(values, stride, start, count)))
+        found = _chunk_scores(values, stride, start, count)
+        scores.append(torch.as_tensor(found, dtype=torch.uint8, device=pixels.device))
         end = start + count
     return torch.cat([*scores, torch.zeros_like(pixels[end:])])
 
@@ -155,10 +156,10 @@ def find_peaks(
     """
     values, floors = to_numpy(scores), to_numpy(floor)
     parts = _chunks_of(bands, values, stride + 1)
-    found = [
-        true_indices(torch.as_tensor(_chunk_peaks(values, floors, stride, start, count))) + start
-        for start, count in parts
-    ]
+    found = []
+    for start, count in parts:
+        is_peak = _chunk_peaks(values, floors, stride, start, count)
+        found.append(true_indices(torch.as_tensor(is_peak, dtype=torch.bool, device=scores.device)) + start)
     return torch.cat(found) if found else torch.zeros(0, dtype=torch.int64, device=scores.device)
 
 
