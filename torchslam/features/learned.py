@@ -37,18 +37,16 @@ class XFeat(nn.Module):
     Args:
         weights: file of the network's weights, or their name.
         num_keypoints: largest number of keypoints per image; rows beyond what the image offers are masked.
-        threshold: of the keypoint heat map, 0 to 1.
 
     Raises:
         ConfigError: The file cannot be read or holds another network.
     """
 
-    def __init__(self, weights: str | Path, num_keypoints: int = 1000, threshold: float = 0.05) -> None:
+    def __init__(self, weights: str | Path, num_keypoints: int = 1000) -> None:
         import kornia  # here, as the import is slow and only the networks need it
 
         super().__init__()
         self.num_keypoints = num_keypoints
-        self.threshold = threshold
         with torch.device("cpu"):
             model = kornia.feature.XFeat().float()
         # The file may leave out the fine matcher, which only dense matching needs.
@@ -66,7 +64,7 @@ class XFeat(nn.Module):
 
         check_images(images, mask)
         coarse, heat, scores = self._maps(images)
-        peaks = nms2d(heat.detach()[:, None], (5, 5), mask_only=True)[:, 0] & (heat > self.threshold)
+        peaks = nms2d(heat.detach()[:, None], (5, 5), mask_only=True)[:, 0] & (heat > 0.05)
         inner = heat.shape[1:]
         if mask is not None:
             peaks &= F.interpolate(mask.float(), inner, mode="nearest-exact")[:, 0] > 0
