@@ -155,17 +155,17 @@ class ALIKED(nn.Module):
         check_images(images, mask)
         with images.device:  # kornia makes tensors on the default device
             found = self.network(images.float())
-        rows = []
-        for one in found:
-            keypoints, scores, descriptors = (
+        rows = [
+            _features(
                 one.keypoints[None],
                 one.keypoint_scores[None],
-                one.descriptors[None],
+                one.descriptors[None].float(),
+                torch.ones_like(one.keypoint_scores, dtype=torch.bool)[None],
+                self.num_keypoints,
+                ALIKED_NOISE,
             )
-            mask_1 = torch.ones_like(scores, dtype=torch.bool)
-            rows.append(
-                _features(keypoints, scores, descriptors.float(), mask_1, self.num_keypoints, ALIKED_NOISE)
-            )
+            for one in found
+        ]
         features = Features.cat(rows)
         return features if mask is None else apply_mask(features, mask)
 

@@ -285,13 +285,9 @@ def _rotated_offsets(stride: int, device: torch.device) -> Int[Tensor, "256 512"
 def describe(
     blurred: Int[Tensor, " R"], positions: Int[Tensor, " N"], angles: Float[Tensor, " N"], stride: int
 ) -> UInt8[Tensor, "N 32"]:
-    """Describe keypoints by 256 brightness comparisons, rotated by their angles.
+    """Describe keypoints by 256 brightness comparisons in the result of `blur`, rotated by their angles, radians.
 
-    Args:
-        blurred: from `blur`.
-        positions: of the keypoints in the image before blurring, RADIUS + BLUR_RADIUS inside their level.
-        angles: radians.
-        stride: length of a row of pixels.
+    Positions are those in the image before blurring, RADIUS + BLUR_RADIUS inside their level.
     """
     bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
     origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)

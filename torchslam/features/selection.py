@@ -141,19 +141,10 @@ def select_evenly(
 ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Choose up to `count` corners per image: the best of every cell first, then the strongest elsewhere.
 
-    Every level first takes its budget; what levels leave unused goes to the best remaining corners of any level.
+    Every level first takes its budget; what levels leave unused goes to the best remaining corners of any level. Only
+    corners that are `strong` may be chosen besides the best of their cell. Cells are numbered within their images.
 
-    Args:
-        scores: higher is better.
-        strong: whether a corner may be chosen besides the best of its cell.
-        cells: of the corners, within their images.
-        images: of the corners.
-        grid: cells and budgets.
-        num_images: in the batch.
-        count: largest number of corners per image.
-
-    Returns:
-        The chosen rows, and the place of each in its image's list, 0 ... count - 1, by falling score.
+    Returns the chosen rows, and the place of each in its image's list, 0 ... count - 1, by falling score.
     """
     num_cells, num_levels = grid.levels.shape[0], grid.budgets.shape[0]
     rows = _falling(scores)  # every rank below follows this order

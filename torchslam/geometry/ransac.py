@@ -216,8 +216,6 @@ def search(
         propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores
             (R,), the higher the better, and support (R,), the number of rows within SUPPORT_WIDTH thresholds.
         available: rows in use per problem.
-        size: of a minimal sample.
-        confidence: probability that some sample has no outlier.
         first_round: samples of the first round; every round draws twice as many as the one before.
         as_needed: draw no more than the support calls for, but at least as many as in the first round.
     """

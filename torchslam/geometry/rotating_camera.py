@@ -69,10 +69,8 @@ def fit_rotating_camera(
     from several focal lengths. Not differentiable by design: it serves a decision.
 
     Args:
-        camera: of both views, one.
-        std: relative standard deviation of its focal length, and of k1; above zero.
+        std: relative standard deviation of the focal length, and of k1; above zero.
         threshold: pixels, about the noise of one coordinate or somewhat more.
-        mask: matches in use.
         turns: rotation vectors by which the camera turns at each view, from there on, in the interval between two
             frames; without them the shutter is global.
     """
@@ -86,11 +84,8 @@ def fit_rotating_camera(
 
     def changed(change: Float[Tensor, "B 2"]) -> Camera:
         """The camera after a change of the logarithm of its focal length and of k1, in standard deviations."""
-        focal, others = (
-            given.params[:2] * factor(change),
-            given.params[2:] + directions[2:, 1] * change[:, 1:],
-        )
-        return given.with_params(torch.cat((focal, others), dim=-1))
+        others = given.params[2:] + directions[2:, 1] * change[:, 1:]
+        return given.with_params(torch.cat((given.params[:2] * factor(change), others), dim=-1))
 
     def image_points(
         R: Float[Tensor, "B 3 3"], at: Camera, readout: Float[Tensor, "B 1"]

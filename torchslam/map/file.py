@@ -67,9 +67,6 @@ def write_atlas(path: str | Path, submaps: Iterable[Submap], camera: Camera, ses
     """Write submaps and their camera atomically; equal submaps give equal bytes.
 
     Args:
-        path: The file to write.
-        submaps: All submaps, removed points included.
-        camera: The camera of all submaps.
         sessions: Number of sessions to keep; frames of later sessions, which were only localized, are left out.
     """
     write_tensors(path, *pack_submaps(submaps, camera, sessions))

@@ -177,17 +177,9 @@ class Map:
         covariances_w: Float[Tensor, "N 3 3"] | None = None,
         from_initialization: bool = False,
     ) -> Int[Tensor, " N"]:
-        """Add points that a keyframe created; `update_appearance` completes them once they are observed.
+        """Add points that a keyframe created, and return their rows; covariances are zero, or None, where unknown.
 
-        Args:
-            positions_w: Positions in map units.
-            descriptors: Of the keypoints.
-            keyframe: Row of the keyframe.
-            covariances_w: Of the positions, zero where unknown; None: all unknown.
-            from_initialization: Whether the two-view initialization created them.
-
-        Returns:
-            The rows of the points.
+        `update_appearance` completes the points once they are observed.
         """
         n, like = len(positions_w), positions_w
         frame_index = self.keyframes["frame_index"][keyframe].expand(n)

@@ -187,8 +187,6 @@ class PosedFrames:
         """Remove observations far from the current reprojection, since their point was merged or has moved.
 
         Args:
-            slam_map: the map.
-            sensor: of all frames.
             chi_square: squared error, in units of the stated noise, from which on an observation is far. By default,
                 twice the distance of the gate: the final adjustment moves frames by less.
             least_ratio: of its observations that must be near; else a frame keeps all, since its pose may be wrong.
@@ -293,9 +291,6 @@ class PosedFrames:
         keyframes observe.
 
         Args:
-            slam_map: the map.
-            sensor: of all frames.
-            submap: number of the submap.
             calibration: the given camera with its error; None: that of `sensor` is exact.
         """
         seen = slam_map.observations(as_detected=True)

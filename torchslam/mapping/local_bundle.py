@@ -102,8 +102,6 @@ def adjust_all(
     """Run a global bundle adjustment with the first keyframe fixed; return the camera of the adjusted map.
 
     Args:
-        slam_map: The map.
-        camera: The camera of all keyframes.
         progress: Called before each iteration; if it raises, the map stays as it was.
         calibration: The given camera with its error: the camera is adjusted as well; None: it is exact.
         tolerance: Predicted relative reduction of the cost that ends it.

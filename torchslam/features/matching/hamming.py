@@ -109,16 +109,9 @@ def hamming(
 def sign_products(
     descriptors_1: UInt8[Tensor, "*batch N1 D"], descriptors_2: UInt8[Tensor, "*batch N2 D"], amplitude: int
 ) -> Num[Tensor, "*batch N1 N2"]:
-    """Compute inner products of the bits as +-amplitude: amplitude^2 (bits - 2 distance).
+    """Compute inner products of packed bits as +-amplitude, at most 64: amplitude^2 (bits - 2 distance).
 
-    Args:
-        descriptors_1: packed bits.
-        descriptors_2: packed bits.
-        amplitude: at most 64.
-
-    Returns:
-        int32 if the processor multiplies int8 matrices quickly, else float32. Both are exact, because the sums stay
-        below 2^24.
+    Of the type of `int8_product`; exact, because the sums stay below 2^24.
     """
     signs_1, signs_2 = spread_bits(descriptors_1, amplitude), spread_bits(descriptors_2, amplitude)
     return int8_product(signs_1, signs_2.mT)
@@ -127,11 +120,7 @@ def sign_products(
 def int8_product(
     left: Int[Tensor, "*batch M K"], right: Int[Tensor, "*batch K N"]
 ) -> Num[Tensor, "*batch M N"]:
-    """Multiply int8 matrices.
-
-    Returns:
-        int32 where the processor multiplies these quickly, else float32, which is exact while no sum exceeds 2^24.
-    """
+    """Multiply int8 matrices: int32 where the processor is quick at it, else float32, exact for sums up to 2^24."""
     if int8_matmul is None or not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
         return left.float() @ right.float()
     batch = left.shape[:-2]
