@@ -9,14 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry import (
-    CHI_SQUARE_95,
-    KeypointNoise,
-    SensorModel,
-    passes_gate,
-    se3_inverse,
-    transform,
-)
+from torchslam.geometry import CHI_SQUARE_95, KeypointNoise, SensorModel, passes_gate, se3_inverse, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import frame_velocities, global_shutter_pixels
 from torchslam.map.map import Map, key_of

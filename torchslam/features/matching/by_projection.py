@@ -22,7 +22,6 @@ from torchslam.features.matching.brute_force import (
     masked_rows,
     one_to_one,
     pair_distances,
-    select_rows,
     to_matches,
 )
 from torchslam.features.matching.hamming import hamming_between
@@ -256,7 +255,7 @@ def match_by_projection(
 
     keypoint_scales = features.scales.detach().flatten()
     if scales is not None:
-        factor = select_rows(keypoint_scales, column) / select_rows(scales.detach().flatten(), row)
+        factor = keypoint_scales.index_select(0, column) / scales.detach().flatten().index_select(0, row)
         row, column = masked_rows((factor <= SCALE_TOLERANCE) & (factor * SCALE_TOLERANCE >= 1), row, column)
 
     pairs = descriptors.flatten(0, 1), row, features.descriptors.flatten(0, 1), column
