@@ -21,7 +21,7 @@ from torchslam.loop_closing.loop_closer import (
     fuse_with_earlier_visits,
     merge_maps,
 )
-from torchslam.loop_closing.loop_detector import LoopCandidate, RelativeSim3Estimator
+from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking.tracker import Tracker
 
@@ -39,7 +39,8 @@ def error(submap: Submap) -> float:
 
 
 def loop(submap: Submap) -> LoopCandidate:
-    S_21 = RelativeSim3Estimator(SharedCamera(CAMERA), CONFIG).estimate(submap.map, END, submap.map, 0)
+    detector = LoopCloser(SharedCamera(CAMERA), CONFIG, Atlas(CAMERA.params)).loop_detector
+    S_21 = detector.estimate(submap.map, END, submap.map, 0)
     assert S_21 is not None
     return LoopCandidate(submap, END, submap, 0, S_21)
 

@@ -37,7 +37,7 @@ def loop_detector(*held: Submap) -> LoopDetector:
         for keyframe in range(submap.map.num_keyframes):
             view = submap.map.frame_features(keyframe)
             database.add(submap.map.key(keyframe), view.descriptors, view.mask)
-    return LoopDetector(SharedCamera(CAMERA), Config(), atlas, database, None)
+    return LoopDetector(SharedCamera(CAMERA), Config(), atlas, database)
 
 
 def two_submaps(S_21: Tensor) -> tuple[Submap, Submap]:

@@ -14,14 +14,16 @@ from torchslam.config import Config
 from torchslam.geometry import SharedCamera, estimate_similarity, se3_inverse, transform
 from torchslam.geometry.similarity import Similarity
 from torchslam.loop_closing import loop_detector
-from torchslam.loop_closing.loop_detector import RelativeSim3Estimator
+from torchslam.loop_closing.keyframe_database import KeyframeDatabase
+from torchslam.loop_closing.loop_detector import LoopDetector
+from torchslam.map.atlas import Atlas
 from torchslam.map.map import Map
 
 SCENE = Scene.of(300)
 ROWS = rows_of(SCENE)
 ONE = sideways(4)
 OTHER = pose(0, 0, 0, 0.0, 0.05, 0.1) @ sideways(4, start=0.08)
-ESTIMATOR = RelativeSim3Estimator(SharedCamera(CAMERA), Config())
+DETECTOR = LoopDetector(SharedCamera(CAMERA), Config(), Atlas(CAMERA.params), KeyframeDatabase())
 TWO = 100  # first frame of the second map
 
 
@@ -32,7 +34,7 @@ def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
 
 
 def related(map_1: Map, map_2: Map) -> Tensor | None:
-    return ESTIMATOR.estimate(map_1, 2, map_2, 1)
+    return DETECTOR.estimate(map_1, 2, map_2, 1)
 
 
 def test_the_similarity_between_two_maps_is_estimated(S_21: Tensor) -> None:
@@ -133,13 +135,13 @@ def test_the_scale_is_that_of_most_depths(S_21: Tensor) -> None:
 def test_a_neighbor_verifies_a_similarity_that_predicts_its_points(S_21: Tensor) -> None:
     map_1, map_2 = maps(S_21)
     near = torch.arange(4)
-    assert ESTIMATOR.verify(S_21, map_1, 3, map_2, near)
+    assert DETECTOR.verify(S_21, map_1, 3, map_2, near)
     for wrong in (pose(0.5), pose(0, 0, 0, 0, 0.1), scaling_sim3(1.3)):
-        assert not ESTIMATOR.verify(wrong @ S_21, map_1, 3, map_2, near)
+        assert not DETECTOR.verify(wrong @ S_21, map_1, 3, map_2, near)
     thinned(map_2, in_both(map_1, map_2)[:20])
-    assert ESTIMATOR.verify(S_21, map_1, 3, map_2, near)
+    assert DETECTOR.verify(S_21, map_1, 3, map_2, near)
     thinned(map_2, in_both(map_1, map_2)[:19])
-    assert not ESTIMATOR.verify(S_21, map_1, 3, map_2, near)
+    assert not DETECTOR.verify(S_21, map_1, 3, map_2, near)
 
 
 @pytest.mark.parametrize(("offset", "agrees"), [(4.85, True), (4.95, False)])
@@ -148,8 +150,8 @@ def test_points_agree_within_twice_the_noise(S_21: Tensor, offset: float, agrees
     T_12 = moved(ONE[2], S_21)
     keypoints, scales = map_1.keyframes["keypoints"], map_1.keyframes["scales"]
     keypoints[2, :, 0] += offset * scales[2]
-    ids, _ = ESTIMATOR.match(map_2, map_2.valid_points(), T_12, map_1, 2)
-    good, at = ESTIMATOR.match_inliers(map_2, map_2.valid_points(), T_12, map_1, 2)
+    ids, _ = DETECTOR.match(map_2, map_2.valid_points(), T_12, map_1, 2)
+    good, at = DETECTOR.match_inliers(map_2, map_2.valid_points(), T_12, map_1, 2)
     assert len(ids) > 100
     assert (len(good) > 100) is agrees
     assert len(good) > 100 or len(good) < 0.1 * len(ids)  # a stray one is near another's place
@@ -162,7 +164,7 @@ def test_projected_points_are_searched_within_eight_pixels(S_21: Tensor) -> None
         map_1, map_2 = maps(S_21)
         map_1.keyframes["keypoints"][2, :, 0] += offset * map_1.keyframes["scales"][2]
         T_12 = moved(ONE[2], S_21)
-        ids, _ = ESTIMATOR.match(map_2, map_2.valid_points(), T_12, map_1, 2)
+        ids, _ = DETECTOR.match(map_2, map_2.valid_points(), T_12, map_1, 2)
         assert (len(ids) > 100) is found
 
 

@@ -70,14 +70,103 @@ _SAME_SCALE, _SAME_DEG, _SAME_SHARE = 1.2, 5.0, 0.1
 scene. Wide: lookalike places differ by meters and tens of degrees. Tried at these values only."""
 
 
-class RelativeSim3Estimator:
-    """Estimates and verifies the Sim(3) between two maps, which may be the same: then it is the drift of a loop."""
+@dataclass(frozen=True)
+class LoopCandidate:
+    """A verified match of a new keyframe with a recognized one of the same place, in the same submap or another.
 
-    def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher | None = None) -> None:
-        """Create the estimator; `matcher`: of two keyframes, by descriptors if None."""
+    S_21 is the Sim(3) from the submap, at the keyframe, to the matched submap.
+    """
+
+    submap: Submap
+    keyframe: int
+    matched_submap: Submap
+    matched_keyframe: int
+    S_21: Float[Tensor, "4 4"]
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether both are in the same submap."""
+        return self.submap is self.matched_submap
+
+    @property
+    def closure(self) -> LoopClosureRecord:
+        """The record of this candidate, independent of later changes of the map."""
+        frame = int(self.submap.map.keyframes["frame_index"][self.keyframe])
+        matched_frame = int(self.matched_submap.map.keyframes["frame_index"][self.matched_keyframe])
+        return LoopClosureRecord(frame, matched_frame, self.submap.number, self.matched_submap.number)
+
+
+@dataclass(frozen=True)
+class LoopClosureRecord:
+    """Record of a loop closure or map merge: frames of the new and the recognized keyframe, and their submaps."""
+
+    frame: int
+    matched_frame: int
+    submap: int
+    matched_submap: int
+
+
+class LoopDetector:
+    """Detects whether a new keyframe shows a known place, by the Sim(3) to a keyframe of it.
+
+    The two keyframes may be of one map: then the Sim(3) is the drift of a loop. `matcher`: of two keyframes, by
+    descriptors if None.
+    """
+
+    def __init__(
+        self,
+        camera: SharedCamera,
+        config: Config,
+        atlas: Atlas,
+        database: KeyframeDatabase,
+        matcher: Matcher | None = None,
+    ) -> None:
         self.camera, self.config = camera, config
+        self.atlas = atlas
+        self.keyframe_database = database
         self.guided_matcher = DescriptorMatcher(config.matching)
         self.matcher = matcher or self.guided_matcher
+
+    def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
+        """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
+        found = [
+            LoopCandidate(submap, keyframe, other, matched_keyframe, S_21)
+            for other, matched_keyframe in self._candidates(submap, keyframe)
+            if (S_21 := self._relation(submap, keyframe, other, matched_keyframe)) is not None
+        ]
+        if not found or any(not are_consistent(found[0], other) for other in found[1:]):
+            return None
+        return found[0]
+
+    def _candidates(self, submap: Submap, keyframe: int) -> Iterator[tuple[Submap, int]]:
+        """Keyframes that look like this one but share no points with it, the most similar first, one of each place."""
+        slam_map = submap.map
+        known = two_hop_covisible(slam_map, keyframe)
+        keys, _ = self.keyframe_database.query_by_key(slam_map.key(keyframe))
+        taken: list[tuple[Submap, Tensor]] = [(submap, known)]
+        for key in keys[: 4 * _MAX_CANDIDATES].tolist():
+            found = self.atlas.find(key)
+            if found is None or len(taken) > _MAX_CANDIDATES:
+                continue
+            other, matched_keyframe = found
+            if any(other is one and bool((near == matched_keyframe).any()) for one, near in taken):
+                continue
+            taken.append((other, other.map.neighborhood(matched_keyframe, _AROUND)))
+            yield other, matched_keyframe
+
+    def _relation(
+        self, submap: Submap, keyframe: int, other: Submap, matched_keyframe: int
+    ) -> Float[Tensor, "4 4"] | None:
+        """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
+        S_21 = self.estimate(submap.map, keyframe, other.map, matched_keyframe)
+        if S_21 is None:
+            return None
+        if submap is other and not is_plausible_drift(submap, keyframe, matched_keyframe, S_21):
+            return None
+        near = other.map.neighborhood(matched_keyframe, _AROUND)
+        covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
+        sure = sum(self.verify(S_21, submap.map, one, other.map, near) for one in covisible.tolist())
+        return S_21 if sure >= _MIN_VERIFYING else None
 
     def estimate(
         self, map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int
@@ -210,101 +299,6 @@ class RelativeSim3Estimator:
         return refined, passes_gate(
             noise.squared_reprojection(transform(refined, points_w), pixels, self.camera.current)
         )
-
-
-@dataclass(frozen=True)
-class LoopCandidate:
-    """A verified match of a new keyframe with a recognized one of the same place, in the same submap or another.
-
-    S_21 is the Sim(3) from the submap, at the keyframe, to the matched submap.
-    """
-
-    submap: Submap
-    keyframe: int
-    matched_submap: Submap
-    matched_keyframe: int
-    S_21: Float[Tensor, "4 4"]
-
-    @property
-    def is_loop(self) -> bool:
-        """Whether both are in the same submap."""
-        return self.submap is self.matched_submap
-
-    @property
-    def closure(self) -> LoopClosureRecord:
-        """The record of this candidate, independent of later changes of the map."""
-        frame = int(self.submap.map.keyframes["frame_index"][self.keyframe])
-        matched_frame = int(self.matched_submap.map.keyframes["frame_index"][self.matched_keyframe])
-        return LoopClosureRecord(frame, matched_frame, self.submap.number, self.matched_submap.number)
-
-
-@dataclass(frozen=True)
-class LoopClosureRecord:
-    """Record of a loop closure or map merge: frames of the new and the recognized keyframe, and their submaps."""
-
-    frame: int
-    matched_frame: int
-    submap: int
-    matched_submap: int
-
-
-class LoopDetector:
-    """Detects whether a new keyframe shows a known place."""
-
-    def __init__(
-        self,
-        camera: SharedCamera,
-        config: Config,
-        atlas: Atlas,
-        database: KeyframeDatabase,
-        matcher: Matcher | None,
-    ) -> None:
-        self.atlas = atlas
-        self.keyframe_database = database
-        self.estimator = RelativeSim3Estimator(camera, config, matcher)
-
-    def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
-        """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
-        found = [
-            LoopCandidate(submap, keyframe, other, matched_keyframe, S_21)
-            for other, matched_keyframe in self._candidates(submap, keyframe)
-            if (S_21 := self._relation(submap, keyframe, other, matched_keyframe)) is not None
-        ]
-        if not found or any(not are_consistent(found[0], other) for other in found[1:]):
-            return None
-        return found[0]
-
-    def _candidates(self, submap: Submap, keyframe: int) -> Iterator[tuple[Submap, int]]:
-        """Keyframes that look like this one but share no points with it, the most similar first, one of each place."""
-        slam_map = submap.map
-        known = two_hop_covisible(slam_map, keyframe)
-        keys, _ = self.keyframe_database.query_by_key(slam_map.key(keyframe))
-        taken: list[tuple[Submap, Tensor]] = [(submap, known)]
-        for key in keys[: 4 * _MAX_CANDIDATES].tolist():
-            found = self.atlas.find(key)
-            if found is None or len(taken) > _MAX_CANDIDATES:
-                continue
-            other, matched_keyframe = found
-            if any(other is one and bool((near == matched_keyframe).any()) for one, near in taken):
-                continue
-            taken.append((other, other.map.neighborhood(matched_keyframe, _AROUND)))
-            yield other, matched_keyframe
-
-    def _relation(
-        self, submap: Submap, keyframe: int, other: Submap, matched_keyframe: int
-    ) -> Float[Tensor, "4 4"] | None:
-        """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
-        S_21 = self.estimator.estimate(submap.map, keyframe, other.map, matched_keyframe)
-        if S_21 is None:
-            return None
-        if submap is other and not is_plausible_drift(submap, keyframe, matched_keyframe, S_21):
-            return None
-        near = other.map.neighborhood(matched_keyframe, _AROUND)
-        covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
-        sure = sum(
-            self.estimator.verify(S_21, submap.map, one, other.map, near) for one in covisible.tolist()
-        )
-        return S_21 if sure >= _MIN_VERIFYING else None
 
 
 def two_hop_covisible(slam_map: Map, keyframe: int) -> Int[Tensor, " R"]:
