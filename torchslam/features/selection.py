@@ -17,21 +17,17 @@ from torchslam.features.pyramid import PackedPyramid
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells over every level of a pyramid, less a border where no keypoint may lie.
+    """Cells over every level of a pyramid, less a border where no keypoint may lie."""
 
-    Attributes:
-        table: the cell of each pixel of the packed pyramid, -1 on the border and between levels.
-        floor: the FAST score that a corner must exceed there; 255 where none may lie.
-        rows: of the pyramid, runs (first, last + 1) of those in which there are cells.
-        levels: the level of each cell.
-        budgets: largest number of keypoints of each level.
-    """
-
-    table: Int[Tensor, " A"]
-    floor: UInt8[Tensor, " A"]
-    rows: tuple[tuple[int, int], ...]
-    levels: Int[Tensor, " N"]
-    budgets: Int[Tensor, " L"]
+    table: Int[
+        Tensor, " A"
+    ]  # the cell of each pixel of the packed pyramid, -1 on the border and between levels
+    floor: UInt8[Tensor, " A"]  # the FAST score that a corner must exceed there; 255 where none may lie
+    rows: tuple[
+        tuple[int, int], ...
+    ]  # of the pyramid, runs (first, last + 1) of those in which there are cells
+    levels: Int[Tensor, " N"]  # the level of each cell
+    budgets: Int[Tensor, " L"]  # largest number of keypoints of each level
 
 
 @lru_cache(maxsize=8)

@@ -18,7 +18,7 @@ from torchslam.geometry.estimate_gradients import (
 )
 from torchslam.geometry.lie import homogeneous, rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
-from torchslam.geometry.precision import full_precision
+from torchslam.geometry.precision import check_positive, full_precision
 from torchslam.geometry.projections import fit_projections, pose_tangent, squared_projections
 from torchslam.geometry.ransac import (
     CONFIDENCE,
@@ -46,7 +46,6 @@ FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are 
 CANDIDATES = 2  # hypotheses of each round that are optimized
 LOCAL_ITERATIONS, FINAL_ITERATIONS = 1, 10
 """Of a hypothesis within the search, which only ranks it, and of the final refinement. Tried at these values only."""
-_MAX_SAMPLES = 3000  # of three points, per camera
 FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without this refinement more runs are lost
 
 
@@ -77,7 +76,7 @@ def estimate_absolute_pose(
     mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
     confidence: float = CONFIDENCE,
-    max_samples: int = _MAX_SAMPLES,
+    max_samples: int = 3000,
 ) -> AbsolutePose:
     """Estimate poses of B cameras by RANSAC over P3P, with local optimization and a least-squares refinement.
 
@@ -151,7 +150,7 @@ def start_pose(
         T_cw, locally optimized on its inliers; None if wrong matches could agree as well, or if the inliers are on a
         line.
     """
-    check_search(threshold, CONFIDENCE, _MAX_SAMPLES)
+    check_positive(threshold=threshold)
     if len(points_w) < 4:
         return None
     center = points_w.mean(0)
@@ -159,7 +158,7 @@ def start_pose(
     mask = torch.ones_like(points[None, :, 0], dtype=torch.bool)
     scale = (undistorted.pixel_scale / threshold)[None, :, None]
     search_data = _Search.of(points[None], xy[None], scale, mask)
-    P = search_data.best_pose(seed, CONFIDENCE, _MAX_SAMPLES)
+    P = search_data.best_pose(seed, CONFIDENCE, 3000)
     P = search_data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
     inliers = search_data.squared_errors(P) < 1
     if not bool(_is_success(inliers, mask, search_data.points, size, threshold)):

@@ -34,11 +34,9 @@ only."""
 
 @dataclass(frozen=True)
 class RotatingCamera:
-    """Cameras that turned between two views.
+    """Cameras that turned between two views, by the rotation R_21.
 
     Attributes:
-        R_21: rotations from view 1 to view 2.
-        camera: the B cameras, each of both views.
         readout: time between the first and the last row of an image, in the unit of the turns.
         readout_std: its standard deviation if matches are known to the threshold; without turns, that of the prior.
         departure: of the focal length or of k1, whichever is larger, from the given one, in standard deviations.
