@@ -21,7 +21,7 @@ from torchslam.loop_closing.loop_closer import (
     fuse_with_earlier_visits,
     merge_maps,
 )
-from torchslam.loop_closing.loop_detector import LoopCandidate, RelativeSim3, RelativeSim3Estimator
+from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.tracking.tracker import Tracker
 
@@ -39,9 +39,10 @@ def error(submap: Submap) -> float:
 
 
 def loop(submap: Submap) -> LoopCandidate:
-    relation = RelativeSim3Estimator(SharedCamera(CAMERA), CONFIG).estimate(submap.map, END, submap.map, 0)
-    assert relation is not None
-    return LoopCandidate(submap, END, submap, 0, relation)
+    detector = LoopCloser(SharedCamera(CAMERA), CONFIG, Atlas(CAMERA.params)).loop_detector
+    S_21 = detector.estimate(submap.map, END, submap.map, 0)
+    assert S_21 is not None
+    return LoopCandidate(submap, END, submap, 0, S_21)
 
 
 def test_a_drifted_loop_is_closed() -> None:
@@ -66,7 +67,7 @@ def test_the_pose_graph_distributes_the_drift_along_the_loop() -> None:
     S_cw = essential_graph_solution(found)
     torch.testing.assert_close(S_cw[0], submap.map.T_cw[0])
     # the loop is closed: the end lies to the place as it was detected, but for what the other ties pull
-    wanted = submap.map.T_cw[END] @ sim3_inverse(found.relation.S_21) @ se3_inverse(submap.map.T_cw[0])
+    wanted = submap.map.T_cw[END] @ sim3_inverse(found.S_21) @ se3_inverse(submap.map.T_cw[0])
     closed = S_cw[END] @ sim3_inverse(S_cw[0])
     before = submap.map.T_cw[END] @ se3_inverse(submap.map.T_cw[0])
     assert float((closed - wanted).norm()) < 0.15 * float((before - wanted).norm())
@@ -100,9 +101,9 @@ def test_two_submaps_are_merged(S_21: Tensor, query: str) -> None:
     older = submap_of_scene(SCENE, sideways(4), number=0)
     newer = submap_of_scene(SCENE, OTHER, S_ws=S_21, first=100, number=1)
     if query == "newer":
-        found = LoopCandidate(newer, 3, older, 2, RelativeSim3(sim3_inverse(S_21), 0, 0, 0))
+        found = LoopCandidate(newer, 3, older, 2, sim3_inverse(S_21))
     else:
-        found = LoopCandidate(older, 3, newer, 2, RelativeSim3(S_21, 0, 0, 0))
+        found = LoopCandidate(older, 3, newer, 2, S_21)
     camera = newer if query == "newer" else older
     last = moved(camera.T_cw, sim3_inverse(S_21)) if query == "newer" else camera.T_cw.clone()
     submap, keyframe = merge_maps(found, CAMERA, CONFIG)

@@ -103,19 +103,6 @@ def test_covariances_are_stored_and_unknown_ones_are_kept(small_map: Map) -> Non
     torch.testing.assert_close(small_map.center_covariances_w()[1:], points)
 
 
-def test_covisibility_of_many_keyframes_equals_that_of_each(small_map: Map) -> None:
-    everyone = torch.arange(small_map.num_keyframes)
-    shared = small_map.covisibility_weights(everyone)
-    assert torch.equal(shared, shared.T)
-    assert not shared.diagonal().any()
-    for keyframe in everyone.tolist():
-        seen = small_map.observed_points(everyone[keyframe][None])
-        others = small_map.count_observed(seen)
-        others[keyframe] = 0
-        assert torch.equal(shared[keyframe], others)
-    assert int(shared.max()) > 0
-
-
 def test_the_local_map_unites_the_most_covisible_of_each() -> None:
     slam_map = submap_of_scene(Scene.of(200), sideways(8, step=0.3)).map
     keyframes = torch.tensor([6, 1])

@@ -12,7 +12,7 @@ from tests.scene import CAMERA, Scene, pose, sideways, submap_of_scene
 from tests.system.judging import Drive
 from tests.walks import Walk, arc
 from torchslam import SLAM, Config
-from torchslam.loop_closing.loop_detector import LoopCandidate, RelativeSim3
+from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.map.atlas import Submap
 from torchslam.map.compaction import RowRemap
 from torchslam.map.map import Map
@@ -128,7 +128,7 @@ def test_of_the_newest_keyframes_some_are_checked_for_loops(
 def test_the_search_ends_with_the_first_loop(monkeypatch: pytest.MonkeyPatch) -> None:
     recorded, checked, closed = Recorded(monkeypatch, is_pending=False), list[int](), list[LoopCandidate]()
     submap = recorded.slam._context.active_map.submap = submap_of_scene(SCENE, sideways(12, step=0.05))
-    found = LoopCandidate(submap, 7, submap, 0, RelativeSim3(pose(), 50, 50, 50))
+    found = LoopCandidate(submap, 7, submap, 0, pose())
 
     def detect(_: Submap, keyframe: int) -> LoopCandidate | None:
         checked.append(keyframe)
@@ -158,7 +158,7 @@ def test_after_a_loop_tracking_continues_at_the_newest_keyframe(monkeypatch: pyt
     submap = recorded.slam._context.active_map.submap = ring_submap(scale=1.01, twist=0.002)
     recorded.slam.tracker.reset_to_keyframe(submap, 3)
     T_before = submap.map.T_cw[END].clone()
-    recorded.maintenance._close(LoopCandidate(submap, END - 2, submap, 0, RelativeSim3(pose(), 50, 50, 50)))
+    recorded.maintenance._close(LoopCandidate(submap, END - 2, submap, 0, pose()))
     assert submap.tracking.reference == END
     torch.testing.assert_close(submap.T_cw, submap.map.T_cw[END])
     assert not torch.allclose(submap.T_cw, T_before)
@@ -174,7 +174,7 @@ def test_a_merge_confirms_a_provisional_map_and_takes_frames_that_are_held_along
     )
     atlas._submaps = [earlier, later]
     active.submap, active.provisional, active.doubted = later, Savepoint(later, 20), Savepoint(later, 2)
-    recorded.maintenance._close(LoopCandidate(later, 3, earlier, 3, RelativeSim3(pose(), 50, 50, 50)))
+    recorded.maintenance._close(LoopCandidate(later, 3, earlier, 3, pose()))
     assert active.provisional is None
     assert active.submap is earlier
     assert active.doubted is not None

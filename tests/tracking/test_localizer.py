@@ -72,7 +72,7 @@ def test_a_pose_elsewhere_in_the_map_uses_the_local_map_there(monkeypatch: pytes
     estimate = finder.locate(here.map, view, matches, here.tracking.local_points)
     assert estimate is not None
     torch.testing.assert_close(estimate.T_cw, T_cw, atol=1e-7, rtol=0)
-    near = finder.local_keyframes(here.map, int(here.map.count_observed(there[alive][:30]).argmax()))
+    near = here.map.neighborhood(int(here.map.count_observed(there[alive][:30]).argmax()), 1)
     assert near.tolist() == [0, 1]
     assert set(estimate.point_ids.tolist()) <= set(here.map.observed_points(near).tolist())
     assert estimate.inliers > 60

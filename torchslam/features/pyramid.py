@@ -20,19 +20,11 @@ MIN_SIDE = 40  # of a packed pyramid, so that every neighborhood fits whatever t
 
 @dataclass(frozen=True)
 class PackedPyramid:
-    """Layout of the levels of a pyramid in one rectangle, in pixels of that rectangle.
+    """Layout of the levels of a pyramid in one rectangle of `rows` times `stride` pixels."""
 
-    Attributes:
-        sizes: (height, width) of each level.
-        corners: (top, left) of each level.
-        scales: full-resolution pixels (x, y) per pixel of each level.
-        rows: height of the rectangle.
-        stride: width of the rectangle.
-    """
-
-    sizes: tuple[tuple[int, int], ...]
-    corners: tuple[tuple[int, int], ...]
-    scales: tuple[tuple[float, float], ...]
+    sizes: tuple[tuple[int, int], ...]  # (height, width) of each level
+    corners: tuple[tuple[int, int], ...]  # (top, left)
+    scales: tuple[tuple[float, float], ...]  # full-resolution pixels (x, y) per pixel
     rows: int
     stride: int
 

@@ -17,21 +17,17 @@ from torchslam.features.pyramid import PackedPyramid
 
 @dataclass(frozen=True)
 class Grid:
-    """Cells over every level of a pyramid, less a border where no keypoint may lie.
+    """Cells over every level of a pyramid, less a border where no keypoint may lie."""
 
-    Attributes:
-        table: the cell of each pixel of the packed pyramid, -1 on the border and between levels.
-        floor: the FAST score that a corner must exceed there; 255 where none may lie.
-        rows: of the pyramid, runs (first, last + 1) of those in which there are cells.
-        levels: the level of each cell.
-        budgets: largest number of keypoints of each level.
-    """
-
-    table: Int[Tensor, " A"]
-    floor: UInt8[Tensor, " A"]
-    rows: tuple[tuple[int, int], ...]
-    levels: Int[Tensor, " N"]
-    budgets: Int[Tensor, " L"]
+    table: Int[
+        Tensor, " A"
+    ]  # the cell of each pixel of the packed pyramid, -1 on the border and between levels
+    floor: UInt8[Tensor, " A"]  # the FAST score that a corner must exceed there; 255 where none may lie
+    rows: tuple[
+        tuple[int, int], ...
+    ]  # of the pyramid, runs (first, last + 1) of those in which there are cells
+    levels: Int[Tensor, " N"]  # the level of each cell
+    budgets: Int[Tensor, " L"]  # largest number of keypoints of each level
 
 
 @lru_cache(maxsize=8)
@@ -141,19 +137,10 @@ def select_evenly(
 ) -> tuple[Int[Tensor, " R"], Int[Tensor, " R"]]:
     """Choose up to `count` corners per image: the best of every cell first, then the strongest elsewhere.
 
-    Every level first takes its budget; what levels leave unused goes to the best remaining corners of any level.
+    Every level first takes its budget; what levels leave unused goes to the best remaining corners of any level. Only
+    corners that are `strong` may be chosen besides the best of their cell. Cells are numbered within their images.
 
-    Args:
-        scores: higher is better.
-        strong: whether a corner may be chosen besides the best of its cell.
-        cells: of the corners, within their images.
-        images: of the corners.
-        grid: cells and budgets.
-        num_images: in the batch.
-        count: largest number of corners per image.
-
-    Returns:
-        The chosen rows, and the place of each in its image's list, 0 ... count - 1, by falling score.
+    Returns the chosen rows, and the place of each in its image's list, 0 ... count - 1, by falling score.
     """
     num_cells, num_levels = grid.levels.shape[0], grid.budgets.shape[0]
     rows = _falling(scores)  # every rank below follows this order

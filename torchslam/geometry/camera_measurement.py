@@ -27,10 +27,9 @@ to 2 at the end of a run: until then, the recording has little weight. Tried at 
 
 @dataclass(frozen=True)
 class CameraMeasurement:
-    """A Gaussian on the parameters of a camera.
+    """A Gaussian on the parameters of a camera, which is the mean.
 
     Attributes:
-        camera: The mean.
         directions: Columns along which the parameters may be wrong, each by one standard deviation.
         observation_variance: Variance of an observation as far as it determines the camera, in units of the
             stated one. Where a bundle adjustment has observations with their stated weights, the information of the

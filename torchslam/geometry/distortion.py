@@ -27,25 +27,15 @@ derivative, two give three."""
 
 @dataclass(frozen=True)
 class Distortion:
-    """One model, as functions of undistorted coordinates xy and coefficients k.
+    """One model, as functions of undistorted coordinates xy and coefficients k."""
 
-    Attributes:
-        coefficients: names of the coefficients, in OpenCV's order.
-        distort: (xy, k) -> distorted coordinates (..., N, 2).
-        slope: (xy, k) -> d distorted / d xy (..., N, 2, 2).
-        coefficient_slope: (xy, k) -> d distorted / d k (..., N, 2, K).
-        undistort: (distorted, k, limit) -> xy.
-        limit: (k) -> up to which `coordinate` the map is monotone (...).
-        coordinate: undistorted radius -> what the limit limits.
-    """
-
-    coefficients: tuple[str, ...]
-    distort: Callable[[Tensor, Tensor], Tensor]
-    slope: Callable[[Tensor, Tensor], Tensor]
-    coefficient_slope: Callable[[Tensor, Tensor], Tensor]
-    undistort: Callable[[Tensor, Tensor, Tensor], Tensor]
-    limit: Callable[[Tensor], Tensor]
-    coordinate: Callable[[Tensor], Tensor]
+    coefficients: tuple[str, ...]  # names, in OpenCV's order
+    distort: Callable[[Tensor, Tensor], Tensor]  # (xy, k) -> distorted coordinates (..., N, 2)
+    slope: Callable[[Tensor, Tensor], Tensor]  # (xy, k) -> d distorted / d xy (..., N, 2, 2)
+    coefficient_slope: Callable[[Tensor, Tensor], Tensor]  # (xy, k) -> d distorted / d k (..., N, 2, K)
+    undistort: Callable[[Tensor, Tensor, Tensor], Tensor]  # (distorted, k, limit) -> xy
+    limit: Callable[[Tensor], Tensor]  # (k) -> up to which `coordinate` the map is monotone (...)
+    coordinate: Callable[[Tensor], Tensor]  # undistorted radius -> what the limit limits
 
 
 def first_positive_root(coefficients: Float[Tensor, "*batch D"]) -> Float[Tensor, "*batch"]:

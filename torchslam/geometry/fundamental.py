@@ -80,10 +80,7 @@ def refine_fundamental(
         F = (U[:, :, :2] * S[:, None, :2]) @ Vh[:, :2]
         F = F / torch.where(finite, F.flatten(1).norm(dim=1)[:, None, None], torch.nan)
         (F,), _ = levenberg_marquardt(
-            (F,),
-            lambda F: _normal_equations(F, x_1, x_2, mask, threshold),
-            moved,
-            _ITERATIONS,
+            (F,), lambda F: _normal_equations(F, x_1, x_2, mask, threshold), moved, _ITERATIONS
         )
         covariance, bend, noise = _uncertainty(F, x_1, x_2, mask, threshold)
     if needs_gradient(x_1, x_2):

@@ -50,13 +50,6 @@ def whitening(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 2 2"]:
     return torch.where(definite[..., None], W, 0.0)
 
 
-def times(
-    weights: Float[Tensor, "*batch N *matrix"], factors: Float[Tensor, "*batch N"]
-) -> Float[Tensor, "*batch N *matrix"]:
-    """Weights (..., N) or (..., N, 2, 2) times factors (..., N)."""
-    return weights * factors.view(*factors.shape, *(1,) * (weights.ndim - factors.ndim))
-
-
 CHI_SQUARE_95 = 5.991
 """95 % of a chi-square distribution of two degrees of freedom."""
 GATE_FACTOR = 2.0

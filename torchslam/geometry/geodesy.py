@@ -19,8 +19,6 @@ FLATTENING = 1 / 298.257223563
 """How much shorter the axis is than the equatorial diameter, relative (WGS84, by definition)."""
 ECCENTRICITY_SQUARED = FLATTENING * (2 - FLATTENING)
 """Of the ellipse through the poles."""
-BOWRING_STEPS = 3
-"""Steps of the fixed point for the latitude: one is right to a nanometer at the ground, three in orbits too."""
 
 
 @full_precision
@@ -48,7 +46,7 @@ def geodetic_from_ecef(ecef: Float[Tensor, "*batch 3"]) -> Float[Tensor, "*batch
     polar = 1 - FLATTENING  # the ratio of the axes
     second = ECCENTRICITY_SQUARED / (1 - ECCENTRICITY_SQUARED)
     reduced = torch.atan2(z, polar * distance)
-    for _ in range(BOWRING_STEPS):
+    for _ in range(3):  # one is right to a nanometer at the ground, three in orbits too
         latitude = torch.atan2(
             z + second * polar * SEMI_MAJOR * reduced.sin() ** 3,
             distance - ECCENTRICITY_SQUARED * SEMI_MAJOR * reduced.cos() ** 3,

@@ -18,16 +18,15 @@ from torch import Tensor
 
 from torchslam.geometry.precision import full_precision
 
-# Below this squared angle the coefficients come from their series, (-1)^k / (2k + n)! for n = 1, 2, 3, 4.
-_SERIES_LIMIT = 0.25
+# For small angles the coefficients come from their series, (-1)^k / (2k + n)! for n = 1, 2, 3, 4.
 _SERIES = tuple(tuple((-1.0) ** k / math.factorial(2 * k + n) for n in (1, 2, 3, 4)) for k in range(7))
-"""Seven terms: the next one is below the rounding of float64 at the limit."""
+"""Seven terms: the next one is below the rounding of float64 at a squared angle of 0.25."""
 
 
 def _rodrigues(angle_squared: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """sin(a)/a, (1 - cos a)/a^2, (a - sin a)/a^3, (cos a - 1 + a^2/2)/a^4 as smooth functions of a^2."""
     x = angle_squared[..., None]
-    small = x < _SERIES_LIMIT
+    small = x < 0.25
     near, far = torch.where(small, x, 0.0), torch.where(small, 1.0, x)
     coefficients = torch.tensor(_SERIES, dtype=x.dtype, device=x.device)
     series = coefficients[6] * near + coefficients[5]

@@ -51,16 +51,16 @@ def _frame(corners: Tensor) -> Tensor:
     return torch.stack((x, torch.linalg.cross(z, x, dim=0), z))
 
 
-# Of a symmetric matrix the entries 00, 01, 02, 11, 22, 12 are stored. Those of its adjugate are a b - c d: all a, then
-# all b, c and d.
-_ADJUGATE = (3, 2, 1, 0, 0, 1, 4, 5, 5, 4, 3, 2, 5, 1, 2, 2, 1, 0, 5, 4, 3, 2, 1, 5)
-
-
 @lru_cache(maxsize=4)
 def _tables(dtype: torch.dtype, device: torch.device) -> tuple[Tensor, Tensor]:
-    """`_ADJUGATE`, and how often each entry is in the full matrix (6, 1)."""
+    """The factors of the entries of an adjugate, and how often each entry is in the full matrix (6, 1).
+
+    Of a symmetric matrix the entries 00, 01, 02, 11, 22, 12 are stored. Those of its adjugate are a b - c d: all a,
+    then all b, c and d.
+    """
+    adjugate = (3, 2, 1, 0, 0, 1, 4, 5, 5, 4, 3, 2, 5, 1, 2, 2, 1, 0, 5, 4, 3, 2, 1, 5)
     times = torch.tensor((1, 2, 2, 1, 1, 2), dtype=dtype, device=device)
-    return torch.tensor(_ADJUGATE, device=device), times[:, None]
+    return torch.tensor(adjugate, device=device), times[:, None]
 
 
 def _depths(

@@ -134,7 +134,8 @@ class _Argument(NamedTuple):
     @classmethod
     def of(cls, name: str, hint: Any) -> _Argument | None:
         """The requirements of a type hint on tensors; None where it has none."""
-        options = [each for each in _alternatives(hint) if each is not NoneType]
+        alternatives = get_args(hint) if get_origin(hint) in (Union, UnionType) else (hint,)
+        options = [each for each in alternatives if each is not NoneType]
         arrays = [each for each in options if isinstance(each, type) and issubclass(each, AbstractArray)]
         classes = tuple(each for each in options if isinstance(each, type) and _is_record(each))
         holds = tuple(_fields(classes[0], name)) if classes else ()
@@ -142,15 +143,6 @@ class _Argument(NamedTuple):
             return None
         is_open = len(options) > len(arrays) + len(classes)
         return cls(name, tuple(_Form.of(each) for each in arrays), classes, holds, is_open)
-
-
-def _alternatives(hint: Any) -> Iterator[Any]:
-    """The members of unions, flat."""
-    if get_origin(hint) in (Union, UnionType):
-        for part in get_args(hint):
-            yield from _alternatives(part)
-    else:
-        yield hint
 
 
 def _is_record(cls: type) -> bool:

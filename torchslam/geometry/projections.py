@@ -36,17 +36,13 @@ def squared_projections(
 
 @dataclass(frozen=True)
 class Tangent:
-    """Derivatives and retraction of a mapping P (3, D) with T local parameters.
+    """Derivatives and retraction of a mapping P (3, D) with T local parameters."""
 
-    Attributes:
-        constant: the 3 (T + 1) D entries of T derivatives of P and of P itself, where P is zero.
-        linear: their derivatives with respect to the entries of P.
-        retract: (P,), step (B, T) -> (P,).
-    """
-
-    constant: Float[Tensor, " entries"]
-    linear: Float[Tensor, "_ entries"]
-    retract: Callable[[ModelState, Tensor], ModelState]
+    constant: Float[
+        Tensor, " entries"
+    ]  # the 3 (T + 1) D of T derivatives of P and of P itself, where P is zero
+    linear: Float[Tensor, "_ entries"]  # their derivatives with respect to the entries of P
+    retract: Callable[[ModelState, Tensor], ModelState]  # (P,), step (B, T) -> (P,)
 
     @staticmethod
     def of(

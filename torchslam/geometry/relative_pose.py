@@ -130,7 +130,6 @@ def estimate_relative_pose(
         camera_1: of the first view, one or B; `camera_2`: of the second one.
         threshold: pixels, about the noise of one coordinate or somewhat more, for matches of weight one.
         mask: matches in use; those with NaN are never used.
-        seed: of the random samples.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples of five matches.
         model: "auto", or "essential" to skip model selection.

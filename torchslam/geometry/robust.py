@@ -120,8 +120,6 @@ TAIL_SCALE = 4.0
 Their tails are those of Student's t with 2 to 2.5 degrees of freedom, of which Cauchy's kernel at the root of that is
 the negative logarithm. Final trajectories are as good or better from 2 on; with less than 3 their adjustment takes two
 to five times as many steps, and some get worse. With 5 the gain is a third smaller."""
-_MIN_VARIANCE, _MAX_VARIANCE = 1e-3, 4.0
-"""Of the stated one: exact pixels are rounded somewhere, and what is larger is not noise. No run came near either."""
 
 
 def middle_variance(squared: Float[Tensor, " O"], redundancy: float) -> float:
@@ -133,7 +131,8 @@ def middle_variance(squared: Float[Tensor, " O"], redundancy: float) -> float:
     if len(squared) == 0 or not redundancy > 0:
         return 1.0
     variance = float(median_scale(squared, NORMAL_SQUARED_MEDIAN_2D)) / redundancy
-    return min(max(variance, _MIN_VARIANCE), _MAX_VARIANCE)
+    # Exact pixels are rounded somewhere, and what is larger is not noise. No run came near either.
+    return min(max(variance, 1e-3), 4.0)
 
 
 def median_scale(

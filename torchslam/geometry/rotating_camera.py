@@ -34,11 +34,9 @@ only."""
 
 @dataclass(frozen=True)
 class RotatingCamera:
-    """Cameras that turned between two views.
+    """Cameras that turned between two views, by the rotation R_21.
 
     Attributes:
-        R_21: rotations from view 1 to view 2.
-        camera: the B cameras, each of both views.
         readout: time between the first and the last row of an image, in the unit of the turns.
         readout_std: its standard deviation if matches are known to the threshold; without turns, that of the prior.
         departure: of the focal length or of k1, whichever is larger, from the given one, in standard deviations.
@@ -69,10 +67,8 @@ def fit_rotating_camera(
     from several focal lengths. Not differentiable by design: it serves a decision.
 
     Args:
-        camera: of both views, one.
-        std: relative standard deviation of its focal length, and of k1; above zero.
+        std: relative standard deviation of the focal length, and of k1; above zero.
         threshold: pixels, about the noise of one coordinate or somewhat more.
-        mask: matches in use.
         turns: rotation vectors by which the camera turns at each view, from there on, in the interval between two
             frames; without them the shutter is global.
     """
@@ -86,11 +82,8 @@ def fit_rotating_camera(
 
     def changed(change: Float[Tensor, "B 2"]) -> Camera:
         """The camera after a change of the logarithm of its focal length and of k1, in standard deviations."""
-        focal, others = (
-            given.params[:2] * factor(change),
-            given.params[2:] + directions[2:, 1] * change[:, 1:],
-        )
-        return given.with_params(torch.cat((focal, others), dim=-1))
+        others = given.params[2:] + directions[2:, 1] * change[:, 1:]
+        return given.with_params(torch.cat((given.params[:2] * factor(change), others), dim=-1))
 
     def image_points(
         R: Float[Tensor, "B 3 3"], at: Camera, readout: Float[Tensor, "B 1"]

@@ -21,9 +21,6 @@ from torchslam.geometry.gating import KeypointNoise, whitening
 from torchslam.geometry.lie import homogeneous, se3_exp_transform
 from torchslam.geometry.rolling_shutter import Readout, row_fractions
 
-_NODES = 2**17  # of a table, at most: a node every two pixels of an image of 752 x 480
-_LEAST_STEP = 2.0  # pixels: the bend of a distortion over one pixel is some thousandths of one
-
 
 @dataclass(frozen=True)
 class UndistortedKeypoints:
@@ -103,9 +100,10 @@ class Undistortion:
 
     @cached_property
     def _step(self) -> Float[Tensor, ""]:
-        """Pixels from node to node, along x and y."""
+        """Pixels from node to node, along x and y: two, or more for a table of at most 2^17 nodes."""
         width, height = self.camera.size
-        return self.camera.params.new_tensor(max(_LEAST_STEP, math.sqrt(width * height / _NODES)))
+        # The bend of a distortion over one pixel is some thousandths of one.
+        return self.camera.params.new_tensor(max(2.0, math.sqrt(width * height / 2**17)))
 
     @cached_property
     def _size(self) -> Float[Tensor, "2 1"]:

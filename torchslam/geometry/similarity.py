@@ -139,9 +139,6 @@ def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 
     return so3_exp(first_order(omega - omega.detach())) @ R
 
 
-# 99 % of two-dimensional normal errors are smaller than this many standard deviations; and the relative standard
-# deviation of the depth of triangulated points, tried at this value only.
-_THRESHOLD, _DEPTH_SIGMA = 3.035, 0.1
 _LOCAL_ITERATIONS = 2
 """Of a hypothesis within the search, which only ranks it. Tried at this value only."""
 
@@ -174,8 +171,8 @@ def estimate_similarity(
     camera_2: Camera,
     sigmas_1: Float[Tensor, "B N"] | None = None,
     sigmas_2: Float[Tensor, "B N"] | None = None,
-    threshold: float = _THRESHOLD,
-    depth_sigma: float = _DEPTH_SIGMA,
+    threshold: float = 3.035,
+    depth_sigma: float = 0.1,
     mask: Bool[Tensor, "B N"] | None = None,
     seed: int = 0,
     with_scale: bool = True,
@@ -191,18 +188,15 @@ def estimate_similarity(
 
     Args:
         points_1: points in the coordinates of camera 1; `points_2`: the same ones in those of camera 2.
-        pixels_1: where camera 1 saw them.
-        pixels_2: where camera 2 saw them.
-        camera_1: one or B.
-        camera_2: one or B.
+        pixels_1: where camera 1 saw them; `pixels_2`: where camera 2 did.
+        camera_1: one or B, as `camera_2`.
         sigmas_1: standard deviations of `pixels_1`, pixels; None: one. `sigmas_2`: of `pixels_2`.
         threshold: reprojection error of an inlier in standard deviations, of the points of each camera in the other
-            image.
+            image; 99 % of two-dimensional normal errors are below 3.035.
         depth_sigma: relative standard deviation of the depths in camera 2. They determine the scale where both
             cameras are at one place, as in a loop closure, and pixels do not depend on it.
         mask: pairs in use; pairs that are not finite, behind their camera, or with a sigma not above zero
             are never used.
-        seed: of the random samples.
         with_scale: False fixes the scale to one.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples per pair of cameras.

@@ -23,7 +23,7 @@ from torch import Tensor
 from torchslam.geometry.estimate_gradients import implicit_step, needs_gradient
 from torchslam.geometry.fundamental import homography_share, refine_fundamental
 from torchslam.geometry.lie import homogeneous
-from torchslam.geometry.precision import check_dtypes, full_precision
+from torchslam.geometry.precision import full_precision
 from torchslam.geometry.robust import NORMAL_SQUARED_MEDIAN_2D, robustify, weighted_median
 from torchslam.geometry.two_view import tangent_basis
 
@@ -93,7 +93,6 @@ def focal_from_fundamentals(
     Returns:
         The focal length, with the gradient to F_21 and weights of the minimum, the noise level fixed.
     """
-    check_dtypes(F_21=F_21, principal_point=principal_point, weights=weights)
     F, weights = _scaled(F_21, principal_point, size, weights)
     F = F / F.flatten(1).norm(dim=1)[:, None, None]
     nothing = F.new_zeros(len(F), 9)
@@ -132,9 +131,6 @@ def focal_from_pairs(
     Returns:
         The focal length, with the gradient to the matches and weights of the minima, the noise fixed.
     """
-    check_dtypes(
-        F_21=F_21, pixels_1=pixels_1, pixels_2=pixels_2, principal_point=principal_point, weights=weights
-    )
     mask = mask & torch.isfinite(pixels_1).all(-1) & torch.isfinite(pixels_2).all(-1)
     x_1, x_2 = (
         (torch.where(mask[..., None], x.double(), 0.0) - principal_point.double()) / max(size)

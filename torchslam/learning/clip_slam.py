@@ -21,7 +21,6 @@ from torchslam.evaluation import MIN_POSES, ate
 from torchslam.features.contract import FixedKeypoints, check_features, check_gray
 from torchslam.features.kornia_modules import KorniaFeatures, is_kornia_module
 from torchslam.geometry import Camera, KeypointNoise, SensorModel
-from torchslam.geometry.gating import times
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.optim.run_graph import GraphSolution, RunGraph, solve_graphs
 from torchslam.system.online_run import finish
@@ -425,7 +424,8 @@ def _as_seen(
     weights = run.weights
     if features.information is not None:
         weights = KeypointNoise.of(features.scales[rows], features.information[rows]).weights.double()
-    weights = times(weights, keypoint_weights[rows])
+    factors = keypoint_weights[rows]
+    weights = weights * factors.view(*factors.shape, *(1,) * (weights.ndim - factors.ndim))
     pixels = features.keypoints[rows].double()
     moved = torch.linalg.vector_norm(pixels.detach() - run.pixels, dim=-1)
     jumped = int((moved > _MAX_MOTION_PX).sum())

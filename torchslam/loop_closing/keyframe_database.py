@@ -26,17 +26,13 @@ CODE_BITS = 64
 _CODE_NOISE = 9.0
 """Bits by which codes of one place differ: their similarity falls by exp(-(distance / _CODE_NOISE)^2).
 Tried at this value only."""
-_CODE_LIMIT = 19
-"""Bits by which codes differ that count as different: the similarity is 0.01 there."""
-# by experiments/vocabulary.py, from rendered images
-_WORDS_FILE = Path(__file__).parent / "words.safetensors"
 _SEED = 0  # of the choice of bits and of the projections of floats; part of what a saved state means
 
 
 @lru_cache(maxsize=4)
 def default_vocabulary(device: torch.device) -> UInt8[Tensor, "1024 32"]:
-    """The vocabulary of the package: centers of ORB descriptors of rendered images."""
-    return load_file(_WORDS_FILE)["words"].to(device)
+    """The vocabulary of the package: centers of ORB descriptors of rendered images (experiments/vocabulary.py)."""
+    return load_file(Path(__file__).with_name("words.safetensors"))["words"].to(device)
 
 
 def binarize(descriptors: UInt8[Tensor, "N 32"] | Float[Tensor, "N D"]) -> UInt8[Tensor, "N 32"]:
@@ -107,7 +103,7 @@ def code_similarity(
 def _kernel(device: torch.device) -> Float[Tensor, "65"]:
     """Similarity by Hamming distance."""
     distance = torch.arange(CODE_BITS + 1, dtype=torch.float64, device="cpu")
-    values = torch.exp(-((distance / _CODE_NOISE) ** 2)) * (distance <= _CODE_LIMIT)
+    values = torch.exp(-((distance / _CODE_NOISE) ** 2)) * (distance <= 19)  # 0.01 there
     return values.float().to(device)
 
 

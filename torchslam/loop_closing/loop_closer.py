@@ -15,7 +15,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, SharedCamera, se3_inverse, sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
-from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector, neighborhood
+from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
@@ -120,7 +120,7 @@ def essential_graph_solution(found: LoopCandidate) -> Float[Tensor, "K 4 4"]:
     measured = T_cw[edges[:, 1]] @ se3_inverse(T_cw[edges[:, 0]])
     # S_21 maps the frame of the keyframe to that of the matched one.
     T_wm = se3_inverse(T_cw[found.matched_keyframe])
-    S_km = T_cw[found.keyframe] @ sim3_inverse(found.relation.S_21) @ T_wm
+    S_km = T_cw[found.keyframe] @ sim3_inverse(found.S_21) @ T_wm
     relations = torch.cat([measured, S_km[None]])
     graph = PoseGraph(T_cw, torch.cat([edges, closing]), relations, fixed=(0,))
     return solve_pose_graph(
@@ -133,15 +133,15 @@ def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Su
 
     The tracking state stays that of the keyframe's submap.
     """
-    submap, other, relation = found.submap, found.matched_submap, found.relation
+    submap, other = found.submap, found.matched_submap
     if other.number < submap.number:
         offset = other.map.num_keyframes
-        other.merge(submap, relation.S_21)
+        other.merge(submap, found.S_21)
         fuse_and_adjust(other, found.keyframe + offset, found.matched_keyframe, camera, config)
         return other, found.keyframe + offset
     offset = submap.map.num_keyframes
     tracking = submap.tracking
-    submap.merge(other, sim3_inverse(relation.S_21))
+    submap.merge(other, sim3_inverse(found.S_21))
     submap.tracking = tracking
     fuse_and_adjust(submap, found.keyframe, found.matched_keyframe + offset, camera, config)
     return submap, found.keyframe
@@ -154,8 +154,8 @@ def fuse_and_adjust(
 
     Before the first adjustment some points are too far from their keypoints to be matched.
     """
-    here = neighborhood(submap.map, keyframe, _VISIT_KEYFRAMES)
-    there = neighborhood(submap.map, matched_keyframe, _VISIT_KEYFRAMES)
+    here = submap.map.neighborhood(keyframe, _VISIT_KEYFRAMES)
+    there = submap.map.neighborhood(matched_keyframe, _VISIT_KEYFRAMES)
     fuse_landmarks(submap.map, here, there, camera, config)
     if not config.paper.unrefined:
         adjust_all(submap.map, camera)

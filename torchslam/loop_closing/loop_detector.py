@@ -19,14 +19,13 @@ from torchslam.geometry import (
     SharedCamera,
     estimate_similarity,
     passes_gate,
-    rigid,
     se3_inverse,
     sim3_inverse,
     sim3_scale,
     transform,
 )
 from torchslam.geometry.ransac import samples_needed
-from torchslam.geometry.transforms import rotation_angle
+from torchslam.geometry.transforms import rotation_angle, without_scale
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
@@ -72,30 +71,111 @@ scene. Wide: lookalike places differ by meters and tens of degrees. Tried at the
 
 
 @dataclass(frozen=True)
-class RelativeSim3:
-    """Sim(3) between two maps, estimated from a keyframe of each."""
+class LoopCandidate:
+    """A verified match of a new keyframe with a recognized one of the same place, in the same submap or another.
 
-    S_21: Float[Tensor, "4 4"]  # from the frame of map 1 to that of map 2
-    inliers_1: int  # points of map 2 that keyframe 1 observes where the Sim(3) predicts them
-    inliers_2: int  # points of map 1 that keyframe 2 observes where the Sim(3) predicts them
-    shared_points: int  # that keyframe 1 observes and that both maps have: they give the scale
+    S_21 is the Sim(3) from the submap, at the keyframe, to the matched submap.
+    """
+
+    submap: Submap
+    keyframe: int
+    matched_submap: Submap
+    matched_keyframe: int
+    S_21: Float[Tensor, "4 4"]
+
+    @property
+    def is_loop(self) -> bool:
+        """Whether both are in the same submap."""
+        return self.submap is self.matched_submap
+
+    @property
+    def closure(self) -> LoopClosureRecord:
+        """The record of this candidate, independent of later changes of the map."""
+        frame = int(self.submap.map.keyframes["frame_index"][self.keyframe])
+        matched_frame = int(self.matched_submap.map.keyframes["frame_index"][self.matched_keyframe])
+        return LoopClosureRecord(frame, matched_frame, self.submap.number, self.matched_submap.number)
 
 
-class RelativeSim3Estimator:
-    """Estimates and verifies the Sim(3) between two maps, which may be the same: then it is the drift of a loop."""
+@dataclass(frozen=True)
+class LoopClosureRecord:
+    """Record of a loop closure or map merge: frames of the new and the recognized keyframe, and their submaps."""
 
-    def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher | None = None) -> None:
-        """Create the estimator; `matcher`: of two keyframes, by descriptors if None."""
+    frame: int
+    matched_frame: int
+    submap: int
+    matched_submap: int
+
+
+class LoopDetector:
+    """Detects whether a new keyframe shows a known place, by the Sim(3) to a keyframe of it.
+
+    The two keyframes may be of one map: then the Sim(3) is the drift of a loop. `matcher`: of two keyframes, by
+    descriptors if None.
+    """
+
+    def __init__(
+        self,
+        camera: SharedCamera,
+        config: Config,
+        atlas: Atlas,
+        database: KeyframeDatabase,
+        matcher: Matcher | None = None,
+    ) -> None:
         self.camera, self.config = camera, config
+        self.atlas = atlas
+        self.keyframe_database = database
         self.guided_matcher = DescriptorMatcher(config.matching)
         self.matcher = matcher or self.guided_matcher
 
-    def estimate(self, map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int) -> RelativeSim3 | None:
-        """Estimate the Sim(3) between two maps from a keyframe of each; None if it is not certain."""
+    def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
+        """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
+        found = [
+            LoopCandidate(submap, keyframe, other, matched_keyframe, S_21)
+            for other, matched_keyframe in self._candidates(submap, keyframe)
+            if (S_21 := self._relation(submap, keyframe, other, matched_keyframe)) is not None
+        ]
+        if not found or any(not are_consistent(found[0], other) for other in found[1:]):
+            return None
+        return found[0]
+
+    def _candidates(self, submap: Submap, keyframe: int) -> Iterator[tuple[Submap, int]]:
+        """Keyframes that look like this one but share no points with it, the most similar first, one of each place."""
+        slam_map = submap.map
+        known = two_hop_covisible(slam_map, keyframe)
+        keys, _ = self.keyframe_database.query_by_key(slam_map.key(keyframe))
+        taken: list[tuple[Submap, Tensor]] = [(submap, known)]
+        for key in keys[: 4 * _MAX_CANDIDATES].tolist():
+            found = self.atlas.find(key)
+            if found is None or len(taken) > _MAX_CANDIDATES:
+                continue
+            other, matched_keyframe = found
+            if any(other is one and bool((near == matched_keyframe).any()) for one, near in taken):
+                continue
+            taken.append((other, other.map.neighborhood(matched_keyframe, _AROUND)))
+            yield other, matched_keyframe
+
+    def _relation(
+        self, submap: Submap, keyframe: int, other: Submap, matched_keyframe: int
+    ) -> Float[Tensor, "4 4"] | None:
+        """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
+        S_21 = self.estimate(submap.map, keyframe, other.map, matched_keyframe)
+        if S_21 is None:
+            return None
+        if submap is other and not is_plausible_drift(submap, keyframe, matched_keyframe, S_21):
+            return None
+        near = other.map.neighborhood(matched_keyframe, _AROUND)
+        covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
+        sure = sum(self.verify(S_21, submap.map, one, other.map, near) for one in covisible.tolist())
+        return S_21 if sure >= _MIN_VERIFYING else None
+
+    def estimate(
+        self, map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int
+    ) -> Float[Tensor, "4 4"] | None:
+        """Estimate the Sim(3) S_21 from map 1 to map 2 by a keyframe of each; None if it is not certain."""
         T_12 = self._first_guess(map_1, keyframe_1, map_2, keyframe_2)
         if T_12 is None:
             return None
-        points_2 = map_2.observed_points(neighborhood(map_2, keyframe_2))
+        points_2 = map_2.observed_points(map_2.neighborhood(keyframe_2, _AROUND))
         ids, keypoints = self.match(map_2, points_2, T_12, map_1, keyframe_1)
         if len(ids) < _MIN_MATCHES:
             return None
@@ -103,8 +183,7 @@ class RelativeSim3Estimator:
         ids, keypoints = ids[agrees], keypoints[agrees]
         own = map_1.keyframes["point_ids"][keyframe_1][keypoints]
         is_shared = own >= 0
-        shared = int(is_shared.sum())
-        if len(ids) < _MIN_MATCHES or shared < _MIN_SHARED:
+        if len(ids) < _MIN_MATCHES or int(is_shared.sum()) < _MIN_SHARED:
             return None
         # One pose has no scale, but the depths of points that both maps have do.
         T_11 = map_1.T_cw[keyframe_1]
@@ -113,18 +192,16 @@ class RelativeSim3Estimator:
         S_2c = se3_inverse(T_12)
         S_2c[:, :3] *= (depth_2 / depth_1).median()
         S_21 = S_2c @ T_11
-        points_1 = map_1.observed_points(neighborhood(map_1, keyframe_1))
-        T_21 = transfer_pose(map_2.T_cw[keyframe_2], S_21)
+        points_1 = map_1.observed_points(map_1.neighborhood(keyframe_1, _AROUND))
+        T_21 = without_scale(map_2.T_cw[keyframe_2] @ S_21)
         back, _ = self.match_inliers(map_1, points_1, T_21, map_2, keyframe_2)
-        if len(back) < _MIN_MATCHES // 2:
-            return None
-        return RelativeSim3(S_21, len(ids), len(back), shared)
+        return S_21 if len(back) >= _MIN_MATCHES // 2 else None
 
     def verify(
-        self, relation: RelativeSim3, map_1: Map, other: int, map_2: Map, near_2: Int[Tensor, " K"]
+        self, S_21: Float[Tensor, "4 4"], map_1: Map, other: int, map_2: Map, near_2: Int[Tensor, " K"]
     ) -> bool:
         """Whether another keyframe of map 1 observes points of keyframes of map 2 where the Sim(3) predicts them."""
-        T_o2 = transfer_pose(map_1.T_cw[other], sim3_inverse(relation.S_21))
+        T_o2 = without_scale(map_1.T_cw[other] @ sim3_inverse(S_21))
         ids, _ = self.match_inliers(map_2, map_2.observed_points(near_2), T_o2, map_1, other)
         return len(ids) >= _MIN_MATCHES // 2
 
@@ -195,8 +272,7 @@ class RelativeSim3Estimator:
         )
         if not bool(found.success[0]) or int(found.inliers[0].sum()) < _NEEDED:
             return None
-        eye = torch.eye(4, dtype=T_1.dtype, device=T_1.device)
-        return transfer_pose(eye, sim3_inverse(found.S_21[0]) @ T_2)
+        return without_scale(sim3_inverse(found.S_21[0]) @ T_2)
 
     def _refined(
         self,
@@ -225,117 +301,6 @@ class RelativeSim3Estimator:
         )
 
 
-def neighborhood(slam_map: Map, keyframe: int, count: int = _AROUND) -> Int[Tensor, " R"]:
-    """Return a keyframe and the `count` most covisible ones."""
-    near = slam_map.covisible_keyframes(keyframe, count)
-    return torch.cat([near.new_tensor([keyframe]), near])
-
-
-def transfer_pose(T_cw: Float[Tensor, "4 4"], S_wv: Float[Tensor, "4 4"]) -> Float[Tensor, "4 4"]:
-    """Return the pose T_cv in world v of a camera at T_cw in world w; S_wv: Sim(3) from v to w.
-
-    The scale is left out, as it has no effect on projections.
-    """
-    S_cv = T_cw @ S_wv
-    scale = sim3_scale(S_cv)
-    return rigid(S_cv[:3, :3] / scale, S_cv[:3, 3] / scale)
-
-
-@dataclass(frozen=True)
-class LoopCandidate:
-    """A verified match of a new keyframe with a recognized one of the same place, in the same submap or another.
-
-    The relation is the Sim(3) from the submap, at the keyframe, to the matched submap.
-    """
-
-    submap: Submap
-    keyframe: int
-    matched_submap: Submap
-    matched_keyframe: int
-    relation: RelativeSim3
-
-    @property
-    def is_loop(self) -> bool:
-        """Whether both are in the same submap."""
-        return self.submap is self.matched_submap
-
-    @property
-    def closure(self) -> LoopClosureRecord:
-        """The record of this candidate, independent of later changes of the map."""
-        frame = int(self.submap.map.keyframes["frame_index"][self.keyframe])
-        matched_frame = int(self.matched_submap.map.keyframes["frame_index"][self.matched_keyframe])
-        return LoopClosureRecord(frame, matched_frame, self.submap.number, self.matched_submap.number)
-
-
-@dataclass(frozen=True)
-class LoopClosureRecord:
-    """Record of a loop closure or map merge: frames of the new and the recognized keyframe, and their submaps."""
-
-    frame: int
-    matched_frame: int
-    submap: int
-    matched_submap: int
-
-
-class LoopDetector:
-    """Detects whether a new keyframe shows a known place."""
-
-    def __init__(
-        self,
-        camera: SharedCamera,
-        config: Config,
-        atlas: Atlas,
-        database: KeyframeDatabase,
-        matcher: Matcher | None,
-    ) -> None:
-        self.atlas = atlas
-        self.keyframe_database = database
-        self.estimator = RelativeSim3Estimator(camera, config, matcher)
-
-    def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
-        """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
-        found = [
-            LoopCandidate(submap, keyframe, other, matched_keyframe, relation)
-            for other, matched_keyframe in self._candidates(submap, keyframe)
-            if (relation := self._relation(submap, keyframe, other, matched_keyframe)) is not None
-        ]
-        if not found or any(not are_consistent(found[0], other) for other in found[1:]):
-            return None
-        return found[0]
-
-    def _candidates(self, submap: Submap, keyframe: int) -> Iterator[tuple[Submap, int]]:
-        """Keyframes that look like this one but share no points with it, the most similar first, one of each place."""
-        slam_map = submap.map
-        known = two_hop_covisible(slam_map, keyframe)
-        keys, _ = self.keyframe_database.query_by_key(slam_map.key(keyframe))
-        taken: list[tuple[Submap, Tensor]] = [(submap, known)]
-        for key in keys[: 4 * _MAX_CANDIDATES].tolist():
-            found = self.atlas.find(key)
-            if found is None or len(taken) > _MAX_CANDIDATES:
-                continue
-            other, matched_keyframe = found
-            if any(other is one and bool((near == matched_keyframe).any()) for one, near in taken):
-                continue
-            taken.append((other, neighborhood(other.map, matched_keyframe)))
-            yield other, matched_keyframe
-
-    def _relation(
-        self, submap: Submap, keyframe: int, other: Submap, matched_keyframe: int
-    ) -> RelativeSim3 | None:
-        """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
-        relation = self.estimator.estimate(submap.map, keyframe, other.map, matched_keyframe)
-        if relation is None:
-            return None
-        if submap is other and not is_plausible_drift(submap, keyframe, matched_keyframe, relation):
-            return None
-        near = neighborhood(other.map, matched_keyframe)
-        covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
-        sure = sum(
-            self.estimator.verify(relation, submap.map, one, other.map, near) for one in covisible.tolist()
-        )
-        return relation if sure >= _MIN_VERIFYING else None
-
-
 def two_hop_covisible(slam_map: Map, keyframe: int) -> Int[Tensor, " R"]:
     """Return a keyframe, those that share points with it, and those that share many with the first of these."""
     near = slam_map.covisible_keyframes(keyframe, slam_map.num_keyframes, min_shared=1)
@@ -343,7 +308,7 @@ def two_hop_covisible(slam_map: Map, keyframe: int) -> Int[Tensor, " R"]:
     return torch.unique(torch.cat([near.new_tensor([keyframe]), near, further]))
 
 
-def is_plausible_drift(submap: Submap, keyframe: int, matched_keyframe: int, relation: RelativeSim3) -> bool:
+def is_plausible_drift(submap: Submap, keyframe: int, matched_keyframe: int, S: Float[Tensor, "4 4"]) -> bool:
     """Whether drift along the path between two keyframes can explain the Sim(3) of a loop.
 
     The Sim(3) between places that only look alike is mostly larger. The path is that of the keyframes between the two,
@@ -356,7 +321,6 @@ def is_plausible_drift(submap: Submap, keyframe: int, matched_keyframe: int, rel
     centers_w = se3_inverse(slam_map.T_cw[order[start : end + 1]])[:, :3, 3]
     length = float(torch.linalg.vector_norm(centers_w.diff(dim=0), dim=-1).sum())
     here = se3_inverse(slam_map.T_cw[keyframe])[:3, 3]
-    S = relation.S_21
     scale = float(sim3_scale(S))
     moved = float(torch.linalg.vector_norm(S[:3, :3] @ here + S[:3, 3] - here))
     turned = float(torch.rad2deg(rotation_angle(S[:3, :3] / scale)))
@@ -372,7 +336,7 @@ def are_consistent(one: LoopCandidate, other: LoopCandidate) -> bool:
     target = one.matched_submap.map
     if one.matched_submap is not other.matched_submap:
         return True
-    S, Z = one.relation.S_21, other.relation.S_21
+    S, Z = one.S_21, other.S_21
     scale, second = sim3_scale(S), sim3_scale(Z)
     turned = torch.rad2deg(rotation_angle(S[:3, :3] / scale @ (Z[:3, :3] / second).mT))
     camera_1 = se3_inverse(one.submap.map.T_cw[one.keyframe])[:3, 3]

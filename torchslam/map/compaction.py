@@ -21,17 +21,11 @@ _MAX_REWRITTEN = 64  # rows of frame observations that may be rewritten per row 
 
 @dataclass(frozen=True)
 class RowRemap:
-    """The new rows after a removal.
+    """The new rows after a removal."""
 
-    Attributes:
-        keyframes: New row of every old keyframe; -1 if removed.
-        points: New row of every old point; -1 if removed.
-        replacement: New row of the keyframe that replaces a removed one; its own for the others.
-    """
-
-    keyframes: Int[Tensor, " K"]
-    points: Int[Tensor, " L"]
-    replacement: Int[Tensor, " K"]
+    keyframes: Int[Tensor, " K"]  # of every old keyframe; -1 if removed
+    points: Int[Tensor, " L"]  # of every old point; -1 if removed
+    replacement: Int[Tensor, " K"]  # of the keyframe that replaces a removed one; its own for the others
 
     def then(self, later: RowRemap) -> RowRemap:
         """Return the new rows after a later removal as well."""

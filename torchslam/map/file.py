@@ -40,7 +40,6 @@ MAX_BYTES = 1 << 34  # of a map of 100,000 keyframes
 MAX_PIXELS = 1 << 26  # of the images; readers of images take no more
 MAX_LENGTH = 1e12
 """Of a position in map units and of a pixel's coordinate: products of a few of them stay finite."""
-MAX_SKEW = 1e-3  # of a rotation: largest entry of R^T R - I
 
 Columns = dict[str, dict[str, Tensor]]
 """Columns by table and name; none if a table is empty."""
@@ -68,9 +67,6 @@ def write_atlas(path: str | Path, submaps: Iterable[Submap], camera: Camera, ses
     """Write submaps and their camera atomically; equal submaps give equal bytes.
 
     Args:
-        path: The file to write.
-        submaps: All submaps, removed points included.
-        camera: The camera of all submaps.
         sessions: Number of sessions to keep; frames of later sessions, which were only localized, are left out.
     """
     write_tensors(path, *pack_submaps(submaps, camera, sessions))
@@ -304,7 +300,7 @@ def _check_numbers(name: str, rows: Tensor) -> None:
     if name in _POSES:
         R, last = rows[:, :3, :3], rows.new_tensor([0.0, 0.0, 0.0, 1.0])
         skew = (R.mT @ R - torch.eye(3, dtype=R.dtype, device="cpu")).abs()
-        if not bool((skew <= MAX_SKEW).all()) or not bool((rows[:, 3] == last).all()):
+        if not bool((skew <= 1e-3).all()) or not bool((rows[:, 3] == last).all()):
             raise ValueError(f"{name}: not rigid transforms")
     lengths = rows[:, :3, 3] if name in _POSES else rows
     if name in (*_POSES, *_LENGTHS) and not bool((lengths.abs() <= MAX_LENGTH).all()):

@@ -177,17 +177,9 @@ class Map:
         covariances_w: Float[Tensor, "N 3 3"] | None = None,
         from_initialization: bool = False,
     ) -> Int[Tensor, " N"]:
-        """Add points that a keyframe created; `update_appearance` completes them once they are observed.
+        """Add points that a keyframe created, and return their rows; covariances are zero, or None, where unknown.
 
-        Args:
-            positions_w: Positions in map units.
-            descriptors: Of the keypoints.
-            keyframe: Row of the keyframe.
-            covariances_w: Of the positions, zero where unknown; None: all unknown.
-            from_initialization: Whether the two-view initialization created them.
-
-        Returns:
-            The rows of the points.
+        `update_appearance` completes the points once they are observed.
         """
         n, like = len(positions_w), positions_w
         frame_index = self.keyframes["frame_index"][keyframe].expand(n)
@@ -303,24 +295,28 @@ class Map:
             **columns,
         )
 
-    def covisibility_weights(self, keyframes: Int[Tensor, " B"]) -> Int[Tensor, "B K"]:
-        """Count the points that keyframes share with every other keyframe; 0 with itself."""
-        table, count = self.keyframes["point_ids"][keyframes], self.num_keyframes
+    def neighborhood(self, keyframe: int, count: int) -> Int[Tensor, " R"]:
+        """Return a keyframe and the at most `count` most covisible ones."""
+        near = self.covisible_keyframes(keyframe, count)
+        return torch.cat([near.new_tensor([keyframe]), near])
+
+    def covisibility_union(self, keyframes: Int[Tensor, " B"], count: int) -> Int[Tensor, " R"]:
+        """Return keyframes and the at most `count` most covisible ones of each, ascending."""
+        table = self.keyframes["point_ids"][keyframes]
         ids = torch.nonzero(torch.bincount(table[table >= 0]))[:, 0]
         which, slots = self._index_of_points.observations_of(ids)
         observers = slots // self._keypoints
-        takes_part = torch.bincount(observers, minlength=count) > 0
+        takes_part = torch.bincount(observers, minlength=self.num_keyframes) > 0
         takes_part[keyframes] = True
         columns, column = torch.nonzero(takes_part)[:, 0], takes_part.cumsum(0) - 1
-        width = len(columns)
+        own, width = column[keyframes], len(columns)
         cells = which * width + column[observers]
         sees = torch.bincount(cells, minlength=len(ids) * width).view(len(ids), width).float()
-        shared = (sees[:, column[keyframes]].T @ sees).long()  # exact: far below 2**24
-        return (
-            shared.new_zeros(len(keyframes), count)
-            .index_copy_(1, columns, shared)
-            .scatter_(1, keyframes[:, None], 0)
-        )
+        shared = (sees[:, own].T @ sees).long().scatter_(1, own[:, None], 0)  # exact: far below 2**24
+        enough = torch.nonzero((shared >= MIN_SHARED).any(0))[:, 0]
+        ranked = torch.sort(shared[:, enough], dim=1, descending=True, stable=True)
+        is_near = ranked.values[:, :count] >= MIN_SHARED
+        return torch.unique(torch.cat([keyframes, columns[enough][ranked.indices[:, :count][is_near]]]))
 
     def covisible_keyframes(
         self, keyframe: int, count: int, min_shared: int = MIN_SHARED
@@ -330,14 +326,6 @@ class Map:
         shared = self.count_observed(row[row >= 0])
         shared[keyframe] = 0
         return top_rows(shared, count, min_shared)
-
-    def covisibility_union(self, keyframes: Int[Tensor, " B"], count: int) -> Int[Tensor, " R"]:
-        """Return keyframes and the at most `count` most covisible ones of each, ascending."""
-        shared = self.covisibility_weights(keyframes)
-        columns = torch.nonzero((shared >= MIN_SHARED).any(0))[:, 0]
-        ranked = torch.sort(shared[:, columns], dim=1, descending=True, stable=True)
-        is_near = ranked.values[:, :count] >= MIN_SHARED
-        return torch.unique(torch.cat([keyframes, columns[ranked.indices[:, :count][is_near]]]))
 
     def observation_mask(
         self, keyframes: Int[Tensor, " B"], point_ids: Int[Tensor, " N"]

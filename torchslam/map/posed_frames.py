@@ -9,25 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry import (
-    CHI_SQUARE_95,
-    KeypointNoise,
-    SensorModel,
-    passes_gate,
-    se3_inverse,
-    transform,
-)
+from torchslam.geometry import CHI_SQUARE_95, KeypointNoise, SensorModel, passes_gate, se3_inverse, transform
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import frame_velocities, global_shutter_pixels
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
 from torchslam.types import FrameFeatures, PoseEstimate, Trajectory
-
-# Twice the distance of the gate: the final adjustment moves frames by less.
-_OUTLIER_CHI_SQUARE = 4.0 * CHI_SQUARE_95
-_MIN_INLIER_RATIO = 0.75  # of a frame's observations, to remove the others
-_CHUNK = 1 << 16  # observations that are checked at once, to bound memory
 
 
 class PosedFrames:
@@ -186,20 +174,19 @@ class PosedFrames:
         self,
         slam_map: Map,
         sensor: SensorModel,
-        chi_square: float = _OUTLIER_CHI_SQUARE,
-        least_ratio: float = _MIN_INLIER_RATIO,
+        chi_square: float = 4.0 * CHI_SQUARE_95,
+        least_ratio: float = 0.75,
     ) -> None:
         """Remove observations far from the current reprojection, since their point was merged or has moved.
 
         Args:
-            slam_map: the map.
-            sensor: of all frames.
-            chi_square: squared error, in units of the stated noise, from which on an observation is far.
+            chi_square: squared error, in units of the stated noise, from which on an observation is far. By default,
+                twice the distance of the gate: the final adjustment moves frames by less.
             least_ratio: of its observations that must be near; else a frame keeps all, since its pose may be wrong.
         """
         T_cw, seen_by = self.T_cw(slam_map), self.observations["frame_row"]
         velocities = None if sensor.readout is None else self._velocities(T_cw)
-        parts = torch.arange(len(seen_by), device=T_cw.device).split(_CHUNK)
+        parts = torch.arange(len(seen_by), device=T_cw.device).split(1 << 16)  # bounds memory
         agrees = torch.cat(
             [self._agree(rows, T_cw, slam_map, sensor, chi_square, velocities) for rows in parts]
         )
@@ -297,9 +284,6 @@ class PosedFrames:
         keyframes observe.
 
         Args:
-            slam_map: the map.
-            sensor: of all frames.
-            submap: number of the submap.
             calibration: the given camera with its error; None: that of `sensor` is exact.
         """
         seen = slam_map.observations(as_detected=True)

@@ -68,8 +68,7 @@ def select_window(slam_map: Map, keyframe: int, camera: Camera) -> BundleWindow 
 
     Other keyframes that observe these points are fixed, and so is the first keyframe of the map.
     """
-    covisible = slam_map.covisible_keyframes(keyframe, LOCAL_WINDOW - 1)
-    free = torch.cat([covisible.new_tensor([keyframe]), covisible])
+    free = slam_map.neighborhood(keyframe, LOCAL_WINDOW - 1)
     free = free[free != 0]
     shared = slam_map.count_observed(slam_map.observed_points(free))
     shared[free] = 0
@@ -103,8 +102,6 @@ def adjust_all(
     """Run a global bundle adjustment with the first keyframe fixed; return the camera of the adjusted map.
 
     Args:
-        slam_map: The map.
-        camera: The camera of all keyframes.
         progress: Called before each iteration; if it raises, the map stays as it was.
         calibration: The given camera with its error: the camera is adjusted as well; None: it is exact.
         tolerance: Predicted relative reduction of the cost that ends it.

@@ -162,25 +162,20 @@ class Mapper:
 def cull_keyframes(submap: Submap, settings: KeyframesConfig) -> RowRemap | None:
     """Remove redundant keyframes, a batch at a time; return where rows went, or None if nothing was removed.
 
-    The first keyframe, the newest ones and the reference keyframe of tracking always stay.
+    Candidates are covisible with those inserted since the last culling, the newest first. The first keyframe, the
+    newest ones and the reference keyframe of tracking always stay.
     """
-    count = submap.map.num_keyframes
+    slam_map, count = submap.map, submap.map.num_keyframes
     if count - submap.num_cull_checked < max(_LEAST_BATCH, count // _BATCH_SHARE):
         return None
-    removed = redundant_keyframes(submap, cull_candidates(submap), settings)
+    new = slam_map.index_tensor(*range(submap.num_cull_checked, count))
+    candidates = slam_map.covisibility_union(new, NUM_COVISIBLE)
+    may_go = (candidates > 0) & (candidates < count - NUM_NEWEST_KEPT)
+    candidates = candidates[may_go & (candidates != submap.tracking.reference)].flip(0)
+    removed = redundant_keyframes(submap, candidates, settings)
     renumbering = remove_keyframes(submap, torch.nonzero(removed)[:, 0]) if bool(removed.any()) else None
     submap.num_cull_checked = submap.map.num_keyframes
     return renumbering
-
-
-def cull_candidates(submap: Submap) -> Int[Tensor, " R"]:
-    """Return keyframes covisible with those inserted since the last culling, the newest first."""
-    slam_map = submap.map
-    candidates = slam_map.covisibility_union(
-        slam_map.index_tensor(*range(submap.num_cull_checked, slam_map.num_keyframes)), NUM_COVISIBLE
-    )
-    may_go = (candidates > 0) & (candidates < slam_map.num_keyframes - NUM_NEWEST_KEPT)
-    return candidates[may_go & (candidates != submap.tracking.reference)].flip(0)
 
 
 def redundant_keyframes(

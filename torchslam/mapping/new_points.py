@@ -184,16 +184,15 @@ def has_consistent_scale(
     scale_1: Float[Tensor, "*#batch N"],
     scale_2: Float[Tensor, "*#batch N"],
     scale_range: tuple[Float[Tensor, "*#batch #N"], ...],
-    factor: float = 1.8,
 ) -> Bool[Tensor, "*#batch N"]:
-    """Return whether the scales in two images agree with the distances of the points, up to a factor.
+    """Return whether the scales in two images agree with the distances of the points, up to a factor of 1.8.
 
     Scales are in pixels; `scale_range` is the finest and the coarsest one of the second image.
     """
     distance_1 = torch.linalg.vector_norm(transform(T_1w, points_w), dim=-1)
     distance_2 = torch.linalg.vector_norm(transform(T_2w, points_w), dim=-1)
     expected = (scale_1 * distance_1 / distance_2.clamp(min=1e-12)).clamp(*scale_range)
-    return (scale_2 < factor * expected) & (scale_2 * factor > expected)
+    return (scale_2 < 1.8 * expected) & (scale_2 * 1.8 > expected)
 
 
 def fuse(

@@ -139,26 +139,12 @@ def match_keyframe(slam_map: Map, keyframe: int, view: FrameFeatures, matcher: M
     return replace(pairs, first=point_ids[pairs.first])
 
 
-def image_cells(
-    pixels: Float[Tensor, "N 2"],
-    size: tuple[float, float],
-    grid: tuple[int, int] = GRID,
-    shape: tuple[int, int] | None = None,
-) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
-    """Columns and rows of the image cells that contain pixels: `size` is divided into `grid` columns and rows.
-
-    They are clamped to `shape`, that of the grid if None.
-    """
-    column, row = (
-        (at / extent * count).clamp_(0, limit - 1).long()
-        for at, extent, count, limit in zip(pixels.unbind(-1), size, grid, shape or grid, strict=True)
-    )
-    return column, row
-
-
 def cell_numbers(pixels: Float[Tensor, "N 2"], size: tuple[int, int]) -> Int[Tensor, " N"]:
-    """Numbers of the cells of `GRID` that contain pixels."""
-    column, row = image_cells(pixels, size)
+    """Numbers of the cells of `GRID` that contain pixels; `size`: width and height of the image, pixels."""
+    column, row = (
+        (at / extent * count).clamp_(0, count - 1).long()
+        for at, extent, count in zip(pixels.unbind(-1), size, GRID, strict=True)
+    )
     return row * GRID[0] + column
 
 

@@ -141,15 +141,12 @@ class Localizer:
 
     def _local_points_with(self, slam_map: Map, point_ids: Tensor, local_points: Tensor) -> Tensor:
         """The local points, or those around the matched points if these are elsewhere in the map."""
-        if len(local_points) and _are_among(point_ids, local_points):
-            return local_points
+        if len(local_points):
+            at = torch.searchsorted(local_points, point_ids).clamp_(max=len(local_points) - 1)
+            if bool((local_points.index_select(0, at) == point_ids).all()):
+                return local_points
         keyframe = int(slam_map.count_observed(point_ids).argmax())
-        return slam_map.observed_points(self.local_keyframes(slam_map, keyframe))
-
-    def local_keyframes(self, slam_map: Map, keyframe: int) -> Int[Tensor, " K"]:
-        """A keyframe and those that share most points with it."""
-        covisible = slam_map.covisible_keyframes(keyframe, LOCAL_KEYFRAMES)
-        return torch.cat([covisible.new_tensor([keyframe]), covisible])
+        return slam_map.observed_points(slam_map.neighborhood(keyframe, LOCAL_KEYFRAMES))
 
     def _refine(
         self,
@@ -191,9 +188,3 @@ def weights_of(pairs: MatchIndices, guided: MatchIndices, keypoints: int) -> Flo
     weights = pairs.weights.new_zeros(keypoints).index_put((pairs.second,), pairs.weights)
     is_same = points[guided.second] == guided.first
     return torch.where(is_same, weights[guided.second], pairs.weights.median())
-
-
-def _are_among(ids: Int[Tensor, " N"], ascending: Int[Tensor, " M"]) -> bool:
-    """Whether all ids are among others, which are sorted and not empty."""
-    at = torch.searchsorted(ascending, ids).clamp_(max=len(ascending) - 1)
-    return bool((ascending.index_select(0, at) == ids).all())

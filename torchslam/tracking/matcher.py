@@ -236,14 +236,6 @@ def match_along_epipolar_lines(
     The distance to the epipolar plane is the sine of an angle; a pixel is 1 / focal length of it. All these planes
     contain the baseline, so that a plane is an angle around it.
 
-    Args:
-        here: keypoints of the one keyframe.
-        there: keypoints of the others.
-        T_21: from the one camera to the others.
-        camera: of all keyframes.
-        epipolar_px: largest distance from the epipolar line, pixels.
-        max_distance: of descriptors.
-
     Returns:
         Per match the row of the other view, and the rows in `here` and `there`, ordered by these three.
     """

@@ -265,17 +265,11 @@ class IndependentMotion:
 
 @dataclass(frozen=True)
 class FilteredView:
-    """A frame without keypoints that are known not to belong to the scene, and with more of them.
+    """A frame without keypoints that are known not to belong to the scene, and with more of them."""
 
-    Attributes:
-        view: without overlays and moving objects.
-        without_overlays: without static overlays only.
-        whole: with all keypoints.
-    """
-
-    view: FrameFeatures
-    without_overlays: FrameFeatures
-    whole: FrameFeatures
+    view: FrameFeatures  # without overlays and moving objects
+    without_overlays: FrameFeatures  # without static overlays only
+    whole: FrameFeatures  # with all keypoints
 
 
 class SceneFilter:

@@ -15,7 +15,6 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.features import match_by_projection
 from torchslam.geometry import Camera, SharedCamera, se3_inverse, transform
-from torchslam.tracking.data_association import image_cells
 from torchslam.tracking.matcher import max_distance
 from torchslam.types import FrameFeatures
 
@@ -95,16 +94,9 @@ class StaticOverlayDetector:
     def observe(
         self, view: FrameFeatures, T_cw: Float[Tensor, "4 4"], depth: float, world: tuple[int, int] = (0, 0)
     ) -> int:
-        """Compare a posed frame, with all its keypoints, with an earlier one.
+        """Compare a posed frame, with all its keypoints, with an earlier one; `world`: see `Submap.world`.
 
-        Args:
-            view: the frame.
-            T_cw: its pose.
-            depth: median depth of the scene.
-            world: of the pose, see `Submap.world`.
-
-        Returns:
-            The number of cells that became known overlays.
+        Returns the number of cells that became known overlays.
         """
         last = self._last
         if last is None or view.session != last.view.session or last.world != world:
@@ -176,9 +168,8 @@ class StaticOverlayDetector:
     def _cells(self, pixels: Float[Tensor, "N 2"]) -> tuple[Int[Tensor, " N"], Int[Tensor, " N"]]:
         """Rows and columns of `evidence` for pixels."""
         rows, columns = self.evidence.shape
-        size = (self.cell_px, self.cell_px)
-        column, row = image_cells(pixels, size, grid=(1, 1), shape=(columns, rows))
-        return row, column
+        column, row = (pixels / self.cell_px).unbind(-1)
+        return row.clamp(0, rows - 1).long(), column.clamp(0, columns - 1).long()
 
 
 def points_at_depths(

@@ -19,6 +19,7 @@ from torchslam.geometry.lie import se3_log
 from torchslam.geometry.transforms import reorthonormalized
 from torchslam.map.atlas import Submap, TrackingState
 from torchslam.map.map import Map
+from torchslam.tracking import localizer
 from torchslam.tracking.data_association import match_keyframe, match_points
 from torchslam.tracking.localizer import Localizer, match_projected_points
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher
@@ -37,19 +38,17 @@ class Tracker:
 
     Stateless: the state is `Submap.tracking`, which `track` reads and `commit` updates.
 
-    Args:
+    Attributes:
         counts: Whether observations are counted in the map; without it, tracking does not change the map.
     """
 
-    def __init__(
-        self, camera: SharedCamera, config: Config, matcher: Matcher | None = None, counts: bool = True
-    ) -> None:
+    def __init__(self, camera: SharedCamera, config: Config, matcher: Matcher | None = None) -> None:
         self.camera = camera
         self.localizer = Localizer(camera, config)
         self.matcher = make_matcher(config.matching, matcher, features=config.features.kind)
         self.brute_force = config.paper.brute_force
         self.matching = config.matching
-        self.counts = counts
+        self.counts = True
 
     def for_session(self, mapping: bool) -> Tracker:
         """The same tracker for a session that maps, or that only localizes."""
@@ -70,7 +69,7 @@ class Tracker:
         self, slam_map: Map, keyframe: int, T_cw: Float[Tensor, "4 4"], tracking: TrackingState
     ) -> TrackingState:
         """The same state at a pose with another reference keyframe, and its local map."""
-        local_keyframes = self.localizer.local_keyframes(slam_map, keyframe)
+        local_keyframes = slam_map.neighborhood(keyframe, localizer.LOCAL_KEYFRAMES)
         if self.brute_force and self.counts:
             last_seen = slam_map.points["last_seen_frame"]
             local_points = torch.nonzero(
@@ -228,7 +227,7 @@ class Relocalizer:
                 return None
             if any(submap is other and bool((near == keyframe).any()) for other, near in tried):
                 continue
-            near = self.tracker.localizer.local_keyframes(submap.map, keyframe)
+            near = submap.map.neighborhood(keyframe, localizer.LOCAL_KEYFRAMES)
             pairs = match_keyframe(submap.map, keyframe, view, self.tracker.matcher)
             points = submap.map.observed_points(near)
             estimate = self.tracker.localizer.locate(submap.map, view, [pairs], points)

@@ -16,15 +16,9 @@ from torchslam.geometry.precision import without_autocast
 from torchslam.utils.indexing import true_indices
 from torchslam.utils.torch_internals import int8_matmul
 
-# Product with this word moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
-_GATHER_BITS = sum(1 << (56 - 7 * i) for i in range(8))
-
-# Bits as +-64 have the product 2^20 - 2^13 * distance: the 13 bits below hold an index, and one maximum finds both.
-_AMPLITUDE = 64
 _INDEX_BITS = 13
-"""Bits of an index: the products above are multiples of 2^13."""
+"""Bits of an index in a key: the products of bits as +-64, 2^20 - 2^13 * distance, are multiples of 2^13."""
 _CHUNK = 1 << 13  # pairs whose bits are counted at once: their words stay in the cache
-_MASKED = -(2**22)  # lowers a key below every valid one and keeps it exact in float32
 
 
 @without_autocast
@@ -37,7 +31,9 @@ def pack_bits(bits: Shaped[Tensor, "*batch D"]) -> UInt8[Tensor, "*batch D//8"]:
     if bits.shape[-1] % 8:
         raise ValueError(f"the number of bits must be a multiple of 8, got {bits.shape[-1]}")
     words = bits.to(torch.bool).reshape(-1).view(torch.int64)
-    return ((words * _GATHER_BITS) >> 56).to(torch.uint8).view(*bits.shape[:-1], bits.shape[-1] // 8)
+    # This product moves the eight 0/1 bytes of a little-endian word into its top byte, bit i from byte i.
+    gather = sum(1 << (56 - 7 * i) for i in range(8))
+    return ((words * gather) >> 56).to(torch.uint8).view(*bits.shape[:-1], bits.shape[-1] // 8)
 
 
 @without_autocast
@@ -113,16 +109,9 @@ def hamming(
 def sign_products(
     descriptors_1: UInt8[Tensor, "*batch N1 D"], descriptors_2: UInt8[Tensor, "*batch N2 D"], amplitude: int
 ) -> Num[Tensor, "*batch N1 N2"]:
-    """Compute inner products of the bits as +-amplitude: amplitude^2 (bits - 2 distance).
+    """Compute inner products of packed bits as +-amplitude, at most 64: amplitude^2 (bits - 2 distance).
 
-    Args:
-        descriptors_1: packed bits.
-        descriptors_2: packed bits.
-        amplitude: at most 64.
-
-    Returns:
-        int32 if the processor multiplies int8 matrices quickly, else float32. Both are exact, because the sums stay
-        below 2^24.
+    Of the type of `int8_product`; exact, because the sums stay below 2^24.
     """
     signs_1, signs_2 = spread_bits(descriptors_1, amplitude), spread_bits(descriptors_2, amplitude)
     return int8_product(signs_1, signs_2.mT)
@@ -131,11 +120,7 @@ def sign_products(
 def int8_product(
     left: Int[Tensor, "*batch M K"], right: Int[Tensor, "*batch K N"]
 ) -> Num[Tensor, "*batch M N"]:
-    """Multiply int8 matrices.
-
-    Returns:
-        int32 where the processor multiplies these quickly, else float32, which is exact while no sum exceeds 2^24.
-    """
+    """Multiply int8 matrices: int32 where the processor is quick at it, else float32, exact for sums up to 2^24."""
     if int8_matmul is None or not _fast_int8(left.device) or 0 in (*left.shape, *right.shape):
         return left.float() @ right.float()
     batch = left.shape[:-2]
@@ -171,8 +156,6 @@ image take twice as long."""
 _BYTES_FROM = 1 << 20
 """Pairs of descriptors from which on columns are chosen by bytes: 3000 and 3000 of SIFT take a third of the time. With
 fewer than 1000 and 1000 there is little to gain."""
-_BYTE_ROWS_AT_ONCE = 256
-"""As `_ROWS_AT_ONCE`: 128 is as fast, 512 takes 1.4 times as long."""
 _STEPS = 360.0
 """Steps of one number of a unit descriptor: products then leave room for `_INDEX_BITS`, as 360^2 < 2^17. The largest
 number of SIFT's root-normalized descriptors is 0.36."""
@@ -250,13 +233,16 @@ def nearest_by_hamming(
     with_second: bool,
 ) -> NearestNeighbors:
     """Find exact nearest neighbors by Hamming distance, by two maxima over the matrix and one more for the second."""
-    keys = sign_products(descriptors_1, descriptors_2, _AMPLITUDE)
+    keys = sign_products(
+        descriptors_1, descriptors_2, 64
+    )  # whose free low bits hold an index: one maximum finds both
     bits, index_bits = 8 * descriptors_1.shape[-1], _INDEX_BITS
     rows, columns = keys.shape[1:]
     if columns > 1 << _INDEX_BITS:  # more columns than the free bits can number: wider keys
         index_bits = columns.bit_length()
         keys = keys.to(torch.int64) << (index_bits - _INDEX_BITS)
-    lowest = _MASKED << (index_bits - _INDEX_BITS)
+    # Below every valid key, and exact in float32.
+    lowest = -(2**22) << (index_bits - _INDEX_BITS)
     keys += ((1 << index_bits) - 1 - torch.arange(columns, device=keys.device)).to(keys.dtype)
 
     def distance(key: Tensor) -> Tensor:
@@ -327,7 +313,8 @@ def _nearest_by_bytes(
         chosen = torch.stack([own.index_select(0, at) for own, at in columns])
         return torch.where(keys > lowest, 1 - (descriptors_1 * chosen).sum(-1), otherwise)
 
-    best, column, second, of_column = pairs.best(keys_of, lowest, _BYTE_ROWS_AT_ONCE, _INDEX_BITS, True)
+    # 128 rows at once are as fast as 256, 512 take 1.4 times as long.
+    best, column, second, of_column = pairs.best(keys_of, lowest, 256, _INDEX_BITS, True)
     mutual = best >> _INDEX_BITS >= of_column >> _INDEX_BITS
     return pairs.neighbors(column, distance(best, 1.0), best > lowest, mutual, distance(second, torch.inf))
 
