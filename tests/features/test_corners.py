@@ -1,4 +1,4 @@
-"""FAST corners and sub-pixel positions."""
+"""FAST corners, Harris responses and sub-pixel positions."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from torchslam.features.corners import (
     fast_scores,
     find_peaks,
     gather_patches,
+    harris_responses,
     patch_scores,
     quadratic_peak,
     soft_peak,
@@ -144,6 +145,19 @@ def test_patches_are_cut_around_their_positions() -> None:
     patches = gather_patches(image.flatten(), torch.tensor([44, 55]), 10, 2)
     assert torch.equal(patches[0], image[2:7, 2:7])
     assert torch.equal(patches[1], image[3:8, 3:8])
+
+
+def test_harris_agrees_with_opencv() -> None:
+    image = np.random.default_rng(0).integers(0, 256, (11, 11), dtype=np.uint8)
+    expected = cv2.cornerHarris(image.astype(np.float32), 7, 3, 0.04)[4:7, 4:7]
+    ours = harris_responses(torch.from_numpy(image)[None].double())[0]
+    # OpenCV divides the derivatives by 4 and sums by 7.
+    np.testing.assert_allclose(ours.numpy() / (4 * 7) ** 4, expected, rtol=1e-4)
+
+
+def test_harris_gradcheck() -> None:
+    patches = torch.rand(2, 10, 10, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    assert torch.autograd.gradcheck(harris_responses, (patches.requires_grad_(),))
 
 
 @pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (0.3, -0.2), (-0.45, 0.4)])

@@ -127,10 +127,11 @@ def test_unsupported_images_are_refused(kind: type[nn.Module], images: Tensor) -
         "scale_factor": 1.0,
         "threshold": 5,
         "low_threshold": 0,
+        "ranking": "best",
     }.items(),
 )
-def test_invalid_options_are_refused(option: str, value: float) -> None:
-    with pytest.raises(ValueError, match="ORB needs"):
+def test_invalid_options_are_refused(option: str, value: float | str) -> None:
+    with pytest.raises(ValueError, match=r"ORB needs|ranking"):
         ORB(**{option: value})
 
 
@@ -204,10 +205,11 @@ def test_a_dim_half_has_keypoints_too() -> None:
     assert 10 <= int(right.sum()) < 150
 
 
-def test_an_image_of_weak_texture_has_the_full_number_of_keypoints() -> None:
+@pytest.mark.parametrize("ranking", ["fast", "harris"])
+def test_an_image_of_weak_texture_has_the_full_number_of_keypoints(ranking: str) -> None:
     bright = scene(240, 320)
     dim = (bright - 0.5) * 0.12 + 0.5  # no corner exceeds the threshold of 20
-    orb = ORB(num_keypoints=300)
+    orb = ORB(num_keypoints=300, ranking=ranking)
     features = orb(torch.cat([bright, dim]))
     assert features.mask.sum(1).tolist() == [300, 300]
     assert same(element(features, 1), orb(dim))  # whatever else the batch holds
@@ -251,14 +253,23 @@ def test_weak_texture_is_less_than_half_of_the_keypoints(monkeypatch: pytest.Mon
     assert decided == {True, False}
 
 
+def test_harris_ranking_finds_other_corners_in_the_same_places() -> None:
+    image = scene(200, 260, 5)
+    harris, fast = ORB(num_keypoints=100, ranking="harris")(image), ORB(num_keypoints=100)(image)
+    assert harris.mask.all()
+    common = (distances(harris.keypoints[0], fast.keypoints[0]) < 0.01).any(1)
+    assert 20 < int(common.sum()) < 100
+
+
 def test_the_batch_leaves_no_gradient_by_default() -> None:
     image = scene(120, 120).requires_grad_()
     assert not ORB(num_keypoints=50)(image).keypoints.requires_grad
 
 
-def test_keypoints_and_scores_pass_gradcheck() -> None:
+@pytest.mark.parametrize("ranking", ["fast", "harris"])
+def test_keypoints_and_scores_pass_gradcheck(ranking: str) -> None:
     image = scene(80, 90, 6).double()
-    extract = ORB(num_keypoints=8, num_levels=2, differentiable=True)
+    extract = ORB(num_keypoints=8, num_levels=2, ranking=ranking, differentiable=True)
     generator = torch.Generator().manual_seed(0)
     image = image + 1e-3 * torch.rand(image.shape, generator=generator, dtype=torch.float64)
     direction = torch.randn(image.shape, generator=torch.Generator().manual_seed(1), dtype=torch.float64)

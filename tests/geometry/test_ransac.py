@@ -10,6 +10,7 @@ from torchslam.geometry.ransac import (
     levenberg_marquardt,
     pad_groups,
     sample_minimal,
+    sample_minimal_of_all,
     samples_needed,
     search,
     truncated_score,
@@ -27,6 +28,13 @@ def test_samples_are_distinct_rows_of_the_mask_and_repeatable() -> None:
         assert allowed[rows].all()
         assert all(len(set(row)) == 5 for row in rows.tolist())
         assert set(rows.flatten().tolist()) == set(allowed.nonzero().flatten().tolist())
+
+
+@pytest.mark.parametrize("rows", [3, 4, 40])
+def test_samples_of_all_rows_equal_those_of_a_full_mask(rows: int) -> None:
+    mask = torch.ones(1, rows, dtype=torch.bool)
+    masked = sample_minimal(mask, 3, 25, torch.Generator().manual_seed(1))[0]
+    assert torch.equal(sample_minimal_of_all(rows, 3, 25, torch.Generator().manual_seed(1)), masked)
 
 
 @pytest.mark.parametrize("available", [0, 1, 2])

@@ -319,6 +319,7 @@ def calls() -> dict[str, Call]:
             features=bits,
             mask=torch.arange(N)[None] % 7 != 0,
             scales=torch.ones(1, N),
+            angles=torch.zeros(1, N),
         ),
         "hamming": decision(features.hamming, descriptors_1=bits.descriptors, descriptors_2=bits.descriptors),
         "pack_bits": decision(features.pack_bits, bits=torch.arange(64).view(2, 32) % 3 == 0),

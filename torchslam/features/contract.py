@@ -18,6 +18,7 @@ from torchslam.utils.torch_internals import in_transform
 BINARY_BYTES = 32
 """Bytes of a binary descriptor, 256 bits."""
 
+LENGTH_TOLERANCE = 0.02  # of descriptors: what half precision leaves of unit length
 NORMALIZE = "torch.nn.functional.normalize(descriptors, dim=-1) makes them so"
 
 
@@ -35,6 +36,9 @@ class FixedKeypoints(Protocol):
         ...
 
 
+_OVER = 1e-3  # beyond black and white, of what resizing or training adds
+
+
 def check_gray(images: Shaped[Tensor, "*batch"], name: str) -> None:
     """Check that images of any shape are floats in [0, 1]; `name`: of them, for messages.
 
@@ -48,15 +52,14 @@ def check_gray(images: Shaped[Tensor, "*batch"], name: str) -> None:
     if images.numel() == 0 or in_transform() or torch.compiler.is_compiling():
         return
     low, high = images.detach().aminmax()
-    over = 1e-3  # beyond black and white, of what resizing or training adds
-    if not bool((low >= -over) & (high <= 1 + over)):  # also for NaN
+    if not bool((low >= -_OVER) & (high <= 1 + _OVER)):  # also for NaN
         raise FrameError(f"{name} must be in [0, 1], these are from {float(low):g} to {float(high):g}")
 
 
 def are_unit_or_zero(descriptors: Float[Tensor, "*batch D"]) -> Bool[Tensor, "*batch"]:
     """Whether float descriptors are finite and of unit length, or zero as those of no keypoint."""
     lengths = torch.linalg.vector_norm(descriptors.detach().float(), dim=-1)
-    return ((lengths - 1).abs() <= 0.02) | (lengths == 0)  # what half precision leaves of unit length
+    return ((lengths - 1).abs() <= LENGTH_TOLERANCE) | (lengths == 0)
 
 
 def check_features(found: object, images: Shaped[Tensor, "B 1 H W"], name: str) -> None:

@@ -1,4 +1,4 @@
-"""FAST corners and their sub-pixel positions.
+"""FAST corners, Harris responses, and sub-pixel positions of corners.
 
 Images are flattened and worked on in chunks: few calls, and intermediate results stay in the cache. On the CPU the
 chunks are NumPy's: for bytes, a call of NumPy takes half the time of one of torch, and gives the same.
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from jaxtyping import Float, Int, Shaped, UInt8
 from torch import Tensor
 
@@ -174,6 +175,12 @@ def _chunk_peaks(scores: Any, floor: Any, stride: int, start: int, count: int) -
     return (center > before) & (center >= after)
 
 
+HARRIS_WINDOW = 7
+"""Side of the window, pixels; as in the ORB of OpenCV."""
+HARRIS_K = 0.04
+"""Weight of the squared trace in the response; as in the ORB of OpenCV."""
+
+
 def gather_patches(
     pixels: Shaped[Tensor, " A"], positions: Int[Tensor, " N"], stride: int, radius: int
 ) -> Shaped[Tensor, "N S S"]:
@@ -187,6 +194,37 @@ def gather_patches(
     return pixels.unfold(0, side, 1).index_select(0, rows.flatten()).view(-1, side, side)
 
 
+@lru_cache(maxsize=16)
+def _harris_matrices(side: int, device: torch.device, dtype: torch.dtype) -> tuple[Tensor, Tensor]:
+    """The Sobel derivatives along x and y at all inner pixels of a flattened patch, and the sums over all windows.
+
+    As matrices, which are eight times as fast as convolutions of small patches.
+    """
+    sobel = torch.tensor(
+        [[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]], dtype=torch.float32, device="cpu"
+    )
+    kernels = torch.stack([sobel, sobel.T])[:, None], sobel.new_ones(1, 1, HARRIS_WINDOW, HARRIS_WINDOW)
+    derivatives, sums = (
+        F.conv2d(torch.eye(size * size, dtype=torch.float32, device="cpu").view(-1, 1, size, size), kernel)
+        for size, kernel in zip((side, side - 2), kernels, strict=True)
+    )
+    return derivatives.flatten(1).to(device, dtype), sums.flatten(1).to(device, dtype)
+
+
+def harris_responses(patches: Float[Tensor, "N S S"]) -> Float[Tensor, "N S-8 S-8"]:
+    """Compute Harris responses wherever the 7x7 window of Sobel derivatives fits (Harris, Stephens, 1988).
+
+    For whole-number pixels below 256 the sums are whole numbers too, so they do not depend on the order of summation.
+    """
+    side = patches.shape[-1]
+    derivatives, windows = _harris_matrices(side, patches.device, patches.dtype)
+    dx, dy = (patches.flatten(1) @ derivatives).chunk(2, dim=-1)
+    xx, yy, xy = (dx * dx) @ windows, (dy * dy) @ windows, (dx * dy) @ windows
+    trace = xx + yy
+    responses = (xx * yy - xy * xy) - HARRIS_K * trace * trace
+    return responses.unflatten(-1, (side - 8, side - 8))
+
+
 @lru_cache(maxsize=8)
 def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "9 5"]:
     """3x3 values to the least-squares paraboloid's gx, gy, gxx, gyy, gxy at the center."""
@@ -198,10 +236,11 @@ def _paraboloid_fit(device: torch.device, dtype: torch.dtype) -> Float[Tensor, "
     return torch.stack(fits, dim=-1).view(9, 5).to(device=device, dtype=dtype)
 
 
-def quadratic_peak(responses: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 2"]:
-    """Offset (x, y) of the maximum of the paraboloid fitted to 3x3 responses from the center, pixels.
+def quadratic_peak(responses: Float[Tensor, "N 3 3"], limit: float = 0.5) -> Float[Tensor, "N 2"]:
+    """Locate the maximum of the paraboloid fitted to 3x3 responses.
 
-    At most half a pixel along x and y; zero where the fit has no maximum.
+    Returns:
+        Offset (x, y) from the center in pixels, within +-limit; zero where the fit has no maximum.
     """
     fit = responses.flatten(1) @ _paraboloid_fit(responses.device, responses.dtype)
     gx, gy, gxx, gyy, gxy = fit.unbind(-1)
@@ -209,17 +248,22 @@ def quadratic_peak(responses: Float[Tensor, "N 3 3"]) -> Float[Tensor, "N 2"]:
     peaked = (trace < 0) & (determinant > 1e-6 * trace * trace)
     determinant = torch.where(peaked, determinant, torch.ones_like(determinant))
     offset = torch.stack([gxy * gy - gyy * gx, gxy * gx - gxx * gy], dim=-1) / determinant[:, None]
-    return torch.where(peaked[:, None], offset, torch.zeros_like(offset)).clamp(-0.5, 0.5)
+    return torch.where(peaked[:, None], offset, torch.zeros_like(offset)).clamp(-limit, limit)
 
 
-def soft_peak(responses: Float[Tensor, "N S S"]) -> Float[Tensor, "N 2"]:
-    """Offset (x, y) of the maximum of neighborhoods of odd side from the center, pixels; differentiable.
+def soft_peak(responses: Float[Tensor, "N S S"], temperature: float = 0.2) -> Float[Tensor, "N 2"]:
+    """Locate the maximum of a neighborhood by a soft arg-max, differentiable.
 
-    A soft arg-max of the responses over their largest magnitude, at a temperature of 0.2.
+    Args:
+        responses: neighborhoods of odd side; each is divided by its largest magnitude.
+        temperature: of the softmax, without unit.
+
+    Returns:
+        Offset (x, y) from the center in pixels.
     """
     side = responses.shape[-1]
     scale = responses.abs().amax(dim=(1, 2), keepdim=True).clamp_min(torch.finfo(responses.dtype).tiny)
-    weights = torch.softmax((responses / scale / 0.2).flatten(1), dim=-1)
+    weights = torch.softmax((responses / scale / temperature).flatten(1), dim=-1)
     axis = torch.arange(side, device=responses.device, dtype=responses.dtype) - side // 2
     grid = torch.stack([axis.expand(side, side), axis[:, None].expand(side, side)], dim=-1).view(-1, 2)
     return weights @ grid

@@ -37,16 +37,18 @@ class XFeat(nn.Module):
     Args:
         weights: file of the network's weights, or their name.
         num_keypoints: largest number of keypoints per image; rows beyond what the image offers are masked.
+        threshold: of the keypoint heat map, 0 to 1.
 
     Raises:
         ConfigError: The file cannot be read or holds another network.
     """
 
-    def __init__(self, weights: str | Path, num_keypoints: int = 1000) -> None:
+    def __init__(self, weights: str | Path, num_keypoints: int = 1000, threshold: float = 0.05) -> None:
         import kornia  # here, as the import is slow and only the networks need it
 
         super().__init__()
         self.num_keypoints = num_keypoints
+        self.threshold = threshold
         with torch.device("cpu"):
             model = kornia.feature.XFeat().float()
         # The file may leave out the fine matcher, which only dense matching needs.
@@ -64,7 +66,7 @@ class XFeat(nn.Module):
 
         check_images(images, mask)
         coarse, heat, scores = self._maps(images)
-        peaks = nms2d(heat.detach()[:, None], (5, 5), mask_only=True)[:, 0] & (heat > 0.05)
+        peaks = nms2d(heat.detach()[:, None], (5, 5), mask_only=True)[:, 0] & (heat > self.threshold)
         inner = heat.shape[1:]
         if mask is not None:
             peaks &= F.interpolate(mask.float(), inner, mode="nearest-exact")[:, 0] > 0
@@ -155,17 +157,17 @@ class ALIKED(nn.Module):
         check_images(images, mask)
         with images.device:  # kornia makes tensors on the default device
             found = self.network(images.float())
-        rows = [
-            _features(
+        rows = []
+        for one in found:
+            keypoints, scores, descriptors = (
                 one.keypoints[None],
                 one.keypoint_scores[None],
-                one.descriptors[None].float(),
-                torch.ones_like(one.keypoint_scores, dtype=torch.bool)[None],
-                self.num_keypoints,
-                ALIKED_NOISE,
+                one.descriptors[None],
             )
-            for one in found
-        ]
+            mask_1 = torch.ones_like(scores, dtype=torch.bool)
+            rows.append(
+                _features(keypoints, scores, descriptors.float(), mask_1, self.num_keypoints, ALIKED_NOISE)
+            )
         features = Features.cat(rows)
         return features if mask is None else apply_mask(features, mask)
 

@@ -19,6 +19,7 @@ from torch import Tensor, nn
 from torchslam.features.contract import check_images
 from torchslam.types import Features
 
+OCTAVE_LAYERS, EDGE_THRESHOLD = 3, 10.0  # as Lowe has them
 FIRST_SIGMA = 1.6  # blur of the first image of an octave, pixels of that octave; Lowe's as well
 
 CONTRAST_THRESHOLD = 0.01
@@ -56,12 +57,20 @@ class OpenCVORB(nn.Module):
 
     Args:
         num_keypoints: largest number of keypoints per image; rows beyond what OpenCV finds are masked.
+        scale_factor: ratio of the sizes of neighboring pyramid levels.
+        num_levels: of the pyramid.
+        threshold: of FAST, gray values of 0 to 255.
     """
 
-    def __init__(self, num_keypoints: int = 1000) -> None:
+    def __init__(
+        self, num_keypoints: int = 1000, scale_factor: float = 1.2, num_levels: int = 8, threshold: int = 20
+    ) -> None:
         super().__init__()
         self.num_keypoints = num_keypoints
-        self._orb = cv2.ORB.create(nfeatures=num_keypoints)  # the other options are those of `ORB`
+        self.scale_factor = scale_factor
+        self._orb = cv2.ORB.create(
+            nfeatures=num_keypoints, scaleFactor=scale_factor, nlevels=num_levels, fastThreshold=threshold
+        )
 
     def forward(
         self, images: Float[Tensor, "B 1 H W"], mask: Bool[Tensor, "B 1 H W"] | None = None
@@ -97,7 +106,7 @@ class OpenCVORB(nn.Module):
         cv2 scales pixels of a level about the center of the first one, but resizes images about their corner; the
         difference is half a pixel of the level less half a pixel of the image.
         """
-        scale = 1.2**point.octave
+        scale = self.scale_factor**point.octave
         shift = (scale - 1) / 2
         angle = math.remainder(math.radians(point.angle), 2 * math.pi)
         return point.pt[0] + shift, point.pt[1] + shift, point.response, scale, angle
@@ -150,12 +159,7 @@ class SIFT(nn.Module):
         # OpenCV takes the strongest before it applies the mask, so with one it must return all.
         limit = self.num_keypoints if mask is None else 0
         # Without the precise upscale all keypoints are off by 0.25 px.
-        options = (
-            3,
-            CONTRAST_THRESHOLD,
-            10.0,
-            FIRST_SIGMA,
-        )  # layers of an octave and edge threshold as Lowe has them
+        options = OCTAVE_LAYERS, CONTRAST_THRESHOLD, EDGE_THRESHOLD, FIRST_SIGMA
         sift = cv2.SIFT.create(limit, *options, enable_precise_upscale=True)
         points, described = sift.detectAndCompute(image, mask)
         rows, descriptors = np.zeros((self.num_keypoints, 5)), np.zeros((self.num_keypoints, 128))

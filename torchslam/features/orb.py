@@ -24,6 +24,7 @@ from torchslam.features.corners import (
     fast_scores,
     find_peaks,
     gather_patches,
+    harris_responses,
     patch_scores,
     quadratic_peak,
     soft_peak,
@@ -44,9 +45,10 @@ RADIUS = 15
 """Of the disk for the orientation, and of the sampling pattern, pixels (Rublee et al.: ORB, 2011)."""
 BLUR_RADIUS = 3
 """Of the Gaussian filter before the tests, pixels: 7 x 7 as in the ORB of OpenCV."""
+_PATTERN_FILE = Path(__file__).with_name("brief.safetensors")
 ANGLE_BINS = 256  # 1.4 degrees: at the pattern's rim the rounding of the angle stays below 0.2 px
 BORDER = 19  # of every level: the descriptor's disk (15), its blur (3), and one for rounding
-PATCH_RADIUS = 4  # 3 of the circle of FAST and 1 of the soft arg-max
+PATCH_RADIUS = 4  # 3 of the circle of FAST and 1 of the soft arg-max; just what a Harris response needs
 MAX_SCORE = 255  # a score that no corner exceeds
 WEAK_TEXTURE_RATIO = 0.5  # of the keypoints that may be chosen: an image that offers fewer has weak texture
 FAINT_THRESHOLD = 4  # gray values: corners of an image of the weakest texture, above a good camera's noise
@@ -64,6 +66,7 @@ class ORB(nn.Module):
         low_threshold: of FAST for the best corner of each cell, so that regions of low contrast have keypoints too;
             for all corners of an image of weak texture, which otherwise offers less than half of `num_keypoints`.
             If there are still fewer, faint corners of more than 4 gray values count.
+        ranking: "fast" ranks corners by their FAST score, which repeats better; "harris" by their Harris response.
         differentiable: keypoints and scores carry gradients to the image (soft arg-max over 3x3 FAST scores); the
             choice of corners, angles and descriptors stay discrete.
     """
@@ -75,6 +78,7 @@ class ORB(nn.Module):
         num_levels: int = 8,
         threshold: int = 20,
         low_threshold: int = 7,
+        ranking: str = "fast",
         differentiable: bool = False,
     ) -> None:
         super().__init__()
@@ -82,11 +86,14 @@ class ORB(nn.Module):
             raise ValueError("ORB needs num_keypoints >= 1, num_levels >= 1 and scale_factor > 1")
         if not 0 < low_threshold <= threshold < 255:
             raise ValueError("ORB needs 0 < low_threshold <= threshold < 255")
+        if ranking not in ("fast", "harris"):
+            raise ValueError(f'ranking must be "fast" or "harris", got {ranking!r}')
         self.num_keypoints = num_keypoints
         self.scale_factor = scale_factor
         self.num_levels = num_levels
         self.threshold = threshold
         self.low_threshold = low_threshold
+        self.ranking = ranking
         self.differentiable = differentiable
 
     def forward(
@@ -129,9 +136,12 @@ class ORB(nn.Module):
             xy = torch.stack([inside % stride - left, inside // stride - top], dim=-1)
             angles = orientations(pixels, positions, stride)
             descriptors = describe(blur(pixels, stride), positions, angles, stride)
+        # Corners are where the FAST score peaks; the maximum of the Harris response lies further inside the corner and
+        # repeats less precisely.
         if self.differentiable:
-            peaks = patch_scores(gather_level_patches(levels, image, level, xy, PATCH_RADIUS))
-            offsets, strengths = soft_peak(peaks), _contrast_score(peaks)
+            offsets, strengths = self._soft_peaks(
+                gather_level_patches(levels, image, level, xy, PATCH_RADIUS)
+            )
         else:
             offsets = quadratic_peak(gather_patches(fast, positions, stride, 1).to(torch.float32))
         scale_xy = torch.tensor(pyramid.scales, dtype=dtype, device=images.device)[level]
@@ -189,14 +199,29 @@ class ORB(nn.Module):
         best = best_per_cell(image * num_cells + cell, fast, batch * num_cells)
         strong |= self._are_few(strong | best, image, batch).index_select(0, image)
         competing = best | strong
-        # By the whole part of what they compete by.
-        promising = prefilter_candidates(fast, competing, cell, image, grid, batch, self.num_keypoints)
-        competing = best | (strong & promising)
+        if self.ranking == "fast":  # the whole part of what they compete by
+            count = self.num_keypoints
+            competing = best | (
+                strong & prefilter_candidates(fast, competing, cell, image, grid, batch, count)
+            )
         kept = competing.nonzero().squeeze(1)
         positions, image, cell, strong = (x.index_select(0, kept) for x in (positions, image, cell, strong))
-        strengths = _contrast_score(gather_patches(scores, positions, stride, 1).to(torch.float32))
+        if self.ranking == "harris":
+            patches = gather_patches(pixels, positions, stride, PATCH_RADIUS)
+            strengths = harris_responses(patches.to(torch.float32)).flatten()
+        else:
+            strengths = _contrast_score(gather_patches(scores, positions, stride, 1).to(torch.float32))
         rows, places = select_evenly(strengths, strong, cell, image, grid, batch, self.num_keypoints)
         return positions[rows], image[rows] * self.num_keypoints + places, strengths[rows]
+
+    def _soft_peaks(
+        self, patches: Float[Tensor, "N 9 9"]
+    ) -> tuple[Float[Tensor, "N 2"], Float[Tensor, " N"]]:
+        """Differentiable sub-pixel offsets of corners in pixels of the level, and their scores."""
+        fast = patch_scores(patches)
+        if self.ranking == "harris":
+            return soft_peak(fast), harris_responses(patches).flatten()
+        return soft_peak(fast), _contrast_score(fast)
 
 
 def _bands(grid: Grid, pyramid: PackedPyramid, batch: int, margin: int = 0) -> Bands:
@@ -269,7 +294,7 @@ def blur(pixels: UInt8[Tensor, " A"], stride: int) -> Int[Tensor, " R"]:
 @lru_cache(maxsize=1)
 def pattern() -> Int[Tensor, "256 4"]:
     """The tests of a descriptor: x and y of the first and of the second pixel, whose brightness is compared."""
-    return load_file(Path(__file__).with_name("brief.safetensors"))["pattern"]
+    return load_file(_PATTERN_FILE)["pattern"]
 
 
 @lru_cache(maxsize=16)
@@ -285,9 +310,13 @@ def _rotated_offsets(stride: int, device: torch.device) -> Int[Tensor, "256 512"
 def describe(
     blurred: Int[Tensor, " R"], positions: Int[Tensor, " N"], angles: Float[Tensor, " N"], stride: int
 ) -> UInt8[Tensor, "N 32"]:
-    """Describe keypoints by 256 brightness comparisons in the result of `blur`, rotated by their angles, radians.
+    """Describe keypoints by 256 brightness comparisons, rotated by their angles.
 
-    Positions are those in the image before blurring, RADIUS + BLUR_RADIUS inside their level.
+    Args:
+        blurred: from `blur`.
+        positions: of the keypoints in the image before blurring, RADIUS + BLUR_RADIUS inside their level.
+        angles: radians.
+        stride: length of a row of pixels.
     """
     bins = torch.round(angles * (ANGLE_BINS / (2 * math.pi))).to(torch.int64) % ANGLE_BINS
     origins = (positions - BLUR_RADIUS * (stride + 1)).to(torch.int32)

@@ -18,7 +18,7 @@ from torchslam.geometry.estimate_gradients import (
 )
 from torchslam.geometry.lie import homogeneous, rigid, se3_exp, transform
 from torchslam.geometry.p3p import p3p
-from torchslam.geometry.precision import check_positive, full_precision
+from torchslam.geometry.precision import full_precision
 from torchslam.geometry.projections import fit_projections, pose_tangent, squared_projections
 from torchslam.geometry.ransac import (
     CONFIDENCE,
@@ -34,6 +34,7 @@ from torchslam.geometry.ransac import (
     pose_rows,
     retract_pose,
     sample_minimal,
+    sample_minimal_of_all,
     search,
     some_problems,
     truncated_rows,
@@ -89,6 +90,7 @@ def estimate_absolute_pose(
         camera: one for all, or a batch of B.
         threshold: reprojection error of an inlier, pixels.
         mask: rows in use; rows with NaN are never used.
+        seed: of the random samples.
         confidence: probability that some sample has no outlier.
         max_samples: largest number of samples per camera.
 
@@ -135,30 +137,35 @@ def start_pose(
     size: tuple[int, int],
     threshold: float,
     seed: int = 0,
+    confidence: float = CONFIDENCE,
+    max_samples: int = 3000,
 ) -> Float[Tensor, "4 4"] | None:
     """Estimate the pose of one camera by RANSAC over P3P, as a start for a refinement.
 
-    The same search as `estimate_absolute_pose`, for a single problem without a mask. Errors are those of undistorted
-    coordinates, in pixels at each keypoint. The same arguments and seed give the same result.
+    The same search as `estimate_absolute_pose`, in fewer calls for a single problem without a mask. Errors are those of
+    undistorted coordinates, in pixels at each keypoint. The same arguments and seed give the same result.
 
     Args:
         undistorted: of the keypoints that see the points, which are finite.
         size: (width, height) of the image.
         threshold: reprojection error of an inlier, pixels.
+        seed: of the random samples.
+        confidence: probability that some sample has no outlier.
+        max_samples: largest number of samples.
 
     Returns:
         T_cw, locally optimized on its inliers; None if wrong matches could agree as well, or if the inliers are on a
         line.
     """
-    check_positive(threshold=threshold)
+    check_search(threshold, confidence, max_samples)
     if len(points_w) < 4:
         return None
     center = points_w.mean(0)
     points, xy = points_w - center, undistorted.xy.mT
     mask = torch.ones_like(points[None, :, 0], dtype=torch.bool)
     scale = (undistorted.pixel_scale / threshold)[None, :, None]
-    search_data = _Search.of(points[None], xy[None], scale, mask)
-    P = search_data.best_pose(seed, CONFIDENCE, 3000)
+    search_data = _Search.of(points[None], xy[None], scale, mask, is_single=True)
+    P = search_data.best_pose(seed, confidence, max_samples)
     P = search_data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
     inliers = search_data.squared_errors(P) < 1
     if not bool(_is_success(inliers, mask, search_data.points, size, threshold)):
@@ -217,7 +224,7 @@ def _estimate(
 class _Search:
     """The data of B searches in undistorted coordinates; points are about their mean: float32 is enough for scores.
 
-    scale: thresholds per unit of xy, of one direction or of both
+    scale: thresholds per unit of xy, of one direction or of both; is_single: one problem in which all rows count
     """
 
     points: Float[Tensor, "B N 3"]
@@ -226,12 +233,13 @@ class _Search:
     xy: Float[Tensor, "B N 2"]
     scale: Float[Tensor, "B N _"]
     mask: Bool[Tensor, "B N"]
+    is_single: bool
 
     @classmethod
-    def of(cls, points: Tensor, xy: Tensor, scale: Tensor, mask: Tensor) -> _Search:
+    def of(cls, points: Tensor, xy: Tensor, scale: Tensor, mask: Tensor, is_single: bool = False) -> _Search:
         rays = homogeneous(xy)
         rays = rays / torch.linalg.vector_norm(rays, dim=-1, keepdim=True)
-        return cls(points, rays, homogeneous(points).mT, xy, scale, mask)
+        return cls(points, rays, homogeneous(points).mT, xy, scale, mask, is_single)
 
     def select(self, rows: Tensor) -> _Search:
         """Some of the problems."""
@@ -252,17 +260,36 @@ class _Search:
 
     def propose(self, count: int, generator: torch.Generator) -> tuple[ModelState, Tensor, Tensor]:
         """The best pose from `count` minimal samples, locally optimized, its score and its support."""
+        P = (self._candidates_of_one if self.is_single else self._candidates)(count, generator)
+        if P.shape[1] == 0:
+            none = torch.zeros_like(self.xy[:, 0, 0])
+            return (P.new_zeros(len(P), 3, 4),), none - torch.inf, none
+        P, cost = self.fit(P, LOCAL_ITERATIONS)
+        (P,), cost = best_of((P,), cost)
+        near = (self.squared_errors(P) < SUPPORT_WIDTH**2) & self.mask
+        return (P,), self.mask.sum(-1) - cost, near.sum(-1)
+
+    def _candidates(self, count: int, generator: torch.Generator) -> Float[Tensor, "B K 3 4"]:
+        """The poses of best score from `count` minimal samples."""
         sample = sample_minimal(self.mask, 3, count, generator)
         R, t, valid = p3p(gather_rows(self.rays, sample), gather_rows(self.points, sample))
         R, t, valid = R.flatten(1, 2), t.flatten(1, 2), valid.flatten(1, 2)
         first = valid_first(valid)
         P = gather_rows(torch.cat((R, t[..., None]), dim=-1).flatten(2), first)
-        valid, count = valid.gather(1, first), min(CANDIDATES, P.shape[1])
-        best = best_models(self.score, P, valid, self.mask, count, generator)
-        P, cost = self.fit(gather_rows(P, best).unflatten(-1, (3, 4)), LOCAL_ITERATIONS)
-        (P,), cost = best_of((P,), cost)
-        near = (self.squared_errors(P) < SUPPORT_WIDTH**2) & self.mask
-        return (P,), self.mask.sum(-1) - cost, near.sum(-1)
+        count = min(CANDIDATES, P.shape[1])
+        best = best_models(self.score, P, valid.gather(1, first), self.mask, count, generator)
+        return gather_rows(P, best).unflatten(-1, (3, 4))
+
+    def _candidates_of_one(self, count: int, generator: torch.Generator) -> Float[Tensor, "1 K 3 4"]:
+        """`_candidates` of one problem in which all rows count, scored on all of them."""
+        rows = sample_minimal_of_all(self.points.shape[1], 3, count, generator).to(self.points.device)
+        R, t, valid = p3p(self.rays[0][rows], self.points[0][rows])
+        P = torch.cat((R, t[..., None]), dim=-1)[valid]
+        squared = squared_projections(
+            P.float()[None], self.homogeneous.float(), self.xy.float(), self.scale.float()
+        )
+        costs = squared[0].clamp_max_(1.0).nan_to_num_(1.0).sum(1)
+        return P[costs.topk(min(CANDIDATES, len(P)), largest=False).indices][None]
 
     def score(self, P: Float[Tensor, "B K 12"], rows: Int[Tensor, "B n"] | None) -> Float[Tensor, "B K"]:
         """Truncated scores of many poses on some of the points, or all, in float32."""

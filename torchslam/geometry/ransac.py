@@ -26,6 +26,8 @@ CONFIDENCE = 0.9999
 """Default of searches: probability that some sample has no outlier. Tried at this value only."""
 # Rows this many thresholds from a model support it: noise about as large as the threshold stays within.
 SUPPORT_WIDTH = 2.0
+_MAX_VALUES_AT_ONCE, _SAMPLES_AT_ONCE = 300_000, 1024
+"""Residuals in memory, and minimal samples solved, at once: they bound the memory. Tried at these values only."""
 # From this many residuals on, models are compared on some rows first, and some models then on all.
 _PREVIEW_FROM, _PREVIEW_ROWS, _PREVIEW_MODELS = 100_000, 80, 32
 
@@ -79,7 +81,7 @@ def in_chunks(
 
     numbers: values of the function's largest intermediate result per problem
     """
-    size = max(1, 300_000 // numbers)
+    size = max(1, _MAX_VALUES_AT_ONCE // numbers)
     if len(tensors[0]) <= size:
         return function(*tensors)
     parts = [function(*part) for part in zip(*(x.split(size) for x in tensors), strict=True)]
@@ -142,6 +144,16 @@ def sample_minimal(
     place = torch.arange(size, device=mask.device) % available.clamp_min(1)[:, None, None]
     position = start[..., None] + place
     return order.gather(1, position.flatten(1)).unflatten(1, (count, size))
+
+
+def sample_minimal_of_all(
+    rows: int, size: int, count: int, generator: torch.Generator
+) -> Int[Tensor, "{count} {size}"]:
+    """The samples of `sample_minimal` for one problem whose mask has all rows, in few calls."""
+    each = rows // size
+    permutations = math.ceil(count / each)
+    order = torch.rand(permutations, rows, generator=generator, dtype=torch.float32, device="cpu").argsort(1)
+    return order[:, : size * each].reshape(-1, size)[:count]
 
 
 def best_models(
@@ -216,15 +228,17 @@ def search(
         propose: (rows (R,) of the problems still open, number of samples) -> their best new models (R, ...), scores
             (R,), the higher the better, and support (R,), the number of rows within SUPPORT_WIDTH thresholds.
         available: rows in use per problem.
+        size: of a minimal sample.
+        confidence: probability that some sample has no outlier.
         first_round: samples of the first round; every round draws twice as many as the one before.
         as_needed: draw no more than the support calls for, but at least as many as in the first round.
     """
 
     def propose_in_chunks(rows: Int[Tensor, " R"], count: int) -> tuple[ModelState, Tensor, Tensor]:
-        """At most 1024 samples at a time, so that what they compute stays in the cache."""
-        if len(rows) * count <= 1024:
+        """Few problems at a time, so that what they compute stays in the cache."""
+        if len(rows) * count <= _SAMPLES_AT_ONCE:
             return propose(rows, count)
-        parts = [propose(part, count) for part in rows.split(max(1, 1024 // count))]
+        parts = [propose(part, count) for part in rows.split(max(1, _SAMPLES_AT_ONCE // count))]
         models, scores, supports = zip(*parts, strict=True)
         return tuple(torch.cat(x) for x in zip(*models, strict=True)), torch.cat(scores), torch.cat(supports)
 

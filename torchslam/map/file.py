@@ -337,7 +337,9 @@ def _check_rows(columns: Columns, sessions: int) -> None:
             limit = "" if end is None else f" to {end - 1}"
             raise ValueError(f"{name} from {least} to {top_rows}, there are {low}{limit}")
     if points:
-        replacement = torch.cat([points["replaced_by"], torch.tensor([-1])])  # -1 reads the last entry
+        replacement = torch.cat(
+            [points["replaced_by"], points["replaced_by"].new_tensor([-1])]
+        )  # -1 reads the last entry
         for _ in range(len(replacement).bit_length()):  # each round doubles the steps
             replacement = replacement[replacement]
         if bool((replacement >= 0).any()):

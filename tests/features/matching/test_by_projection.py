@@ -35,7 +35,8 @@ def naive_projected(
         for j in range(d.shape[1]):
             apart = (second.keypoints[row, j] - pixels[row, i]).norm()
             factor = float(second.scales[row, j] / query.scales[row, i])
-            fits = not guided or 1 / 1.5 <= factor <= 1.5
+            turn = float((second.angles[row, j] - query.angles[row, i] + math.pi) % (2 * math.pi) - math.pi)
+            fits = not guided or (1 / 1.3 <= factor <= 1.3 and abs(turn) <= 0.5)
             if second.mask[row, j] and apart <= radius[row, i] and fits:
                 candidates.append((float(d[i, j]), j))
         if not candidates:
@@ -62,9 +63,11 @@ def test_match_by_projection_equals_the_loop(
     pixels[0, 0], pixels[1, 0], pixels[1, 1] = -1e4, 1e30, math.nan
     radius = size * torch.rand(2, 25, generator=g)
     limit = 60 if floats is None else 0.3
-    scales = query.scales.to(device) if guided else None
+    extras = {"scales": query.scales.to(device), "angles": query.angles.to(device)} if guided else {}
     given = (tensor.to(device) for tensor in (query.descriptors, pixels, radius, second, query.mask))
-    matches = match_by_projection(*given, scales=scales, ratio=0.9, max_distance=limit)
+    matches = match_by_projection(
+        *given, ratio=0.9, max_distance=limit, scale_tolerance=1.3, angle_tolerance=0.5, **extras
+    )
     for row in range(2):
         assert pairs(matches, row) == naive_projected(query, pixels, radius, second, row, 0.9, limit, guided)
 

@@ -34,6 +34,9 @@ _BAND_HEIGHT = 32.0  # pixels, of the bands of keypoints that the torch backend 
 # Pixels from one band to the next, and from one image to the next, where keypoints stand in one row. Far more than
 # images have; a wider window takes in keypoints outside of its radius, which are then left out.
 _BAND_OFFSET, _IMAGE_OFFSET = 2.0**20, 2.0**36
+# Pixels, in the NumPy backend: a window is some runs of cells, one per row.
+_CELL_WIDTH, _CELL_HEIGHT = 8.0, 32.0
+_MAX_COLUMNS, _MAX_ROWS = 256, 64  # of cells: those of larger images are larger
 
 
 def pairs_within_radius(
@@ -94,8 +97,8 @@ def _pairs_within_radius_numpy(
     """`pairs_within_radius` on the CPU."""
     (x, y), (at_x, at_y) = (np.ascontiguousarray(xy.reshape(-1, 2).T) for xy in (keypoints, pixels))
     reach = radius.reshape(-1)
-    # Cells of 8 x 32 pixels; those of larger images are larger. A window is some runs of cells, one per row.
-    across, down = _CellAxis.of(x, 8.0, 256), _CellAxis.of(y, 32.0, 64)
+    across = _CellAxis.of(x, _CELL_WIDTH, _MAX_COLUMNS)
+    down = _CellAxis.of(y, _CELL_HEIGHT, _MAX_ROWS)
     columns = across.number
     order, starts = _sorted_into_cells(x, y, keypoint_mask, across, down)
 
@@ -207,6 +210,7 @@ PROJECTION_RATIO = 0.9
 ORB-SLAM2's search by projection. Tried at this value only."""
 SCALE_TOLERANCE = 1.5
 """Largest factor between the predicted and the found scale of a keypoint."""
+_MAX_PIXEL = 1e6  # points projected farther outside of the image do not match
 
 
 @without_autocast
@@ -217,8 +221,11 @@ def match_by_projection(
     features: Features,
     mask: Bool[Tensor, "B M"] | None = None,
     scales: Float[Tensor, "B M"] | None = None,
+    angles: Float[Tensor, "B M"] | None = None,
     ratio: float | None = PROJECTION_RATIO,
     max_distance: float | None = 64,
+    scale_tolerance: float = SCALE_TOLERANCE,
+    angle_tolerance: float = math.pi / 6,
 ) -> Matches:
     """Match points of known descriptors to the keypoints near their predicted pixels.
 
@@ -230,10 +237,13 @@ def match_by_projection(
         radius: of the search around the predicted pixels, pixels.
         features: keypoints to match.
         mask: points that may match; None: all.
-        scales: predicted `Features.scales`; a keypoint's may differ by the factor `SCALE_TOLERANCE`.
+        scales: predicted `Features.scales`; a keypoint's may differ by the factor `scale_tolerance`.
+        angles: predicted angles in radians; a keypoint's may differ by `angle_tolerance`.
         ratio: the nearest must be closer than `ratio` times the nearest other keypoint of its scale in the window
             (keypoints of other levels mostly see the same corner); None: no ratio test.
         max_distance: Hamming bits, or 1 - cosine for floats; None: no limit.
+        scale_tolerance: largest factor between a predicted and a found scale.
+        angle_tolerance: largest difference of a predicted and a found angle, radians.
 
     Returns:
         Matches with M rows: row i is point i, `indices_2` its keypoint.
@@ -241,13 +251,13 @@ def match_by_projection(
     Raises:
         ValueError: The descriptors differ in type or length, or are not of unit length.
     """
-    check_positive(ratio=ratio)
+    check_positive(ratio=ratio, scale_tolerance=scale_tolerance, angle_tolerance=angle_tolerance)
     check_descriptors(descriptors, features.descriptors)
     batch, rows, columns = len(pixels), pixels.shape[1], features.keypoints.shape[1]
     if rows == 0 or columns == 0:
         return empty_matches(batch, rows, pixels.device)
     radius = torch.as_tensor(radius, dtype=pixels.dtype, device=pixels.device).expand(batch, rows)
-    is_near = pixels.detach().abs().amax(-1) < 1e6  # false for NaN as well
+    is_near = pixels.detach().abs().amax(-1) < _MAX_PIXEL  # false for NaN as well
     mask = is_near if mask is None else mask & is_near
     at = torch.where(mask[..., None], pixels.detach(), 0)
     around = torch.where(mask, radius.detach(), 0)
@@ -256,7 +266,12 @@ def match_by_projection(
     keypoint_scales = features.scales.detach().flatten()
     if scales is not None:
         factor = keypoint_scales.index_select(0, column) / scales.detach().flatten().index_select(0, row)
-        row, column = masked_rows((factor <= SCALE_TOLERANCE) & (factor * SCALE_TOLERANCE >= 1), row, column)
+        row, column = masked_rows((factor <= scale_tolerance) & (factor * scale_tolerance >= 1), row, column)
+    if angles is not None:
+        turn = features.angles.detach().flatten().index_select(
+            0, column
+        ) - angles.detach().flatten().index_select(0, row)
+        row, column = masked_rows(torch.cos(turn) >= math.cos(angle_tolerance), row, column)
 
     pairs = descriptors.flatten(0, 1), row, features.descriptors.flatten(0, 1), column
     limit = math.inf if max_distance is None else max_distance
