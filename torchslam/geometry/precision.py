@@ -115,7 +115,7 @@ class _Form(NamedTuple):
 
 
 def _dimension(token: str) -> int | str | None:
-    """A size, a name, or None for what a call does not know: a pattern, or the result of a computation."""
+    """The size or the name of a dimension; None for a pattern such as `*batch`, or for an expression."""
     if token.isdigit():
         return int(token)
     name = token.strip("#")

@@ -212,7 +212,10 @@ class ObservationGraph:
             given = self.calibration.camera.params, self.calibration.directions
             check_dtypes(camera=params, calibration=given[0], directions=given[1])
             if given[0].shape != params.shape or given[1].ndim != 2 or len(given[1]) != len(params):
-                raise ValueError("the calibration does not fit the camera")
+                raise ValueError(
+                    f"the calibration has {len(given[0])} parameters and directions {tuple(given[1].shape)}; the camera "
+                    f"has {len(params)} parameters"
+                )
             if not all(bool(part.isfinite().all()) for part in given):
                 raise ValueError("the calibration is not finite")
             if not 0 < self.calibration.observation_variance < math.inf:

@@ -77,11 +77,11 @@ class CameraEstimate:
 
     @property
     def departure(self) -> float:
-        """How many standard errors of the images they are from the given camera; see `departure_from`."""
+        """Departure of the estimate from the given camera in standard errors; see `departure_from`."""
         return self.departure_from(self.prior.camera)
 
     def departure_from(self, camera: Camera) -> float:
-        """How many standard errors of the images they are from a camera; 0 where nothing is free.
+        """Return the departure of the estimate from a camera in standard errors; 0 if nothing is free.
 
         It is the length of the whitened step, which chance alone makes 2.4 and 2.8 in 5 % of all cases with two and
         three parameters.

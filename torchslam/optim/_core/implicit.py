@@ -80,7 +80,7 @@ class Minimization(Protocol):
         ...
 
     def retracted(self, found: Tensors, direction: Tensors) -> Tensors:
-        """`found` with theta moved along a direction."""
+        """Return `found` with theta moved along a direction."""
         ...
 
     def push(self, found: Tensors, direction: Tensors) -> Tensors:
