@@ -213,8 +213,8 @@ class ObservationGraph:
             check_dtypes(camera=params, calibration=given[0], directions=given[1])
             if given[0].shape != params.shape or given[1].ndim != 2 or len(given[1]) != len(params):
                 raise ValueError(
-                    f"the calibration has {len(given[0])} parameters and directions {tuple(given[1].shape)}; the camera "
-                    f"has {len(params)} parameters"
+                    f"the calibration has {len(given[0])} parameters and directions {tuple(given[1].shape)}; "
+                    f"the camera has {len(params)} parameters"
                 )
             if not all(bool(part.isfinite().all()) for part in given):
                 raise ValueError("the calibration is not finite")
