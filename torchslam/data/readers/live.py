@@ -111,10 +111,7 @@ class LiveSequence(Sequence):
                 f"{self.image_name(index)}: is gone; a live source gives each frame once, in order"
             )
         if not self._is_watched and not self._ended:
-            self._is_watched = True
-            if time.time() - self._arrived[0][0] > STALE:
-                self._arrived.clear()
-            self._thread = self._watch_until(lambda: False)
+            self._begin()
         with self._fresh:
             self._fresh.wait_for(lambda: self._arrived or self._ended, self._patience)
             if not self._arrived:
@@ -146,6 +143,13 @@ class LiveSequence(Sequence):
         self._closing = True
         if not self._thread.is_alive():
             self._end()
+
+    def _begin(self) -> None:
+        """Watch from now on, without what was seen long ago."""
+        self._is_watched = True
+        if time.time() - self._arrived[0][0] > STALE:
+            self._arrived.clear()
+        self._thread = self._watch_until(lambda: False)
 
     def _watch_until(self, is_enough: Callable[[], bool]) -> threading.Thread:
         """A thread that keeps the newest frames until that is enough, the source ends or it is closed."""
