@@ -77,7 +77,7 @@ def test_a_queued_frame_is_extracted_by_the_worker_with_the_same_result(reader: 
     found = []
     for index in range(8):
         if index == SMALL:
-            with pytest.raises(FrameError, match="another size"):
+            with pytest.raises(FrameError, match="160x50, the others are 160x120"):
                 reader[index]
             continue
         frame = reader[index]
