@@ -9,7 +9,8 @@ import torch
 from torchslam.calibration.find_camera import NUM_KEYPOINTS, find_camera, with_stated_std
 from torchslam.config import Config
 from torchslam.data.sequence import Calibrated, Sequence
-from torchslam.global_mapping.mapper import features_to_keep
+from torchslam.global_mapping.links import learned_config
+from torchslam.global_mapping.mapper import features_to_keep, mapping_config
 from torchslam.global_mapping.recording import MappedRun, Mapping, run_recording
 from torchslam.metric.options import given_options, sources_of
 from torchslam.metric.source import MetricSource
@@ -44,11 +45,13 @@ def run(
 
     Raises:
         MeasurementError: A measurement is wrong; where a file is, before the first frame.
+        ConfigError: Weights that the configuration asks for are missing.
     """
     config, mapping = config or Config(), Mapping(mapping)
     sources = [*sources_of(given_options(config.metric, sequence.measurements)), *measurements]
     features = None
     if mapping is not Mapping.ONLINE and not sequence.is_live:
+        learned_config(mapping_config(config))  # raises now rather than after the online run
         features = features_to_keep(config, sequence.size, NUM_KEYPOINTS, device)
     if sequence.calibrated is not Calibrated.GIVEN and not sequence.is_live:
         sequence, _ = find_camera(sequence, config, None, device, extract=features)

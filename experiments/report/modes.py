@@ -15,9 +15,9 @@ import numpy as np
 from experiments.common import parser_of, table
 from experiments.report.record import ROOT
 from torchslam.io.plots.charts import (
-    _SHADES,
     GROUND_TRUTH,
     MUTED,
+    SHADES,
     house_style,
     new_figure,
 )
@@ -41,10 +41,10 @@ PLACES = {
 """Where each mode is drawn."""
 TRACKED = "#dbe7ef"
 COLORS = {
-    State.INITIALIZING: _SHADES[State.INITIALIZING][0],
-    State.LOST: _SHADES[State.LOST][0],
+    State.INITIALIZING: SHADES[State.INITIALIZING][0],
+    State.LOST: SHADES[State.LOST][0],
     State.TRACKING: TRACKED,
-    State.UNCERTAIN: _SHADES[State.UNCERTAIN][0],
+    State.UNCERTAIN: SHADES[State.UNCERTAIN][0],
 }
 BEND = 0.08  # of an arrow, as a ratio of its length: two modes may lead to each other
 LABEL_AT = 0.3  # of the way along an arrow

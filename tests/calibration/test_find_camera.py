@@ -160,6 +160,9 @@ def test_a_guess_without_a_search_counts_as_one() -> None:
     assert not with_stated_std(config, unknown.with_camera(unknown.camera)).camera.guessed
     stated = with_stated_std(config, unknown.with_camera(unknown.camera, std=0.1))
     assert stated.camera == CameraConfig(std=0.1)
+    shaken = replace(config, camera=CameraConfig(readout=20.0, readout_std=1.0, guessed=True))
+    stated = with_stated_std(shaken, unknown.with_camera(unknown.camera, std=0.1))
+    assert stated.camera == CameraConfig(std=0.1, readout=20.0, readout_std=1.0)
 
 
 @pytest.mark.parametrize(

@@ -65,6 +65,21 @@ def test_a_second_camera_has_its_own_tracking_state() -> None:
     torch.testing.assert_close(submap.T_cw, before)
 
 
+def test_poses_are_compared_within_a_world_only() -> None:
+    """It ends where keyframes are corrected as a whole, and where another map joins."""
+    one, other = (submap_of_scene(Scene.of(30), sideways(3)) for _ in range(2))
+    other.number = 1
+    assert one.world != other.world
+    worlds = [one.world]
+    one.apply_sim3_correction(one.map.T_cw.clone())
+    worlds.append(one.world)
+    one.transform(pose())
+    worlds.append(one.world)
+    one.merge(other, pose())
+    worlds.append(one.world)
+    assert len(set(worlds)) == 4
+
+
 def test_the_nearest_of_the_most_covisible_keyframes_is_the_replacement() -> None:
     """Cameras in a row that look at one scene: those on either side are as near as the step says."""
     T_cw = sideways(6)

@@ -16,6 +16,7 @@ from tests.map.simulated import CAMERA
 from tests.metric.drives import measure, reason
 from tests.metric.plane_world import PlaneWorld
 from torchslam.data import open_sequence
+from torchslam.data.formats import depth_images
 from torchslam.data.formats.depth_images import find_depth_images
 from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.evaluation import evaluate
@@ -110,6 +111,17 @@ def test_a_list_is_matched_by_times(world: NamedWorld, view: SubmapView, tmp_pat
         assert found.count >= FRAMES - 1
         assert found.rejected == ()
         assert abs(error(found)) < 0.002
+
+
+def test_a_list_has_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(depth_images, "MAX_FILES", 3)
+    for count, message in ((3, None), (4, "depth.txt: more than 3 depth images")):
+        (tmp_path / "depth.txt").write_text("".join(f"{index} depth/{index}.png\n" for index in range(count)))
+        if message is None:
+            assert len(find_depth_images(tmp_path).paths) == count
+        else:
+            with pytest.raises(MeasurementError, match=message):
+                find_depth_images(tmp_path)
 
 
 def test_values_without_depth_do_not_count(world: NamedWorld, view: SubmapView, tmp_path: Path) -> None:

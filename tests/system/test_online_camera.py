@@ -242,6 +242,10 @@ def test_the_estimate_is_by_the_given_camera_and_the_one_in_use() -> None:
     assert len(priors) == 1
     assert torch.equal(cameras[0].params[:4], slam.camera.params[:4])
     assert cameras[-1] is slam.online_camera.changes[-1].camera
+    assert slam.submap is not None
+    assert slam.submap.epoch == len(
+        slam.online_camera.changes
+    )  # poses by another camera are of another world
 
 
 @pytest.mark.parametrize(

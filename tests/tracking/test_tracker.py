@@ -198,7 +198,9 @@ def test_the_tracking_state_restarts_after_relocalization() -> None:
     view = SCENE.view(50, sideways(1, start=0.02)[0])
     estimate = followed(here.fork(), view, follower)
     here.map.points["last_seen_frame"][:] = 0
+    before = here.world
     follower.start_at_estimate(here, view, estimate)
+    assert here.world != before
     assert here.tracking.reference == 0
     assert here.tracking.velocity is None
     assert (here.tracking.error, here.tracking.explained_ratio) == (0.0, 1.0)

@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchslam.config import CameraConfig, Config
+from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.data.calibration import CALIBRATION, check_replaceable, read_numbers, write_calibration
 from torchslam.data.sequence import Calibrated
@@ -227,7 +227,7 @@ def with_stated_std(config: Config, sequence: Sequence) -> Config:
     if sequence.camera_std is None:
         guessed = sequence.calibrated is Calibrated.GUESSED
         return replace(config, camera=replace(config.camera, guessed=guessed)) if guessed else config
-    return replace(config, camera=CameraConfig(std=sequence.camera_std))
+    return replace(config, camera=replace(config.camera, std=sequence.camera_std, guessed=False))
 
 
 def camera_remark(finished: Run, found: str) -> str:

@@ -18,7 +18,8 @@ from torch import Tensor
 from torchslam.cli import arguments
 from torchslam.config import load_config
 from torchslam.data.trajectories import read_trajectory, write_trajectory
-from torchslam.errors import ConfigError, ResultsError
+from torchslam.errors import ConfigError, ResultsError, TrajectoryError
+from torchslam.evaluation import evaluate
 from torchslam.io import results as files
 from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.export.scene import Images
@@ -106,8 +107,11 @@ def _write(run: SavedRun, moved: dict[int, Float[Tensor, "4 4"]], unmeasured: li
     main = run.main
     metric = None if main is None else main.metric
     metrics |= {"metric": None if metric is None else metric.as_dict(), "unmeasured": unmeasured}
-    evaluation = results.evaluation(main.trajectory(session)) if main and "ate_m" in metrics else None
-    metrics |= {} if evaluation is None else evaluation.as_dict()
+    if main is not None and results.groundtruth is not None and "ate_m" in metrics:
+        try:
+            metrics |= evaluate(main.trajectory(session), results.groundtruth).as_dict()
+        except TrajectoryError as error:
+            warn(f"no evaluation: {error}")
     write_metrics(directory, metrics)
     redraw(directory)
     return metrics

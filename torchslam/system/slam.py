@@ -37,7 +37,6 @@ from torchslam.system.front_end import (
     check_size,
     checked_extractor,
     image_extractor,
-    source,
 )
 from torchslam.system.metric_run import run_in_meters
 from torchslam.system.modes import Mode
@@ -250,7 +249,6 @@ class SLAM:
             MeasurementError: A measurement from outside is wrong; where a file is, before the first frame.
         """
         measurements = [*sources_of(given_options(self.config.metric, sequence.measurements)), *measurements]
-        sequence = source(sequence, self.config, self.camera)
         finished = OnlineRun(self, sequence, None, processes, Observer(progress)).run()
         return run_in_meters(finished, sequence, measurements) if self.mapping else finished
 

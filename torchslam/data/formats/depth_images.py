@@ -84,7 +84,10 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
     listed = [path / DEPTH_LIST, *([path.parent / DEPTH_LIST] if path.name == "depth" else [])]
     found = next((each for each in listed if each.is_file()), None if path.is_dir() else path)
     if found is not None:
-        places, seconds, paths = zip(*listed_files(found, MeasurementError), strict=True)
+        lines = itertools.islice(listed_files(found, MeasurementError), MAX_FILES + 1)
+        places, seconds, paths = zip(*lines, strict=True)
+        if len(paths) > MAX_FILES:
+            raise MeasurementError(f"{found}: more than {MAX_FILES} depth images")
         check_rising(seconds, places, MeasurementError)
         return DepthImages(found, paths, float64(seconds), units_per_meter or 5000.0)
     files = _files(path)

@@ -101,7 +101,7 @@ def thin(count: int, limit: int) -> Int[np.ndarray, " R"]:
     return np.arange(count) if count <= limit else np.linspace(0, count - 1, limit).round().astype(int)
 
 
-_SHADES = {
+SHADES = {
     State.LOST: ("#f3d9d2", "lost"),
     State.UNCERTAIN: ("#e2d2ec", "uncertain"),
     State.INITIALIZING: ("#f1ecdf", "initializing"),
@@ -173,8 +173,8 @@ def _shade(axes: Axes, results: Sequence[StepResult], origin: float) -> None:
         state = results[start].state
         if end < len(results) and results[end].state is state:
             continue
-        if state in _SHADES:
-            color, label = _SHADES[state]
+        if state in SHADES:
+            color, label = SHADES[state]
             label = "_" * (state in labeled) + label
             times = (results[row].timestamp - origin for row in (start, min(end, len(results) - 1)))
             axes.axvspan(*times, color=color, lw=0, label=label)
