@@ -17,6 +17,7 @@ from torchslam.geometry.rolling_shutter import Readout
 from torchslam.optim.model_choice import LEAST_GAIN, Gain
 from torchslam.optim.rolling_shutter import (
     RollingShutter,
+    ShakingTest,
     _Block,
     find_rolling_shutter,
     project_out,
@@ -84,15 +85,21 @@ def test_a_global_shutter_is_not_named() -> None:
 
 def test_a_test_of_fewer_frames_says_the_same_of_the_readout() -> None:
     graph = adjusted(recording(0.9))
-    whole, quick = estimated(graph), find_rolling_shutter(graph, 20, for_shaking=False)
+    whole, quick = estimated(graph), find_rolling_shutter(graph, 20, shaking=ShakingTest.NEVER)
     assert quick is not None
     assert quick.is_read_out
     assert quick.readout * FRAME_RATE == pytest.approx(0.9, abs=0.09)
     assert math.isnan(quick.by_row)
     assert not quick.is_shaken
-    same = find_rolling_shutter(graph, for_shaking=False)
+    same = find_rolling_shutter(graph, shaking=ShakingTest.NEVER)
     assert same is not None
     assert (same.readout, same.readout_std) == (whole.readout, whole.readout_std)
+    assert find_rolling_shutter(graph, shaking=ShakingTest.UNLESS_READ_OUT) == same
+
+
+def test_shaking_is_tested_where_no_readout_is_found() -> None:
+    graph = adjusted(recording(0.0))
+    assert find_rolling_shutter(graph, shaking=ShakingTest.UNLESS_READ_OUT) == estimated(graph)
 
 
 def test_a_readout_is_what_was_given_or_what_residuals_show() -> None:

@@ -17,7 +17,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum
 
 import torch
 from jaxtyping import Bool, Float, Int
@@ -56,6 +57,14 @@ MIN_MORE_EXPLAINED = 0.1
 or less on real sequences, 0.16 or more where the rows of their images are shifted by up to 6 px."""
 
 
+class ShakingTest(Enum):
+    """Whether smooth functions of the row are tested as well, which takes half of the time."""
+
+    NEVER = "never"
+    UNLESS_READ_OUT = "where the motion between frames shows no readout"
+    ALWAYS = "always"
+
+
 @dataclass(frozen=True)
 class RollingShutter:
     """The exposure of the rows by the residuals of a run.
@@ -76,8 +85,8 @@ class RollingShutter:
     interval: float
     shift: float
     gain: Gain
-    by_row: float
-    by_column: float
+    by_row: float = math.nan
+    by_column: float = math.nan
 
     @property
     def is_read_out(self) -> bool:
@@ -151,7 +160,7 @@ def project_out(values: Float[Tensor, "O 2 D"], blocks: Sequence[_Block]) -> Flo
 @full_precision
 @torch.no_grad()
 def find_rolling_shutter(
-    graph: ObservationGraph, max_frames: int = MAX_FRAMES, for_shaking: bool = True
+    graph: ObservationGraph, max_frames: int = MAX_FRAMES, shaking: ShakingTest = ShakingTest.ALWAYS
 ) -> RollingShutter | None:
     """Test the residuals of a run at its solution, in the submap, and of its sessions in that, with most frames.
 
@@ -159,7 +168,7 @@ def find_rolling_shutter(
 
     Args:
         max_frames: most frames of the test, evenly distributed.
-        for_shaking: whether functions of the row are tested as well, which takes half of the time.
+        shaking: whether functions of the row are tested as well.
 
     Returns:
         The result; None with too few frames, or too few observations of the same points.
@@ -205,18 +214,21 @@ def find_rolling_shutter(
     left, shift = project_out(torch.cat((residuals, row * flow), dim=-1), [poses, *others]).split(1, dim=-1)
     readout, std, gain = _regress(left[..., 0], shift[..., 0], frame, count, start / interval)
     left = left - readout * shift
-    ratios = [] if for_shaking else [math.nan, math.nan]
-    for place in (row, column) if for_shaking else ():
+    typical = (row * flow)[..., 0].norm(dim=-1).median() / residuals[..., 0].norm(dim=-1).median()
+    readout += start / interval
+    size_of_shift = abs(readout) * float(typical)
+    found = RollingShutter(interval * readout, interval * std, interval, size_of_shift, gain)
+    if shaking is ShakingTest.NEVER or (shaking is ShakingTest.UNLESS_READ_OUT and found.is_read_out):
+        return found
+    ratios = []
+    for place in (row, column):
         # Legendre polynomials of the second and third degree on -1/2 ... 1/2, without that of the first: up to a
         # rotation, a shift along x that grows with the row is a shift along y that grows with the column.
         bends = [bend * J_poses[..., 3:5] for bend in (6 * place**2 - 0.5, 20 * place**3 - 3 * place)]
         bent = _Block.of(torch.cat((J_poses, *bends), dim=-1), frame, count)
         remaining = project_out(left, [bent, *others]).square().sum() / left.square().sum()
         ratios.append(1.0 - float(remaining))
-    typical = (row * flow)[..., 0].norm(dim=-1).median() / residuals[..., 0].norm(dim=-1).median()
-    readout += start / interval
-    size_of_shift = abs(readout) * float(typical)
-    return RollingShutter(interval * readout, interval * std, interval, size_of_shift, gain, *ratios)
+    return replace(found, by_row=ratios[0], by_column=ratios[1])
 
 
 def readout_by(found: RollingShutter | None, known: Readout) -> Readout | None:

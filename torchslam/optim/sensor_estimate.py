@@ -31,7 +31,13 @@ from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._scores import camera_scores
 from torchslam.optim.bundle._solve import solve_bundle
 from torchslam.optim.model_choice import Gain
-from torchslam.optim.rolling_shutter import MAX_FRAMES, RollingShutter, find_rolling_shutter, readout_by
+from torchslam.optim.rolling_shutter import (
+    MAX_FRAMES,
+    RollingShutter,
+    ShakingTest,
+    find_rolling_shutter,
+    readout_by,
+)
 from torchslam.optim.run_graph import ObservationGraph, RunGraph, camera_prior, keyframe_problem
 
 MAX_STRETCHES, STRETCH_FRAMES = 10, 3
@@ -297,7 +303,7 @@ def estimate_sensor(
     prior: SensorPrior,
     options: SolverOptions,
     readout_frames: int = MAX_FRAMES,
-    for_shaking: bool = False,
+    shaking: ShakingTest = ShakingTest.NEVER,
 ) -> SensorEstimate:
     """Estimate the readout and the camera of a graph of one submap. Detached.
 
@@ -306,13 +312,14 @@ def estimate_sensor(
         prior: what is known without it.
         options: of the adjustment of its keyframes.
         readout_frames: most frames from which the readout is estimated.
-        for_shaking: as in `find_rolling_shutter`.
+        shaking: as in `find_rolling_shutter`, by the last readout.
     """
     readout, shutter = graph.readout, None
     if prior.readout.is_sought or prior.readout.is_given:
         # Gauss-Newton steps, each with the keypoints corrected by the one before: the second changes it by a thirtieth.
-        for _ in range(2):
-            shutter = find_rolling_shutter(replace(graph, readout=readout), readout_frames, for_shaking)
+        first = ShakingTest.NEVER if shaking is ShakingTest.NEVER else ShakingTest.UNLESS_READ_OUT
+        for test in (first, shaking):
+            shutter = find_rolling_shutter(replace(graph, readout=readout), readout_frames, test)
             # The one in use stays where none is better.
             readout = readout_by(shutter, prior.readout) or readout
             if readout is None:

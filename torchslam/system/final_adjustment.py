@@ -16,7 +16,7 @@ from torchslam.geometry.gating import passes_gate
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import adjust_all, noise_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
-from torchslam.optim.rolling_shutter import RollingShutter
+from torchslam.optim.rolling_shutter import RollingShutter, ShakingTest
 from torchslam.optim.run_graph import GraphSolution, RunGraph, keyframe_problem, solve_graph
 from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor, graph_evidence
 from torchslam.system.online_camera import given_readout
@@ -104,7 +104,9 @@ class FinalAdjustment:
     def _steps(self, settled: bool, is_main: bool) -> list[_Step]:
         """The steps of a submap. The rounds of a settled map have adjusted and rejected already."""
         roughly, exactly = partial(self._solve, options=ROUGH), partial(self._solve, options=FINAL)
-        shutter: list[_Step] = [self._estimate_readout] if is_main else []
+        # Where a readout is found, it is estimated once more by better poses.
+        test = ShakingTest.ALWAYS if settled else ShakingTest.UNLESS_READ_OUT
+        shutter: list[_Step] = [partial(self._estimate_readout, shaking=test)] if is_main else []
         noise: list[_Step] = [self._estimate_noise] if is_main else []
         camera: list[_Step] = [self._choose_camera] if is_main else []
         end: list[_Step] = [self._correct, self._state_camera, self._store_covariances]
@@ -129,9 +131,9 @@ class FinalAdjustment:
     def _correct(self, submap: Submap) -> None:
         submap.correct_keyframes(self.sensor)
 
-    def _estimate_readout(self, submap: Submap) -> None:
+    def _estimate_readout(self, submap: Submap, shaking: ShakingTest) -> None:
         graph = submap.posed_frames.graph(submap.map, self.sensor)
-        found = estimate_sensor(graph, replace(self.prior, camera=None), FINAL, for_shaking=True)
+        found = estimate_sensor(graph, replace(self.prior, camera=None), FINAL, shaking=shaking)
         self.sensor = replace(self.sensor, readout=found.sensor.readout)
         self.shutter, self._has_other_readout = found.shutter, found.has_other_readout
 
@@ -141,7 +143,7 @@ class FinalAdjustment:
 
     def _refine_readout(self, submap: Submap) -> None:
         if self.sensor.readout is not None:
-            self._estimate_readout(submap)
+            self._estimate_readout(submap, ShakingTest.ALWAYS)
 
     def _reject(self, submap: Submap) -> None:
         """Remove observations that are far from their points.

@@ -67,7 +67,8 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure as PNG; the same figure gives the same bytes."""
     path.parent.mkdir(parents=True, exist_ok=True)
     with house_style():
-        figure.savefig(path, format="png", metadata={"Software": None})
+        # Of zlib's levels 3 takes half of the time of the default, for files that are a tenth larger.
+        figure.savefig(path, format="png", metadata={"Software": None}, pil_kwargs={"compress_level": 3})
 
 
 def to_numpy(values: Shaped[Tensor, "*shape"]) -> Float[np.ndarray, "*shape"]:
