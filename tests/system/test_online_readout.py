@@ -17,7 +17,7 @@ from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.online_run import Observer, OnlineRun, RunProgress
 from torchslam.tracking.non_static import NO_MOVEMENT, SceneFilter
 
-ROOM = open_sequence("synthetic:room?readout=30&pace=2", limit=56)
+ROOM = open_sequence("synthetic:room?readout=30&pace=2", limit=60)
 
 
 class Saved:
