@@ -19,7 +19,7 @@ from torchslam.tracking.matcher import make_matcher, run_matcher
 from torchslam.tracking.turning_camera import READOUT_SIGMAS, TurningCamera
 from torchslam.types import FrameFeatures, Reason, TwoViewMap
 
-SCENE = Scene.of(1200, width=24.0)
+SCENE = Scene.of(1600, width=24.0)
 
 
 def walk(frames: int, step: float) -> Tensor:
