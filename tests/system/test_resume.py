@@ -39,10 +39,10 @@ SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.
 SETTINGS += ["simulated.noise_px=0.05", "camera.readout_std=0"]
 SET = [part for setting in SETTINGS for part in ("--set", setting)]
 CONFIG = load_config(None, SETTINGS)
-FRAMES = 26
+FRAMES = 22
 PATH = arc(45)[:FRAMES]
 WALK = Walk(PATH)
-STOP = 17  # frame after which a run ends early
+STOP = 14  # frame after which a run ends early
 
 
 @pytest.fixture(scope="module", autouse=True)
