@@ -330,9 +330,7 @@ def test_every_frame_uses_a_bounded_part_of_the_map() -> None:
     slam = SLAM(
         walk.camera, load_config(None, [*SIMULATED, "simulated.depth_near=0.032", "simulated.depth_far=0.16"])
     )
-    frames = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(walk)
-    for index in range(len(walk)):
-        slam.step(frames[index])
+    slam.run(walk)
     assert slam.map.num_keyframes > 10
     assert slam.submap is not None
     tracking = slam.submap.tracking
