@@ -22,7 +22,8 @@ torch.set_num_threads(1)
 HAS_SIMULATED_ACCELERATOR = accelerator.register()
 
 WHOLE_RUNS = ("batch", "calibration", "cli", "docs", "experiments", "io", "parallel", "refine", "system")
-"""Folders of tests that run the whole system many times."""
+WHOLE_RUNS += ("test_defaults.py", "test_devices.py", "test_plugins.py", "test_recording.py")
+"""Folders and files of tests that run the whole system many times."""
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 

@@ -51,6 +51,7 @@ def config(*overrides: str) -> Config:
             "simulated.depth_far=2",
             "simulated.noise_px=0.1",
             "global_mapping.max_images=15",
+            "camera.readout_std=0",
             *overrides,
         ],
     )
