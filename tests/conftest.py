@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import hypothesis
 import jaxtyping
+import numpy as np
 import pytest
 import torch
 
@@ -20,10 +22,14 @@ torch.set_num_threads(1)
 HAS_SIMULATED_ACCELERATOR = accelerator.register()
 
 WHOLE_RUNS = ("batch", "calibration", "cli", "docs", "experiments", "io", "parallel", "refine", "system")
-"""Folders of tests that run the whole system many times."""
+WHOLE_RUNS += ("test_defaults.py", "test_devices.py", "test_plugins.py", "test_recording.py")
+"""Folders and files of tests that run the whole system many times."""
 
 DATA_DIR = Path(os.environ.get("TORCHSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 
+
+MAX_RENDERED = 300
+"""Rendered images that are kept, of 0.3 MB each."""
 
 hypothesis.settings.register_profile("short", max_examples=40)  # others in each run
 hypothesis.settings.load_profile("short")
@@ -72,6 +78,30 @@ def _check_shapes(request: pytest.FixtureRequest) -> Iterator[None]:
     jaxtyping.config.update("jaxtyping_disable", area in WHOLE_RUNS)
     yield
     jaxtyping.config.update("jaxtyping_disable", False)
+
+
+@pytest.fixture(scope="session", autouse=True)
+def rendered_images() -> Iterator[dict[object, np.ndarray]]:
+    """Keep rendered images: many tests see the first frames of the same room, and rendering takes half their time."""
+    from torchslam.data.formats.image_file import gray_to_tensor  # not before jaxtyping adds its checks
+    from torchslam.data.synthetic.sequence import SyntheticSequence
+
+    kept: dict[object, np.ndarray] = {}
+    render = SyntheticSequence.image
+
+    def image(sequence: SyntheticSequence, index: int) -> torch.Tensor:
+        if sequence._options.blank:
+            return render(sequence, index)
+        key = (sequence.name, replace(sequence._options, frames=0), index)
+        if key not in kept:
+            if len(kept) == MAX_RENDERED:
+                kept.pop(next(iter(kept)))
+            kept[key] = (255 * render(sequence, index)).round().to(torch.uint8)[0, 0].numpy()
+        return gray_to_tensor(kept[key])
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(SyntheticSequence, "image", image)
+        yield kept
 
 
 @pytest.fixture

@@ -42,7 +42,7 @@ CPU = torch.device("cpu")
 @pytest.fixture(scope="module")
 def room() -> Sequence:
     """Rendered images, of whose focal length of 500 px nothing is known."""
-    whole = open_sequence("synthetic:room", "f=0.85w", limit=100)
+    whole = open_sequence("synthetic:room", "f=0.85w", limit=60)
     return whole.with_camera(whole.camera, Calibrated.GUESSED)
 
 
@@ -186,7 +186,7 @@ def straight(camera: Camera, factor: float = 1.0) -> Camera:
 
 
 @pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_better_camera_is_near_the_true_one(
     simulated: Callable[..., ObservationGraph], truth: Camera, factor: float, seed: int
 ) -> None:

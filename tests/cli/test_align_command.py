@@ -15,6 +15,7 @@ from torchslam.data import read_trajectory
 from torchslam.map.file import read_atlas
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
+pytestmark = pytest.mark.usefixtures("without_pictures")
 MARKER = ["--marker", "apriltag-36h11:0.2"]  # there is none in the room
 
 
@@ -36,7 +37,9 @@ class Known:
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("run")
-    assert main(["run", ROOM, "--output", str(directory), *FAST, *MARKER]) == 0
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr("torchslam.io.write_run.draw", lambda results, output: [])
+        assert main(["run", ROOM, "--output", str(directory), *FAST, *MARKER]) == 0
     return directory
 
 

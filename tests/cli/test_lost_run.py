@@ -22,15 +22,15 @@ from torchslam.system import online_run
 from torchslam.system.online_run import Observer, OnlineRun, finish
 
 SETTINGS = ["features.kind=simulated", "features.num_keypoints=250", "simulated.points_per_view=150"]
-SETTINGS += ["simulated.noise_px=0.05"]
-FRAMES, LOST = 26, 17
+SETTINGS += ["simulated.noise_px=0.05", "camera.readout_std=0"]
+FRAMES, LOST = 20, 12
 WALK = Walk(arc(45)[:FRAMES])
 
 Run = Callable[..., dict[str, Any]]
 
 
 @pytest.fixture(autouse=True)
-def steps(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def steps(without_pictures: None, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """The frames that were processed online; one is said to be lost."""
     processed, step = list[int](), SLAM.step
 

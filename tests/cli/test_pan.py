@@ -35,6 +35,7 @@ def pan(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.usefixtures("without_pictures")
 @pytest.mark.parametrize(("focal", "frames"), [(408, 24), pytest.param(576, 16, marks=pytest.mark.slow)])
 def test_a_pan_with_an_uncertain_camera_gives_no_map_and_a_reason(
     pan: Path, focal: int, frames: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -25,6 +25,7 @@ from torchslam.io.export.nerfstudio import nerfstudio_camera
 from torchslam.refine.pose_refinement import align_to_input
 from torchslam.types import Trajectory
 
+pytestmark = pytest.mark.usefixtures("without_pictures")
 FRAMES = 8
 WRONG = Camera.pinhole(525.0, 525.0, 319.5, 239.5, size=(640, 480))  # it is 500
 

@@ -55,10 +55,10 @@ def test_run_under_a_mask(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     mask = np.full((480, 640), 255, np.uint8)
     mask[:, :200] = 0
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    sequence = ["synthetic:planar?frames=12", "--stop", "10", "--mask", str(tmp_path / "mask.png")]
+    sequence = ["synthetic:room?frames=12", "--stop", "10", "--mask", str(tmp_path / "mask.png")]
     assert main(["run", *sequence, "-o", str(tmp_path / "r"), "--resize", "0.5", *FAST]) in (0, 3)
     figures = json.loads((tmp_path / "r" / "metrics.json").read_text())
     assert (figures["frames"], figures["dropped"]) == (10, 0)
-    masked = open_sequence("synthetic:planar?frames=12", mask=tmp_path / "mask.png", resize_to="0.5")
+    masked = open_sequence("synthetic:room?frames=12", mask=tmp_path / "mask.png", resize_to="0.5")
     assert masked[0].mask[0, 0, :, :100].any().item() is False
     assert float(masked.camera.fx) == 250.0

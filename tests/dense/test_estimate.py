@@ -44,6 +44,8 @@ def inside(values: Tensor) -> Tensor:
 
 
 def test_the_depth_of_a_slanted_plane(device: torch.device, dtype: torch.dtype) -> None:
+    if device.type == "sim" and dtype == torch.float64:
+        pytest.skip("tried in single precision")
     reference, sources, camera, T_sr, depth = scene(WIDTH, HEIGHT)
     near, far = limits(dtype=dtype)
     found = estimate_depth(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -46,6 +47,8 @@ def test_for_an_untrained_network_all_is_as_probable_as_not() -> None:
 
 
 def test_of_any_type_on_any_device(device: torch.device, dtype: torch.dtype) -> None:
+    if device.type == "sim" and dtype == torch.float64:
+        pytest.skip("tried in single precision")
     found, gray, near, far = found_in(dtype=dtype, device=device)
     confidence = learned_confidence(found, gray, near, far)
     assert confidence.dtype == dtype

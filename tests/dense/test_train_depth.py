@@ -9,7 +9,7 @@ import torch
 from torch.nn.functional import avg_pool2d, pixel_shuffle, pixel_unshuffle
 
 from examples.train_depth import Example, crop, example, loss_of, of_room, train
-from experiments.dense.rooms import samples
+from experiments.dense.rooms import Sample, samples
 from tests.dense.slanted_plane import FAR, NEAR, scene
 from torchslam.dense.cost_volume import matching_cost
 from torchslam.dense.estimate import estimate_depth
@@ -23,8 +23,12 @@ def room() -> list[Example]:
     return of_room(SEED, 2)
 
 
-def test_rendered_rooms_have_exact_depth() -> None:
-    sample = next(samples(SEED, 1))
+@pytest.fixture(scope="module")
+def sample() -> Sample:
+    return next(samples(SEED, 1))
+
+
+def test_rendered_rooms_have_exact_depth(sample: Sample) -> None:
     assert sample.sources.shape[1:] == sample.reference.shape == sample.depth.shape
     inverse = 1 / sample.depth
     hypotheses = torch.stack((inverse, 1.1 * inverse, inverse / 1.1))
@@ -36,10 +40,10 @@ def test_rendered_rooms_have_exact_depth() -> None:
     assert all(float(each[is_textured].mean()) > 1.5 * float(right[is_textured].mean()) for each in wrong)
 
 
-def test_rooms_are_the_same_again() -> None:
-    first, again = (next(samples(SEED, 1)) for _ in range(2))
-    assert torch.equal(first.sources, again.sources)
-    assert torch.equal(first.T_sr, again.T_sr)
+def test_rooms_are_the_same_again(sample: Sample) -> None:
+    again = next(samples(SEED, 1))
+    assert torch.equal(sample.sources, again.sources)
+    assert torch.equal(sample.T_sr, again.T_sr)
 
 
 def test_a_crop_is_a_part_mirrored_or_not(room: list[Example]) -> None:

@@ -17,7 +17,7 @@ from torchslam.features import SimulatedFeatures
 from torchslam.geometry import se3_exp
 from torchslam.system import map_start, state_machine
 
-FRAMES = 10
+FRAMES = 7
 
 
 class BentExtractor(nn.Module):
@@ -235,7 +235,7 @@ def test_weights_of_keypoints_of_another_shape_are_refused() -> None:
     for change in (lambda x: x[..., None], lambda x: x[0], lambda x: x.long()):
         extractor = BentExtractor(walk, bend=0.02)
         clip_slam = ClipSLAM(extractor, lambda features, change=change: change(features.scores))
-        with pytest.raises(ValueError, match=r"keypoint_weight must give floats \(T, N\) = \(10, 300\), not"):
+        with pytest.raises(ValueError, match=r"keypoint_weight must give floats \(T, N\) = \(7, 300\), not"):
             clip_slam(clip_of(walk)[0], walk.camera)
 
 

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from tests.learning.test_clip_slam import FRAMES, BentExtractor, clip_of
+from tests.learning.test_clip_slam import BentExtractor, clip_of
 from tests.walks import Walk, arc
 from torchslam import ClipGraph, ClipPoses, ClipSLAM, Features, clip_loss
 from torchslam.learning import clip_slam as clip_module
@@ -22,7 +22,7 @@ class Seen:
     """A clip that was looked at, and its true poses."""
 
     def __init__(self) -> None:
-        walk = Walk(arc(FRAMES, length=1.0))
+        walk = Walk(arc(10, length=1.0))
         images, self.truth = clip_of(walk)
         self.clip_slam = ClipSLAM(BentExtractor(walk, bend=0.0))
         with torch.no_grad():

@@ -17,7 +17,7 @@ from torchslam.optim.bundle import _solve as minimization
 from torchslam.optim.bundle._dense import DenseBundle
 from torchslam.optim.bundle._problem import sanitized, select_moving
 
-CONVERGED = {"iterations": 25, "tolerance": 0.0}
+CONVERGED = {"iterations": 15, "tolerance": 0.0}
 EQUAL = {"rtol": 1e-8, "atol": 1e-10}
 
 

@@ -18,7 +18,7 @@ from torchslam.geometry import se3_exp, se3_inverse, sim3_exp, so3_exp
 from torchslam.optim import PosePrior, solve_bundle
 from torchslam.optim.run_graph import solve_graph
 
-CONVERGED = {"iterations": 25, "tolerance": 0.0}
+CONVERGED = {"iterations": 20, "tolerance": 0.0}
 EXACT = {"rtol": 0.0, "atol": 1e-10}
 Problem = tuple[Callable[[Tensor], Tensor], Tensor]
 

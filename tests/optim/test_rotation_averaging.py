@@ -102,7 +102,7 @@ def test_the_error_of_a_loop_is_shared_by_variance(
     torch.testing.assert_close(solution.angles, torch.tensor(shares, dtype=torch.float64), rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("edges", [scattered(60, 12), chain(60, 5, loops=20)], ids=["scattered", "chain"])
 def test_a_third_of_wrong_edges_does_no_harm(edges: list[tuple[int, int]], seed: int) -> None:
     views = make_views(edges, wrong=0.3, seed=seed)
@@ -118,7 +118,7 @@ def test_a_third_of_wrong_edges_does_no_harm(edges: list[tuple[int, int]], seed:
     assert torch.isinf(right.angles[views.is_wrong]).all()
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("edges", [scattered(100, 7), chain(100, 4, loops=20)], ids=["scattered", "chain"])
 def test_where_wrong_edges_outvote_right_ones_the_minimum_is_as_low(
     edges: list[tuple[int, int]], seed: int

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 import warnings
 from pathlib import Path
@@ -36,9 +37,13 @@ def fail_elsewhere(folder: Path, main: int, number: int) -> None:
     note(folder, number)
 
 
-@pytest.mark.usefixtures("start_method")
-@pytest.mark.parametrize("processes", [1, 2, 3])
-def test_each_task_is_done_once_by_all_processes(tmp_path: Path, processes: int) -> None:
+@pytest.mark.parametrize(("method", "processes"), [("fork", 1), ("fork", 3), ("spawn", 2)])
+def test_each_task_is_done_once_by_all_processes(
+    tmp_path: Path, method: str, processes: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(
+        "torchslam.parallel.pool.can_fork", lambda: method == "fork" and sys.platform == "linux"
+    )
     with SharedTasks(note, (tmp_path,), processes) as shared:
         if processes > 1:
             wait_until_ready(shared)

@@ -41,11 +41,11 @@ def frames() -> list[Frame]:
     return [Frame(row, times[row], image, features=SCENE(WALK.pose(row), row)) for row in range(len(WALK))]
 
 
-def run(failing_call: int) -> tuple[SLAM, int, Failing]:
-    """The system after all frames, the frame in which the matcher failed, -1 if none, and the matcher."""
+def run(failing_call: int, count: int = len(WALK)) -> tuple[SLAM, int, Failing]:
+    """The system after some frames, the frame in which the matcher failed, -1 if none, and the matcher."""
     matcher, failed = Failing(failing_call), -1
     slam = SLAM(WALK.camera, CONFIG, matcher=matcher)
-    for frame in frames():
+    for frame in frames()[:count]:
         before = slam.state, len(slam.atlas), slam.atlas.num_created
         try:
             slam.step(frame)
@@ -57,11 +57,11 @@ def run(failing_call: int) -> tuple[SLAM, int, Failing]:
 
 
 def test_the_frame_that_starts_the_map_can_be_tried_again() -> None:
-    expected, _, matcher = run(0)
-    start = int(expected.map.keyframes["frame_index"][1])
+    start = int(run(0)[0].map.keyframes["frame_index"][1])
+    expected, _, matcher = run(0, start + 2)
     failures = {}
     for call in range(1, matcher.calls + 1):
-        slam, failed, _ = run(call)
+        slam, failed, _ = run(call, start + 2)
         failures[call] = failed
         if failed > start:
             break
@@ -73,7 +73,7 @@ def test_the_frame_that_starts_the_map_can_be_tried_again() -> None:
 
 def test_a_tracked_frame_can_be_tried_again_unless_it_has_a_pose() -> None:
     expected, _, matcher = run(0)
-    for call in range(9, matcher.calls + 1, matcher.calls // 5):
+    for call in range(9, matcher.calls + 1, matcher.calls // 3):
         matcher = Failing(call)
         slam = SLAM(WALK.camera, CONFIG, matcher=matcher)
         for frame in frames():

@@ -17,7 +17,7 @@ from torchslam.system.front_end import WithFeatures, image_extractor, reduced
 from torchslam.system.run import Run
 from torchslam.types import Features, Frame
 
-WALK = "synthetic:room?frames=20"
+WALK = "synthetic:room?frames=12"
 
 
 @pytest.mark.parametrize(
@@ -52,7 +52,7 @@ def seen(width: int, height: int, image_pixels: int = 640 * 480) -> Features:
     return image_extractor(Config(features=FeaturesConfig(max_image_pixels=image_pixels)))(frame)
 
 
-@pytest.mark.parametrize("size", [(1280, 960), (1920, 1440), (1500, 1000)])
+@pytest.mark.parametrize("size", [(1280, 960), (1500, 1000)])
 def test_a_large_image_has_the_keypoints_of_a_small_one(size: tuple[int, int]) -> None:
     small, large = seen(640, 480), seen(*size)
     matches = match(small, large)

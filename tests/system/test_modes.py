@@ -236,7 +236,7 @@ def test_every_transition_happens(transition: tuple[Mode, Mode], monkeypatch: py
     assert scenarios
     for drives, constants in scenarios:
         with monkeypatch.context() as patched:
-            for constant in constants:
+            for constant in (*SOON_KEPT, *constants):
                 patched.setattr(*constant)
             drive = Drive(patched, Walk(arc(120)))
             drives(drive)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -36,6 +35,8 @@ SETTINGS = ["features.kind=simulated", "features.num_keypoints=400", "simulated.
 SETTINGS += ["simulated.noise_px=0.2"]
 OFF = 1.06
 """Ratio of the given focal length to the true one: two given standard deviations, and known of after a dozen frames."""
+EARLY = 40
+"""A frame before which an estimate has begun."""
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -88,9 +89,62 @@ def error_after(found: Run, frame: int) -> float:
     return evaluate(Trajectory(online.timestamps[later], online.T_wc[later]), WALK.groundtruth).ate_m
 
 
+class Calls:
+    """A solver that computes here, and records when estimates are begun and taken, by the frame before."""
+
+    def __init__(self, slam: SLAM) -> None:
+        self.slam, self.begun, self.taken = slam, list[int](), list[int]()
+        self.found: list[SensorEstimate] = []
+        self.keyframes, self.cameras, self.priors = list[int](), list[Camera](), list[SensorPrior]()
+
+    def __call__(
+        self, function: Callable[..., Any], graph: RunGraph, prior: SensorPrior, *more: Any
+    ) -> Callable[[], Any]:
+        assert function is estimate_sensor
+        assert self.slam.submap is not None
+        self.keyframes.append(self.slam.submap.map.num_keyframes)
+        self.cameras.append(graph.camera)
+        self.priors.append(prior)
+        assert graph.camera is self.slam.shared_camera.current
+        self.begun.append(self.frame)
+        found = function(graph, prior, *more)
+
+        def result() -> Any:
+            self.taken.append(self.frame)
+            self.found.append(found)
+            return found
+
+        return result
+
+    @property
+    def frame(self) -> int:
+        """The frame that is processed now."""
+        assert self.slam.last_frame is not None
+        return self.slam.last_frame[0]
+
+
 @pytest.fixture(scope="module")
-def corrected() -> Run:
-    return run(OFF)
+def watched() -> tuple[Run, Calls, int]:
+    """A run with a wrong camera, its estimates, and after how many frames the whole map was being adjusted."""
+    slam = SLAM(given(OFF), config())
+    calls, adjusted = Calls(slam), 0
+
+    def look(_: StepResult) -> None:
+        nonlocal adjusted
+        if slam.mapper.adjustment.is_whole:
+            adjusted += 1
+            assert not slam.can_checkpoint
+
+    begin = slam.online_camera.solver
+    with slam.online_camera.solved_by(calls):
+        found = OnlineRun(slam, seen(), observer=Observer(look)).run()
+    assert slam.online_camera.solver is begin
+    return found, calls, adjusted
+
+
+@pytest.fixture(scope="module")
+def corrected(watched: tuple[Run, Calls, int]) -> Run:
+    return watched[0]
 
 
 def test_a_wrong_camera_is_corrected_while_the_run_goes_on(corrected: Run) -> None:
@@ -135,15 +189,19 @@ def run_until(is_enough: Callable[[OnlineCamera], bool]) -> tuple[SLAM, RunProgr
     return slam, so_far
 
 
-def half() -> tuple[SLAM, RunProgress]:
-    """A system after its camera was changed."""
-    return run_until(lambda sensor: bool(sensor.changes))
-
-
-def test_a_resumed_run_goes_on_with_the_camera_that_was_found(corrected: Run, tmp_path: Path) -> None:
-    path = tmp_path / "checkpoint.safetensors"
-    slam, so_far = half()
+@pytest.fixture(scope="module")
+def half(tmp_path_factory: pytest.TempPathFactory) -> tuple[SLAM, Path]:
+    """A system after its camera was changed, and its checkpoint."""
+    path = tmp_path_factory.mktemp("half") / "checkpoint.safetensors"
+    slam, so_far = run_until(lambda sensor: bool(sensor.changes))
     write_checkpoint(path, slam, so_far, seen())
+    return slam, path
+
+
+def test_a_resumed_run_goes_on_with_the_camera_that_was_found(
+    corrected: Run, half: tuple[SLAM, Path]
+) -> None:
+    slam, path = half
     resumed, loaded = read_checkpoint(path, seen(), config())
     assert torch.equal(resumed.shared_camera.current.params, slam.shared_camera.current.params)
     assert not torch.equal(resumed.shared_camera.current.params[:4], resumed.camera.params[:4])
@@ -153,95 +211,49 @@ def test_a_resumed_run_goes_on_with_the_camera_that_was_found(corrected: Run, tm
 
 
 @pytest.mark.parametrize("params", [[400.0], [float("nan")] * 9, [0.0] * 9])
-def test_a_damaged_camera_is_named(params: list[float], tmp_path: Path) -> None:
+def test_a_damaged_camera_is_named(params: list[float], half: tuple[SLAM, Path], tmp_path: Path) -> None:
     path = tmp_path / "checkpoint.safetensors"
-    write_checkpoint(path, *half(), seen())
-    tensors, about = read_tensors(path)
+    tensors, about = read_tensors(half[1])
     about["run"]["camera_changes"][0][1] = params
     write_tensors(path, tensors, about)
     with pytest.raises(ResultsError, match="not a whole checkpoint"):
         read_checkpoint(path, seen(), config())
 
 
-def test_a_new_start_has_the_given_camera_again() -> None:
-    slam, _ = half()
+def test_a_new_start_has_the_given_camera_again(half: tuple[SLAM, Path]) -> None:
+    slam, _ = read_checkpoint(half[1], seen(), config())
+    assert slam.online_camera.changes
     slam.reset()
     assert torch.equal(slam.shared_camera.current.params, slam.camera.params)
     assert slam.online_camera.changes == []
 
 
-class Calls:
-    """A solver that computes here, and records when estimates are begun and taken, by the frame before."""
-
-    def __init__(self, slam: SLAM) -> None:
-        self.slam, self.begun, self.taken = slam, list[int](), list[int]()
-        self.found: list[SensorEstimate] = []
-
-    def __call__(self, function: Callable[..., Any], *arguments: Any) -> Callable[[], Any]:
-        assert function is estimate_sensor
-        self.begun.append(self.frame)
-        found = function(*arguments)
-
-        def result() -> Any:
-            self.taken.append(self.frame)
-            self.found.append(found)
-            return found
-
-        return result
-
-    @property
-    def frame(self) -> int:
-        """The frame that is processed now."""
-        assert self.slam.last_frame is not None
-        return self.slam.last_frame[0]
-
-
-def test_no_frame_waits_for_an_estimate() -> None:
+def test_no_frame_waits_for_an_estimate(watched: tuple[Run, Calls, int]) -> None:
     """It is taken some frames after it was begun, and the map that is adjusted by it some frames later."""
-    slam = SLAM(given(OFF), config())
-    calls, keyframes = Calls(slam), list[int]()
-    begin = slam.online_camera.solver
-
-    def solver(*arguments: Any) -> Callable[[], Any]:
-        assert slam.submap is not None
-        keyframes.append(slam.submap.map.num_keyframes)
-        return calls(*arguments)
-
-    with slam.online_camera.solved_by(solver):
-        OnlineRun(slam, seen()).run()
-    assert slam.online_camera.solver is begin
+    found, calls, _ = watched
     assert len(calls.begun) > 2
-    assert keyframes[0] >= FIRST_KEYFRAMES
-    assert all(later >= GROWTH * earlier for earlier, later in pairwise(keyframes))
-    assert keyframes[-1] <= MAX_KEYFRAMES
+    assert calls.begun[0] < EARLY
+    assert calls.keyframes[0] >= FIRST_KEYFRAMES
+    assert all(later >= GROWTH * earlier for earlier, later in pairwise(calls.keyframes))
+    assert calls.keyframes[-1] <= MAX_KEYFRAMES
     waits = [taken - begun for begun, taken in zip(calls.begun, calls.taken, strict=False)]
     assert all(wait >= ESTIMATE_FRAMES for wait in waits)
     assert all(
         begun >= taken for begun, taken in zip(calls.begun[1:], calls.taken, strict=False)
     )  # one at a time
-    changes = slam.online_camera.changes
     moments = [taken for taken, found in zip(calls.taken, calls.found, strict=True) if found.is_change]
-    assert changes
-    for moment, change in zip(moments, changes, strict=False):
+    assert found.camera_changes
+    for moment, change in zip(moments, found.camera_changes, strict=False):
         assert moment < change.frame <= moment + ADJUST_FRAMES
 
 
-def test_the_estimate_is_by_the_given_camera_and_the_one_in_use() -> None:
-    slam = SLAM(given(OFF), config())
-    cameras, priors = list[Camera](), set[int]()
-
-    def solver(function: Callable[..., Any], graph: RunGraph, prior: SensorPrior, *more: Any) -> Any:
-        cameras.append(graph.camera)
-        priors.add(id(prior))
-        assert graph.camera is slam.shared_camera.current
-        assert prior.camera is slam.online_camera.given
-        return partial(function, graph, prior, *more)
-
-    with slam.online_camera.solved_by(solver):
-        OnlineRun(slam, seen()).run()
-    assert len(priors) == 1
-    assert torch.equal(cameras[0].params[:4], slam.camera.params[:4])
-    assert cameras[-1] is slam.online_camera.changes[-1].camera
+def test_the_estimate_is_by_the_given_camera_and_the_one_in_use(watched: tuple[Run, Calls, int]) -> None:
+    _, calls, _ = watched
+    slam = calls.slam
+    assert {id(prior) for prior in calls.priors} == {id(calls.priors[0])}
+    assert calls.priors[0].camera is slam.online_camera.given
+    assert torch.equal(calls.cameras[0].params[:4], slam.camera.params[:4])
+    assert calls.cameras[-1] is slam.online_camera.changes[-1].camera
     assert slam.submap is not None
     assert slam.submap.epoch == len(
         slam.online_camera.changes
@@ -256,7 +268,7 @@ def test_the_estimate_is_by_the_given_camera_and_the_one_in_use() -> None:
 def test_nothing_is_estimated_where_nothing_may_change(settings: tuple[str, ...]) -> None:
     slam = SLAM(given(1.0), config(*settings))
     with slam.online_camera.solved_by(lambda *arguments: pytest.fail("an estimate was begun")):
-        OnlineRun(slam, seen()).run()
+        OnlineRun(slam, seen().part(stop=EARLY)).run()
     assert slam.online_camera.changes == []
 
 
@@ -276,23 +288,13 @@ def test_a_checkpoint_has_the_estimate_that_is_pending(tmp_path: Path) -> None:
         assert torch.equal(one[1].sensor.camera.params, other[1].sensor.camera.params)
 
 
-def test_no_checkpoint_while_the_whole_map_is_adjusted() -> None:
-    slam = SLAM(given(OFF), config())
-    adjusted = 0
-
-    def look(_: StepResult) -> None:
-        nonlocal adjusted
-        if slam.mapper.adjustment.is_whole:
-            adjusted += 1
-            assert not slam.can_checkpoint
-
-    OnlineRun(slam, seen(), observer=Observer(look)).run()
-    assert adjusted > 0
+def test_no_checkpoint_while_the_whole_map_is_adjusted(watched: tuple[Run, Calls, int]) -> None:
+    assert watched[2] > 0
 
 
-def test_an_estimate_of_a_map_that_is_gone_is_forgotten() -> None:
+def test_an_estimate_of_a_map_that_is_gone_is_forgotten(half: tuple[SLAM, Path]) -> None:
     """Of a discarded one at once, and of another one than the active map when it would be taken."""
-    slam, _ = half()
+    slam, _ = read_checkpoint(half[1], seen(), config())
     online, (submap,) = slam.online_camera, slam.atlas
     online.solver = lambda *arguments: lambda: pytest.fail("the estimate was taken")
     online.next_check = 0

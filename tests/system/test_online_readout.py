@@ -11,6 +11,7 @@ from torchslam import SLAM, Config, Run, StepResult, Trajectory, evaluate, open_
 from torchslam.config import CameraConfig
 from torchslam.errors import ResultsError
 from torchslam.geometry import SensorModel
+from torchslam.geometry.rolling_shutter import Readout
 from torchslam.map.file import read_tensors, write_tensors
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
 from torchslam.system.online_run import Observer, OnlineRun, RunProgress
@@ -19,9 +20,19 @@ from torchslam.tracking.non_static import NO_MOVEMENT, SceneFilter
 ROOM = open_sequence("synthetic:room?readout=30&pace=2", limit=60)
 
 
-def run(**camera: float) -> tuple[SLAM, Run]:
-    slam = SLAM(ROOM.camera, Config(camera=CameraConfig(**camera)))
-    return slam, slam.run(ROOM)
+class Saved:
+    """A checkpoint of a run that has just found the readout, and its state there."""
+
+    def __init__(self, path: Path, slam: SLAM) -> None:
+        self.path, self.slam, self.so_far = path, slam, RunProgress()
+        self.readout: Readout | None = None
+        self.next_check = 0
+
+    def write(self, _: StepResult) -> None:
+        readout = self.slam.shared_camera.model.readout
+        if self.readout is None and readout is not None and self.slam.can_checkpoint:
+            write_checkpoint(self.path, self.slam, self.so_far, ROOM)
+            self.readout, self.next_check = readout, self.slam.online_camera.next_check
 
 
 def error_after(found: Run, frame: int) -> float:
@@ -32,8 +43,19 @@ def error_after(found: Run, frame: int) -> float:
 
 
 @pytest.fixture(scope="module")
-def found() -> tuple[SLAM, Run]:
-    return run()
+def saved(tmp_path_factory: pytest.TempPathFactory) -> tuple[SLAM, Run, Saved]:
+    slam = SLAM(ROOM.camera)
+    saved = Saved(tmp_path_factory.mktemp("readout") / "checkpoint.safetensors", slam)
+    with pytest.MonkeyPatch.context() as patched:
+        # What moves is not in a checkpoint.
+        patched.setattr(SceneFilter, "detect_independent_motion", lambda *_: NO_MOVEMENT)
+        run = OnlineRun(slam, ROOM, saved.so_far, observer=Observer(saved.write)).run()
+    return slam, run, saved
+
+
+@pytest.fixture(scope="module")
+def found(saved: tuple[SLAM, Run, Saved]) -> tuple[SLAM, Run]:
+    return saved[:2]
 
 
 @pytest.mark.slow
@@ -48,7 +70,8 @@ def test_a_readout_is_found_while_the_run_goes_on(found: tuple[SLAM, Run]) -> No
     assert float(slam.shared_camera.model.readout.seconds) == pytest.approx(0.030, abs=0.0025)
     for change in corrected.camera_changes:
         assert float(change.camera.focal) == pytest.approx(500.0, rel=0.01)
-    told, without = run(readout_std=0.0)
+    told = SLAM(ROOM.camera, Config(camera=CameraConfig(readout_std=0.0)))
+    without = told.run(ROOM)
     assert told.shared_camera.model.readout is None
     assert all(change.readout is None for change in without.camera_changes)
     assert error_after(corrected, first.frame) < 0.7 * error_after(without, first.frame)
@@ -95,28 +118,22 @@ def test_a_given_readout_holds_from_the_first_frame() -> None:
     assert SLAM(ROOM.camera).shared_camera.model.readout is None
 
 
-def test_a_resumed_run_goes_on_with_the_readout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    # What moves is not in a checkpoint.
+def test_a_resumed_run_goes_on_with_the_readout(
+    saved: tuple[SLAM, Run, Saved], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(SceneFilter, "detect_independent_motion", lambda *_: NO_MOVEMENT)
-    slam, so_far, path = SLAM(ROOM.camera), RunProgress(), tmp_path / "checkpoint.safetensors"
-
-    class Enough(BaseException):
-        pass
-
-    def stop(_: StepResult) -> None:
-        if slam.shared_camera.model.readout is not None and slam.can_checkpoint:
-            raise Enough
-
-    with pytest.raises(Enough):
-        OnlineRun(slam, ROOM, so_far, observer=Observer(stop)).run()
-    write_checkpoint(path, slam, so_far, ROOM)
-    resumed, loaded = read_checkpoint(path, ROOM, Config())
-    assert resumed.shared_camera.model.readout == slam.shared_camera.model.readout
-    assert resumed.online_camera.changes[-1].readout == slam.online_camera.changes[-1].readout
-    assert resumed.online_camera.next_check == slam.online_camera.next_check
-    following = ROOM[loaded.next]
-    assert torch.equal(resumed.step(following).T_cw, slam.step(following).T_cw)
-    tensors, about = read_tensors(path)
+    _, whole, before = saved
+    resumed, loaded = read_checkpoint(before.path, ROOM, Config())
+    assert before.readout is not None
+    assert resumed.shared_camera.model.readout == before.readout
+    change = next(change for change in whole.camera_changes if change.readout == before.readout)
+    assert resumed.online_camera.changes[-1].readout == change.readout
+    assert resumed.online_camera.next_check == before.next_check
+    T_cw = whole.results[loaded.next].T_cw
+    assert T_cw is not None
+    assert torch.equal(resumed.step(ROOM[loaded.next]).T_cw, T_cw)
+    tensors, about = read_tensors(before.path)
+    path = tmp_path / "checkpoint.safetensors"
     for wrong in ([0.03], [float("inf"), 0.001, 0.0, 0.2], [0.03, -1.0, 0.0, 0.2], "fast"):
         write_tensors(path, tensors, about | {"run": about["run"] | {"readout": wrong}})
         with pytest.raises(ResultsError, match="not a whole checkpoint"):

@@ -21,10 +21,10 @@ ORIGIN = torch.tensor((48.98, 8.39, 112.0), dtype=torch.float64)
 
 
 def test_a_map_on_the_earth(tmp_path: Path) -> None:
-    sequence = open_sequence("synthetic:room").part(0, 60)
+    sequence = open_sequence("synthetic:room").part(0, 40)
     truth = sequence.groundtruth
     assert truth is not None
-    rows = torch.arange(0, 60, 3)
+    rows = torch.arange(0, 40, 2)
     noise = 0.005 * torch.randn(20, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     positions_e = truth.positions_w[rows].double() + noise
     lines = ["time,latitude,longitude,altitude"]

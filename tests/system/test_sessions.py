@@ -20,6 +20,7 @@ from torchslam.system.front_end import Simulated, WithFeatures
 from torchslam.types import Features
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=300", "simulated.points_per_view=200"]
+SIMULATED += ["camera.readout_std=0"]
 FIRST = 30  # frames of the walk that the first session sees
 WALK = Walk(arc(50))
 

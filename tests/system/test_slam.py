@@ -35,13 +35,15 @@ from torchslam.mapping.local_bundle import ApplyAt, AsyncBundleAdjustment
 from torchslam.mapping.mapper import MapInitializer
 from torchslam.optim import GRAPH_OPTIONS
 from torchslam.system import map_start, state_machine
+from torchslam.system.final_adjustment import FinalAdjustment
 from torchslam.system.front_end import Simulated
 from torchslam.system.modes import Mode
 from torchslam.system.state_machine import StateMachine
 from torchslam.tracking.localizer import LOCAL_KEYFRAMES
-from torchslam.types import FrameFeatures, Reason, Trajectory, TwoViewMap
+from torchslam.types import FrameFeatures, Reason, TwoViewMap
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=400", "simulated.points_per_view=250"]
+SIMULATED += ["camera.readout_std=0"]  # a walk has none
 
 
 def run_walk(walk: Walk, *overrides: str, progress: Callable[[StepResult], None] | None = None) -> Run:
@@ -49,20 +51,20 @@ def run_walk(walk: Walk, *overrides: str, progress: Callable[[StepResult], None]
 
 
 def test_exact_features_give_the_exact_trajectory() -> None:
-    walk = Walk(arc(60)[:30])
+    walk = Walk(arc(60)[:22])
     run = run_walk(walk)
-    assert len(run.trajectory) == 30  # frames before the start are posed once there is a map
+    assert len(run.trajectory) == 22  # frames before the start are posed once there is a map
     result = evaluate(run.trajectory, walk.groundtruth)
     assert result.ate_m < 1e-4 * result.path_length_m
-    assert all(r.state is State.TRACKING for r in run.results[-20:])
+    assert all(r.state is State.TRACKING for r in run.results[-15:])
 
 
 @pytest.mark.parametrize("scales", ["false", "true"])
 def test_noise_and_outliers_are_tolerated(scales: str) -> None:
-    walk = Walk(arc(60)[:30])
+    walk = Walk(arc(60)[:20])
     noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1")
     run = run_walk(walk, *noisy, f"simulated.with_scales={scales}")
-    assert len(run.trajectory) == 30
+    assert len(run.trajectory) == 20
     result = evaluate(run.trajectory, walk.groundtruth)
     assert result.ate_m < 0.01 * result.path_length_m
 
@@ -92,12 +94,18 @@ def test_without_parallax_there_is_no_map_and_a_reason(poses: torch.Tensor, mess
 
 
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not() -> None:
-    walk = Walk(arc(40)[:16])
+    walk = Walk(arc(40)[:12])
     noisy = ("simulated.noise_px=0.5", "simulated.outlier_ratio=0.1")
     one, two, other = run_walk(walk, *noisy), run_walk(walk, *noisy), run_walk(walk, *noisy, "seed=1")
     assert torch.equal(one.trajectory.T_wc, two.trajectory.T_wc)
     assert torch.equal(one.map.positions_w, two.map.positions_w)
     assert not torch.equal(one.trajectory.T_wc, other.trajectory.T_wc)
+
+
+@pytest.fixture
+def soon_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new map is soon no longer taken back."""
+    monkeypatch.setattr(map_start, "PROVISIONAL_FRAMES", 8)
 
 
 class Gap(Walk):
@@ -113,7 +121,7 @@ class Gap(Walk):
 
 
 def test_loss_is_reported_and_tracking_recovers() -> None:
-    walk = Gap(arc(60))
+    walk = Gap(arc(60)[:46])
     run = run_walk(walk)
     states = [r.state for r in run.results]
     assert states[35:40] == [State.LOST] * 5
@@ -122,10 +130,10 @@ def test_loss_is_reported_and_tracking_recovers() -> None:
     assert states[40:confirmed] == [State.UNCERTAIN] * (confirmed - 40)
     assert run.results[40].reason == Reason.RELOCALIZED
     assert not any(r.is_keyframe for r in run.results[35 : confirmed + 1])
-    assert states[confirmed:] == [State.TRACKING] * (60 - confirmed)
+    assert states[confirmed:] == [State.TRACKING] * (46 - confirmed)
     assert len(run.submaps) == 1
     assert {r.submap for r in run.results if r.T_cw is not None} == {0}
-    assert len(run.trajectory) == 55
+    assert len(run.trajectory) == 41
     assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-3
 
 
@@ -151,25 +159,26 @@ def test_frames_pending_at_the_end_have_uncertain_poses(monkeypatch: pytest.Monk
 
 
 class FrameSnapshot(Walk):
-    """From frame 25 on the camera is where nothing was ever seen, but for one frame that shows frame 20 again."""
+    """From frame 15 on the camera is where nothing was ever seen, but for one frame that shows frame 12 again."""
 
     def __getitem__(self, index: int) -> Frame:
         frame = super().__getitem__(index)
         away = torch.eye(4, dtype=torch.float64)
         away[2, 3] = -1e6
-        if index == 28:
-            return replace(frame, T_cw_groundtruth=super().__getitem__(20).T_cw_groundtruth)
-        return frame if index < 25 else replace(frame, T_cw_groundtruth=away)
+        if index == 18:
+            return replace(frame, T_cw_groundtruth=super().__getitem__(12).T_cw_groundtruth)
+        return frame if index < 15 else replace(frame, T_cw_groundtruth=away)
 
 
+@pytest.mark.usefixtures("soon_kept")
 def test_an_unconfirmed_relocalization_leaves_no_trace() -> None:
-    run = run_walk(FrameSnapshot(arc(34)))
+    run = run_walk(FrameSnapshot(arc(34)[:24]))
     states = [r.state for r in run.results]
-    assert states[25:] == [State.LOST] * 3 + [State.UNCERTAIN] + [State.LOST] * 5
-    assert run.results[28].reason == Reason.RELOCALIZED
-    assert len(run.trajectory) == 25
-    assert int(run.map.keyframes["frame_index"].max()) < 25
-    assert int(run.posed_frames.frames["frame_index"].max()) < 25
+    assert states[15:] == [State.LOST] * 3 + [State.UNCERTAIN] + [State.LOST] * 5
+    assert run.results[18].reason == Reason.RELOCALIZED
+    assert len(run.trajectory) == 15
+    assert int(run.map.keyframes["frame_index"].max()) < 15
+    assert int(run.posed_frames.frames["frame_index"].max()) < 15
 
 
 @pytest.mark.parametrize(("least", "believed"), [(0.4, True), (0.6, False)])
@@ -196,7 +205,8 @@ def test_a_contradicting_initialization_replaces_a_provisional_map(
 ) -> None:
     """No support is enough here: whatever start the first and the last frame make is a rival."""
     few = ("initialization.min_matches=30",)
-    walk, plain = Walk(arc(120)[:30]), run_walk(Walk(arc(120)[:30]), *few)
+    walk = Walk(arc(120)[:26])
+    plain = None if explained else run_walk(walk, *few)
     monkeypatch.setattr("torchslam.tracking.initialization.MIN_SUPPORT_RATIO", 2.0)
     found, founded = MapInitializer.build, []
 
@@ -212,7 +222,7 @@ def test_a_contradicting_initialization_replaces_a_provisional_map(
     anew = [r for r in run.results if r.reason == Reason.STARTED_ANEW]
     assert len(founded) > 1
     assert [view.index for view in founded[1]] == list(range(founded[1][-1].index + 1))
-    assert len(run.trajectory) == 30
+    assert len(run.trajectory) == 26
     assert len(run.submaps) == 1
     assert run.submaps[0].number == len(anew)
     if explained:
@@ -222,6 +232,7 @@ def test_a_contradicting_initialization_replaces_a_provisional_map(
         assert evaluate(run.trajectory, walk.groundtruth).ate_m < 1e-4
     else:
         assert not anew
+        assert plain is not None
         assert torch.equal(run.trajectory.T_wc, plain.trajectory.T_wc)
 
 
@@ -241,10 +252,9 @@ JOINED = ("simulated.depth_near=0.3", "simulated.depth_far=0.8", "simulated.nois
 
 
 @pytest.fixture
-def submaps_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def submaps_soon(soon_kept: None, monkeypatch: pytest.MonkeyPatch) -> None:
     """A lost camera soon starts another submap, which is soon kept."""
     monkeypatch.setattr(state_machine, "FRAMES_BEFORE_NEW_SUBMAP", 3)
-    monkeypatch.setattr(map_start, "PROVISIONAL_FRAMES", 8)
 
 
 @pytest.mark.usefixtures("submaps_soon")
@@ -278,24 +288,24 @@ class Damaged(Walk):
 
 
 def test_damaged_frames_are_skipped_with_a_warning_and_counted() -> None:
-    walk = Damaged(arc(60)[:22])
+    walk = Damaged(arc(60)[:19])
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         run = run_walk(walk)
     assert [str(w.message) for w in caught if "skipped a frame" in str(w.message)] != []
     assert run.skipped == ["rgb.txt:3: is not an image", "rgb.txt:17: is not an image"]
-    assert len(run.trajectory) == 20
+    assert len(run.trajectory) == 17
 
 
 def test_an_interrupt_keeps_the_results_so_far() -> None:
     def interrupt(result: StepResult) -> None:
-        if result.index == 20:
+        if result.index == 12:
             raise KeyboardInterrupt
 
-    run = run_walk(Walk(arc(60)[:24]), progress=interrupt)
+    run = run_walk(Walk(arc(60)[:16]), progress=interrupt)
     assert run.interrupted
-    assert len(run.results) == 21
-    assert len(run.trajectory) == 21
+    assert len(run.results) == 13
+    assert len(run.trajectory) == 13
 
 
 def test_simulated_features_need_true_poses() -> None:
@@ -329,54 +339,11 @@ def test_every_frame_uses_a_bounded_part_of_the_map() -> None:
 
 
 def test_a_rendered_room_is_tracked() -> None:
-    sequence = open_sequence("synthetic:room").part(0, 30)
+    sequence = open_sequence("synthetic:room").part(0, 20)
     run = SLAM(sequence.camera).run(sequence)
-    assert len(run.trajectory) >= 29
+    assert len(run.trajectory) >= 19
     result = evaluate(run.trajectory, sequence.groundtruth)
     assert result.ate_m < 0.02 * result.path_length_m
-
-
-@pytest.mark.data
-@pytest.mark.parametrize(("name", "frames", "ate_m"), [("shelf_bin", 50, 0.02), ("machine_hall", 60, 0.02)])
-def test_real_images_are_tracked(data_dir: object, name: str, frames: int, ate_m: float) -> None:
-    sequence = open_sequence(f"{data_dir}/{name}").part(0, frames)
-    run = SLAM(sequence.camera).run(sequence)
-    assert len(run.trajectory) >= 0.9 * frames
-    assert evaluate(run.trajectory, sequence.groundtruth).ate_m < ate_m
-
-
-@pytest.mark.data
-@pytest.mark.parametrize(
-    ("name", "frames", "precision_m"),
-    [
-        ("shelf_bin", 50, 0.0005),
-        pytest.param("machine_hall", 320, 0.0005, marks=pytest.mark.slow),
-        ("fr2_desk_20", 20, 0.0005),
-        pytest.param("kitti07", 160, 0.02, marks=pytest.mark.slow),
-        pytest.param("redkitchen", 300, 0.01, marks=pytest.mark.slow),
-    ],
-)
-def test_the_final_trajectory_is_not_worse_than_the_online_one(
-    data_dir: object, name: str, frames: int, precision_m: float
-) -> None:
-    """By more than a twentieth and what the ground truth tells, whose errors are up to 3 cm in redkitchen."""
-    sequence = open_sequence(f"{data_dir}/{name}").part(0, frames)
-    run = SLAM(sequence.camera).run(sequence)
-    assert len(run.online) > 0.5 * frames
-    both = torch.isin(run.trajectory.timestamps, run.online.timestamps)
-    posed_online = Trajectory(run.trajectory.timestamps[both], run.trajectory.T_wc[both])
-    online, final = (
-        evaluate(trajectory, sequence.groundtruth).ate_m for trajectory in (run.online, posed_online)
-    )
-    assert final <= 1.05 * online + precision_m
-
-
-@pytest.mark.data
-def test_a_real_static_camera_initializes_no_map(data_dir: object) -> None:
-    sequence = open_sequence(f"{data_dir}/standstill")
-    run = SLAM(sequence.camera).run(sequence)
-    assert run.map.num_keyframes == 0
-    assert "stands still" in run.failure
 
 
 def test_the_trajectory_of_a_run_minimizes_its_graph() -> None:
@@ -489,6 +456,7 @@ def adjustment_events(monkeypatch: pytest.MonkeyPatch, walk: Walk, *overrides: s
         if slam.submap is not None and slam.mode not in (Mode.PROVISIONAL, Mode.PROVISIONAL_DOUBTED):
             confirmed.append(result.index)
 
+    monkeypatch.setattr(FinalAdjustment, "adjust", lambda *_, **__: None)
     slam.run(walk, after)
     assert not slam.mapper.adjustment.is_pending
     return [event for event in events if event[1] in confirmed[1:]]
@@ -498,23 +466,19 @@ def test_an_adjustment_is_applied_after_some_frames_or_before_the_next_keyframe(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     walk = Walk(arc(80, 6.0)[:40])
-    for delay in (1, 3):
+    for delay, translation in ((1, 0.1), (2, 0.6)):
         monkeypatch.setattr(mapper, "DELAY_FRAMES", delay)
-        events = adjustment_events(monkeypatch, walk)
+        events = adjustment_events(monkeypatch, walk, f"keyframes.max_translation={translation}")
         kinds = [what for what, _ in events]
-        assert kinds[: len(kinds) // 2 * 2] == ["requested", "applied"] * (
-            len(kinds) // 2
-        )  # one after the other
+        pairs = len(kinds) // 2
+        assert kinds[: 2 * pairs] == ["requested", "applied"] * pairs  # one after the other
         waits = [
             applied - requested
             for (_, requested), (_, applied) in zip(events[::2], events[1::2], strict=False)
         ]
         assert len(waits) >= 3
         assert set(waits) <= set(range(1, delay + 1))
-    monkeypatch.setattr(mapper, "DELAY_FRAMES", 2)
-    rare = adjustment_events(monkeypatch, walk, "keyframes.max_translation=0.6")
-    waits = [applied - requested for (_, requested), (_, applied) in zip(rare[::2], rare[1::2], strict=False)]
-    assert 2 in waits
+        assert delay in waits
 
 
 @pytest.mark.slow

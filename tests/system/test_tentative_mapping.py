@@ -13,17 +13,23 @@ from tests.system.judging import DOUBT, SIMULATED, judge
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
 from torchslam import SLAM, Frame, State, evaluate, load_config
+from torchslam.system import map_start, state_machine
 from torchslam.system import savepoint as savepoints
-from torchslam.system import state_machine
 from torchslam.system.front_end import Simulated
 from torchslam.system.local_mapping import LocalMapping
 from torchslam.system.modes import Mode
 from torchslam.tracking.non_static import NO_MOVEMENT
 from torchslam.types import Reason, Rejection
 
-DOUBTFUL = range(22, 34)
-LATE = 15  # the first frame that may begin a submap, where one starts late
-SEEN = 46  # frames, until as many were certain as were doubtful
+DOUBTFUL = range(14, 26)
+LATE = 7  # the first frame that may begin a submap, where one starts late
+SEEN = 38  # frames, until as many were certain as were doubtful
+
+
+@pytest.fixture(autouse=True)
+def soon_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A new map is kept before frames are doubted."""
+    monkeypatch.setattr(map_start, "PROVISIONAL_FRAMES", 12)
 
 
 class Leaving(Walk):
@@ -77,7 +83,7 @@ def test_tentative_keyframes_are_committed_when_confirmed(monkeypatch: pytest.Mo
 
 def test_tentative_keyframes_are_rolled_back_when_the_camera_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two systems that see the same, but that one of them does not map what is doubtful."""
-    walk = Leaving(arc(60)[:30], 27)
+    walk = Leaving(arc(60)[:22], 19)
     slam = doubting(monkeypatch, DOUBTFUL)
     grown: list[int] = []
     states = states_of(slam, walk, lambda _: grown.append(slam.map.num_keyframes))
@@ -105,7 +111,7 @@ def test_a_pose_that_disagrees_with_its_matches_is_not_mapped(
     values = {"ratio": 0.1, "matches": 9, "std": 0.1, "translation": 0.1, "degrees": 30.0}
     slam = doubting(monkeypatch, DOUBTFUL, Rejection(rejection, values))
     grown: list[int] = []
-    states = states_of(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
+    states = states_of(slam, Walk(arc(60)[:32]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
     assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
@@ -125,14 +131,14 @@ def test_a_frame_with_independent_motion_is_mapped_tentatively(
         lambda *_: moving if slam.last_frame and slam.last_frame[0] in DOUBTFUL else NO_MOVEMENT,
     )
     grown: list[int] = []
-    states = states_of(slam, Walk(arc(60)[:40]), lambda _: grown.append(slam.map.num_keyframes))
+    states = states_of(slam, Walk(arc(60)[:32]), lambda _: grown.append(slam.map.num_keyframes))
     assert State.UNCERTAIN in states
     assert (len(set(grown[DOUBTFUL[0] - 1 : DOUBTFUL[-1] + 1])) > 1) is is_mapped
 
 
 def test_tentative_frames_at_the_end_keep_their_poses(monkeypatch: pytest.MonkeyPatch) -> None:
-    walk = Walk(arc(60)[:36])
-    slam = doubting(monkeypatch, range(22, 60))
+    walk = Walk(arc(60)[:28])
+    slam = doubting(monkeypatch, range(14, 60))
     states = states_of(slam, walk)
     before = slam.map.num_keyframes
     slam.finalize()
@@ -155,8 +161,8 @@ def test_a_provisional_map_that_ends_uncertain_is_tracked_backward(
     end: Callable[[SLAM], None], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What was mapped on trial is kept before the way back adds to the map."""
-    walk = Walk(arc(60)[:36])
-    slam = doubting(monkeypatch, range(22, 60))
+    walk = Walk(arc(60)[:28])
+    slam = doubting(monkeypatch, range(14, 60))
     starting_late(monkeypatch, slam)
     states_of(slam, walk)
     assert slam.mode is Mode.PROVISIONAL_DOUBTED
@@ -170,19 +176,19 @@ def test_a_provisional_map_that_ends_uncertain_is_tracked_backward(
 def test_the_number_of_tentative_frames_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """The oldest keep their poses for good, even if the camera is lost then; later ones wait again."""
     monkeypatch.setattr(savepoints, "MAX_HELD_FRAMES", 5)
-    walk = Leaving(arc(60)[:40], 34)
-    slam = doubting(monkeypatch, range(22, 60))
+    walk = Leaving(arc(60)[:32], 26)
+    slam = doubting(monkeypatch, range(14, 60))
     states = states_of(slam, walk)
-    assert states[22:34] == [State.UNCERTAIN] * 12
-    assert states[34:] == [State.LOST] * 6
-    assert slam.posed_frames.frames["frame_index"].tolist() == list(range(32))
-    assert int(slam.map.keyframes["frame_index"].max()) < 32
+    assert states[14:26] == [State.UNCERTAIN] * 12
+    assert states[26:] == [State.LOST] * 6
+    assert slam.posed_frames.frames["frame_index"].tolist() == list(range(24))
+    assert int(slam.map.keyframes["frame_index"].max()) < 24
     assert len(slam.loop_closer.keyframe_database) == slam.map.num_keyframes
 
 
 def test_a_loop_precheck_applies_to_its_own_keyframe_only(monkeypatch: pytest.MonkeyPatch) -> None:
     """A keyframe whose adjustment is taken over without a look back, as before the first keyframe on trial."""
-    slam, walk = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED)), Walk(arc(60)[:40])
+    slam, walk = SLAM(Walk(arc(2)).camera, load_config(None, SIMULATED)), Walk(arc(60)[:32])
     frames = Simulated(slam.config, slam.camera, true_T_cw(walk)).of(walk)
     for index in range(len(walk)):
         slam.step(frames[index])

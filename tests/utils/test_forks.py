@@ -51,15 +51,15 @@ def test_a_video_is_read_by_the_workers_of_a_data_loader(clip: Path) -> None:
                 return self.sequence.image(index)
 
         frames = Frames(open_sequence(sys.argv[1], "60,60,160,120"))
-        for workers in (1, 2):
+        for workers in (2,):
             loaded = DataLoader(frames, batch_size=None, num_workers=workers, multiprocessing_context="fork")
             print([float(image.sum()) for image in loaded])
         print([float(frames[index].sum()) for index in range(40)])
         """,
         clip,
     )
-    by_one, by_two, own = printed.splitlines()
-    assert by_one == by_two == own
+    by_two, own = printed.splitlines()
+    assert by_two == own
     assert len(set(own.split())) > 38
 
 
@@ -105,7 +105,7 @@ def test_decoders_are_closed_for_a_fork_and_opened_again(clip: Path) -> None:
     assert printed.split() == ["True", "True"]
 
 
-@pytest.mark.parametrize("kind", ["ros1", "sqlite3", "mcap"])
+@pytest.mark.parametrize("kind", ["ros1", "mcap"])
 def test_parent_and_fork_read_a_recording_each_at_its_own_place(tmp_path: Path, kind: str) -> None:
     pytest.importorskip("rosbags")
     from tests.data.readers.test_bag import STAMPS, Recording

@@ -57,7 +57,7 @@ def test_wrong_images(image: np.ndarray, channels: str, message: str) -> None:
 
 
 def test_step_accepts_an_image_array() -> None:
-    sequence = open_sequence("synthetic:planar").part(0, 3)
+    sequence = open_sequence("synthetic:room").part(0, 3)
     frames, images = (
         SLAM(sequence.camera, load_config(None, ["features.kind=opencv-orb"])) for _ in range(2)
     )

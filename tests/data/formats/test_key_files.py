@@ -96,9 +96,9 @@ def test_files_by_their_content(tmp_path: Path, text: str, tree: dict[str, Any] 
 @pytest.mark.parametrize(
     "text",
     [
-        *("a" + " " * 250_000 + "b", "[" * 250_000, "[\n" * 120_000, "- " * 120_000, "a: b\n" * 50_000),
-        *("- \n" * 80_000, "a:\n" * 80_000, ":" * 250_000, '"' * 250_000, "{a: " * 60_000),
-        "a: [\n" + "1,\n" * 80_000,
+        *("a" + " " * 250_000 + "b", "[" * 250_000, "[\n" * 120_000, "- " * 120_000, "a: b\n" * 25_000),
+        *("- \n" * 40_000, "a:\n" * 40_000, ":" * 250_000, '"' * 250_000, "{a: " * 60_000),
+        "a: [\n" + "1,\n" * 40_000,
         "".join(" " * depth + "a:\n" for depth in range(600)),
     ],
 )
@@ -106,4 +106,4 @@ def test_every_text_ends_soon(text: str) -> None:
     start = time.process_time()
     with contextlib.suppress(ValueError):
         parse_yaml(text[:MAX_YAML])
-    assert time.process_time() - start < 5
+    assert time.process_time() - start < 3

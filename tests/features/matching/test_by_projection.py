@@ -27,22 +27,28 @@ def naive_projected(
     guided: bool,
 ) -> dict[int, int]:
     d = distances_between(query, second)[row]
+    apart = (second.keypoints[row] - pixels[row, :, None]).norm(dim=-1)
+    factors = (second.scales[row] / query.scales[row, :, None]).tolist()
+    turns = (second.angles[row] - query.angles[row, :, None] + math.pi) % (2 * math.pi) - math.pi
+    is_near, turned, scales = (
+        (apart <= radius[row, :, None]).tolist(),
+        turns.tolist(),
+        second.scales[row].tolist(),
+    )
+    masks = query.mask[row].tolist(), second.mask[row].tolist()
     claims: dict[int, tuple[float, int]] = {}
     for i in range(d.shape[0]):
-        if not query.mask[row, i]:
+        if not masks[0][i]:
             continue
         candidates = []
         for j in range(d.shape[1]):
-            apart = (second.keypoints[row, j] - pixels[row, i]).norm()
-            factor = float(second.scales[row, j] / query.scales[row, i])
-            turn = float((second.angles[row, j] - query.angles[row, i] + math.pi) % (2 * math.pi) - math.pi)
-            fits = not guided or (1 / 1.3 <= factor <= 1.3 and abs(turn) <= 0.5)
-            if second.mask[row, j] and apart <= radius[row, i] and fits:
+            fits = not guided or (1 / 1.3 <= factors[i][j] <= 1.3 and abs(turned[i][j]) <= 0.5)
+            if masks[1][j] and is_near[i][j] and fits:
                 candidates.append((float(d[i, j]), j))
         if not candidates:
             continue
         nearest, j = min(candidates)
-        same_scale = [c for c, k in candidates if k != j and second.scales[row, k] == second.scales[row, j]]
+        same_scale = [c for c, k in candidates if k != j and scales[k] == scales[j]]
         good = nearest <= limit and nearest < ratio * min(same_scale, default=math.inf)
         if good and (nearest, i) < claims.get(j, (math.inf, -1)):
             claims[j] = (nearest, i)

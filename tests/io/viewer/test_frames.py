@@ -29,6 +29,7 @@ from torchslam.io.viewer.frames import (
 from torchslam.types import State, StepResult
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=300", "simulated.points_per_view=200"]
+SIMULATED += ["camera.std=0", "camera.readout_std=0"]
 FRAMES = 12
 GRAY = 90
 

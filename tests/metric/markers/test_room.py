@@ -24,7 +24,7 @@ from torchslam.system.slam import SLAM
 )
 def test_a_board_gives_meters(scene: str, text: str) -> None:
     """OpenCV counts the chessboard from either end, as the camera goes past it."""
-    sequence = open_sequence(f"synthetic:{scene}?frames=30&blur=0.8&noise=3")
+    sequence = open_sequence(f"synthetic:{scene}?frames=20&blur=0.8&noise=3")
     run = SLAM(sequence.camera).run(sequence)
     assert run.main is not None
     assert sequence.groundtruth is not None
