@@ -95,7 +95,7 @@ def test_a_right_map_of_the_whole_needs_no_other_frames_online(run: Run, steps: 
     [
         ("--mapping", "online"),
         pytest.param(("--video",), marks=pytest.mark.slow),  # which shows every frame
-        ("--set", f"global_mapping.max_images={FRAMES - 1}"),  # which are chosen by what is lost
+        ("--set", f"global_mapping.window_images={FRAMES - 1}"),  # which are chosen by what is lost
     ],
 )
 def test_all_frames_are_processed_online_where_they_count(

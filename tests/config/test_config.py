@@ -64,9 +64,9 @@ def test_overrides_take_precedence_over_the_file(tmp_path: Path) -> None:
         ("matching.max_ratio=nan", "matching.max_ratio must be above 0 and at most 1, not nan"),
         ("matching.max_ratio=-0.5", "matching.max_ratio must be above 0 and at most 1, not -0.5"),
         (
-            "global_mapping.max_images=0",
-            "--set global_mapping.max_images=0: global_mapping.max_images must be at least 3 and at most 1000000, "
-            "not 0",
+            "global_mapping.window_images=0",
+            "--set global_mapping.window_images=0: global_mapping.window_images must be at least 3 and at most "
+            "1000000, not 0",
         ),
         ("features.max_image_pixels=1", "features.max_image_pixels must be 0 or at least 1024 and at most"),
         ("seed=18446744073709551616", "seed must be at least 0 and at most 9223372036854775807"),
@@ -193,7 +193,7 @@ def test_an_invalid_value_in_python_is_rejected_by_name(build: Any, message: str
         ("simulated.noise_px", 0, -1e-9),
         ("matching.max_cosine_distance", 2, 2.001),
         ("keyframes.max_rotation_deg", 180, 180.1),
-        ("global_mapping.max_images", 3, 2),
+        ("global_mapping.window_images", 3, 2),
     ],
 )
 def test_limits_are_inclusive_or_exclusive_as_declared(key: str, accepted: float, refused: float) -> None:

@@ -17,7 +17,7 @@ from torchslam.global_mapping.links import (
     ACROSS,
     match_guided,
     near_epipolar_line,
-    pairs_across,
+    pairs_around,
     strengthen,
     weak_links,
 )
@@ -72,14 +72,14 @@ def test_images_that_no_pair_has_are_passed_over() -> None:
     assert weak_links(pairs) == []
     pairs[3] = of_size(3, 7, 50)
     assert weak_links(pairs) == [([1, 2, 3], [7, 8, 9])]
-    assert pairs_across(weak_links(pairs)) == []  # further apart than three
+    assert pairs_around(weak_links(pairs)) == []  # further apart than three
     assert weak_links([]) == []
 
 
-def test_pairs_across_are_up_to_three_apart() -> None:
+def test_pairs_around_links_are_up_to_three_apart() -> None:
     assert ACROSS == 3
-    assert pairs_across([([2, 3, 4], [5, 6, 7])]) == [(2, 5), (3, 5), (3, 6), (4, 5), (4, 6), (4, 7)]
-    assert pairs_across([([2, 3, 4], [5, 6, 7]), ([3, 4, 5], [6, 7, 8])]) == [
+    assert pairs_around([([2, 3, 4], [5, 6, 7])]) == [(2, 5), (3, 5), (3, 6), (4, 5), (4, 6), (4, 7)]
+    assert pairs_around([([2, 3, 4], [5, 6, 7]), ([3, 4, 5], [6, 7, 8])]) == [
         (2, 5), (3, 5), (3, 6), (4, 5), (4, 6), (4, 7), (5, 6), (5, 7), (5, 8),
     ]  # fmt: skip
 

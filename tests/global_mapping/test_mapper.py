@@ -50,7 +50,7 @@ def config(*overrides: str) -> Config:
             "simulated.depth_near=0.6",
             "simulated.depth_far=2",
             "simulated.noise_px=0.1",
-            "global_mapping.max_images=15",
+            "global_mapping.window_images=15",
             "camera.readout_std=0",
             *overrides,
         ],
@@ -425,7 +425,7 @@ def test_a_part_that_nothing_ties_to_the_map_is_lost() -> None:
     """The frames there are lost, keyframes or not, and the others are mapped as if these were not."""
     T_wc = torch.cat([walk_arc(20, 2.0), at(*(5000 + 0.1 * torch.arange(6.0)).tolist()).groundtruth.T_wc])  # type: ignore[union-attr]
     walk = Walk(T_wc)
-    settings = config("global_mapping.max_images=13")
+    settings = config("global_mapping.window_images=13")
     # A scene around the walk only, not around the distance between both parts.
     scene = Simulated(settings, walk.camera, se3_inverse(T_wc[:20]))
     made = GlobalMapper(scene.of(walk), walk.camera, settings, None).run()
@@ -479,7 +479,7 @@ def map_room(stop: int) -> GlobalMap:
     """Every fourth frame; every other one of these is mapped."""
     sequence = open_sequence("synthetic:room").part(0, stop, 4)
     settings = load_config(
-        None, [f"global_mapping.max_images={stop // 8}", "global_mapping.num_keypoints=600"]
+        None, [f"global_mapping.window_images={stop // 8}", "global_mapping.num_keypoints=600"]
     )
     given = CameraMeasurement.of(sequence.camera.to(torch.float64), settings.camera.std)
     return GlobalMapper(sequence, sequence.camera, settings, given).run()

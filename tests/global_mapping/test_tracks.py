@@ -17,8 +17,8 @@ from torchslam.geometry import se3_exp, se3_inverse, so3_exp
 from torchslam.global_mapping.tracks import (
     MIN_PARALLAX,
     Tracks,
+    held_parts,
     join_matches,
-    largest_part,
     longest_tracks,
     make_map,
     parallax,
@@ -344,7 +344,6 @@ def test_images_are_held_together_by_shared_points(shared: int) -> None:
             rows += [(number, view, number) for view in views]
     tracks = Tracks(*(torch.tensor(column) for column in zip(*rows, strict=True)))
     everything = torch.ones(len(tracks), dtype=torch.bool)
-    held = largest_part(tracks, everything, 6, least_shared=5)
-    assert held.tolist() == [True, True, True, shared == 5, shared == 5, False]
-    only = largest_part(tracks, tracks.view > 2, 6, least_shared=5)
-    assert only.tolist() == [False, False, False, True, True, False]
+    other = 0 if shared == 5 else 3
+    assert held_parts(tracks, everything, 6, least_shared=5).tolist() == [0, 0, 0, other, other, 5]
+    assert held_parts(tracks, tracks.view > 2, 6, least_shared=5).tolist() == [0, 1, 2, 3, 3, 5]

@@ -178,15 +178,15 @@ class GlobalMappingConfig(Settings, section="global_mapping"):
         num_keypoints: Maximum number of keypoints per image, in place of `features.num_keypoints`.
         max_image_pixels: Number of pixels to which much larger images are reduced, in place of
             `features.max_image_pixels`.
-        max_images: Number of images that are spread evenly over the recording; frames between them are posed
-            afterwards.
+        window_images: Number of images that are mapped together; more are mapped in windows that overlap, and joined.
+            Memory and time of a window grow with it.
         learned_links: Connect images that too few SIFT tracks connect by XFeat and LightGlue. Requires their weights:
             `torchslam download xfeat-lighterglue`.
     """
 
     num_keypoints: int = setting(3000, low=1, high=MAX_KEYPOINTS)
     max_image_pixels: int = setting(1_000_000, low=32 * 32, high=MAX_PIXELS, also=0)
-    max_images: int = setting(300, low=3, high=MAX_NUMBER)
+    window_images: int = setting(300, low=3, high=MAX_NUMBER)
     learned_links: bool = False
 
 

@@ -82,7 +82,7 @@ def strengthen(
     """
     best = {(pair.first, pair.second): pair for pair in pairs}
     found = []
-    for one, other in pairs_across(weak_links(pairs)):
+    for one, other in pairs_around(weak_links(pairs)):
         T_21 = T_cw[other] @ se3_inverse(T_cw[one])
         matches = match_guided(matcher, one, other, T_21, camera)
         if len(matches.first) >= MIN_MATCHES:
@@ -114,7 +114,7 @@ def _around(rows: Sequence[int], links: Sequence[int]) -> Links:
     ]
 
 
-def pairs_across(links: Links) -> list[tuple[int, int]]:
+def pairs_around(links: Links) -> list[tuple[int, int]]:
     """The pairs of images on both sides of links that are matched again, ascending."""
     pairs = {ends for before, after in links for ends in product(before, after)}
     return sorted((one, other) for one, other in pairs if other - one <= ACROSS)

@@ -7,6 +7,9 @@ from collections.abc import Callable, Collection, Iterator
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import compress, pairwise
+from statistics import median
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -15,7 +18,7 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError, FrameError
-from torchslam.geometry import Camera, SensorModel, rigid, so3_log
+from torchslam.geometry import Camera, SensorModel, rigid
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.baselines import chained_positions
@@ -27,7 +30,7 @@ from torchslam.global_mapping.links import (
     Links,
     learned_config,
     open_links,
-    pairs_across,
+    pairs_around,
     strengthen,
     with_learned,
 )
@@ -46,6 +49,16 @@ from torchslam.global_mapping.view_graph import (
     ViewPair,
     build_view_graph,
     connected_views,
+)
+from torchslam.global_mapping.windows import (
+    MappedWindow,
+    join_windows,
+    moved_pairs,
+    pairs_across,
+    pairs_that_hold,
+    pairs_within,
+    rotations_hold,
+    split,
 )
 from torchslam.map.atlas import Atlas
 from torchslam.mapping.local_bundle import squared_errors
@@ -70,9 +83,6 @@ SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 ROTATION_STD_RAD = 0.01
 """Standard deviation of the rotation of a pair with the mean number of matches: 0.15 to 0.3 degrees in the median on
 real recordings, with a long tail. Tried 0.005 to 0.02."""
-MAX_ROTATION_ERROR_RAD = 0.1
-"""A pair whose rotation differs more from the averaged ones does not hold. On garden right ones differ by 0.15 degrees
-in the median and wrong ones by 10 and more; tried 0.05 to 0.2."""
 MIN_GENERAL = 0.2
 """Least share of pairs that determine a direction of motion: a camera that only turns has none, or, with a wrong focal
 length, a few; walks have 0.8 and more."""
@@ -127,6 +137,22 @@ Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
 """Rows of the views that have a pose, the tracks in all views, and the reconstruction."""
 
 
+class CoarseMap(NamedTuple):
+    """Poses that are right to about a pixel.
+
+    Attributes:
+        pairs: that the map is from; learned: those of learned features; unposed: those with images without a pose.
+        observed: the longest tracks.
+        found: poses of all views, camera and the points of these tracks.
+    """
+
+    pairs: list[ViewPair]
+    learned: list[ViewPair]
+    observed: ObservedTracks
+    found: Reconstruction
+    unposed: list[ViewPair]
+
+
 def mapping_config(config: Config) -> Config:
     """The configuration of global mapping: SIFT in place of the default features, unless others were chosen."""
     settings = config.global_mapping
@@ -160,13 +186,27 @@ def features_to_keep(
 
 
 def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
-    """The frames that are mapped: at most so many evenly over the recording, and all that were lost or uncertain."""
-    stride = -(-count // most)
-    chosen = set(range(0, count, stride))
-    doubtful = [result.index for result in results if result.state in (State.LOST, State.UNCERTAIN)]
-    if len(doubtful) <= most:
-        chosen |= set(doubtful)
-    return sorted(index for index in chosen if index < count)
+    """The frames that are mapped: all of a short recording, else by what they have in common.
+
+    The keyframes of an online run overlap as they should. Where it was lost or uncertain, frames follow each other
+    twice as fast as keyframes did elsewhere. Where nothing is known of the overlap, frames are spread evenly.
+
+    Args:
+        count: the number of frames.
+        results: of an online run.
+        most: frames of a recording that is short, or that are spread evenly.
+    """
+    keyframes = sorted({result.index for result in results if result.is_keyframe})
+    if count <= most or len(keyframes) < MIN_VIEWS:
+        return list(range(0, count, -(-count // most)))
+    gap = median(after - before for before, after in pairwise(keyframes))
+    chosen, last = set(keyframes), -count
+    for result in results:
+        is_doubtful = result.state is not State.TRACKING
+        if is_doubtful and result.index - last >= gap / 2:
+            chosen.add(result.index)
+            last = result.index
+    return sorted(chosen)
 
 
 class GlobalMapper:
@@ -220,7 +260,7 @@ class GlobalMapper:
             raise ConfigError(
                 "global_mapping.learned_links requires images; the recording has precomputed features"
             )
-        images = choose_images(len(self.sequence), results, self.config.global_mapping.max_images)
+        images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
         views = self._saved_views(images)
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
@@ -268,7 +308,7 @@ class GlobalMapper:
         if config is None or not links:
             return None
         own = GlobalMapper(self.sequence, self.camera, config, self.given, self.camera.params.device)
-        ends = pairs_across(links)
+        ends = pairs_around(links)
         found: dict[int, FrameFeatures] = {}
         for row in sorted({row for pair in ends for row in pair}):
             self.progress("learned features", len(found), len(views))
@@ -286,60 +326,118 @@ class GlobalMapper:
     def reconstruct(
         self, views: list[FrameFeatures], pairs: list[ViewPair], learned: LearnedPairs | None = None
     ) -> Reconstructed | str:
-        """Rotations, positions and rounds of adjustment of the largest connected set of views.
+        """Map the largest set of views that pairs connect: coarsely, together or in windows, then all exactly.
 
         Returns the rows of the views that have a pose, the tracks in all views, and the reconstruction; or the reason
         why there is no map. `learned`: more keypoints of the same images, with verified pairs.
         """
-        self.progress("rotations", 0, 1)
-        device = self.camera.params.device
-        own, plain = len(pairs), views
+        matcher, more = PairMatcher(views, self.camera, self.matcher, self.config), list[ViewPair]()
         if learned is not None:
-            views, pairs = learned.views, pairs + learned.pairs
-        ends = [(pair.first, pair.second) for pair in pairs]
-        edges = torch.tensor(ends, dtype=torch.int64, device=device).view(-1, 2)
-        if len(edges) == 0:
+            views, more = learned
+        windows = split(len(views), self.config.global_mapping.window_images)
+        begun = (
+            self._begin(views, pairs, more)
+            if len(windows) == 1
+            else self._begin_in_windows(windows, views, pairs, more)
+        )
+        if isinstance(begun, str):
+            return begun
+        T_cw, camera = begun.found.T_cw, begun.found.camera
+        self.progress("weak links", 0, 1)
+        used = strengthen(matcher, begun.pairs, T_cw, camera) + begun.learned + begun.unposed
+        observed = ObservedTracks.join(used, views)
+        found = adjust_in_rounds(observed, T_cw, self.given, camera, False, self._log)
+        seen = torch.unique(observed.tracks.view[found.agrees])
+        if len(seen) < MIN_VIEWS:
+            return f"no map: {len(views)} images agree on no points; the camera may only turn"
+        return seen, observed, found
+
+    def _begin(
+        self, views: list[FrameFeatures], pairs: list[ViewPair], learned: list[ViewPair]
+    ) -> CoarseMap | str:
+        """Rotations, positions and coarse adjustment of views that are mapped together."""
+        self.progress("rotations", 0, 1)
+        own, pairs = len(pairs), pairs + learned
+        if not pairs:
             return f"no map: no two of {len(views)} images show the same scene"
+        edges = torch.tensor([(pair.first, pair.second) for pair in pairs], device=self.camera.params.device)
         R_21 = torch.stack([pair.T_21[:3, :3] for pair in pairs])
         weights = R_21.new_tensor([float(len(pair)) for pair in pairs])
         weights = weights / weights.mean() / ROTATION_STD_RAD**2
         average = solve_rotations(
             edges, R_21, len(views), weights, options=ROTATION_OPTIONS.replace(backward="detached")
         )
-        off = so3_log(R_21 @ average.R_cw[edges[:, 0]] @ average.R_cw[edges[:, 1]].mT).norm(dim=-1)
-        held = (off < MAX_ROTATION_ERROR_RAD).tolist()
+        held = rotations_hold(pairs, average.R_cw)
         own = sum(held[:own])
-        pairs = [pair for pair, holds in zip(pairs, held, strict=True) if holds]
+        pairs = list(compress(pairs, held))
         others = sum(pair.relation is not Relation.GENERAL for pair in pairs)
         if len(pairs) - others < MIN_GENERAL * len(pairs):
             about = f"{others} of {len(pairs)} pairs of images"
             return f"no map: the camera stands still, only turns, or sees a plane in {about}"
-        rows = connected_views(pairs, len(views))
-        connected = set(rows.tolist())
+        connected = set(connected_views(pairs, len(views)).tolist())
         own = sum(pair.first in connected for pair in pairs[:own])
         pairs = [pair for pair in pairs if pair.first in connected]
-        observed = ObservedTracks.join(pairs, views)
-        if observed.tracks.count == 0:
-            return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
         self.progress("positions", 0, 1)
         camera = self.camera if self.given is None else self.given.camera
         centers_w = chained_positions(pairs, average.R_cw, views, self.camera)
         T_cw = rigid(average.R_cw, -(average.R_cw @ centers_w[..., None])[..., 0])
+        return self._adjusted(views, pairs[:own], pairs[own:], T_cw, camera, [])
+
+    def _begin_in_windows(
+        self,
+        windows: list[range],
+        views: list[FrameFeatures],
+        pairs: list[ViewPair],
+        learned: list[ViewPair],
+    ) -> CoarseMap | str:
+        """Map windows of views, and give them a common world."""
+        mapped, own, more, failure = list[MappedWindow](), list[ViewPair](), list[ViewPair](), ""
+        for number, window in enumerate(windows):
+            self.progress("windows", number, len(windows))
+            part = self._begin(
+                views[window.start : window.stop],
+                pairs_within(pairs, window),
+                pairs_within(learned, window),
+            )
+            if isinstance(part, str):
+                failure = failure or part
+                continue
+            mapped.append(MappedWindow(part.observed, part.found, window.start))
+            own += moved_pairs(part.pairs, window.start)
+            more += moved_pairs(part.learned, window.start)
+        if not mapped:
+            return failure
+        self.progress("joining", 0, 1)
+        T_cw, known = join_windows(mapped, pairs + learned, views)
+        own, more = (
+            pairs_that_hold(held + pairs_across(found, windows), T_cw, known)
+            for held, found in ((own, pairs), (more, learned))
+        )
+        camera = max(mapped, key=lambda part: int(part.found.agrees.sum())).found.camera
+        posed = set(known.nonzero()[:, 0].tolist())
+        unposed = [pair for pair in pairs + learned if not {pair.first, pair.second} <= posed]
+        return self._adjusted(views, own, more, T_cw, camera, unposed)
+
+    def _adjusted(
+        self,
+        views: list[FrameFeatures],
+        pairs: list[ViewPair],
+        learned: list[ViewPair],
+        T_cw: Float[Tensor, "K 4 4"],
+        camera: Camera,
+        unposed: list[ViewPair],
+    ) -> CoarseMap | str:
+        """Adjust approximate poses coarsely."""
+        observed = ObservedTracks.join(pairs + learned, views)
+        if observed.tracks.count == 0:
+            return f"no map: no point is seen by {MIN_VIEWS} of {len(views)} images"
         self.progress("adjustment", 0, 1)
+        observed = observed.longest()
+        found = adjust_coarsely(observed, T_cw, self.given, camera, self._log)
+        return CoarseMap(pairs, learned, observed, found, unposed)
 
-        def log(words: str) -> None:
-            self.progress(words, 0, 1)
-
-        coarse = adjust_coarsely(observed, T_cw, self.given, camera, log)
-        matcher = PairMatcher(plain, self.camera, self.matcher, self.config)
-        self.progress("weak links", 0, 1)
-        stronger = strengthen(matcher, pairs[:own], coarse.T_cw, coarse.camera)
-        observed = ObservedTracks.join(stronger + pairs[own:], views)
-        found = adjust_in_rounds(observed, coarse.T_cw, self.given, coarse.camera, False, log)
-        seen = torch.unique(observed.tracks.view[found.agrees])
-        if len(seen) < MIN_VIEWS:
-            return f"no map: {len(views)} images agree on no points; the camera may only turn"
-        return seen, observed, found
+    def _log(self, words: str) -> None:
+        self.progress(words, 0, 1)
 
     def finish(
         self,

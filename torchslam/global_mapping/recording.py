@@ -124,7 +124,7 @@ def run_recording(
     """
     config, observer, sources = online.slam.config, online.observer, list(sources)
     length = sequence.known_length
-    are_all_mapped = length is not None and length <= config.global_mapping.max_images
+    are_all_mapped = length is not None and length <= config.global_mapping.window_images
     may_map = mapping in (Mapping.AUTO, Mapping.GLOBAL)
     run = MappedRun.of(online.run(until_lost=may_map and are_all_mapped and not all_frames))
     if mapping is not None and not run.interrupted:

@@ -21,8 +21,8 @@ from torchslam.geometry.robust import Kernel
 from torchslam.global_mapping.tracks import (
     MIN_PARALLAX,
     Tracks,
+    held_parts,
     join_matches,
-    largest_part,
     longest_tracks,
     parallax,
     triangulate_tracks,
@@ -117,6 +117,10 @@ class ObservedTracks:
         """Some of the tracks, renumbered."""
         rows = keep[self.tracks.track]
         return ObservedTracks(self.tracks.select(rows, 1)[0], self.pixels[rows], self.noise[rows])
+
+    def longest(self) -> ObservedTracks:
+        """The tracks that the coarse rounds use."""
+        return self.select(longest_tracks(self.tracks, COARSE_TRACKS))
 
     def errors(self, found: Reconstruction) -> Float[Tensor, " O"]:
         """Reprojection errors in standard deviations, infinite behind the camera."""
@@ -226,19 +230,18 @@ def adjust_coarsely(
     """Find poses that are right to about a pixel, and the camera, from poses that may be many pixels off.
 
     Args:
-        observed: the tracks, of which the longest ones are used.
+        observed: the longest tracks.
         T_cw: approximate poses.
         given: the given camera with its error, a prior; None: the camera is exact.
         camera: to start with.
         log: receives what each round found.
     """
-    chosen = observed.select(longest_tracks(observed.tracks, COARSE_TRACKS))
-    found = chosen.triangulate(T_cw, camera, COARSE_GATE * COARSE[0][1])
+    found = observed.triangulate(T_cw, camera, COARSE_GATE * COARSE[0][1])
     gates = [scale for _, scale, _ in COARSE[1:]] + [FINE[1]]
     for (kernel, scale, tolerance), following in zip(COARSE, gates, strict=True):
-        found = adjust(chosen, found, kernel, scale, tolerance, given)
-        found = chosen.filter(found, COARSE_GATE * following)
-        log(f"{kernel} {scale:g}: {int(found.agrees.sum())} of {len(chosen.tracks)} observations agree")
+        found = adjust(observed, found, kernel, scale, tolerance, given)
+        found = observed.filter(found, COARSE_GATE * following)
+        log(f"{kernel} {scale:g}: {int(found.agrees.sum())} of {len(observed.tracks)} observations agree")
     return found
 
 
@@ -261,7 +264,7 @@ def adjust_in_rounds(
         log: receives what each round found.
     """
     if coarse:
-        begun = adjust_coarsely(observed, T_cw, given, camera, log)
+        begun = adjust_coarsely(observed.longest(), T_cw, given, camera, log)
         T_cw, camera = begun.T_cw, begun.camera
     found = observed.triangulate(T_cw, camera, FINE_START * GATE)
     for number in range(MAX_ROUNDS):
@@ -274,5 +277,6 @@ def adjust_in_rounds(
         log(f"round {number + 1}: {int(found.agrees.sum())} observations agree, {change:.1%} changed")
         if change < MIN_CHANGE:
             break
-    held = largest_part(observed.tracks, found.agrees, len(found.T_cw), MIN_SHARED)
-    return replace(found, agrees=found.agrees & held[observed.tracks.view])
+    part = held_parts(observed.tracks, found.agrees, len(found.T_cw), MIN_SHARED)
+    largest = torch.bincount(part).argmax()
+    return replace(found, agrees=found.agrees & (part == largest)[observed.tracks.view])

@@ -79,10 +79,10 @@ def join_matches(pairs: list[ViewPair], views: int, keypoints: int) -> Tracks:
     return Tracks(track, view, nodes % keypoints).select(counts[which] == 1)[0]
 
 
-def largest_part(
+def held_parts(
     tracks: Tracks, agrees: Bool[Tensor, " O"], views: int, least_shared: int
-) -> Bool[Tensor, " {views}"]:
-    """The largest set of images that points hold together, by the observations that agree.
+) -> Int[Tensor, " {views}"]:
+    """The lowest image of the part of each image: of those that points hold together, by observations that agree.
 
     least_shared: points that two images must share, each seen by no image between them, to hold together
     """
@@ -90,8 +90,7 @@ def largest_part(
     follows = track[1:] == track[:-1]
     links, counts = torch.unique((view[:-1] * views + view[1:])[follows], return_counts=True)
     links = links[counts >= least_shared]
-    label = connected_parts(torch.stack([links // views, links % views], dim=1), views)
-    return label == torch.bincount(label, minlength=views).argmax()
+    return connected_parts(torch.stack([links // views, links % views], dim=1), views)
 
 
 def longest_tracks(tracks: Tracks, per_view: int) -> Bool[Tensor, " N"]:

@@ -140,7 +140,9 @@ def refine_poses(
     camera = sequence.camera.to(device).to(torch.float64)
     free = _measurement(camera, radial) if choice is CameraChoice.FREE else None
     mapper = GlobalMapper(sequence, camera, config, free, device, extractor)
-    chosen = [frames[row] for row in choose_images(len(frames), (), mapper.config.global_mapping.max_images)]
+    chosen = [
+        frames[row] for row in choose_images(len(frames), (), mapper.config.global_mapping.window_images)
+    ]
     refinement = _Refinement(mapper, frames, chosen, given.T_cw[rows].to(camera.params))
     failure = refinement.failure
     if not failure:
