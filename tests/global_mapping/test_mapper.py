@@ -62,8 +62,8 @@ def map_whole(sequence: Sequence, *overrides: str, results: Iterable[StepResult]
     return GlobalMapper(sequence, sequence.camera, settings, None).run(list(results))
 
 
-def result(index: int, state: State) -> StepResult:
-    return StepResult(index, 0.1 * index, state, None)
+def result(index: int, state: State, is_keyframe: bool = False) -> StepResult:
+    return StepResult(index, 0.1 * index, state, None, is_keyframe=is_keyframe)
 
 
 # --- which frames ----------------------------------------------------------------------------------------------
@@ -85,14 +85,17 @@ def test_images_are_spread_evenly(count: int, most: int, chosen: list[int]) -> N
     assert choose_images(count, [], most) == chosen
 
 
-def test_doubtful_frames_are_mapped_as_well() -> None:
-    """Lost and uncertain ones, unless they are more than all others may be; those beyond the end are none."""
-    states = {1: State.LOST, 2: State.TRACKING, 3: State.INITIALIZING, 6: State.UNCERTAIN, 8: State.LOST}
-    results = [result(index, state) for index, state in states.items()]
-    assert choose_images(10, results, 3) == [0, 1, 4, 6, 8]
-    assert choose_images(7, results, 3) == [0, 1, 3, 6]
-    assert choose_images(10, [*results, result(9, State.LOST)], 3) == [0, 4, 8]
-    assert choose_images(10, [*results, result(9, State.LOST)], 4) == [0, 1, 3, 6, 8, 9]
+def test_images_of_long_recordings_are_keyframes_and_doubtful_frames() -> None:
+    """Doubtful frames twice as close as keyframes; with fewer than three keyframes the overlap is not known."""
+    keyframes = (0, 4, 8, 30)
+    results = [result(index, State.TRACKING, index in keyframes) for index in range(31)]
+    assert choose_images(31, results, 30) == [0, 4, 8, 30]
+    assert choose_images(31, results, 31) == list(range(31))
+    for index in range(15, 23):
+        results[index] = result(index, State.LOST if index < 18 else State.UNCERTAIN)
+    assert choose_images(31, results, 30) == [0, 4, 8, 15, 17, 19, 21, 30]
+    few = [result(index, State.TRACKING, index in (0, 4)) for index in range(31)]
+    assert choose_images(31, few, 11) == list(range(0, 31, 3))
 
 
 def test_one_in_ten_pairs_that_are_no_neighbors_is_held_back() -> None:
@@ -285,7 +288,7 @@ SCENE = Recording.of(arc(20, 120.0, 2.5), ball(120), noise_px=0.3, first=0)
 
 
 def reconstructing() -> GlobalMapper:
-    return GlobalMapper(WALK, CAMERA, config(), None)
+    return GlobalMapper(WALK, CAMERA, config("global_mapping.window_images=20"), None)
 
 
 def rotated(pair: ViewPair, rotvec: Tensor) -> ViewPair:

@@ -188,8 +188,8 @@ def features_to_keep(
 def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]:
     """The frames that are mapped: all of a short recording, else by what they have in common.
 
-    The keyframes of an online run overlap as they should. Where it was lost or uncertain, frames follow each other
-    twice as fast as keyframes did elsewhere. Where nothing is known of the overlap, frames are spread evenly.
+    The keyframes of an online run overlap as they should; without any, frames are spread evenly. Where the run was lost
+    or uncertain, frames follow each other twice as fast as these do.
 
     Args:
         count: the number of frames.
@@ -198,12 +198,12 @@ def choose_images(count: int, results: Rows[StepResult], most: int) -> list[int]
     """
     keyframes = sorted({result.index for result in results if result.is_keyframe})
     if count <= most or len(keyframes) < MIN_VIEWS:
-        return list(range(0, count, -(-count // most)))
-    gap = median(after - before for before, after in pairwise(keyframes))
+        keyframes = list(range(0, count, -(-count // most)))
+    gap = median(after - before for before, after in pairwise([*keyframes, count]))
     chosen, last = set(keyframes), -count
     for result in results:
-        is_doubtful = result.state is not State.TRACKING
-        if is_doubtful and result.index - last >= gap / 2:
+        is_doubtful = result.state in (State.LOST, State.UNCERTAIN)
+        if is_doubtful and gap / 2 <= result.index - last and result.index < count:
             chosen.add(result.index)
             last = result.index
     return sorted(chosen)

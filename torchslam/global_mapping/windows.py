@@ -31,7 +31,8 @@ from torchslam.utils.indexing import connected_parts
 OVERLAP = 0.2
 """Share of a window's images that the next one has as well. Tried at this value only."""
 MIN_HOLDING = 25
-"""Of the longest tracks those that must hold an image with its neighbors, so that the map of a window is rigid there."""
+"""Of the longest tracks, those that must hold an image with its neighbors, so that the map of a window is rigid there.
+Tried at this value only."""
 MIN_JOINING = 12
 """Points that a pair of images must have in two maps. Tried at 40, with which the loop of office_loop is not found."""
 ENOUGH_JOINING = 100
@@ -59,7 +60,6 @@ class MappedWindow(NamedTuple):
     observed: ObservedTracks
     found: Reconstruction
     first: int
-
 
     def parts(self) -> list[MappedWindow]:
         """The parts that enough points hold together: where they are few, each side may have a scale of its own."""

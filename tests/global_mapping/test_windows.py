@@ -1,0 +1,219 @@
+"""Windows of a recording: which images they have, and whether their maps find a common world again."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from itertools import pairwise
+
+import pytest
+import torch
+from torch import Tensor
+
+from tests.global_mapping.synthetic import CAMERA, Recording, apart, line, wall
+from tests.walks import Walk
+from tests.walks import arc as walk_arc
+from torchslam.config import load_config
+from torchslam.geometry import se3_inverse, so3_exp, transform
+from torchslam.geometry.transforms import without_scale
+from torchslam.global_mapping.mapper import GlobalMapper
+from torchslam.global_mapping.rounds import Reconstruction
+from torchslam.global_mapping.view_graph import ViewPair
+from torchslam.global_mapping.windows import (
+    MIN_HOLDING,
+    MIN_JOINING,
+    MappedWindow,
+    join_windows,
+    pairs_across,
+    pairs_that_hold,
+    pairs_within,
+    split,
+)
+
+SCENE = Recording.of(line(40), wall(900, 10.0), noise_px=0.3)
+EXACT = Recording.of(line(40), wall(900, 10.0))
+
+
+def similarity(seed: int) -> Tensor:
+    """A rotation of any size, a shift, and a scale between a half and two."""
+    numbers = torch.randn(7, generator=torch.Generator().manual_seed(seed), dtype=torch.float64)
+    S = torch.eye(4, dtype=torch.float64)
+    S[:3, :3] = (2.0 ** float(numbers[6].clamp(-1, 1))) * so3_exp(numbers[:3])
+    S[:3, 3] = numbers[3:6]
+    return S
+
+
+def mapped(scene: Recording, window: range, seed: int, seen: Tensor | None = None) -> MappedWindow:
+    """The true map of a window in a world of its own; `seen`: which points are mapped."""
+    own = Recording(
+        scene.T_cw[window.start : window.stop],
+        scene.points_w,
+        scene.shows[window.start : window.stop],
+        scene.views[window.start : window.stop],
+    )
+    S = similarity(seed)
+    observed = own.observed
+    shown = own.shows[observed.tracks.view, observed.tracks.keypoint]
+    of_track = torch.zeros(observed.tracks.count, dtype=torch.int64)
+    of_track[observed.tracks.track] = shown
+    agrees = torch.ones(len(shown), dtype=torch.bool) if seen is None else seen[shown]
+    T_ca = without_scale(own.T_cw @ torch.linalg.inv(S))
+    points_a = transform(S, scene.points_w[of_track])
+    return MappedWindow(observed, Reconstruction(T_ca, CAMERA, points_a, agrees), window.start)
+
+
+@pytest.mark.parametrize(
+    ("count", "size"), [(10, 10), (11, 10), (40, 15), (1000, 250), (7, 3), (301, 300), (1, 3)]
+)
+def test_windows_cover_all_images_and_overlap(count: int, size: int) -> None:
+    windows = split(count, size)
+    assert windows[0].start == 0
+    assert windows[-1].stop == count
+    assert all(len(window) == min(size, count) for window in windows)
+    shared = [before.stop - after.start for before, after in pairwise(windows)]
+    assert all(each >= int(0.2 * size) for each in shared)
+    assert len(windows) <= 1 + -(-(count - 1) // max(round(0.75 * size), 1))
+
+
+def test_windows_that_overlap_find_their_common_world() -> None:
+    windows = split(40, 15)
+    maps = [mapped(EXACT, window, seed) for seed, window in enumerate(windows)]
+    T_cw, known = join_windows(maps, [], EXACT.views)
+    assert bool(known.all())
+    error, degrees = apart(T_cw, EXACT.T_cw)
+    assert error < 1e-6
+    assert degrees < 1e-4
+
+
+def test_pairs_join_windows_that_share_no_image() -> None:
+    """In either order of their images; windows that nothing ties are left out, the smaller part of them."""
+    windows = [range(14), range(14, 24), range(24, 40)]
+    maps = [mapped(EXACT, window, seed) for seed, window in enumerate(windows)]
+    joining = [EXACT.pair(12, 15), EXACT.pair(11, 16)]
+    T_cw, known = join_windows(maps, joining, EXACT.views)
+    assert known.tolist() == [True] * 24 + [False] * 16
+    assert apart(T_cw[:24], EXACT.T_cw[:24])[0] < 1e-6
+    backwards = [
+        replace(
+            pair,
+            first=pair.second,
+            second=pair.first,
+            keypoints_1=pair.keypoints_2,
+            keypoints_2=pair.keypoints_1,
+        )
+        for pair in joining
+    ]
+    assert torch.allclose(join_windows(maps, backwards, EXACT.views)[0][:24], T_cw[:24], atol=1e-6)
+    _, known = join_windows(maps, [], EXACT.views)
+    assert known.tolist() == [False] * 24 + [True] * 16
+
+
+def test_too_few_common_points_join_nothing() -> None:
+    for count, joins in ((MIN_JOINING - 1, False), (MIN_JOINING + 3, True)):
+        pair = EXACT.pair(18, 21)
+        few = replace(pair, keypoints_1=pair.keypoints_1[:count], keypoints_2=pair.keypoints_2[:count])
+        maps = [mapped(EXACT, range(20), 0), mapped(EXACT, range(20, 40), 1)]
+        assert int(join_windows(maps, [few], EXACT.views)[1].sum()) == (40 if joins else 20)
+
+
+def test_loops_correct_the_drift_of_windows() -> None:
+    """Each window begins a little off; a similarity from the last to the first one spreads what is left."""
+    windows = [range(12), range(9, 21), range(18, 30)]
+    maps = [mapped(EXACT, window, seed) for seed, window in enumerate(windows)]
+    bent = maps[1].found.T_cw.clone()
+    turn = so3_exp(torch.tensor([0.0, 0.02, 0.0], dtype=torch.float64))
+    bent[-3:, :3] = turn @ bent[-3:, :3]  # its last images say that the next window is turned
+    maps[1] = maps[1]._replace(found=replace(maps[1].found, T_cw=bent))
+    chain, _ = join_windows(maps, [], EXACT.views)
+    loops = [EXACT.pair(8, 22), EXACT.pair(7, 22)]
+    assert min(len(pair) for pair in loops) > 100
+    closed, known = join_windows(maps, loops, EXACT.views)
+    assert bool(known[:30].all())
+    rest = [row for row in range(30) if not 18 <= row < 21]
+    assert apart(closed[rest], EXACT.T_cw[rest])[0] < 0.7 * apart(chain[rest], EXACT.T_cw[rest])[0]
+
+
+@pytest.mark.parametrize(("crossing", "parts"), [(MIN_HOLDING - 5, 2), (MIN_HOLDING + 5, 1)])
+def test_a_window_is_cut_where_few_points_hold_it(crossing: int, parts: int) -> None:
+    """Points that images on both sides of the tenth see are thinned out."""
+    sees = torch.zeros(40, len(EXACT.points_w), dtype=torch.bool)
+    for row, view in enumerate(EXACT.views):
+        sees[row, EXACT.shows[row][view.mask]] = True
+    across = (sees[:10].any(0) & sees[10:20].any(0)).nonzero()[:, 0]
+    near = across[sees[9, across] & sees[10, across]]
+    keep = torch.ones(len(EXACT.points_w), dtype=torch.bool)
+    keep[across] = False
+    keep[near[:crossing]] = True
+    found = mapped(EXACT, range(20), 0, keep).parts()
+    assert len(found) == parts
+    rows = [torch.unique(part.observed.tracks.view[part.found.agrees]).tolist() for part in found]
+    assert sorted(row for part in rows for row in part) == list(range(20))
+
+
+def test_pairs_of_windows() -> None:
+    """Those within have the rows of their window; of the others none has both images."""
+    pairs = SCENE.pairs(1, 12)
+    windows = split(40, 15)
+    within = [pairs_within(pairs, window) for window in windows]
+    assert all(0 <= pair.first < pair.second < 15 for of_window in within for pair in of_window)
+    across = pairs_across(pairs, windows)
+    ends = {(pair.first, pair.second) for pair in across}
+    inside = {
+        (pair.first + window.start, pair.second + window.start)
+        for of_window, window in zip(within, windows, strict=True)
+        for pair in of_window
+    }
+    assert not ends & inside
+    assert ends | inside == {(pair.first, pair.second) for pair in pairs}
+
+
+def test_pairs_that_poses_contradict_are_left_out() -> None:
+    pairs = SCENE.pairs(1)
+    T_21 = pairs[3].T_21.clone()
+    T_21[:3, :3] = so3_exp(torch.tensor([0.11, 0.0, 0.0], dtype=torch.float64)) @ T_21[:3, :3]
+    given = [*pairs, replace(pairs[3], T_21=T_21), *pairs[:2]]
+    known = torch.ones(40, dtype=torch.bool)
+    known[20] = False
+    held = pairs_that_hold(given, SCENE.T_cw, known)
+    assert [(pair.first, pair.second) for pair in held] == [
+        (row, row + 1) for row in range(39) if row not in (3, 19, 20)
+    ]
+    assert pairs_that_hold([], SCENE.T_cw, known) == []
+
+
+# --- the mapper -------------------------------------------------------------------------------------------------
+
+
+def mapper(size: int) -> GlobalMapper:
+    config = load_config(None, ["features.kind=simulated", f"global_mapping.window_images={size}"])
+    return GlobalMapper(Walk(walk_arc(3)), CAMERA, config, None)
+
+
+def reconstructed(size: int, pairs: list[ViewPair]) -> tuple[list[int], Tensor]:
+    found = mapper(size).reconstruct(SCENE.views, pairs)
+    assert not isinstance(found, str)
+    return found[0].tolist(), found[2].T_cw
+
+
+def test_a_map_in_windows_is_the_map_of_the_whole() -> None:
+    pairs = SCENE.pairs(1, 2, 3)
+    rows, whole = reconstructed(40, pairs)
+    assert rows == list(range(40))
+    rows, windowed = reconstructed(15, pairs)
+    assert rows == list(range(40))
+    assert apart(windowed, whole)[0] < 1e-3 * float(se3_inverse(SCENE.T_cw)[:, 0, 3].max())
+    assert apart(windowed, SCENE.T_cw)[0] < 5e-3
+
+
+def test_an_image_that_only_other_windows_see_has_a_pose() -> None:
+    """The last image is matched with none of its own window."""
+    pairs = [pair for pair in SCENE.pairs(1, 2, 3) if pair.second < 39]
+    far = [SCENE.pair(row, 39) for row in (24, 25)]
+    assert min(len(pair) for pair in far) > 20
+    rows, T_cw = reconstructed(14, pairs + far)
+    assert rows == list(range(40))
+    assert apart(T_cw, SCENE.T_cw)[0] < 1e-2
+
+
+def test_without_a_map_of_any_window_the_first_reason_is_given() -> None:
+    failure = mapper(15).reconstruct(SCENE.views, [])
+    assert failure == "no map: no two of 15 images show the same scene"
