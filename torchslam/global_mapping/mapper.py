@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from collections.abc import Sequence as Rows
 from dataclasses import dataclass, replace
 from functools import partial
@@ -23,7 +23,7 @@ from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.baselines import chained_positions
 from torchslam.global_mapping.check import MapCheck, check_map
-from torchslam.global_mapping.frames_between import pose_frames
+from torchslam.global_mapping.frames_between import FollowedViews, pose_frames
 from torchslam.global_mapping.links import (
     MIN_LEARNED_MATCHES,
     LearnedPairs,
@@ -61,6 +61,7 @@ from torchslam.global_mapping.windows import (
     split,
 )
 from torchslam.map.atlas import Atlas
+from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import squared_errors
 from torchslam.optim import ROTATION_OPTIONS
 from torchslam.optim.model_choice import predictive_gain
@@ -75,8 +76,8 @@ from torchslam.system.front_end import (
     source,
 )
 from torchslam.system.run import Run
-from torchslam.tracking.matcher import make_matcher, prepare_view
-from torchslam.types import Explanation, FrameFeatures, Reason, State, StepResult
+from torchslam.tracking.matcher import DescriptorMatcher, make_matcher, prepare_view
+from torchslam.types import Explanation, Frame, FrameFeatures, Reason, State, StepResult
 
 SIFT_RATIO, SIFT_DISTANCE = 0.64, 0.245
 """Ratio test and largest distance of SIFT's descriptors, as 1 - cosine: COLMAP's 0.8 and 0.7 between unit vectors."""
@@ -469,8 +470,8 @@ class GlobalMapper:
         submap.map = make_map(own, found.T_cw[rows], tracks, found.points_w[former])
         submap.map.set_noise(squared_errors(submap.map, submap.map.observations(), found.camera))
         sensor = SensorModel(found.camera, self.readout)
-        every = self._all_views(range(len(self.sequence)) if frames is None else frames, views)
-        results = pose_frames(submap, every, sensor, self.config, given_cw)
+        every = self._all_views(range(len(self.sequence)) if frames is None else frames, views, submap.map)
+        results = pose_frames(submap, every, sensor, self.config, given_cw, self.view)
         final = FinalAdjustment(sensor, self.config, self.given)
         if not keep:
             final.adjust(atlas, 0, partial(self.progress, "final adjustment"), settled=True)
@@ -505,6 +506,18 @@ class GlobalMapper:
 
     def view(self, index: int) -> FrameFeatures | None:
         """The features of a frame; None if it cannot be read, which is counted once."""
+        frame = self._frame(index)
+        if frame is None:
+            return None
+        features = frame.features
+        if self.extract is not None:
+            with torch.inference_mode():
+                features = self.extract(frame)
+        assert features is not None
+        return prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
+
+    def _frame(self, index: int) -> Frame | None:
+        """A frame; None if it cannot be read, which is counted once."""
         try:
             frame = self.sequence[index]
             if frame.features is None or frame.image.numel():
@@ -514,19 +527,23 @@ class GlobalMapper:
                 warnings.warn(f"skipped a frame: {error}", stacklevel=2)
                 self.skipped.append(str(error))
             return None
-        features = frame.features
-        if self.extract is not None:
-            with torch.inference_mode():
-                features = self.extract(frame)
-        assert features is not None
-        return prepare_view(FrameFeatures.of(frame, features, self.camera.params), frame, self.matcher)
+        return frame
 
-    def _all_views(self, frames: Rows[int], views: list[FrameFeatures]) -> Iterator[FrameFeatures]:
-        """Frames in order, those that were mapped without extracting their features again."""
+    def _all_views(
+        self, frames: Rows[int], views: list[FrameFeatures], slam_map: Map
+    ) -> Iterator[FrameFeatures]:
+        """Frames in order: those that were mapped, and those between them."""
         mapped = {view.index: view for view in views}
-        for done, index in enumerate(frames):
+        found: Iterable[FrameFeatures | None] = (mapped.get(index) or self.view(index) for index in frames)
+        if self.extract is not None and isinstance(self.matcher, DescriptorMatcher):
+            points = zip(
+                slam_map.keyframes["frame_index"].tolist(), slam_map.keyframes["point_ids"], strict=True
+            )
+            with_point = {index: ids >= 0 for index, ids in points}
+            reduction = self.config.features.reduction(self.camera.size)
+            found = FollowedViews(self._frame, self.view, mapped, with_point, reduction).of(frames)
+        for done, view in enumerate(found):
             self.progress("frames between", done, len(frames))
-            view = mapped[index] if index in mapped else self.view(index)
             if view is not None:
                 yield view
 
