@@ -166,6 +166,18 @@ def test_poses_of_images_are_those_of_the_run(mapped: GlobalMap) -> None:
     assert not bool(poses_of(replace(mapped.run, submaps=()), others)[1].any())
 
 
+@pytest.mark.parametrize(
+    ("enough", "chosen"), [(20, [0, 8, 16, 24]), (1000, [*range(0, 25, 2)])], ids=["enough", "too few"]
+)
+def test_frames_between_keyframes_that_share_too_little_are_mapped(
+    monkeypatch: pytest.MonkeyPatch, enough: int, chosen: list[int]
+) -> None:
+    """Twice as close, and twice again; images have 200 keypoints."""
+    monkeypatch.setattr("torchslam.global_mapping.mapper.LEAST_SHARED", enough)
+    results = [result(index, State.TRACKING, index in (0, 8, 16, 24)) for index in range(30)]
+    assert [view.index for view in map_whole(WALK, results=results).views] == chosen
+
+
 def test_doubtful_frames_of_an_online_run_are_mapped() -> None:
     """And each frame is read and its features are extracted once."""
 

@@ -219,6 +219,14 @@ def test_the_map_that_predicts_the_held_out_pairs_better_is_kept(
     assert made.check == world.checks[kept is Mapping.GLOBAL]
 
 
+@pytest.mark.parametrize(("posed", "kept"), [(98, Mapping.GLOBAL), (97, Mapping.ONLINE)])
+def test_a_right_map_with_a_few_frames_less_is_kept(world: World, posed: int, kept: Mapping) -> None:
+    """Where neither predicts surely better, and the check contradicts the online map."""
+    world.whole = a_run(posed=posed)
+    world.checks = {True: a_check(predicted=100), False: a_check(0.7, predicted=100)}
+    assert world.map(a_run(), Mapping.GLOBAL).kept is kept
+
+
 def test_without_any_map_the_whole_one_must_be_right(world: World) -> None:
     failed = a_run(posed=0, failure="the camera only turns")
     world.checks = {True: a_check(0.7), False: a_check(0.0)}

@@ -91,6 +91,9 @@ HELD_BACK = 10
 """One in this many verified pairs is held out from mapping, for the check of the map."""
 HELD_BACK_DISTANCE = 2
 """Least distance in images of pairs that are held back: pairs of neighbors keep the images together."""
+LEAST_SHARED, HALVINGS = 200, 2
+"""Verified matches that neighbors must have, or else a frame between them is mapped as well, and how often the distance
+is halved so. Keyframes of machine_hall have 637 in the median, those of office_loop, mapped alone, lose its loop."""
 SAVED_TOGETHER = 50
 """Images whose features are saved in one file, 80 MB. So many, some seconds of work, are lost when a run is killed.
 Tried at this value only."""
@@ -263,6 +266,8 @@ class GlobalMapper:
             )
         images = choose_images(len(self.sequence), results, self.config.global_mapping.window_images)
         views = self._saved_views(images)
+        if any(result.is_keyframe for result in results):
+            views = self._overlapping(views)
         if before is not None:
             views, self.readout = before.at_middle_row(views), before.readout
         if len(views) < MIN_VIEWS:
@@ -487,6 +492,27 @@ class GlobalMapper:
             calibration=final.calibration,
             shutter=final.shutter,
         )
+
+    def _overlapping(self, views: list[FrameFeatures]) -> list[FrameFeatures]:
+        """Views, and those of frames between neighbors that have too few verified matches."""
+        tried: set[tuple[int, int]] = set()
+        for _ in range(HALVINGS):
+            ends = [(before.index, after.index) for before, after in pairwise(views)]
+            apart = [
+                row
+                for row, (before, after) in enumerate(ends)
+                if after - before > 1 and ends[row] not in tried
+            ]
+            matcher = PairMatcher(views, self.camera, self.matcher, self.config)
+            found = {
+                pair.first: len(pair) for pair in self.saved.pairs(matcher, ((row, row + 1) for row in apart))
+            }
+            tried |= {ends[row] for row in apart}
+            more = [sum(ends[row]) // 2 for row in apart if found.get(row, 0) < LEAST_SHARED]
+            if not more:
+                break
+            views = sorted(views + self._saved_views(more), key=lambda view: view.index)
+        return views
 
     def _saved_views(self, images: list[int]) -> list[FrameFeatures]:
         """The features of the images that can be read, saved in groups."""

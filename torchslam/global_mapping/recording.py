@@ -212,9 +212,12 @@ def map_recording(
         # A camera that only turns, with a wrong focal length, makes maps that contradict themselves.
         return MappedRun.of(online, Mapping.ONLINE, None, why)
     gain = predictive_gain(whole.evidence, before.evidence, made.held_back_times)
-    is_better = len(made.run.trajectory) >= len(online.trajectory)
+    posed, before_posed = len(made.run.trajectory), len(online.trajectory)
+    is_better = posed >= before_posed
     if abs(gain.sigmas) > SURE:
         is_better = gain.total > 0
+    elif whole.is_right and not before.is_right:
+        is_better = posed >= FEW_POSED * before_posed
     why = why or "it was asked for"
     if is_better:
         return MappedRun.of(made.run, Mapping.GLOBAL, whole, why, online)
