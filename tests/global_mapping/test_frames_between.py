@@ -138,6 +138,17 @@ def test_frames_without_a_keyframe_have_their_own_features() -> None:
     assert Film().views((), (), 2) != []
 
 
+def test_only_followed_frames_are_extracted_again() -> None:
+    film = Film()
+    known = {0: keyframe(0, PIXELS)}
+    followed = FollowedViews(film.read, film.extract, known, {0: known[0].mask}, 1.0)
+    assert len(list(followed.of([0, 1, 2]))) == 3
+    assert followed.again(0) is None
+    again = followed.again(2)
+    assert again is not None
+    assert (again.index, len(again.keypoints), film.extracted) == (2, 1, [2])
+
+
 def test_frames_that_cannot_be_read_are_left_out() -> None:
     found = Film((2, 4)).views((0, 6), (0, 6), 7)
     assert [view.index for view in found if view is not None] == [0, 1, 3, 5, 6]

@@ -125,6 +125,11 @@ class FollowedViews:
     ) -> None:
         self.read, self.extract, self.reduction = read, extract, reduction
         self.mapped, self.with_point = mapped, with_point
+        self._followed = set[int]()
+
+    def again(self, index: int) -> FrameFeatures | None:
+        """The features of a frame whose view was of followed keypoints; None for another one."""
+        return self.extract(index) if index in self._followed else None
 
     def of(self, frames: Iterable[int]) -> Iterator[FrameFeatures | None]:
         """The views of frames, in order; None for one that cannot be read."""
@@ -157,6 +162,7 @@ class FollowedViews:
         for index in frames:
             frame = self.read(index)
             if frame is not None:
+                self._followed.add(index)
                 yield Still(index, frame.timestamp, gray_of(frame.image, self.reduction))
 
     def _template(self, index: int) -> Template | None:
@@ -175,7 +181,7 @@ def pose_frames(
     sensor: SensorModel,
     config: Config,
     given_cw: dict[int, Float[Tensor, "4 4"]] | None = None,
-    extract: Callable[[int], FrameFeatures | None] | None = None,
+    again: Callable[[int], FrameFeatures | None] | None = None,
 ) -> list[StepResult]:
     """Add all views to the posed frames of a submap, whose map has some of them as keyframes, in order.
 
@@ -185,7 +191,7 @@ def pose_frames(
         sensor: of all views.
         config: of the tracker.
         given_cw: poses of the views by another program, by frame: these are the online poses then.
-        extract: the features of a frame, where the view is of keypoints that were followed; None: it never is.
+        again: the features of a frame whose view is of followed keypoints, or None; None: there is no such frame.
     """
     tracker = Tracker(SharedCamera(sensor.camera, sensor.readout), config)
     row_of = {index: row for row, index in enumerate(submap.map.keyframes["frame_index"].tolist())}
@@ -195,7 +201,7 @@ def pose_frames(
         if view.index in row_of:
             result = _add_keyframe(tracker, submap, view, row_of[view.index])
         else:
-            result = _track(tracker, submap, view, extract)
+            result = _track(tracker, submap, view, again)
         if given_cw is not None:
             result = replace(result, T_cw=given_cw[view.index], submap=submap.number)
         results.append(result)
@@ -224,13 +230,14 @@ def _track(
     tracker: Tracker,
     submap: Submap,
     view: FrameFeatures,
-    extract: Callable[[int], FrameFeatures | None] | None,
+    again: Callable[[int], FrameFeatures | None] | None,
 ) -> StepResult:
     """Track a frame from the last keyframe, or relocalize it by the keyframes nearest in time."""
     view = tracker.at_middle_row(submap, view)
     estimate = tracker.track(submap, view)
-    if estimate is None and extract is not None:
-        view = tracker.at_middle_row(submap, extract(view.index) or view)
+    extracted = again(view.index) if estimate is None and again is not None else None
+    if extracted is not None:
+        view = tracker.at_middle_row(submap, extracted)
         estimate = tracker.track(submap, view)
     tracker.commit(submap, view, estimate)
     if estimate is None:

@@ -475,8 +475,10 @@ class GlobalMapper:
         submap.map = make_map(own, found.T_cw[rows], tracks, found.points_w[former])
         submap.map.set_noise(squared_errors(submap.map, submap.map.observations(), found.camera))
         sensor = SensorModel(found.camera, self.readout)
-        every = self._all_views(range(len(self.sequence)) if frames is None else frames, views, submap.map)
-        results = pose_frames(submap, every, sensor, self.config, given_cw, self.view)
+        followed = self._followed(views, submap.map)
+        every = self._all_views(range(len(self.sequence)) if frames is None else frames, views, followed)
+        again = None if followed is None else followed.again
+        results = pose_frames(submap, every, sensor, self.config, given_cw, again)
         final = FinalAdjustment(sensor, self.config, self.given)
         if not keep:
             final.adjust(atlas, 0, partial(self.progress, "final adjustment"), settled=True)
@@ -503,6 +505,8 @@ class GlobalMapper:
                 for row, (before, after) in enumerate(ends)
                 if after - before > 1 and ends[row] not in tried
             ]
+            if not apart:
+                break
             matcher = PairMatcher(views, self.camera, self.matcher, self.config)
             found = {
                 pair.first: len(pair) for pair in self.saved.pairs(matcher, ((row, row + 1) for row in apart))
@@ -556,22 +560,28 @@ class GlobalMapper:
         return frame
 
     def _all_views(
-        self, frames: Rows[int], views: list[FrameFeatures], slam_map: Map
+        self, frames: Rows[int], views: list[FrameFeatures], followed: FollowedViews | None
     ) -> Iterator[FrameFeatures]:
         """Frames in order: those that were mapped, and those between them."""
         mapped = {view.index: view for view in views}
         found: Iterable[FrameFeatures | None] = (mapped.get(index) or self.view(index) for index in frames)
-        if self.extract is not None and isinstance(self.matcher, DescriptorMatcher):
-            points = zip(
-                slam_map.keyframes["frame_index"].tolist(), slam_map.keyframes["point_ids"], strict=True
-            )
-            with_point = {index: ids >= 0 for index, ids in points}
-            reduction = self.config.features.reduction(self.camera.size)
-            found = FollowedViews(self._frame, self.view, mapped, with_point, reduction).of(frames)
+        if followed is not None:
+            found = followed.of(frames)
         for done, view in enumerate(found):
             self.progress("frames between", done, len(frames))
             if view is not None:
                 yield view
+
+    def _followed(self, views: list[FrameFeatures], slam_map: Map) -> FollowedViews | None:
+        """The views between keyframes; None without images, or where the matcher needs more than descriptors."""
+        if self.extract is None or not isinstance(self.matcher, DescriptorMatcher):
+            return None
+        keyframes = slam_map.keyframes
+        points = zip(keyframes["frame_index"].tolist(), keyframes["point_ids"], strict=True)
+        with_point = {index: ids >= 0 for index, ids in points if bool((ids >= 0).any())}
+        reduction = self.config.features.reduction(self.camera.size)
+        mapped = {view.index: view for view in views}
+        return FollowedViews(self._frame, self.view, mapped, with_point, reduction)
 
     def _failed(self, reason: str, views: list[FrameFeatures], pairs: list[ViewPair]) -> GlobalMap:
         reasons = (Explanation.of(Reason.OTHER, text=reason),)
