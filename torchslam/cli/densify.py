@@ -21,6 +21,8 @@ from tqdm import tqdm
 from torchslam.cli import arguments
 from torchslam.cli.progress import shown_warnings
 from torchslam.config import CHOICES, load_config
+from torchslam.densify import densify
+from torchslam.densify.views import views_of
 from torchslam.errors import ConfigError, ResultsError
 from torchslam.io.export.mesh import import_open3d, write_mesh
 from torchslam.io.export.ply import upright_from_map, write_cloud
@@ -92,9 +94,6 @@ def densify_results(directory: Path, options: argparse.Namespace) -> dict[str, s
         directory: the results folder.
         options: those of `torchslam densify`, or of `torchslam run --dense`, which has some of them.
     """
-    from torchslam.densify import densify  # which loads all of dense depth, and most runs have none
-    from torchslam.densify.views import views_of
-
     device, every, rows = options.device, options.every, dict[str, str]()
     if options.mesh:
         import_open3d()

@@ -164,7 +164,7 @@ class _World:
     Attributes:
         rows: of the images with a pose.
         T_ca: their poses.
-        keys: of keypoints that have a point, image times `count` plus keypoint, ascending.
+        keys: of keypoints that have a point, image times `_KEYS` plus keypoint, ascending.
         points_a: their points; sigmas: their standard deviations, pixels.
     """
 
@@ -202,7 +202,8 @@ class _World:
         return self.T_ca[int(torch.searchsorted(self.rows, view))]
 
 
-_KEYS = 1 << 20  # more than there are keypoints in an image
+_KEYS = 1 << 20
+"""More than there are keypoints in an image."""
 
 
 def _keys(view: Int[Tensor, " M"] | int, keypoint: Int[Tensor, " M"]) -> Int[Tensor, " M"]:
