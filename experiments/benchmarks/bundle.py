@@ -103,7 +103,7 @@ def loss_of(solution: BundleSolution) -> Tensor:
 
 def points_loss(points_w: Tensor) -> Tensor:
     points = points_w.flatten()
-    return points @ torch.linspace(-1, 1, len(points), dtype=points.dtype)
+    return points @ torch.linspace(-1, 1, len(points)).to(points)
 
 
 def large() -> list[str]:
