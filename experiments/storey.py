@@ -1,6 +1,8 @@
 """`synthetic:storey`: a storey with a corridor and one room, for experiments; importing this module adds the scene.
+`synthetic:storeys`: three of them, one above the other, joined by a shaft in the corner at (-6, -5).
 
 python -m experiments.storey run synthetic:storey -o results/storey     # the command line of torchslam with it
+python -m experiments.storey render synthetic:storeys results/storeys/recording     # its images, as a folder
 
 The corridor of the storey is weak in texture; it leads all around a core with a furnished room. Seen from above, x to
 the right and z up the page:
@@ -20,14 +22,19 @@ the right and z up the page:
 from __future__ import annotations
 
 import math
+import sys
 from dataclasses import replace
+from pathlib import Path
 
+import cv2
 import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from tqdm import tqdm
 
 from torchslam.cli.main import console
+from torchslam.data import open_sequence
 from torchslam.data.synthetic.scene import (
     BUILDING_TEXEL,
     FLOOR,
@@ -41,6 +48,7 @@ from torchslam.data.synthetic.scene import (
     Z,
 )
 from torchslam.data.synthetic.sequence import SCENES, Scene, poses
+from torchslam.data.trajectories import write_trajectory
 
 TOP = np.array((0.0, -HEIGHT / 2, 0.0))
 STOREY_OUTER = (6.0, 5.0)
@@ -95,6 +103,16 @@ WALK = (  # over the storey: x, z and heading in quarter turns to the right from
     (-5.1, -4.1, -7),
     (-4.0, -4.1, -7),
 )
+SHAFT = (-4.2, -3.2)
+"""Corner of the shaft, along x and z: it reaches from there to the outer walls."""
+SLAB = 0.3
+"""Meters between the ceiling of a storey and the floor of the next."""
+STOREYS = 3
+PAUSE_TIME = 2.5
+"""A pause takes as long as a walk of so many meters: three seconds at the scene's pace."""
+GLANCE = (0.6, 0.25)
+"""Quarter turns of a quick glance to the side, and how long it takes, as meters of the walk: three times as fast as
+other turns."""
 QUARTER_TIME = 1.4
 """A quarter turn takes as long as a walk of so many meters."""
 EASING = 0.6
@@ -110,16 +128,46 @@ def storey(seed: int) -> list[Rectangle]:
     return _corridor(plain) + _boards(painter) + _storey_room(painter, plain)
 
 
-def _corridor(plain: Painter) -> list[Rectangle]:
-    """Its ceiling and FLOOR, which the room has as well, the outer walls, three of the core's."""
+def storeys(seed: int) -> list[Rectangle]:
+    """`STOREYS` storeys with textures of their own; each is `HEIGHT + SLAB` above the one before."""
+    rectangles = []
+    x, z = STOREY_OUTER
+    for number in range(STOREYS):
+        painter = Painter(np.random.default_rng((seed, number)), BUILDING_TEXEL)
+        plain = replace(painter, coverage=PLAIN)
+        parts = _corridor(plain, below=number > 0, above=number < STOREYS - 1)
+        if number:  # the four sides of the shaft through the slab below
+            corner = FLOOR * Y - np.array((x, 0.0, z))
+            sides = SHAFT[0] + x, SHAFT[1] + z
+            parts += [painter.rectangle(corner + far * X, Z, Y, (sides[1], SLAB)) for far in (0.0, sides[0])]
+            parts += [painter.rectangle(corner + far * Z, X, Y, (sides[0], SLAB)) for far in (0.0, sides[1])]
+        parts += _boards(painter) + _storey_room(painter, plain)
+        up = -number * (HEIGHT + SLAB) * Y
+        rectangles += [replace(rectangle, origin=rectangle.origin + up) for rectangle in parts]
+    return rectangles
+
+
+def _corridor(plain: Painter, below: bool = False, above: bool = False) -> list[Rectangle]:
+    """Its ceiling and FLOOR, which the room has as well, the outer walls, three of the core's.
+
+    below, above: the shaft leads on through the floor, the ceiling
+    """
     x, z = STOREY_OUTER
     core_x, core_z = STOREY_CORE
     lengths = (2 * x, 2 * z)
     corner = TOP + np.array((-x, 0.0, -z))
     inner = TOP + np.array((-core_x, 0.0, -core_z))
+
+    def level(at: Vector, is_open: bool) -> list[Rectangle]:
+        if not is_open:
+            return [plain.rectangle(at, X, Z, lengths)]
+        width, depth = SHAFT[0] + x, SHAFT[1] + z
+        beside = plain.rectangle(at + width * X, X, Z, (2 * x - width, depth))
+        return [beside, plain.rectangle(at + depth * Z, X, Z, (2 * x, 2 * z - depth))]
+
     return [
-        plain.rectangle(corner, X, Z, lengths),
-        plain.rectangle(corner + HEIGHT * Y, X, Z, lengths),
+        *level(corner, above),
+        *level(corner + HEIGHT * Y, below),
         *(plain.rectangle(corner + far * Z, X, Y, (2 * x, HEIGHT)) for far in (0.0, 2 * z)),
         *(plain.rectangle(corner + far * X, Z, Y, (2 * z, HEIGHT)) for far in (0.0, 2 * x)),
         *(plain.rectangle(inner + far * Z, X, Y, (2 * core_x, HEIGHT)) for far in (0.0, 2 * core_z)),
@@ -182,15 +230,47 @@ def _storey_room(painter: Painter, plain: Painter) -> list[Rectangle]:
 
 
 def round_the_storey(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
-    """Around the corridor of the storey and into its room, one round a phase of 2 pi; the body turns in place.
+    """Around the corridor of the storey and into its room, one round a phase of 2 pi; the body turns in place."""
+    ends = torch.tensor([(x, 0.0, z, turns) for x, z, turns in WALK], dtype=torch.float64, device="cpu")
+    return _held(phase, *_walked(phase, ends, ends.new_zeros(len(ends) - 1), again=True))
 
-    The camera is held at arm's length and looks ahead, it sways and glances to the sides.
+
+def through_the_storeys(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
+    """Once around each storey, from one to the next in the shaft, and down again: a phase of 2 pi.
+
+    Each round ends where it began, with a view along the corridor that was seen before. In every storey a pause and two
+    quick glances.
     """
-    x, z, yaw = _walked(phase)
+    corner, turns = (-5.1, -4.1), 1.0
+    ends, pauses = list[tuple[float, float, float, float]](), list[float]()
+
+    def go(x: float, up: float, z: float, heading: float, pause: float = 0.0) -> None:
+        ends.append((x, -up * (HEIGHT + SLAB), z, heading))
+        pauses.append(pause)
+
+    for number in range(STOREYS):
+        go(corner[0], number, corner[1], turns)
+        for place, (x, z, heading) in enumerate(WALK[1:-1]):
+            go(x, number, z, turns + heading - 1)
+            if place == 6:
+                go(x, number, z, turns + heading - 1, PAUSE_TIME)
+            if place in (3, 9):  # the pause takes away from the time of the turn
+                for side in (GLANCE[0], 0.0):
+                    go(x, number, z, turns + heading - 1 + side, GLANCE[1] - QUARTER_TIME * GLANCE[0])
+        turns -= 8
+    go(corner[0], 0.0, corner[1], turns)  # down, over the start
+    go(0.0, 0.0, corner[1], turns)
+    at = torch.tensor(ends, dtype=torch.float64, device="cpu")
+    walked = _walked(phase, at, torch.tensor(pauses[1:], dtype=torch.float64, device="cpu"), again=False)
+    return _held(STOREYS_FRAMES / STOREY_FRAMES * phase, *walked)
+
+
+def _held(phase: Tensor, x: Tensor, y: Tensor, z: Tensor, yaw: Tensor) -> Float[Tensor, "N 4 4"]:
+    """The camera is held at arm's length before a body and looks ahead, it sways and glances to the sides."""
     yaw = yaw + 0.15 * torch.sin(17.3 * phase) + 0.015 * torch.sin(61.7 * phase)
     return poses(
         x + ARM * torch.sin(yaw) + 0.012 * torch.sin(49.1 * phase),
-        -0.1 + 0.015 * torch.sin(83.7 * phase) + 0.05 * torch.sin(5.3 * phase + 0.5),
+        y - 0.1 + 0.015 * torch.sin(83.7 * phase) + 0.05 * torch.sin(5.3 * phase + 0.5),
         z + ARM * torch.cos(yaw) + 0.012 * torch.sin(43.9 * phase + 1.0),
         yaw,
         -0.02 + 0.012 * torch.sin(57.7 * phase + 0.4),
@@ -198,26 +278,54 @@ def round_the_storey(phase: Float[Tensor, " N"]) -> Float[Tensor, "N 4 4"]:
     )
 
 
-def _walked(phase: Float[Tensor, " N"]) -> Float[Tensor, "3 N"]:
-    """x, z and yaw of the body on `WALK`, eased by a Hann window over the time."""
-    ends = torch.tensor(WALK, dtype=torch.float64, device="cpu")
+def _walked(
+    phase: Float[Tensor, " N"], ends: Float[Tensor, "E 4"], pauses: Float[Tensor, " E1"], again: bool
+) -> Float[Tensor, "4 N"]:
+    """x, y, z and yaw of the body, eased by a Hann window over the time.
+
+    ends: x, y, z and heading, quarter turns, of each end of a step or a turn
+    pauses: by how much each step takes longer
+    again: from the end on to the start
+    """
     steps = ends.diff(dim=0)
-    durations = steps[:, :2].norm(dim=-1) + QUARTER_TIME * steps[:, 2].abs()
+    durations = steps[:, :3].norm(dim=-1) + QUARTER_TIME * steps[:, 3].abs() + pauses
     starts = torch.cat((durations.new_zeros(1), durations.cumsum(0)))
     window = torch.linspace(-1, 1, 25, dtype=torch.float64, device="cpu")[1:-1]
     weights = torch.cos(0.5 * math.pi * window) ** 2
-    time = (phase[:, None] * (starts[-1] / (2 * math.pi)) + EASING * window) % starts[-1]
+    time = phase[:, None] * (starts[-1] / (2 * math.pi)) + EASING * window
+    time = time % starts[-1] if again else time.clamp(min=0.0).minimum(starts[-1])
     row = (torch.searchsorted(starts, time, right=True) - 1).clamp(max=len(steps) - 1)
     share = (time - starts[row]) / durations[row]
     at = ends[row] + share[..., None] * steps[row]
     # A round ends eight quarter turns from where it began: in a window over its end the heading goes on from there.
-    jump = torch.round((at[..., 2] - at[:, len(window) // 2, None, 2]) / 8) * 8
-    at = torch.stack((at[..., 0], at[..., 1], 0.5 * math.pi * (at[..., 2] - jump)))
+    jump = torch.round((at[..., 3] - at[:, len(window) // 2, None, 3]) / 8) * 8
+    at = torch.stack((*at[..., :3].unbind(-1), 0.5 * math.pi * (at[..., 3] - jump)))
     return (at * weights).sum(-1) / weights.sum()
 
 
+STOREY_FRAMES, STOREYS_FRAMES = 1160, 5000
+"""Of a round of one storey, and of the walk through all."""
 # A corridor all around with a room on the way, and 100 frames on, over the start.
-SCENES["storey"] = Scene(storey, round_the_storey, 1160, 1260)
+SCENES["storey"] = Scene(storey, round_the_storey, STOREY_FRAMES, STOREY_FRAMES + 100)
+SCENES["storeys"] = Scene(storeys, through_the_storeys, STOREYS_FRAMES, STOREYS_FRAMES)
+
+
+def render(name: str, folder: Path) -> None:
+    """Write a rendered sequence as a folder in the format of TUM RGB-D: a run then takes no time to render."""
+    sequence = open_sequence(name)
+    truth = sequence.groundtruth
+    assert truth is not None
+    (folder / "rgb").mkdir(parents=True)
+    files = [f"{time:.6f} rgb/{number:05}.jpg" for number, time in enumerate(sequence.timestamps.tolist())]
+    for number in tqdm(range(len(sequence)), unit="image"):
+        gray = (255 * sequence.image(number)[0, 0]).round().to(torch.uint8).numpy()
+        cv2.imwrite(str(folder / f"rgb/{number:05}.jpg"), gray, [cv2.IMWRITE_JPEG_QUALITY, 95])
+    (folder / "rgb.txt").write_text("\n".join(files) + "\n")
+    write_trajectory(folder / "groundtruth.txt", truth)
+
 
 if __name__ == "__main__":
-    console()
+    if sys.argv[1:2] == ["render"]:
+        render(sys.argv[2], Path(sys.argv[3]))
+    else:
+        console()
