@@ -251,8 +251,8 @@ def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
     monkeypatch.setattr(_sparse, "_INNER_FRAMES", 2)
     settle, seen = SparseBundle._settled, []
 
-    def settled(self, estimate):
-        found = settle(self, estimate)
+    def settled(self, estimate, model):
+        found = settle(self, estimate, model)
         seen.append((self, estimate, found))
         return found
 
@@ -270,6 +270,25 @@ def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
     assert float((left * gradient.mT)[free].sum()) < 1e-3 * float(
         lower.sum()
     )  # what one more step could gain
+
+
+def test_a_point_that_steps_too_far_does_not_stop_the_others(monkeypatch, bundle_scene):
+    """Where the joint step raises the cost, such a point goes back."""
+    problem = bundle_scene(frames=6, points=40, perturbation=0.05).problem
+    monkeypatch.setattr(_sparse, "_INNER_FRAMES", 2)
+    settle, moved = SparseBundle._settled, []
+
+    def settled(self, estimate, model):
+        points_w = estimate.points_w.clone()
+        points_w[3] += 40.0  # one step of one point goes wrong
+        found = settle(self, estimate._replace(points_w=points_w), model)
+        moved.append(float((found.points_w - model.estimate.points_w)[3].norm()))
+        return found
+
+    monkeypatch.setattr(SparseBundle, "_settled", settled)
+    start = float(adjusted(problem, iterations=0).cost)
+    assert float(adjusted(problem, iterations=1).cost) < 0.3 * start  # else the step is refused
+    assert moved[0] < 1.0
 
 
 def test_steps_of_points_lead_to_the_same_minimum(monkeypatch, bundle_scene):

@@ -105,6 +105,18 @@ class Structure:
         """How many frames are free."""
         return len(self.frame_ends)
 
+    @cached_property
+    def tile_blocks(self) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Of each tile the pairs of members that are covisible, first and second, and the numbers of their blocks."""
+        assert self.pairs is not None
+        most, found = self.num_frames + len(self.pairs.keys) - 1, []
+        for tile in self.tiles:
+            members = tile.frames.members
+            row, column = torch.triu_indices(len(members), len(members), device=members.device)
+            number = self.pairs.number(members[row], members[column])
+            found.append(tuple(part[number < most] for part in (row, column, number)))
+        return found
+
     @property
     def num_linked(self) -> int:
         """How many observations are made by free frames."""
@@ -312,14 +324,12 @@ class NormalEquations:
             of_cameras = camera_rows - split
             own[_at(of_cameras, of_cameras)] = _damped(self.cameras, damping)
             columns[_at(frame_rows, of_cameras[self.structure.cameras])] = self.frames_cameras
-        for tile, (_, rows, A) in zip(self.structure.tiles, tiles, strict=True):
-            members = tile.frames.members
-            width = dims * len(members)
-            row, column = torch.triu_indices(len(members), len(members), device=members.device)
-            number = pairs.number(members[row], members[column])
-            row, column, number = (part[number < most] for part in (row, column, number))
+        structure = self.structure
+        for tile, covisible, (_, rows, A) in zip(structure.tiles, structure.tile_blocks, tiles, strict=True):
+            (row, column, number), members = covisible, len(tile.frames.members)
+            width = dims * members
             products = A[:, :width].mT @ A
-            of_frames = products[:, :width].reshape(len(members), dims, len(members), dims)
+            of_frames = products[:, :width].reshape(members, dims, members, dims)
             blocks.index_add_(0, number, of_frames[row, :, column], alpha=-1)
             if size:
                 border, of_cameras = A[:, width:], rows[width:] - split
