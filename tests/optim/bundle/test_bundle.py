@@ -280,7 +280,7 @@ def test_points_that_step_too_far_do_not_stop_the_others(monkeypatch, bundle_sce
 
     def settled(self, estimate, model):
         points_w = estimate.points_w.clone()
-        points_w[::8] *= 1e3  # the steps of some points go wrong
+        points_w[::4] *= -1.0  # behind the cameras
         return settle(self, estimate._replace(points_w=points_w), model)
 
     monkeypatch.setattr(SparseBundle, "_settled", settled)
