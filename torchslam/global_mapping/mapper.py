@@ -42,7 +42,7 @@ from torchslam.global_mapping.rounds import (
     adjust_in_rounds,
 )
 from torchslam.global_mapping.saved_stages import SavedStages
-from torchslam.global_mapping.tracks import make_map
+from torchslam.global_mapping.tracks import keypoints_of_tracks, make_map
 from torchslam.global_mapping.view_graph import (
     PairMatcher,
     Relation,
@@ -471,10 +471,11 @@ class GlobalMapper:
         row_of = torch.full((len(views),), -1, device=rows.device)
         row_of[rows] = torch.arange(len(rows), device=rows.device)
         tracks = replace(tracks, view=row_of[tracks.view])
-        own = [views[row] for row in rows.tolist()]
+        own, tracks = keypoints_of_tracks([views[row] for row in rows.tolist()], tracks)
         submap.map = make_map(own, found.T_cw[rows], tracks, found.points_w[former])
         submap.map.set_noise(squared_errors(submap.map, submap.map.observations(), found.camera))
         sensor = SensorModel(found.camera, self.readout)
+        views = own + [view for view, row in zip(views, row_of.tolist(), strict=True) if row < 0]
         followed = self._followed(views, submap.map)
         every = self._all_views(range(len(self.sequence)) if frames is None else frames, views, followed)
         again = None if followed is None else followed.again

@@ -7,14 +7,16 @@ observations that disagree are left out, not forgotten: with better poses they a
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.global_mapping.view_graph import ViewPair
-from torchslam.map.map import Map
+from torchslam.map.map import KEYPOINT_COLUMNS, Map
 from torchslam.types import FrameFeatures
 from torchslam.utils.indexing import connected_parts
 
@@ -203,6 +205,24 @@ def _sums(tracks: Tracks, values: Float[Tensor, "O *n"]) -> Float[Tensor, "N *n"
     flat = values.reshape(len(values), math.prod(values.shape[1:]))
     total = torch.segment_reduce(flat, "sum", lengths=tracks.lengths, unsafe=True)
     return total.view(tracks.count, *values.shape[1:])
+
+
+def keypoints_of_tracks(
+    views: Sequence[FrameFeatures], tracks: Tracks
+) -> tuple[list[FrameFeatures], Tracks]:
+    """The views without the keypoints that no track has, in as many rows each, and the tracks with these rows.
+
+    Of the keypoints of an image that was matched, one in six to one in thirty belongs to a point.
+    """
+    rows = _rows_of(tracks.view, len(views))
+    most, kept, moved = max(map(len, rows)), list[FrameFeatures](), torch.empty_like(tracks.keypoint)
+    for view, own in zip(views, rows, strict=True):
+        chosen, moved[own] = torch.unique(tracks.keypoint[own], return_inverse=True)
+        filled = torch.cat((chosen, chosen.new_zeros(most - len(chosen))))
+        columns: dict[str, Any] = {name: getattr(view, name)[filled] for name in KEYPOINT_COLUMNS}
+        columns["mask"][len(chosen) :] = False
+        kept.append(replace(view, **columns))
+    return kept, replace(tracks, keypoint=moved)
 
 
 def make_map(
