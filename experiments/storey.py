@@ -158,7 +158,7 @@ def _corridor(plain: Painter, below: bool = False, above: bool = False) -> list[
     corner = TOP + np.array((-x, 0.0, -z))
     inner = TOP + np.array((-core_x, 0.0, -core_z))
 
-    def level(at: Vector, is_open: bool) -> list[Rectangle]:
+    def level(at: np.ndarray, is_open: bool) -> list[Rectangle]:
         if not is_open:
             return [plain.rectangle(at, X, Z, lengths)]
         width, depth = SHAFT[0] + x, SHAFT[1] + z

@@ -14,13 +14,14 @@ import math
 import multiprocessing
 import resource
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from experiments.benchmarks.solvers import camera
+from experiments.benchmarks.solvers import camera, colmap_solve, rmse
 from experiments.common import parser_of, publish_page, table
 from torchslam.geometry import rigid, se3_exp, se3_inverse, so3_exp, transform
 from torchslam.optim import BUNDLE_OPTIONS, BundleProblem, solve_bundle
@@ -36,14 +37,15 @@ SEEN_AGAIN, PLACE, EVERY = (
     40,
 )  # share of points, in so many of so many images, that the next lap sees
 NOISE_PX, DRIFT = 0.5, 2e-4
+LARGE_IMAGES, LARGE_POINTS = 1000, 400  # 3.2 million observations
 ITERATIONS = 5
 MOST_INVERTED = (
     500  # images up to which the dense matrix is inverted for the covariances: beyond, it takes minutes
 )
 
 
-def walk(images: int) -> BundleProblem:
-    """The adjustment of a walk, from poses that drift."""
+def walk(images: int, points: int = POINTS) -> BundleProblem:
+    """The adjustment of a walk, from poses that drift; so many points begin in each image."""
     generator = torch.Generator().manual_seed(0)
 
     def uniform(*shape: int) -> Tensor:
@@ -59,7 +61,7 @@ def walk(images: int) -> BundleProblem:
     R_wc = so3_exp(torch.stack((zero, -angle, zero), dim=-1))
     T_cw = se3_inverse(rigid(R_wc, centers_w))
 
-    first = torch.arange(images).repeat_interleave(POINTS)
+    first = torch.arange(images).repeat_interleave(points)
     pixels = torch.tensor([40.0, 40.0]) + uniform(len(first), 2) * torch.tensor([560.0, 400.0])
     rays = camera().unproject(pixels.double())
     points_c = rays / rays[:, 2:] * (2 + 6 * uniform(len(first), 1))
@@ -124,6 +126,32 @@ def measure(images: int, by_blocks: bool) -> Cost:
     )
 
 
+class Large(NamedTuple):
+    """CPU seconds, steps, root mean square error in pixels and peak memory of a solver on a large walk."""
+
+    seconds: float
+    steps: int
+    rmse: float
+    megabytes: float
+
+
+def measure_large(by_ceres: bool) -> tuple[int, int, Large]:
+    """Points and observations of a large walk, and its adjustment by one of two solvers. For a process of its own."""
+    torch.set_num_threads(1)
+    problem = replace(walk(LARGE_IMAGES, LARGE_POINTS), fixed_frames=(0, 1))
+    begin = time.process_time()
+    if by_ceres:
+        peer = colmap_solve(problem)
+        steps, reached = peer.iterations, peer.rmse
+    else:
+        options = BUNDLE_OPTIONS.replace(kernel="none", tolerance=1e-6, backward="detached")
+        solution = solve_bundle(problem, options=options)
+        steps = int(solution.convergence.iterations)
+        reached = rmse(replace(problem, T_cw=solution.T_cw, points_w=solution.points_w))
+    seconds = time.process_time() - begin
+    return len(problem.points_w), len(problem.pixels), Large(seconds, steps, reached, _peak_mb())
+
+
 def _peak_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
@@ -150,6 +178,11 @@ def main() -> None:
                 difference = f"{abs(cost.reached / blocks.reached - 1):.0e}"
                 rows.append([*sizes, *of_steps, *covariances, difference])
                 print(rows[-1], flush=True)
+        large = [pool.apply(measure_large, (by_ceres,)) for by_ceres in (False, True)]
+    of_large = [
+        [name, f"{cost.seconds:.0f} s", f"{cost.steps}", f"{cost.rmse:.4f} px", f"{cost.megabytes:.0f} MB"]
+        for name, (_, _, cost) in zip(("torchslam", "Ceres (pycolmap)"), large, strict=True)
+    ]
     lines = [
         f"A simulated walk, three times round a block; {POINTS} points begin in each image. One thread, float64, CPU",
         "time with that of the check that all is determined, which is one more factorization; the memory is that of",
@@ -158,6 +191,10 @@ def main() -> None:
         "    python -m experiments.benchmarks.long_bundle",
         "",
         table(header, rows),
+        "",
+        f"{LARGE_IMAGES} images, {large[0][0]} points, {large[0][1]} observations, without a kernel, to convergence:",
+        "",
+        table(["", "CPU", "steps", "error", "peak memory"], of_large),
     ]
     publish_page("The adjustment of a long recording", "\n".join(lines), arguments)
 

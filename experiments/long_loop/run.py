@@ -2,25 +2,32 @@
 
 python -m experiments.long_loop.run rounds
 python -m experiments.long_loop.run to_and_fro
+python -m experiments.long_loop.run storeys
 """
 
 from __future__ import annotations
 
 import math
 import resource
+import subprocess
+import sys
 import time
 from collections.abc import Iterable
 from dataclasses import replace
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from experiments.common import parser_of, place_of, publish, table
+from experiments.storey import render
 from torchslam.config import Config, load_config
 from torchslam.data import open_sequence
 from torchslam.data.sequence import Sequence
+from torchslam.data.synthetic.sequence import FOCAL, SIZE
 from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera, rigid, se3_inverse, so3_exp
+from torchslam.io.results import read_metrics
 from torchslam.system.front_end import Simulated
 from torchslam.system.online_run import finish
 from torchslam.system.slam import SLAM
@@ -31,6 +38,9 @@ WINDOWS = 10
 """Rows of the table."""
 HEADER = "frames | median (ms) | mean (ms) | 95 % (ms) | keyframes | points | rows of points | peak (MB)"
 FRAMES_PER_LAP = 500
+STOREYS = Path("results") / "storeys"
+"""Folder of the rendered walk and of its runs."""
+STOREYS_FRAMES = 1250, 2500, 5000
 
 
 def rounds(frames: int) -> Tensor:
@@ -102,13 +112,50 @@ def processed(slam: SLAM, frames: Iterable[Frame], window: int) -> tuple[list[li
     return rows, results
 
 
+def storeys() -> str:
+    """Table of `torchslam run` on the first frames of a walk through three storeys, which is rendered once."""
+    recording = STOREYS / "recording"
+    if not (recording / "rgb.txt").exists():
+        render("synthetic:storeys", recording)
+    focal, size = FOCAL, SIZE
+    camera = f"{focal},{focal},{(size[0] - 1) / 2},{(size[1] - 1) / 2}"
+    rows, per_frame = [], []
+    for frames in STOREYS_FRAMES:
+        output = STOREYS / str(frames)
+        command = ["run", str(recording), "--stop", str(frames), "--camera", camera, "--output", str(output)]
+        if not output.exists():
+            subprocess.run([sys.executable, "-m", "torchslam", *command], check=True, capture_output=True)
+        found = read_metrics(output)
+        per_frame.append(found["cpu_s"] / frames)
+        length = found["path_length_m"]
+        rows.append(
+            [
+                f"{frames}",
+                f"{found['posed']}",
+                f"{found['mapping']}",
+                f"{found['keyframes']}",
+                f"{found['ate_m']:.3f} m ({found['ate_m'] / length:.2%} of {length:.0f} m)",
+                f"{found['online_ate_m']:.3f} m",
+                f"{found['cpu_s']:.0f}",
+                f"{found['peak_memory_mb']:.0f}",
+            ]
+        )
+    header = "frames | posed | map kept | keyframes | ATE | online ATE | CPU, s | memory, MB"
+    growth = per_frame[-1] / per_frame[0]
+    return f"{table(header, rows)}\nCPU time per frame of the last row to that of the first: {growth:.2f}.\n"
+
+
 def main() -> None:
     parser = parser_of(__doc__, readme=True)
-    parser.add_argument("path", choices=FRAMES)
+    parser.add_argument("path", choices=[*FRAMES, "storeys"])
     parser.add_argument("--frames", type=int)
     parser.add_argument("--sequence", default="redkitchen", help="of to_and_fro")
     options = parser.parse_args()
     torch.set_num_threads(1)
+    marks = f"<!-- {options.path} -->\n", f"<!-- end {options.path} -->"
+    if options.path == "storeys":
+        publish(storeys(), options, __file__, *marks)
+        return
     count = options.frames or FRAMES[options.path]
     if options.path == "rounds":
         slam, frames = simulated(count)
@@ -130,7 +177,6 @@ def main() -> None:
             f"{run.map.num_keyframes} keyframes, {len(run.trajectory)} of {count} frames posed, "
             f"ATE {evaluate(run.trajectory, truth).ate_m:.4f} m.\n"
         )
-    marks = f"<!-- {options.path} -->\n", f"<!-- end {options.path} -->"
     publish(table(HEADER, rows) + summary, options, __file__, *marks)
 
 

@@ -207,9 +207,7 @@ def _sums(tracks: Tracks, values: Float[Tensor, "O *n"]) -> Float[Tensor, "N *n"
     return total.view(tracks.count, *values.shape[1:])
 
 
-def keypoints_of_tracks(
-    views: Sequence[FrameFeatures], tracks: Tracks
-) -> tuple[list[FrameFeatures], Tracks]:
+def keypoints_of_tracks(views: Sequence[FrameFeatures], tracks: Tracks) -> tuple[list[FrameFeatures], Tracks]:
     """The views without the keypoints that no track has, in as many rows each, and the tracks with these rows.
 
     Of the keypoints of an image that was matched, one in six to one in thirty belongs to a point.

@@ -114,7 +114,8 @@ class Structure:
             members = tile.frames.members
             row, column = torch.triu_indices(len(members), len(members), device=members.device)
             number = self.pairs.number(members[row], members[column])
-            found.append(tuple(part[number < most] for part in (row, column, number)))
+            there = number < most
+            found.append((row[there], column[there], number[there]))
         return found
 
     @property
