@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import pytest
 import torch
@@ -17,10 +18,12 @@ from torchslam.geometry import se3_inverse, so3_exp, transform
 from torchslam.geometry.transforms import without_scale
 from torchslam.global_mapping.mapper import GlobalMapper
 from torchslam.global_mapping.rounds import Reconstruction
+from torchslam.global_mapping.saved_stages import SavedStages
 from torchslam.global_mapping.view_graph import ViewPair
 from torchslam.global_mapping.windows import (
     MIN_HOLDING,
     MIN_JOINING,
+    CoarseMap,
     MappedWindow,
     join_windows,
     pairs_across,
@@ -28,6 +31,7 @@ from torchslam.global_mapping.windows import (
     pairs_within,
     split,
 )
+from torchslam.types import FrameFeatures
 
 SCENE = Recording.of(line(40), wall(900, 10.0), noise_px=0.3)
 EXACT = Recording.of(line(40), wall(900, 10.0))
@@ -212,6 +216,35 @@ def test_an_image_that_only_other_windows_see_has_a_pose() -> None:
     rows, T_cw = reconstructed(14, pairs + far)
     assert rows == list(range(40))
     assert apart(T_cw, SCENE.T_cw)[0] < 1e-2
+
+
+def test_a_run_that_was_killed_goes_on_at_its_window(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pairs, begun, begin = SCENE.pairs(1, 2, 3), list[int](), GlobalMapper._begin
+
+    def counted(self: GlobalMapper, views: list[FrameFeatures], *pairs: list[ViewPair]) -> CoarseMap | str:
+        begun.append(views[0].index)
+        return begin(self, views, *pairs)
+
+    monkeypatch.setattr(GlobalMapper, "_begin", counted)
+
+    def found(folder: Path | None, stop: int = -1) -> list[Tensor]:
+        def progress(stage: str, done: int, most: int) -> None:
+            if (stage, done) == ("windows", stop):
+                raise KeyboardInterrupt
+
+        begun.clear()
+        made = mapper(15)
+        made.progress, made.saved = progress, SavedStages(folder, made.sequence, made.config)
+        found = made.reconstruct(SCENE.views, pairs)
+        assert not isinstance(found, str)
+        return [found[0], found[2].T_cw, found[2].points_w]
+
+    whole, windows = found(None), list(begun)
+    assert len(windows) > 2
+    with pytest.raises(KeyboardInterrupt):
+        found(tmp_path / "stages", 2)
+    assert all(map(torch.equal, found(tmp_path / "stages"), whole))
+    assert begun == windows[2:]
 
 
 def test_without_a_map_of_any_window_the_first_reason_is_given() -> None:

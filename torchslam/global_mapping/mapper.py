@@ -9,7 +9,6 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import compress, pairwise
 from statistics import median
-from typing import NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -51,6 +50,7 @@ from torchslam.global_mapping.view_graph import (
     connected_views,
 )
 from torchslam.global_mapping.windows import (
+    CoarseMap,
     MappedWindow,
     join_windows,
     moved_pairs,
@@ -139,22 +139,6 @@ def middle_times(
 
 Reconstructed = tuple[Int[Tensor, " K"], ObservedTracks, Reconstruction]
 """Rows of the views that have a pose, the tracks in all views, and the reconstruction."""
-
-
-class CoarseMap(NamedTuple):
-    """Poses that are right to about a pixel.
-
-    Attributes:
-        pairs: that the map is from; learned: those of learned features; unposed: those with images without a pose.
-        observed: the longest tracks.
-        found: poses of all views, camera and the points of these tracks.
-    """
-
-    pairs: list[ViewPair]
-    learned: list[ViewPair]
-    observed: ObservedTracks
-    found: Reconstruction
-    unposed: list[ViewPair]
 
 
 def mapping_config(config: Config) -> Config:
@@ -400,10 +384,12 @@ class GlobalMapper:
         mapped, own, more, failure = list[MappedWindow](), list[ViewPair](), list[ViewPair](), ""
         for number, window in enumerate(windows):
             self.progress("windows", number, len(windows))
-            part = self._begin(
+            part = self.saved.window(
                 views[window.start : window.stop],
                 pairs_within(pairs, window),
                 pairs_within(learned, window),
+                self.camera,
+                self._begin,
             )
             if isinstance(part, str):
                 failure = failure or part

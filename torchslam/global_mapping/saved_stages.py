@@ -1,4 +1,4 @@
-"""The costly stages of global mapping in a folder: features by groups of images, verified pairs by distance.
+"""The costly stages of global mapping in a folder: features by groups of images, verified pairs by distance, windows.
 
 A run that was killed finds what it had, and goes on with the same bytes. The name of a file is a hash of all that its
 content depends on, so what belongs to another run, or to other images, is never read; a checksum of its content tells
@@ -20,13 +20,17 @@ import torchslam
 from torchslam.config import Config
 from torchslam.data.sequence import Sequence as Recording
 from torchslam.errors import ResultsError
+from torchslam.geometry import Camera
+from torchslam.global_mapping.rounds import ObservedTracks, Reconstruction
+from torchslam.global_mapping.tracks import Tracks
 from torchslam.global_mapping.view_graph import PairMatcher, Relation, ViewPair
+from torchslam.global_mapping.windows import CoarseMap
 from torchslam.map.file import FORMAT, read_tensors, write_tensors
 from torchslam.system.checkpoint import input_hash
 from torchslam.types import FrameFeatures
 from torchslam.utils.files import PART, fingerprint
 
-VIEWS, PAIRS = "views", "pairs"
+VIEWS, PAIRS, WINDOW = "views", "pairs", "window"
 """What files begin with."""
 COLUMNS = "keypoints", "scales", "angles", "descriptors", "mask", "information"
 """Attributes of `FrameFeatures` with a row per keypoint. True poses are not saved: only what makes simulated features
@@ -80,6 +84,48 @@ class SavedStages:
         of = [[view.index for view in matcher.views], ends]
         return self._stage(PAIRS, of, lambda: matcher.match(ends), _packed_pairs, _unpacked_pairs)
 
+    def window(
+        self,
+        views: list[FrameFeatures],
+        pairs: list[ViewPair],
+        learned: list[ViewPair],
+        camera: Camera,
+        find: Callable[[list[FrameFeatures], list[ViewPair], list[ViewPair]], CoarseMap | str],
+    ) -> CoarseMap | str:
+        """The coarse map that is found of views from their pairs; a reason why there is none is not saved."""
+
+        def pack(found: list[CoarseMap | str]) -> _Columns | None:
+            (made,) = found
+            if isinstance(made, str):
+                return None
+            tracks, solved = made.observed.tracks, made.found
+            return {
+                "pairs": _rows_among(pairs, made.pairs),
+                "learned": _rows_among(learned, made.learned),
+                "track": tracks.track,
+                "view": tracks.view,
+                "keypoint": tracks.keypoint,
+                "T_cw": solved.T_cw,
+                "params": solved.camera.params,
+                "points_w": solved.points_w,
+                "agrees": solved.agrees,
+            }
+
+        def unpack(columns: _Columns) -> list[CoarseMap | str]:
+            tracks = Tracks(columns["track"], columns["view"], columns["keypoint"])
+            own, more = (
+                [every[row] for row in columns[name].tolist()]
+                for name, every in (("pairs", pairs), ("learned", learned))
+            )
+            found = Reconstruction(
+                columns["T_cw"], camera.with_params(columns["params"]), columns["points_w"], columns["agrees"]
+            )
+            return [CoarseMap(own, more, ObservedTracks.of(tracks, views), found, [])]
+
+        ends = [[(pair.first, pair.second, len(pair)) for pair in every] for every in (pairs, learned)]
+        of = [[view.index for view in views], ends]
+        return self._stage(WINDOW, of, lambda: [find(views, pairs, learned)], pack, unpack)[0]
+
     def _stage(
         self,
         name: str,
@@ -111,11 +157,18 @@ def delete_stages(folder: Path) -> None:
     """Delete saved stages, and their folder if nothing else is in it."""
     if not folder.is_dir():
         return
-    for name in (VIEWS, PAIRS):
+    for name in (VIEWS, PAIRS, WINDOW):
         for path in (*folder.glob(f"{name}_*.safetensors"), *folder.glob(f"{name}_*.safetensors{PART}")):
             path.unlink()
     if not any(folder.iterdir()):
         folder.rmdir()
+
+
+def _rows_among(pairs: list[ViewPair], chosen: list[ViewPair]) -> Tensor:
+    """The rows of chosen pairs."""
+    row_of = {(pair.first, pair.second): row for row, pair in enumerate(pairs)}
+    rows = [row_of[pair.first, pair.second] for pair in chosen]
+    return torch.tensor(rows, dtype=torch.int64, device="cpu")
 
 
 def _checksum(columns: _Columns) -> int:

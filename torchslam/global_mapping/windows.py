@@ -48,6 +48,22 @@ JOINT_STD = 0.01
 Those of windows of garden with 50 images differ by .0004 rad, .003 and .005."""
 
 
+class CoarseMap(NamedTuple):
+    """Poses that are right to about a pixel.
+
+    Attributes:
+        pairs: that the map is from; learned: those of learned features; unposed: those with images without a pose.
+        observed: the longest tracks.
+        found: poses of all views, camera and the points of these tracks.
+    """
+
+    pairs: list[ViewPair]
+    learned: list[ViewPair]
+    observed: ObservedTracks
+    found: Reconstruction
+    unposed: list[ViewPair]
+
+
 class MappedWindow(NamedTuple):
     """The map of a window.
 
