@@ -161,12 +161,12 @@ def test_files_of_speeds(tmp_path: Path, content: str, expected: list[float]) ->
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "is empty; expected lines `time speed`"),
+        ("", "the first line must name the columns `time`"),
         ("time,rpm\n0,1\n", "no `time` or no `speed`"),
         ("time,speed\n0,1\n", "1 speeds, two are needed"),
         ("time,speed\n1,1\n0,1\n", "is earlier than the one before"),
         ("time,speed\n1,1\n2,5000\n", "5000 is no speed in meters per second"),
-        ("time,speed\n1,1\n2,nan\n", "nan is no speed"),
+        ("time,speed\n1,1\n2,nan\n", "1 speeds, two are needed; .* left out 1 rows"),
         ("0,1,2\n", "expected `time speed`, got 3 numbers"),
     ],
 )

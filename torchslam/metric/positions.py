@@ -61,7 +61,7 @@ class PositionSource:
             find = self._by_names if self.fixes.timestamps is None else self._by_times
             pairs, fit, shift = find(view, path)
         except _NoFit as error:
-            return Unmeasured(ScaleSource.POSITION, str(error))
+            return Unmeasured(ScaleSource.POSITION, "; ".join([str(error), *self.fixes.notes]))
         is_line = fit.up_std > LINE_UP_STD
         notes, offset = list(self.fixes.notes), shift + fit.offset
         if abs(offset) > 3 * fit.offset_std:
