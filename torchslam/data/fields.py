@@ -9,7 +9,7 @@ import math
 
 from torchslam.data.tables import TIMES, Column, Unknown
 
-NINES = [sign * (10**n - 10**-k) for sign in (1, -1) for n in range(2, 7) for k in range(4)]
+NINES = [sign * (10**n - 10**-k) for sign in (1, -1) for n in range(2, 6) for k in range(4)]
 """99.99 and -9999: fields filled with nines, as of NMEA's dilution, netCDF and terrain models."""
 LIMITS = [
     -(2**15),

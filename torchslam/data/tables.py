@@ -27,6 +27,9 @@ from torchslam.data.text_file import (
 from torchslam.errors import TorchslamError
 
 
+ROUNDING = 1e-6  # relative difference of a number and its rounded value in another unit
+
+
 class Unknown(NamedTuple):
     """The numbers that devices write in a field where they do not know the value.
 
@@ -34,12 +37,10 @@ class Unknown(NamedTuple):
         numbers: in any unit of the field.
         near: a number of the list is a measurement all the same if another value, of its sign and not on the list, is
             at most this far from it; in the unit of the values.
-        tolerance: relative, of a number of the list; converted ones are rounded.
     """
 
     numbers: Sequence[float] = ()
     near: float = 0.0
-    tolerance: float = 1e-9
 
 
 class Column(NamedTuple):
@@ -88,7 +89,7 @@ class Column(NamedTuple):
         listed = np.abs(single) > 1e30  # the largest floats, of 32 and of 64 bits
         for factor in {1.0, *self.units.values()} - {math.nan}:
             for number in self.unknown.numbers:
-                listed |= np.abs(single / factor - number) <= self.unknown.tolerance * abs(number)
+                listed |= np.abs(single / factor - number) <= ROUNDING * abs(number)
         others = np.concatenate(([-np.inf], single[~listed & np.isfinite(single)], [np.inf]))
         place = np.searchsorted(others, single)
         for beside in (others[place - 1], others[place.clip(max=len(others) - 1)]):
@@ -239,7 +240,7 @@ def _with_plain_header(lines: list[str], delimiter: str) -> tuple[list[str], str
     Quotes around whole lines are removed, and R's names of rows get a column.
     """
     bare = [line.strip() for line in lines]
-    is_above = re.compile(r"(?i)#|sep=.$|$").match
+    is_above = re.compile(r"(?i)#|sep=.?$|$").match
     start = next((row for row, line in enumerate(bare) if not is_above(line)), len(bare))
     comments = [row for row in range(start) if bare[row].startswith("#")]
     first = bare[start] if start < len(bare) else ""

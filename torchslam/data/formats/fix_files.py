@@ -186,14 +186,15 @@ def _csv_rows(path: Path) -> Iterator[Fix]:
             raise MeasurementError(f"{row.where}: neither a `time` nor the `name` of an image")
         if "latitude" not in row.units and "longitude" not in row.units and "altitude" in row.units:
             raise MeasurementError(f"{row.where}: no `latitude` and `longitude`, in degrees")
-        place = []
-        for name, side, letters in (("latitude", "north", "NS"), ("longitude", "east", "EW")):
-            text = row.cells.get(name, "")
-            is_lettered = text[-1:].upper() in tuple(letters)
-            degrees = row.number(name, text[:-1] if is_lettered else text)
-            if is_lettered or side in row.units:
-                degrees = _signed(degrees, text[-1] if is_lettered else row.cells.get(side, ""), letters)
-            place.append(degrees)
+        texts = [row.cells.get(name, "") for name in NUMBERS[:2]]
+        sides = [row.cells.get(side, "") if side in row.units else None for side in ("north", "east")]
+        if texts[0][-1:] in ("N", "S") and texts[1][-1:] in ("E", "W"):  # E alone may be that of an exponent
+            texts, sides = [text[:-1] for text in texts], [text[-1] for text in texts]
+        place = [row.number(name, text) for name, text in zip(NUMBERS, texts, strict=False)]
+        place = [
+            degrees if side is None else _signed(degrees, side, letters)
+            for degrees, side, letters in zip(place, sides, ("NS", "EW"), strict=True)
+        ]
         std = row.number("std_horizontal"), row.number("std_vertical")
         name = row.cells.get("name", "")
         yield Fix(row.where, place[0], place[1], row.number("altitude"), moment, name, std)
@@ -350,17 +351,18 @@ def _read_nmea(path: Path, text: str) -> Fixes:
 
 
 def _nmea_rows(rows: list[tuple[str, float, list[str]]]) -> Iterator[Fix]:
-    days, void, dates = list[float](), set[int](), dict[int, float]()
+    days, void, dates, doubtful = list[float](), set[int](), dict[int, float](), dict[int, float]()
     epochs = list[int]()  # of sentences that follow each other and have one time
     for where, clock, fields in rows:
         before = rows[len(epochs) - 1][1] if epochs else clock
         epochs.append(epochs[-1] + (clock != before) if epochs else 0)
         if clock != before or not days:
             days.append((days[-1] if days else 0.0) + 2 * HALF_DAY * (clock < before - HALF_DAY))
-        if fields[0] == "RMC" and fields[2] != "A":
-            void.add(epochs[-1])
-        elif (date := _nmea_date(fields, where)) is not None:
-            dates[epochs[-1]] = date - days[-1]
+        is_void = fields[0] == "RMC" and fields[2] != "A"
+        void |= {epochs[-1]} if is_void else set()
+        if (date := _nmea_date(fields, where)) is not None:
+            (doubtful if is_void else dates)[epochs[-1]] = date - days[-1]
+    dates = dates or doubtful
     start = next(iter(dates.values()), 0.0)
     kind = "GGA" if any(fields[0] == "GGA" for _, _, fields in rows) else "RMC"
     for epoch, (where, clock, fields) in zip(epochs, rows, strict=True):
