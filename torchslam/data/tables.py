@@ -26,7 +26,6 @@ from torchslam.data.text_file import (
 )
 from torchslam.errors import TorchslamError
 
-
 ROUNDING = 1e-6  # relative difference of a number and its rounded value in another unit
 
 
@@ -96,7 +95,7 @@ class Column(NamedTuple):
             is_measured = (beside < 0) == (single < 0)
             listed &= ~(is_measured & (np.abs(beside - single) <= self.unknown.near))
         listed = listed[rows]
-        words = Counter(f"{value:.9g}" for value in values[listed].tolist())
+        words = Counter(f"{value:.6g}" for value in values[listed].tolist())
         text = ", ".join(f"{word} ({count} times)" for word, count in words.most_common(3))
         return np.where(listed, np.nan, values), text
 

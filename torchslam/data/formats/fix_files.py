@@ -90,11 +90,9 @@ def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = 
         raise MeasurementError(f"{path}: more than the {MAX_FIXES} positions that are read")
     table = np.array([(*row[1:4], *row.std) for row in listed], float).reshape(-1, 5)
     invalid = table[:, 3:] < 0  # iOS states by a negative accuracy that the value is invalid
-    columns, words = zip(
-        *(POSITION_COLUMNS[n].known(c) for n, c in zip(NUMBERS, table.T, strict=True)), strict=True
-    )
-    table = np.stack(columns, axis=1)
     table[:, :3][np.repeat(invalid, (2, 1), axis=1)] = math.nan
+    known = [POSITION_COLUMNS[name].known(column) for name, column in zip(NUMBERS, table.T, strict=True)]
+    table, words = np.stack([values for values, _ in known], axis=1), [text for _, text in known]
     table[:, 3:][table[:, 3:] <= 0] = math.nan
     empty = np.isnan(table[:, :2]).any(1)
     is_timed = any(row.time is not None for row in listed)
@@ -297,17 +295,14 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         raise MeasurementError(
             f"{path}: no points of a track (trkpt) in it; routes and waypoints have no times"
         )
-    texts = [
-        {child.tag.rpartition("}")[2]: child.text or "" for child in point} | dict(point.items())
-        for point in points
-    ]
-    moments = [parse_moment(each.get("time", "")) for each in texts]
+    moments = [parse_moment(point.findtext("{*}time") or "") for point in points]
     if all(moment is None for moment in moments):
         raise MeasurementError(
             f"{path}: point 1: no time, nor has another point; a planned route cannot be used"
         )
-    for number, (each, moment) in enumerate(zip(texts, moments, strict=True), start=1):
+    for number, (point, moment) in enumerate(zip(points, moments, strict=True), start=1):
         where = f"{path}: point {number}"
+        each = {child.tag.rpartition("}")[2]: child.text or "" for child in point} | point.attrib
         is_void = each.get("fix", "").strip() == "none"
         latitude, longitude, altitude = (
             math.nan if is_void else parse_known(each.get(name, ""), f"{where}: {name}", MeasurementError)
