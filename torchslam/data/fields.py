@@ -11,18 +11,7 @@ from torchslam.data.tables import TIMES, Column, Unknown
 
 NINES = [sign * (10**n - 10**-k) for sign in (1, -1) for n in range(2, 6) for k in range(4)]
 """99.99 and -9999: fields filled with nines, as of NMEA's dilution, netCDF and terrain models."""
-LIMITS = [
-    -(2**15),
-    2**15 - 1,
-    2**16 - 1,
-    655.35,
-    65.535,
-    -(2**31),
-    2**31 - 1,
-    2**32 - 1,
-    214.7483647,
-    -214.7483648,
-]
+LIMITS = [-32768, 32767, 65535, 655.35, 65.535, -(2**31), 2**31 - 1, 2**32 - 1, 214.7483647, -214.7483648]
 """Largest integers: MAVLink's and FIT's invalid ones, also in cm and mm; the last ones in 1e-7 degrees."""
 
 
@@ -50,11 +39,11 @@ METERS = {
     "mm": 1e-3,
 }
 """Factors to meters; above sea level is no unit."""
-NOWHERE = Unknown((0.0, -1.0, 90.0, 91.0, 180.0, 181.0, -180.0, 200.0, *NINES, *LIMITS), near=0.1)
-"""Of coordinates: 0 before the first fix, 91 and 181 of AIS, -180 of iOS. Degrees: 11 km."""
-NO_HEIGHT = Unknown((0.0, -1.0, *NINES, *LIMITS, 12607.0), near=10.0)
-"""Of altitudes: 0 without a fix in three dimensions, -32768 of terrain models, 12607 of FIT; -9999. Meters; a drone
-climbs by less than 10 in a second."""
+NOWHERE = Unknown((0.0, -1.0, 90.0, 91.0, 180.0, 181.0, -180.0, 200.0, *NINES, *LIMITS), near=0.01)
+"""Of coordinates: 0 before the first fix, 91 and 181 of AIS, -180 of iOS. Degrees: 1.1 km."""
+NO_HEIGHT = Unknown((0.0, -1.0, *NINES, *LIMITS, 12607.0), near=2.0)
+"""Of altitudes: 0 without a fix in three dimensions, -32768 of terrain models, 12607 of FIT; -9999. Meters: at the sea
+there are others that near."""
 POSITION_COLUMNS = {
     **TIMES,
     "name": Column(("name", "image", "filename", "file", "sourcefile")),
@@ -76,17 +65,10 @@ SPEEDS = {
     "mms": 0.001,
 }
 """Factors to m/s."""
-NO_SPEED = Unknown(
-    [
-        *(-round(1 / factor, digits) for factor in {*SPEEDS.values()} for digits in range(1, 7)),
-        *NINES,
-        *LIMITS,
-    ],
-    near=5.0,
-)
-"""Of speeds: -1 m/s of iOS, also in another unit; -9999. A vehicle that backs up has other ones within 5 m/s."""
+# Of iOS, also as other units are rounded.
+_AS_MINUS_ONE = [-round(1 / factor, digits) for factor in {*SPEEDS.values()} for digits in range(1, 7)]
+NO_SPEED = Unknown((*_AS_MINUS_ONE, *NINES, *LIMITS), near=0.25)
+"""Of speeds: -1 m/s, and -9999. A vehicle that backs up has others around them, the errors of one that stands are .1."""
 SPEED = Column(spelled("speed", "velocity", "groundspeed", "speed3d", "3dspeed"), SPEEDS, NO_SPEED)
-
-
-NO_SAMPLE = Unknown((*NINES, *LIMITS), near=5.0)
-"""Of rates and forces: fill values and the largest integers. Rad/s or m/s^2: others in shaking are that near."""
+NO_SAMPLE = Unknown((*NINES, *LIMITS), near=1.0)
+"""Of rates and forces, rad/s and m/s^2: fill values and the largest integers."""
