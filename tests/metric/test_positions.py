@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tests.metric.drives import ORIGIN, drive, error, measure, reason, receiver, true_S_ew, view_of
-from torchslam.data.formats.fix_files import Fixes
+from torchslam.data.fixes import Fixes
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, geodetic_from_enu, so3_exp, transform
 from torchslam.metric.camera_path import Clock, clocks_of, parse_clock

@@ -68,7 +68,7 @@ SPEEDS = {
 # Of iOS, also as other units are rounded.
 _AS_MINUS_ONE = [-round(1 / factor, digits) for factor in {*SPEEDS.values()} for digits in range(1, 7)]
 NO_SPEED = Unknown((*_AS_MINUS_ONE, *NINES, *LIMITS), near=0.25)
-"""Of speeds: -1 m/s, and -9999. A vehicle that backs up has others around them, the errors of one that stands are .1."""
+"""Of speeds: -1 m/s, and -9999. A vehicle that backs up has others around them; one that stands errs by .1."""
 SPEED = Column(spelled("speed", "velocity", "groundspeed", "speed3d", "3dspeed"), SPEEDS, NO_SPEED)
 NO_SAMPLE = Unknown((*NINES, *LIMITS), near=1.0)
 """Of rates and forces, rad/s and m/s^2: fill values and the largest integers."""

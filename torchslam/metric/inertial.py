@@ -215,8 +215,7 @@ class InertialSource:
         if found.reason is not InertialReason.MEASURED or found.rotation is None:
             uncertain = found.reason is InertialReason.NOT_DETERMINED and found.relative_std < 1
             more = f": its scale is uncertain by {found.relative_std:.0%}" if uncertain else ""
-            reason = "; ".join([f"{found.reason}{more}", *self.samples.notes])
-            return Unmeasured(ScaleSource.INERTIAL, reason)
+            return Unmeasured(ScaleSource.INERTIAL, "; ".join([f"{found.reason}{more}", *self.samples.notes]))
         turn = math.degrees(float(found.rotation.bias.norm()))
         note = (
             f"inertial sensor: bias of the gyroscope {turn:.3f} degrees/s, of the accelerometer "

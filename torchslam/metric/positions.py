@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.data.formats.fix_files import Fixes, read_fixes
+from torchslam.data.fixes import Fixes
+from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, sim3_scale

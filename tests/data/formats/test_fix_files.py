@@ -11,7 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from torchslam.data.formats.fix_files import Fixes, read_fixes
+from torchslam.data.fixes import Fixes
+from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.text_file import utc_from_gps
 from torchslam.errors import MeasurementError, TorchslamError
 

@@ -150,13 +150,14 @@ def read_depth(path: Path, units_per_meter: float) -> Float[np.ndarray, "H W"]:
     Raises FrameError if the file cannot be read, MeasurementError if it has another type, shape or unit.
     """
     values = _values(path)
-    largest = 1e4 * units_per_meter  # renderers write more for the sky
-    if values.dtype.kind in "iu" and values.dtype.itemsize > 1:
-        largest = np.iinfo(values.dtype).max
-    elif values.dtype.kind != "f":
+    is_whole = values.dtype.kind in "iu" and values.dtype.itemsize > 1
+    if not is_whole and values.dtype.kind != "f":
         raise MeasurementError(f"{path}: {values.dtype}, not of 16 bits or floats: no depth image")
     if values.ndim != 2:
         raise MeasurementError(f"{path}: an array {values.shape}, not one depth for each pixel")
+    largest = (
+        np.iinfo(values.dtype).max if is_whole else 1e4 * units_per_meter
+    )  # renderers write more for the sky
     # Like 0, the largest values, NaN and negative ones mark pixels without a measurement.
     depth = np.where((values > 0) & (values < largest), values, 0).astype(np.float32)
     depth /= np.float32(units_per_meter)

@@ -2,155 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import operator
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import reduce
+from collections.abc import Iterator
+from functools import partial, reduce
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
-from jaxtyping import Float
-from torch import Tensor
 
 from torchslam.data.fields import POSITION_COLUMNS
+from torchslam.data.fixes import NUMBERS, Fix, Fixes, checked_fixes, signed_degrees
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.image_file import SUFFIXES, exif_block
 from torchslam.data.formats.vehicle_files import oxts_folder, read_oxts
 from torchslam.data.tables import read_table
-from torchslam.data.text_file import (
-    CLOCK_SET,
-    MAX_LINE,
-    float64,
-    parse_known,
-    parse_moment,
-    read_text,
-    with_set_clock,
-)
+from torchslam.data.text_file import CLOCK_SET, MAX_LINE, parse_known, parse_moment, read_text
 from torchslam.errors import FrameError, MeasurementError
-
-NUMBERS = ("latitude", "longitude", "altitude", "std_horizontal", "std_vertical")
-"""The columns of a position, in the order of `Fix`."""
-MAX_FIXES = 1_000_000  # maximum number of positions of a file: more than a day at 10 Hz
-
-
-class Fix(NamedTuple):
-    """One position as a file has it, at a file and line, of a time in seconds or of the name of an image.
-
-    Attributes:
-        latitude, longitude: degrees; NaN where the receiver had no position.
-        altitude: meters, above the sea or the ellipsoid or the start; NaN if unknown.
-        std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
-    """
-
-    where: str
-    latitude: float
-    longitude: float
-    altitude: float = math.nan
-    time: float | None = None
-    name: str = ""
-    std: tuple[float, float] = (math.nan, math.nan)
-
-
-@dataclass(frozen=True)
-class Fixes:
-    """N positions, each at a time, seconds, increasing, on the clock of the file, or of an image of some name.
-
-    Attributes:
-        geodetic: latitude, longitude and altitude, as in `Fix`.
-        std: as in `Fix`.
-        notes: remarks for the user, one line each.
-    """
-
-    path: Path
-    geodetic: Float[Tensor, "N 3"]
-    std: Float[Tensor, "N 2"]
-    timestamps: Float[Tensor, " N"] | None = None
-    names: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.geodetic)
-
-
-def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = ()) -> Fixes:
-    """The positions of a file in the order of time, without those that the receiver did not have.
-
-    Rows without a position or a time, or with what devices write for an unknown one, and second ones of one time are
-    left out, with a note. Raises MeasurementError for coordinates that cannot be, times out of order, and where nothing
-    is left.
-    """
-    listed = list(itertools.islice(rows, MAX_FIXES + 1))
-    if len(listed) > MAX_FIXES:
-        raise MeasurementError(f"{path}: more than the {MAX_FIXES} positions that are read")
-    table = np.array([(*row[1:4], *row.std) for row in listed], float).reshape(-1, 5)
-    invalid = table[:, 3:] < 0  # iOS states by a negative accuracy that the value is invalid
-    table[:, :3][np.repeat(invalid, (2, 1), axis=1)] = math.nan
-    known = [POSITION_COLUMNS[name].known(column) for name, column in zip(NUMBERS, table.T, strict=True)]
-    table, words = np.stack([values for values, _ in known], axis=1), [text for _, text in known]
-    table[:, 3:][table[:, 3:] <= 0] = math.nan
-    empty = np.isnan(table[:, :2]).any(1)
-    is_timed = any(row.time is not None for row in listed)
-    times = with_set_clock(np.array([math.nan if row.time is None else row.time for row in listed], float))
-    unset = np.isnan(times) & is_timed & ~empty
-    kept = np.flatnonzero(~empty & ~unset)
-    steps = np.diff(times[kept], prepend=-math.inf)
-    places = "".join(f": {name} {text}" for name, text in zip(NUMBERS, words[:2], strict=False) if text)
-    said = [
-        *notes,
-        *([f"{path}: left out {empty.sum()} rows without a position{places}"] if empty.any() else []),
-        *([f"{path}: left out {unset.sum()} positions without a time"] if unset.any() else []),
-        *([f"{path}: left out {(steps == 0).sum()} positions with a duplicate time"] if 0 in steps else []),
-    ]
-    if words[2] or invalid[:, 1].any():
-        said.append(
-            f"{path}: {np.isnan(table[kept, 2]).sum()} altitudes are unknown{words[2] and ': ' + words[2]}"
-        )
-    if unset.any() and not len(kept):
-        raise MeasurementError(f"{listed[int(unset.argmax())].where}: the time is missing, as in all rows")
-    if not len(kept):
-        what = f"; {len(listed)} rows are empty" if listed else ""
-        raise MeasurementError("; ".join([f"{path}: no position in it{what}", *notes]))
-    for row in kept[steps < 0][:1]:
-        raise MeasurementError(
-            f"{listed[row].where}: the time {float(times[row])!r} is earlier than the one before: "
-            "sort the file by its times"
-        )
-    kept = kept[steps != 0]
-    limits = 90.0, 360.0, 1e5  # balloons and rockets of amateurs stay below
-    for row in kept[(np.abs(table[kept, :3]) > limits).any(1)][:1]:
-        raise MeasurementError(f"{listed[row].where}: {_impossible(*table[row, :3])}")
-    return Fixes(
-        Path(path),
-        float64(table[kept, :3]),
-        float64(table[kept, 3:]),
-        float64(times[kept]) if is_timed else None,
-        () if is_timed else tuple(listed[row].name for row in kept),
-        tuple(said),
-    )
-
-
-def _impossible(latitude: float, longitude: float, altitude: float) -> str:
-    """Say what of a position is none of the Earth's."""
-    if abs(latitude) > 90:
-        hint = ": are latitude and longitude swapped?" if abs(longitude) <= 90 else ""
-        return f"a latitude of {latitude:g} degrees is beyond the poles{hint}"
-    if abs(longitude) > 360:
-        return f"a longitude of {longitude:g} degrees is beyond 180"
-    return f"an altitude of {altitude:g} is no altitude in meters above the ground of the Earth"
-
-
-def _signed(degrees: float, hemisphere: str, letters: str) -> float:
-    """Degrees with the sign of a hemisphere, of the two `letters` "NS" or "EW"; NaN where none is stated."""
-    letter = hemisphere.strip("\0 .").upper()[:1]
-    if not letter or letter not in letters or (degrees < 0 and letter == letters[0]):
-        return math.nan
-    return abs(degrees) if letter == letters[0] else -abs(degrees)
 
 
 def read_fixes(path: str | Path) -> Fixes:
@@ -163,14 +33,10 @@ def read_fixes(path: str | Path) -> Fixes:
         oxts = oxts_folder(path)
         return read_image_fixes(path) if oxts is None else checked_fixes(path, _oxts_rows(oxts))
     suffix = path.suffix.lower()
-    if suffix == ".srt":
-        return checked_fixes(path, _srt_rows(path))
-    if suffix == ".gpx":
-        return checked_fixes(path, _gpx_rows(path))
+    if suffix in (".srt", ".gpx"):
+        return checked_fixes(path, _srt_rows(path) if suffix == ".srt" else _gpx_rows(path))
     if suffix in SUFFIXES:
-        raise MeasurementError(
-            f"{path}: one image; give the folder of all whose EXIF blocks have the positions"
-        )
+        raise MeasurementError(f"{path}: one image; give the folder of all, whose EXIF has the positions")
     text = read_text(path, MeasurementError)
     if suffix == ".nmea" or text.lstrip().startswith(("$G", "$B")):
         return _read_nmea(path, text)
@@ -188,14 +54,15 @@ def _csv_rows(path: Path) -> Iterator[Fix]:
         sides = [row.cells.get(side, "") if side in row.units else None for side in ("north", "east")]
         if texts[0][-1:] in ("N", "S") and texts[1][-1:] in ("E", "W"):  # E alone may be that of an exponent
             texts, sides = [text[:-1] for text in texts], [text[-1] for text in texts]
-        place = [row.number(name, text) for name, text in zip(NUMBERS, texts, strict=False)]
-        place = [
-            degrees if side is None else _signed(degrees, side, letters)
-            for degrees, side, letters in zip(place, sides, ("NS", "EW"), strict=True)
-        ]
+        latitude, longitude = (
+            degrees if side is None else signed_degrees(degrees, side, letters)
+            for degrees, side, letters in zip(
+                map(row.number, NUMBERS, texts), sides, ("NS", "EW"), strict=True
+            )
+        )
         std = row.number("std_horizontal"), row.number("std_vertical")
-        name = row.cells.get("name", "")
-        yield Fix(row.where, place[0], place[1], row.number("altitude"), moment, name, std)
+        name, altitude = row.cells.get("name", ""), row.number("altitude")
+        yield Fix(row.where, latitude, longitude, altitude, moment, name, std)
 
 
 _TOKEN = r"[ \t]*([^\s\[\]();]+?)[mM]?,?(?=[\s\[\]();]|$)"
@@ -220,10 +87,8 @@ def _srt_rows(path: Path) -> Iterator[Fix]:
     cues = [
         (where, time, *found) for where, time, text in _cues(path) if (found := _srt_position(text, where))
     ]
-    columns = [
-        POSITION_COLUMNS["altitude"].known(column)[0]
-        for column in zip(*(cue[4] for cue in cues), strict=True)
-    ]
+    known = POSITION_COLUMNS["altitude"].known
+    columns = [known(column)[0] for column in zip(*(cue[4] for cue in cues), strict=True)]
     changes = [len(np.unique(column[~np.isnan(column)])) - 1 for column in columns]
     best = next((row for row, count in enumerate(changes) if count >= max(changes) / 2 and count >= 0), 0)
     before: tuple[float, float, float] | None = None
@@ -260,9 +125,7 @@ def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
 def _srt_position(text: str, where: str) -> tuple[float, float, list[float]] | None:
     """Latitude, longitude and all heights of a cue, NaN for unknown ones; None where it has no position."""
 
-    def number(word: str) -> float:
-        return parse_known(word, where, MeasurementError)
-
+    number = partial(parse_known, where=where, error=MeasurementError)
     heights = [number(match[1]) if (match := each.search(text)) else math.nan for each in HEIGHTS]
     latitude, longitude = (each.search(text) for each in BRACKETS)
     if latitude is not None and longitude is not None:
@@ -297,9 +160,7 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         )
     moments = [parse_moment(point.findtext("{*}time") or "") for point in points]
     if all(moment is None for moment in moments):
-        raise MeasurementError(
-            f"{path}: point 1: no time, nor has another point; a planned route cannot be used"
-        )
+        raise MeasurementError(f"{path}: point 1: no time, as of all; a planned route cannot be used")
     for number, (point, moment) in enumerate(zip(points, moments, strict=True), start=1):
         where = f"{path}: point {number}"
         each = {child.tag.rpartition("}")[2]: child.text or "" for child in point} | point.attrib
@@ -364,12 +225,11 @@ def _nmea_rows(rows: list[tuple[str, float, list[str]]]) -> Iterator[Fix]:
         start = dates.get(epoch, start)
         if fields[0] != kind:
             continue
-        at, latitude, longitude, altitude = (2 if kind == "GGA" else 3), math.nan, math.nan, math.nan
+        at, latitude, longitude = (2 if kind == "GGA" else 3), math.nan, math.nan
         if epoch not in void and (kind == "RMC" or fields[6] not in ("", "0")):
             latitude = _degrees(fields[at], fields[at + 1], "NS", where)
             longitude = _degrees(fields[at + 2], fields[at + 3], "EW", where)
-        if kind == "GGA":
-            altitude = parse_known(fields[9], where, MeasurementError)
+        altitude = parse_known(fields[9], where, MeasurementError) if kind == "GGA" else math.nan
         yield Fix(where, latitude, longitude, altitude, start + days[epoch] + clock)
 
 
@@ -399,7 +259,7 @@ def _degrees(text: str, hemisphere: str, letters: str, where: str) -> float:
     is_right = math.isnan(number) or (re.match(r"\d{3}", text) and minutes < 60)
     if not is_right or hemisphere not in ("", *letters):
         raise MeasurementError(f"{where}: `{text},{hemisphere}` is not a latitude or longitude of NMEA")
-    return _signed(whole + minutes / 60, hemisphere, letters)
+    return signed_degrees(whole + minutes / 60, hemisphere, letters)
 
 
 def read_image_fixes(folder: Path) -> Fixes:
@@ -434,7 +294,7 @@ def _image_fix(path: Path) -> Fix | None:
             return None
         sides = ((block[tag], str(block.get(tag - 1, ""))) for tag in (2, 4))
         latitude, longitude = (
-            _signed(sum(float(part) / 60**power for power, part in enumerate(parts)), side, letters)
+            signed_degrees(sum(float(part) / 60**power for power, part in enumerate(parts)), side, letters)
             for (parts, side), letters in zip(sides, ("NS", "EW"), strict=True)
         )
         below = block.get(5, 0) in (1, b"\x01", 3, b"\x03")  # 3 in EXIF 3.0, above sea level
@@ -450,7 +310,7 @@ def _image_fix(path: Path) -> Fix | None:
 def _oxts_rows(folder: Path) -> Iterator[Fix]:
     """On the clock of KITTI's raw images, with the accuracy that the receiver states."""
     for packet in read_oxts(folder):
-        accuracy = packet.numbers[23:24]  # `pos_accuracy` (dataformat.txt)
-        std = abs(accuracy[0]) if accuracy else math.nan
-        latitude, longitude, altitude = packet.numbers[:3]
-        yield Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std))
+        std = (
+            abs(packet.numbers[23]) if len(packet.numbers) > 23 else math.nan
+        )  # `pos_accuracy` (dataformat.txt)
+        yield Fix(packet.where, *packet.numbers[:3], time=packet.time, std=(std, std))

@@ -5,7 +5,6 @@ Source of the packets: dataformat.txt of the development kit of https://www.cvli
 
 from __future__ import annotations
 
-import datetime
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +16,14 @@ from torch import Tensor
 
 from torchslam.data.fields import SPEED
 from torchslam.data.tables import TIMES, read_table
-from torchslam.data.text_file import check_rising, float64, numbered_lines, parse_floats, with_set_clock
+from torchslam.data.text_file import (
+    check_rising,
+    float64,
+    numbered_lines,
+    parse_floats,
+    parse_moment,
+    with_set_clock,
+)
 from torchslam.errors import MeasurementError, TorchslamError, TrajectoryError
 
 
@@ -58,18 +64,13 @@ def read_oxts(folder: Path) -> list[Packet]:
 
 def read_day_times(path: Path, error: type[TorchslamError]) -> list[float]:
     """Lines `2011-09-26 13:02:25.964389445`, as seconds since the beginning of the first one's day."""
-    times: list[float] = []
-    midnight: datetime.datetime | None = None
+    times, midnight = list[float](), 0.0
     for where, line in numbered_lines(path, error):
         found = re.fullmatch(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,9})?", line)
-        try:
-            moment = datetime.datetime.fromisoformat(found[1]) if found else None
-        except ValueError:
-            moment = None
-        if found is None or moment is None:
+        if found is None or (moment := parse_moment(found[1])) is None:
             raise error(f"{where}: expected `2011-09-26 13:02:25.964389445`, got `{line}`")
-        midnight = midnight or moment.replace(hour=0, minute=0, second=0)
-        times.append((moment - midnight).total_seconds() + float(found[2] or 0))
+        midnight = midnight if times else moment - moment % 86400
+        times.append(moment - midnight + float(found[2] or 0))
     return times
 
 
