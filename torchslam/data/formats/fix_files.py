@@ -189,14 +189,12 @@ def _read_nmea(path: Path, text: str) -> Fixes:
         body, star, given = line.strip()[1:].partition("*")
         fields = [field.strip() for field in body.split(",")]
         kind = fields[0][2:]
-        if line.lstrip()[:1] != "$" or kind not in SENTENCES:
-            continue
+        if line.lstrip()[:1] != "$" or len(fields) < SENTENCES.get(kind, math.inf) or not fields[1]:
+            continue  # another one, or no fix yet, without a time
         if star and given[:2].upper() != f"{reduce(operator.xor, body.encode(), 0):02X}":
             damaged += 1
             continue
         clock = re.fullmatch(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(\.\d{1,9})?", fields[1], re.ASCII)
-        if len(fields) < SENTENCES[kind] or not fields[1]:
-            continue  # no fix yet, without a time
         if clock is None:
             raise MeasurementError(f"{path}:{number}: `{fields[1][:100]}` is not a time of NMEA")
         hours, minutes, seconds, parts = clock.groups()
@@ -239,14 +237,8 @@ def _nmea_date(fields: list[str], where: str) -> float | None:
     if not text.strip("0"):
         return None
     found = re.fullmatch(r"(\d\d)(\d\d)(\d\d|\d{4})", text, re.ASCII)
-    year = (
-        ""
-        if found is None
-        else found[3]
-        if len(found[3]) == 4
-        else ("19" if found[3] >= "80" else "20") + found[3]
-    )
-    moment = None if found is None else parse_moment(f"{year}-{found[2]}-{found[1]}")
+    century = "" if len(text) == 8 else "19" if text[4:] >= "80" else "20"
+    moment = None if found is None else parse_moment(f"{century}{found[3]}-{found[2]}-{found[1]}")
     if moment is None:
         raise MeasurementError(f"{where}: `{text[:100]}` is not a date")
     return moment if moment >= CLOCK_SET else None
@@ -273,15 +265,13 @@ def read_image_fixes(folder: Path) -> Fixes:
             f"{folder}: neither images nor oxts/ of KITTI in it; positions are read from .srt, .gpx, .nmea and .csv"
         )
     found = [row for row in map(_image_fix, images) if row is not None]
-    missing, partial = (
+    missing, incomplete = (
         len(images) - len(found),
-        sum(math.isnan(row.latitude + row.longitude) for row in found),
+        sum(math.isnan(row.latitude * row.longitude) for row in found),
     )
     notes = [f"{folder}: {missing} images have no position"] if missing else []
-    if partial:
-        notes.append(
-            f"{folder}: {partial} images have a position without a hemisphere (GPSLatitudeRef) or a number"
-        )
+    if incomplete:
+        notes.append(f"{folder}: {incomplete} images have a position without a hemisphere (GPSLatitudeRef)")
     if missing == len(images):
         raise MeasurementError(f"{folder}: no image of {missing} has a position in its EXIF block")
     return checked_fixes(folder, found, notes)
@@ -313,4 +303,5 @@ def _oxts_rows(folder: Path) -> Iterator[Fix]:
         std = (
             abs(packet.numbers[23]) if len(packet.numbers) > 23 else math.nan
         )  # `pos_accuracy` (dataformat.txt)
-        yield Fix(packet.where, *packet.numbers[:3], time=packet.time, std=(std, std))
+        latitude, longitude, altitude = packet.numbers[:3]
+        yield Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std))
