@@ -49,7 +49,7 @@ test-slow: $(INSTALLED_DEV)  ## the tests that `make test` leaves out: half an h
 test-docs: $(INSTALLED_DEV) $(INSTALLED_DOCS)  ## execute the code blocks of the documentation, all tutorials included
 	$(BIN)/python -m pytest tests/docs -m 'slow or not slow' $(PYTEST_ARGS)
 
-fuzz: $(INSTALLED_DEV)  ## feed tens of thousands of invalid inputs to every reader: each must be read or refused within 10 s and 1 GB
+fuzz: $(INSTALLED_DEV)  ## feed tens of thousands of invalid inputs to every reader: each must be read rightly or refused within 10 s and 1 GB
 	$(BIN)/python -m tests.fuzz
 
 mutation: $(INSTALLED_MUTATION)  ## mutation testing of the system layer: how many mutants do the tests detect?

@@ -463,3 +463,10 @@ def test_keys_that_are_no_other_distortion(tmp_path: Path, name: str, text: str)
 def test_angle_of_a_blender_scene(tmp_path: Path) -> None:
     (tmp_path / "t.json").write_text(f'{{"camera_angle_x": {math.pi / 2}, "w": 640, "h": 480, "frames": []}}')
     assert read_calibration(tmp_path / "t.json").params == pytest.approx([320, 320, 319.5, 239.5])
+
+
+def test_a_decimal_comma_does_not_cut_a_number(tmp_path: Path) -> None:
+    lines = "%YAML:1.0\nCamera.fx: 517,3\nCamera.fy: 516.4\nCamera.cx: 318\nCamera.cy: 255\n"
+    (tmp_path / "c.yaml").write_text(lines)
+    with pytest.raises(CalibrationError, match=r"c.yaml: Camera.fx: `517,3` is not one number"):
+        parse_camera(str(tmp_path / "c.yaml"), (640, 480))

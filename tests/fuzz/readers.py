@@ -16,7 +16,7 @@ from pathlib import Path
 import torch
 from safetensors.torch import save
 
-from tests.fuzz import conventions, named_images, valid_inputs
+from tests.fuzz import conventions, meant_values, named_images, valid_inputs
 from tests.fuzz.mutators import Files
 from tests.fuzz.sample_files import CONFIG, OVERRIDES, WALK, sample_files
 from tests.walks import T_cw
@@ -149,6 +149,16 @@ def readers() -> dict[str, Reader]:
             ("times of images", named_images.listed_images, named_images.read_listed_images, 600),
             ("images of results", named_images.changed_folder, named_images.read_changed_folder, 900),
         )
+    ]
+    found += [
+        Reader(
+            f"values {kind}",
+            partial(make, random.Random(0)),
+            partial(meant_values.check, kind=kind),
+            inputs,
+            make,
+        )
+        for kind, (make, _, inputs) in meant_values.VALUES.items()
     ]
     found += [
         Reader(f"image {kind}", partial(_kind, valid_inputs.images, kind), _image, 250) for kind in IMAGES

@@ -23,7 +23,7 @@ from torchslam.geometry import (
 from torchslam.geometry.transforms import level_rotation
 from torchslam.map.file import read_atlas, write_atlas
 from torchslam.map.unit import MetricUnit
-from torchslam.metric.meters import bring_into_meters, combine_scales
+from torchslam.metric.meters import bring_into_meters, combine_scales, vertical_contradictions
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 from torchslam.system.metric_run import run_in_meters
 from torchslam.system.run import Run
@@ -259,3 +259,36 @@ def test_no_measurement_is_an_error() -> None:
 def test_a_scale_must_be_positive_with_a_finite_error(scale: float, std: float) -> None:
     with pytest.raises(MeasurementError):
         measurement(scale, std)
+
+
+@pytest.mark.parametrize(
+    ("up", "std", "words"),
+    [
+        ((0.0, -1.0, 0.0), 0.01, ""),
+        ((0.5, -0.8, 0.3), 0.01, ""),
+        ((0.0, 1.0, 0.1), 0.01, "the images are rolled by 180 degrees"),
+        ((1.0, 0.0, 0.0), 0.01, "the images are rolled by 90 degrees"),
+        ((0.0, 0.1, 1.0), 0.01, "the camera looks up by 84 degrees"),
+        ((0.0, 0.1, -1.0), 0.01, ""),  # at the ground
+        ((0.0, 1.0, 0.1), 1.0, ""),  # hardly known
+    ],
+)
+def test_a_vertical_that_contradicts_the_images(up: tuple[float, ...], std: float, words: str) -> None:
+    """Of a mirrored path, or an inertial sensor with another mounting; most images decide."""
+    up_w = torch.nn.functional.normalize(torch.tensor(up, dtype=torch.float64), dim=0)
+    R_cw = torch.eye(3, dtype=torch.float64).repeat(5, 1, 1)
+    R_cw[0] = torch.diag(torch.tensor((-1.0, -1.0, 1.0), dtype=torch.float64))  # one is upside down
+    measured = ScaleMeasurement(ScaleSource.MARKER, 2.0, 0.01, 3, "markers", up_w=up_w, up_std=std)
+    lines = vertical_contradictions(R_cw, [measured])
+    assert bool(lines) == bool(words)
+    assert all(
+        line.startswith("the vertical of marker contradicts the images") and words in line for line in lines
+    )
+
+
+def test_a_size_in_another_unit_is_named() -> None:
+    one = ScaleMeasurement(ScaleSource.MARKER, 0.8, 0.01, 1, "marker", stated="apriltag-25h9:0.8")
+    other = ScaleMeasurement(ScaleSource.SPEED, 0.08, 0.01, 9, "stretches")
+    (line,) = combine_scales([one, other]).contradictions
+    assert line.startswith("marker and speed contradict each other by a factor of 10: ")
+    assert line.endswith("; stated: marker apriltag-25h9:0.8")

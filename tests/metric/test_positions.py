@@ -11,10 +11,11 @@ import torch
 from torch import Tensor
 
 from tests.metric.drives import ORIGIN, drive, error, measure, reason, receiver, true_S_ew, view_of
-from torchslam.data.formats.fix_files import Fixes
+from torchslam.data.fixes import Fixes
 from torchslam.errors import MeasurementError
-from torchslam.geometry import enu_from_geodetic, geodetic_from_enu, transform
+from torchslam.geometry import enu_from_geodetic, geodetic_from_enu, so3_exp, transform
 from torchslam.metric.camera_path import Clock, clocks_of, parse_clock
+from torchslam.metric.meters import vertical_contradictions
 from torchslam.metric.positions import PositionSource, from_options
 from torchslam.metric.source import ScaleSource
 
@@ -188,3 +189,17 @@ def test_options_read_their_files(tmp_path: Path) -> None:
     assert len(source.fixes) == 2
     with pytest.raises(MeasurementError, match="cannot be read"):
         from_options({"gps": ((str(tmp_path / "b.csv"),),)})
+
+
+@pytest.mark.parametrize("down", [0.0, math.pi / 2])
+def test_a_path_on_the_wrong_side_of_the_equator_is_reported(down: float) -> None:
+    """Without hemispheres it is mirrored, and turns the map upside down; also of a camera that looks at the ground."""
+    times, T_ec = drive()
+    turn = torch.eye(4, dtype=torch.float64)
+    turn[:3, :3] = so3_exp(torch.tensor((-down, 0.0, 0.0), dtype=torch.float64))
+    at, positions_e, _ = receiver(times, T_ec, noise=0.1)
+    fixes = fixes_of(at, positions_e * torch.tensor((1.0, -1.0, 1.0), dtype=torch.float64))
+    view = view_of(times, T_ec @ turn)
+    found = measure(PositionSource(fixes), view)
+    (line,) = vertical_contradictions(view.T_cw[:, :3, :3], [found])
+    assert "the vertical of position contradicts the images" in line

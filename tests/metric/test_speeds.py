@@ -53,6 +53,21 @@ def test_wheels_that_slip() -> None:
     assert "as with wheels that slip" in found.rejected[0]
 
 
+def test_speeds_that_a_phone_does_not_know_do_not_count(tmp_path: Path) -> None:
+    """iOS writes -1; the rows that were left out are in the notes of the measurement."""
+    times, T_ec = drive()
+    own = wheel(T_ec)
+    own[::3] = -1.0
+    lines = [f"{time},{speed}" for time, speed in zip(times.tolist(), own.tolist(), strict=True)]
+    (tmp_path / "v.csv").write_text("\n".join(["time,speed", *lines]))
+    found = measure(SpeedSource(read_speeds(tmp_path / "v.csv")), view_of(times, T_ec))
+    assert abs(error(found)) < 0.003
+    assert (
+        f"left out {len(own[::3])} rows without a speed or a time: -1 ({len(own[::3])} times)"
+        in found.notes[0]
+    )
+
+
 def test_speeds_on_another_clock() -> None:
     times, T_ec = drive()
     view = view_of(times, T_ec)
@@ -149,6 +164,9 @@ def test_the_mean_of_a_series_that_wanders() -> None:
         ("# time speed\n0 1.5\n0.5 2\n", [1.5, 2.0]),
         ("time,speed\n0,1.5\n0.5,2\n", [1.5, 2.0]),
         ("time_ms;speed_km_h\n0;3.6\n500;7.2\n", [1.0, 2.0]),
+        ("time,speed\n-1,-1\n0,1\n0.1,-1.0\n0.2,\n0.3,NaN\n0.5,2\n0.6,-9999\n", [1.0, 2.0]),
+        ("time,speed (mph)\n0,2.2369363\n0.2,-2.24\n0.3,-1\n0.5,4.4738726\n", [1.0, 2.0]),
+        ('"time" "GPS speed [kn]"\n"1" 0 1.9438445\n"2" 0.5 3.887689\n', [1.0, 2.0]),
     ],
 )
 def test_files_of_speeds(tmp_path: Path, content: str, expected: list[float]) -> None:
@@ -161,12 +179,12 @@ def test_files_of_speeds(tmp_path: Path, content: str, expected: list[float]) ->
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        ("", "is empty; expected lines `time speed`"),
+        ("", "the first line must name the columns `time`"),
         ("time,rpm\n0,1\n", "no `time` or no `speed`"),
         ("time,speed\n0,1\n", "1 speeds, two are needed"),
         ("time,speed\n1,1\n0,1\n", "is earlier than the one before"),
         ("time,speed\n1,1\n2,5000\n", "5000 is no speed in meters per second"),
-        ("time,speed\n1,1\n2,nan\n", "nan is no speed"),
+        ("time,speed\n1,1\n2,nan\n", "1 speeds, two are needed; .* left out 1 rows"),
         ("0,1,2\n", "expected `time speed`, got 3 numbers"),
     ],
 )

@@ -13,7 +13,8 @@ from typing import Any
 from torchslam.config import Config
 from torchslam.config.schema import check_override_in_file
 from torchslam.data.synthetic import is_synthetic
-from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, parse_number, read_cells
+from torchslam.data.tables import read_cells
+from torchslam.data.text_file import MAX_LINE, numbered_lines, parse_count, parse_number
 from torchslam.errors import ConfigError, SequenceError
 from torchslam.utils.console import without_credentials
 

@@ -225,7 +225,7 @@ class MetricConfig(Settings, section="metric"):
             gyro_x to gyro_z and acc_x to acc_z with their units, as in `gyro_x [deg/s]`.
         imu_camera: How that sensor is mounted on the camera: Kalibr's camchain-imucam, EuRoC's sensor.yaml of the
             camera, or ORB-SLAM3's settings. Without it, the rotation between the two is found.
-        depth: Depth images of 16 bits that were taken with the images: a folder or TUM's depth.txt, and after a colon
+        depth: Depth images, 16 bits or floats, taken with the images: a folder or TUM's depth.txt, and after a colon
             the units per meter if they are not those of the dataset or 1000; auto: those that the dataset has.
         depth_camera: The camera of those depth images, as --camera; without it they are registered to the color images.
     """

@@ -17,8 +17,10 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from torchslam.data.fields import NO_SAMPLE
 from torchslam.data.formats.key_files import Keys, read_keys
-from torchslam.data.text_file import TIME_UNITS, Column, float64, read_table
+from torchslam.data.tables import TIME_UNITS, Column, read_table
+from torchslam.data.text_file import float64
 from torchslam.data.trajectories import ORTHOGONAL, orthogonality_error
 from torchslam.errors import CalibrationError, MeasurementError
 from torchslam.geometry.lie import rigid, se3_inverse
@@ -41,7 +43,7 @@ SENSORS = {
 COLUMNS = {
     "time": Column(("timestamp", "time", "t", "secondselapsed", "elapsed", "seconds"), TIME_UNITS),
     **{
-        f"{kind}_{axis}": Column(tuple(word + axis for word in words), units)
+        f"{kind}_{axis}": Column(tuple(word + axis for word in words), units, NO_SAMPLE)
         for kind, (words, units) in SENSORS.items()
         for axis in AXES
     },
@@ -70,6 +72,7 @@ class InertialSamples:
     gyroscope: Float[Tensor, "M 3"]
     accelerometer: Float[Tensor, "M 3"]
     source: str = "inertial samples"
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.timestamps) < 2:
@@ -111,15 +114,19 @@ def read_imu(path: str | Path) -> InertialSamples:
         units = dict(row.units)
         places.append(row.where)
         rows.append([row.number(column) for column in COLUMNS])
-    if len(rows) < 2:
-        raise MeasurementError(f"{path}: {len(rows)} samples; at least two are needed")
     for kind in SENSORS:
-        if len({str(units[f"{kind}_{axis}"]) for axis in AXES}) > 1:
+        if len({str(units.get(f"{kind}_{axis}")) for axis in AXES}) > 1:
             raise MeasurementError(f"{path}: the axes of a sensor have different units")
-    table = np.array(rows)
-    empty = np.argwhere(np.isnan(table))
-    if len(empty):
-        raise MeasurementError(f"{places[empty[0, 0]]}: no number in column {[*COLUMNS][empty[0, 1]]}")
+    table = np.array(rows).reshape(-1, 7)
+    for column, kind in enumerate(COLUMNS):
+        table[:, column], _ = COLUMNS[kind].known(table[:, column])
+    # Forces are exactly zero only before the first one came.
+    kept = np.flatnonzero(np.isfinite(table).all(1) & (table[:, 4:] != 0).any(1))
+    lost = len(rows) - len(kept)
+    notes = [f"{path}: left out {lost} rows without all values"] if lost else []
+    if len(kept) < 2:
+        raise MeasurementError("; ".join([f"{path}: {len(kept)} samples; at least two are needed", *notes]))
+    table, places = table[kept], [places[row] for row in kept]
     periods = np.diff(table[:, 0])
     late = np.nonzero(periods <= 0)[0]
     if len(late):
@@ -143,7 +150,9 @@ def read_imu(path: str | Path) -> InertialSamples:
             f"{path}: the median of the forces is {force:.3g} m/s^2, not that of gravity, 9.81; state the unit, as in "
             "acc_x [g], and leave gravity in"
         )
-    return InertialSamples(float64(table[:, 0] * unit), float64(gyroscope), float64(accelerometer), str(path))
+    return InertialSamples(
+        float64(table[:, 0] * unit), float64(gyroscope), float64(accelerometer), str(path), tuple(notes)
+    )
 
 
 def read_inertial_calibration(path: str | Path | None, imu: str | Path | None = None) -> InertialCalibration:

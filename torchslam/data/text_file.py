@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
-import io
 import itertools
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any, NamedTuple
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -70,26 +67,46 @@ def parse_floats(text: str, where: str, error: type[TorchslamError]) -> list[flo
     """Parse finite numbers separated by spaces or commas. Raises `error` at `where` otherwise."""
     if len(text) > MAX_LINE:
         raise error(f"{where}: {len(text)} characters, more than the {MAX_LINE} of a line of numbers")
+    words = text.split()
+    commas = [word for word in words if "." not in word and re.fullmatch(r"[-+]?\d+,\d+(e.*)?", word, re.I)]
+    if len(words) > 1 and commas:
+        raise error(
+            f"{where}: `{commas[0][:100]}`: a decimal comma, or two numbers? Write points, or spaces alone"
+        )
     return [parse_number(word, where, error) for word in text.replace(",", " ").split()]
 
 
+NUMBER = re.compile(r"[-+]?(\d+,\d+|\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
+THOUSANDS = re.compile(r"[-+]?[1-9]\d{0,2},\d{3}")
+"""A number that has a decimal comma in one country, and a thousand of something in another."""
+UNKNOWN_WORDS = {
+    *("", "-", "--", "?", "na", "n/a", "#n/a", "nil", "none", "null", "\\n", "unknown", "undefined"),
+    *("nan", "-nan", "nan(ind)", "-nan(ind)", "1.#qnan", "-1.#ind"),
+}
+"""What programs write for a number that they do not have, in lower case: R, Excel, SQL, C on several systems."""
+
+
 def parse_number(text: str, where: str, error: type[TorchslamError]) -> float:
-    """Parse a finite number, which must be the whole text. Raises `error` at `where` otherwise."""
-    try:
-        number = float(text)
-    except ValueError:
-        raise error(f"{where}: `{text[:100]}` is not a number") from None
+    """Parse a finite number with a decimal point or comma, which must be the whole text. Raises `error` at `where`."""
+    text = text.strip()
+    is_unclear = THOUSANDS.fullmatch(text) is not None
+    is_number = NUMBER.fullmatch(text) is not None and not is_unclear
+    number = float(text.replace(",", ".")) if is_number else math.nan
     if not math.isfinite(number):
-        raise error(f"{where}: `{text[:100]}` is not a finite number")
+        is_other = is_number or text.strip("+-").lower() in ("nan", "inf", "infinity")
+        hint = "; is its comma a decimal one? Write a point" if is_unclear else ""
+        raise error(f"{where}: `{text[:100]}` is not a {'finite ' if is_other else ''}number{hint}")
     return number
 
 
+def parse_known(text: str, where: str, error: type[TorchslamError]) -> float:
+    """Parse a number; NaN for a word that stands for an unknown one. Raises `error` at `where` otherwise."""
+    return math.nan if text.strip().lower() in UNKNOWN_WORDS else parse_number(text, where, error)
+
+
 def are_numbers(words: Iterable[str]) -> bool:
-    """Return whether all words are finite numbers."""
-    try:
-        return all(map(math.isfinite, map(float, words)))
-    except ValueError:
-        return False
+    """Return whether all words are finite numbers with a decimal point."""
+    return all(NUMBER.fullmatch(word) and "," not in word and math.isfinite(float(word)) for word in words)
 
 
 def parse_count(text: str) -> int | None:
@@ -145,6 +162,15 @@ def in_seconds(number: float, where: str, error: type[TorchslamError]) -> float:
     return number
 
 
+CLOCK_SET = 946771200.0
+"""2000-01-02, seconds since 1970: a receiver begins at 1970, 1980 or 2000 and gets the date with its first fix."""
+
+
+def with_set_clock(times: np.ndarray) -> np.ndarray:
+    """Times with NaN for those of a clock that was not set: before CLOCK_SET where others are after it."""
+    return np.where((times < CLOCK_SET) & (times >= CLOCK_SET).any(), np.nan, times)
+
+
 def check_rising(times: Sequence[float], places: Sequence[str], error: type[TorchslamError]) -> None:
     """Raise `error` at the place of a time that is not later than the one before."""
     for (before, time), where in zip(itertools.pairwise(times), places[1:], strict=True):
@@ -169,155 +195,3 @@ def parse_moment(text: str) -> float | None:
     except ValueError:
         return None
     return (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)).timestamp()
-
-
-class Column(NamedTuple):
-    """A kind of column of tables.
-
-    Attributes:
-        names: in lower case, letters and digits alone.
-        units: factors of the units that its heading may state, as in `time_ms` or `gyro x [deg/s]`; letters and digits.
-    """
-
-    names: tuple[str, ...]
-    units: Mapping[str, float] = MappingProxyType({})
-
-    def unit(self, heading: str, where: str, error: type[TorchslamError]) -> float | None:
-        """Return the factor of the unit in a heading, NaN without a unit; None if it is another kind of column.
-
-        Raises `error` for a unit in brackets that is not known.
-        """
-        bare, *brackets = re.split(r"[\[(]", heading.lower().replace("²", "2"), maxsplit=1)
-        parts = [part for part in re.split(r"[^a-z0-9µ°]+", bare) if part]
-        stated = re.sub(r"[^a-z0-9µ°]", "", "".join(brackets))
-        for length in range(len(parts), 0, -1):
-            unit = stated or "".join(parts[length:])
-            if "".join(parts[:length]) not in self.names:
-                continue
-            if stated and stated not in self.units:
-                known = ", ".join(self.units) or "none"
-                raise error(
-                    f"{where}: column `{heading[:80]}`: the unit `{unit}` is not known; known are {known}"
-                )
-            if not unit or unit in self.units:
-                return self.units[unit] if unit else math.nan
-        return None
-
-
-TIME_UNITS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "ns": 1e-9}  # factors to seconds
-TIMES = {
-    "time": Column(("time", "timestamp", "t"), TIME_UNITS),
-    "gps_time": Column(("gpstime",), TIME_UNITS),
-}
-"""Columns of times; GPS time counts from 1980 and has no leap seconds."""
-
-
-@dataclass(frozen=True)
-class Row:
-    """A line of a table at a file and line; the error is raised for a wrong cell.
-
-    Attributes:
-        cells: text of each known column that is not empty.
-        units: of each known column in the header, the factor of its unit; NaN without a unit.
-    """
-
-    where: str
-    cells: Mapping[str, str]
-    units: Mapping[str, float]
-    error: type[TorchslamError]
-
-    def number(self, column: str) -> float:
-        """The number in a column, times its unit; NaN where that is empty or `nan`. Raises the error otherwise."""
-        text = self.cells.get(column, "nan")
-        if text.lower() == "nan":
-            return math.nan
-        number, unit = parse_number(text, f"{self.where}: column {column}", self.error), self.units[column]
-        return number if math.isnan(unit) else number * unit
-
-    def time(self) -> float | None:
-        """The time, seconds; None in a table without a column of times. Raises the error for anything else."""
-        column = next((column for column in TIMES if column in self.units), None)
-        if column is None:
-            return None
-        text = self.cells.get(column, "")
-        moment = parse_moment(text) if re.search(r"\d-\d", text) else None
-        if moment is not None:
-            return moment
-        seconds = self.number(column)
-        if math.isnan(seconds):
-            raise self.error(f"{self.where}: the time is missing")
-        if math.isnan(self.units[column]):
-            seconds = in_seconds(seconds, self.where, self.error)
-        return utc_from_gps(seconds) if column == "gps_time" else seconds
-
-
-def read_table(
-    path: str | Path,
-    columns: Mapping[str, Column],
-    error: type[TorchslamError],
-    needed: Iterable[str] = (),
-    are_unique: bool = True,
-) -> Iterator[Row]:
-    """Yield the rows of a table whose first line names its columns; other columns than the known ones are left out.
-
-    Raises `error` for no header, an unknown one, one without the `needed` columns, another number of cells, and two
-    columns of one kind, unless not `are_unique`: then the first one counts.
-    """
-    lines = read_cells(path, error)
-    where, headings = next(lines, (f"{path}:1", []))
-    headings = [heading.lstrip("#").strip(" \"'") for heading in headings]
-    places: dict[str, int] = {}
-    units: dict[str, float] = {}
-    for place, heading in enumerate(headings):
-        for kind, column in columns.items():
-            unit = column.unit(heading, where, error)
-            if unit is None or (kind in places and not are_unique):
-                continue
-            if kind in places:
-                raise error(f"{where}: two columns of the kind `{kind}`: {', '.join(headings)}")
-            places[kind], units[kind] = place, unit
-    found = ", ".join(headings)[:200]
-    if not places:
-        expected = ", ".join(f"`{kind}`" for kind in columns)
-        raise error(f"{where}: the first line must name the columns {expected}; it is `{found}`")
-    missing = next((kind for kind in needed if kind not in places), None)
-    if missing is not None:
-        raise error(f"{where}: no column {missing} in the header `{found}`; needed are {', '.join(needed)}")
-    for where, cells in lines:
-        known = {kind: text for kind, place in places.items() if (text := cells[place].strip())}
-        yield Row(where, known, units, error)
-
-
-def read_cells(
-    path: str | Path, error: type[TorchslamError], limit: int | None = None, delimiter: str = ""
-) -> Iterator[tuple[str, list[str]]]:
-    """Yield the place and the cells of each line of a table, those of its header first.
-
-    Empty lines and comments, which begin with `#`, are left out. Without `delimiter` it is the comma, semicolon or tab
-    of the first line, or white space. Raises `error` for anything but a text of at most `limit` bytes, a quote that
-    does not end, or another number of cells than in the header.
-    """
-    text = read_text(path, error, limit)
-    first = text.lstrip().split("\n", 1)[0]
-    if len(first) > MAX_LINE:
-        raise error(f"{path}:1: {len(first)} characters, more than the {MAX_LINE} of a line")
-    if not delimiter:
-        delimiter = max(",;\t", key=first.count)
-        delimiter = delimiter if delimiter in first else " "
-    lines: Iterable[str] = io.StringIO(text, newline="")
-    if delimiter == " ":
-        lines = (" ".join(line.split()) for line in text.split("\n"))
-    reader = csv.reader(lines, delimiter=delimiter, strict=True)
-    count = 0
-    try:
-        for cells in reader:
-            if not any(cell.strip() for cell in cells) or (count and cells[0].lstrip().startswith("#")):
-                continue
-            count = count or len(cells)
-            while len(cells) > count and not cells[-1].strip():
-                cells.pop()
-            if len(cells) != count:
-                raise error(f"{path}:{reader.line_num}: {len(cells)} cells, the header has {count} columns")
-            yield f"{path}:{reader.line_num}", cells
-    except csv.Error as cause:
-        raise error(f"{path}:{reader.line_num}: not CSV: {cause}") from cause

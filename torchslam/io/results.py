@@ -14,7 +14,8 @@ from jaxtyping import Float
 from torch import Tensor
 
 from torchslam.data.formats.image_file import read_gray
-from torchslam.data.text_file import read_cells, read_object
+from torchslam.data.tables import read_cells
+from torchslam.data.text_file import read_object
 from torchslam.data.trajectories import read_trajectory
 from torchslam.dense.cloud import PointCloud
 from torchslam.errors import ResultsError, TrajectoryError

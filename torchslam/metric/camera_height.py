@@ -16,13 +16,13 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.geometry.robust import median_with_error
 from torchslam.metric.image_depth import correlate, sample_windows
 from torchslam.metric.options import Given
-from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured, parse_length
 
+HEIGHTS = 0.01, 500.0  # meters: a toy, and a drone; above, the number is meant in millimeters
 FRAMES = 16
 """Frames, evenly spread over a submap, in which a plane is sought: the error of one is 3 to 4 %."""
 LEAST_FRAMES = 4
@@ -70,8 +70,7 @@ class CameraHeight:
     meters: float
 
     def __post_init__(self) -> None:
-        if not 0 < self.meters < math.inf:
-            raise MeasurementError(f"--camera-height {self.meters}: no height in meters")
+        parse_length(f"{self.meters:g}", f"--camera-height {self.meters}", *HEIGHTS)
 
     def measure(self, view: SubmapView) -> ScaleMeasurement | Unmeasured:
         """Measure the unit of a submap by the median height over its frames."""

@@ -10,11 +10,12 @@ from torchslam.errors import MeasurementError
 from torchslam.metric.image_depth import locate_pixel
 from torchslam.metric.meters import MAX_DISAGREEMENT, combine_scales
 from torchslam.metric.options import Given
-from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
+from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured, parse_length
 
 UNIT_STD = 0.01
 """Relative standard deviation of the unit of a map from place to place, by its drift: two lengths in different places
 differ by about that much, however well their ends are found (redkitchen, against its depth images)."""
+LENGTHS = 1e-6, 1e5  # meters of a known length: in a microscope, and in an aerial image
 MAX_RELATIVE_STD = 0.5
 """Relative error of a length from which on it is not used."""
 
@@ -51,12 +52,7 @@ def parse_distance(words: Sequence[str]) -> Distance:
     """Read `FRAME:X,Y FRAME:X,Y METERS`. Raises MeasurementError for anything else."""
     whole = f"--distance {' '.join(words)}"
     first, second = (_click(word, whole) for word in words[:2])
-    try:
-        meters = float(words[2])
-    except ValueError:
-        meters = math.nan
-    if not 0 < meters <= 1e5:
-        raise MeasurementError(f"{whole}: {words[2]} is no length in meters")
+    meters = parse_length(words[2], whole, *LENGTHS)
     if first == second:
         raise MeasurementError(f"{whole}: both points are the same")
     return Distance(first, second, meters)

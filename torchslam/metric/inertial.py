@@ -215,7 +215,7 @@ class InertialSource:
         if found.reason is not InertialReason.MEASURED or found.rotation is None:
             uncertain = found.reason is InertialReason.NOT_DETERMINED and found.relative_std < 1
             more = f": its scale is uncertain by {found.relative_std:.0%}" if uncertain else ""
-            return Unmeasured(ScaleSource.INERTIAL, f"{found.reason}{more}")
+            return Unmeasured(ScaleSource.INERTIAL, "; ".join([f"{found.reason}{more}", *self.samples.notes]))
         turn = math.degrees(float(found.rotation.bias.norm()))
         note = (
             f"inertial sensor: bias of the gyroscope {turn:.3f} degrees/s, of the accelerometer "
@@ -231,7 +231,7 @@ class InertialSource:
             tuple(f"the stretch from {time:.2f} s on contradicts the others" for time in found.rejected),
             up_w=-found.gravity_w / found.gravity_w.norm(),
             up_std=found.gravity_std,
-            notes=(note,),
+            notes=(*self.samples.notes, note),
         )
 
 

@@ -21,6 +21,9 @@ from torchslam.geometry.transforms import level_rotation
 from torchslam.map.unit import MetricUnit, UnitSource
 from torchslam.metric.source import MetricSource, ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
 
+MAX_ROLL_DEG = 60.0
+"""Roll of most images, or elevation of their optical axes, from which on a vertical contradicts them: people hold a
+camera upright, on its side at most for a part, and hardly ever film the zenith. Verticals are known to 5."""
 MAX_DISAGREEMENT = 3.0
 """Standard errors by which two measurements may differ before they count as a contradiction: .3 % of right pairs do."""
 
@@ -61,10 +64,11 @@ def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
     for one, other in itertools.combinations(measurements, 2):
         off = math.log(one.meters_per_unit / other.meters_per_unit)
         if abs(off) > MAX_DISAGREEMENT * math.hypot(one.relative_std, other.relative_std):
+            stated = "".join(f"; stated: {each.source} {each.stated}" for each in (one, other) if each.stated)
             contradictions.append(
-                f"{one.source} and {other.source} contradict each other: "
+                f"{one.source} and {other.source} contradict each other by a factor of {math.exp(abs(off)):.3g}: "
                 f"{one.meters_per_unit:.4g} ± {one.relative_std:.1%} and "
-                f"{other.meters_per_unit:.4g} ± {other.relative_std:.1%} meters per unit"
+                f"{other.meters_per_unit:.4g} ± {other.relative_std:.1%} meters per unit{stated}"
             )
     return CombinedScale(
         math.exp(float(mean)),
@@ -72,6 +76,32 @@ def combine_scales(measurements: Sequence[ScaleMeasurement]) -> CombinedScale:
         tuple(measurements),
         tuple(contradictions),
     )
+
+
+def vertical_contradictions(
+    R_cw: Float[Tensor, "K 3 3"], measurements: Iterable[ScaleMeasurement]
+) -> tuple[str, ...]:
+    """One line for each measurement by whose vertical most images are upside down, on their side, or of the zenith.
+
+    `R_cw` are the rotations of the images, world to camera. Images of the nadir or the zenith have no roll.
+    """
+    lines = []
+    for each in measurements:
+        if each.up_w is None or each.up_std > math.radians(MAX_ROLL_DEG) / MAX_DISAGREEMENT:
+            continue
+        x, y, z = (R_cw.double().cpu() @ each.up_w.double().cpu()).unbind(-1)
+        elevation, rolled = torch.asin(z.clamp(-1, 1)).rad2deg(), torch.atan2(x, -y).abs().rad2deg()
+        has_roll = elevation.abs() < MAX_ROLL_DEG
+        what = ""
+        if float((elevation >= MAX_ROLL_DEG).double().mean()) > 0.5:
+            what = f"the camera looks up by {float(elevation.median()):.0f} degrees"
+        elif float((rolled[has_roll] > MAX_ROLL_DEG).sum()) > 0.5 * len(z):
+            what = f"the images are rolled by {float(rolled[has_roll].median()):.0f} degrees"
+        if what:
+            lines.append(
+                f"the vertical of {each.source} contradicts the images: by it, in most of them {what}"
+            )
+    return tuple(lines)
 
 
 @torch.no_grad()
@@ -94,14 +124,17 @@ def bring_into_meters(
     answers = [source.measure(view) for source in sources]
     silent = tuple(answer for answer in answers if isinstance(answer, Unmeasured))
     measurements = [answer for answer in answers if not isinstance(answer, Unmeasured)]
+    tilted = vertical_contradictions(view.T_cw[:, :3, :3], measurements)
     S_mw = torch.eye(4, dtype=torch.float64, device="cpu")
     if measurements and submap.metric is not None:
         before = ScaleMeasurement(ScaleSource.MAP, 1.0, submap.metric.relative_std, 1, "map in meters")
         contradictions = combine_scales([before, *measurements]).contradictions
-        contradictions = (*submap.metric.contradictions, *contradictions)
+        contradictions = (*submap.metric.contradictions, *contradictions, *tilted)
         submap.metric = replace(submap.metric, contradictions=contradictions)
     elif measurements:
-        S_mw, submap.metric = _similarity_to_meters(view, combine_scales(measurements))
+        scale = combine_scales(measurements)
+        scale = replace(scale, contradictions=(*scale.contradictions, *tilted))
+        S_mw, submap.metric = _similarity_to_meters(view, scale)
         submap.transform(S_mw.to(submap.map.T_cw))
     return S_mw, silent
 

@@ -72,7 +72,9 @@ class SpeedSource:
             return Stretches(ends[:-1] + STRETCH / 2, lengths_w, lengths, known & seen)
 
         shift = _best_shift(at, path) if self.clock.seconds is None else 0.0
-        return _measured(at(shift), ScaleSource.SPEED, "the speeds", clock_notes(file, shift))
+        return _measured(
+            at(shift), ScaleSource.SPEED, "the speeds", [*self.speeds.notes, *clock_notes(file, shift)]
+        )
 
 
 @dataclass(frozen=True)

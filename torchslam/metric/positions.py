@@ -9,7 +9,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from torchslam.data.formats.fix_files import Fixes, read_fixes
+from torchslam.data.fixes import Fixes
+from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.formats.given_poses import rows_by_name
 from torchslam.errors import MeasurementError
 from torchslam.geometry import enu_from_geodetic, sim3_scale
@@ -61,7 +62,7 @@ class PositionSource:
             find = self._by_names if self.fixes.timestamps is None else self._by_times
             pairs, fit, shift = find(view, path)
         except _NoFit as error:
-            return Unmeasured(ScaleSource.POSITION, str(error))
+            return Unmeasured(ScaleSource.POSITION, "; ".join([str(error), *self.fixes.notes]))
         is_line = fit.up_std > LINE_UP_STD
         notes, offset = list(self.fixes.notes), shift + fit.offset
         if abs(offset) > 3 * fit.offset_std:

@@ -16,6 +16,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from torchslam.data.text_file import parse_number
 from torchslam.errors import FrameError, MeasurementError
 from torchslam.geometry import Camera
 from torchslam.geometry.rolling_shutter import Readout
@@ -55,6 +56,7 @@ class ScaleMeasurement:
             it is nowhere on earth.
         apart: relative standard deviation of the single measurements; None where it is not known.
         notes: remarks for the user, one line each.
+        stated: what the user gave, such as the sizes of markers; named where another source contradicts it.
     """
 
     source: ScaleSource
@@ -69,6 +71,7 @@ class ScaleMeasurement:
     origin: tuple[float, float, float] | None = None
     apart: float | None = None
     notes: tuple[str, ...] = ()
+    stated: str = ""
 
     def __post_init__(self) -> None:
         if not (0 < self.meters_per_unit < math.inf and 0 < self.relative_std < math.inf):
@@ -162,3 +165,14 @@ class MetricSource(Protocol):
             MeasurementError: the measurements themselves are wrong, for whatever submap. The run ends with its results
                 in an arbitrary unit, and with this message.
         """
+
+
+def parse_length(text: str, whole: str, least: float, most: float) -> float:
+    """Read a length of an option, meters. Raises MeasurementError, with the `whole` option, for an impossible one."""
+    length = parse_number(text, f"{whole}: no length in meters (sizes are in meters)", MeasurementError)
+    if not least <= length <= most:
+        hint = f"; {text} mm are {length / 1000:g}" if length > most else ""
+        raise MeasurementError(
+            f"{whole}: {text} is no length in meters; sizes are in meters, from {least:g} to {most:g}{hint}"
+        )
+    return length

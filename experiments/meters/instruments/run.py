@@ -12,7 +12,7 @@ from torch import Tensor
 from experiments.common import parser_of, publish, sequences, table
 from experiments.meters.scale import view_of_run
 from torchslam import evaluate
-from torchslam.data.formats.fix_files import Fixes
+from torchslam.data.fixes import Fixes
 from torchslam.data.formats.vehicle_files import Speeds
 from torchslam.data.trajectories import interpolate_poses
 from torchslam.geometry import geodetic_from_enu, rigid, se3_exp, se3_inverse, so3_exp

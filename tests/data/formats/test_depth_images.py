@@ -12,7 +12,7 @@ from tests.fuzz import valid_inputs
 from tests.fuzz.valid_inputs import place
 from torchslam.data import open_sequence
 from torchslam.data.formats.depth_images import find_depth_images, parse_depth_folder, read_depth
-from torchslam.errors import MeasurementError
+from torchslam.errors import FrameError, MeasurementError
 
 
 def write(path: Path, values: np.ndarray) -> Path:
@@ -102,3 +102,38 @@ def test_nothing_there(tmp_path: Path) -> None:
     for path, message in ((tmp_path / "none", "no such folder"), (tmp_path, "no depth images")):
         with pytest.raises(MeasurementError, match=message):
             find_depth_images(path)
+
+
+@pytest.mark.parametrize("name", ["a.tif", "a.pfm", "a.npy"])
+def test_floats_are_meters(tmp_path: Path, name: str) -> None:
+    """Unless the user states another unit; what is not a depth is zero."""
+    values = np.array([[0.0, -1.0, np.nan, np.inf], [1e10, 2.5, 2.5, 3.0]], np.float32)
+    np.save(tmp_path / name, values) if name.endswith(".npy") else write(tmp_path / name, values)
+    found = find_depth_images(tmp_path)
+    assert (found.units_per_meter, found.said) == (1.0, True)
+    assert read_depth(tmp_path / name, 1.0).tolist() == [[0, 0, 0, 0], [0, 2.5, 2.5, 3]]
+    assert find_depth_images(tmp_path, 1000.0).units_per_meter == 1000.0
+    with pytest.raises(MeasurementError, match=r"its middle depth is 0.0025 m with 1000 units"):
+        read_depth(tmp_path / name, 1000.0)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.int32])
+def test_arrays_of_integers_have_units(tmp_path: Path, kind: type) -> None:
+    np.save(tmp_path / "a.npy", np.array([[0, 2500, np.iinfo(kind).max]], kind)[..., None])
+    found = find_depth_images(tmp_path)
+    assert (found.units_per_meter, found.said) == (1000.0, False)
+    assert read_depth(tmp_path / "a.npy", 1000.0).tolist() == [[0, 2.5, 0]]
+
+
+def test_files_that_have_no_depth(tmp_path: Path) -> None:
+    for name, content in {"a.npy": b"\x93NUMPY", "b.npy": b"x", "c.exr": b"v/1\x01" + bytes(99)}.items():
+        (tmp_path / name).write_bytes(content)
+        words = "not an array of NumPy" if name != "c.exr" else "OPENCV_IO_ENABLE_OPENEXR"
+        with pytest.raises(FrameError, match=words):
+            read_depth(tmp_path / name, 1.0)
+    np.save(tmp_path / "d.npy", np.ones((2, 3, 4)))
+    np.save(tmp_path / "e.npy", np.ones((2, 3), bool))
+    with pytest.raises(MeasurementError, match="not one depth for each pixel"):
+        read_depth(tmp_path / "d.npy", 1.0)
+    with pytest.raises(MeasurementError, match="bool, not of 16 bits or floats"):
+        read_depth(tmp_path / "e.npy", 1.0)

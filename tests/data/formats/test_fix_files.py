@@ -11,7 +11,8 @@ import pytest
 import torch
 from PIL import Image
 
-from torchslam.data.formats.fix_files import Fixes, read_fixes
+from torchslam.data.fixes import Fixes
+from torchslam.data.formats.fix_files import read_fixes
 from torchslam.data.text_file import utc_from_gps
 from torchslam.errors import MeasurementError, TorchslamError
 
@@ -229,7 +230,6 @@ def test_packets_of_kitti(tmp_path: Path) -> None:
         ("a.csv", "time,lat,lon\n0,4800,1100\n", "beyond the poles$"),
         ("a.csv", "time,lat,lon\n1,48,11\n0,48,11\n", "a.csv:3: the time 0.0 is earlier"),
         ("a.csv", "time,lat,lon,alt\n1,48,11,1e6\n", "no altitude in meters"),
-        ("a.csv", "time,lat,lon,std_horizontal\n1,48,11,0\n", "deviation of 0 m"),
         ("a.csv", "time,lat,lon\n123456789012,48,11\n", "times are seconds, or milli"),
         ("a.csv", "", "the first line must name"),
         ("a.srt", "1\n00:00:00,000 --> 00:00:01,000\nHello\n", "no position in it"),
@@ -258,3 +258,147 @@ def test_zeros_and_second_positions_of_a_time_are_left_out(tmp_path: Path) -> No
     fixes = read(tmp_path, "a.csv", "time,lat,lon\n0,0,0\n1,48,11\n1,48,11\n2,48,11\n")
     assert len(fixes) == 2
     assert len(fixes.notes) == 2
+
+
+def rows(fixes: Fixes) -> list[list[float]]:
+    """Latitude, longitude and altitude, -1 if unknown."""
+    return fixes.geodetic.nan_to_num(-1.0).tolist()
+
+
+def test_values_for_unknown_ones_are_left_out_and_counted(tmp_path: Path) -> None:
+    text = (
+        "time,lat,lon,alt,horizontalAccuracy,verticalAccuracy\n0,-180,-180,0,-1,-1\n1,48,11,500,5,4\n"
+        "2,48,11.1,-9999,5,0\n3,48,11.2,7,5,-1\n4,49,12,500,-1,4\n,48,11.3,501,5,3\n6,0.0,0.0,,,\n7,48,11.1,0,0,3\n"
+    )
+    fixes = read(tmp_path, "a.csv", text)
+    assert rows(fixes) == [[48, 11, 500], [48, 11.1, -1], [48, 11.2, -1], [48, 11.1, -1]]
+    assert [row[0] for row in fixes.std.nan_to_num(-1.0).tolist()] == [5, 5, 5, -1]
+    places, times, heights = fixes.notes
+    assert "left out 3 rows without a position: latitude 0 (1 times)" in places
+    assert "left out 1 positions without a time" in times
+    assert "3 altitudes are unknown: -9999 (1 times), 0 (1 times)" in heights
+    late = read(tmp_path, "a.csv", "time,lat,lon\n1970-01-01T00:00:09Z,48,11\n2024-05-01T10:00:00Z,48,11\n")
+    assert len(late) == 1
+
+
+def test_a_side_of_the_equator_is_never_assumed(tmp_path: Path) -> None:
+    text = "time,LATITUDE,N/S,LONGITUDE,E/W\n0,33.9,S,18.4,E\n1,33.9,,18.4,E\n2,-33.9,N,18.4,E\n3,33.8,s,18.4,W\n"
+    fixes = read(tmp_path, "a.csv", text)
+    assert rows(fixes) == [[-33.9, 18.4, -1], [-33.8, -18.4, -1]]
+    assert "left out 2 rows" in fixes.notes[0]
+    assert rows(read(tmp_path, "a.csv", "time,lat,lon\n0,33.9S,18.4E\n")) == [[-33.9, 18.4, -1]]
+    for wrong in ("33.9,4.5E", "33.9S,18.4"):
+        with pytest.raises(MeasurementError, match=r"a.csv:2: column l"):
+            read(tmp_path, "a.csv", f"time,lat,lon\n0,{wrong}\n")
+    no_side = NMEA.replace("4807.038,N", "4807.038,", 1)
+    assert len(read(tmp_path, "a.nmea", with_sums(no_side))) == 1
+
+
+def test_images_without_a_hemisphere_are_left_out(tmp_path: Path) -> None:
+    for index, (north, east) in enumerate([("S", "E"), (None, "E"), ("S", "?"), (b"s\x00", "W\0")]):
+        image = Image.fromarray(np.zeros((8, 8), np.uint8))
+        exif = image.getexif()
+        block = {1: north, 2: (33.0, 30.0, 0.0), 3: east, 4: (18.0, 0.0, 0.0), 5: 1, 6: 20.0}
+        exif.get_ifd(0x8825).update({tag: value for tag, value in block.items() if value is not None})
+        image.save(tmp_path / f"{index}.jpg", exif=exif)
+    fixes = read_fixes(tmp_path)
+    assert (fixes.names, rows(fixes)) == (("0.jpg", "3.jpg"), [[-33.5, 18, -20], [-33.5, -18, -20]])
+    assert "2 images have a position without a hemisphere (GPSLatitudeRef)" in fixes.notes[0]
+    for name in fixes.names:
+        (tmp_path / name).unlink()
+    with pytest.raises(MeasurementError, match=r"no position in it.*without a hemisphere"):
+        read_fixes(tmp_path)
+
+
+def test_the_height_that_moves_with_the_drone_counts(tmp_path: Path) -> None:
+    cue = "{0}\n00:00:0{0},000 --> 00:00:0{0},900\n[latitude: 59.{0}] [longitude: 18,{0}] [rel_alt: {1} abs_alt: {2}]\n"
+    for heights, expected in (
+        ([("1.5", "130.0"), ("2.5", "130.0"), ("3.5", "130.0")], [1.5, 2.5, 3.5]),
+        ([("1.5", "131.5"), ("2.5", "132.5"), ("3.5", "133.5")], [131.5, 132.5, 133.5]),
+        ([("0.0", "131.5"), ("0.0", "132.5"), ("0.0", "133.5")], [131.5, 132.5, 133.5]),
+        ([("1.5", "0.000"), ("1.5", "0.000"), ("1.6", "0.000")], [1.5, 1.5, 1.6]),
+    ):
+        text = "\n".join(cue.format(row, *pair) for row, pair in enumerate(heights))
+        assert read(tmp_path, "a.srt", text).geodetic[:, 2].tolist() == expected
+
+
+@pytest.mark.parametrize(
+    ("text", "place"),
+    [
+        ("[latitude: 59,302335] [longitude: -1.5e-05] [altitude: 3]", [59.302335, -1.5e-5, 3]),
+        ("GPS(-1.5e-05,59.3,16) BAROMETER:-2.5", [59.3, -1.5e-5, -2.5]),
+        ("GPS(18.1,59.3,16)", [59.3, 18.1, -1]),
+        ("GPS (18.1, 59.3, 132.5)", [59.3, 18.1, 132.5]),
+    ],
+)
+def test_numbers_of_subtitles_are_read_whole(tmp_path: Path, text: str, place: list[float]) -> None:
+    assert rows(read(tmp_path, "a.srt", f"1\n00:00:00,000 --> 00:00:01,000\n{text}\n")) == [place]
+
+
+@pytest.mark.parametrize(
+    "text", ["[latitude: 4.5e] [longitude: 1]", "GPS(18,1,59,3,16)", "GPS(W: 1, N: 2, 3)"]
+)
+def test_numbers_of_subtitles_are_refused_with_their_line(tmp_path: Path, text: str) -> None:
+    with pytest.raises(MeasurementError, match=r"a.srt:2: "):
+        read(tmp_path, "a.srt", f"1\n00:00:00,000 --> 00:00:01,000\n{text}\n")
+
+
+def test_points_without_a_time_or_an_altitude(tmp_path: Path) -> None:
+    point = '<trkpt lat="{}" lon="-11.5">{}</trkpt>'
+    time = "<time>2024-05-01T10:00:0{}Z</time>"
+    bodies = (
+        "<time/>",
+        "",
+        "<ele/>" + time.format(2),
+        "<ele>-32768</ele>" + time.format(3),
+        "<ele>5</ele>" + time.format(4),
+    )
+    text = "".join(point.format(f"48.{row}", body) for row, body in enumerate(bodies))
+    text += point.format("", time.format(5)) + point.format("48.6", "<fix>none</fix>" + time.format(6))
+    fixes = read(tmp_path, "a.gpx", f"<gpx>{text}</gpx>")
+    assert rows(fixes) == [[48.2, -11.5, -1], [48.3, -11.5, -1], [48.4, -11.5, 5]]
+    assert "left out 2 rows without a position" in fixes.notes[0]
+    assert "left out 2 positions without a time" in fixes.notes[1]
+
+
+GGA = "$GPGGA,{},4807.038,N,01131.000,E,1,08,0.9,545.4,M,46.9,M,,*%s\n"
+RMC = "$GPRMC,{},A,4807.038,N,01131.000,E,022.4,084.4,{},003.1,W*%s\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "times"),
+    [
+        (
+            ["G235958", "G000001", "R000002 240324", "G000002"],
+            [(23, 23, 59, 58), (24, 0, 0, 1), (24, 0, 0, 2)],
+        ),
+        (["G100000", "R100000 230324", "G100000.5", "G100000", "R100000 260324"], None),
+        (
+            ["G100000", "R100000 230324", "G120000", "G100000.2", "R100000.2 260324"],
+            [(23, 10, 0, 0), (23, 12, 0, 0), (26, 10, 0, 0.2)],
+        ),
+        (["G100000", "Z100000 23,03,2024", "G100001"], [(23, 10, 0, 0), (23, 10, 0, 1)]),
+        (["G100000", "R100000 060180", "G100001", "R100001 230324"], [(23, 10, 0, 0), (23, 10, 0, 1)]),
+    ],
+)
+def test_dates_of_nmea(tmp_path: Path, lines: list[str], times: list[tuple[float, ...]] | None) -> None:
+    """They count backwards, over midnight, and anew after a pause of days."""
+    text = ""
+    for line in lines:
+        clock, _, date = line[1:].partition(" ")
+        zda = f"$GPZDA,{clock},{date},00,00*%s\n"
+        text += {"G": GGA.format(clock), "R": RMC.format(clock, date), "Z": zda}[line[0]]
+    if times is None:  # a clock that is set back within a day
+        times = [(23, 10, 0, 0), (23, 10, 0, 0.5), (26, 10, 0, 0)]
+    found = read(tmp_path, "a.nmea", with_sums(text)).timestamps
+    assert found is not None
+    assert found.tolist() == pytest.approx([utc(2024, 3, *each[:3]) + each[3] for each in times])
+
+
+def test_sentences_of_a_receiver_without_a_fix_are_left_out(tmp_path: Path) -> None:
+    text = GGA.format("100000") + RMC.format("100000", "230324").replace(",A,", ",V,") + GGA.format("100001")
+    assert len(read(tmp_path, "a.nmea", with_sums(text))) == 1
+    for wrong, words in (("246100", "not a time"), ("100000", "not a latitude")):
+        line = GGA.format(wrong).replace("4807", "4890" if wrong == "100000" else "4807")
+        with pytest.raises(MeasurementError, match=rf"a.nmea:1: `.*` is {words}"):
+            read(tmp_path, "a.nmea", with_sums(line))

@@ -36,6 +36,8 @@ def test_boards_have_the_corners_between_their_squares() -> None:
         ("aruco-9x9:0.05", "no family aruco-9x9"),
         ("aruco-4x4:50mm", "no length in meters"),
         ("aruco-4x4:500", "sizes are in meters"),
+        ("apriltag-25h9:80", "sizes are in meters, from 0.001 to 5; 80 mm are 0.08"),
+        ("chessboard-7x5:40", "40 mm are 0.04"),
         ("aruco-4x4:-1", "sizes are in meters"),
         ("aruco-4x4:nan", "sizes are in meters"),
         ("aruco-4x4:0.1,7=0.2,7=0.3", "marker 7 has two sizes"),

@@ -1,4 +1,4 @@
-"""Depth images of a second sensor: files of 16 bits, in folders or lists of several datasets.
+"""Depth images of a second sensor: 16 bits, or floats in meters, in folders or lists of several datasets.
 
 TUM, ETH3D   `depth.txt`, lines of `timestamp file`, 5000 units per meter:
              https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats
@@ -10,24 +10,26 @@ ScanNet, Open3D, RealSense   a folder of images, millimeters
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-import math
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 from torch import Tensor
 
 from torchslam.data.formats.frame_names import MAX_FILES, in_order, times_in_names
-from torchslam.data.formats.image_file import read_pixels
-from torchslam.data.text_file import check_rising, float64, listed_files
-from torchslam.errors import MeasurementError, SequenceError
+from torchslam.data.formats.image_file import AS_STORED, MAX_BYTES, MAX_PIXELS, read_pixels
+from torchslam.data.text_file import check_rising, float64, listed_files, parse_number
+from torchslam.errors import FrameError, MeasurementError, SequenceError
+from torchslam.utils.files import check_regular
 
 DEPTH_LIST = "depth.txt"
-SUFFIXES = frozenset({".png", ".tif", ".tiff", ".pgm"})
-"""Of images that can have 16 bits."""
+FLOATS = frozenset({".tif", ".tiff", ".npy", ".exr", ".pfm"})
+SUFFIXES = FLOATS | {".png", ".pgm"}
+"""Of files that can have floats, and of others that can have 16 bits."""
 SEVEN_SCENES_DEPTH = "frame-*.depth.png"
 BOUNDS_M = 0.05, 200.0
 """Meters that the middle depth of an image may have; beyond, its unit is another one. Sensors see .2 to 20 m, rendered
@@ -61,22 +63,18 @@ def parse_depth_folder(text: str) -> tuple[str, float | None]:
     folder, colon, scale = text.rpartition(":")
     if not colon or Path(text).exists() or not folder or re.search(r"[/\\]", scale):
         return text, None
-    try:
-        units = float(scale)
-    except ValueError:
-        units = math.nan
-    if not 0 < units < math.inf:
-        raise MeasurementError(
-            f"--depth {text}: {scale} is no number of units per meter, such as 1000 for millimeters"
-        )
+    where = f"--depth {text}: {scale} is no number of units per meter, such as 1000 for millimeters"
+    units = parse_number(scale, where, MeasurementError)
+    if units <= 0:
+        raise MeasurementError(where)
     return folder, units
 
 
 def find_depth_images(path: str | Path, units_per_meter: float | None = None) -> DepthImages:
     """The depth images of a list (`depth.txt`), of a folder, or of a dataset whose folder has them.
 
-    Without `units_per_meter`, values are in the unit of the dataset, or millimeters. Raises MeasurementError if there
-    are none, or a list is wrong, naming file and line.
+    Without `units_per_meter`, floats are meters, other values in the unit of the dataset, or millimeters. Raises
+    MeasurementError if there are none, or a list is wrong, naming file and line.
     """
     path = Path(path)
     if not path.exists():
@@ -89,14 +87,15 @@ def find_depth_images(path: str | Path, units_per_meter: float | None = None) ->
         if len(paths) > MAX_FILES:
             raise MeasurementError(f"{found}: more than {MAX_FILES} depth images")
         check_rising(seconds, places, MeasurementError)
-        return DepthImages(found, paths, float64(seconds), units_per_meter or 5000.0)
+        return DepthImages(found, paths, float64(seconds), units_per_meter or _meters(paths[0]) or 5000.0)
     files = _files(path)
     if not files and (path / "depth").is_dir():
         path = path / "depth"
         files = _files(path)
     if not files:
-        raise MeasurementError(f"{path}: no depth images: no {DEPTH_LIST} and no .png, .tif or .pgm")
+        raise MeasurementError(f"{path}: no depth images: no {DEPTH_LIST}, {', '.join(sorted(SUFFIXES))}")
     is_icl = next(path.parent.glob("*.gt.freiburg"), None) is not None
+    units_per_meter = units_per_meter or _meters(files[0])
     is_known = is_icl or files[0].match(SEVEN_SCENES_DEPTH) or units_per_meter is not None
     units = units_per_meter or (5000.0 if is_icl else 1000.0)
     times = times_in_names(files)
@@ -117,16 +116,51 @@ def _files(folder: Path) -> list[Path]:
         raise MeasurementError(str(error)) from None
 
 
+def _meters(path: Path) -> float | None:
+    """1, the units per meter of floats; None for a file of integers, or one that cannot be read."""
+    with contextlib.suppress(FrameError):  # said when it is read
+        if path.suffix.lower() in FLOATS and _values(path).dtype.kind == "f":
+            return 1.0
+    return None
+
+
+def _values(path: Path) -> Shaped[np.ndarray, "H W *channels"]:
+    """The values of a file as they are stored. Raises FrameError if it cannot be read."""
+    if path.suffix.lower() != ".npy":
+        try:
+            return read_pixels(path, str(path), flags=AS_STORED)
+        except FrameError as cause:
+            hint = "depth is read from PNG, TIFF and PGM of 16 bits, and from TIFF, PFM and .npy with floats"
+            if path.suffix.lower() == ".exr":
+                hint += "; from EXR if OpenCV has it, and OPENCV_IO_ENABLE_OPENEXR=1 is set"
+            raise FrameError(f"{cause}; {hint}") from cause
+    try:
+        check_regular(path, MAX_BYTES, "an array that is read")
+        values = np.lib.format.open_memmap(path, mode="r")  # allocates nothing for what a header declares
+    except (OSError, ValueError, OverflowError, SyntaxError, TypeError) as cause:
+        raise FrameError(f"{path}: not an array of NumPy: {cause}") from cause
+    if values.size > MAX_PIXELS:
+        raise FrameError(f"{path}: {values.size} values, more than the {MAX_PIXELS} of an image that is read")
+    return np.array(values[..., 0] if values.shape[2:] == (1,) else values)
+
+
 def read_depth(path: Path, units_per_meter: float) -> Float[np.ndarray, "H W"]:
     """Depth along the optical axis in meters, float32; 0 where it was not measured.
 
-    Raises FrameError if the file cannot be read, MeasurementError if it has no 16 bits, or another unit.
+    Raises FrameError if the file cannot be read, MeasurementError if it has another type, shape or unit.
     """
-    values = read_pixels(path, str(path), as_stored=True)
-    if values.dtype != np.uint16 or values.ndim != 2:
-        raise MeasurementError(f"{path}: not of 16 bits: no depth image with numbers per meter")
-    # Like 0, the largest value marks pixels without a measurement.
-    depth = np.where(values == 65535, 0, values).astype(np.float32) / np.float32(units_per_meter)
+    values = _values(path)
+    is_whole = values.dtype.kind in "iu" and values.dtype.itemsize > 1
+    if not is_whole and values.dtype.kind != "f":
+        raise MeasurementError(f"{path}: {values.dtype}, not of 16 bits or floats: no depth image")
+    if values.ndim != 2:
+        raise MeasurementError(f"{path}: an array {values.shape}, not one depth for each pixel")
+    largest = (
+        np.iinfo(values.dtype).max if is_whole else 1e4 * units_per_meter
+    )  # renderers write more for the sky
+    # Like 0, the largest values, NaN and negative ones mark pixels without a measurement.
+    depth = np.where((values > 0) & (values < largest), values, 0).astype(np.float32)
+    depth /= np.float32(units_per_meter)
     known = depth[depth > 0]
     if known.size and not BOUNDS_M[0] < (middle := float(np.median(known))) < BOUNDS_M[1]:
         raise MeasurementError(

@@ -6,145 +6,21 @@ import math
 import operator
 import os
 import re
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from functools import reduce
+from collections.abc import Iterator
+from functools import partial, reduce
 from pathlib import Path
-from typing import NamedTuple
 from xml.etree import ElementTree
 
-from jaxtyping import Float
-from torch import Tensor
+import numpy as np
 
+from torchslam.data.fields import POSITION_COLUMNS
+from torchslam.data.fixes import NUMBERS, Fix, Fixes, checked_fixes, signed_degrees
 from torchslam.data.formats.frame_names import find_frames
 from torchslam.data.formats.image_file import SUFFIXES, exif_block
 from torchslam.data.formats.vehicle_files import oxts_folder, read_oxts
-from torchslam.data.text_file import (
-    MAX_LINE,
-    TIMES,
-    Column,
-    float64,
-    parse_moment,
-    parse_number,
-    read_table,
-    read_text,
-)
+from torchslam.data.tables import read_table
+from torchslam.data.text_file import CLOCK_SET, MAX_LINE, parse_known, parse_moment, read_text
 from torchslam.errors import FrameError, MeasurementError
-
-LATITUDE, LONGITUDE, ALTITUDE = 2, 4, 6
-"""Tags in that block; the hemisphere, or whether it is below the sea, is the tag before each."""
-DEGREES, METERS = {"deg": 1.0, "degrees": 1.0, "°": 1.0}, {"m": 1.0, "meters": 1.0}
-"""Units that headings may state."""
-COLUMNS = {
-    **TIMES,
-    "name": Column(("name", "image", "filename", "file")),
-    "latitude": Column(("latitude", "lat"), DEGREES),
-    "longitude": Column(("longitude", "lon", "lng"), DEGREES),
-    "altitude": Column(("altitude", "alt", "elevation", "ele"), METERS),
-    "std_horizontal": Column(("stdhorizontal",), METERS),
-    "std_vertical": Column(("stdvertical",), METERS),
-}
-MAX_FIXES = 1_000_000  # maximum number of positions of a file: more than a day at 10 Hz
-
-
-class Fix(NamedTuple):
-    """One position as a file has it, at a file and line, of a time in seconds or of the name of an image.
-
-    Attributes:
-        latitude, longitude: degrees; NaN where the receiver had no position.
-        altitude: meters, above the sea or the ellipsoid or the start; NaN if unknown.
-        std: standard deviations, horizontal along one axis and vertical, meters; NaN if unknown.
-    """
-
-    where: str
-    latitude: float
-    longitude: float
-    altitude: float = math.nan
-    time: float | None = None
-    name: str = ""
-    std: tuple[float, float] = (math.nan, math.nan)
-
-
-@dataclass(frozen=True)
-class Fixes:
-    """N positions, each at a time, seconds, increasing, on the clock of the file, or of an image of some name.
-
-    Attributes:
-        geodetic: latitude, longitude and altitude, as in `Fix`.
-        std: as in `Fix`.
-        notes: remarks for the user, one line each.
-    """
-
-    path: Path
-    geodetic: Float[Tensor, "N 3"]
-    std: Float[Tensor, "N 2"]
-    timestamps: Float[Tensor, " N"] | None = None
-    names: tuple[str, ...] = ()
-    notes: tuple[str, ...] = ()
-
-    def __len__(self) -> int:
-        return len(self.geodetic)
-
-
-def checked_fixes(path: str | Path, rows: Iterable[Fix], notes: Sequence[str] = ()) -> Fixes:
-    """The positions of a file in the order of time, without those that the receiver did not have.
-
-    Rows without a position (empty, NaN or the zeros that receivers write) and second ones of one time are left out,
-    with a note. Raises MeasurementError for coordinates or errors that cannot be, times out of order, and where nothing
-    is left.
-    """
-    kept: list[Fix] = []
-    empty = doubled = 0
-    for count, row in enumerate(rows):
-        if count >= MAX_FIXES:
-            raise MeasurementError(f"{path}: more than the {MAX_FIXES} positions that are read")
-        if math.isnan(row.latitude) or math.isnan(row.longitude) or row.latitude == row.longitude == 0:
-            empty += 1
-            continue
-        _check(row)
-        before = kept[-1].time if kept else None
-        if row.time is not None and before is not None and row.time < before:
-            raise MeasurementError(
-                f"{row.where}: the time {row.time!r} is earlier than the one before, {before!r}: "
-                "sort the file by its times"
-            )
-        if row.time is not None and row.time == before:
-            doubled += 1
-            continue
-        kept.append(row)
-    if not kept:
-        raise MeasurementError(f"{path}: no position in it" + (f"; {empty} rows are empty" if empty else ""))
-    said = [*notes]
-    if empty:
-        said.append(f"{path}: left out {empty} rows without a position")
-    if doubled:
-        said.append(f"{path}: skipped {doubled} positions with a duplicate time")
-    times = [row.time for row in kept if row.time is not None]
-    return Fixes(
-        Path(path),
-        float64([row[1:4] for row in kept]),
-        float64([row.std for row in kept]),
-        float64(times) if times else None,
-        () if times else tuple(row.name for row in kept),
-        tuple(said),
-    )
-
-
-def _check(row: Fix) -> None:
-    """Raise MeasurementError for a position that is none of the Earth's, or an error that is none."""
-    what = ""
-    if not abs(row.latitude) <= 90:
-        hint = ": are latitude and longitude swapped?" if abs(row.longitude) <= 90 else ""
-        what = f"a latitude of {row.latitude:g} degrees is beyond the poles{hint}"
-    elif not abs(row.longitude) <= 360:
-        what = f"a longitude of {row.longitude:g} degrees is beyond 180"
-    elif abs(row.altitude) > 1e5:  # NaN is not; balloons and rockets of amateurs stay below
-        what = f"an altitude of {row.altitude:g} is no altitude in meters above the ground of the Earth"
-    for std in row.std:
-        if not (math.isnan(std) or 0 < std < math.inf):
-            what = what or f"a standard deviation of {std:g} m is not above zero"
-    if what:
-        raise MeasurementError(f"{row.where}: {what}")
 
 
 def read_fixes(path: str | Path) -> Fixes:
@@ -157,14 +33,10 @@ def read_fixes(path: str | Path) -> Fixes:
         oxts = oxts_folder(path)
         return read_image_fixes(path) if oxts is None else checked_fixes(path, _oxts_rows(oxts))
     suffix = path.suffix.lower()
-    if suffix == ".srt":
-        return checked_fixes(path, _srt_rows(path))
-    if suffix == ".gpx":
-        return checked_fixes(path, _gpx_rows(path))
+    if suffix in (".srt", ".gpx"):
+        return checked_fixes(path, _srt_rows(path) if suffix == ".srt" else _gpx_rows(path))
     if suffix in SUFFIXES:
-        raise MeasurementError(
-            f"{path}: one image; give the folder of all whose EXIF blocks have the positions"
-        )
+        raise MeasurementError(f"{path}: one image; give the folder of all, whose EXIF has the positions")
     text = read_text(path, MeasurementError)
     if suffix == ".nmea" or text.lstrip().startswith(("$G", "$B")):
         return _read_nmea(path, text)
@@ -172,46 +44,59 @@ def read_fixes(path: str | Path) -> Fixes:
 
 
 def _csv_rows(path: Path) -> Iterator[Fix]:
-    for row in read_table(path, COLUMNS, MeasurementError):
+    for row in read_table(path, POSITION_COLUMNS, MeasurementError):
         moment = row.time()
         if moment is None and "name" not in row.cells:
             raise MeasurementError(f"{row.where}: neither a `time` nor the `name` of an image")
-        if "latitude" not in row.cells and "longitude" not in row.cells and "altitude" in row.cells:
+        if "latitude" not in row.units and "longitude" not in row.units and "altitude" in row.units:
             raise MeasurementError(f"{row.where}: no `latitude` and `longitude`, in degrees")
-        yield Fix(
-            row.where,
-            row.number("latitude"),
-            row.number("longitude"),
-            row.number("altitude"),
-            moment,
-            row.cells.get("name", ""),
-            (row.number("std_horizontal"), row.number("std_vertical")),
+        texts = [row.cells.get(name, "") for name in NUMBERS[:2]]
+        sides = [row.cells.get(side, "") if side in row.units else None for side in ("north", "east")]
+        if texts[0][-1:] in ("N", "S") and texts[1][-1:] in ("E", "W"):  # E alone may be that of an exponent
+            texts, sides = [text[:-1] for text in texts], [text[-1] for text in texts]
+        latitude, longitude = (
+            degrees if side is None else signed_degrees(degrees, side, letters)
+            for degrees, side, letters in zip(
+                map(row.number, NUMBERS, texts), sides, ("NS", "EW"), strict=True
+            )
         )
+        std = row.number("std_horizontal"), row.number("std_vertical")
+        name, altitude = row.cells.get("name", ""), row.number("altitude")
+        yield Fix(row.where, latitude, longitude, altitude, moment, name, std)
 
 
-_NUMBER = r"([-+]?\d{1,9}(?:\.\d{1,12})?)"
-BRACKETS = [
-    re.compile(rf"\b{word}\s*:\s*{_NUMBER}")  # some models write `longtitude`
-    for word in ("latitude", "longt?itude", "abs_alt", "altitude", "rel_alt")
-]
-"""`[latitude: 59.30] [longitude: 18.20] [rel_alt: 1.3 abs_alt: 132.9]`, altitudes in the order in which they count."""
-TUPLE = re.compile(rf"\bGPS\s*\(\s*{_NUMBER}\s*,\s*{_NUMBER}\s*(?:,\s*{_NUMBER}\s*(M)?\s*)?\)")
+_TOKEN = r"[ \t]*([^\s\[\]();]+?)[mM]?,?(?=[\s\[\]();]|$)"
+BRACKETS = [re.compile(rf"\b{word}[ \t]*:{_TOKEN}") for word in ("[Ll]atitude", "[Ll]ongt?itude")]
+"""`[latitude: 59.30] [longitude: 18.20] [rel_alt: 1.3 abs_alt: 132.9]`; some models write `longtitude`."""
+TUPLE = re.compile(r"\bGPS[ \t]*\(([^)]*)\)")
 """`GPS(longitude,latitude,satellites or altitude)`; the Matrice's has latitude first and its altitude ends with M."""
-HEIGHT = re.compile(rf"\b(?:BAROMETER\s*:|H\s)\s*{_NUMBER}")  # height over the start in those lines
+HEIGHTS = [
+    re.compile(rf"\b{word}{_TOKEN}")
+    for word in ("abs_alt[ \t]*:", "altitude[ \t]*:", "rel_alt[ \t]*:", "BAROMETER[ \t]*:", "H[ \t]")
+]
+"""In the order in which they count if they move with the drone; the last ones are over the start."""
+MOST_SATELLITES = 60.0  # that a receiver may count; a whole number below in place of an altitude is one
 
 
 def _srt_rows(path: Path) -> Iterator[Fix]:
     """A position for each cue in which it is another one, at its beginning, on the clock of the video.
 
-    A receiver has 1 to 10 positions a second, and each is repeated in the cues of all frames until the next.
+    A receiver has 1 to 10 positions a second, and each is repeated in the cues of all frames until the next. Of several
+    heights that one counts which changes most often.
     """
-    before: tuple[float, ...] = ()
-    for where, time, text in _cues(path):
-        found = _srt_position(text)
-        if found is None or found == before:
-            continue
-        before = found
-        yield Fix(where, *found, time=time)
+    cues = [
+        (where, time, *found) for where, time, text in _cues(path) if (found := _srt_position(text, where))
+    ]
+    known = POSITION_COLUMNS["altitude"].known
+    columns = [known(column)[0] for column in zip(*(cue[4] for cue in cues), strict=True)]
+    changes = [len(np.unique(column[~np.isnan(column)])) - 1 for column in columns]
+    best = next((row for row, count in enumerate(changes) if count >= max(changes) / 2 and count >= 0), 0)
+    before: tuple[float, float, float] | None = None
+    for where, time, latitude, longitude, heights in cues:
+        place = latitude, longitude, heights[best]
+        if place != before:
+            yield Fix(where, *place, time=time)
+        before = place
 
 
 def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
@@ -237,20 +122,25 @@ def _cues(path: Path) -> Iterator[tuple[str, float, str]]:
         yield where, begin, text
 
 
-def _srt_position(text: str) -> tuple[float, float, float] | None:
-    """Latitude, longitude and altitude of a cue; None where it has none."""
-    matches = (pattern.search(text) for pattern in BRACKETS)
-    latitude, longitude, *altitudes = (None if match is None else float(match[1]) for match in matches)
+def _srt_position(text: str, where: str) -> tuple[float, float, list[float]] | None:
+    """Latitude, longitude and all heights of a cue, NaN for unknown ones; None where it has no position."""
+
+    number = partial(parse_known, where=where, error=MeasurementError)
+    heights = [number(match[1]) if (match := each.search(text)) else math.nan for each in HEIGHTS]
+    latitude, longitude = (each.search(text) for each in BRACKETS)
     if latitude is not None and longitude is not None:
-        return latitude, longitude, next((each for each in altitudes if each is not None), math.nan)
+        return number(latitude[1]), number(longitude[1]), [*heights, math.nan]
     found = TUPLE.search(text)
     if found is None:
         return None
-    first, second = float(found[1]), float(found[2])
-    height = HEIGHT.search(text)
-    if found[4]:
-        return first, second, float(found[3])
-    return second, first, float(height[1]) if height else float(found[3] or "nan")
+    words = [word.strip() for word in found[1].split(",")]
+    if len(words) not in (2, 3):
+        raise MeasurementError(f"{where}: `{found[0][:100]}` is not GPS(longitude,latitude,altitude)")
+    first, second, third = (number(word.rstrip("mM")) for word in (*words, "")[:3])
+    if words[-1][-1:] in ("M", "m"):
+        return first, second, [*heights, third]
+    is_height = "." in words[-1] or third > MOST_SATELLITES
+    return second, first, [*heights, third if is_height else math.nan]
 
 
 def _gpx_rows(path: Path) -> Iterator[Fix]:
@@ -268,73 +158,100 @@ def _gpx_rows(path: Path) -> Iterator[Fix]:
         raise MeasurementError(
             f"{path}: no points of a track (trkpt) in it; routes and waypoints have no times"
         )
-    for number, point in enumerate(points, start=1):
+    moments = [parse_moment(point.findtext("{*}time") or "") for point in points]
+    if all(moment is None for moment in moments):
+        raise MeasurementError(f"{path}: point 1: no time, as of all; a planned route cannot be used")
+    for number, (point, moment) in enumerate(zip(points, moments, strict=True), start=1):
         where = f"{path}: point {number}"
-        children = {child.tag.rpartition("}")[2]: (child.text or "").strip() for child in point}
-        time = parse_moment(children.get("time", ""))
-        if time is None:
-            raise MeasurementError(f"{where}: no time; a planned route cannot be used")
+        each = {child.tag.rpartition("}")[2]: child.text or "" for child in point} | point.attrib
+        is_void = each.get("fix", "").strip() == "none"
         latitude, longitude, altitude = (
-            math.nan if text == "nan" else parse_number(text, where, MeasurementError)
-            for text in (point.get("lat", ""), point.get("lon", ""), children.get("ele", "nan"))
+            math.nan if is_void else parse_known(each.get(name, ""), f"{where}: {name}", MeasurementError)
+            for name in ("lat", "lon", "ele")
         )
-        yield Fix(where, latitude, longitude, altitude, time=time)
+        yield Fix(where, latitude, longitude, altitude, math.nan if moment is None else moment)
+
+
+SENTENCES = {"GGA": 10, "RMC": 10, "ZDA": 5}
+"""Of NMEA 0183, with the fewest fields: positions with altitudes, positions with dates, dates alone."""
+HALF_DAY = 43200.0  # seconds by which a clock is set back at midnight at least, and never otherwise
 
 
 def _read_nmea(path: Path, text: str) -> Fixes:
-    """GGA, which has the altitude, with the date of the RMC of the same time. Source: NMEA 0183.
+    """GGA, which has the altitude, or else RMC, with the date of the RMC or ZDA before, or of the first one.
 
-    Without RMC the times are seconds since midnight, UTC. Lines with a wrong checksum are skipped, with a note.
+    Without a date the times are seconds since midnight, UTC. Lines with a wrong checksum are skipped, with a note.
+    Source: NMEA 0183.
     """
-    rows: dict[str, list[tuple[str, list[str]]]] = {"GGA": [], "RMC": []}
+    rows: list[tuple[str, float, list[str]]] = []
     damaged = 0
     for number, line in enumerate(text.split("\n"), start=1):
-        line = line.strip()
-        if not line.startswith("$") or line[3:6] not in rows:
-            continue
-        body, star, given = line[1:].partition("*")
-        if star and given[:2].upper() != f"{reduce(operator.xor, body.encode()):02X}":
+        body, star, given = line.strip()[1:].partition("*")
+        fields = [field.strip() for field in body.split(",")]
+        kind = fields[0][2:]
+        if line.lstrip()[:1] != "$" or len(fields) < SENTENCES.get(kind, math.inf) or not fields[1]:
+            continue  # another one, or no fix yet, without a time
+        if star and given[:2].upper() != f"{reduce(operator.xor, body.encode(), 0):02X}":
             damaged += 1
             continue
-        rows[line[3:6]].append((f"{path}:{number}", body.split(",")))
+        clock = re.fullmatch(r"([01]\d|2[0-3])([0-5]\d)([0-5]\d|60)(\.\d{1,9})?", fields[1], re.ASCII)
+        if clock is None:
+            raise MeasurementError(f"{path}:{number}: `{fields[1][:100]}` is not a time of NMEA")
+        hours, minutes, seconds, parts = clock.groups()
+        time = int(hours) * 3600 + int(minutes) * 60 + int(seconds) + float(parts or 0)
+        rows.append((f"{path}:{number}", time, [kind, *fields[1:]]))
     notes = [f"{path}: skipped {damaged} lines with a wrong checksum"] if damaged else []
-    dates = {fields[1]: fields[9] for _, fields in rows["RMC"] if len(fields) > 9}
-    return checked_fixes(path, _nmea_rows(rows["GGA"] or rows["RMC"], dates), notes)
+    return checked_fixes(path, _nmea_rows(rows), notes)
 
 
-def _nmea_rows(rows: list[tuple[str, list[str]]], dates: dict[str, str]) -> Iterator[Fix]:
-    midnight, last = 0.0, -math.inf
-    for where, fields in rows:
-        if len(fields) < 10 or not re.fullmatch(r"\d{6}(\.\d{1,9})?", fields[1]):
-            continue  # no fix yet, without a time
-        clock = int(fields[1][:2]) * 3600 + int(fields[1][2:4]) * 60 + float(fields[1][4:])
-        date = dates.get(fields[1], "")
-        if re.fullmatch(r"\d{6}", date):
-            moment = parse_moment(f"20{date[4:]}-{date[2:4]}-{date[:2]}")
-            if moment is None:
-                raise MeasurementError(f"{where}: `{date}` is not a date")
-            midnight = moment
-        elif midnight + clock < last:  # past midnight
-            midnight += 86400.0
-        last = midnight + clock
-        is_gga = fields[0].endswith("GGA")
-        latitude = longitude = altitude = math.nan
-        if fields[6] not in ("", "0") if is_gga else fields[2] == "A":
-            at = 2 if is_gga else 3
+def _nmea_rows(rows: list[tuple[str, float, list[str]]]) -> Iterator[Fix]:
+    days, void, dates, doubtful = list[float](), set[int](), dict[int, float](), dict[int, float]()
+    epochs = list[int]()  # of sentences that follow each other and have one time
+    for where, clock, fields in rows:
+        before = rows[len(epochs) - 1][1] if epochs else clock
+        epochs.append(epochs[-1] + (clock != before) if epochs else 0)
+        if clock != before or not days:
+            days.append((days[-1] if days else 0.0) + 2 * HALF_DAY * (clock < before - HALF_DAY))
+        is_void = fields[0] == "RMC" and fields[2] != "A"
+        void |= {epochs[-1]} if is_void else set()
+        if (date := _nmea_date(fields, where)) is not None:
+            (doubtful if is_void else dates)[epochs[-1]] = date - days[-1]
+    dates = dates or doubtful
+    start = next(iter(dates.values()), 0.0)
+    kind = "GGA" if any(fields[0] == "GGA" for _, _, fields in rows) else "RMC"
+    for epoch, (where, clock, fields) in zip(epochs, rows, strict=True):
+        start = dates.get(epoch, start)
+        if fields[0] != kind:
+            continue
+        at, latitude, longitude = (2 if kind == "GGA" else 3), math.nan, math.nan
+        if epoch not in void and (kind == "RMC" or fields[6] not in ("", "0")):
             latitude = _degrees(fields[at], fields[at + 1], "NS", where)
             longitude = _degrees(fields[at + 2], fields[at + 3], "EW", where)
-        if is_gga and fields[9]:
-            altitude = parse_number(fields[9], where, MeasurementError)
-        yield Fix(where, latitude, longitude, altitude, time=last)
+        altitude = parse_known(fields[9], where, MeasurementError) if kind == "GGA" else math.nan
+        yield Fix(where, latitude, longitude, altitude, start + days[epoch] + clock)
 
 
-def _degrees(text: str, hemisphere: str, expected: str, where: str) -> float:
-    """Degrees of `4807.038` and `N`: 48 degrees, 7.038 minutes."""
-    found = re.fullmatch(r"(\d{1,3})(\d\d(?:\.\d{1,12})?)", text)
-    if found is None or hemisphere not in tuple(expected):
+def _nmea_date(fields: list[str], where: str) -> float | None:
+    """Midnight of the date of an RMC or ZDA, seconds since 1970; None without one."""
+    text = "".join(fields[2:5]) if fields[0] == "ZDA" else fields[9] if fields[0] == "RMC" else ""
+    if not text.strip("0"):
+        return None
+    found = re.fullmatch(r"(\d\d)(\d\d)(\d\d|\d{4})", text, re.ASCII)
+    century = "" if len(text) == 8 else "19" if text[4:] >= "80" else "20"
+    moment = None if found is None else parse_moment(f"{century}{found[3]}-{found[2]}-{found[1]}")
+    if moment is None:
+        raise MeasurementError(f"{where}: `{text[:100]}` is not a date")
+    return moment if moment >= CLOCK_SET else None
+
+
+def _degrees(text: str, hemisphere: str, letters: str, where: str) -> float:
+    """Degrees of `4807.038` and `N`: 48 degrees, 7.038 minutes; NaN where one of both is missing."""
+    number = parse_known(text, where, MeasurementError)
+    whole, minutes = divmod(number, 100)
+    is_right = math.isnan(number) or (re.match(r"\d{3}", text) and minutes < 60)
+    if not is_right or hemisphere not in ("", *letters):
         raise MeasurementError(f"{where}: `{text},{hemisphere}` is not a latitude or longitude of NMEA")
-    degrees = int(found[1]) + float(found[2]) / 60
-    return degrees if hemisphere == expected[0] else -degrees
+    return signed_degrees(whole + minutes / 60, hemisphere, letters)
 
 
 def read_image_fixes(folder: Path) -> Fixes:
@@ -348,41 +265,43 @@ def read_image_fixes(folder: Path) -> Fixes:
             f"{folder}: neither images nor oxts/ of KITTI in it; positions are read from .srt, .gpx, .nmea and .csv"
         )
     found = [row for row in map(_image_fix, images) if row is not None]
-    if not found:
-        raise MeasurementError(f"{folder}: no image of {len(images)} has a position in its EXIF block")
-    missing = len(images) - len(found)
-    return checked_fixes(folder, found, [f"{folder}: {missing} images have no position"] if missing else [])
+    missing, incomplete = (
+        len(images) - len(found),
+        sum(math.isnan(row.latitude * row.longitude) for row in found),
+    )
+    notes = [f"{folder}: {missing} images have no position"] if missing else []
+    if incomplete:
+        notes.append(f"{folder}: {incomplete} images have a position without a hemisphere (GPSLatitudeRef)")
+    if missing == len(images):
+        raise MeasurementError(f"{folder}: no image of {missing} has a position in its EXIF block")
+    return checked_fixes(folder, found, notes)
 
 
 def _image_fix(path: Path) -> Fix | None:
     try:
-        block = exif_block(path, 0x8825)  # of the position, EXIF 2.32
-        if LATITUDE not in block or LONGITUDE not in block:
+        block = exif_block(path, 0x8825)  # of the position, by the tags of EXIF 2.32
+        if 2 not in block or 4 not in block:
             return None
+        sides = ((block[tag], str(block.get(tag - 1, ""))) for tag in (2, 4))
         latitude, longitude = (
-            _exif_degrees(block[tag], block.get(tag - 1, "")) for tag in (LATITUDE, LONGITUDE)
+            signed_degrees(sum(float(part) / 60**power for power, part in enumerate(parts)), side, letters)
+            for (parts, side), letters in zip(sides, ("NS", "EW"), strict=True)
         )
-        below = block.get(ALTITUDE - 1, 0) in (1, b"\x01")
-        altitude = float(block.get(ALTITUDE, math.nan)) * (-1 if below else 1)
+        below = block.get(5, 0) in (1, b"\x01", 3, b"\x03")  # 3 in EXIF 3.0, above sea level
+        altitude = float(block.get(6, math.nan)) * (-1 if below else 1)
         error = float(block.get(31, math.nan))  # horizontal, meters
     except FrameError as cause:
         raise MeasurementError(str(cause)) from cause
     except Exception as cause:  # values of a damaged block have any type
         raise MeasurementError(f"{path}: its EXIF block cannot be read: {cause}") from cause
-    std = error if error > 0 else math.nan, math.nan
-    return Fix(str(path), latitude, longitude, altitude, name=path.name, std=std)
-
-
-def _exif_degrees(parts: tuple[float, ...], hemisphere: str) -> float:
-    """Degrees of degrees, minutes and seconds."""
-    degrees = sum(float(part) / 60**power for power, part in enumerate(parts))
-    return -degrees if str(hemisphere).strip("\0 ").upper() in ("S", "W") else degrees
+    return Fix(str(path), latitude, longitude, altitude, name=path.name, std=(error, math.nan))
 
 
 def _oxts_rows(folder: Path) -> Iterator[Fix]:
     """On the clock of KITTI's raw images, with the accuracy that the receiver states."""
     for packet in read_oxts(folder):
-        accuracy = packet.numbers[23:24]  # `pos_accuracy` (dataformat.txt)
-        std = accuracy[0] if accuracy and accuracy[0] > 0 else math.nan
+        std = (
+            abs(packet.numbers[23]) if len(packet.numbers) > 23 else math.nan
+        )  # `pos_accuracy` (dataformat.txt)
         latitude, longitude, altitude = packet.numbers[:3]
         yield Fix(packet.where, latitude, longitude, altitude, packet.time, std=(std, std))

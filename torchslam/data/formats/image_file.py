@@ -6,6 +6,7 @@ Plain PNG files are decoded two to four times faster than by OpenCV, to the same
 from __future__ import annotations
 
 import io
+import struct
 import warnings
 import zlib
 from collections.abc import Iterable, Iterator
@@ -31,6 +32,8 @@ FOREIGN = frozenset(
 """Suffixes of images that are not read."""
 AS_GRAY = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
 AS_COLOR = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH
+AS_STORED = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
+"""Channels and numbers of the file, floats too."""
 MAX_BYTES = 1 << 29  # size limit of image files
 MAX_PIXELS = 1 << 26  # maximum number of pixels; a small file may declare any number
 
@@ -73,7 +76,10 @@ def read_color(
 def read_pixels(
     path: str | Path, where: str, as_stored: bool = False, flags: int = AS_GRAY
 ) -> Shaped[np.ndarray, "H W *channels"]:
-    """An image file as gray, or as OpenCV's flags say, uint8 or uint16. Raises FrameError as `read_gray`."""
+    """An image file as gray, or as OpenCV's flags say, uint8, uint16, or with AS_STORED floats.
+
+    Raises FrameError as `read_gray`.
+    """
     try:
         data = read_bytes(path, MAX_BYTES, "an image that is read")
     except OSError as cause:
@@ -125,8 +131,10 @@ def exif_block(path: Path, block: int) -> dict[int, Any]:
 
 
 def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
-    """An image file's bytes as (H, W) gray, uint8 or uint16, or as OpenCV's flags say; None for anything that is not a
-    whole image."""
+    """An image file's bytes as (H, W) gray, or as OpenCV's flags say, uint8, uint16, or with AS_STORED floats.
+
+    None for anything that is not a whole image.
+    """
     if not data or not _has_whole_chunks(data) or _declared_pixels(data) > MAX_PIXELS:
         return None
     if flags & ~cv2.IMREAD_IGNORE_ORIENTATION == AS_GRAY and (gray := decode_png_gray(data)) is not None:
@@ -135,7 +143,8 @@ def decode_pixels(data: bytes, flags: int = AS_GRAY) -> np.ndarray | None:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except (cv2.error, MemoryError):  # a header that promises more pixels than OpenCV takes
         return None
-    return image if image is not None and image.dtype in (np.uint8, np.uint16) else None
+    kinds = (np.uint8, np.uint16, *((np.float32, np.float64) if flags == AS_STORED else ()))
+    return image if image is not None and image.dtype in kinds else None
 
 
 SAMPLES = 20  # number of images in which the brightest pixel of a 16-bit sequence is searched
@@ -169,6 +178,10 @@ def _declared_pixels(data: bytes) -> int:
     """Return the number of pixels that a header declares; more than the limit if it cannot be read."""
     if data.startswith((b"II*\0", b"MM\0*")):
         return _tiff_pixels(data)
+    if data.startswith(b"v/1\x01"):  # OpenEXR: the window is two corners, which belong to it
+        window = data.partition(b"dataWindow\0box2i\0\x10\0\0\0")[2][:16].ljust(16, b"\0")
+        left, top, right, bottom = struct.unpack("<4i", window)
+        return (right - left + 1) * (bottom - top + 1) if right > left and bottom > top else MAX_PIXELS + 1
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large images: these have their limit

@@ -162,8 +162,14 @@ class Keys:
         return _numbers(value, f"{self.source}: {name}")
 
     def number(self, *keys: str) -> float | None:
-        """The first number of a key. Raises CalibrationError for anything else."""
-        return next(iter(self.numbers(*keys)), None)
+        """The first number of a key, or of a list. Raises CalibrationError for anything else, such as `517,3`."""
+        name, value = self._found(keys)
+        numbers = _numbers(value, f"{self.source}: {name}")
+        if isinstance(value, str) and len(numbers) > 1:
+            raise CalibrationError(
+                f"{self.source}: {name}: `{value[:40]}` is not one number; write a decimal point"
+            )
+        return next(iter(numbers), None)
 
     def unused(self, pattern: re.Pattern[str]) -> str | None:
         """The first key, as it is written, that fits a pattern, was not asked for and is neither empty nor zeros."""

@@ -5,30 +5,26 @@ Source of the packets: dataformat.txt of the development kit of https://www.cvli
 
 from __future__ import annotations
 
-import datetime
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from jaxtyping import Float
 from torch import Tensor
 
+from torchslam.data.fields import SPEED
+from torchslam.data.tables import TIMES, read_table
 from torchslam.data.text_file import (
-    TIMES,
-    Column,
     check_rising,
     float64,
-    in_seconds,
-    number_rows,
     numbered_lines,
     parse_floats,
-    read_table,
+    parse_moment,
+    with_set_clock,
 )
 from torchslam.errors import MeasurementError, TorchslamError, TrajectoryError
-
-SPEED = Column(("speed", "velocity"), {"ms": 1.0, "mps": 1.0, "kmh": 1 / 3.6, "kph": 1 / 3.6})  # m/s
 
 
 class Packet(NamedTuple):
@@ -68,18 +64,13 @@ def read_oxts(folder: Path) -> list[Packet]:
 
 def read_day_times(path: Path, error: type[TorchslamError]) -> list[float]:
     """Lines `2011-09-26 13:02:25.964389445`, as seconds since the beginning of the first one's day."""
-    times: list[float] = []
-    midnight: datetime.datetime | None = None
+    times, midnight = list[float](), 0.0
     for where, line in numbered_lines(path, error):
         found = re.fullmatch(r"(\d{4}-\d\d-\d\d \d\d:\d\d:\d\d)(\.\d{1,9})?", line)
-        try:
-            moment = datetime.datetime.fromisoformat(found[1]) if found else None
-        except ValueError:
-            moment = None
-        if found is None or moment is None:
+        if found is None or (moment := parse_moment(found[1])) is None:
             raise error(f"{where}: expected `2011-09-26 13:02:25.964389445`, got `{line}`")
-        midnight = midnight or moment.replace(hour=0, minute=0, second=0)
-        times.append((moment - midnight).total_seconds() + float(found[2] or 0))
+        midnight = midnight if times else moment - moment % 86400
+        times.append(moment - midnight + float(found[2] or 0))
     return times
 
 
@@ -87,42 +78,41 @@ def read_day_times(path: Path, error: type[TorchslamError]) -> list[float]:
 class Speeds:
     """N speeds of a vehicle, meters per second along the path, without the sign of one that backs up.
 
-    Times are seconds, increasing, on the clock of the file.
+    Times are seconds, increasing, on the clock of the file; `notes` are for the user, one line each.
     """
 
     path: Path
     timestamps: Float[Tensor, " N"]
     speeds: Float[Tensor, " N"]
+    notes: tuple[str, ...] = ()
 
 
 def read_speeds(path: str | Path) -> Speeds:
-    """A table with the columns `time` and `speed`, or two numbers a line without a header.
+    """A table with the columns `time` and `speed`, or two numbers a line without a header; without unknown speeds.
 
     Raises MeasurementError naming file and line.
     """
     path = Path(path)
-    rows = list(_speed_rows(path))
-    if len(rows) < 2:
-        raise MeasurementError(f"{path}: {len(rows)} speeds, two are needed")
-    places, times, speeds = zip(*rows, strict=True)
-    for where, speed in zip(places, speeds, strict=True):
-        if not abs(speed) <= 1000:  # airplanes fly at 250
-            raise MeasurementError(f"{where}: {speed:g} is no speed in meters per second")
-    check_rising(times, places, MeasurementError)
-    return Speeds(path, float64(times), float64(speeds).abs())
-
-
-def _speed_rows(path: Path) -> Iterator[tuple[str, float, float]]:
-    """Place, time in seconds and speed of each line."""
-    _, line = next(numbered_lines(path, MeasurementError), ("", ""))
-    if not any(character.isalpha() for character in line.lower().replace("e", "")):
-        for where, (time, speed) in number_rows(path, "time speed", MeasurementError):
-            yield where, in_seconds(time, where, MeasurementError), speed
-        return
-    for row in read_table(path, TIMES | {"speed": SPEED}, MeasurementError):
+    places, rows = list[str](), list[tuple[float, float]]()
+    for row in read_table(path, TIMES | {"speed": SPEED}, MeasurementError, unnamed=("time", "speed")):
         moment = row.time()
-        if moment is None or "speed" not in row.cells:
+        if moment is None or "speed" not in row.units:
             raise MeasurementError(
                 f"{row.where}: no `time` or no `speed`, in meters per second (or `speed_km_h`)"
             )
-        yield row.where, moment, row.number("speed")
+        places.append(row.where)
+        rows.append((moment, row.number("speed")))
+    times, speeds = np.array(rows, float).reshape(-1, 2).T
+    speeds, words = SPEED.known(speeds)
+    times = with_set_clock(times)
+    kept = np.flatnonzero(~np.isnan(times + speeds))
+    lost = len(rows) - len(kept)
+    notes = (
+        [f"{path}: left out {lost} rows without a speed or a time{words and ': ' + words}"] if lost else []
+    )
+    if len(kept) < 2:
+        raise MeasurementError("; ".join([f"{path}: {len(kept)} speeds, two are needed", *notes]))
+    for row in kept[np.abs(speeds[kept]) > 1000][:1]:  # airplanes fly at 250
+        raise MeasurementError(f"{places[row]}: {speeds[row]:g} is no speed in meters per second")
+    check_rising(times[kept].tolist(), [places[row] for row in kept], MeasurementError)
+    return Speeds(path, float64(times[kept]), float64(np.abs(speeds[kept])), tuple(notes))

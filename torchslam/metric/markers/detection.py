@@ -22,8 +22,9 @@ from jaxtyping import Bool, Float, Int, UInt8
 
 from torchslam.errors import MeasurementError
 from torchslam.geometry import Camera
+from torchslam.metric.source import parse_length
 
-MIN_METERS, MAX_METERS = 0.001, 100.0
+MIN_METERS, MAX_METERS = 0.001, 5.0
 """Sides of a marker: one that a camera resolves, and one that is believed; a larger number is meant in millimeters."""
 MAX_SQUARES = 100
 """Most squares along a side of a board."""
@@ -108,14 +109,15 @@ class Target:
 
 def parse_target(text: str) -> Target:
     """Read the description of a target. Raises MeasurementError if it is none, or a size is impossible."""
+    limits = f"--marker {text}", MIN_METERS, MAX_METERS
     if found := re.fullmatch(SINGLE, text):
         dictionary(found["family"], text)
         others = [other.split("=") for other in found["others"].split(",") if other]
-        sizes = tuple((int(identity), _length(size, text)) for identity, size in others)
+        sizes = tuple((int(identity), parse_length(size, *limits)) for identity, size in others)
         twice = [identity for identity, _ in sizes if [other for other, _ in sizes].count(identity) > 1]
         if twice:
             raise MeasurementError(f"--marker {text}: marker {twice[0]} has two sizes")
-        return Target(text, TargetKind.MARKER, found["family"], _length(found["size"], text), sizes)
+        return Target(text, TargetKind.MARKER, found["family"], parse_length(found["size"], *limits), sizes)
     if found := re.fullmatch(BOARD, text):
         squares = int(found["columns"]), int(found["rows"])
         if not all(3 <= count <= MAX_SQUARES for count in squares):
@@ -123,7 +125,7 @@ def parse_target(text: str) -> Target:
                 f"--marker {text}: a board has 3 to {MAX_SQUARES} squares along each side; count all squares, "
                 "not the corners between them"
             )
-        lengths = [_length(length, text) for length in found["lengths"].split(":")]
+        lengths = [parse_length(length, *limits) for length in found["lengths"].split(":")]
         kind = TargetKind(found["kind"])
         if len(lengths) != (2 if kind is TargetKind.CHARUCO else 1):
             needed = "of a square and of a marker" if kind is TargetKind.CHARUCO else "of a square"
@@ -138,19 +140,6 @@ def parse_target(text: str) -> Target:
         "ids as apriltag-36h11:0.05,7=0.1; or charuco-7x5:SQUARE:MARKER or chessboard-7x5:SQUARE, with columns and "
         "rows of squares"
     )
-
-
-def _length(text: str, whole: str) -> float:
-    """A size in meters."""
-    try:
-        length = float(text)
-    except ValueError:
-        raise MeasurementError(f"--marker {whole}: {text!r} is no length in meters") from None
-    if not MIN_METERS <= length <= MAX_METERS:
-        raise MeasurementError(
-            f"--marker {whole}: a side of {text} m; sizes are in meters, from {MIN_METERS} to {MAX_METERS:g}"
-        )
-    return length
 
 
 def dictionary(family: str, text: str) -> cv2.aruco.Dictionary:

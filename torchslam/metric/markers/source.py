@@ -97,6 +97,7 @@ class Markers:
             if not bool(solution.keyframes[0].success):
                 return Unmeasured(ScaleSource.MARKER, "the adjustment with the corners of the markers failed")
             measured = scale_of_targets(with_corners, solution, pixels)
+        measured = replace(measured, stated=" ".join(target.text for target in self._targets))
         detached = replace(solution, T_cw=solution.T_cw.detach(), points_w=solution.points_w.detach())
         submap.posed_frames.apply_solution(detached, graph, submap.map)
         return measured
