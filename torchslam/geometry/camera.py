@@ -83,7 +83,7 @@ class Camera(ByValue):
         if self.params.shape[-1:] != (expected,):
             shape = tuple(self.params.shape)
             raise ValueError(f"a {self.model} camera has {expected} parameters, but params has shape {shape}")
-        if check_values and not (self._is_traced or bool((proper := self._proper).all())):
+        if check_values and not (self._is_traced or bool((proper := self.is_proper).all())):
             wrong = self.params.detach()[~proper][0].tolist()
             raise ValueError(f"a camera needs finite parameters and focal lengths above zero, got {wrong}")
 
@@ -93,7 +93,7 @@ class Camera(ByValue):
         return torch.compiler.is_compiling() or in_transform()
 
     @property
-    def _proper(self) -> Bool[Tensor, "*batch"]:
+    def is_proper(self) -> Bool[Tensor, "*batch"]:
         """Which cameras have finite parameters and focal lengths above zero."""
         params = self.params.detach()
         return torch.isfinite(params).all(-1) & (params[..., :2] > 0).all(-1)
@@ -102,7 +102,7 @@ class Camera(ByValue):
         """The camera, with harmless parameters and a mark where it is not proper, in which nothing is valid."""
         if "_usable" in self.__dict__:
             return self
-        proper = self._proper
+        proper = self.is_proper
         if not self._is_traced and bool(proper.all()):
             return self
         harmless = self.params.new_tensor((1.0, 1.0, *(0.0,) * (self.params.shape[-1] - 2)))
