@@ -33,6 +33,10 @@ from torchslam.refine.files import write_refined
 from torchslam.system.metric_run import run_in_meters
 from torchslam.utils.console import say, table, warn
 
+MAX_CONTRADICTED = (
+    0.5  # share of image pairs that contradict the given poses, beyond which a warning names it
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam refine`."""
@@ -107,7 +111,12 @@ def execute(options: argparse.Namespace) -> int:
     if "online ATE" in rows:
         rows["ATE as given"] = rows.pop("online ATE")
     print(f"\n{sequence.name}\n{table(rows)}")
-    for line in [*(metrics["metric"] or {}).get("remarks", ()), *metrics.get("unmeasured", ())]:
+    contradicted = 1 - refined.agreeing
+    remarks = [
+        f"{contradicted:.0%} of the image pairs contradict the given poses, in every convention that was tried: only "
+        "their frame and unit were used"
+    ] * (contradicted > MAX_CONTRADICTED)
+    for line in [*remarks, *(metrics["metric"] or {}).get("remarks", ()), *metrics.get("unmeasured", ())]:
         warn(line)
     if refined.run.failure:
         say(refined.run.failure)

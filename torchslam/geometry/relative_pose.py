@@ -189,12 +189,11 @@ def _nothing(pixels: Float[Tensor, "B N 2"], given: list[Tensor]) -> RelativePos
     """The answer where there is nothing to sample from."""
     B, N = pixels.shape[:2]
     T_21 = torch.eye(4, dtype=pixels.dtype, device=pixels.device).repeat(B, 1, 1)
-    scores = (torch.zeros_like(T_21[:, 0, 0]) for _ in MODELS)
+    essential, homography, rotation = torch.zeros(3, B, dtype=T_21.dtype, device=T_21.device)
     model = torch.full((B,), ROTATION, device=pixels.device)
     inliers, success, ambiguous = (pixels.new_zeros(shape, dtype=torch.bool) for shape in ((B, N), B, B))
-    return RelativePose(
-        with_zero_gradient(T_21, *given), inliers, success, model, ambiguous, *scores, T_21.clone()
-    )
+    T_21, guess = with_zero_gradient(T_21, *given), T_21.clone()
+    return RelativePose(T_21, inliers, success, model, ambiguous, essential, homography, rotation, guess)
 
 
 def _fit_motion(

@@ -104,7 +104,7 @@ def align_poses(
     """Compute the similarity S_ba from poses of cameras in one world to the same cameras' poses in another.
 
     Its rotation is the mean of those of the cameras, so that centers on a line, or close to each other, determine it
-    too. Its scale is the ratio of the spreads of the centers, one where all are at one place.
+    too. Its scale is the ratio of the spreads of the centers, one where those of either world are at one place.
 
     Args:
         use_centers: let centers and orientations count equally in the rotation.
@@ -114,10 +114,12 @@ def align_poses(
     mean_a, mean_b = a.mean(0), b.mean(0)
     spread_a, spread_b = ((x - m).square().sum().sqrt() for x, m in ((a, mean_a), (b, mean_b)))
     least = torch.finfo(a.dtype).tiny
+    rounding = 16 * torch.finfo(a.dtype).eps
+    have_extent = (spread_a > rounding * a.norm() + least) & (spread_b > rounding * b.norm() + least)
     if use_centers:
         M = M / len(T_ac) + (b - mean_b).mT @ (a - mean_a) / (spread_a * spread_b).clamp_min(least)
     R = nearest_rotation(M)
-    scale = torch.where((spread_a > least) & (spread_b > least), spread_b / spread_a.clamp_min(least), 1.0)
+    scale = torch.where(have_extent, spread_b / spread_a.clamp_min(least), 1.0)
     return rigid(scale * R, mean_b - scale * R @ mean_a)
 
 

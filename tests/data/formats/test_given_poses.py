@@ -18,7 +18,7 @@ from torchslam.data.formats.given_poses import GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import CalibrationError, TorchslamError, TrajectoryError
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, se3_exp
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.scene import ExportedScene
@@ -120,6 +120,11 @@ def test_images_are_matched_by_their_times() -> None:
             json.dumps({"frames": [{"file_path": "a", "transform_matrix": (2 * torch.eye(4)).tolist()}]}),
             "not a rigid transformation",
         ),
+        (
+            "transforms.json",
+            json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}),
+            r"frame a: 1 of 1 poses are mirrored \(determinant -1\)",
+        ),
         ("images.txt", "1 1 0 0 0 0 0 0 1\n", "expected `id qw"),
         ("images.txt", "1 3 0 0 0 0 0 0 1 a.png\n\n", "unit length"),
         ("images.txt", "# nothing\n", "no images"),
@@ -179,3 +184,18 @@ def test_times_that_were_counted_must_all_be_there(tmp_path: Path) -> None:
     (tmp_path / "2.png").unlink()
     with pytest.raises(TrajectoryError, match=r"1 of 4 poses are of no image of .* are counted: .* rgb\.txt"):
         given.rows(open_sequence(tmp_path))
+
+
+def test_given_poses_of_a_program_are_checked_as_those_of_files() -> None:
+    mirrored = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))[None]
+    for T_cw, message in ((mirrored, "mirrored"), (torch.nan * mirrored, "rigid"), (2 * mirrored, "rigid")):
+        with pytest.raises(TrajectoryError, match=message):
+            GivenPoses("tum", Path("poses.txt"), T_cw, torch.zeros(1, dtype=torch.float64))
+
+
+def test_rotations_with_few_digits_become_rotations(tmp_path: Path) -> None:
+    T_wc = se3_exp(torch.tensor([[1.0, 2.0, 3.0, 0.3, -0.2, 0.5]], dtype=torch.float64))
+    frame = {"file_path": "a", "transform_matrix": T_wc[0].mul(1000).round().div(1000).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    R = read_poses(tmp_path).T_cw[0, :3, :3]
+    torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)

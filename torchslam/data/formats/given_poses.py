@@ -19,9 +19,10 @@ from torchslam.data.calibration import Calibration
 from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
 from torchslam.data.text_file import are_numbers, float64, parse_floats, read_text
-from torchslam.data.trajectories import nearest, orthogonality_error, poses_from_rows, read_trajectory
+from torchslam.data.trajectories import checked_poses, nearest, poses_from_rows, read_trajectory
 from torchslam.errors import CalibrationError, FrameError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse
+from torchslam.geometry.similarity import nearest_rotation
 from torchslam.geometry.transforms import opengl
 from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
@@ -49,10 +50,16 @@ class GivenPoses:
     calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
-        """Raise TrajectoryError for a name that could not be a word of a line."""
+        """Raise TrajectoryError for a name that could not be a word of a line, and for a pose that is none."""
         wrong = [name for name in self.names if not name.isprintable()]
         if wrong:
             raise TrajectoryError(f"{self.path}: the name of an image has control characters: {wrong[0]!r}")
+        checked_poses(self.T_cw.cpu(), self.path)
+
+    @property
+    def is_world_to_camera(self) -> bool:
+        """Whether the format has poses from world to camera."""
+        return self.kind == COLMAP
 
     def __len__(self) -> int:
         return len(self.T_cw)
@@ -212,10 +219,9 @@ def _read_transforms(path: Path) -> GivenPoses:
         raise TrajectoryError(f"{path}: not the frames of a transforms.json: {cause!r}") from cause
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
-    R = T_wc[:, :3, :3]
-    if not bool(T_wc.isfinite().all() & (orthogonality_error(R) < 1e-3).all()):
-        raise TrajectoryError(f"{path}: a transform_matrix is not a rigid transformation")
-    T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
+    places = [f"{path}: frame {name[:80]}" for name, _ in frames]
+    T_wc = checked_poses(rigid(T_wc[:, :3, :3], T_wc[:, :3, 3]), places)
+    T_cw = se3_inverse(opengl(rigid(nearest_rotation(T_wc[:, :3, :3]), T_wc[:, :3, 3])))
     is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it
     calibration = read_calibration(path) if is_shared else None
     return GivenPoses(NERFSTUDIO, path, T_cw, None, tuple(name for name, _ in frames), calibration)
