@@ -92,6 +92,7 @@ class RefinementResult:
         rounds: Number of cameras with which a map was built.
         kept: Whether the given poses were kept, since the images do not improve on them.
         agreeing: Share of the image pairs that agree with the given poses.
+        check: The check of the refined poses in a sentence.
     """
 
     run: Run
@@ -100,6 +101,7 @@ class RefinementResult:
     rounds: int
     kept: bool = False
     agreeing: float = 1.0
+    check: str = ""
 
     @property
     def without_image(self) -> int:
@@ -176,7 +178,8 @@ def refine_poses(
             rounds = 2
     kept = refinement.keep_given_unless_improved(is_free=mapper.given is not None)
     log(f"refined: {refinement.after.sentence()}" + ("; the given poses are kept" if kept else ""))
-    return RefinementResult(refinement.run, given, rows, rounds, kept, refinement.before.used_agreeing)
+    agreeing, check = refinement.before.used_agreeing, refinement.after.sentence()
+    return RefinementResult(refinement.run, given, rows, rounds, kept, agreeing, check)
 
 
 def _measurement(camera: Camera, radial: int) -> CameraMeasurement:

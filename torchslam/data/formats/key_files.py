@@ -134,6 +134,15 @@ class Keys:
     def __contains__(self, keys: tuple[str, ...]) -> bool:
         return any(key in self._values for key in keys)
 
+    def with_values(self, values: Tree) -> Keys:
+        """The keys with other values; what either was asked for is used in both."""
+        others = {
+            name: value for key, (name, value) in self._values.items() if key not in set(map(normal, values))
+        }
+        keys = Keys(values | others, self.source)
+        keys._used = self._used
+        return keys
+
     def value(self, *keys: str) -> Any:
         """The value of a key; None without it."""
         return self._found(keys)[1]
