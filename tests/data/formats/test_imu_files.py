@@ -162,7 +162,8 @@ def test_noise_beside_the_samples(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "no keys in it"),
-        ("fx: 3\n", "no transformation between camera and inertial sensor"),
+        ("fx: 3\n", "no transformation in it; looked for that between camera and inertial sensor"),
+        (f"T_from_factory: [{DATA}]\n", "the direction of T_from_factory is not known; looked for"),
         ("T_BS: [1, 0, 0]\n", "16 numbers, not 3"),
         ("T_BS: [1, 0, 0, x]\n", "`x` is not a number"),
         ("T_BS: [" + DATA.replace("-1.0", "-2.0") + "]\n", "is not rigid"),

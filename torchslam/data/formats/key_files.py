@@ -174,6 +174,14 @@ class Keys:
         """The first number of a key. Raises CalibrationError for anything else."""
         return next(iter(self.numbers(*keys)), None)
 
+    def matrices(self, count: int) -> list[str]:
+        """The keys, as they are written, of this many numbers."""
+        names = []
+        for key, (name, _) in list(self._values.items()):
+            with contextlib.suppress(CalibrationError):
+                names += [name] * (len(self.numbers(key)) == count)
+        return names
+
     def unused(self, pattern: re.Pattern[str]) -> str | None:
         """The first key, as it is written, that fits a pattern, was not asked for and is neither empty nor zeros."""
         for key, (name, value) in self._values.items():
