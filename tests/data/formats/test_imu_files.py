@@ -137,8 +137,12 @@ def test_a_missing_file(tmp_path: Path) -> None:
         f"%YAML:1.0\nIMU.T_b_c1: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: f\n   data: [{DATA}]\n"
         "IMU.NoiseGyro: 1e-4\n",
         f"%YAML:1.0\nTbc: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: f\n   data: [{DATA}]\n",
+        f"T_ic: [{DATA}]\n",
+        "T_ci: [0, 1, 0, -0.2, -1, 0, 0, 0.1, 0, 0, 1, -0.3, 0, 0, 0, 1]\n",
+        f"T_SC: [{DATA}]\n",
+        f"cam0:\n  T_imu_cam: [{DATA}]\n",
     ],
-    ids=["euroc", "torchslam", "kalibr", "orb-slam3", "orb-slam3-old"],
+    ids=["euroc", "torchslam", "kalibr", "orb-slam3", "orb-slam3-old", "kalibr-ic", "kalibr-ci", "okvis", "openvins"],
 )
 def test_mountings_of_other_programs(tmp_path: Path, text: str) -> None:
     path = tmp_path / "camera.yaml"
