@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform
-from torchslam.geometry.transforms import opengl
-from torchslam.refine.conventions import MIN_PAIRS, Reading, _signed_axes, fitting_reading
+from torchslam.geometry.transforms import opengl, signed_axes
+from torchslam.refine.conventions import MIN_PAIRS, Reading, fitting_reading
 
 EYE = torch.eye(3, dtype=torch.float64)
 GL = torch.diag(torch.tensor((1.0, -1.0, -1.0), dtype=torch.float64))
@@ -65,7 +65,7 @@ def test_right_poses_have_no_other_reading(T_cw: Tensor, world_to_camera: bool, 
 def test_every_change_of_axes_is_found(
     T_cw: Tensor, world_to_camera: bool, inverted: bool, noise: float
 ) -> None:
-    for axes in _signed_axes(EYE):
+    for axes in signed_axes(EYE):
         if torch.equal(axes, EYE) and not inverted:
             continue
         # A left-handed camera is in a left-handed world.

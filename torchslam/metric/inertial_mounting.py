@@ -7,7 +7,7 @@ in the world. Both are compared for all exchanges and reversals of axes; the bes
 from __future__ import annotations
 
 from dataclasses import replace
-from itertools import permutations, product
+from itertools import product
 
 import torch
 from jaxtyping import Float
@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples
 from torchslam.geometry import se3_inverse, so3_log, umeyama
+from torchslam.geometry.transforms import signed_axes
 from torchslam.metric.inertial_rotation import TURN_INTERVAL, increments, start_offset, thinned
 
 BETTER = 0.7
@@ -40,7 +41,7 @@ def other_readings(
     found = increments(samples, times[:-1], times[1:], torch.zeros_like(samples.gyroscope[0]))
     duration = found.duration[:, None]
     rates_c, rates_b = so3_log(turns_c) / duration, so3_log(found.R_ij) / duration
-    forces, signed = found.velocity / duration, _signed_axes(T_cw)
+    forces, signed = found.velocity / duration, signed_axes(T_cw)
 
     mountings = [("", calibration)]
     if calibration.T_bc is not None:
@@ -93,17 +94,6 @@ def _simplest(errors: list[tuple[float, int, Tensor]]) -> tuple[float, int, Tens
         if errors[0][0] * BETTER <= least
         else next(each for each in errors if each[0] <= least / BETTER)
     )
-
-
-def _signed_axes(like: Tensor) -> list[Float[Tensor, "3 3"]]:
-    """The 24 rotations that exchange and reverse axes, the identity first, and their mirror images."""
-    eye = torch.eye(3, dtype=like.dtype, device=like.device)
-    every = [
-        eye[list(order)] * like.new_tensor(signs)[:, None]
-        for order in permutations(range(3))
-        for signs in product((1.0, -1.0), repeat=3)
-    ]
-    return sorted(every, key=lambda A: float(torch.linalg.det(A)) < 0)
 
 
 def _names(A: Float[Tensor, "3 3"]) -> str:

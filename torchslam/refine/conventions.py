@@ -5,7 +5,7 @@ Every reading of the poses predicts the epipolar lines of image pairs, and the p
 
 from __future__ import annotations
 
-from itertools import permutations, product
+from itertools import product
 from typing import NamedTuple
 
 import torch
@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import rigid
+from torchslam.geometry.transforms import signed_axes
 from torchslam.geometry.two_view_matrices import epipolar_offsets
 
 TOLERANCES = (0.005, 0.012, 0.025)
@@ -94,7 +95,7 @@ def fitting_reading(
     """
     if len(pairs) < MIN_PAIRS:
         return 1.0, None
-    signed = _signed_axes(poses)
+    signed = signed_axes(poses)
     readings, motions = [], []
     for inverted, swapped in product((False, True), repeat=2):
         R_cw = poses[:, :3, :3]
@@ -116,11 +117,3 @@ def fitting_reading(
             found = (Reading(*each, share) for each, share in zip(readings, shares, strict=True))
             return as_given, min((each for each in found if each.share >= best - TIED), key=Reading.changes)
     return as_given, None
-
-
-def _signed_axes(like: Tensor) -> Float[Tensor, "48 3 3"]:
-    """The matrices that exchange and reverse axes, the identity first."""
-    eye = torch.eye(3, dtype=like.dtype, device=like.device)
-    orders = torch.stack([eye[list(order)] for order in permutations(range(3))])
-    signs = like.new_tensor(list(product((1.0, -1.0), repeat=3)))
-    return (orders[:, None] * signs[:, :, None]).flatten(0, 1)

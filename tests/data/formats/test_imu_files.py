@@ -142,7 +142,17 @@ def test_a_missing_file(tmp_path: Path) -> None:
         f"T_SC: [{DATA}]\n",
         f"cam0:\n  T_imu_cam: [{DATA}]\n",
     ],
-    ids=["euroc", "torchslam", "kalibr", "orb-slam3", "orb-slam3-old", "kalibr-ic", "kalibr-ci", "okvis", "openvins"],
+    ids=[
+        "euroc",
+        "torchslam",
+        "kalibr",
+        "orb-slam3",
+        "orb-slam3-old",
+        "kalibr-ic",
+        "kalibr-ci",
+        "okvis",
+        "openvins",
+    ],
 )
 def test_mountings_of_other_programs(tmp_path: Path, text: str) -> None:
     path = tmp_path / "camera.yaml"
