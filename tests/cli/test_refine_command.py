@@ -216,9 +216,10 @@ def test_images_without_a_map_are_reported(folder: Path, given: Tensor, tmp_path
 
 @pytest.mark.parametrize("kind", ["tum", "nerfstudio", "colmap"])
 def test_poses_of_the_inverse_convention_are_refused_by_name(
-    kind: str, folder: Path, given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    kind: str, folder: Path, truth: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    poses = write(kind, se3_inverse(given), tmp_path)
+    """Of so few images, noisy poses would fit other conventions as well."""
+    poses = write(kind, se3_inverse(truth), tmp_path)
     call = ["refine", str(folder), "--poses", str(poses), "-o", str(tmp_path / "a"), *FAST]
     assert main([*call, "--camera", "500,500,319.5,239.5"]) == 2
     other = "camera to world" if kind == "colmap" else "world to camera"

@@ -224,20 +224,20 @@ class _Refinement:
 
     def check_convention(self, given: GivenPoses) -> None:
         """Raise TrajectoryError, naming what fits, for poses that image pairs contradict as the format defines them."""
+        if not self.pairs:
+            return
         poses = self.T_cw if given.is_world_to_camera else se3_inverse(self.T_cw)
         pairs = self.pairs[:: 1 + len(self.pairs) // MAX_PAIRS]
-        sides = (
-            [(pair.first, pair.keypoints_1) for pair in pairs],
-            [(pair.second, pair.keypoints_2) for pair in pairs],
-        )
-        pixels = (
-            torch.stack(
-                [self.views[view].keypoints[rows[:: len(rows) // MATCHES][:MATCHES]] for view, rows in side]
-            )
-            for side in sides
-        )
+
+        def pixels(view: int, rows: Int[Tensor, " M"]) -> Float[Tensor, "M 2"]:
+            return self.views[view].keypoints[rows[:: len(rows) // MATCHES][:MATCHES]]
+
+        pixels_1 = torch.stack([pixels(pair.first, pair.keypoints_1) for pair in pairs])
+        pixels_2 = torch.stack([pixels(pair.second, pair.keypoints_2) for pair in pairs])
         ends = torch.tensor([(pair.first, pair.second) for pair in pairs], device=poses.device)
-        share, other = fitting_reading(poses, given.is_world_to_camera, ends, *pixels, self.mapper.camera)
+        share, other = fitting_reading(
+            poses, given.is_world_to_camera, ends, pixels_1.to(poses), pixels_2.to(poses), self.mapper.camera
+        )
         if other is None:
             return
         of_format = "world to camera" if given.is_world_to_camera else "camera to world"
