@@ -45,7 +45,7 @@ class Reading(NamedTuple):
     share: float
 
     def changes(self) -> int:
-        """How rare the reading is: inverted or OpenGL's axes count one, other axes or centers two, mirrored axes three."""
+        """How rare the reading is: inverted or OpenGL's axes count one, other axes or centers two, mirrored three."""
         eye, opengl = torch.eye(3, dtype=self.axes.dtype), torch.diag(self.axes.new_tensor((1.0, -1.0, -1.0)))
         known = [torch.equal(self.axes.cpu(), each.cpu()) for each in (eye, opengl)]
         of_axes = known.index(True) if any(known) else 2 + int(torch.linalg.det(self.axes) < 0)
