@@ -199,8 +199,8 @@ def ate(
         with_scale: align by a similarity; False: by a rigid transform.
 
     Returns:
-        The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count, one is not finite, or all
-        true centers are at one place, to which a similarity shrinks any other path.
+        The errors; NaN, with a gradient of zero, where fewer than `MIN_POSES` rows count, one is not finite, or the
+        centers of one of both alone are all at one place, so that nothing fixes the scale.
     """
     T_cw, T_cw_groundtruth, known, enough = _counted(T_cw, T_cw_groundtruth, mask)
     centers, truth = _centers(T_cw), _centers(T_cw_groundtruth)
@@ -209,7 +209,7 @@ def ate(
     error = _rms((moved - truth).square().sum(-1), mask)
     known = known & enough
     if with_scale:
-        known = known & (_has_extent(truth, mask) | ~_has_extent(centers, mask))
+        known = known & (_has_extent(truth, mask) == _has_extent(centers, mask))
     return torch.where(known, error, torch.nan)
 
 

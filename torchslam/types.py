@@ -17,10 +17,11 @@ from torch import Tensor
 from torchslam.errors import TrajectoryError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import KeypointNoise, packed_information, unpacked_information
+from torchslam.utils.by_value import ByValue
 
 
-@dataclass(frozen=True)
-class Frame:
+@dataclass(frozen=True, eq=False)
+class Frame(ByValue):
     """One image of a sequence.
 
     Attributes:
@@ -44,8 +45,8 @@ class Frame:
     backlog: int = 0
 
 
-@dataclass(frozen=True)
-class Features:
+@dataclass(frozen=True, eq=False)
+class Features(ByValue):
     """A batch of keypoints with descriptors. Invalid rows (`mask` False) are finite.
 
     Attributes:
@@ -92,8 +93,8 @@ class Features:
         return Features(*changed)
 
 
-@dataclass(frozen=True)
-class Matches:
+@dataclass(frozen=True, eq=False)
+class Matches(ByValue):
     """A batch of matches between two sets of features. Invalid rows have index 0 and `mask` False.
 
     Attributes:
@@ -309,8 +310,8 @@ class Observations:
         return len(self.point_index)
 
 
-@dataclass(frozen=True)
-class Trajectory:
+@dataclass(frozen=True, eq=False)
+class Trajectory(ByValue):
     """Camera poses over time, ordered by timestamp.
 
     Attributes:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
+import subprocess
 import sys
 import threading
 from functools import partial
@@ -278,3 +280,21 @@ def test_a_pattern_that_the_shell_expanded(
     with pytest.raises(SystemExit):
         main([*command, str(files[0]), "nonsense"])
     assert "unrecognized arguments: nonsense" in capsys.readouterr().err
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="pipes of another kind")
+@pytest.mark.parametrize("unbuffered", ["", "1"])
+@pytest.mark.parametrize("arguments", [["config"], ["--help"], ["info", "/nowhere"]], ids=" ".join)
+def test_a_reader_that_is_gone_is_no_error(arguments: list[str], unbuffered: str) -> None:
+    """As in `torchslam ... | head`, with and without the messages in the pipe."""
+    command = [sys.executable, "-m", "torchslam", *arguments]
+    for messages in (subprocess.PIPE, subprocess.STDOUT):
+        reader, writer = os.pipe()
+        os.close(reader)
+        environment = os.environ | {"PYTHONUNBUFFERED": unbuffered}
+        done = subprocess.run(
+            command, stdout=writer, stderr=messages, env=environment, check=False, text=True
+        )
+        os.close(writer)
+        assert done.returncode == 141
+        assert "roken pipe" not in (done.stderr or "")

@@ -19,7 +19,7 @@ from torchslam.data import open_sequence, read_trajectory
 from torchslam.data.formats.calibration_files import read_calibration
 from torchslam.data.formats.given_poses import read_poses
 from torchslam.data.trajectories import write_trajectory
-from torchslam.geometry import Camera, se3_inverse
+from torchslam.geometry import Camera, se3_exp, se3_inverse
 from torchslam.geometry.transforms import opengl, quaternion_wxyz
 from torchslam.io.export.nerfstudio import nerfstudio_camera
 from torchslam.refine.pose_refinement import align_to_input
@@ -212,3 +212,36 @@ def test_images_without_a_map_are_reported(folder: Path, given: Tensor, tmp_path
     assert main([*arguments, "--limit", "1"]) == 3
     assert "not enough" in json.loads((tmp_path / "results" / "metrics.json").read_text())["failure"]
     assert not (tmp_path / "results" / "refined").exists()
+
+
+@pytest.mark.parametrize("kind", ["tum", "nerfstudio", "colmap"])
+def test_poses_of_the_inverse_convention_are_refused_by_name(
+    kind: str, folder: Path, truth: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of so few images, noisy poses would fit other conventions as well."""
+    poses = write(kind, se3_inverse(truth), tmp_path)
+    call = ["refine", str(folder), "--poses", str(poses), "-o", str(tmp_path / "a"), *FAST]
+    assert main([*call, "--camera", "500,500,319.5,239.5"]) == 2
+    other = "camera to world" if kind == "colmap" else "world to camera"
+    assert f"% as {other}" in capsys.readouterr().err
+    assert not (tmp_path / "a" / "refined").exists()
+
+
+def test_poses_that_no_convention_fits_are_named(
+    folder: Path, given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    poses = write("tum", given[[3, 0, 6, 1, 5, 2, 4, 7]], tmp_path)
+    call = ["refine", str(folder), "--poses", str(poses), "-o", str(tmp_path / "a"), *FAST]
+    assert main([*call, "--camera", "500,500,319.5,239.5"]) == 0
+    assert "of the image pairs contradict the given poses, in every convention" in capsys.readouterr().err
+
+
+def test_orientations_that_contradict_the_images_are_no_frame(
+    folder: Path, given: Tensor, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    turns = torch.randn(FRAMES, 6, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    poses = write("tum", se3_exp(3 * turns) @ given, tmp_path)
+    call = ["refine", str(folder), "--poses", str(poses), "-o", str(tmp_path / "a"), *FAST]
+    assert main([*call, "--camera", "500,500,319.5,239.5"]) == 3
+    assert "degrees off those that the images determine" in capsys.readouterr().err
+    assert not (tmp_path / "a" / "refined").exists()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -413,7 +414,7 @@ def test_opencv_files_say_whether_they_are_of_a_fisheye(tmp_path: Path, suffix: 
         (
             "a.json",
             NERFSTUDIO.replace('"images/0.png"', '"images/0.png", "k4": 0.3'),
-            "frame images/0.png has a k4 of its own",
+            "k4 is not modeled",
         ),
         ("a.txt", "1 FISHEYE624 64 48 5 5 3 2\n", "camera model FISHEYE624 is not known"),
         ("a.yaml", "K: [5, 0, 0, 0, 5, 0, 3, 2, 1]\n", "a camera matrix is fx 0 cx, 0 fy cy, 0 0 1, not"),
@@ -431,7 +432,17 @@ def test_opencv_files_say_whether_they_are_of_a_fisheye(tmp_path: Path, suffix: 
         ("a.yaml", ORB_SLAM.replace("Camera1.cy", "Camera1.c"), "fx, fy, cx and cy are needed"),
         ("a.txt", "1 OPENCV 640 480 500 501 320 240\n", "OPENCV has the parameters fx fy"),
         ("a.txt", "1 FOV 640 480 500 501 320 240 1\n", "camera model FOV is not known"),
-        ("a.txt", "1 PINHOLE 4 4 5 5 3 2\n2 PINHOLE 4 4 5 5 3 2\n", "2 cameras"),
+        ("a.txt", "1 PINHOLE 4 4 5 5 3 2\n2 PINHOLE 4 4 5 6 3 2\n", "2 cameras with different parameters"),
+        (
+            "a.json",
+            '{"w": 8, "h": 6, "frames": [{"file_path": "a", "fl_x": 500}, {"file_path": "b", "fl_x": 501}]}',
+            "different cameras: fl_x is 500 of a, 501 of b",
+        ),
+        (
+            "a.json",
+            '{"w": 8, "h": 6, "frames": [{"file_path": "a", "fl_x": 500}, {"file_path": "b"}]}',
+            "different cameras: fl_x is 500 of a, missing of b",
+        ),
         ("a.json", "{}", "no camera in it; looked for"),
         ("a.json", "{]", "not valid JSON"),
         ("a.json", '{"fl_x": NaN}', "fl_x: nan is not finite"),
@@ -470,3 +481,16 @@ def test_a_decimal_comma_does_not_cut_a_number(tmp_path: Path) -> None:
     (tmp_path / "c.yaml").write_text(lines)
     with pytest.raises(CalibrationError, match=r"c.yaml: Camera.fx: `517,3` is not one number"):
         parse_camera(str(tmp_path / "c.yaml"), (640, 480))
+
+
+def test_frames_with_equal_cameras_have_one(tmp_path: Path) -> None:
+    """As Polycam writes them, and COLMAP with a camera for each image."""
+    whole = json.loads(NERFSTUDIO)
+    camera = {key: whole.pop(key) for key in list(whole) if key != "frames"}
+    whole["frames"] = [{"file_path": f"images/{index}.png"} | camera for index in range(3)]
+    (tmp_path / "t.json").write_text(json.dumps(whole))
+    (tmp_path / "t.txt").write_text(COLMAP + COLMAP.splitlines()[-1].replace("1 ", "2 ", 1) + "\n")
+    for name in ("t.json", "t.txt"):
+        found = read_calibration(tmp_path / name)
+        assert found.params == pytest.approx(BROWN)
+        assert found.size == VGA

@@ -155,3 +155,30 @@ def test_points_on_a_line_give_no_pose() -> None:
     points_w = torch.tensor([[0.0, 0.0, 4.0]]).double() + along * torch.tensor([[1.0, 0.2, 0.3]]).double()
     pixels = CAMERA.project(points_w)[0]
     assert start_pose(points_w, UndistortedKeypoints.of(pixels, CAMERA), CAMERA.size, 3.0) is None
+
+
+@pytest.mark.parametrize(("distinct", "success"), [(3, False), (4, True), (5, True)])
+@pytest.mark.parametrize(("noise", "jitter"), [(0.0, 0.0), (0.5, 0.0), (0.5, 1e-4)])
+def test_points_that_repeat_count_once(distinct: int, success: bool, noise: float, jitter: float) -> None:
+    """Three points have up to four poses, however often each is seen."""
+    generator = torch.Generator().manual_seed(1)
+    points_w, _, T_cw = points_and_pixels(2, outliers=0.0)
+    points_w = points_w[:, :distinct].repeat(1, 20, 1)
+    points_w = points_w + jitter * torch.randn(points_w.shape, generator=generator, dtype=torch.float64)
+    pixels = CAMERA.project(transform(T_cw, points_w))[0]
+    pixels = pixels + noise * torch.randn(pixels.shape, generator=generator, dtype=torch.float64)
+    found = estimate_absolute_pose(points_w, pixels, camera=CAMERA)
+    assert bool(found.success) == success
+    assert not success or rotation_error(found.T_cw[:, :3, :3], T_cw[:, :3, :3]) < 1
+
+
+@pytest.mark.parametrize("count", [0, 2, 40])
+def test_rows_that_fail_share_no_memory(count: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    points_w, pixels = (300 * torch.rand(3, count, d, generator=generator) for d in (3, 2))
+    found = estimate_absolute_pose(points_w, pixels, camera=CAMERA)
+    assert not found.success.any()
+    for rows in (found.T_cw, found.inliers, found.success, found.score):
+        before = rows[1:].clone()
+        rows[0] = 1
+        assert torch.equal(rows[1:], before)

@@ -458,3 +458,41 @@ def test_parameters_of_numbers_and_tensors() -> None:
     one, two = torch.tensor(500.0), torch.tensor(500.0, dtype=torch.float64)
     for fx, fy, dtype in ((5.0, 5.0, torch.float64), (one, 5.0, torch.float32), (one, two, torch.float64)):
         assert Camera.pinhole(fx, fy, 320.0, 240.0, SIZE).params.dtype == dtype
+
+
+@pytest.mark.parametrize("place", ["fx", "fy", "cx", "last"])
+@pytest.mark.parametrize("bad", [0.0, -5.0, math.nan, math.inf])
+def test_a_camera_without_finite_parameters_and_focal_lengths_above_zero_is_refused(
+    camera: Camera, place: str, bad: float
+) -> None:
+    params = camera.params.repeat(2, 1)
+    params[1, {"fx": 0, "fy": 1, "cx": 2, "last": -1}[place]] = bad
+    degenerate = camera.with_params(params)  # as a step of an optimizer may leave it
+    if math.isfinite(bad) and place not in ("fx", "fy"):
+        return
+    with pytest.raises(ValueError, match=r"finite parameters and focal lengths above zero, got \["):
+        Camera(camera.model, params, SIZE)
+
+    cloud = points().requires_grad_()
+    (pixels, valid), (expected, valid_before) = degenerate.project(cloud), camera.project(points())
+    rays = degenerate.unproject(expected)
+    (pixels.sum() + rays.sum()).backward()
+    assert cloud.grad is not None
+    assert torch.equal(valid, torch.stack((valid_before[0], torch.zeros_like(valid_before[1]))))
+    assert torch.equal(pixels[0], expected[0])
+    assert torch.equal(rays[0], camera.unproject(expected)[0])
+    assert torch.isfinite(pixels).all()
+    assert torch.isfinite(rays).all()
+    assert torch.isfinite(cloud.grad).all()
+    assert not cloud.grad[1].any()
+    projected = vmap(lambda params, cloud: camera.with_params(params).project(cloud))(params, points())
+    assert torch.equal(projected[1], valid)
+
+
+def test_cameras_are_values(camera: Camera) -> None:
+    others = [camera.with_params(camera.params * 1.01), Camera(camera.model, camera.params, (641, 480))]
+    same = [camera.with_params(camera.params.clone()), camera]
+    assert all(camera == each and hash(camera) == hash(each) for each in same)
+    assert not any(camera == each for each in [*others, camera.params, Camera.stack([camera])])
+    assert len({camera, *same, *others}) == 3
+    assert Camera.stack([camera, others[0]]) == Camera.stack([*same[:1], others[0]])

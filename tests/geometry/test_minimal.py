@@ -206,3 +206,16 @@ def test_rotation_from_two_rays() -> None:
     R_true = g.so3_exp(normal(0, 5, 3))
     rays = normal(1, 5, 2, 3)
     torch.testing.assert_close(g.rotation_from_matches(rays, rays @ R_true.mT), R_true)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.05, 0.5])
+def test_a_noisy_essential_matrix_decomposes_into_rotations(noise: float) -> None:
+    T_21 = poses(20, rotation=0.8)
+    E = g.essential_from_pose(T_21[:, :3, :3], T_21[:, :3, 3])
+    R, t = g.decompose_essential(E + noise * E.norm(dim=(1, 2), keepdim=True) * normal(7, 20, 3, 3))
+    eye = torch.eye(3, dtype=torch.float64).expand(20, 2, 3, 3)
+    torch.testing.assert_close(R.mT @ R, eye, atol=1e-12, rtol=0)
+    torch.testing.assert_close(torch.linalg.det(R), torch.ones(20, 2).double())
+    torch.testing.assert_close(t.norm(dim=-1), torch.ones(20).double())
+    turned = (R - T_21[:, None, :3, :3]).abs().amax((-2, -1)).amin(-1)
+    assert float(turned.median()) < 1e-9 + 4 * noise

@@ -1,4 +1,4 @@
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 import poselib
@@ -162,3 +162,27 @@ def test_failures_are_as_the_page_on_gradients_says() -> None:
     assert (found.model, found.success.tolist()) == (("rotation",), [False])
     assert not found.T_21[0, :3, 3].any()
     assert gradient.abs().sum() > 0
+
+
+@pytest.mark.parametrize(("distinct", "success"), [(5, False), (10, True)])
+@pytest.mark.parametrize("noise", [0.0, 0.3])
+def test_matches_that_repeat_count_once(distinct: int, success: bool, noise: float) -> None:
+    """Five matches have up to ten poses, however often each is seen."""
+    generator = torch.Generator().manual_seed(0)
+    scene = two_views(1, count=distinct, outliers=0.0, noise=0.0)
+    pixels = (x.repeat(1, 12, 1) for x in (scene.pixels_1, scene.pixels_2))
+    pixels_1, pixels_2 = (
+        x + noise * torch.randn(x.shape, generator=generator, dtype=torch.float64) for x in pixels
+    )
+    found = estimate_relative_pose(pixels_1, pixels_2, camera_1=CAMERA, camera_2=CAMERA)
+    assert bool(found.success) == success
+
+
+def test_results_of_too_few_matches_share_no_memory() -> None:
+    found = estimate_relative_pose(*torch.ones(2, 3, 4, 2), camera_1=CAMERA, camera_2=CAMERA)
+    tensors = [getattr(found, field.name) for field in fields(found)]
+    before = [tensor[1:].clone() for tensor in tensors]
+    for tensor in tensors:
+        tensor[0] = 1
+    assert all(torch.equal(tensor[1:], rows) for tensor, rows in zip(tensors, before, strict=True))
+    assert not found.score_rotation[1:].any()

@@ -275,3 +275,15 @@ def test_poses_at_one_place_keep_their_unit() -> None:
     T_ac = rigid(so3_exp(torch.tensor([[0.1, 0.2, 0.3]], dtype=torch.float64)), torch.ones(1, 3).double())
     S_ba = align_poses(T_ac, torch.eye(4, dtype=torch.float64)[None])
     torch.testing.assert_close(S_ba @ T_ac[0], torch.eye(4, dtype=torch.float64), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("both", [False, True])
+def test_points_at_one_place_have_no_scale_and_no_gradient(both: bool) -> None:
+    """Their mean differs from them by rounding, which must not count as a spread."""
+    source = torch.tensor([0.1, 0.7, -0.3]).double().expand(9, 3).clone().requires_grad_()
+    target = source.detach() if both else torch.linspace(0, 1, 27).double().view(9, 3)
+    scale, R, _ = umeyama(source, target)
+    (gradient,) = torch.autograd.grad(scale + R.sum(), source)
+    assert float(scale) == 1
+    assert torch.equal(R, torch.eye(3).double())
+    assert not gradient.any()

@@ -208,3 +208,17 @@ def test_a_run_without_a_map(run: Run) -> None:
     figures = run_metrics(replace(run, results=[], skipped=[], failure="the sequence has no frames"))
     assert figures["fps"] == figures["ms_median"] == 0.0
     assert figures["stage_ms"] == {}
+
+
+def test_the_summary_leaves_out_what_did_not_happen(run: Run) -> None:
+    """No speed where no frame was processed by itself; and what nothing checked is named."""
+    whole = replace(run, results=[replace(result, stage_ms={}) for result in run.results])
+    assert "speed" not in summary(run_metrics(whole))
+    timed = [replace(result, stage_ms={"total": 100.0}) for result in run.results]
+    assert summary(run_metrics(replace(run, results=timed)))["speed"].startswith(
+        "10.0 frames/s; 100 ms a frame"
+    )
+    check = MapCheck(9, 0, 0, 0, 0, 0.0, 0.0, torch.zeros(0), (), (), ())
+    for mapped in (run, MappedRun.of(run, Mapping.ONLINE), MappedRun.of(run, Mapping.GLOBAL, check)):
+        row = summary(run_metrics(mapped) | check_metrics(mapped))["check"]
+        assert row.startswith("none: no image pairs tested this map")

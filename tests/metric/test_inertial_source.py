@@ -50,6 +50,65 @@ def test_what_is_not_measured_has_a_reason() -> None:
     assert few == Unmeasured(ScaleSource.INERTIAL, str(InertialReason.NO_OVERLAP))
 
 
+EXCHANGED = torch.tensor([[0.0, 1, 0], [1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+TURNED = torch.tensor([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]], dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("gyroscope", "accelerometer", "words"),
+    [
+        (None, -torch.eye(3).double(), "accelerations of the opposite sign"),
+        (EXCHANGED, EXCHANGED, "the axes of the sensor read as (y, x, z)"),
+        (TURNED, TURNED, "the axes of the sensor read as (-y, x, z)"),
+        (None, TURNED, "the axes of the accelerometer read as (-y, x, z)"),
+        (TURNED, None, "the axes of the gyroscope read as (-y, x, z)"),
+        (
+            EXCHANGED,
+            -EXCHANGED,
+            "the axes of the sensor read as (y, x, z) and accelerations of the opposite sign",
+        ),
+    ],
+)
+@pytest.mark.parametrize("noise", [False, True])
+def test_axes_and_signs_that_would_fit_are_named(
+    gyroscope: Tensor | None, accelerometer: Tensor | None, words: str, noise: bool
+) -> None:
+    simulation = simulate(sensor_noise=noise)
+    samples = simulation.samples
+    if gyroscope is not None:
+        samples = replace(samples, gyroscope=samples.gyroscope @ gyroscope.T)
+    if accelerometer is not None:
+        samples = replace(samples, accelerometer=samples.accelerometer @ accelerometer.T)
+    source = InertialSource(samples, simulation.calibration)
+    found = source.measure(view_of(simulation.timestamps, simulation.T_cw))
+    assert isinstance(found, Unmeasured)
+    assert f"but do with {words}:" in found.reason
+
+
+def test_an_inverse_mounting_that_would_fit_is_named() -> None:
+    simulation = simulate(sensor_noise=True)
+    assert simulation.calibration.T_bc is not None
+    inverse = replace(simulation.calibration, T_bc=se3_inverse(simulation.calibration.T_bc))
+    found = InertialSource(simulation.samples, inverse).measure(
+        view_of(simulation.timestamps, simulation.T_cw)
+    )
+    assert isinstance(found, Unmeasured)
+    assert "but do with the inverse of the transformation between camera and sensor:" in found.reason
+
+
+def test_an_unknown_mounting_of_a_left_handed_sensor() -> None:
+    """Without a mounting no rotation is wrong, but a mirrored sensor is."""
+    simulation = simulate(sensor_noise=True)
+    samples = replace(
+        simulation.samples,
+        gyroscope=simulation.samples.gyroscope @ EXCHANGED.T,
+        accelerometer=simulation.samples.accelerometer @ EXCHANGED.T,
+    )
+    found = InertialSource(samples).measure(view_of(simulation.timestamps, simulation.T_cw))
+    assert isinstance(found, Unmeasured)
+    assert "but do with the axes of the sensor read as" in found.reason
+
+
 def test_clocks_that_have_nothing_in_common() -> None:
     simulation = simulate(seconds=5)
     source = InertialSource(simulation.samples)

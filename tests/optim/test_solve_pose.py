@@ -244,3 +244,19 @@ def test_the_pinhole_shortcut_equals_the_general_expansion(generator: torch.Gene
     pair = PoseProblem(short.points_w, two, None)
     torch.testing.assert_close(pair.expand(T_cw, ALL).hessian[0], short.expand(T_cw, ALL).hessian[0])
     assert not torch.allclose(pair.expand(T_cw, ALL).hessian[1], short.expand(T_cw, ALL).hessian[1])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), 0.0, -500.0])
+def test_a_degenerate_camera_fails_alone(pose_scene, bad):
+    scene = pose_scene(batch=2)
+    params = scene.camera.params.repeat(2, 1)
+    params[1, 0] = bad
+    params.requires_grad_()
+    pixels = scene.pixels.clone().requires_grad_()
+    refined = scene.solved(camera=scene.camera.with_params(params), pixels=pixels)
+    refined.T_cw.sum().backward()
+    assert refined.success.tolist() == [True, False]
+    assert torch.equal(refined.T_cw[0], scene.solved().T_cw[0])
+    for gradient in (params.grad, pixels.grad):
+        assert gradient[0].any()
+        assert not gradient[1].any()

@@ -1,19 +1,22 @@
 """The command line: `torchslam COMMAND`, with the commands of `COMMANDS`.
 
 Exit status: 0 done, 2 an error that the message explains, 3 no map could be initialized or no frame could be
-localized, 4 some sequences of a batch failed, 130 and 143 ended by Ctrl-C and by SIGTERM.
+localized, 4 some sequences of a batch failed, 130 and 143 ended by Ctrl-C and by SIGTERM, 141 whoever read the output
+is gone, as of `torchslam ... | head`.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import gc
 import os
+import select
 import sys
 from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import torchslam
 from torchslam.errors import TorchslamError
@@ -56,13 +59,38 @@ def console() -> NoReturn:
     thread from within, which aborts the process, so then nothing but the buffers is left to be done.
     """
     gc.disable()  # until `main` has imported what it needs
-    status = main()
+    try:
+        status = main()
+    except SystemExit as end:  # of argparse
+        status = int(end.code or 0)
+    except BrokenPipeError:  # of the message itself
+        status = ERROR
+    status = _flushed(status)
     live = sys.modules.get("torchslam.data.readers.live")  # imports torch
     if live is not None and not live.close_sources():
-        sys.stdout.flush()
-        sys.stderr.flush()
         os._exit(status)
     sys.exit(status)
+
+
+def _flushed(status: int) -> int:
+    """Flush the output; return the status, 141 where nobody reads it any more, which Python would report at exit."""
+    for stream in (sys.stdout, sys.stderr):
+        with contextlib.suppress(BrokenPipeError):
+            stream.flush()
+        if _is_abandoned(stream):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+            status = 141  # 128 and the number of SIGPIPE, as of shells
+    return status
+
+
+def _is_abandoned(stream: TextIO) -> bool:
+    """Whether a stream is a pipe that nobody reads any more."""
+    try:
+        poll = select.poll()
+        poll.register(stream.fileno(), 0)
+    except (AttributeError, OSError):  # Windows; a stream without a file
+        return False
+    return any(event & select.POLLERR for _, event in poll.poll(0))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -80,6 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             _compute_in_one_thread()
         return options.execute(options)
     except (TorchslamError, OSError) as error:
+        if isinstance(error, BrokenPipeError) and (abandoned := _flushed(0)):
+            return abandoned
         say(f"error: {printable(without_credentials(str(error)))}")
         return ERROR
     except ModuleNotFoundError as error:

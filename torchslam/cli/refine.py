@@ -33,6 +33,10 @@ from torchslam.refine.files import write_refined
 from torchslam.system.metric_run import run_in_meters
 from torchslam.utils.console import say, table, warn
 
+MAX_CONTRADICTED = (
+    0.5  # share of image pairs that contradict the given poses, beyond which a warning names it
+)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam refine`."""
@@ -65,8 +69,8 @@ def execute(options: argparse.Namespace) -> int:
     """Execute `torchslam refine`; returns the exit status."""
     if options.fix_camera and options.refine_distortion:
         raise ConfigError("--refine-distortion cannot be combined with --fix-camera")
-    given = read_poses(options.poses)
-    calibration = given.calibration if options.camera is None else None
+    given = read_poses(options.poses, with_camera=options.camera is None)
+    calibration = given.calibration
     if is_synthetic(options.path):  # which is opened with a camera of its own alone
         sequence = arguments.sequence(options)
         if calibration is not None:
@@ -100,14 +104,19 @@ def execute(options: argparse.Namespace) -> int:
     if refined.kept:
         words += "; the images do not improve on them: kept"
     rows = {"poses": words} | summary(metrics)
-    rows.pop("speed", None)  # frames are not processed one by one
     if not refined.run.failure:
+        rows["check"] = refined.check
         rows["refined"] = str(write_refined(options.output / "refined", refined))
     rows["results"] = str(options.output)
     if "online ATE" in rows:
         rows["ATE as given"] = rows.pop("online ATE")
     print(f"\n{sequence.name}\n{table(rows)}")
-    for line in [*(metrics["metric"] or {}).get("remarks", ()), *metrics.get("unmeasured", ())]:
+    contradicted = 1 - refined.agreeing
+    remarks = [
+        f"{contradicted:.0%} of the image pairs contradict the given poses, in every convention that was tried: only "
+        "their frame and unit were used"
+    ] * (contradicted > MAX_CONTRADICTED)
+    for line in [*remarks, *(metrics["metric"] or {}).get("remarks", ()), *metrics.get("unmeasured", ())]:
         warn(line)
     if refined.run.failure:
         say(refined.run.failure)
@@ -138,9 +147,10 @@ def _write(refined: RefinementResult, sequence: Sequence, options: argparse.Name
 def _describe_camera(refined: RefinementResult, sequence: Sequence, is_fixed: bool) -> str:
     """Return how the camera was determined."""
     found, focal = refined.run.calibration, float(refined.run.camera.focal)
+    origin = "as given" if sequence.calibrated is Calibrated.GIVEN else "a guess"
     params = with_radial_terms(refined.run.camera).params.cpu()
     if torch.equal(params, with_radial_terms(sequence.camera).params):
-        words = f"focal length {focal:.1f} px, as given"
+        words = f"focal length {focal:.1f} px, {origin}"
         return words if is_fixed or refined.run.failure else f"{words}; the images do not contradict it"
     std = "" if found is None else f" ± {focal * found.focal_std:.1f}"
-    return f"focal length {focal:.1f}{std} px from the images, given {float(sequence.camera.focal):.1f}"
+    return f"focal length {focal:.1f}{std} px from the images, {float(sequence.camera.focal):.1f} {origin}"

@@ -53,8 +53,13 @@ SHORTEST_PERIOD = 2e-4
 FORCE_RANGE = (7.0, 13.0)
 """m/s^2, of the median length of forces: gravity, with the worst bias and shaking. Tried on drones and at rest: 9.8."""
 # Keys in lower case, letters and digits alone.
-T_CAMERA_TO_BODY = ("tbscam0", "timucam", "bodytcam0", "imutbc1", "imutbc", "tbc1", "tbc", "tbs")
-T_BODY_TO_CAMERA = ("tcamimu", "tic", "tcb")
+T_CAMERA_TO_BODY = (
+    *("tbscam0", "timucam", "timucam0", "bodytcam0", "imutbc1", "imutbc", "tbc1", "tbc", "tbs"),
+    *("tic", "tsc"),
+)
+T_BODY_TO_CAMERA = ("tcamimu", "tcam0imu", "tci", "tcb")
+"""As the tools document them: Kalibr's T_cam_imu and T_ci lead to the camera, its T_ic, OKVIS' T_SC, OpenVINS' and
+Basalt's T_imu_cam, ORB-SLAM3's Tbc, maplab's T_B_C, VINS' body_T_cam0 and EuRoC's T_BS from it."""
 DENSITIES = {
     "gyroscope_density": ("gyroscopenoisedensity", "imunoisegyro", "gyrn"),
     "accelerometer_density": ("accelerometernoisedensity", "imunoiseacc", "accn"),
@@ -203,9 +208,13 @@ def _mounting(all_keys: list[Keys], path: Path) -> Float[Tensor, "4 4"]:
                     "give the file of the camera"
                 )
             return se3_inverse(T) if names is T_BODY_TO_CAMERA else T
+    others = [name for keys in all_keys for name in keys.matrices(16)]
+    unknown = (
+        f"the direction of {', '.join(others[:3])} is not known" if others else "no transformation in it"
+    )
     raise MeasurementError(
-        f"{path}: no transformation between camera and inertial sensor in it; looked for T_cam_imu (Kalibr), T_BS "
-        "(EuRoC, of the camera), Tbc (ORB-SLAM3) and body_T_cam0 (VINS)"
+        f"{path}: {unknown}; looked for that between camera and inertial sensor: T_cam_imu (Kalibr), T_BS (EuRoC, of "
+        "the camera), Tbc (ORB-SLAM3), T_imu_cam (OpenVINS, Basalt), T_SC (OKVIS) and body_T_cam0 (VINS)"
     )
 
 

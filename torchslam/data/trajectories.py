@@ -46,6 +46,13 @@ def checked_poses(T_wc: Float[Tensor, "N 4 4"], places: Path | Sequence[str]) ->
     """Return poses unchanged. Raises TrajectoryError for an invalid rotation or position, at its place or its file."""
     is_rigid = orthogonality_error(T_wc[:, :3, :3]) < ORTHOGONAL
     _check(is_rigid, places, "a pose is not a rigid transformation")
+    is_proper = torch.linalg.det(T_wc[:, :3, :3]) > 0
+    _check(
+        is_proper,
+        places,
+        f"{int((~is_proper).sum())} of {len(T_wc)} poses are mirrored (determinant -1), which no camera can be: "
+        "reverse one axis of the world, or of the camera, in all of them",
+    )
     is_near = T_wc[:, :3, 3].abs().amax(1) < FARTHEST
     _check(is_near, places, f"a position is farther away than {FARTHEST:g}")
     return T_wc

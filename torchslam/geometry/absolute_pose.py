@@ -27,6 +27,7 @@ from torchslam.geometry.ransac import (
     best_models,
     best_of,
     check_search,
+    count_distinct,
     gather_rows,
     is_significant,
     leave_a_line,
@@ -42,6 +43,7 @@ from torchslam.geometry.ransac import (
     valid_first,
 )
 from torchslam.geometry.sensor import UndistortedKeypoints
+from torchslam.utils.by_value import ByValue
 
 FIRST_ROUND = 160  # samples; with 64, frames of sheared and blurred images are lost
 CANDIDATES = 2  # hypotheses of each round that are optimized
@@ -50,8 +52,8 @@ LOCAL_ITERATIONS, FINAL_ITERATIONS = 1, 10
 FINAL_WIDTH = 1.5  # thresholds, for the tail of the noise; without this refinement more runs are lost
 
 
-@dataclass(frozen=True)
-class AbsolutePose:
+@dataclass(frozen=True, eq=False)
+class AbsolutePose(ByValue):
     """Absolute poses of B cameras.
 
     Attributes:
@@ -103,11 +105,10 @@ def estimate_absolute_pose(
     B, N = pixels.shape[:2]
     if B == 0 or N < 3:
         nothing = torch.zeros(B, N, dtype=torch.bool, device=pixels.device)
-        T_cw = torch.eye(4, dtype=points_w.dtype, device=points_w.device).expand(B, 4, 4)
+        T_cw = torch.eye(4, dtype=points_w.dtype, device=points_w.device).repeat(B, 1, 1)
         T_cw = with_zero_gradient(T_cw, points_w, pixels, camera.params)
-        return AbsolutePose(
-            T_cw, nothing, torch.zeros_like(T_cw[:, 0, 0], dtype=torch.bool), T_cw.detach()[:, 0, 1]
-        )
+        score = torch.zeros_like(T_cw[:, 0, 0])
+        return AbsolutePose(T_cw, nothing, score > 0, score)
     finite = torch.isfinite(points_w).all(-1) & torch.isfinite(pixels).all(-1)
     mask = finite if mask is None else mask & finite
     points_w = torch.where(mask[..., None], points_w, 0.0)
@@ -168,7 +169,7 @@ def start_pose(
     P = search_data.best_pose(seed, confidence, max_samples)
     P = search_data.fit(P[:, None], FINAL_ITERATIONS, FINAL_WIDTH)[0][:, 0]
     inliers = search_data.squared_errors(P) < 1
-    if not bool(_is_success(inliers, mask, search_data.points, size, threshold)):
+    if not bool(search_data.is_success(P, inliers, size, threshold)):
         return None
     P = P[0]
     T_cw = torch.eye(4, dtype=P.dtype, device=P.device)
@@ -212,7 +213,7 @@ def _estimate(
         projected, valid = camera.project((P @ data.homogeneous).mT)
         # Infinite also beyond the monotone part of the distortion.
         squared = ((projected - pixels) / threshold).square().sum(-1).masked_fill(~valid, torch.inf)
-    success = _is_success((squared < 1) & mask, mask, data.points, camera.size, threshold)
+    success = data.is_success(P, (squared < 1) & mask, camera.size, threshold)
     score = torch.where(mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)
     R, t = P[..., :3], P[..., 3]
     T_cw = rigid(R, t - (R @ center[..., None]).squeeze(-1))
@@ -314,15 +315,20 @@ class _Search:
         squared = squared_projections(P[:, None], self.homogeneous, self.xy, self.scale)
         return squared[:, 0].nan_to_num(torch.inf)
 
-
-def _is_success(
-    inliers: Bool[Tensor, "B N"],
-    mask: Bool[Tensor, "B N"],
-    points: Float[Tensor, "B N 3"],
-    size: tuple[int, int],
-    threshold: float,
-) -> Bool[Tensor, " B"]:
-    """Test whether the inliers among the rows in use are significant and fix the pose: four or more, not on a line."""
-    chance = torch.full_like(mask[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64)
-    significant = is_significant(inliers.sum(-1), mask.sum(-1), 3, chance, solutions=4)
-    return significant & leave_a_line(points, inliers)
+    def is_success(
+        self, P: Float[Tensor, "B 3 4"], inliers: Bool[Tensor, "B N"], size: tuple[int, int], threshold: float
+    ) -> Bool[Tensor, " B"]:
+        """Test whether inliers are significant and fix the pose: four or more distinct points, not on a line."""
+        points_c = torch.where(inliers[..., None], (P @ self.homogeneous).mT, 1.0)
+        depth = points_c[..., 2:]
+        # Thresholds in the image, and as much in depth.
+        places = torch.cat((points_c[..., :2] / depth, depth.log()), dim=-1) * self.scale.mean(
+            -1, keepdim=True
+        )
+        chance = torch.full_like(
+            inliers[:, 0], math.pi * threshold**2 / (size[0] * size[1]), dtype=torch.float64
+        )
+        significant = is_significant(
+            *count_distinct(places, inliers, self.mask.sum(-1)), 3, chance, solutions=4
+        )
+        return significant & leave_a_line(self.points, inliers)

@@ -6,7 +6,7 @@ Camera frame: x right, y down, z forward. Pixel (0, 0) is the center of the top 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass
 from functools import reduce, wraps
 from typing import Any, ClassVar, Concatenate, ParamSpec, TypeVar
 
@@ -18,6 +18,7 @@ from torch import Tensor
 from torchslam.geometry import distortion
 from torchslam.geometry.lie import homogeneous
 from torchslam.geometry.precision import without_autocast
+from torchslam.utils.by_value import ByValue
 from torchslam.utils.torch_internals import default_collate_fn_map, in_transform, register_pytree
 
 Scalar = float | Tensor
@@ -33,14 +34,19 @@ def _in_dtype_of_data(method: Callable[Concatenate[Camera, P], R]) -> Callable[C
     @wraps(method)
     def following(self: Camera, *args: P.args, **kwargs: P.kwargs) -> R:
         data: Any = args[0] if args else next(iter(kwargs.values()))
-        return method(self if data.dtype == self.params.dtype else self.to(data.dtype), *args, **kwargs)
+        camera = self if data.dtype == self.params.dtype else self.to(data.dtype)
+        return method(camera._without_degenerate(), *args, **kwargs)
 
     return following
 
 
-@dataclass(frozen=True)
-class Camera:
+@dataclass(frozen=True, eq=False)
+class Camera(ByValue):
     """A calibrated camera, or many of one model and size. Without batch dimensions it broadcasts over any points.
+
+    Parameters that are not finite, or focal lengths not above zero, raise ValueError. `with_params` alone takes them,
+    as of an optimizer; that camera of a batch then sees nothing: no point is valid, and it has no gradient. Cameras of
+    equal model, size and parameters are equal.
 
     Parameters given as Python numbers are float64. Whoever takes a camera and tensors computes in the dtype of the
     tensors, the methods as well. Every method is differentiable with respect to points, pixels and `params`, up to the
@@ -53,16 +59,18 @@ class Camera:
             pinhole, k1, k2, p1, p2, k3 for radial_tangential, these and k4, k5, k6 for rational, k1, k2, k3, k4 for
             fisheye.
         size: (width, height) in pixels.
+        check_values: whether the values of `params` are checked, which waits for a GPU.
     """
 
     model: str
     params: Float[Tensor, "*batch P"]
     size: tuple[int, int]
+    check_values: InitVar[bool] = True
 
     follows_data: ClassVar[bool] = True
     """`full_precision` lets it have another dtype, and converts it."""
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, check_values: bool) -> None:
         if self.model not in distortion.MODELS:
             raise ValueError(f"unknown camera model {self.model!r}; known are {', '.join(distortion.MODELS)}")
         if not isinstance(self.params, Tensor):
@@ -75,6 +83,32 @@ class Camera:
         if self.params.shape[-1:] != (expected,):
             shape = tuple(self.params.shape)
             raise ValueError(f"a {self.model} camera has {expected} parameters, but params has shape {shape}")
+        if check_values and not (self._is_traced or bool((proper := self.is_proper).all())):
+            wrong = self.params.detach()[~proper][0].tolist()
+            raise ValueError(f"a camera needs finite parameters and focal lengths above zero, got {wrong}")
+
+    @property
+    def _is_traced(self) -> bool:
+        """Whether no decision may depend on values."""
+        return torch.compiler.is_compiling() or in_transform()
+
+    @property
+    def is_proper(self) -> Bool[Tensor, "*batch"]:
+        """Which cameras have finite parameters and focal lengths above zero."""
+        params = self.params.detach()
+        return torch.isfinite(params).all(-1) & (params[..., :2] > 0).all(-1)
+
+    def _without_degenerate(self) -> Camera:
+        """The camera, with harmless parameters and a mark where it is not proper, in which nothing is valid."""
+        if "_usable" in self.__dict__:
+            return self
+        proper = self.is_proper
+        if not self._is_traced and bool(proper.all()):
+            return self
+        harmless = self.params.new_tensor((1.0, 1.0, *(0.0,) * (self.params.shape[-1] - 2)))
+        camera = self.with_params(torch.where(proper[..., None], self.params, harmless))
+        camera.__dict__["_usable"] = proper
+        return camera
 
     @staticmethod
     def pinhole(fx: Scalar, fy: Scalar, cx: Scalar, cy: Scalar, size: tuple[int, int]) -> Camera:
@@ -206,7 +240,7 @@ class Camera:
     def limit(self) -> Float[Tensor, "*batch"]:
         """Extent of the monotone distortion: a radius in x/z, y/z, or an angle for a fisheye; may be infinite."""
         k = self.params.detach()[..., 4:]
-        if torch.compiler.is_compiling() or in_transform():
+        if self._is_traced:
             return self._distortion.limit(k)
         # Kept, since it takes longer than the distortion itself, until an optimizer changes the parameters in place.
         known = self.__dict__.get("_limit")
@@ -220,9 +254,9 @@ class Camera:
         return distortion.MODELS[self.model]
 
     def with_params(self, params: Float[Tensor, "*batch P"]) -> Camera:
-        """Replace the parameters, keeping model and size."""
+        """Replace the parameters, whose values are not checked, keeping model and size."""
         # Not `replace`: compiled graphs of torch 2.5 do not take it.
-        return Camera(self.model, params, self.size)
+        return Camera(self.model, params, self.size, check_values=False)
 
     def __getitem__(self, index: Any) -> Camera:
         """Index the leading dimensions of many cameras, as for a tensor."""
@@ -244,7 +278,7 @@ class Camera:
 
     def to(self, *args: Any, **kwargs: Any) -> Camera:
         """Move the camera to another device or dtype; arguments as of `Tensor.to`."""
-        return Camera(self.model, self.params.to(*args, **kwargs), self.size)
+        return self.with_params(self.params.to(*args, **kwargs))
 
     @_in_dtype_of_data
     def project(
@@ -299,7 +333,10 @@ class Camera:
     def normalize(self, pixels: Float[Tensor, "*#batch N 2"]) -> Float[Tensor, "*#batch N 2"]:
         """Compute x/z, y/z of pixels, clamped to the edge of the monotone distortion; NaN gives the center."""
         # Replaced before the parameters see it: zero times NaN would be their gradient.
-        pixels = torch.where(torch.isfinite(pixels), pixels, self.params.detach()[..., None, 2:4])
+        finite = torch.isfinite(pixels)
+        if (usable := self.__dict__.get("_usable")) is not None:
+            finite = finite & usable[..., None, None]
+        pixels = torch.where(finite, pixels, self.params.detach()[..., None, 2:4])
         distorted = (pixels - self.params[..., None, 2:4]) / self.params[..., None, :2]
         distorted = torch.where(torch.isfinite(distorted), distorted, 0.0)
         return self._distortion.undistort(distorted, self.params[..., None, 4:], self.limit[..., None])
@@ -337,6 +374,8 @@ class Camera:
         depth = points_c[..., 2]
         tiny = torch.finfo(depth.dtype).eps
         valid = (depth > tiny) & torch.isfinite(points_c).all(-1)
+        if (usable := self.__dict__.get("_usable")) is not None:
+            valid = valid & usable[..., None]
         safe = torch.where(valid[..., None], points_c, 1.0)
         normalized = safe[..., :2] / safe[..., 2:]
         if self.model != "pinhole":

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.precision import full_precision, without_autocast
+from torchslam.utils.by_value import ByValue
 
 
 def triangle(A: Float[Tensor, "*batch 2 2"]) -> Float[Tensor, "*batch 3"]:
@@ -57,8 +58,8 @@ GATE_FACTOR = 2.0
 errors of its own. Scales, where no information is provided, include that factor: ORB is precise to half its scale."""
 
 
-@dataclass(frozen=True)
-class KeypointNoise:
+@dataclass(frozen=True, eq=False)
+class KeypointNoise(ByValue):
     """The errors of keypoints.
 
     Attributes:

@@ -10,7 +10,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.geometry.ransac import SUPPORT_WIDTH, best_of, is_significant, is_unlikely
+from torchslam.geometry.ransac import SUPPORT_WIDTH, best_of, count_distinct, is_significant, is_unlikely
 from torchslam.geometry.robust import NORMAL_MEDIAN, NORMAL_SQUARED_MEDIAN_2D
 from torchslam.geometry.two_view import (
     TRANSFER_WIDTH,
@@ -38,6 +38,9 @@ _HOMOGRAPHY_SAMPLES, _ROTATION_SAMPLES, _TRIAL_ITERATIONS = 64, 16, 5
 """Minimal samples of a homography and a rotation, and iterations for one that may not be needed. Tried at these values
 only."""
 _CLEARLY_OFF = 2.0  # thresholds of the transfer error: three deviations of noise as large as the threshold
+# Deviations of the noise, in both images together, up to which matches may be one that is repeated. Tried at this value
+# only.
+_DISTINCT = 6.0
 _LEAST_SPREAD = 3.0  # thresholds by which the inliers must leave a line
 _LEAST_SHARE = 0.05  # of the matches that must contradict the simpler model for the richer one to be chosen
 # A best sample of which this share of the matches is clearly off, of at least this many in all: no fit brings these
@@ -313,10 +316,12 @@ def is_no_accident(
     """
     still = (model == ROTATION) & by_noise
     in_thresholds = views.in_units(1 / noise[:, None])
+    places = torch.cat((views.x_1 * views.scale_1[..., None], views.x_2 * views.scale_2[..., None]), dim=-1)
     found = torch.zeros_like(still)
     for width in (1 / noise, torch.full_like(noise, FINAL_WIDTH))[: 1 + by_noise]:
         inliers = (squared < width.square()[:, None]) & views.mask
-        count, available, chances = inliers.sum(-1), views.mask.sum(-1), chance * width * noise
+        count, available = count_distinct(places / _DISTINCT, inliers, views.mask.sum(-1))
+        chances = chance * width * noise
         counted = is_significant(count, available, 5, chances, 10)
         if bool(still.any()):
             counted |= still & is_significant(count, available, 2, chances.square(), 1)

@@ -32,6 +32,11 @@ _MAX_VALUES_AT_ONCE, _SAMPLES_AT_ONCE = 300_000, 1024
 _PREVIEW_FROM, _PREVIEW_ROWS, _PREVIEW_MODELS = 100_000, 80, 32
 
 
+_FEW_PLACES = 12
+"""Distinct rows from which on repeated ones do not matter: as many are significant for every model here, unless nearly
+all rows are wrong. Tried at this value only."""
+
+
 def check_search(threshold: float, confidence: float, max_samples: int, min_samples: int = 1) -> None:
     """Raises ValueError for options of a search that make no sense."""
     check_positive(threshold=threshold, min_samples=min_samples, max_samples=max_samples)
@@ -287,6 +292,28 @@ def is_significant(
         return alarms + math.log(solutions * max(available - size, 1))
 
     return _is_below(1e-3, log_false_alarms, inliers, available, chance)
+
+
+def count_distinct(
+    rows: Float[Tensor, "B N D"], inliers: Bool[Tensor, "B N"], available: Int[Tensor, " B"]
+) -> tuple[Int[Tensor, " B"], Int[Tensor, " B"]]:
+    """Count inliers and rows in use for `is_significant`, where rows that repeat a few places are not independent.
+
+    Inliers at fewer than `_FEW_PLACES` places count as that many, and the rows in use by the same ratio.
+
+    rows: in units of the distance from which on two rows are distinct; available: rows in use
+    """
+    count, (B, N) = inliers.sum(-1), inliers.shape
+    far = torch.where(inliers, torch.inf, 0.0).to(rows.dtype)  # squared distance to the nearest place so far
+    places, index = torch.zeros_like(count), torch.arange(B, device=rows.device)
+    for _ in range(min(_FEW_PLACES, N)):
+        farthest, row = far.max(-1)
+        places += farthest > 1
+        distance = (rows - rows[index, row][:, None]).square().sum(-1)
+        far = torch.where(inliers, torch.minimum(far, distance), 0.0)
+    few = places < _FEW_PLACES
+    scaled = (available * places / count.clamp_min(1)).round().to(available.dtype)
+    return torch.where(few, places, count), torch.where(few, scaled, available)
 
 
 def _is_below(limit: float, log_alarms: Callable[..., float], *of_problems: Tensor) -> Bool[Tensor, " B"]:

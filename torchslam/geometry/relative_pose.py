@@ -47,6 +47,7 @@ from torchslam.geometry.two_view import (
     tangent_basis,
 )
 from torchslam.geometry.two_view_matrices import essential_from_pose, sampson_errors, transfer_errors
+from torchslam.utils.by_value import ByValue
 
 Model = Literal["auto", "essential"]
 
@@ -55,8 +56,8 @@ Model = Literal["auto", "essential"]
 _KERNEL_WIDTH, _KERNEL_ITERATIONS, _LEAST_NOISE = 1.5, 20, 1 / 64
 
 
-@dataclass(frozen=True)
-class RelativePose:
+@dataclass(frozen=True, eq=False)
+class RelativePose(ByValue):
     """Relative poses of B pairs of views.
 
     Attributes:
@@ -187,13 +188,12 @@ def estimate_relative_pose(
 def _nothing(pixels: Float[Tensor, "B N 2"], given: list[Tensor]) -> RelativePose:
     """The answer where there is nothing to sample from."""
     B, N = pixels.shape[:2]
-    T_21 = torch.eye(4, dtype=pixels.dtype, device=pixels.device).expand(B, 4, 4)
-    score = torch.zeros(B, dtype=pixels.dtype, device=pixels.device)
+    T_21 = torch.eye(4, dtype=pixels.dtype, device=pixels.device).repeat(B, 1, 1)
+    essential, homography, rotation = torch.zeros(3, B, dtype=T_21.dtype, device=T_21.device)
     model = torch.full((B,), ROTATION, device=pixels.device)
-    no = torch.zeros(B, N + 1, dtype=torch.bool, device=pixels.device)
-    return RelativePose(
-        with_zero_gradient(T_21, *given), no[:, :N], no[:, N], model, no[:, N], score, score, score, T_21
-    )
+    inliers, success, ambiguous = (pixels.new_zeros(shape, dtype=torch.bool) for shape in ((B, N), B, B))
+    T_21, guess = with_zero_gradient(T_21, *given), T_21.clone()
+    return RelativePose(T_21, inliers, success, model, ambiguous, essential, homography, rotation, guess)
 
 
 def _fit_motion(

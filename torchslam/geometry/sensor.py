@@ -20,10 +20,11 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import KeypointNoise, whitening
 from torchslam.geometry.lie import homogeneous, se3_exp_transform
 from torchslam.geometry.rolling_shutter import Readout, row_fractions
+from torchslam.utils.by_value import ByValue
 
 
-@dataclass(frozen=True)
-class UndistortedKeypoints:
+@dataclass(frozen=True, eq=False)
+class UndistortedKeypoints(ByValue):
     """Keypoints of one camera, undistorted once; coordinates come first in memory.
 
     Attributes:
@@ -125,8 +126,8 @@ class Undistortion:
         return torch.cat((exact.xy, exact.slope.flatten(0, 1), inverse.flatten(0, 1))).mT.contiguous()
 
 
-@dataclass(frozen=True)
-class SensorModel:
+@dataclass(frozen=True, eq=False)
+class SensorModel(ByValue):
     """Camera, shutter and noise of the images of a recording.
 
     Attributes:

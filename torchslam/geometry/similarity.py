@@ -22,6 +22,7 @@ from torchslam.geometry.ransac import (
     best_models,
     best_of,
     check_search,
+    count_distinct,
     gather_rows,
     is_significant,
     leave_a_line,
@@ -35,6 +36,7 @@ from torchslam.geometry.ransac import (
     truncated_score,
 )
 from torchslam.geometry.transforms import without_scale
+from torchslam.utils.by_value import ByValue
 
 
 @full_precision
@@ -49,7 +51,8 @@ def umeyama(
     Differentiable once in points and weights (a second time raises RuntimeError), on exact data and at repeated
     singular values too: the rotation's gradient comes from the optimality condition, not from the singular vectors.
     With fewer than three points, or collinear ones, the result is finite and one of many minimizers, and its
-    gradient leaves out the free direction. Source: Umeyama, "Least-squares estimation of transformation parameters
+    gradient leaves out the free direction. Points at one place up to rounding have scale one and the identity as
+    rotation, without gradient. Source: Umeyama, "Least-squares estimation of transformation parameters
     between two point patterns", 1991.
 
     Args:
@@ -68,12 +71,14 @@ def umeyama(
     source, target = torch.where(used, source, 0.0), torch.where(used, target, 0.0)
     w = (w / w.sum(-1, keepdim=True).clamp_min(torch.finfo(w.dtype).tiny))[..., None]
     mean_source, mean_target = (w * source).sum(-2), (w * target).sum(-2)
-    x, y = source - mean_source[..., None, :], target - mean_target[..., None, :]
+    spread_source, spread_target = _is_spread(w, source, mean_source), _is_spread(w, target, mean_target)
+    x = torch.where(spread_source, source - mean_source[..., None, :], 0.0)
+    y = torch.where(spread_target, target - mean_target[..., None, :], 0.0)
     covariance = (w * y).mT @ x
     R = nearest_rotation(covariance)
     if with_scale:
         variance = (w * x * x).sum((-2, -1))
-        spread = variance > torch.finfo(w.dtype).tiny
+        spread = spread_source[..., 0, 0]
         scale = (R * covariance).sum((-2, -1)) / torch.where(spread, variance, 1.0)
         scale = torch.where(spread, scale, 1.0)
     else:
@@ -84,13 +89,22 @@ def umeyama(
     return scale, R, torch.where(finite[..., 0], t, torch.nan)
 
 
+def _is_spread(
+    w: Float[Tensor, "*batch N 1"], points: Float[Tensor, "*batch N 3"], mean: Float[Tensor, "*batch 3"]
+) -> Bool[Tensor, "*batch 1 1"]:
+    """Test whether points differ from their weighted mean by more than rounding."""
+    variance = (w * (points - mean[..., None, :]).detach().square()).sum((-2, -1))
+    eps, size = torch.finfo(w.dtype).eps, (w * points.detach().square()).sum((-2, -1))
+    return (variance > (16 * eps) ** 2 * size + torch.finfo(w.dtype).tiny)[..., None, None]
+
+
 def align_poses(
     T_ac: Float[Tensor, "N 4 4"], T_bc: Float[Tensor, "N 4 4"], use_centers: bool = False
 ) -> Float[Tensor, "4 4"]:
     """Compute the similarity S_ba from poses of cameras in one world to the same cameras' poses in another.
 
     Its rotation is the mean of those of the cameras, so that centers on a line, or close to each other, determine it
-    too. Its scale is the ratio of the spreads of the centers, one where all are at one place.
+    too. Its scale is the ratio of the spreads of the centers, one where those of either world are at one place.
 
     Args:
         use_centers: let centers and orientations count equally in the rotation.
@@ -100,10 +114,12 @@ def align_poses(
     mean_a, mean_b = a.mean(0), b.mean(0)
     spread_a, spread_b = ((x - m).square().sum().sqrt() for x, m in ((a, mean_a), (b, mean_b)))
     least = torch.finfo(a.dtype).tiny
+    rounding = 16 * torch.finfo(a.dtype).eps
+    have_extent = (spread_a > rounding * a.norm() + least) & (spread_b > rounding * b.norm() + least)
     if use_centers:
         M = M / len(T_ac) + (b - mean_b).mT @ (a - mean_a) / (spread_a * spread_b).clamp_min(least)
     R = nearest_rotation(M)
-    scale = torch.where((spread_a > least) & (spread_b > least), spread_b / spread_a.clamp_min(least), 1.0)
+    scale = torch.where(have_extent, spread_b / spread_a.clamp_min(least), 1.0)
     return rigid(scale * R, mean_b - scale * R @ mean_a)
 
 
@@ -139,12 +155,13 @@ def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 
     return so3_exp(first_order(omega - omega.detach())) @ R
 
 
+_DISTINCT = 2.0  # thresholds, in both images together, up to which pairs may be one that is repeated
 _LOCAL_ITERATIONS = 2
 """Of a hypothesis within the search, which only ranks it. Tried at this value only."""
 
 
-@dataclass(frozen=True)
-class Similarity:
+@dataclass(frozen=True, eq=False)
+class Similarity(ByValue):
     """Similarities between the coordinates of B pairs of cameras.
 
     Attributes:
@@ -215,8 +232,9 @@ def estimate_similarity(
     use = use if mask is None else use & mask
     B, N = use.shape
     if B == 0 or N < 3:
-        S_21 = torch.eye(4, dtype=points_1.dtype, device=points_1.device).expand(B, 4, 4)
-        return Similarity(S_21, torch.zeros_like(use), torch.zeros_like(S_21[:, 0, 0]) > 0, S_21[:, 0, 1])
+        S_21 = torch.eye(4, dtype=points_1.dtype, device=points_1.device).repeat(B, 1, 1)
+        score = torch.zeros_like(S_21[:, 0, 0])
+        return Similarity(S_21, torch.zeros_like(use), score > 0, score)
     points_1, points_2, pixels_1, pixels_2 = (torch.where(use[..., None], x, 0.0).detach() for x in given)
     sigmas = tuple(torch.where(use, sigma, 1.0).detach() for sigma in sigmas)
     with torch.inference_mode():  # less work per operation than without gradients only
@@ -305,7 +323,9 @@ class _Problem:
             for view in (self.forward, self.backward)
         ]
         chance = torch.maximum(*areas).double() / count.clamp_min(1)
-        success = is_significant(inliers.sum(-1), count, 3, chance, solutions=1)
+        views = self.forward, self.backward
+        places = torch.cat([view.normalized * view.scale for view in views], dim=-1) / _DISTINCT
+        success = is_significant(*count_distinct(places, inliers, count), 3, chance, solutions=1)
         for view in (self.forward, self.backward):
             success = success & leave_a_line(view.points, inliers)
         score = torch.where(self.mask, (1 - squared).clamp_min(0.0), 0.0).sum(-1)

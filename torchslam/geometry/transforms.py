@@ -16,6 +16,7 @@ Every change of axes is made here:
 from __future__ import annotations
 
 import math
+from itertools import permutations, product
 from typing import TYPE_CHECKING
 
 import torch
@@ -120,6 +121,15 @@ def corner_camera(camera: Camera) -> Camera:
 def opengl(T_wc: Float[Tensor, "*batch 4 4"]) -> Float[Tensor, "*batch 4 4"]:
     """Convert camera-to-world transforms to camera axes x right, y up, z backward."""
     return T_wc * T_wc.new_tensor((1.0, -1.0, -1.0, 1.0))
+
+
+def signed_axes(like: Tensor) -> Float[Tensor, "48 3 3"]:
+    """The matrices that exchange and reverse axes: 24 rotations, the identity first, and their mirror images."""
+    eye = torch.eye(3, dtype=like.dtype, device=like.device)
+    orders = torch.stack([eye[list(order)] for order in permutations(range(3))])
+    signs = like.new_tensor(list(product((1.0, -1.0), repeat=3)))
+    every = (orders[:, None] * signs[:, :, None]).flatten(0, 1)
+    return every[torch.argsort(torch.linalg.det(every), descending=True, stable=True)]
 
 
 def quaternion_wxyz(R: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 4"]:

@@ -12,10 +12,11 @@ from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import inverse_2x2, whitening
 from torchslam.geometry.lie import homogeneous, se3_inverse, skew, transform
 from torchslam.geometry.precision import full_precision
+from torchslam.utils.by_value import ByValue
 
 
-@dataclass(frozen=True)
-class Triangulation:
+@dataclass(frozen=True, eq=False)
+class Triangulation(ByValue):
     """Points seen in two views. Invalid rows are finite.
 
     Attributes:
@@ -36,8 +37,8 @@ class Triangulation:
     mask: Bool[Tensor, "*batch N"]
 
 
-@dataclass(frozen=True)
-class MultiViewTriangulation:
+@dataclass(frozen=True, eq=False)
+class MultiViewTriangulation(ByValue):
     """Points seen in up to V views. Invalid rows are finite.
 
     Attributes:

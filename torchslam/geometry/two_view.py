@@ -38,10 +38,10 @@ from torchslam.geometry.ransac import (
 )
 from torchslam.geometry.robust import NORMAL_MEDIAN, Kernel, median_scale, robustify
 from torchslam.geometry.two_view_matrices import (
-    decompose_essential,
     essential_from_pose,
     five_point,
     homography_from_matches,
+    motions_of_essential,
     rotation_from_matches,
     transfer_errors,
 )
@@ -263,7 +263,7 @@ def propose_essential(
         return (support @ some.mask.to(support.dtype)[..., None]).squeeze(-1)
 
     best = best_models(score, E, valid, views.mask, candidates, generator)
-    R, t = decompose_essential(gather_rows(E, best).unflatten(-1, (3, 3)))
+    R, t = motions_of_essential(gather_rows(E, best).unflatten(-1, (3, 3)))
     # Padding has no pose; start it from the identity.
     valid, eye = valid.gather(1, best)[..., None], torch.eye(3, dtype=R.dtype, device=R.device)
     R, t = torch.where(valid[..., None], R[:, :, 0], eye), torch.where(valid, t, eye[2])

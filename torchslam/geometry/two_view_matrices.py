@@ -15,7 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import homogeneous, skew
+from torchslam.geometry.lie import homogeneous, matrix_from_quaternion, quaternion_from_matrix, skew
 from torchslam.geometry.precision import full_precision
 
 # The unknowns are x, y, z in E = x E_0 + y E_1 + z E_2 + E_3. The monomials by their powers of x, y, z: first those
@@ -203,9 +203,18 @@ def decompose_essential(
 ) -> tuple[Float[Tensor, "*batch 2 3 3"], Float[Tensor, "*batch 3"]]:
     """Decompose essential matrices of any scale into R_i and t of unit length: poses (R_i, t) and (R_i, -t).
 
-    Without a singular value decomposition, so that the gradient is correct at the equal singular values. Source:
-    Horn, "Recovering baseline and orientation from essential matrix", 1990.
+    Also of a matrix that is none, by noise: the R_i are rotations up to rounding. Without a singular value
+    decomposition, so that the gradient is correct at the equal singular values. Source: Horn, "Recovering baseline and
+    orientation from essential matrix", 1990.
     """
+    R, t = motions_of_essential(E)
+    return matrix_from_quaternion(quaternion_from_matrix(R)), t
+
+
+def motions_of_essential(
+    E: Float[Tensor, "*batch 3 3"],
+) -> tuple[Float[Tensor, "*batch 2 3 3"], Float[Tensor, "*batch 3"]]:
+    """As `decompose_essential`, where the R_i are rotations only as far as E is an essential matrix."""
     gram = E @ E.mT
     half_trace = 0.5 * gram.diagonal(dim1=-2, dim2=-1).sum(-1)
     outer = half_trace[..., None, None] * torch.eye(3, dtype=E.dtype, device=E.device) - gram  # t t^T

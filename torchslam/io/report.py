@@ -266,16 +266,20 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
             f"observations off by more than {FAR_PX:g} px, points seen in "
             f"{metrics['track_length']:.1f} frames, {metrics['uncertain'] / frames:.1%} of the frames uncertain"
         )
-    if metrics.get("check"):
+    check = metrics.get("check")
+    if check and check["pairs"]:
         how = {"online": "frame by frame", "global": "global mapping"}[metrics["mapping"]]
-        rows["check"] = f"{how}: {metrics['check']['sentence']}"
+        rows["check"] = f"{how}: {check['sentence']}"
+    else:
+        rows["check"] = "none: no image pairs tested this map, and what it states of itself may be wrong"
     rows |= _describe_submaps(metrics)
     rows |= {"camera": metrics["camera"]} if metrics.get("camera") else {}
     rows |= {"readout": readout_words(readout)} if (readout := metrics.get("readout")) else {}
-    rows["speed"] = (
-        f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
-        f"{metrics['ms_p95']:.0f} ms (95th percentile)"
-    )
+    if metrics["fps"]:  # frames were processed one by one
+        rows["speed"] = (
+            f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
+            f"{metrics['ms_p95']:.0f} ms (95th percentile)"
+        )
     return rows | accuracy(metrics) | {"unit": unit_words(metrics)}
 
 

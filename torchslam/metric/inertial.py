@@ -21,7 +21,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.data.inertial import InertialCalibration, InertialSamples, read_imu, read_inertial_calibration
@@ -36,6 +36,7 @@ from torchslam.metric.inertial_equations import (
     stretch_rows,
     stretches_of,
 )
+from torchslam.metric.inertial_mounting import other_readings
 from torchslam.metric.inertial_rotation import InertialRotation, align_rotations
 from torchslam.metric.options import Given
 from torchslam.metric.source import ScaleMeasurement, ScaleSource, SubmapView, Unmeasured
@@ -115,9 +116,7 @@ def align_inertial(
         turn_std: rad, of the camera's turns over `TURN_INTERVAL`.
         position_std: meters, of its positions. None: those of the residuals, which have no gradient.
     """
-    inside = (timestamps + calibration.offset > samples.timestamps[0] + EDGE) & (
-        timestamps + calibration.offset < samples.timestamps[-1] - EDGE
-    )
+    inside = within(timestamps, samples, calibration)
     timestamps, T_cw = timestamps[inside], T_cw[inside]
     if len(timestamps) < FEWEST_FRAMES or timestamps[-1] - timestamps[0] < SHORTEST:
         return _nothing(InertialReason.NO_OVERLAP, T_cw)
@@ -167,6 +166,14 @@ def align_inertial(
     )
 
 
+def within(
+    timestamps: Float[Tensor, " K"], samples: InertialSamples, calibration: InertialCalibration
+) -> Bool[Tensor, " K"]:
+    """Which times lie within those of the samples."""
+    times = timestamps + calibration.offset
+    return (times > samples.timestamps[0] + EDGE) & (times < samples.timestamps[-1] - EDGE)
+
+
 def lies_still(samples: InertialSamples, start: float, end: float) -> bool:
     """Whether the sensor neither turns nor is shaken between two times."""
     rows = (samples.timestamps >= start) & (samples.timestamps <= end)
@@ -213,7 +220,14 @@ class InertialSource:
                 )
         found = align_inertial(timestamps, T_cw, self.samples, self.calibration)
         if found.reason is not InertialReason.MEASURED or found.rotation is None:
-            uncertain = found.reason is InertialReason.NOT_DETERMINED and found.relative_std < 1
+            undetermined = found.reason is InertialReason.NOT_DETERMINED
+            if undetermined and (other := self._fitting(timestamps, T_cw)):
+                return Unmeasured(
+                    ScaleSource.INERTIAL,
+                    f"the samples do not fit the motion of the camera, but do with {other}: change the file of the "
+                    "samples or of the mounting",
+                )
+            uncertain = undetermined and found.relative_std < 1
             more = f": its scale is uncertain by {found.relative_std:.0%}" if uncertain else ""
             return Unmeasured(ScaleSource.INERTIAL, "; ".join([f"{found.reason}{more}", *self.samples.notes]))
         turn = math.degrees(float(found.rotation.bias.norm()))
@@ -233,6 +247,16 @@ class InertialSource:
             up_std=found.gravity_std,
             notes=(*self.samples.notes, note),
         )
+
+    def _fitting(self, timestamps: Float[Tensor, " K"], T_cw: Float[Tensor, "K 4 4"]) -> str:
+        """Another reading of the samples and the mounting with which the scale is determined; empty without one."""
+        inside = within(timestamps, self.samples, self.calibration)
+        for words, samples, calibration in other_readings(
+            timestamps[inside], T_cw[inside], self.samples, self.calibration
+        ):
+            if align_inertial(timestamps, T_cw, samples, calibration).reason is InertialReason.MEASURED:
+                return words
+        return ""
 
 
 def from_options(given: Given) -> list[InertialSource]:

@@ -90,7 +90,7 @@ def align_rotations(
     times, R_cw = timestamps[nodes], R_cw[nodes]
     turns_c = R_cw[:-1] @ R_cw[1:].mT  # from the camera at the end of an interval to that at its start
     with torch.no_grad():
-        prior = times.new_tensor(_start_offset(times, turns_c, samples, calibration.offset))
+        prior = times.new_tensor(start_offset(times, turns_c, samples, calibration.offset))
         R_bc, bias = _start_rotation(times + prior, turns_c, samples, calibration.T_bc)
     offset = prior
     for step in range(ROUNDS):
@@ -115,7 +115,7 @@ def increments(
     return preintegrate(steps, torch.cat((bias, torch.zeros_like(bias))), *densities)
 
 
-def _start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, given: float) -> float:
+def start_offset(times: Tensor, turns_c: Tensor, samples: InertialSamples, given: float) -> float:
     """The offset at which the angular speeds correlate best, or the given one."""
     angles = so3_log(turns_c).norm(dim=-1)
     speed = samples.gyroscope.norm(dim=-1)

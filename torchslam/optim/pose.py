@@ -304,7 +304,8 @@ def solve_pose(
     points_w, pixels = points_w.expand(batch, count, 3), pixels.expand(batch, count, 2)
     weights = torch.ones_like(pixels[..., 0]) if weights is None else weights
     weights = weights.expand(batch, *weights.shape[1:])
-    use = usable(pixels, points_w, weights)
+    proper = camera.is_proper[..., None]
+    use = usable(pixels, points_w, weights) & proper
     use = use if mask is None else use & mask
     rows, scale = use[..., None], kernel_scale(options.scale, T_cw)[..., None]
     priors: Tensors = ()
@@ -312,7 +313,8 @@ def solve_pose(
         priors = prior.T_cw.expand(batch, 4, 4), prior.information.expand(batch, 6, 6)
     points_w, pixels = torch.where(rows, points_w, 0.0), torch.where(rows, pixels, 0.0)
     # A copy, as of the others: parameters may move in place before the covariance is asked for.
-    inputs = T_cw, points_w, pixels, only(use, weights), camera.params.clone(), scale, *priors
+    params = torch.where(proper, camera.params, 1.0)
+    inputs = T_cw, points_w, pixels, only(use, weights), params, scale, *priors
     minimization = PoseMinimization(camera, options, inputs)
     found = find_minimum(minimization, inputs, options.backward)
     refined, success, *how = found

@@ -24,7 +24,7 @@ from torchslam.utils.files import JSON_BYTES, parse_json
 # Keys of a camera in a transforms.json; all of them are replaced.
 CAMERA_KEYS = (
     *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "k1", "k2", "k3", "k4", "p1", "p2"),
-    *("camera_angle_x", "camera_angle_y"),
+    *("camera_angle_x", "camera_angle_y", "is_fisheye"),
 )
 
 

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from torchslam.calibration.find_camera import better_camera
 from torchslam.config import Config
-from torchslam.data.formats.given_poses import TUM, GivenPoses, read_poses
+from torchslam.data.formats.given_poses import NERFSTUDIO, TUM, GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.geometry import Camera, SensorModel, se3_inverse, transform
@@ -31,8 +31,10 @@ from torchslam.geometry.camera_measurement import (
     intrinsics_directions,
     with_radial_terms,
 )
+from torchslam.geometry.lie import rigid, sim3_scale
 from torchslam.geometry.robust import fit_inliers
 from torchslam.geometry.similarity import align_poses
+from torchslam.geometry.transforms import opengl, rotation_angle
 from torchslam.global_mapping.check import MapCheck, check_map
 from torchslam.global_mapping.mapper import GlobalMapper, choose_held_back, choose_images
 from torchslam.global_mapping.rounds import GATE, MIN_VIEWS, ObservedTracks, Reconstruction, adjust_in_rounds
@@ -43,6 +45,7 @@ from torchslam.global_mapping.view_graph import (
     build_view_graph,
     connected_views,
 )
+from torchslam.refine.conventions import MATCHES, MAX_PAIRS, fitting_reading
 from torchslam.system.front_end import FeatureExtractor
 from torchslam.system.run import Run
 from torchslam.types import Explanation, Reason, State, StepResult, Trajectory
@@ -56,6 +59,11 @@ IMPROVED = 0.9
 improve on the given poses; two maps of one recording by different features differ by 5 %."""
 MORE_AGREE = 0.05
 """By how much the share of pairs that agree must grow to count as improved, whatever their distance."""
+
+
+MAX_TURNED = 30.0
+"""Median angle, degrees, between given and refined orientations from which on nothing relates the frames of both.
+Tried at this value only."""
 
 
 class CameraChoice(Enum):
@@ -83,6 +91,8 @@ class RefinementResult:
         pose_rows: Row of the given pose of each frame of the sequence, -1 for none.
         rounds: Number of cameras with which a map was built.
         kept: Whether the given poses were kept, since the images do not improve on them.
+        agreeing: Share of the image pairs that agree with the given poses.
+        check: The check of the refined poses in a sentence.
     """
 
     run: Run
@@ -90,6 +100,8 @@ class RefinementResult:
     pose_rows: Int[Tensor, " F"]
     rounds: int
     kept: bool = False
+    agreeing: float = 1.0
+    check: str = ""
 
     @property
     def without_image(self) -> int:
@@ -146,6 +158,7 @@ def refine_poses(
     refinement = _Refinement(mapper, frames, chosen, given.T_cw[rows].to(camera.params))
     failure = refinement.failure
     if not failure:
+        refinement.check_convention(given)
         counts = f"{len(refinement.views)} images, {len(refinement.pairs)} pairs"
         log(f"{counts}; given: {refinement.before.sentence()}")
         failure = refinement.map()
@@ -165,7 +178,8 @@ def refine_poses(
             rounds = 2
     kept = refinement.keep_given_unless_improved(is_free=mapper.given is not None)
     log(f"refined: {refinement.after.sentence()}" + ("; the given poses are kept" if kept else ""))
-    return RefinementResult(refinement.run, given, rows, rounds, kept)
+    agreeing, check = refinement.before.used_agreeing, refinement.after.sentence()
+    return RefinementResult(refinement.run, given, rows, rounds, kept, agreeing, check)
 
 
 def _measurement(camera: Camera, radial: int) -> CameraMeasurement:
@@ -208,6 +222,32 @@ class _Refinement:
         everything = torch.ones(len(self.views), dtype=torch.bool, device="cpu")
         self.before = self._check(self.T_cw, everything, mapper.camera)
 
+    def check_convention(self, given: GivenPoses) -> None:
+        """Raise TrajectoryError, naming what fits, for poses that image pairs contradict as the format defines them."""
+        if not self.pairs:
+            return
+        poses = self.T_cw if given.is_world_to_camera else se3_inverse(self.T_cw)
+        pairs = self.pairs[:: 1 + len(self.pairs) // MAX_PAIRS]
+
+        def pixels(view: int, rows: Int[Tensor, " M"]) -> Float[Tensor, "M 2"]:
+            return self.views[view].keypoints[rows[:: len(rows) // MATCHES][:MATCHES]]
+
+        pixels_1 = torch.stack([pixels(pair.first, pair.keypoints_1) for pair in pairs])
+        pixels_2 = torch.stack([pixels(pair.second, pair.keypoints_2) for pair in pairs])
+        ends = torch.tensor([(pair.first, pair.second) for pair in pairs], device=poses.device)
+        share, other = fitting_reading(
+            poses, given.is_world_to_camera, ends, pixels_1.to(poses), pixels_2.to(poses), self.mapper.camera
+        )
+        if other is None:
+            return
+        of_format = "world to camera" if given.is_world_to_camera else "camera to world"
+        axes = torch.eye(3, dtype=poses.dtype, device=poses.device)
+        axes = opengl(rigid(axes, axes[0]))[:3, :3] if given.kind == NERFSTUDIO else axes
+        raise TrajectoryError(
+            f"{given.path}: {share:.0%} of {len(pairs)} image pairs agree with the poses as {of_format}, but "
+            f"{other.share:.0%} as {other.sentence(of_format, axes)}: convert them"
+        )
+
     @torch.no_grad()
     def map(self) -> str:
         """Map the images, and pose the other frames; returns why that failed, or nothing."""
@@ -226,8 +266,19 @@ class _Refinement:
         self.after = self._check(reconstruction.T_cw, known, reconstruction.camera)
         self.run = self.mapper.finish(self.views, *made, self.frames, self.given)
         submap = self.run.submaps[0]
-        posed = submap.posed_frames.frames["frame_index"]
-        submap.transform(align_to_input(submap.posed_frames.T_cw(submap.map), self.given_cw[posed]))
+        T_cw, given = (
+            submap.posed_frames.T_cw(submap.map),
+            self.given_cw[submap.posed_frames.frames["frame_index"]],
+        )
+        S = align_to_input(T_cw, given)
+        submap.transform(S)
+        R_S = S[:3, :3] / sim3_scale(S)
+        off = float(torch.rad2deg(rotation_angle(given[:, :3, :3].mT @ T_cw[:, :3, :3] @ R_S.T)).median())
+        if off > MAX_TURNED:
+            return (
+                f"the orientations of the given poses are {off:.0f} degrees off those that the images determine, and "
+                "no other convention of the poses fits; map the images without them (torchslam run)"
+            )
         return ""
 
     @torch.no_grad()

@@ -18,7 +18,7 @@ from torchslam.data.formats.given_poses import GivenPoses, read_poses
 from torchslam.data.sequence import Sequence
 from torchslam.data.trajectories import write_trajectory
 from torchslam.errors import CalibrationError, TorchslamError, TrajectoryError
-from torchslam.geometry import Camera
+from torchslam.geometry import Camera, se3_exp
 from torchslam.io.export.colmap import write_colmap
 from torchslam.io.export.nerfstudio import write_nerfstudio
 from torchslam.io.export.scene import ExportedScene
@@ -73,7 +73,7 @@ def test_nerfstudio_poses_round_trip(scene: ExportedScene, tmp_path: Path) -> No
 
 def test_a_transforms_without_a_camera(tmp_path: Path) -> None:
     """Then the camera must be given; a camera at the origin looks along -z of OpenGL, y up."""
-    frames = [{"file_path": "./train/r_0", "transform_matrix": torch.eye(4).tolist(), "fl_x": 3.0}]
+    frames = [{"file_path": "./train/r_0", "transform_matrix": torch.eye(4).tolist()}]
     (tmp_path / "transforms.json").write_text(json.dumps({"frames": frames}))
     given = read_poses(tmp_path)
     assert given.calibration is None
@@ -120,6 +120,11 @@ def test_images_are_matched_by_their_times() -> None:
             json.dumps({"frames": [{"file_path": "a", "transform_matrix": (2 * torch.eye(4)).tolist()}]}),
             "not a rigid transformation",
         ),
+        (
+            "transforms.json",
+            json.dumps({"frames": [{"file_path": "a", "transform_matrix": np.diag([1, 1, -1, 1]).tolist()}]}),
+            r"frame a: 1 of 1 poses are mirrored \(determinant -1\)",
+        ),
         ("images.txt", "1 1 0 0 0 0 0 0 1\n", "expected `id qw"),
         ("images.txt", "1 3 0 0 0 0 0 0 1 a.png\n\n", "unit length"),
         ("images.txt", "# nothing\n", "no images"),
@@ -135,16 +140,27 @@ def test_invalid_poses_are_refused(tmp_path: Path, name: str, content: str | byt
 
 
 def test_several_cameras_are_too_many(tmp_path: Path) -> None:
-    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n")
-    (tmp_path / "cameras.txt").write_text("1 PINHOLE 4 4 1 1 2 2\n2 PINHOLE 4 4 1 1 2 2\n")
-    with pytest.raises(CalibrationError, match="2 cameras"):
-        read_poses(tmp_path)
-    (tmp_path / "images.txt").unlink()
+    """Those that the images have, and that differ; with a camera of the user's own they do not matter."""
+    (tmp_path / "images.txt").write_text("1 1 0 0 0 0 0 0 1 a.png\n\n2 1 0 0 0 1 0 0 2 b.png\n\n")
+    for second, message in (("2 PINHOLE 4 4 1 2 2 2", "2 cameras"), ("3 PINHOLE 4 4 1 1 2 2", "no camera 2")):
+        (tmp_path / "cameras.txt").write_text(f"1 PINHOLE 4 4 1 1 2 2\n{second}\n")
+        with pytest.raises(CalibrationError, match=message):
+            read_poses(tmp_path)
+        assert read_poses(tmp_path, with_camera=False).calibration is None
+    lines = "1 PINHOLE 4 4 1 1 2 2\n2 PINHOLE 4 4 1 1 2 2\n3 PINHOLE 4 4 9 9 2 2\n"
+    (tmp_path / "cameras.txt").write_text(lines)
+    assert params_of(read_poses(tmp_path), Camera.pinhole(1, 1, 1.5, 1.5, size=(4, 4))) == [1, 1, 1.5, 1.5]
+
+
+def test_several_cameras_of_a_binary_model(tmp_path: Path) -> None:
     (tmp_path / "images.bin").write_bytes(
-        struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 1) + b"a.png\0" + struct.pack("<Q", 0)
+        struct.pack("<QI7dI", 1, 1, 1, 0, 0, 0, 0, 0, 0, 2) + b"a.png\0" + struct.pack("<Q", 0)
     )
-    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 2))
-    with pytest.raises(CalibrationError, match="2 cameras"):
+    cameras = [struct.pack("<IiQQ4d", number, 1, 4, 4, number, 1, 2, 2) for number in (1, 2)]
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 2) + b"".join(cameras))
+    assert params_of(read_poses(tmp_path), Camera.pinhole(2, 1, 1.5, 1.5, size=(4, 4))) == [2, 1, 1.5, 1.5]
+    (tmp_path / "cameras.bin").write_bytes(struct.pack("<Q", 1) + cameras[0])
+    with pytest.raises(CalibrationError, match="no camera 2"):
         read_poses(tmp_path)
     (tmp_path / "cameras.bin").write_bytes(b"")
     with pytest.raises(TorchslamError, match="not COLMAP's cameras"):
@@ -179,3 +195,18 @@ def test_times_that_were_counted_must_all_be_there(tmp_path: Path) -> None:
     (tmp_path / "2.png").unlink()
     with pytest.raises(TrajectoryError, match=r"1 of 4 poses are of no image of .* are counted: .* rgb\.txt"):
         given.rows(open_sequence(tmp_path))
+
+
+def test_given_poses_of_a_program_are_checked_as_those_of_files() -> None:
+    mirrored = torch.diag(torch.tensor([1.0, 1.0, -1.0, 1.0], dtype=torch.float64))[None]
+    for T_cw, message in ((mirrored, "mirrored"), (torch.nan * mirrored, "rigid"), (2 * mirrored, "rigid")):
+        with pytest.raises(TrajectoryError, match=message):
+            GivenPoses("tum", Path("poses.txt"), T_cw, torch.zeros(1, dtype=torch.float64))
+
+
+def test_rotations_with_few_digits_become_rotations(tmp_path: Path) -> None:
+    T_wc = se3_exp(torch.tensor([[1.0, 2.0, 3.0, 0.3, -0.2, 0.5]], dtype=torch.float64))
+    frame = {"file_path": "a", "transform_matrix": T_wc[0].mul(1000).round().div(1000).tolist()}
+    (tmp_path / "transforms.json").write_text(json.dumps({"frames": [frame]}))
+    R = read_poses(tmp_path).T_cw[0, :3, :3]
+    torch.testing.assert_close(R @ R.T, torch.eye(3, dtype=torch.float64), atol=1e-12, rtol=0)

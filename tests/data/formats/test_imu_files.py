@@ -136,8 +136,22 @@ def test_a_missing_file(tmp_path: Path) -> None:
         f"%YAML:1.0\nIMU.T_b_c1: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: f\n   data: [{DATA}]\n"
         "IMU.NoiseGyro: 1e-4\n",
         f"%YAML:1.0\nTbc: !!opencv-matrix\n   rows: 4\n   cols: 4\n   dt: f\n   data: [{DATA}]\n",
+        f"T_ic: [{DATA}]\n",
+        "T_ci: [0, 1, 0, -0.2, -1, 0, 0, 0.1, 0, 0, 1, -0.3, 0, 0, 0, 1]\n",
+        f"T_SC: [{DATA}]\n",
+        f"cam0:\n  T_imu_cam: [{DATA}]\n",
     ],
-    ids=["euroc", "torchslam", "kalibr", "orb-slam3", "orb-slam3-old"],
+    ids=[
+        "euroc",
+        "torchslam",
+        "kalibr",
+        "orb-slam3",
+        "orb-slam3-old",
+        "kalibr-ic",
+        "kalibr-ci",
+        "okvis",
+        "openvins",
+    ],
 )
 def test_mountings_of_other_programs(tmp_path: Path, text: str) -> None:
     path = tmp_path / "camera.yaml"
@@ -161,7 +175,8 @@ def test_noise_beside_the_samples(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("", "no keys in it"),
-        ("fx: 3\n", "no transformation between camera and inertial sensor"),
+        ("fx: 3\n", "no transformation in it; looked for that between camera and inertial sensor"),
+        (f"T_from_factory: [{DATA}]\n", "the direction of T_from_factory is not known; looked for"),
         ("T_BS: [1, 0, 0]\n", "16 numbers, not 3"),
         ("T_BS: [1, 0, 0, x]\n", "`x` is not a number"),
         ("T_BS: [" + DATA.replace("-1.0", "-2.0") + "]\n", "is not rigid"),

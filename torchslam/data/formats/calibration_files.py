@@ -13,6 +13,7 @@ import difflib
 import math
 import os
 import re
+from collections.abc import Collection
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -219,7 +220,7 @@ def _from_tree(path: Path, tree: Tree) -> Calibration:
         prefix = next((each for each in ("camera1", "camera") if (f"{each}fx",) in here), "")
         if prefix:
             found = _from_single_keys(keys, prefix)
-        elif ("flx", "cameraanglex") in here:
+        elif ("flx", "cameraanglex") in here or has_cameras(here.value("frames")):
             found = _from_transforms(keys)
         elif ("intrinsics",) in here:
             found = _from_intrinsics(keys)
@@ -340,11 +341,22 @@ def _from_single_keys(keys: Keys, prefix: str, model_keys: tuple[str, ...] = ())
     return _with_distortion(keys, intrinsics, prefix, model_keys)
 
 
-def from_colmap(path: Path, lines: list[str]) -> Calibration:
-    """The single camera of a cameras.txt: `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`."""
-    if len(lines) != 1:
-        raise CalibrationError(f"{path}: {len(lines)} cameras; a file with the one to be used is needed")
-    _, model, width, height, *words = lines[0].split()
+def from_colmap(path: Path, lines: list[str], used: Collection[str] | None = None) -> Calibration:
+    """The camera of a cameras.txt, `CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]`, once or with equal parameters.
+
+    used: numbers of the cameras of the images; None: all
+    """
+    cameras = {number: words for number, *words in map(str.split, lines)}
+    used = cameras if used is None else used
+    missing = [number for number in used if number not in cameras]
+    if missing:
+        raise CalibrationError(f"{path}: no camera {missing[0]}, which an image has")
+    different = {tuple(cameras[number]) for number in used}
+    if len(different) != 1:
+        raise CalibrationError(
+            f"{path}: {len(different)} cameras with different parameters; the images of one are needed, or --camera"
+        )
+    ((model, width, height, *words),) = different
     if model not in COLMAP_MODELS:
         raise CalibrationError(
             f"{path}: camera model {model} is not known; there are {', '.join(COLMAP_MODELS)}"
@@ -362,28 +374,49 @@ def from_colmap(path: Path, lines: list[str]) -> Calibration:
     return replace(found, as_stored=True)
 
 
-def _from_transforms(keys: Keys) -> Calibration:
-    """The camera that all frames of a transforms.json share; its pixels count from the corner of the top left one."""
-    source = keys.source
-    shared = (
-        "camera_model",
-        "w",
-        "h",
-        "fl_x",
-        "fl_y",
-        "cx",
-        "cy",
-        "is_fisheye",
-        *MODELS["rational"].coefficients,
+OF_FRAMES = (
+    *("camera_model", "w", "h", "fl_x", "fl_y", "cx", "cy", "camera_angle_x", "camera_angle_y", "is_fisheye"),
+    *MODELS["rational"].coefficients,
+)
+"""Keys of the camera in a transforms.json, for all frames or of each."""
+
+
+def has_cameras(frames: Any) -> bool:
+    """Whether frames of a transforms.json have focal lengths of their own."""
+    of_frames = frames if isinstance(frames, list) else ()
+    return any(
+        isinstance(frame, dict) and not {"fl_x", "camera_angle_x"}.isdisjoint(frame) for frame in of_frames
     )
-    frames: Any = keys.value("frames")
+
+
+def _from_transforms(keys: Keys) -> Calibration:
+    """The one camera of the frames of a transforms.json, stated for all of them or equally by each.
+
+    Its pixels count from the corner of the top left one.
+    """
+    source, frames = keys.source, keys.value("frames") if ("frames",) in keys else ()
+    cameras: dict[str, dict[str, Any]] = {}  # the frame that has it first
+    shared = {key: keys.value(normal(key)) for key in OF_FRAMES if (normal(key),) in keys}
     for frame in frames if isinstance(frames, list) else ():
-        for key in shared if isinstance(frame, dict) else ():
-            if key in frame and frame[key] != (keys.value(normal(key)) if (normal(key),) in keys else 0):
-                raise CalibrationError(
-                    f"{source}: frame {str(frame.get('file_path', ''))[:80]} has a {key} of its own; "
-                    "only one camera for all frames is read"
-                )
+        own = {key: frame[key] for key in OF_FRAMES if key in frame} if isinstance(frame, dict) else {}
+        other = next((key for key in own.keys() & shared.keys() if own[key] != shared[key]), None)
+        if other is not None:
+            raise CalibrationError(
+                f"{source}: frame {str(frame.get('file_path', ''))[:80]} has a {other} of its own, {own[other]}, where "
+                f"{shared[other]} is for all frames; give the images of one camera, or --camera for all"
+            )
+        whole = {key: value for key, value in (shared | own).items() if value}
+        if whole not in cameras.values():
+            cameras[str(frame.get("file_path", ""))[:80] if isinstance(frame, dict) else ""] = whole
+        if len(cameras) > 1:
+            (one, first), (other, second) = list(cameras.items())[:2]
+            key = next(key for key in OF_FRAMES if first.get(key) != second.get(key))
+            raise CalibrationError(
+                f"{source}: the frames have different cameras: {key} is {first.get(key, 'missing')} of {one}, "
+                f"{second.get(key, 'missing')} of {other}; give the images of one camera, or --camera for all"
+            )
+    if cameras:
+        keys = keys.with_values(dict.fromkeys(shared) | next(iter(cameras.values())))
     size = _size(keys, ("",))
     focal, angle = keys.number("flx"), keys.number("cameraanglex")
     if focal is None and size is not None and angle is not None:

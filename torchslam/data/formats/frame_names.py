@@ -44,6 +44,25 @@ class Found(NamedTuple):
         return [f"ignored: {kinds}"] if kinds else []
 
 
+CAMERA_WORDS = {
+    "cam",
+    "camera",
+    "image",
+    "img",
+    "sensor",
+    "lens",
+    "eye",
+    "view",
+    "rgb",
+    "color",
+    "imager",
+    "stereo",
+}
+"""Words before the number of a camera."""
+MAX_CAMERAS = 8  # of a rig whose images are in one folder
+LEAST_ALIKE = (
+    241  # images that count alike are of cameras: more than frames in a second or seconds in a minute
+)
 NUMBER = re.compile(r"((?<!\d)(?<!\d\.)\d+\.\d+(?!\.?\d)|\d+)")
 """A run of digits, or two with a dot between them; more dots separate parts of a version or a date."""
 UNIX_DIGITS = range(9, 11)  # digits of the seconds since 1970, from 1973 to 2286
@@ -145,17 +164,45 @@ def find_frames(folder: Path, pattern: str = "*") -> Found:
             frames.append(file)
         else:
             left_out[kind] += 1
-    series: dict[str, set[str]] = {}  # of names with `#` for each number: the numbers that occur
+    series: dict[str, list[tuple[str, ...]]] = {}  # of names with `*` for each number: the numbers
     for file in frames:
-        name = re.sub(r"\d+", "#", file.stem) + file.suffix
-        if "#" in name:
-            series.setdefault(name, set()).add("-".join(str(int(n)) for n in re.findall(r"\d+", file.stem)))
-    shared = Counter(number for numbers in series.values() for number in numbers)
-    rivals = [name for name, numbers in series.items() if any(shared[number] > 1 for number in numbers)]
-    if len(rivals) > 1:
-        globs = " or ".join(f"'{folder / name.replace('#', '*')}'" for name in sorted(rivals)[:4])
+        if numbers := re.findall(r"\d+", file.stem):
+            series.setdefault(re.sub(r"\d+", "*", file.stem) + file.suffix, []).append(tuple(numbers))
+    counted = {name: {tuple(map(int, each)) for each in numbers} for name, numbers in series.items()}
+    shared = Counter(number for numbers in counted.values() for number in numbers)
+    rivals = sorted(
+        name for name, numbers in counted.items() if any(shared[number] > 1 for number in numbers)
+    )
+    rivals = rivals if len(rivals) > 1 else [each for item in series.items() for each in _cameras(*item)]
+    if rivals:
+        globs = " or ".join(f"'{folder / name}'" for name in rivals[:4])
         raise SequenceError(f"{folder}: several series of images that count alike; which one? Give {globs}")
     return Found(in_order(frames), left_out)
+
+
+def _cameras(name: str, numbers: list[tuple[str, ...]]) -> list[str]:
+    """Return the patterns of the cameras that one number of the names counts, none where no number does.
+
+    They are few, and their images count alike: many of them, or any of them after a word for a camera.
+    """
+    columns, parts = list(zip(*numbers, strict=True)), name.split("*")
+    varying = sum(len(set(texts)) > 1 for texts in columns)
+    for place, texts in enumerate(columns):
+        images: dict[str, set[tuple[int, ...]]] = {}
+        for text, each in zip(texts, numbers, strict=True):
+            images.setdefault(text, set()).add(tuple(map(int, each[:place] + each[place + 1 :])))
+        if not 1 < len(images) <= MAX_CAMERAS or varying == 1:
+            continue
+        word = re.search(r"([a-z]*)[^a-z]*$", parts[place].lower())
+        pairs = list(itertools.combinations(images.values(), 2))
+        if word is not None and word[1] in CAMERA_WORDS:  # shutters of two clocks give no equal times
+            are_alike = all(max(min(a), min(b)) <= min(max(a), max(b)) for a, b in pairs)
+        else:
+            are_alike = varying == 2 and all(len(a & b) >= LEAST_ALIKE for a, b in pairs)
+        if are_alike:
+            ends = "*".join(parts[: place + 1]), "*".join(parts[place + 1 :])
+            return [text.join(ends) for text in sorted(images)]
+    return []
 
 
 def other_kind(file: Path) -> str | None:

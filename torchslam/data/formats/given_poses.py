@@ -16,12 +16,13 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration
-from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, read_calibration
+from torchslam.data.formats.calibration_files import COLMAP_MODELS, from_colmap, has_cameras, read_calibration
 from torchslam.data.sequence import GROUNDTRUTH_TOLERANCE, Sequence
-from torchslam.data.text_file import are_numbers, float64, parse_floats, read_text
-from torchslam.data.trajectories import nearest, orthogonality_error, poses_from_rows, read_trajectory
+from torchslam.data.text_file import are_numbers, float64, numbered_lines, parse_floats, read_text
+from torchslam.data.trajectories import checked_poses, nearest, poses_from_rows, read_trajectory
 from torchslam.errors import CalibrationError, FrameError, TrajectoryError
 from torchslam.geometry.lie import rigid, se3_inverse
+from torchslam.geometry.similarity import nearest_rotation
 from torchslam.geometry.transforms import opengl
 from torchslam.utils.files import JSON_BYTES, parse_json, read_bytes
 
@@ -49,10 +50,16 @@ class GivenPoses:
     calibration: Calibration | None = None
 
     def __post_init__(self) -> None:
-        """Raise TrajectoryError for a name that could not be a word of a line."""
+        """Raise TrajectoryError for a name that could not be a word of a line, and for a pose that is none."""
         wrong = [name for name in self.names if not name.isprintable()]
         if wrong:
             raise TrajectoryError(f"{self.path}: the name of an image has control characters: {wrong[0]!r}")
+        checked_poses(self.T_cw.cpu(), self.path)
+
+    @property
+    def is_world_to_camera(self) -> bool:
+        """Whether the format has poses from world to camera."""
+        return self.kind == COLMAP
 
     def __len__(self) -> int:
         return len(self.T_cw)
@@ -99,8 +106,10 @@ class GivenPoses:
         return found
 
 
-def read_poses(path: str | Path) -> GivenPoses:
+def read_poses(path: str | Path, with_camera: bool = True) -> GivenPoses:
     """The poses in a TUM trajectory, a folder with a COLMAP model, or a transforms.json (or a folder with one).
+
+    with_camera: whether the camera is read as well, which must be one.
 
     Raises TrajectoryError or CalibrationError naming the file.
     """
@@ -112,9 +121,9 @@ def read_poses(path: str | Path) -> GivenPoses:
             raise TrajectoryError(f"{path}: neither {' or '.join(models)} of COLMAP nor {TRANSFORMS} in it")
         path = path / inside
     if path.name in models:
-        return _read_colmap(path.parent, binary=path.suffix == ".bin")
+        return _read_colmap(path.parent, path.suffix == ".bin", with_camera)
     if path.suffix.lower() == ".json":
-        return _read_transforms(path)
+        return _read_transforms(path, with_camera)
     trajectory = read_trajectory(path)
     return GivenPoses(TUM, path, se3_inverse(trajectory.T_wc), trajectory.timestamps)
 
@@ -136,21 +145,26 @@ def rows_by_name(names: Listed[str], images: list[str]) -> Int[Tensor, " F"]:
     return torch.full((len(images),), -1, device="cpu")
 
 
-def _read_colmap(folder: Path, binary: bool) -> GivenPoses:
+def _read_colmap(folder: Path, binary: bool, with_camera: bool) -> GivenPoses:
     """Source: https://colmap.github.io/format.html."""
     read = _binary_images if binary else _text_images
     images = sorted(read(folder / f"images.{'bin' if binary else 'txt'}"))
     if not images:
         raise TrajectoryError(f"{folder}: no images in the model")
-    names, rows = zip(*images, strict=True)
+    names, rows, cameras = zip(*images, strict=True)
     T_cw = poses_from_rows(float64(rows)[:, [4, 5, 6, 1, 2, 3, 0]], [f"{folder}: {name}" for name in names])
-    read_camera = _binary_camera if binary else read_calibration
-    calibration = read_camera(folder / f"cameras.{'bin' if binary else 'txt'}")
+    calibration = None
+    if with_camera:
+        path = folder / f"cameras.{'bin' if binary else 'txt'}"
+        lines = (
+            _binary_cameras(path) if binary else [line for _, line in numbered_lines(path, CalibrationError)]
+        )
+        calibration = from_colmap(path, lines, cameras)
     return GivenPoses(COLMAP, folder, T_cw, None, names, calibration)
 
 
-def _text_images(path: Path) -> list[tuple[str, list[float]]]:
-    """Names and `qw qx qy qz tx ty tz`; the line after an image lists its points, and may be empty or left out."""
+def _text_images(path: Path) -> list[tuple[str, list[float], str]]:
+    """Names, `qw qx qy qz tx ty tz` and camera; the line after an image lists its points, and may be left out."""
     images, is_points = [], False
     for line in read_text(path, TrajectoryError).splitlines():
         if line.startswith("#"):
@@ -162,47 +176,50 @@ def _text_images(path: Path) -> list[tuple[str, list[float]]]:
             continue
         if len(words) != 10:
             raise TrajectoryError(f"{path}: expected `id qw qx qy qz tx ty tz camera name`, got `{line}`")
-        images.append((words[9].strip(), parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)))
+        numbers_of_pose = parse_floats(" ".join(words[1:8]), str(path), TrajectoryError)
+        images.append((words[9].strip(), numbers_of_pose, words[8]))
         is_points = True
     return images
 
 
-def _binary_images(path: Path) -> list[tuple[str, list[float]]]:
+def _binary_images(path: Path) -> list[tuple[str, list[float], str]]:
     images = []
     try:
         data = read_bytes(path, _MAX_BYTES, "a model that is read")
         (count,) = struct.unpack_from("<Q", data)
         at = 8
         for _ in range(count):
-            _, *numbers, _ = struct.unpack_from("<I7dI", data, at)
+            _, *numbers, camera = struct.unpack_from("<I7dI", data, at)
             end = data.index(b"\0", at + 64)
             (points,) = struct.unpack_from("<Q", data, end + 1)
-            images.append((data[at + 64 : end].decode(), numbers))
+            images.append((data[at + 64 : end].decode(), numbers, str(camera)))
             at = end + 9 + 24 * points
     except (OSError, struct.error, ValueError, OverflowError) as cause:
         raise TrajectoryError(f"{path}: not COLMAP's images: {cause}") from cause
     return images
 
 
-def _binary_camera(path: Path) -> Calibration:
-    """The single camera of a cameras.bin."""
+def _binary_cameras(path: Path) -> list[str]:
+    """The cameras of a cameras.bin as lines of a cameras.txt."""
+    # By its number (src/colmap/sensor/models.h); 7, FOV, is not modeled.
+    models = dict(zip((*range(7), *range(8, 10)), COLMAP_MODELS, strict=True))
+    lines, at = [], 8
     try:
         data = read_bytes(path, _MAX_BYTES, "a model that is read")
         (count,) = struct.unpack_from("<Q", data)
-        if count != 1:
-            raise CalibrationError(f"{path}: {count} cameras; a model with the one of all images is needed")
-        number, model, width, height = struct.unpack_from("<IiQQ", data, 8)
-        # By its number (src/colmap/sensor/models.h); 7, FOV, is not modeled.
-        names = dict(zip((*range(7), *range(8, 10)), COLMAP_MODELS, strict=True))
-        name = names.get(model, "FOV" if model == 7 else str(model))
-        keys = COLMAP_MODELS.get(name, "").split()
-        params = struct.unpack_from(f"<{len(keys)}d", data, 32)
-    except (OSError, struct.error) as cause:
-        raise CalibrationError(f"{path}: not COLMAP's cameras: {cause}") from cause
-    return from_colmap(path, [" ".join(map(str, (number, name, width, height, *params)))])
+        for _ in range(count):
+            number, model, width, height = struct.unpack_from("<IiQQ", data, at)
+            if model not in models:
+                raise CalibrationError(f"{path}: camera model {'FOV' if model == 7 else model} is not known")
+            params = struct.unpack_from(f"<{len(COLMAP_MODELS[models[model]].split())}d", data, at + 24)
+            at += 24 + 8 * len(params)
+            lines.append(" ".join(map(str, (number, models[model], width, height, *params))))
+    except (OSError, struct.error, OverflowError) as cause:
+        raise TrajectoryError(f"{path}: not COLMAP's cameras: {cause}") from cause
+    return lines
 
 
-def _read_transforms(path: Path) -> GivenPoses:
+def _read_transforms(path: Path, with_camera: bool) -> GivenPoses:
     """Frames as nerfstudio, instant-ngp and the first NeRF write them; a world that was moved stays as it is."""
     try:
         content: Any = parse_json(read_text(path, TrajectoryError, JSON_BYTES))
@@ -212,10 +229,10 @@ def _read_transforms(path: Path) -> GivenPoses:
         raise TrajectoryError(f"{path}: not the frames of a transforms.json: {cause!r}") from cause
     if T_wc.shape[1:] not in ((4, 4), (3, 4)):
         raise TrajectoryError(f"{path}: no frames with a transform_matrix of 4 x 4 numbers")
-    R = T_wc[:, :3, :3]
-    if not bool(T_wc.isfinite().all() & (orthogonality_error(R) < 1e-3).all()):
-        raise TrajectoryError(f"{path}: a transform_matrix is not a rigid transformation")
-    T_cw = se3_inverse(opengl(rigid(R, T_wc[:, :3, 3])))
-    is_shared = "fl_x" in content or "camera_angle_x" in content  # else the sequence or the user must know it
-    calibration = read_calibration(path) if is_shared else None
+    places = [f"{path}: frame {name[:80]}" for name, _ in frames]
+    T_wc = checked_poses(rigid(T_wc[:, :3, :3], T_wc[:, :3, 3]), places)
+    T_cw = se3_inverse(opengl(rigid(nearest_rotation(T_wc[:, :3, :3]), T_wc[:, :3, 3])))
+    # Else the sequence or the user must know it.
+    has_camera = "fl_x" in content or "camera_angle_x" in content or has_cameras(content["frames"])
+    calibration = read_calibration(path) if with_camera and has_camera else None
     return GivenPoses(NERFSTUDIO, path, T_cw, None, tuple(name for name, _ in frames), calibration)

@@ -134,6 +134,15 @@ class Keys:
     def __contains__(self, keys: tuple[str, ...]) -> bool:
         return any(key in self._values for key in keys)
 
+    def with_values(self, values: Tree) -> Keys:
+        """The keys with other values; what either was asked for is used in both."""
+        others = {
+            name: value for key, (name, value) in self._values.items() if key not in set(map(normal, values))
+        }
+        keys = Keys(values | others, self.source)
+        keys._used = self._used
+        return keys
+
     def value(self, *keys: str) -> Any:
         """The value of a key; None without it."""
         return self._found(keys)[1]
@@ -170,6 +179,14 @@ class Keys:
                 f"{self.source}: {name}: `{value[:40]}` is not one number; write a decimal point"
             )
         return next(iter(numbers), None)
+
+    def matrices(self, count: int) -> list[str]:
+        """The keys, as they are written, of this many numbers."""
+        names = []
+        for key, (name, _) in list(self._values.items()):
+            with contextlib.suppress(CalibrationError):
+                names += [name] * (len(self.numbers(key)) == count)
+        return names
 
     def unused(self, pattern: re.Pattern[str]) -> str | None:
         """The first key, as it is written, that fits a pattern, was not asked for and is neither empty nor zeros."""

@@ -23,6 +23,7 @@ from torch.utils._pytree import tree_map
 from torchslam.errors import ConvergenceError
 from torchslam.geometry.robust import TAIL_SCALE, Kernel
 from torchslam.optim._core.implicit import Backward
+from torchslam.utils.by_value import ByValue
 
 INITIAL_DAMPING = 1e-4
 """Relative to the diagonal of the Hessian: nearly a step of Gauss and Newton at first. Tried at this value only."""
@@ -211,7 +212,7 @@ def minimize_batch(
     """
     active = problem.solvable
     model = problem.evaluate(start, torch.zeros_like(active))
-    initial_cost = model.cost.detach()
+    initial_cost = model.cost.detach().clone()  # results share no memory
     # Close to the optimum a step lowers the gradient long after the cost changes by rounding only.
     rounding = torch.finfo(initial_cost.dtype).eps
     slack = 1 + 100 * rounding
@@ -250,8 +251,8 @@ def minimize_batch(
     return model, Convergence(steps, converged, initial_cost, model.cost.detach(), limit=iterations)
 
 
-@dataclass(frozen=True)
-class SolverOptions:
+@dataclass(frozen=True, eq=False)
+class SolverOptions(ByValue):
     """How a solver minimizes.
 
     Each solver has a constant with its defaults: `solve_pose(..., options=POSE_OPTIONS.replace(strict=True))`.

@@ -15,6 +15,7 @@ from torch import Tensor
 from torch.func import jvp, vmap
 
 from torchslam.geometry.lie import se3_inverse, sim3_exp, skew, so3_left_jacobian, so3_log
+from torchslam.utils.by_value import ByValue
 
 
 def retract(T: Float[Tensor, "*#batch 4 4"], xi: Float[Tensor, "*#batch 6"]) -> Float[Tensor, "*batch 4 4"]:
@@ -92,8 +93,8 @@ def pull_back_sim3(
     return torch.cat((pull_back(S, grad_S), scale[..., None]), dim=-1)
 
 
-@dataclass(frozen=True)
-class PosePrior:
+@dataclass(frozen=True, eq=False)
+class PosePrior(ByValue):
     """Gaussian prior on poses.
 
     Attributes:
@@ -105,8 +106,8 @@ class PosePrior:
     information: Float[Tensor, "*#batch 6 6"]
 
 
-@dataclass(frozen=True)
-class CameraPrior:
+@dataclass(frozen=True, eq=False)
+class CameraPrior(ByValue):
     """Gaussian prior on the parameters of one or several cameras.
 
     Attributes:

@@ -23,11 +23,12 @@ from torchslam.optim.bundle._factors import (
     frames_with_factors,
     packed_factors,
 )
+from torchslam.utils.by_value import ByValue
 from torchslam.utils.indexing import row_mask
 
 
-@dataclass(frozen=True)
-class BundleProblem:
+@dataclass(frozen=True, eq=False)
+class BundleProblem(ByValue):
     """O observations of N points by K frames; or a batch of B such problems.
 
     `T_cw` (B, K, 4, 4) makes it a batch. Everything else may lead with B, too; without, it is shared by all problems.
