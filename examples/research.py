@@ -62,9 +62,8 @@ class Corrections(nn.Module):
         super().__init__()
         self.weigh = nn.Sequential(nn.Linear(2, 16), nn.Tanh(), nn.Linear(16, 1)).double()
         self.move = nn.Sequential(nn.Linear(2, 16), nn.Tanh(), nn.Linear(16, 2)).double()
-        for last in (self.weigh[-1], self.move[-1]):
-            nn.init.zeros_(last.weight)
-            nn.init.zeros_(last.bias)
+        for last in (*self.weigh[2].parameters(), *self.move[2].parameters()):
+            nn.init.zeros_(last)
         self.slip = nn.Parameter(torch.zeros((), dtype=torch.float64))
 
     def wheels(self, T_1w: Tensor, T_2w: Tensor, distances: Tensor) -> Tensor:
@@ -131,10 +130,10 @@ def check_gradient(module: Corrections, example: Example) -> float:
     with torch.no_grad():
         for step in (1e-4, -2e-4):  # to one side, and on to the other one
             for parameter, gradient in zip(parameters, found, strict=True):
-                parameter += step * gradient / length
+                parameter.add_(gradient / length, alpha=step)
             losses.append(float(error(module, example, precise=True)))
         for parameter, gradient in zip(parameters, found, strict=True):
-            parameter += 1e-4 * gradient / length
+            parameter.add_(gradient / length, alpha=1e-4)
     return abs((losses[0] - losses[1]) / 2e-4 / float(length) - 1)
 
 
@@ -182,10 +181,7 @@ def main(arguments: list[str] | None = None) -> None:
     error(module, first).backward()
     print(f"first gradient after {time.perf_counter() - start:.1f} s")
     print(f"gradient off a central difference by {check_gradient(module, first):.1e} of its length")
-    train, test = (
-        [prepared(seed, options.options, options.output) for seed in seeds[name]]
-        for name in ("train", "test")
-    )
+    train, test = ([prepared(seed, options.options, options.output) for seed in part] for part in seeds)
 
     def measure() -> None:
         with torch.no_grad():

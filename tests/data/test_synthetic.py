@@ -287,7 +287,7 @@ def test_rendered_images_are_kept_on_disk(tmp_path: Path, monkeypatch: pytest.Mo
         open_sequence("synthetic:planar?frames=3&noise=2&cache=1").image(1)
     file.write_bytes(b"")
     with pytest.raises(FrameError, match="planar#1"):
-        open_sequence("synthetic:planar?frames=3&noise=1&cache=1").image(1)
+        open_sequence("synthetic:planar?frames=4&noise=1&cache=1").image(1)  # tests keep images by name
 
 
 def test_all_scenes_and_options_are_documented() -> None:

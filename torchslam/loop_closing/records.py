@@ -83,7 +83,8 @@ def pack_closures(
     closures: Sequence[LoopClosureRecord],
 ) -> tuple[dict[str, Shaped[Tensor, "..."]], list[list[int]]]:
     """Convert records to tensors by name, and a list for JSON."""
-    tensors, about = {}, []
+    tensors: dict[str, Tensor] = {}
+    about = []
     for number, each in enumerate(closures):
         about.append([each.frame, each.matched_frame, each.submap, each.matched_submap])
         if each.edge is not None:
@@ -118,7 +119,7 @@ def unpack_closures(
 def write_closures(path: str | Path, closures: Sequence[LoopClosureRecord]) -> None:
     """Write records as a safetensors file, atomically; equal records give equal bytes."""
     tensors, about = pack_closures(closures)
-    tensors = {name: rows.cpu().contiguous() for name, rows in tensors.items()}
+    tensors = {name: rows.cpu().clone().contiguous() for name, rows in tensors.items()}
     write_whole(path, safetensors.torch.save(tensors, {"loops": json.dumps(about)}))
 
 
