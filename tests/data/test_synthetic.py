@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from functools import lru_cache
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -13,8 +15,8 @@ import torch
 from torchslam.data import open_sequence
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import MIP_LEVELS, QUARTER_TURN, Rectangle, corridors, rooms, wall
-from torchslam.data.synthetic.sequence import OUTWARD
-from torchslam.errors import SequenceError
+from torchslam.data.synthetic.sequence import OUTWARD, SCENES, RenderOptions, SyntheticSequence
+from torchslam.errors import FrameError, SequenceError
 
 Build = Callable[[int], list[Rectangle]]
 SIZE = (160, 120)
@@ -271,3 +273,30 @@ def test_the_walk_meets_corresponding_places_of_the_corridors() -> None:
 def test_bad_names(name: str, message: str) -> None:
     with pytest.raises(SequenceError, match=message):
         open_sequence(name)
+
+
+def test_rendered_images_are_kept_on_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rendered_images: dict[object, np.ndarray]
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+
+    def image(name: str) -> torch.Tensor:
+        rendered_images.clear()  # of the tests
+        return open_sequence(f"synthetic:planar?{name}").image(1)
+
+    first = image("noise=1&cache=1")
+    assert torch.equal(first, image("noise=1"))
+    (file,) = (tmp_path / "torchslam" / "rendered").rglob("*.png")
+    monkeypatch.setattr(SyntheticSequence, "_rendered", None)
+    assert torch.equal(image("frames=9&noise=1&cache=1"), first)
+    with pytest.raises(TypeError):
+        image("noise=2&cache=1")
+    file.write_bytes(b"")
+    with pytest.raises(FrameError, match="planar#1"):
+        image("noise=1&cache=1")
+
+
+def test_all_scenes_and_options_are_documented() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "tutorials" / "research.md").read_text(encoding="utf-8")
+    for name in (*SCENES, *(column.name for column in fields(RenderOptions))):
+        assert f"| `{name}` |" in page, name

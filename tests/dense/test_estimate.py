@@ -28,8 +28,15 @@ from torchslam.dense.cost_volume import (
     semi_global,
     warp,
 )
-from torchslam.dense.estimate import choose_neighbors, estimate_depth, halved, neighbor_scores, refine_depth
-from torchslam.geometry import Camera, se3_inverse
+from torchslam.dense.estimate import (
+    RADIUS,
+    choose_neighbors,
+    estimate_depth,
+    halved,
+    neighbor_scores,
+    refine_depth,
+)
+from torchslam.geometry import Camera, se3_exp, se3_inverse
 
 WIDTH, HEIGHT = 192, 144
 BORDER = 36
@@ -183,42 +190,128 @@ def test_a_batch_is_a_loop() -> None:
         torch.testing.assert_close(found.fine.margin[one], single.fine.margin)
 
 
-def test_gradients_of_depth_to_images_poses_and_camera() -> None:
-    reference, sources, camera, T_sr, depth = scene(28, 24, 2)
-    step, least = torch.tensor([0.01]).double(), torch.tensor([0.1]).double()
+def test_gradients_of_costs_to_images_poses_camera_and_hypotheses() -> None:
+    reference, sources, camera, T_sr, depth = scene(14, 12, 2)
 
-    def refined(reference: Tensor, sources: Tensor, T_sr: Tensor, params: Tensor) -> Tensor:
-        found, _ = refine_depth(
-            reference[None],
-            sources[None],
-            camera.with_params(params),
-            T_sr[None],
-            1.003 / depth[None],
-            step,
-            least,
-        )
-        return 1 / found[0, 8:16, 8:16]  # where nothing jumps
+    def cost(reference: Tensor, sources: Tensor, T_sr: Tensor, params: Tensor, hypotheses: Tensor) -> Tensor:
+        found = matching_cost(reference, sources, camera.with_params(params), T_sr, hypotheses, 2, 2)
+        return found[:, 4:8, 4:8]
 
-    tensors = (reference, sources, T_sr, camera.params)
+    tensors = (reference, sources, T_sr, camera.params, 1.003 / depth[None])
     inputs = tuple(each.clone().requires_grad_() for each in tensors)
-    assert torch.autograd.gradcheck(refined, inputs, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
-    for gradient in torch.autograd.grad(refined(*inputs).sum(), inputs):
-        assert torch.isfinite(gradient).all()
-        assert gradient.abs().max() > 0
+    assert torch.autograd.gradcheck(cost, inputs, eps=1e-7, atol=1e-4, rtol=1e-3, fast_mode=True)
 
 
-def test_the_surface_found_at_half_size_has_no_gradient() -> None:
-    reference, sources, camera, T_sr, _ = scene(48, 40, 2)
-    near, far = (each.double().requires_grad_() for each in limits())
-    params = camera.params.clone().requires_grad_()
+def minimum(
+    reference: Tensor, sources: Tensor, camera: Camera, T_sr: Tensor, surface: Tensor, step: float
+) -> Tensor:
+    """Inverse depth of the least cost of the windows around each pixel, near a surface, without hypotheses far off."""
+    moves = torch.tensor([-1.0, 0, 1]).double()[:, None, None] * step
+    for _ in range(2):
+        cost = box_sum(matching_cost(reference, sources, camera, T_sr, surface + moves, RADIUS, 2), RADIUS)
+        surface = surface + step * (0.5 * (cost[0] - cost[2]) / (cost[0] - 2 * cost[1] + cost[2]))
+    return surface
+
+
+@pytest.mark.parametrize("direction", ["all baselines", "one baseline", "turn", "focal length", "image"])
+def test_the_gradient_of_depth_is_the_slope_of_the_minimum(direction: str) -> None:
+    """Between pixels the cost is as bent as the interpolation, so that finite differences need steps of a pixel."""
+    # What moves the minima of two sources against each other leaves none between.
+    reference, sources, camera, T_sr, depth = scene(WIDTH, HEIGHT, 2 if "baseline" in direction else 1)
+    views, translation, focal = torch.zeros(len(sources)).double(), torch.zeros(4, 4).double(), torch.zeros(4)
+    views[: 1 if direction == "one baseline" else None] = 1
+    translation[:3, 3], focal[:2] = 1, 1
+    turn = torch.tensor([0, 0, 0, 0, 0.2, 0]).double()
+
+    def moved(s: Tensor) -> tuple[Tensor, Camera, Tensor]:
+        poses, params, images = T_sr, camera.params, sources
+        if "baseline" in direction:
+            poses = T_sr * (1 + s * views[:, None, None] * translation)
+        elif direction == "turn":
+            poses = se3_exp(s * turn) @ T_sr
+        elif direction == "focal length":
+            params = params * (1 + s * focal)
+        else:
+            images = sources + 10 * s * (sources.roll(1, -1) - sources)
+        return images, camera.with_params(params), poses
+
+    s = torch.zeros((), dtype=torch.float64, requires_grad=True)
+    surface, step, least = 1 / depth, torch.tensor([0.01]).double(), torch.tensor([0.1]).double()
+    images, pinhole, poses = moved(s)
+    found, _ = refine_depth(reference[None], images[None], pinhole, poses[None], surface[None], step, least)
+    places = [(row, column) for row in range(40, 104, 20) for column in range(50, 142, 30)]
+    slopes = torch.stack([torch.autograd.grad(found[0][at], s, retain_graph=True)[0] for at in places])
+    ahead, behind = (
+        minimum(reference, *moved(torch.tensor(x).double()), surface, 0.01) for x in (0.01, -0.01)
+    )
+    expected = torch.stack([((ahead - behind) / 0.02)[at] for at in places])
+    torch.testing.assert_close(slopes, expected, rtol=0.15, atol=0.1 * float(expected.abs().median()))
+    if direction == "all baselines":
+        exact = -torch.stack([surface[at] for at in places])
+        torch.testing.assert_close(slopes, exact, rtol=0.01, atol=0)
+
+
+def test_brightness_and_contrast_do_not_move_depth() -> None:
+    reference, sources, camera, T_sr, _ = scene(WIDTH, HEIGHT, 2)
+    reference, sources = reference.requires_grad_(), sources.requires_grad_()
     found = estimate_depth(
-        reference[None], sources[None], camera.with_params(params), T_sr[None], near, far, planes=16
+        reference[None], sources[None], camera, T_sr[None], *limits(dtype=torch.float64), planes=16
+    )
+    for image, gradient in zip(
+        (reference, sources),
+        torch.autograd.grad(found.inverse_depth.sum(), (reference, sources)),
+        strict=True,
+    ):
+        assert gradient.abs().max() > 0
+        assert abs(float(gradient.sum())) < 1e-6 * float(gradient.abs().sum())
+        assert abs(float((gradient * image.detach()).sum())) < 0.01 * float(
+            (gradient * image.detach()).abs().sum()
+        )
+
+
+def test_the_gradient_of_depth_is_zero_without_texture_and_changes_no_value() -> None:
+    reference, sources, camera, T_sr, _ = scene(48, 40, 2)
+    T_sr = T_sr.requires_grad_()
+    blank = torch.full_like(sources, 0.5)
+    for images in (sources, blank):
+        given = reference[None], images[None], camera
+        near, far = limits(dtype=torch.float64)
+        found = estimate_depth(*given, T_sr[None], near, far, planes=16)
+        assert torch.equal(
+            found.inverse_depth,
+            estimate_depth(*given, T_sr.detach()[None], near, far, planes=16).inverse_depth,
+        )
+        (gradient,) = torch.autograd.grad(found.inverse_depth.sum(), T_sr)
+        assert torch.isfinite(gradient).all()
+        assert bool(gradient.any()) == (images is sources)
+
+
+def test_parameters_of_the_aggregation_have_a_gradient_and_the_range_has_none() -> None:
+    reference, sources, camera, T_sr, _ = scene(48, 40, 2)
+    near, far = (each.requires_grad_() for each in limits(dtype=torch.float64))
+    weight = torch.tensor(0.05, dtype=torch.float64, requires_grad=True)
+
+    def aggregate(cost: Tensor, image: Tensor) -> Tensor:
+        return cost + weight * box_sum(cost, 1)
+
+    found = estimate_depth(
+        reference[None], sources[None], camera, T_sr[None], near, far, planes=16, aggregate=aggregate
     )
     found.inverse_depth.sum().backward()
-    assert params.grad is not None
-    assert torch.isfinite(params.grad).all()
+    assert weight.grad is not None
+    assert weight.grad != 0
     assert not found.coarse.cost.requires_grad
     assert near.grad is None
+
+
+def test_depth_has_no_second_derivative() -> None:
+    reference, sources, camera, T_sr, _ = scene(48, 40, 2)
+    T_sr = T_sr.requires_grad_()
+    near, far = limits(dtype=torch.float64)
+    found = estimate_depth(reference[None], sources[None], camera, T_sr[None], near, far, planes=16)
+    (first,) = torch.autograd.grad(found.inverse_depth.sum(), T_sr, create_graph=True)
+    with pytest.raises(RuntimeError, match="second derivative"):
+        first.sum().backward()
 
 
 def test_the_halved_camera_sees_the_same_rays() -> None:

@@ -18,8 +18,11 @@ from torchslam.io.report import run_metrics
 from torchslam.io.results import (
     DENSE_CLOUD,
     DEPTHS,
+    GRAPH,
+    LOOPS,
     MESH,
     PICTURES,
+    open_run,
     prepare,
     read_metrics,
     read_results,
@@ -27,7 +30,7 @@ from torchslam.io.results import (
     results_in,
 )
 from torchslam.io.write_run import draw, write_results
-from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.loop_closing.records import LoopClosureRecord, LoopEdge, LoopMatches
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
 from torchslam.system.run import Run
@@ -67,6 +70,36 @@ def test_results_round_trip(tmp_path: Path, run: Run) -> None:
     assert len(results.keyframes) == 6
     assert [frame.submap for frame in results.frames] == [result.submap for result in run.results]
     assert results.session == 0
+
+
+def test_a_run_leaves_its_graph_and_its_loops(tmp_path: Path, run: Run) -> None:
+    edge = LoopEdge(
+        LoopMatches(
+            torch.zeros(0, dtype=torch.int64), torch.zeros(0, 2), torch.zeros(0, 3), torch.zeros(0, 3)
+        ),
+        *(run.map.T_cw[:2], torch.tensor([[0, 1]]), run.map.T_cw[2:3]),
+        *(run.map.keyframes[name][:2] for name in ("frame_index", "session")),
+    )
+    closed = replace(
+        run, loop_closures=(LoopClosureRecord(20, 3, 0, 0, edge), LoopClosureRecord(21, 4, 0, 0))
+    )
+    write(closed, tmp_path)
+    saved = open_run(tmp_path)
+    for name in ("pixels", "weights", "T_cw", "point_ids", "keypoint_index"):
+        assert torch.equal(getattr(saved.graph, name), getattr(run.graph, name))
+    first, second = saved.loop_closures
+    assert (first, second.edge) == (closed.loop_closures[0], None)
+    assert first.edge is not None
+    assert torch.equal(first.edge.graph.S_ji, edge.S_ji)
+    content = [(tmp_path / name).read_bytes() for name in (GRAPH, LOOPS)]
+    write(closed, tmp_path)
+    assert [(tmp_path / name).read_bytes() for name in (GRAPH, LOOPS)] == content
+    (tmp_path / GRAPH).unlink()
+    (tmp_path / LOOPS).write_bytes(b"no loops")
+    with pytest.raises(ResultsError, match="no graph"):
+        _ = saved.graph
+    with pytest.raises(ResultsError, match="not the loops"):
+        _ = saved.loop_closures
 
 
 def test_the_dense_cloud_is_read_into_the_world_of_the_map(tmp_path: Path, run: Run) -> None:

@@ -6,7 +6,12 @@ import torch
 from tests.loop_closing.ring import END, ring_submap, scaling_sim3
 from tests.scene import Scene, pose
 from torchslam.geometry import sim3_scale
-from torchslam.loop_closing.loop_closer import MIN_ESSENTIAL_WEIGHT, essential_edges, essential_graph_solution
+from torchslam.loop_closing.loop_closer import (
+    MIN_ESSENTIAL_WEIGHT,
+    essential_edges,
+    essential_graph_solution,
+    loop_edge,
+)
 from torchslam.loop_closing.loop_detector import LoopCandidate
 from torchslam.map.map import Map
 
@@ -56,6 +61,6 @@ def test_the_scale_of_a_loop_is_distributed_over_its_way() -> None:
     submap = ring_submap()
     T_cw = submap.map.T_cw[END]
     S_21 = torch.linalg.inv(T_cw) @ scaling_sim3(1.3) @ T_cw
-    S_cw = essential_graph_solution(LoopCandidate(submap, END, submap, END - 15, S_21))
+    S_cw = essential_graph_solution(loop_edge(LoopCandidate(submap, END, submap, END - 15, S_21)).graph)
     ratio = float(sim3_scale(S_cw[END - 15]) / sim3_scale(S_cw[END]))
     assert ratio == pytest.approx(1.3, abs=0.15)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -19,10 +21,13 @@ from torchslam.loop_closing.loop_closer import (
     fuse_and_adjust,
     fuse_landmarks,
     fuse_with_earlier_visits,
+    loop_edge,
     merge_maps,
 )
 from torchslam.loop_closing.loop_detector import LoopCandidate
+from torchslam.loop_closing.records import pack_closures, unpack_closures
 from torchslam.map.atlas import Atlas, Submap
+from torchslam.optim import solve_pose_graph
 from torchslam.tracking.tracker import Tracker
 
 CONFIG = Config()
@@ -40,16 +45,17 @@ def error(submap: Submap) -> float:
 
 def loop(submap: Submap) -> LoopCandidate:
     detector = LoopCloser(SharedCamera(CAMERA), CONFIG, Atlas(CAMERA.params)).loop_detector
-    S_21 = detector.estimate(submap.map, END, submap.map, 0)
-    assert S_21 is not None
-    return LoopCandidate(submap, END, submap, 0, S_21)
+    found = detector.estimate(submap.map, END, submap.map, 0)
+    assert found is not None
+    return LoopCandidate(submap, END, submap, 0, *found)
 
 
 def test_a_drifted_loop_is_closed() -> None:
     submap = ring_submap(scale=1.01, twist=0.002)
     assert error(submap) > 0.1
     points = submap.map.num_points
-    close_loop(loop(submap), CAMERA, CONFIG)
+    found = loop(submap)
+    close_loop(found, loop_edge(found).graph, CAMERA, CONFIG)
     assert error(submap) < 2e-3
     visible = {int(p) for k, T in enumerate(around()) for p in visible_points(k, T)}
     assert submap.map.num_points <= len(visible) + 0.02 * points < points
@@ -64,7 +70,7 @@ def visible_points(keyframe: int, T_cw: Tensor) -> Tensor:
 def test_the_pose_graph_distributes_the_drift_along_the_loop() -> None:
     submap = ring_submap(scale=1.01, twist=0.002)
     found = loop(submap)
-    S_cw = essential_graph_solution(found)
+    S_cw = essential_graph_solution(loop_edge(found).graph)
     torch.testing.assert_close(S_cw[0], submap.map.T_cw[0])
     # the loop is closed: the end lies to the place as it was detected, but for what the other ties pull
     wanted = submap.map.T_cw[END] @ sim3_inverse(found.S_21) @ se3_inverse(submap.map.T_cw[0])
@@ -77,10 +83,40 @@ def test_the_pose_graph_distributes_the_drift_along_the_loop() -> None:
     assert error(submap) < 0.1
 
 
+def test_the_pose_graph_of_a_closed_loop_has_a_gradient_to_its_matches() -> None:
+    submap = ring_submap(scale=1.01, twist=0.002)
+    closer = LoopCloser(SharedCamera(CAMERA), CONFIG, Atlas(CAMERA.params))
+    with torch.inference_mode():
+        found = loop(submap)
+        expected = essential_graph_solution(loop_edge(found).graph)
+        closer.close(found)
+    tensors, about = pack_closures(closer.loop_closures)
+    (record,) = unpack_closures(tensors, about)
+    assert (record.frame, record.matched_frame, record.edge is None) == (END, 0, False)
+    edge = record.edge
+    assert edge is not None
+    torch.testing.assert_close(
+        essential_graph_solution(edge.graph), expected.clone()
+    )  # before the correction
+    assert edge.frame_ids[edge.edges[-1]].tolist() == [0, END]
+    weights = torch.ones(len(edge.matches.points_k), dtype=torch.float64, requires_grad=True)
+    scale, R, t = umeyama(edge.matches.points_m, edge.matches.points_k, weights)
+    torch.testing.assert_close(scale * R, edge.S_ji[-1, :3, :3], atol=0.05, rtol=0)  # of a bent map
+    S_km = torch.cat((torch.cat((scale * R, t[:, None]), 1), edge.S_ji[-1, 3:]))
+    graph = replace(edge.graph, S_ji=torch.cat((edge.S_ji[:-1], S_km[None])))
+    solve_pose_graph(graph).S_cw[END // 2, 0, 3].backward()
+    assert weights.grad is not None
+    assert bool(weights.grad.any())
+    tensors["loops.0.edges"] = tensors["loops.0.edges"] + END + 1
+    with pytest.raises(ValueError, match="loop 0: edges"):
+        unpack_closures(tensors, about)
+
+
 def test_a_loop_without_drift_moves_nothing() -> None:
     submap = ring_submap()
     T_cw = submap.map.T_cw.clone()
-    close_loop(loop(submap), CAMERA, CONFIG)
+    found = loop(submap)
+    close_loop(found, loop_edge(found).graph, CAMERA, CONFIG)
     torch.testing.assert_close(submap.map.T_cw, T_cw, atol=1e-4, rtol=0)
     torch.testing.assert_close(submap.posed_frames.T_cw(submap.map), T_cw, atol=1e-4, rtol=0)
 
@@ -88,8 +124,8 @@ def test_a_loop_without_drift_moves_nothing() -> None:
 def test_the_final_adjustment_can_be_left_out() -> None:
     submap = ring_submap(scale=1.01, twist=0.002)
     found = loop(submap)
-    T_cw = essential_graph_solution(found)
-    close_loop(found, CAMERA, load_config(None, ["paper.unrefined=true"]))
+    T_cw = essential_graph_solution(loop_edge(found).graph)
+    close_loop(found, loop_edge(found).graph, CAMERA, load_config(None, ["paper.unrefined=true"]))
     unit = torch.linalg.det(T_cw[:, :3, :3]) ** (1 / 3)
     torch.testing.assert_close(submap.map.T_cw[:, :3, :3], T_cw[:, :3, :3] / unit[:, None, None])
     torch.testing.assert_close(submap.map.T_cw[:, :3, 3], T_cw[:, :3, 3] / unit[:, None])

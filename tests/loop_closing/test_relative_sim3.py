@@ -34,7 +34,8 @@ def maps(S_21: Tensor, noise: float = 0.0) -> tuple[Map, Map]:
 
 
 def related(map_1: Map, map_2: Map) -> Tensor | None:
-    return DETECTOR.estimate(map_1, 2, map_2, 1)
+    found = DETECTOR.estimate(map_1, 2, map_2, 1)
+    return None if found is None else found[0]
 
 
 def test_the_similarity_between_two_maps_is_estimated(S_21: Tensor) -> None:

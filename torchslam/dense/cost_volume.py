@@ -1,9 +1,11 @@
 """A cost volume: how well the views agree with each depth hypothesis of each pixel, its aggregation and its minimum.
 
 Plane sweep: a hypothesis is an inverse depth, 1 / z, per pixel: constant over the image for a sweep of planes, or
-around a known surface for a refinement, whose windows then follow the surface. Everything is differentiable with
-respect to images, poses, camera and hypotheses; whether a pixel is seen, and which views are the best ones, are
-decisions without a gradient. Images are gray, in [0, 1]; `camera` is the pinhole of all views, T_sr are poses from the
+around a known surface for a refinement, whose windows then follow the surface. Costs are differentiable with respect to
+images, poses, camera and hypotheses; whether a pixel is seen, and which views are the best ones, are decisions without
+a gradient. The gradient of depth comes from `implicit_change`, not from costs: between two pixels these are as bent as
+the interpolation, not as the image, and the penalties of an aggregation hold their minimum where it is.
+Images are gray, in [0, 1]; `camera` is the pinhole of all views, T_sr are poses from the
 reference camera to source cameras, and inverse depths are in 1 / map units.
 
 Semi-global aggregation (Hirschmüller 2008): smooth surfaces that may jump at edges of the image. A path comes to every
@@ -23,6 +25,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from torchslam.geometry import Camera
+from torchslam.geometry.estimate_gradients import first_order
 
 NOISE = 1.5 / 255
 """Standard deviation of image noise, added to that of every window: where the texture is weaker, nothing correlates."""
@@ -147,6 +150,68 @@ def matching_cost(
         scores = torch.where(is_seen, scores, 0.0)
         costs.append(1 - mean_of_best(scores.movedim(-4, 0), num_best))
     return torch.cat(costs, dim=-3)
+
+
+def implicit_change(
+    reference: Float[Tensor, "*batch H W"],
+    sources: Float[Tensor, "*batch V H W"],
+    camera: Camera,
+    T_sr: Float[Tensor, "*batch V 4 4"],
+    inverse_depth: Float[Tensor, "*batch H W"],
+    radius: int,
+    num_best: int,
+) -> Float[Tensor, "*batch H W"]:
+    """A change of inverse depth, of value zero, that carries the gradient of the minimum of the matching cost.
+
+    It is a Gauss-Newton step at the minimum, which differentiates it implicitly: in windows, a change of the samples
+    less that of the reference is expressed by what a change of inverse depth does to the samples. As in `correlation`,
+    brightness and contrast of a window are free. Windows around a pixel count by their texture, as held weights of
+    the aggregation; the best views are those at the minimum. Where nothing correlates, the gradient is zero. There are
+    no second derivatives.
+
+    Args:
+        reference, sources, camera, T_sr, radius, num_best: as in `matching_cost`.
+        inverse_depth: at the minimum; without a gradient.
+    """
+
+    def mean(images: Tensor) -> Tensor:
+        return box_sum(images, radius) / count
+
+    def covariance(one: Tensor, other: Tensor) -> Tensor:
+        return mean(one * other) - mean(one) * mean(other)
+
+    gray = reference.detach().mean((-1, -2), keepdim=True)
+    reference, sources = (reference - gray)[..., None, :, :], sources - gray[..., None, :, :]
+    count = box_sum(torch.ones_like(reference), radius)
+    views = sources.shape[-3]
+    at = inverse_depth.detach()[..., None, None, None, :, :]
+    at = at.expand(*sources.shape[:-2], 1, 1, *sources.shape[-2:]).contiguous().requires_grad_()
+    with torch.enable_grad():
+        samples, is_seen = warp(sources[..., None, :, :], camera, T_sr[..., None, :, :], at[..., 0, :, :])
+    (slope,) = torch.autograd.grad(samples.sum(), at, retain_graph=True)
+    samples, is_seen, slope = (each[..., 0, 0, :, :] for each in (samples, is_seen, slope))
+    fixed, floor = samples.detach(), NOISE * NOISE
+    var_s = covariance(fixed, fixed).clamp(min=0) + floor
+    with torch.no_grad():
+        var_r = covariance(reference, reference).clamp(min=0) + floor
+        scores = torch.where(is_seen, correlation(reference, fixed, radius), 0.0)
+        is_best = torch.zeros_like(is_seen).scatter(
+            -3, scores.topk(min(num_best, views), dim=-3).indices, True
+        )
+        weights = torch.where(is_best & is_seen, 1 / var_s, 0.0)
+        contrast = covariance(slope, fixed) / var_s
+        normal = weights * (covariance(slope, slope) - contrast * covariance(slope, fixed))
+        normal = box_sum(normal.sum(-3), radius)
+
+    def along(images: Tensor) -> Tensor:
+        """How much of a change of the windows is like that by a change of inverse depth."""
+        return covariance(slope, images) - contrast * covariance(fixed, images)
+
+    change = along(samples) - (var_s / var_r).sqrt() * along(reference)
+    change = box_sum((weights * change).sum(-3), radius)
+    is_known = normal * inverse_depth.detach() ** 2 > torch.finfo(normal.dtype).eps  # whatever the unit
+    change = torch.where(is_known, -change / torch.where(is_known, normal, 1.0), 0.0)
+    return first_order(change - change.detach())
 
 
 STD_FACTOR = 0.61

@@ -17,12 +17,14 @@ from torchslam.dense.cost_volume import (
     Aggregation,
     Minimum,
     find_minimum,
+    implicit_change,
     inverse_depth_planes,
     matching_cost,
     position_std,
     semi_global,
 )
 from torchslam.geometry import Camera
+from torchslam.geometry.estimate_gradients import needs_gradient
 from torchslam.geometry.precision import without_autocast
 
 PLANES = 64
@@ -113,7 +115,8 @@ def estimate_depth(
 ) -> Estimate:
     """Estimate the depth of every pixel of reference views.
 
-    Gradients are those of `refine_depth`; detached are the range of depth and the surface found at half size.
+    Gradients are those of `refine_depth`. The range of depth has none: the minimum does not depend on where it was
+    looked for.
 
     Args:
         reference: gray images in [0, 1], of even width and height.
@@ -157,26 +160,31 @@ def refine_depth(
 ) -> tuple[Float[Tensor, "B H W"], Minimum]:
     """Find the inverse depth of the least cost near a surface.
 
-    Differentiable with respect to images, poses and camera, through the costs around the minimum. Which hypothesis is
-    the best one, which views match, and the penalties of the aggregation are decisions without a gradient.
+    The inverse depth is differentiable with respect to images, poses and camera, by `implicit_change`: once, and where
+    it is above `least`. It and the minimum are differentiable with respect to parameters of the aggregation.
 
     Args:
         reference, sources, camera, T_sr, aggregate: as for `estimate_depth`.
-        surface: inverse depth to look around.
+        surface: inverse depth to look around; without a gradient, as `step` and `least`.
         step: between hypotheses, of which there are STEPS on either side.
         least: inverse depth that no hypothesis lies below, positive.
 
     Returns:
         Inverse depth, and the minimum of the cost in steps.
     """
-    step, least = step[:, None, None], least[:, None, None]
-    offsets = torch.arange(-STEPS, STEPS + 1, dtype=surface.dtype, device=surface.device)[:, None, None]
-    hypotheses = torch.maximum(surface[:, None] + offsets * step[:, None], least[:, None])
-    cost = matching_cost(
-        reference, sources, camera, T_sr, hypotheses, RADIUS, min(BEST_VIEWS, sources.shape[1])
-    )
-    found = find_minimum(aggregate(cost, reference))
-    return torch.maximum(surface + (found.position - STEPS) * step, least), found
+    with torch.no_grad():
+        step, least = step[:, None, None], least[:, None, None]
+        offsets = torch.arange(-STEPS, STEPS + 1, dtype=surface.dtype, device=surface.device)[:, None, None]
+        hypotheses = torch.maximum(surface[:, None] + offsets * step[:, None], least[:, None])
+        best = min(BEST_VIEWS, sources.shape[1])
+        cost = matching_cost(reference, sources, camera, T_sr, hypotheses, RADIUS, best)
+    found = find_minimum(aggregate(cost, reference.detach()))
+    inverse_depth = surface.detach() + (found.position - STEPS) * step
+    if needs_gradient(reference, sources, T_sr, camera.params):
+        inverse_depth = inverse_depth + implicit_change(
+            reference, sources, camera, T_sr, torch.maximum(inverse_depth, least), RADIUS, best
+        )
+    return torch.maximum(inverse_depth, least), found
 
 
 def _doubled(values: Float[Tensor, "B H W"]) -> Float[Tensor, "B H2 W2"]:

@@ -33,9 +33,11 @@ from torchslam.io.export.scene import (
     open_images,
     scene_of,
 )
+from torchslam.loop_closing.records import LoopClosureRecord, read_closures
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
 from torchslam.map.map import Map
+from torchslam.optim.run_graph import RunGraph
 from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.console import is_unicode
 from torchslam.utils.files import write_whole
@@ -46,6 +48,8 @@ ONLINE = "online.txt"
 KEYFRAMES = "keyframes.txt"
 GROUND_TRUTH = "groundtruth.txt"
 MAP = "map.safetensors"
+GRAPH = "graph.safetensors"  # all observations
+LOOPS = "loops.safetensors"  # the loops that were closed, and their pose graphs
 CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
 STAGES = "global_mapping"  # folder of the saved stages of global mapping, during a run
 POINT_CLOUD = "map.ply"
@@ -95,6 +99,21 @@ class SavedRun:
     def readout(self) -> Readout | None:
         """The readout of a rolling shutter; None for a global shutter."""
         return readout_of(self.metrics)
+
+    @property
+    def graph(self) -> RunGraph:
+        """All observations as one differentiable problem, as `Run.graph`. Raises ResultsError if it is missing."""
+        path = self.directory / GRAPH
+        if not path.exists():
+            raise ResultsError(
+                f"{path}: no graph: there is no map, or an earlier version wrote it; run again"
+            )
+        return RunGraph.load(path)
+
+    @property
+    def loop_closures(self) -> tuple[LoopClosureRecord, ...]:
+        """Closed loops and merges of submaps, with what was measured. Raises ResultsError if they are missing."""
+        return tuple(read_closures(self.directory / LOOPS))
 
     def scene(self, submap: Submap, keyframes_alone: bool) -> ExportedScene:
         """The scene of the run in a submap, see `scene_of`. Raises ResultsError if there are no frames."""
@@ -239,7 +258,19 @@ def prepare(folder: Path, overwrite: bool, resume: bool) -> None:
 
 def results_in(directory: Path) -> list[Path]:
     """Return the files in a folder that a run would replace."""
-    names = (METRICS, TRAJECTORY, MAP, KEYFRAMES, ONLINE, GROUND_TRUTH, POINT_CLOUD, CONFIG, FRAMES)
+    names = (
+        METRICS,
+        TRAJECTORY,
+        MAP,
+        GRAPH,
+        LOOPS,
+        KEYFRAMES,
+        ONLINE,
+        GROUND_TRUTH,
+        POINT_CLOUD,
+        CONFIG,
+        FRAMES,
+    )
     return [directory / name for name in (*names, EXAMPLE_IMAGE) if (directory / name).exists()]
 
 

@@ -24,6 +24,7 @@ from torchslam.io.export.ply import write_map_cloud
 from torchslam.io.plots import draw
 from torchslam.io.results import delete_dense, example_keyframe, read_results, write_metrics
 from torchslam.io.viewer.page import write_view
+from torchslam.loop_closing.records import write_closures
 from torchslam.map.file import write_atlas
 from torchslam.map.map import Map
 from torchslam.map.unit import MetricUnit
@@ -100,7 +101,9 @@ def colorize_points(maps: Iterable[Map], sequence: Sequence, session: int) -> No
 def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directory: Path) -> None:
     """Write the results of a run as `write_run`, but no colors, plots and viewer; existing results are replaced."""
     directory.mkdir(parents=True, exist_ok=True)
-    stale = [directory / name for name in (files.GROUND_TRUTH, files.EXAMPLE_IMAGE, GEOJSON, GPX)]
+    stale = [
+        directory / name for name in (files.GROUND_TRUTH, files.EXAMPLE_IMAGE, files.GRAPH, GEOJSON, GPX)
+    ]
     for old in [*stale, *directory.glob(files.OTHER_TRAJECTORY.format("[0-9]*"))]:
         old.unlink(missing_ok=True)
     delete_dense(directory)
@@ -116,6 +119,9 @@ def write_results(run: Run, sequence: Sequence, metrics: dict[str, Any], directo
     if sequence.groundtruth is not None:
         write_trajectory(directory / files.GROUND_TRUTH, sequence.groundtruth)
     write_atlas(directory / files.MAP, run.submaps, run.camera, run.sessions)
+    if any(len(submap.map.points) for submap in run.submaps):
+        run.graph.save(directory / files.GRAPH)
+    write_closures(directory / files.LOOPS, run.loop_closures)
     write_map_cloud(directory / files.POINT_CLOUD, run.map, run.session, run.metric)
     if run.calibration is not None and not run.session:
         remark, std = str(metrics.get("camera", "")), run.calibration.focal_std

@@ -8,6 +8,8 @@ Tardos, "ORB-SLAM: a versatile and accurate monocular SLAM system", 2015, sectio
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from jaxtyping import Float, Int
 from torch import Tensor
@@ -15,7 +17,8 @@ from torch import Tensor
 from torchslam.config import Config
 from torchslam.geometry import Camera, SharedCamera, se3_inverse, sim3_inverse
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
-from torchslam.loop_closing.loop_detector import LoopCandidate, LoopClosureRecord, LoopDetector
+from torchslam.loop_closing.loop_detector import LoopCandidate, LoopDetector
+from torchslam.loop_closing.records import LoopClosureRecord, LoopEdge, LoopMatches, no_matches
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.mapping.local_bundle import adjust_all
@@ -96,36 +99,55 @@ class LoopCloser:
 
     def close(self, found: LoopCandidate) -> tuple[Submap, int]:
         """Close a loop or merge two submaps; return the submap and the row of the keyframe in it."""
-        self.loop_closures.append(found.closure)
+        edge = loop_edge(found)
+        self.loop_closures.append(replace(found.closure, edge=edge))
         if found.is_loop:
-            close_loop(found, self.camera.current, self.config)
+            close_loop(found, edge.graph, self.camera.current, self.config)
             return found.submap, found.keyframe
         submap, keyframe = merge_maps(found, self.camera.current, self.config)
         self.atlas.remove(found.submap if submap is found.matched_submap else found.matched_submap)
         return submap, keyframe
 
 
-def close_loop(found: LoopCandidate, camera: Camera, config: Config) -> None:
-    """Correct the drift of a submap by a pose graph, then fuse landmarks; the first keyframe stays."""
+def close_loop(found: LoopCandidate, graph: PoseGraph, camera: Camera, config: Config) -> None:
+    """Correct the drift of a submap by the pose graph of `loop_edge`, then fuse landmarks; the first keyframe stays."""
     submap = found.submap
-    submap.apply_sim3_correction(essential_graph_solution(found))
+    submap.apply_sim3_correction(essential_graph_solution(graph))
     fuse_and_adjust(submap, found.keyframe, found.matched_keyframe, camera, config)
 
 
-def essential_graph_solution(found: LoopCandidate) -> Float[Tensor, "K 4 4"]:
-    """Optimize the pose graph of the essential graph and the loop edge; return Sim(3), world to keyframe."""
-    T_cw = found.submap.map.T_cw
-    edges = essential_edges(found.submap.map)
-    closing = edges.new_tensor([[found.matched_keyframe, found.keyframe]])
-    measured = T_cw[edges[:, 1]] @ se3_inverse(T_cw[edges[:, 0]])
-    # S_21 maps the frame of the keyframe to that of the matched one.
-    T_wm = se3_inverse(T_cw[found.matched_keyframe])
-    S_km = T_cw[found.keyframe] @ sim3_inverse(found.S_21) @ T_wm
-    relations = torch.cat([measured, S_km[None]])
-    graph = PoseGraph(T_cw, torch.cat([edges, closing]), relations, fixed=(0,))
-    return solve_pose_graph(
-        graph, options=POSE_GRAPH_OPTIONS.replace(iterations=_ITERATIONS, backward="detached")
-    ).S_cw
+def essential_graph_solution(graph: PoseGraph) -> Float[Tensor, "K 4 4"]:
+    """Optimize the pose graph of a loop; return Sim(3), world to keyframe."""
+    options = POSE_GRAPH_OPTIONS.replace(iterations=_ITERATIONS, backward="detached")
+    return solve_pose_graph(graph, options=options).S_cw
+
+
+def loop_edge(found: LoopCandidate) -> LoopEdge:
+    """The measured loop in the essential graph, or the measured relation of two submaps: copies that autograd can use.
+
+    The last edge is the measured one.
+    """
+    here, there = found.submap.map, found.matched_submap.map
+    T_wm = se3_inverse(there.T_cw[found.matched_keyframe])
+    S_km = here.T_cw[found.keyframe] @ sim3_inverse(found.S_21) @ T_wm
+    if found.is_loop:
+        rows, S_cw = [(here, slice(None))], here.T_cw
+        edges = essential_edges(here)
+        measured = S_cw[edges[:, 1]] @ se3_inverse(S_cw[edges[:, 0]])
+        edges = torch.cat([edges, edges.new_tensor([[found.matched_keyframe, found.keyframe]])])
+        S_ji = torch.cat([measured, S_km[None]])
+    else:
+        rows = [(there, slice(found.matched_keyframe, found.matched_keyframe + 1))]
+        rows.append((here, slice(found.keyframe, found.keyframe + 1)))
+        edges, S_ji = here.index_tensor(0, 1)[None], S_km[None]
+        S_cw = torch.stack((torch.eye(4, dtype=S_km.dtype, device=S_km.device), S_km))
+    origin = [
+        torch.cat([each.keyframes[name][row] for each, row in rows]) for name in ("frame_index", "session")
+    ]
+    matches = no_matches(S_cw) if found.matches is None else found.matches
+    with torch.inference_mode(False):
+        own = LoopMatches(*(each.clone() for each in matches))
+        return LoopEdge(own, *(each.clone() for each in (S_cw, edges, S_ji, *origin)))
 
 
 def merge_maps(found: LoopCandidate, camera: Camera, config: Config) -> tuple[Submap, int]:

@@ -27,6 +27,7 @@ from torchslam.geometry import (
 from torchslam.geometry.ransac import samples_needed
 from torchslam.geometry.transforms import rotation_angle, without_scale
 from torchslam.loop_closing.keyframe_database import KeyframeDatabase
+from torchslam.loop_closing.records import LoopClosureRecord, LoopMatches
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map
 from torchslam.optim import POSE_OPTIONS, solve_pose
@@ -74,7 +75,7 @@ scene. Wide: lookalike places differ by meters and tens of degrees. Tried at the
 class LoopCandidate:
     """A verified match of a new keyframe with a recognized one of the same place, in the same submap or another.
 
-    S_21 is the Sim(3) from the submap, at the keyframe, to the matched submap.
+    S_21 is the Sim(3) from the submap, at the keyframe, to the matched submap; `matches` measured it.
     """
 
     submap: Submap
@@ -82,6 +83,7 @@ class LoopCandidate:
     matched_submap: Submap
     matched_keyframe: int
     S_21: Float[Tensor, "4 4"]
+    matches: LoopMatches | None = None
 
     @property
     def is_loop(self) -> bool:
@@ -94,16 +96,6 @@ class LoopCandidate:
         frame = int(self.submap.map.keyframes["frame_index"][self.keyframe])
         matched_frame = int(self.matched_submap.map.keyframes["frame_index"][self.matched_keyframe])
         return LoopClosureRecord(frame, matched_frame, self.submap.number, self.matched_submap.number)
-
-
-@dataclass(frozen=True)
-class LoopClosureRecord:
-    """Record of a loop closure or map merge: frames of the new and the recognized keyframe, and their submaps."""
-
-    frame: int
-    matched_frame: int
-    submap: int
-    matched_submap: int
 
 
 class LoopDetector:
@@ -130,9 +122,9 @@ class LoopDetector:
     def detect(self, submap: Submap, keyframe: int) -> LoopCandidate | None:
         """Return the verified candidate of a keyframe; None if there is none or if candidates disagree."""
         found = [
-            LoopCandidate(submap, keyframe, other, matched_keyframe, S_21)
+            LoopCandidate(submap, keyframe, other, matched_keyframe, *relation)
             for other, matched_keyframe in self._candidates(submap, keyframe)
-            if (S_21 := self._relation(submap, keyframe, other, matched_keyframe)) is not None
+            if (relation := self._relation(submap, keyframe, other, matched_keyframe)) is not None
         ]
         if not found or any(not are_consistent(found[0], other) for other in found[1:]):
             return None
@@ -156,22 +148,24 @@ class LoopDetector:
 
     def _relation(
         self, submap: Submap, keyframe: int, other: Submap, matched_keyframe: int
-    ) -> Float[Tensor, "4 4"] | None:
+    ) -> tuple[Float[Tensor, "4 4"], LoopMatches] | None:
         """The Sim(3) of a candidate, if covisible keyframes confirm it and drift can explain it; else None."""
-        S_21 = self.estimate(submap.map, keyframe, other.map, matched_keyframe)
-        if S_21 is None:
+        found = self.estimate(submap.map, keyframe, other.map, matched_keyframe)
+        if found is None:
             return None
+        S_21 = found[0]
         if submap is other and not is_plausible_drift(submap, keyframe, matched_keyframe, S_21):
             return None
         near = other.map.neighborhood(matched_keyframe, _AROUND)
         covisible = submap.map.covisible_keyframes(keyframe, _NUM_VERIFYING)
         sure = sum(self.verify(S_21, submap.map, one, other.map, near) for one in covisible.tolist())
-        return S_21 if sure >= _MIN_VERIFYING else None
+        return found if sure >= _MIN_VERIFYING else None
 
     def estimate(
         self, map_1: Map, keyframe_1: int, map_2: Map, keyframe_2: int
-    ) -> Float[Tensor, "4 4"] | None:
-        """Estimate the Sim(3) S_21 from map 1 to map 2 by a keyframe of each; None if it is not certain."""
+    ) -> tuple[Float[Tensor, "4 4"], LoopMatches] | None:
+        """Estimate the Sim(3) S_21 from map 1 to map 2 by a keyframe of each, None if it is not certain; with its
+        matches."""
         T_12 = self._first_guess(map_1, keyframe_1, map_2, keyframe_2)
         if T_12 is None:
             return None
@@ -187,15 +181,19 @@ class LoopDetector:
             return None
         # One pose has no scale, but the depths of points that both maps have do.
         T_11 = map_1.T_cw[keyframe_1]
-        depth_1 = transform(T_11, map_1.positions_w[own[is_shared]])[:, 2]
+        points_1 = transform(T_11, map_1.positions_w[own[is_shared]])
         depth_2 = transform(T_12, map_2.positions_w[ids[is_shared]])[:, 2]
         S_2c = se3_inverse(T_12)
-        S_2c[:, :3] *= (depth_2 / depth_1).median()
+        S_2c[:, :3] *= (depth_2 / points_1[:, 2]).median()
         S_21 = S_2c @ T_11
-        points_1 = map_1.observed_points(map_1.neighborhood(keyframe_1, _AROUND))
-        T_21 = without_scale(map_2.T_cw[keyframe_2] @ S_21)
-        back, _ = self.match_inliers(map_1, points_1, T_21, map_2, keyframe_2)
-        return S_21 if len(back) >= _MIN_MATCHES // 2 else None
+        around_1 = map_1.observed_points(map_1.neighborhood(keyframe_1, _AROUND))
+        T_22 = map_2.T_cw[keyframe_2]
+        back, _ = self.match_inliers(map_1, around_1, without_scale(T_22 @ S_21), map_2, keyframe_2)
+        if len(back) < _MIN_MATCHES // 2:
+            return None
+        rows = keypoints[is_shared]
+        pixels = map_1.frame_features(keyframe_1).keypoints[rows]
+        return S_21, LoopMatches(rows, pixels, points_1, transform(T_22, map_2.positions_w[ids[is_shared]]))
 
     def verify(
         self, S_21: Float[Tensor, "4 4"], map_1: Map, other: int, map_2: Map, near_2: Int[Tensor, " K"]

@@ -11,6 +11,7 @@ quickly, since poses hardly change the motion between them.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -38,8 +39,10 @@ from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._solve import BundleSolution, solve_bundle
 from torchslam.optim.pose import solve_pose
 from torchslam.types import Trajectory
-from torchslam.utils.files import check_regular
+from torchslam.utils.files import check_regular, parse_json, write_whole
 
+_ABOUT = "graph"
+"""Metadata of a file: the camera's model and size, and the variance of the calibration, as JSON."""
 _CALIBRATION = "calibration.params", "calibration.directions"
 """Tensors of a file that has them."""
 MAX_ROUNDS, SETTLED_PX = 12, 2e-3
@@ -132,7 +135,7 @@ class ObservationGraph:
         )
 
     def save(self, path: str | Path) -> None:
-        """Write to a safetensors file."""
+        """Write to a safetensors file, atomically; equal graphs give equal bytes."""
         tensors = {name: getattr(self, name).detach().cpu().contiguous() for name in self.columns()}
         tensors["camera"] = self.camera.params.detach().cpu().contiguous()
         width, height = self.camera.size
@@ -143,7 +146,8 @@ class ObservationGraph:
             metadata["observation_variance"] = repr(given.observation_variance)
         if self.readout is not None:
             tensors["readout"] = self.readout.numbers
-        safetensors.torch.save_file(tensors, path, metadata)
+        # One metadata entry: several would be written in an order that differs from run to run.
+        write_whole(path, safetensors.torch.save(tensors, {_ABOUT: json.dumps(metadata)}))
 
     @classmethod
     def load(cls, path: str | Path) -> Self:
@@ -156,6 +160,9 @@ class ObservationGraph:
             check_regular(path, 1 << 34, "a graph that is read")
             with safe_open(str(path), framework="pt") as file:
                 metadata, known = file.metadata() or {}, set(file.keys())
+                metadata = (
+                    parse_json(metadata[_ABOUT]) if _ABOUT in metadata else metadata
+                )  # of earlier versions
                 # From here on `cls` is what the file holds; in the signature, what is asked for.
                 if cls is ObservationGraph and set(RunGraph.columns()) <= known | {"submap"}:
                     cls = RunGraph  # type: ignore[assignment]

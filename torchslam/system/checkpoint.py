@@ -8,7 +8,7 @@ is no provisional map and no held-back frame, since no checkpoint is written the
 from __future__ import annotations
 
 import math
-from dataclasses import astuple, fields
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import with_radial_terms
 from torchslam.geometry.rolling_shutter import Readout
-from torchslam.loop_closing.loop_detector import LoopClosureRecord
+from torchslam.loop_closing.records import pack_closures, unpack_closures
 from torchslam.map.atlas import TrackingState
 from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_submaps, write_tensors
 from torchslam.optim.sensor_estimate import SensorEstimate
@@ -54,6 +54,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
     whole = {column.name: getattr(submap.tracking, column.name) for column in fields(TrackingState)}
     tracking = {TRACKING + name: value for name, value in whole.items() if isinstance(value, Tensor)}
     results, reasons, stages = _packed(so_far.results)
+    loops, closures = pack_closures(slam.loop_closer.loop_closures)
     about["run"] = {
         "sequence": input_hash(sequence),
         "config": input_hash(slam.config),
@@ -75,11 +76,15 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
         "next_camera_check": slam.online_camera.next_check,
         "pending_estimate": _plain_estimate(slam.online_camera.pending),
         "readout": _plain_readout(slam.shared_camera.model.readout),
-        "loop_closures": [astuple(closure) for closure in slam.loop_closer.loop_closures],
+        "loop_closures": closures,
     }
     write_tensors(
         path,
-        tensors | tracking | results | {"run.evidence": slam.scene_filter.static_overlay.evidence},
+        tensors
+        | tracking
+        | results
+        | {f"run.{name}": rows for name, rows in loops.items()}
+        | {"run.evidence": slam.scene_filter.static_overlay.evidence},
         about,
     )
 
@@ -160,8 +165,9 @@ def _restore(
     session = Session(saved.camera, saved.atlas, saved.sessions - 1)
     slam.start_session(session, submap, (int(index), float(timestamp)))
     precheck = run["loop_precheck"]
+    loops = {name.removeprefix("run."): rows for name, rows in tensors.items()}
     slam.loop_closer.restore(
-        [LoopClosureRecord(*closure) for closure in run["loop_closures"]],
+        unpack_closures(loops, run["loop_closures"]),
         None if precheck is None else (int(precheck[0]), bool(precheck[1])),
     )
     changes = [_camera_change(saved.camera, *change) for change in run["camera_changes"]]

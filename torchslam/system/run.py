@@ -35,7 +35,7 @@ class Run:
         skipped: messages about the frames that could not be read.
         interrupted: True if the user stopped the run.
         failure: message that says why no frame has a pose; empty if some have one.
-        loop_closures: closed loops and merges of submaps.
+        loop_closures: closed loops and merges of submaps, each with its pose graph and the matches that measured it.
         session: number of the run among those over the same map; frames and trajectories are those of this session.
         sessions: number of sessions of the map, without those that only localized.
         given: the given camera with its error, if the final adjustment changed it.
@@ -144,9 +144,10 @@ class Run:
         Raises:
             InitializationError: if there is no map.
         """
-        if not self.submaps:
+        mapped = [submap for submap in self.submaps if len(submap.map.points)]
+        if not mapped:
             raise InitializationError(self.failure)
-        return concatenate_graphs([self._graph_of(submap) for submap in self.submaps])
+        return concatenate_graphs([self._graph_of(submap) for submap in mapped])
 
     def _graph_of(self, submap: Submap) -> RunGraph:
         return submap.posed_frames.graph(submap.map, self.sensor, submap.number, self.given)

@@ -5,24 +5,27 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
+from functools import cached_property, lru_cache
+from pathlib import Path
 from urllib.parse import parse_qsl
 
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import Calibration, GivenCamera
-from torchslam.data.formats.image_file import gray_to_tensor
+from torchslam.data.formats.image_file import gray_to_tensor, read_gray
 from torchslam.data.sequence import Calibrated, Reader, Sequence
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Rectangle, corridors, room, rooms, wall
 from torchslam.errors import CalibrationError, SequenceError
+from torchslam.features.weights import downloads
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import rigid, se3_inverse, so3_exp
 from torchslam.types import Trajectory
+from torchslam.utils.files import fingerprint, write_whole
 
 FRAME_RATE = 20.0  # frames per second
 SIZE = (640, 480)  # width and height of the images, pixels
@@ -136,6 +139,7 @@ class RenderOptions:
         blank: 1: gray images instead of rendered ones, if only the poses are used
         readout: milliseconds from the exposure of the first row to the last, whose middle has the frame's pose
         pace: speed of the camera, 1 as the scene has it
+        cache: 1: rendered images are kept on disk, in `torchslam/rendered` of the user's cache folder
     """
 
     frames: int
@@ -146,6 +150,7 @@ class RenderOptions:
     blank: int = 0
     readout: float = 0.0
     pace: float = 1.0
+    cache: int = 0
 
 
 class SyntheticSequence(Sequence):
@@ -168,6 +173,24 @@ class SyntheticSequence(Sequence):
         options = self._options
         if options.blank:
             return torch.full((1, 1, SIZE[1], SIZE[0]), 0.5, dtype=torch.float32, device="cpu")
+        if not options.cache:
+            return gray_to_tensor(self._rendered(index))
+        path = self._folder / f"{index:06d}.png"
+        if not path.exists():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            write_whole(path, cv2.imencode(".png", self._rendered(index))[1].tobytes())
+        return read_gray(path, self.image_name(index))
+
+    @cached_property
+    def _folder(self) -> Path:
+        """Where rendered images are kept: the name has all that they depend on, and the code."""
+        options = asdict(self._options) | {"frames": 0, "cache": 0}
+        code = [path.read_bytes() for path in sorted(Path(__file__).parent.glob("*.py"))]
+        name = f"{self.name}-{fingerprint([sorted(options.items()), *code], 16)}"
+        return downloads().parent / "rendered" / name
+
+    def _rendered(self, index: int) -> UInt8[np.ndarray, "H W"]:
+        options = self._options
         image = _renderer(self._scene.build, options.seed).render(self._row_poses(index))
         if options.blur > 0:
             image = cv2.GaussianBlur(image, (0, 0), options.blur)
@@ -175,7 +198,7 @@ class SyntheticSequence(Sequence):
         # The noise of a frame does not depend on the order of access.
         rng = np.random.default_rng((options.seed, index))
         image += options.noise * rng.standard_normal(image.shape, dtype=np.float32)
-        return gray_to_tensor(image.round().clip(0, 255).astype(np.uint8))
+        return image.round().clip(0, 255).astype(np.uint8)
 
     def _row_poses(self, index: int) -> np.ndarray:
         """T_cw (H, 4, 4) of the rows of an image; (1, 4, 4) if they are exposed at once."""
