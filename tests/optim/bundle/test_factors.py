@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 
 from tests.optim.conftest import adjusted, minimized
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, transform
@@ -201,6 +201,33 @@ def test_the_gradient_agrees_with_differences_with_free_camera_and_kernel(bundle
         with torch.no_grad():
             up, down = (loss(tensors | {name: tensors[name] + sign * step}) for sign in (1, -1))
         torch.testing.assert_close((gradient * step).sum(), 0.5 * (up - down), rtol=1e-3, atol=1e-12)
+
+
+def test_what_an_error_closes_over_has_its_gradient(bundle_scene):
+    """Parameters of a network and a tensor with a history, to second order and by every transform."""
+    scene = bundle_scene(noise=1.0, frames=3, points=10, fixed_frames=(0,))
+    frames = torch.tensor([(0, 2), (1, 2)])
+    T_21, information = motions_of(scene.T_cw, frames), spd(2, 6)
+
+    def position(weight, offset):
+        def learned(T_1w, T_2w, T_21):
+            error = relative_pose_error(T_1w, T_2w, T_21)
+            shown = torch.tanh(error[..., :1] + 0.1 * offset.square())
+            return error + torch.nn.functional.linear(shown, weight)
+
+        factors = (FrameFactors(frames, T_21, information, learned),)
+        solution = adjusted(replace(scene.problem, frame_factors=factors), kernel="none", **CONVERGED)
+        return solution.T_cw[2, :3, 3]
+
+    given = (0.1 * draw(6, 1)).requires_grad_(), draw(1, seed=1).requires_grad_()
+    assert gradcheck(position, given, eps=1e-4, atol=1e-8, rtol=1e-6)
+    assert gradgradcheck(lambda *x: position(*x)[0], given, eps=1e-4, atol=1e-7, rtol=1e-4, fast_mode=True)
+    wanted = torch.autograd.functional.jacobian(position, given)
+    for mode in (torch.func.jacrev, torch.func.jacfwd):
+        for found, expected in zip(mode(position, (0, 1))(*given), wanted, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-10)
+    with pytest.raises(RuntimeError, match="vmap over a tensor that an error closes over"):
+        torch.vmap(position, (0, None))(torch.stack([given[0]] * 2), given[1])
 
 
 def test_a_frame_that_sees_nothing_follows_its_factors(bundle_scene):

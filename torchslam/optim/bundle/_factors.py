@@ -20,6 +20,7 @@ from torch.func import grad, jvp
 
 from torchslam.geometry.lie import se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
+from torchslam.optim._core.implicit import tensors_closed_over
 from torchslam.optim._core.residuals import Expansion
 from torchslam.optim._core.tangent import retract, row_jacobian
 
@@ -196,6 +197,18 @@ def packed_factors(
         measured.append(own.expand(batch, count, *shape).reshape(batch, -1))
         information.append(matrices.expand(batch, count, size, size).reshape(batch, -1))
     return torch.cat(measured, dim=1), torch.cat(information, dim=1)
+
+
+def tensors_of_errors(factors: Sequence[FrameFactors], T_cw: Float[Tensor, "B K 4 4"]) -> list[Tensor]:
+    """The tensors with derivatives that the errors close over, such as the parameters of a network."""
+    found: dict[int, Tensor] = {}
+    for each in factors:
+        if len(each.frames):
+            T_1w, T_2w = (T_cw[0, rows] for rows in each.frames.unbind(1))
+            own = each.measured if each.information.ndim == 3 else each.measured[0]
+            _, tensors = tensors_closed_over(each.error, T_1w, T_2w, own)
+            found |= {id(tensor): tensor for tensor in tensors}
+    return list(found.values())
 
 
 def _unpacked(

@@ -32,7 +32,13 @@ from torchslam.optim.bundle._dense import (
     dense_data,
     suits_dense,
 )
-from torchslam.optim.bundle._factors import FactorKind, depth_terms, factor_kinds, factor_slope
+from torchslam.optim.bundle._factors import (
+    FactorKind,
+    depth_terms,
+    factor_kinds,
+    factor_slope,
+    tensors_of_errors,
+)
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
@@ -157,8 +163,8 @@ def solve_bundle(
         free_camera: True frees all P parameters of every camera. A tensor (P, n) frees steps along its n columns, of
             which the covariances then are. Every problem of a batch finds its own parameters.
         options: how to minimize; gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed
-            poses and fixed points, and depths and what factors measure, with their information. Nothing flows to the
-            start of free unknowns.
+            poses and fixed points, depths and what factors measure, with their information, and the tensors that
+            errors of factors close over. Nothing flows to the start of free unknowns.
         progress: called before each iteration with its number and the maximum; its exceptions end the minimization.
         check: test whether all that moves is determined. Without, `success` is that of the start; saves a tenth.
 
@@ -172,7 +178,8 @@ def solve_bundle(
     given = sanitized(problem, options.scale)
     matrices, kinds = given.weights.ndim > 2, factor_kinds(problem.frame_factors)
     minimization = BundleMinimization(problem.camera, free_camera, options, progress, check, matrices, kinds)
-    found = BundleMinimum(*find_minimum(minimization, given, options.backward))
+    closed_over = tensors_of_errors(problem.frame_factors, given.T_cw)
+    found = BundleMinimum(*find_minimum(minimization, given, options.backward, closed_over))
     if options.strict:
         check_minimum(found.success, found.converged, "bundle adjustments")
     detached = [x.detach() for x in given]
