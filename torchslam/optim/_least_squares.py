@@ -25,6 +25,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     index_tree,
     minimize_batch,
     select_models,
+    warned,
     where_tree,
 )
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
@@ -194,6 +195,7 @@ def solve_least_squares(
         check_minimum(success, convergence.converged, "elements")
     if options.backward == "truncated":
         solution = minimization.last_step(solution, tensors, success)
+    solution = tuple(warned(x, success, convergence, "elements") for x in solution)
     return LeastSquaresSolution(solution, convergence.cost, success, convergence)
 
 

@@ -213,7 +213,9 @@ class _Closed:
         """The inputs of the problem itself, and the context in which the others stand in for what is closed over."""
         inputs, others = _split(inputs, len(inputs) - len(self.tensors))
         if any(tensor.ndim != dims for tensor, dims in zip(others, self.dims, strict=True)):
-            raise RuntimeError("vmap over a tensor that an error closes over is not supported: make it an input")
+            raise RuntimeError(
+                "vmap over a tensor that an error closes over is not supported: make it an input"
+            )
         pairs = zip(self.tensors, others, strict=True)
         places = {id(own): (own, other) for own, other in pairs if own is not other}
         if not places:
