@@ -470,7 +470,7 @@ def test_factors_that_shrink_the_map_without_limit_end_soon_with_a_reason():
     solution = solve_graph(graph, factors=(level,))
     assert not solution.success[graph.is_keyframe].any()
     assert "shrink the map" in str(solution.reasons[0])
-    assert solution.convergence.iterations[0] < 60
+    assert solution.convergence.iterations[0] < 100
 
 
 def test_a_solution_that_has_not_converged_warns_of_its_gradient_once():

@@ -693,8 +693,8 @@ def _solve(
     of_bundles = []
     for number, graph in enumerate(graphs):
         place = torch.unique(graph.submap, return_inverse=True)[1]
-        own = [bundle for bundle, submap in zip(bundles, submaps, strict=True) if submap.graph == number]
-        columns = zip(*(bundle.convergence.tensors for bundle in own), strict=True)
+        of_graph = [b for b, submap in zip(bundles, submaps, strict=True) if submap.graph == number]
+        columns = zip(*(bundle.convergence.tensors for bundle in of_graph), strict=True)
         of_bundles.append([torch.cat(column)[place] for column in columns])
     every = (torch.cat(column) for column in zip(*of_bundles, strict=True))
     convergence = Convergence(*every, limit=options.iterations)

@@ -94,10 +94,10 @@ class Rounded(Protocol):
 
 
 @runtime_checkable
-class Drifting(Protocol[M]):
+class Drifting(Protocol):
     """A problem that may have no minimum because its unknowns drift to a limit where it is degenerate."""
 
-    def drifts(self, old: M, new: M, relative_reduction: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
+    def drifts(self, old: Any, new: Any, relative_reduction: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
         """Which elements to give up, called once for each step that was accepted."""
         ...
 
@@ -201,11 +201,14 @@ def warned(tensor: Tensor, success: Tensor, convergence: Convergence, what: str)
     unfinished = success.flatten() & ~convergence.converged.expand(success.numel())
     if not bool(unfinished.any()):
         return tensor
-    tensor, has_warned = tensor.view_as(tensor), []
+    tensor = tensor.view_as(tensor)
+    has_warned: list[bool] = []
 
-    def warn(gradient: Tensor) -> None:
+    def warn(gradient: Tensor | None) -> None:
+        if gradient is None or has_warned:
+            return
         rows = unfinished & (gradient != 0).reshape(len(unfinished), -1).any(-1)
-        if has_warned or not bool(rows.any()):
+        if not bool(rows.any()):
             return
         has_warned.append(True)
         reasons = Counter(

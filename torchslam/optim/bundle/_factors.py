@@ -490,11 +490,12 @@ def factor_terms(
             joined.append((numbers, beside * hessian))
     ends = torch.cat(pairs)
     between = FrameBlocks(ends[:, 0], ends[:, 1], torch.cat(blocks))
-    split, of_points = 6 * count, None
+    split = 6 * count
+    joining: PointBlocks | None = None
     if any(kind.points.shape[1] for kind in kinds):
-        of_points = PointBlocks(gradient[split:].view(-1, 3), points, *_beside(joined, gradient))
+        joining = PointBlocks(gradient[split:].view(-1, 3), points, *_beside(joined, gradient))
     of_frames = gradient[:split].view(-1, 6), frames, between
-    return FactorTerms(cost, *of_frames, camera_gradient, camera, of_points)
+    return FactorTerms(cost, *of_frames, camera_gradient, camera, joining)
 
 
 def _beside(joined: list[tuple[Tensor, Tensor]], like: Tensor) -> tuple[Tensor, Tensor]:

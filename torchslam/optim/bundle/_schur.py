@@ -451,11 +451,10 @@ class FactorizedEquations:
         inverse = self.reduced.inverse_frames, points_w, self.reduced.inverse_cameras
         correction = self._correction
         if correction is not None:
-            frames, points, cameras = correction.columns
-            columns = frames, points, cameras.flatten(0, 1)
-            pairs = zip(inverse, columns, strict=True)
-            inverse = tuple(
-                torch.where(correction.definite, x - Y @ correction.middle @ Y.mT, 0.0) for x, Y in pairs
+            columns = *correction.columns[:2], correction.columns.cameras.flatten(0, 1)
+            inverse = tuple(  # type: ignore[assignment]
+                torch.where(correction.definite, x - Y @ correction.middle @ Y.mT, 0.0)
+                for x, Y in zip(inverse, columns, strict=True)
             )
         return Marginals(*inverse)
 

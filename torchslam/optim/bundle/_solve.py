@@ -361,8 +361,10 @@ class BundleMinimization:
             slope = slope + (terms.slope * velocity[:, 2]).sum()
         if self.kinds:
             moved = found.moved_frames[..., None], found.moved_points[..., None]
-            step = torch.where(moved[0], frames, 0.0), torch.where(moved[1], points, 0.0)
-            step = *step, self._along(camera, at.params)
+            of_frames, of_points = (
+                torch.where(mask, part, 0.0) for mask, part in zip(moved, (frames, points), strict=True)
+            )
+            step = of_frames, of_points, self._along(camera, at.params)
             slope = slope + factor_slope(self.kinds, at, given.measured, given.factor_information, step)
         if not given.has_priors:
             return slope
