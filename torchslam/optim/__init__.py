@@ -29,6 +29,7 @@ from torchslam.optim.bundle._factors import (
     pose_error,
     relative_pose_error,
 )
+from torchslam.optim.bundle._marginalization import marginalize
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.bundle._scores import pose_covariance
@@ -76,6 +77,7 @@ __all__ = [
     "displacement_error",
     "log_distance_error",
     "log_length_error",
+    "marginalize",
     "plane_error",
     "pose_covariance",
     "pose_error",

@@ -453,7 +453,7 @@ def factor_terms(
     frames, points = T_cw.new_zeros(count, 6, 6), T_cw.new_zeros(num_points, 3, 3)
     pairs, blocks, joined = [torch.zeros_like(kinds[0].pairs[:0])], [T_cw.new_zeros(0, 6, 6)], []
     for kind, own, matrix in _unpacked(kinds, measured, information):
-        moved = _moved(kind, at, own, directions, in_world=True)
+        moved = moved_errors(kind, at, own, directions, in_world=True)
         n, m = kind.frames.shape[1], kind.points.shape[1]
         zero = T_cw.new_zeros(len(kind.frames), most if kind.of_camera else 6 * n + 3 * m)
         error, J = _with_jacobian(moved, zero)
@@ -521,7 +521,7 @@ def factor_slope(
     for kind, own, matrix in _unpacked(kinds, measured, information):
         along = torch.cat([part.flatten(-2) for part in _rows_of(kind, *step[:2])], dim=-1)
         along = step[2] if kind.of_camera else along
-        moved = _moved(kind, at, own)
+        moved = moved_errors(kind, at, own)
         error, velocity = jvp(moved, (torch.zeros_like(along),), (along,))[:2]
         slope = slope + torch.einsum("...i,...ij,...j->...", error, matrix, velocity).sum()
     return slope
@@ -540,7 +540,7 @@ def _seen_by(kind: FactorKind, T_cw: Tensor, points_w: Tensor, params: Tensor) -
     return *(T_cw[..., rows, :, :] for rows in frames), *(points_w[..., rows, :] for rows in points)
 
 
-def _moved(
+def moved_errors(
     kind: FactorKind,
     at: tuple[Tensor, Tensor, Tensor],
     measured: Tensor,
