@@ -24,6 +24,9 @@ Loss = Callable[[GraphSolution], Tensor]
 CHECK_TOLERANCE = 1e-20
 """Of the searches: the poses are then exact to some 1e-10 of their standard deviation. Tried from 1e-10, where
 differences are off by up to a quarter, to 0, where every search takes all iterations."""
+_CAMERA_UNIT = 0.01
+"""Share of the camera's parameters that counts as much as a pixel. Tried at this value and at 1, where the differences of
+a run are 3e-4 off."""
 GAUGE = "translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale"
 GAUGE_TOLERANCE = 1e-6
 """Change of a loss, as a share of it, by a motion of the world of one unit (or radian, or by the factor e) from which
@@ -93,7 +96,7 @@ def check_gradient(
         inputs: of "pixels", "weights" and "camera". The camera's parameters are those of the calibration where the
             graph has one.
         directions: number of random ones for each input.
-        step: length of the differences, in pixels, or relative to weights and parameters.
+        step: length of the differences, in pixels, relative to weights, or in hundredths of the camera's parameters.
         options: as of `solve_graph`, but for the tolerance.
         given: other arguments of `solve_graph`, such as factors.
 
@@ -121,7 +124,8 @@ def check_gradient(
 
     names, slopes = [], []
     for name, gradient in zip(inputs, gradients, strict=True):
-        unit = torch.ones_like(gradient) if name == "pixels" else values[name].abs()
+        size_of = {"weights": values[name].abs(), "camera": _CAMERA_UNIT * values[name].abs()}
+        unit = size_of.get(name, torch.ones_like(gradient))
         for _ in range(directions):
             noise = torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
             along = unit * noise.to(gradient)
