@@ -25,7 +25,7 @@ CHECK_TOLERANCE = 1e-20
 """Of the searches: the poses are then exact to some 1e-10 of their standard deviation. Tried from 1e-10, where
 differences are off by up to a quarter, to 0, where every search takes all iterations."""
 _CAMERA_UNIT = 0.01
-"""Share of the camera's parameters that counts as much as a pixel. Tried at this value and at 1, where the differences of
+"""Share of the camera's parameters that counts as much as a pixel. Tried at this value and at 1, where differences of
 a run are 3e-4 off."""
 GAUGE = "translation x", "translation y", "translation z", "rotation x", "rotation y", "rotation z", "scale"
 GAUGE_TOLERANCE = 1e-6
