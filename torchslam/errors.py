@@ -61,5 +61,9 @@ class ConvergenceError(TorchslamError):
     """A least-squares problem that was solved with `strict=True` has no minimum, or the search for it did not end."""
 
 
+class ConvergenceWarning(UserWarning):
+    """A gradient passes a solution that is not at a minimum. With `strict=True` a `ConvergenceError` comes before."""
+
+
 class ClipError(TorchslamError):
     """A clip to learn from has no poses to compare."""

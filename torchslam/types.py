@@ -18,11 +18,12 @@ from torchslam.errors import TrajectoryError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.gating import KeypointNoise, packed_information, unpacked_information
 from torchslam.utils.by_value import ByValue
+from torchslam.utils.torch_internals import default_collate_fn_map
 
 
 @dataclass(frozen=True, eq=False)
 class Frame(ByValue):
-    """One image of a sequence.
+    """One image of a sequence. A `DataLoader` collates B of them to a dictionary of their columns.
 
     Attributes:
         index: position in the sequence, from 0.
@@ -91,6 +92,28 @@ class Features(ByValue):
     def _each(self, change: Callable[[Tensor], Tensor]) -> Features:
         changed: Any = (None if column is None else change(column) for column in vars(self).values())
         return Features(*changed)
+
+
+def _collate(frames: Sequence[Frame], *, collate_fn_map: object = None) -> dict[str, Any]:
+    """The columns of B frames: images and masks (B, 1, H, W), poses (B, 4, 4), numbers (B,), names as a list, features
+    as one batch. What one of them lacks is left out."""
+    columns: dict[str, Any] = {}
+    for each in fields(Frame):
+        column = [getattr(frame, each.name) for frame in frames]
+        if any(value is None for value in column):
+            continue
+        if each.name == "features":
+            columns[each.name] = Features.cat(column)
+        elif each.name in ("image", "mask"):
+            columns[each.name] = torch.cat(column)
+        elif each.name == "T_cw_groundtruth":
+            columns[each.name] = torch.stack(column)
+        else:
+            columns[each.name] = column if each.name == "name" else torch.tensor(column, device="cpu")
+    return columns
+
+
+default_collate_fn_map[Frame] = _collate  # of `DataLoader`
 
 
 @dataclass(frozen=True, eq=False)

@@ -186,6 +186,15 @@ def bent(k1: float) -> Camera:
 POINTS = torch.tensor([[0.3, -0.2, 2.0], [-0.4, 0.1, 1.5]], dtype=torch.float64)
 
 
+def test_torch_loads_a_camera_with_weights_only(tmp_path):
+    camera = pinhole(500.0)
+    torch.save({"camera": camera}, tmp_path / "camera.pt")
+    loaded = torch.load(tmp_path / "camera.pt", weights_only=True)["camera"]
+    assert isinstance(loaded, Camera)
+    assert torch.equal(loaded.params, camera.params)
+    assert (loaded.model, loaded.size) == (camera.model, camera.size)
+
+
 def test_collate_and_a_loader_give_a_batch_of_cameras():
     samples = [{"camera": pinhole(500.0 + row), "frame": row} for row in range(4)]
     batch = default_collate(samples)["camera"]

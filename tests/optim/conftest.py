@@ -20,7 +20,7 @@ from torchslam.optim import (
     BundleProblem,
     BundleSolution,
     DepthPrior,
-    FrameFactors,
+    Factors,
     LeastSquaresSolution,
     PoseGraph,
     PoseGraphSolution,
@@ -112,12 +112,12 @@ def optimized(graph: PoseGraph, **options: Any) -> PoseGraphSolution:
 def solved_graph(
     graph: ObservationGraph,
     *,
-    frame_factors: Sequence[FrameFactors] = (),
+    factors: Sequence[Factors] = (),
     depth_prior: DepthPrior | None = None,
     **options: Any,
 ) -> GraphSolution:
     """`solve_graph` with some options changed."""
-    more = {"frame_factors": frame_factors, "depth_prior": depth_prior}
+    more = {"factors": factors, "depth_prior": depth_prior}
     return solve_graph(graph, **more, options=GRAPH_OPTIONS.replace(**options))
 
 

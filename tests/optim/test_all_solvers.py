@@ -39,9 +39,9 @@ def arguments_of(name: str) -> dict[str, Any]:
         return calls()[name].arguments
     problem, pairs, eye = bundle(), torch.tensor([(0, 1), (1, 2)]), torch.eye(6, dtype=torch.float64)
     motions = problem.T_cw[pairs[:, 1]] @ se3_inverse(problem.T_cw[pairs[:, 0]])
-    factors = [optim.FrameFactors.relative_poses(pairs, motions, 100 * eye.repeat(2, 1, 1))]
+    factors = [optim.Factors.relative_poses(pairs, motions, 100 * eye.repeat(2, 1, 1))]
     prior = optim.PosePrior(problem.T_cw, 0.1 * eye.repeat(3, 1, 1))
-    return {"problem": replace(problem, frame_factors=factors, pose_prior=prior), "free_camera": True}
+    return {"problem": replace(problem, factors=factors, pose_prior=prior), "free_camera": True}
 
 
 def solved(name: str, arguments: dict[str, Any], mode: Backward = "implicit") -> Any:

@@ -229,13 +229,40 @@ def test_a_failure_does_not_affect_the_other_elements(pose_scene):
     assert pixels.grad[0].norm() > 0
 
 
+def test_a_residual_may_close_over_tensors_with_gradients():
+    x, y = normal(2, 9), normal(2, 9)
+    start = torch.zeros(2, 2, dtype=torch.float64)
+
+    def both(shift):
+        inside = solve_least_squares(lambda c, x, y: line(c, x, y + shift * x.sin()), start, (x, y))
+        given = solve_least_squares(
+            lambda c, x, y, shift: line(c, x, y + shift * x.sin()), start, (x, y, shift.expand(2, 9))
+        )
+        return inside.unknowns[0], given.unknowns[0]
+
+    shift = normal(9).requires_grad_()
+    found, expected = torch.autograd.functional.jacobian(both, shift)
+    torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-12)
+    assert found.abs().max() > 0
+
+
 @pytest.mark.usefixtures("without_shape_checks")
 def test_inconsistent_inputs_are_rejected_by_name():
     x, y = normal(2, 9), normal(2, 9)
     start = torch.zeros(2, 2, dtype=torch.float64)
     leaf = y.clone().requires_grad_()
-    with pytest.raises(ValueError, match="with gradient that is not among its inputs"):
-        solve_least_squares(lambda c, x: line(c, x, leaf), start, (x,))
+
+    class Hidden(torch.autograd.Function):
+        @staticmethod
+        def forward(ctx, y):
+            return y.clone()
+
+        @staticmethod
+        def backward(ctx, gradient):
+            return gradient
+
+    with pytest.raises(ValueError, match="with gradient that cannot be found"):
+        solve_least_squares(lambda c, x: line(c, x, Hidden.apply(leaf)), start, (x,))
     with pytest.raises(ValueError, match=r"input 1 must lead with the batch of 2, not have shape \(9,\)"):
         solve_least_squares(line, start, (x, y[0]))
     with pytest.raises(ValueError, match=r"weights must be \(B, N\), not \(9,\)"):

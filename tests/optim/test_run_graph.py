@@ -1,4 +1,6 @@
+import warnings
 from dataclasses import replace
+from multiprocessing.reduction import ForkingPickler
 
 import pytest
 import torch
@@ -6,11 +8,12 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from tests.optim.conftest import solved_graph
-from torchslam.errors import ConvergenceError, TorchslamError
+from torchslam.errors import ConvergenceError, ConvergenceWarning, TorchslamError
 from torchslam.evaluation import ate
 from torchslam.geometry import Camera, se3_exp, se3_inverse, transform, umeyama
 from torchslam.geometry.camera_measurement import CameraMeasurement
-from torchslam.optim import GRAPH_OPTIONS, DepthPrior, FrameFactors
+from torchslam.optim import GRAPH_OPTIONS, DepthPrior, Factors, log_distance_error
+from torchslam.optim.gradient_check import check_gradient
 from torchslam.optim.run_graph import (
     ObservationGraph,
     RunGraph,
@@ -410,12 +413,12 @@ def test_factors_and_depths_of_a_graph_determine_the_scale_of_every_submap():
 
     long = (centers(exact, frames[:, 1]) - centers(exact, frames[:, 0])).norm(dim=-1).detach()
     distances = (1.2 * long).requires_grad_()
-    factors = (FrameFactors.distances(frames, distances, torch.full((len(frames),), 1e8).double()),)
+    factors = (Factors.distances(frames, distances, torch.full((len(frames),), 1e8).double()),)
     seen = exact.T_cw[graph.frame_index, 2, :3] * exact.points_w[graph.point_index]
     depths = 1.2 * (seen.sum(-1) + exact.T_cw[graph.frame_index, 2, 3])
     information = torch.where(graph.submap[graph.frame_index] == graph.submaps[1], 1e4, 0.0).double()
     prior = DepthPrior(depths.detach(), information)
-    solution = solved_graph(graph, frame_factors=factors, depth_prior=prior, kernel="none", strict=True)
+    solution = solved_graph(graph, factors=factors, depth_prior=prior, kernel="none", strict=True)
     for rows in keyframes:
         grown = centers(solution, rows) - centers(solution, rows[:1])
         before = centers(exact, rows) - centers(exact, rows[:1])
@@ -423,8 +426,128 @@ def test_factors_and_depths_of_a_graph_determine_the_scale_of_every_submap():
     (gradient,) = torch.autograd.grad(centers(solution, frames[:, 1]).norm(dim=-1).sum(), distances)
     assert gradient.abs().max() > 0
     joined = torch.stack((keyframes[0][:1], keyframes[1][:1]), dim=-1)
-    other = (~graph.is_keyframe).nonzero()[:1, 0]
-    for pair in (joined, torch.stack((keyframes[0][:1], other), dim=-1)):
-        wrong = FrameFactors.distances(pair, torch.ones(1).double(), torch.ones(1).double())
-        with pytest.raises(ValueError, match="keyframes of one submap"):
-            solve_graph(graph, frame_factors=(wrong,))
+    wrong = Factors.distances(joined, torch.ones(1).double(), torch.ones(1).double())
+    with pytest.raises(ValueError, match="of one submap"):
+        solve_graph(graph, factors=(wrong,))
+
+
+def test_factors_of_frames_between_keyframes_and_of_points():
+    """Heights, gravity and a length place and scale the map; their frames are solved with the keyframes."""
+    _, graph = simulated(noise=0.0)
+    exact = solve_graph(graph)
+    up = torch.tensor((0.0, -1, 0)).double()
+    frames, ones = torch.arange(10), torch.full((10,), 1e4).double()
+    assert not graph.is_keyframe[frames].all()
+    heights = (2.0 * se3_inverse(exact.T_cw)[:, :3, 3] @ up + 3).requires_grad_()
+    down_c = (exact.T_cw[:, :3, :3] @ -up).detach()
+    pair = torch.tensor([(0, 1)])
+    length = 2 * (exact.points_w[1] - exact.points_w[0]).norm()[None].detach()
+    factors = (
+        Factors.heights(frames, heights, ones, up),
+        Factors.directions(frames, down_c, -up, ones),
+        Factors.lengths(pair, length, ones[:1]),
+    )
+    solution = solve_graph(graph, factors=factors)
+    assert solution.success.all()
+    assert solution.converged.all()
+    found = se3_inverse(solution.T_cw)[:, :3, 3] @ up
+    torch.testing.assert_close(found, heights, rtol=0, atol=1e-4)
+    torch.testing.assert_close((solution.points_w[1] - solution.points_w[0]).norm()[None], length)
+    (gradient,) = torch.autograd.grad(found.sum(), heights)
+    torch.testing.assert_close(gradient.sum(), torch.tensor(10.0).double())  # all of them higher
+
+
+def test_factors_that_shrink_the_map_without_limit_end_soon_with_a_reason():
+    """No extent is the best of a plane that the camera does not keep, as nothing determines the scale."""
+    _, graph = simulated(noise=0.5)
+    keyframes = graph.is_keyframe.nonzero().squeeze(-1)
+
+    def rise(T_1w, T_2w, measured):
+        return (se3_inverse(T_2w)[..., 1, 3] - se3_inverse(T_1w)[..., 1, 3] - measured)[..., None]
+
+    pairs = torch.stack((keyframes[:-1], keyframes[1:]), dim=-1)
+    level = Factors(pairs, torch.zeros(3).double(), torch.full((3, 1, 1), 1e4).double(), rise)
+    solution = solve_graph(graph, factors=(level,))
+    assert not solution.success[graph.is_keyframe].any()
+    assert "shrink the map" in str(solution.reasons[0])
+    assert solution.convergence.iterations[0] < 100
+
+
+def test_a_solution_that_has_not_converged_warns_of_its_gradient_once():
+    _, graph = simulated(noise=1.0)
+    weights = graph.weights.clone().requires_grad_()
+    solution = solved_graph(replace(graph, weights=weights), iterations=2)
+    assert not solution.converged.any()
+    assert {str(reason) for reason in solution.reasons} == {"not converged: allow more iterations"}
+    with pytest.warns(ConvergenceWarning, match=r"of 10 of 10 frames .*\(10 not converged: allow more"):
+        solution.T_cw.square().sum().backward(retain_graph=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        solution.T_cw.square().sum().backward()  # once is enough
+        solve_graph(replace(graph, weights=weights)).T_cw.square().sum().backward()
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.bfloat16, torch.float16])
+def test_any_precision_is_computed_in_float64(dtype):
+    _, graph = simulated()
+    weights = graph.weights.to(dtype).requires_grad_()
+    with torch.autocast("cpu", dtype=torch.bfloat16):
+        solution = solve_graph(replace(graph, weights=weights))
+    exact = graph.weights.to(dtype).double().requires_grad_()
+    expected = solve_graph(replace(graph, weights=exact))
+    assert torch.equal(solution.T_cw, expected.T_cw)
+    solution.T_cw.square().sum().backward()
+    expected.T_cw.square().sum().backward()
+    assert weights.grad.dtype == dtype
+    torch.testing.assert_close(weights.grad, exact.grad.to(dtype))
+
+
+def test_a_solution_travels_between_processes_without_its_graph():
+    _, graph = simulated()
+    pixels = graph.pixels.clone().requires_grad_()
+    solution = solve_graph(replace(graph, pixels=pixels))
+    factor = Factors.distances(torch.tensor([(0, 9)]), torch.ones(1).double(), torch.ones(1).double())
+    own = solve_graph(graph, factors=(replace(factor, error=lambda *x: log_distance_error(*x)),))
+    for each in (solution, own):
+        copy = ForkingPickler.loads(ForkingPickler.dumps(each))
+        assert torch.equal(copy.T_cw, each.T_cw)
+        assert not copy.T_cw.requires_grad
+        assert copy.reasons == each.reasons
+        covariance = copy.keyframes[0].covariance([1], [2]), each.keyframes[0].covariance([1], [2])
+        assert all(torch.equal(*pair) for pair in zip(*covariance, strict=True))
+
+
+def test_a_graph_moves_to_a_dtype():
+    _, graph = simulated()
+    small = graph.to(dtype=torch.float32)
+    assert small.pixels.dtype == small.camera.params.dtype == torch.float32
+    assert small.frame_index.dtype == torch.int64
+    assert small.timestamps.dtype == torch.float64
+    torch.testing.assert_close(solve_graph(small).T_cw, solve_graph(graph).T_cw, rtol=0, atol=1e-5)
+    assert torch.equal(graph.to("cpu").pixels, graph.pixels)
+
+
+def test_a_warm_start_ends_soon_at_the_same_minimum():
+    _, graph = simulated()
+    before = solve_graph(graph)
+    changed = replace(graph, weights=graph.weights * 1.01)
+    cold, warm = solve_graph(changed), solve_graph(changed, start=before)
+    torch.testing.assert_close(warm.T_cw, cold.T_cw, rtol=0, atol=1e-5)
+    assert warm.keyframes[0].convergence.iterations < cold.keyframes[0].convergence.iterations
+    with pytest.raises(ValueError, match=r"start\.T_cw must be"):
+        solve_graph(graph, start=replace(before, T_cw=before.T_cw[1:]))
+
+
+def test_the_gradient_check_agrees_and_names_the_gauge():
+    truth, graph = simulated(noise=1.0)
+    check = check_gradient(graph, lambda found: ate(T_cw=found.T_cw, T_cw_groundtruth=truth), directions=1)
+    assert check.names == ("pixels", "weights", "camera")
+    assert check.errors.max() < 1e-5
+    assert check.depends_on == ()
+    check = check_gradient(
+        graph, lambda found: found.T_cw[:, :3, 3].square().sum(), ("weights",), directions=1
+    )
+    assert "scale" in check.depends_on
+    assert "align it" in str(check)
+    with pytest.raises(ValueError, match="unknown input 'poses'"):
+        check_gradient(graph, lambda found: found.T_cw.sum(), ("poses",))

@@ -110,6 +110,9 @@ class Camera(ByValue):
         camera.__dict__["_usable"] = proper
         return camera
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {"model": self.model, "params": self.params, "size": self.size}
+
     @staticmethod
     def pinhole(fx: Scalar, fy: Scalar, cx: Scalar, cy: Scalar, size: tuple[int, int]) -> Camera:
         """A camera without distortion."""
@@ -413,3 +416,4 @@ def _collate(cameras: Sequence[Camera], *, collate_fn_map: object = None) -> Cam
 # agree where trees are compared, and in a batch.
 register_pytree(Camera, "params", _flatten, _unflatten)
 default_collate_fn_map[Camera] = _collate
+torch.serialization.add_safe_globals([Camera])  # `torch.load` with weights_only reads it

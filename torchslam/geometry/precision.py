@@ -65,6 +65,50 @@ def _precise(function: Callable[P, R], one_dtype: bool) -> Callable[P, R]:
     return precise
 
 
+def in_widest_precision(function: Callable[P, R]) -> Callable[P, R]:
+    """The function, all tensors of floats in the widest precision of any of them, float64 where none is float32 or
+    float64; gradients come back in the precision of each. Cameras follow, numbers stay as they are."""
+
+    @wraps(function)
+    def widened(*args: P.args, **kwargs: P.kwargs) -> R:
+        found = set(_dtypes_in((*args, *kwargs.values())))
+        if len(found) < 2 and found <= set(_FLOATS):
+            return function(*args, **kwargs)
+        dtype = torch.float32 if torch.float32 in found and torch.float64 not in found else torch.float64
+        args = tuple(_in_dtype(value, dtype) for value in args)  # type: ignore[assignment]
+        kwargs = {name: _in_dtype(value, dtype) for name, value in kwargs.items()}  # type: ignore[assignment]
+        return function(*args, **kwargs)
+
+    return widened
+
+
+def _dtypes_in(value: Any) -> Iterator[torch.dtype]:
+    """The types of the tensors of floats in a value, its fields and its elements."""
+    if isinstance(value, Tensor):
+        if value.is_floating_point() and value.ndim:
+            yield value.dtype
+    elif isinstance(value, (list, tuple)):
+        for each in value:
+            yield from _dtypes_in(each)
+    elif is_dataclass(value) and not getattr(value, "follows_data", False):
+        for each in fields(value):
+            yield from _dtypes_in(getattr(value, each.name))
+
+
+def _in_dtype(value: Any, dtype: torch.dtype) -> Any:
+    """A value with the tensors that `_dtypes_in` counts in another type."""
+    if isinstance(value, Tensor):
+        return value.to(dtype) if value.is_floating_point() and value.ndim else value
+    if type(value) in (list, tuple):
+        return type(value)(_in_dtype(each, dtype) for each in value)
+    if getattr(value, "follows_data", False):
+        return _following(value, dtype)
+    if not is_dataclass(value) or isinstance(value, type) or not any(_dtypes_in(value)):
+        return value
+    changed = {each.name: _in_dtype(getattr(value, each.name), dtype) for each in fields(value)}
+    return replace(value, **changed)
+
+
 def check_dtypes(**tensors: Tensor | None) -> None:
     """Raises ValueError unless all tensors are float32, or all float64; names the first that is not."""
     call = _Call(one_dtype=True)

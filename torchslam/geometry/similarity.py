@@ -11,7 +11,7 @@ from torch import Tensor
 
 from torchslam.geometry.absolute_pose import CANDIDATES, FINAL_ITERATIONS, FINAL_WIDTH, FIRST_ROUND
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.estimate_gradients import first_order, needs_gradient, refuse_transforms
+from torchslam.geometry.estimate_gradients import needs_gradient, refuse_transforms
 from torchslam.geometry.lie import homogeneous, rigid, se3_inverse, sim3_inverse, so3_exp, transform, vee
 from torchslam.geometry.precision import check_positive, full_precision
 from torchslam.geometry.projections import squared_projections
@@ -48,8 +48,8 @@ def umeyama(
 ) -> tuple[Float[Tensor, "*#batch"], Float[Tensor, "*#batch 3 3"], Float[Tensor, "*#batch 3"]]:
     """Align points by the similarity that minimizes sum_i w_i |target_i - (s R source_i + t)|^2.
 
-    Differentiable once in points and weights (a second time raises RuntimeError), on exact data and at repeated
-    singular values too: the rotation's gradient comes from the optimality condition, not from the singular vectors.
+    Differentiable up to the third order in points and weights, on exact data and at repeated singular values too: the
+    rotation's gradients come from the optimality condition, not from the singular vectors.
     With fewer than three points, or collinear ones, the result is finite and one of many minimizers, and its
     gradient leaves out the free direction. Points at one place up to rounding have scale one and the identity as
     rotation, without gradient. Source: Umeyama, "Least-squares estimation of transformation parameters
@@ -131,11 +131,17 @@ def in_place_of(
     return without_scale(T_ca @ sim3_inverse(S_ba)), transform(S_ba, points_a)
 
 
+_ORDERS = 3
+"""Of derivatives of a rotation that are right: a Newton step of a loss whose gradient is trained takes as many. Tried
+at 2 and 3."""
+
+
 def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 3"]:
-    """The rotation that maximizes tr(R^T M), with a finite first-order gradient.
+    """The rotation that maximizes tr(R^T M), with finite gradients that are right up to the third order.
 
     At the maximum S = M R^T is symmetric; for a change of M the rotation moves by exp(omega) with
-    (tr(S) I - S) omega = vee(2 antisymmetric part of dM R^T).
+    (tr(S) I - S) omega = vee(2 antisymmetric part of dM R^T). This is a step of Newton's method with a fixed matrix:
+    each one makes the derivatives of one more order right.
     """
     fixed = M.detach()
     U, singular, Vh = torch.linalg.svd(fixed)
@@ -148,11 +154,13 @@ def nearest_rotation(M: Float[Tensor, "*batch 3 3"]) -> Float[Tensor, "*batch 3 
     s = singular * sign
     stiffness = torch.stack((s[..., 1] + s[..., 2], s[..., 0] + s[..., 2], s[..., 0] + s[..., 1]), dim=-1)
     free = stiffness <= 1e-12 * singular[..., :1] + torch.finfo(M.dtype).tiny
-    residual = 2 * vee(M @ R.mT)
-    in_basis = (U.mT @ residual[..., None]).squeeze(-1)
-    omega = torch.where(free, 0.0, in_basis / torch.where(free, 1.0, stiffness))
-    omega = (U @ omega[..., None]).squeeze(-1)
-    return so3_exp(first_order(omega - omega.detach())) @ R
+    for _ in range(_ORDERS):
+        residual = 2 * vee(M @ R.mT)
+        in_basis = (U.mT @ residual[..., None]).squeeze(-1)
+        omega = torch.where(free, 0.0, in_basis / torch.where(free, 1.0, stiffness))
+        omega = (U @ omega[..., None]).squeeze(-1)
+        R = so3_exp(omega - omega.detach()) @ R
+    return R
 
 
 _DISTINCT = 2.0  # thresholds, in both images together, up to which pairs may be one that is repeated

@@ -18,15 +18,23 @@ from torchslam.optim._core.tangent import CameraPrior, PosePrior
 from torchslam.optim._least_squares import LeastSquaresSolution, Manifold, solve_least_squares
 from torchslam.optim.bundle._factors import (
     DepthPrior,
-    FrameFactors,
+    Factors,
+    bounds_error,
+    center_error,
+    direction_error,
     displacement_error,
     log_distance_error,
+    log_length_error,
+    plane_error,
+    pose_error,
     relative_pose_error,
 )
+from torchslam.optim.bundle._marginalization import marginalize
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._schur import Marginals
 from torchslam.optim.bundle._scores import pose_covariance
 from torchslam.optim.bundle._solve import BundleSolution, solve_bundle
+from torchslam.optim.gradient_check import GradientCheck, check_gradient
 from torchslam.optim.pose import RefinedPose, solve_pose
 from torchslam.optim.pose_graph import PoseGraph, PoseGraphSolution, solve_pose_graph
 from torchslam.optim.rotation_averaging import RotationAverage, solve_rotations
@@ -48,7 +56,8 @@ __all__ = [
     "CameraPrior",
     "Convergence",
     "DepthPrior",
-    "FrameFactors",
+    "Factors",
+    "GradientCheck",
     "LeastSquaresSolution",
     "Manifold",
     "Marginals",
@@ -60,10 +69,18 @@ __all__ = [
     "RotationAverage",
     "SolverOptions",
     "SolverReason",
+    "bounds_error",
     "camera_evidence",
+    "center_error",
+    "check_gradient",
+    "direction_error",
     "displacement_error",
     "log_distance_error",
+    "log_length_error",
+    "marginalize",
+    "plane_error",
     "pose_covariance",
+    "pose_error",
     "relative_pose_error",
     "solve_bundle",
     "solve_least_squares",

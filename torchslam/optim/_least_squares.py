@@ -15,7 +15,7 @@ from torch.func import grad, jvp
 from torchslam.geometry.precision import check_dtypes, full_precision
 from torchslam.geometry.robust import Kernel, kernel_scale, robustify
 from torchslam.optim._core import tangent
-from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum
+from torchslam.optim._core.implicit import Ndims, Tensors, find_minimum, tensors_closed_over
 from torchslam.optim._core.levenberg_marquardt import (
     LEAST_SQUARES_OPTIONS,
     Convergence,
@@ -25,6 +25,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     index_tree,
     minimize_batch,
     select_models,
+    warned,
     where_tree,
 )
 from torchslam.optim._core.linear import DefiniteFactor, diagonal_floor, factorize
@@ -166,30 +167,35 @@ def solve_least_squares(
             (B, N, D). It is called with any part of the batch. PyTorch must be able to differentiate it in forward
             mode and twice: it cannot for `grid_sample`, it can for bilinear sums of gathered pixels.
         start: one or several unknowns, all leading with B, together of few dimensions: their Hessian is dense.
-        inputs: all tensors that differ between elements or require a gradient, leading with B.
+        inputs: all tensors that differ between elements, leading with B. Others, such as the parameters of a network,
+            the residual may close over: they receive their gradient, too.
         manifolds: manifold of each unknown, or one for all.
         weights: inverse variances, one if None.
         mask: residuals that count, all if None; the others must be finite, with finite derivatives.
-        options: how to minimize; gradients reach inputs, weights and the scale of the kernel.
+        options: how to minimize; gradients reach inputs, weights, the scale of the kernel, and what the residual
+            closes over.
 
     Raises:
-        ValueError: a shape or a dtype does not fit, a name is unknown, or the residual has gradients to tensors other
-            than its inputs, which would not receive any.
+        ValueError: a shape or a dtype does not fit, a name is unknown, or the residual has gradients to tensors that
+            it hides, as in torch.jit.script.
         ConvergenceError: with `options.strict`.
     """
     unknowns = (start,) if isinstance(start, Tensor) else tuple(start)
     names = (manifolds,) * len(unknowns) if isinstance(manifolds, str) else tuple(manifolds)
     product = Product.of(names, unknowns)
-    weights, counted, scale = _checked(residual, unknowns, tuple(inputs), weights, mask, options.scale)
+    (weights, counted, scale), closed_over = _checked(
+        residual, unknowns, tuple(inputs), weights, mask, options.scale
+    )
     tensors = (*unknowns, counted, weights, scale, *inputs)
     minimization = _Minimization(residual, product, options, tensors)
-    found = find_minimum(minimization, tensors, options.backward)
+    found = find_minimum(minimization, tensors, options.backward, closed_over)
     solution, (success, *how) = found[: len(unknowns)], found[len(unknowns) :]
     convergence = Convergence(*how, limit=options.iterations)
     if options.strict:
         check_minimum(success, convergence.converged, "elements")
     if options.backward == "truncated":
         solution = minimization.last_step(solution, tensors, success)
+    solution = tuple(warned(x, success, convergence, "elements") for x in solution)
     return LeastSquaresSolution(solution, convergence.cost, success, convergence)
 
 
@@ -200,18 +206,15 @@ def _checked(
     weights: Tensor | None,
     mask: Tensor | None,
     scale: Tensor | float,
-) -> Tensors:
-    """Weights (B, N), which residuals count (B, N), and the scale (B,)."""
+) -> tuple[Tensors, list[Tensor]]:
+    """Weights (B, N), which residuals count (B, N), and the scale (B,); the tensors that the residual closes over."""
     batch, like = len(unknowns[0]), unknowns[0]
     for number, tensor in enumerate((*unknowns, *inputs)):
         name = f"unknown {number}" if number < len(unknowns) else f"input {number - len(unknowns)}"
         if tensor.ndim == 0 or len(tensor) != batch:
             shape = tuple(tensor.shape)
             raise ValueError(f"{name} must lead with the batch of {batch}, not have shape {shape}")
-    with torch.enable_grad():
-        value = residual(*(tensor.detach() for tensor in (*unknowns, *inputs)))
-    if value.requires_grad:
-        raise ValueError("the residual depends on a tensor with gradient that is not among its inputs")
+    value, closed_over = tensors_closed_over(residual, *unknowns, *inputs)
     rows, shape = value.shape[:2], tuple(value.shape)
     if value.ndim not in (2, 3) or len(value) != batch:
         raise ValueError(f"the residual must be (B, N) or (B, N, D) with B = {batch}, not {shape}")
@@ -224,7 +227,7 @@ def _checked(
     starts = {f"unknown {number}": x for number, x in enumerate(unknowns)}
     check_dtypes(**starts, **floats, residual=value, weights=weights)
     scale = kernel_scale(scale, like)
-    return weights.expand(rows), counted.expand(rows), scale.expand(batch)
+    return (weights.expand(rows), counted.expand(rows), scale.expand(batch)), closed_over
 
 
 class _Model(NamedTuple):

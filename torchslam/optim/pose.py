@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float
@@ -28,6 +28,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     check_minimum,
     minimize_batch,
     select_models,
+    warned,
 )
 from torchslam.optim._core.linear import diagonal_floor, factorize
 from torchslam.optim._core.residuals import (
@@ -256,6 +257,9 @@ class RefinedPose(Outcome):
     convergence: Convergence
     _problem: Callable[[], PoseProblem] = field(repr=False)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "covariance": self.covariance, "_problem": None}
+
     @cached_property
     def covariance(self) -> Float[Tensor, "B 6 6"]:
         """Covariance of the left perturbation (translation, rotation), detached; zero where `success` is False.
@@ -326,4 +330,5 @@ def solve_pose(
         at_minimum = problem.evaluate(refined, ~success)
         last, _ = problem.step(at_minimum, torch.zeros_like(convergence.cost))
         refined = torch.where(success[:, None, None], last, refined)
+    refined = warned(refined, success, convergence, "poses")
     return RefinedPose(refined, convergence.cost, success, convergence, partial(minimization.problem, inputs))

@@ -40,6 +40,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     check_minimum,
     minimize_batch,
     select_models,
+    warned,
 )
 from torchslam.optim._core.linear import (
     BlockStructure,
@@ -131,6 +132,7 @@ def solve_pose_graph(graph: PoseGraph, *, options: SolverOptions = POSE_GRAPH_OP
         solution = minimization.last_step(at_minimum, inputs, success)
     if options.backward != "detached":
         solution = torch.where(success[:, None, None, None], solution, at_minimum)
+    solution = warned(solution, success, convergence, "pose graphs")
     row = slice(None) if graph.S_cw.ndim == 4 else 0
     return PoseGraphSolution(solution[row], convergence.cost[row], success[row], moving[row], convergence)
 

@@ -30,11 +30,25 @@ from torch.nn.utils.rnn import pad_sequence
 from torchslam.errors import TorchslamError
 from torchslam.geometry import Camera, se3_inverse
 from torchslam.geometry.camera_measurement import OBSERVATION_VARIANCE, CameraMeasurement
-from torchslam.geometry.precision import check_dtypes, full_precision, without_autocast
+from torchslam.geometry.precision import (
+    check_dtypes,
+    full_precision,
+    in_widest_precision,
+    without_autocast,
+)
 from torchslam.geometry.rolling_shutter import Readout, frame_velocities, global_shutter_pixels
-from torchslam.optim._core.levenberg_marquardt import GRAPH_OPTIONS, Progress, SolverOptions, check_minimum
+from torchslam.optim._core.levenberg_marquardt import (
+    GRAPH_OPTIONS,
+    Convergence,
+    Outcome,
+    Progress,
+    SolverOptions,
+    check_minimum,
+    part_of_a_solver,
+    warned,
+)
 from torchslam.optim._core.tangent import CameraPrior
-from torchslam.optim.bundle._factors import DepthPrior, FrameFactors
+from torchslam.optim.bundle._factors import DepthPrior, Factors
 from torchslam.optim.bundle._problem import BundleProblem
 from torchslam.optim.bundle._solve import BundleSolution, solve_bundle
 from torchslam.optim.pose import solve_pose
@@ -64,7 +78,8 @@ class ObservationGraph:
         T_cw: world to camera, as the run left them.
         frame_index: rows of T_cw.
         point_index: rows of points_w.
-        weights: inverse variances in px^-2, or (O, 2, 2) inverse covariances.
+        weights: inverse variances in px^-2, or (O, 2, 2) inverse covariances. Their scale is absolute: the kernel
+            counts residuals in standard deviations, so that weights a thousand times too large make outliers of all.
         camera: one for all frames.
         is_keyframe: Keyframes and points are solved together, the other frames against the points.
         submap: submap of each frame, 0 if omitted. Submaps share nothing but the camera.
@@ -133,6 +148,24 @@ class ObservationGraph:
             self.camera,
             self.readout.seconds.to(self.pixels),
         )
+
+    def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Self:
+        """The same graph on a device, with a dtype of all floats but the timestamps."""
+
+        def moved(name: str, column: Tensor) -> Tensor:
+            return column.to(device, dtype if column.is_floating_point() and name != "timestamps" else None)
+
+        def camera(camera: Camera) -> Camera:
+            return camera.to(device=device, dtype=dtype or camera.params.dtype)
+
+        given, readout = self.calibration, self.readout
+        if given is not None:
+            directions = moved("directions", given.directions)
+            given = replace(given, camera=camera(given.camera), directions=directions)
+        if readout is not None:
+            readout = replace(readout, seconds=readout.seconds.to(device))
+        columns = {name: moved(name, getattr(self, name)) for name in self.columns()}
+        return replace(self, camera=camera(self.camera), calibration=given, readout=readout, **columns)
 
     def save(self, path: str | Path) -> None:
         """Write to a safetensors file, atomically; equal graphs give equal bytes."""
@@ -276,8 +309,10 @@ Graph = TypeVar("Graph", bound=ObservationGraph)
 
 
 @dataclass(frozen=True)
-class GraphSolution:
+class GraphSolution(Outcome):
     """The minimum of a graph, differentiable with respect to its pixels, weights and camera.
+
+    It can be pickled, without gradients. Backward through frames that have not converged warns once.
 
     Attributes:
         T_cw: world to camera.
@@ -285,11 +320,13 @@ class GraphSolution:
         success: A frame that its observations do not determine stays at its start, without gradient. If the
             keyframes of a submap together are not determined, none of them succeeds.
         moved_points: Points that too few keyframes see stay at their start; their observations do not count.
-        converged: the search for a frame's pose, and before for its submap's keyframes and points, ended at
-            a minimum. Elsewhere the poses are nearly right, but the gradient may be wrong by any factor.
+        convergence: of the search for each frame's pose, or of its submap's keyframes and points, whose costs are of
+            all together. A frame has `converged` where both ended at a minimum. Elsewhere the poses are nearly right,
+            but the gradient may be wrong by any factor; `reasons` has why.
         submap: submap of each frame; different submaps share no coordinate frame.
         keyframes: the bundle adjustment of each submap, in the order of `ObservationGraph.submaps`, with its
-            covariances; its rows are the submap's keyframes and the points that its frames see.
+            covariances; its rows are the submap's keyframes, with other frames of factors, and the points that its
+            frames see.
     """
 
     timestamps: Float[Tensor, " K"]
@@ -298,7 +335,7 @@ class GraphSolution:
     camera: Camera
     success: Bool[Tensor, " K"]
     moved_points: Bool[Tensor, " N"]
-    converged: Bool[Tensor, " K"]
+    convergence: Convergence
     submap: Int[Tensor, " K"]
     keyframes: tuple[BundleSolution, ...]
 
@@ -315,6 +352,7 @@ class GraphSolution:
         return Trajectory(self.timestamps[order], se3_inverse(self.T_cw[order]))
 
 
+@in_widest_precision
 @full_precision
 def solve_graph(
     graph: ObservationGraph,
@@ -322,14 +360,16 @@ def solve_graph(
     free_camera: bool | Float[Tensor, "P n"] | None = None,
     options: SolverOptions = GRAPH_OPTIONS,
     progress: Progress | None = None,
-    frame_factors: Sequence[FrameFactors] = (),
+    factors: Sequence[Factors] = (),
     depth_prior: DepthPrior | None = None,
+    start: GraphSolution | None = None,
 ) -> GraphSolution:
     """Minimize the robust reprojection errors of a run's graph: keyframes and points, then the other frames.
 
     Every submap is solved on its own. Its first keyframe and its scale stay those of the start, unless
-    `frame_factors` or `depth_prior` determine the scale; a loss should not depend on them (aligned trajectory errors do
-    not). A camera that is free is found in the submap with most keyframes; the others are solved with it.
+    `factors` or `depth_prior` determine the scale; a loss should not depend on them (aligned trajectory errors do
+    not). With factors of a single frame or point, which are relative to the world, no keyframe is fixed. A camera that
+    is free is found in the submap with most keyframes; the others are solved with it.
 
     With `graph.readout`, the minimum is that of the keypoints that its own poses, points and camera correct. The
     implicit gradient passes `GRADIENT_ROUNDS` rounds of correction and solution there, and is right to 1e-5; it also
@@ -341,24 +381,27 @@ def solve_graph(
             camera is fixed where there is none.
         options: how to minimize; gradients reach pixels, weights and camera, or the calibration where that is a prior.
         progress: called before each iteration of a bundle adjustment.
-        frame_factors: measured motions or distances between keyframes of one submap, or custom residuals, with rows
-            of the graph's frames.
+        factors: measured motions, heights, planes, lengths and the like, or custom residuals, with rows of the
+            graph's frames and points, each of one submap. Their frames are solved together with the keyframes.
         depth_prior: depths of the observations. Those of frames that are not keyframes do not count.
+        start: the solution of a graph like this one, before a step of a training, from which poses, points and a free
+            camera start.
 
     Returns:
         The minimum, differentiable with respect to pixels, weights and camera, depths and what was measured.
 
     Raises:
-        ValueError: a submap has no keyframe, two submaps see the same point, or a factor joins other frames than
-            keyframes of one submap.
+        ValueError: a submap has no keyframe, two submaps see the same point, or a factor joins two submaps.
         ConvergenceError: with `options.strict`.
     """
     strict, options = options.strict, options.replace(strict=False)
-    _check_factors(graph, frame_factors)
+    graph = _with_frames_of_factors(graph, factors)
 
     free, prior = (False, None) if free_camera is None else (free_camera, None)
     if free_camera is None and graph.calibration is not None:
         free, prior = graph.calibration.directions, camera_prior(graph.calibration)
+    if start is not None:
+        graph = _started(graph, start, free)
 
     def solved(graph: ObservationGraph, options: SolverOptions) -> GraphSolution:
         """The minimum of a graph whose keypoints are those of a global shutter."""
@@ -366,7 +409,7 @@ def solve_graph(
         def adjust(submaps: Sequence[_GraphSubmap]) -> list[BundleSolution]:
             solve = partial(solve_bundle, options=options, progress=progress)
             main = max(range(len(submaps)), key=lambda row: len(submaps[row].keyframes))
-            problems = [_with_factors(submap, graph, frame_factors, depth_prior) for submap in submaps]
+            problems = [_with_factors(submap, graph, factors, depth_prior) for submap in submaps]
             first = solve(replace(problems[main], camera_prior=prior), free_camera=free)
             return [
                 first if row == main else solve(replace(problem, camera=first.camera))
@@ -375,10 +418,35 @@ def solve_graph(
 
         return _solve([graph], adjust, options)[0]
 
-    solution = solved(graph, options) if graph.readout is None else _solve_in_rounds(graph, solved, options)
+    with part_of_a_solver():
+        solution = (
+            solved(graph, options) if graph.readout is None else _solve_in_rounds(graph, solved, options)
+        )
     if strict:
         check_minimum(solution.success, solution.converged, "frames")
-    return solution
+    return _warning(solution)
+
+
+def _warning(solution: GraphSolution) -> GraphSolution:
+    """The solution, which warns of the gradient of frames that have not converged."""
+    return replace(solution, T_cw=warned(solution.T_cw, solution.success, solution.convergence, "frames"))
+
+
+def _started(graph: ObservationGraph, start: GraphSolution, free: bool | Tensor) -> ObservationGraph:
+    """The graph with the poses, points and what is free of the camera of a solution."""
+    for name in ("T_cw", "points_w"):
+        own, given = getattr(graph, name), getattr(start, name)
+        if own.shape != given.shape:
+            raise ValueError(
+                f"start.{name} must be {tuple(own.shape)} as of the graph, not {tuple(given.shape)}"
+            )
+    params, change = graph.camera.params, start.camera.params.detach() - graph.camera.params.detach()
+    if isinstance(free, Tensor):
+        change = free.detach() @ (torch.linalg.pinv(free.detach()) @ change)
+    if free is not False:
+        params = params + change
+    T_cw, points_w = start.T_cw.detach().to(graph.T_cw), start.points_w.detach().to(graph.points_w)
+    return replace(graph, T_cw=T_cw, points_w=points_w, camera=graph.camera.with_params(params))
 
 
 def _solve_in_rounds(
@@ -405,38 +473,53 @@ def _solve_in_rounds(
     return solution
 
 
-def _check_factors(graph: ObservationGraph, factors: Sequence[FrameFactors]) -> None:
-    """Raises ValueError where a factor joins other frames than keyframes of one submap."""
-    count = len(graph.T_cw)
-    for frames in (factor.frames for factor in factors):
-        if frames.numel() and not 0 <= int(frames.min()) <= int(frames.max()) < count:
-            raise ValueError(f"frames of factors must lie in 0 ... {count - 1}")
-        submaps = graph.submap[frames]
-        if not bool(graph.is_keyframe[frames].all()) or bool((submaps[:, 0] != submaps[:, 1]).any()):
-            raise ValueError("factors must join keyframes of one submap")
+def _with_frames_of_factors(graph: Graph, factors: Sequence[Factors]) -> Graph:
+    """The graph with the frames that factors touch as keyframes. Raises ValueError where a factor joins two submaps, or
+    a row is out of range."""
+    is_keyframe, submaps = graph.is_keyframe, graph.submap
+    of_points = submaps.new_zeros(len(graph.points_w))
+    of_points = of_points.index_copy(0, graph.point_index, submaps[graph.frame_index])
+    for each in factors:
+        points = each.frames[:, :0] if each.points is None else each.points
+        for name, rows, count in (
+            ("frames", each.frames, len(submaps)),
+            ("points", points, len(graph.points_w)),
+        ):
+            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < count:
+                raise ValueError(f"{name} of factors must lie in 0 ... {count - 1}")
+        joined = torch.cat((submaps[each.frames], of_points[points]), dim=1)
+        if bool((joined != joined[:, :1]).any()):
+            raise ValueError("factors must join frames and points of one submap")
+        is_keyframe = is_keyframe.index_fill(0, each.frames.flatten(), True)
+    return replace(graph, is_keyframe=is_keyframe)
 
 
 def _with_factors(
     submap: _GraphSubmap,
     graph: ObservationGraph,
-    factors: Sequence[FrameFactors],
+    factors: Sequence[Factors],
     depth_prior: DepthPrior | None,
 ) -> BundleProblem:
     """The bundle adjustment of a submap with its share of the factors and depths of its graph."""
-    slots, own = _slots(graph, submap.keyframes), []
+    slots, own = _slots(submap.keyframes, len(graph.T_cw)), []
+    of_points = _slots(submap.points, len(graph.points_w))
     for each in factors:
-        rows = (slots[each.frames[:, 0]] >= 0).nonzero().squeeze(-1)
-        given = each.measured[rows], each.information[rows], each.error
-        own.append(FrameFactors(slots[each.frames[rows]], *given))
+        points = each.frames[:, :0] if each.points is None else each.points
+        frames, points = slots[each.frames], of_points[points]
+        rows = (torch.cat((frames, points), dim=1) >= 0).all(1).nonzero().squeeze(-1)
+        given = each.measured[rows], each.information[rows], each.error, points[rows], each.of_camera
+        own.append(Factors(frames[rows], *given))
     if depth_prior is not None:
         depth_prior = DepthPrior(depth_prior.depths[submap.rows], depth_prior.information[submap.rows])
-    return replace(submap.problem, frame_factors=tuple(own), depth_prior=depth_prior)
+    problem = replace(submap.problem, factors=tuple(own), depth_prior=depth_prior)
+    is_placed = any(len(each.measured) and each.is_of_world for each in own)
+    return replace(problem, fixed_frames=()) if is_placed else problem
 
 
-def _slots(graph: ObservationGraph, keyframes: Tensor) -> Tensor:
-    """The place (K,) of each frame among keyframes; -1 of others."""
-    slots = torch.full_like(graph.submap, -1)
-    slots[keyframes] = torch.arange(len(keyframes), device=slots.device)
+def _slots(rows: Tensor, count: int) -> Tensor:
+    """The place of each of `count` frames or points among some rows; -1 of others."""
+    slots = rows.new_full((count,), -1)
+    slots[rows] = torch.arange(len(rows), device=slots.device)
     return slots
 
 
@@ -463,7 +546,7 @@ def keyframe_problem(graph: ObservationGraph, submap: int) -> tuple[Tensor, Tens
     """The keyframes (k,) of one submap, its points (p,), the observations (o,), and their bundle adjustment."""
     frames, rows, points = graph.part(submap)
     keyframes = frames[graph.is_keyframe[frames]]
-    slots = _slots(graph, keyframes)
+    slots = _slots(keyframes, len(graph.T_cw))
     rows = rows[graph.is_keyframe[graph.frame_index[rows]]]
     problem = BundleProblem(
         graph.T_cw[keyframes],
@@ -485,14 +568,15 @@ def _pose_other_frames(
     camera: Camera,
     moved: Tensor,
     success: Tensor,
+    convergence: Convergence,
     options: SolverOptions,
-) -> tuple[Tensor, Tensor, Tensor]:
-    """The poses, with frames that are not keyframes refined against the points, `success` and `converged`; camera: one
-    for all frames or one of each, params (K, P)."""
+) -> tuple[Tensor, Tensor, Convergence]:
+    """The poses, with frames that are not keyframes refined against the points, `success` and convergence, given those
+    of the keyframes, for the others those of their submaps; camera: one for all frames or one of each, (K, P)."""
     others = (~graph.is_keyframe).nonzero().squeeze(-1)
     in_rank = torch.argsort(graph.frame_index, stable=True)
     counts = torch.bincount(graph.frame_index, minlength=len(graph.T_cw))
-    starts, converged = counts.cumsum(0) - counts, torch.ones_like(success)
+    starts, of_submaps = counts.cumsum(0) - counts, convergence.converged
     for frames in others.split(64) if len(others) else ():  # in batches, which bounds the memory
         slot = torch.arange(int(counts[frames].max()), device=frames.device)
         mask = slot < counts[frames, None]
@@ -509,8 +593,14 @@ def _pose_other_frames(
         )
         T_cw = T_cw.index_copy(0, frames, refined.T_cw)
         success = success.index_copy(0, frames, refined.success)
-        converged = converged.index_copy(0, frames, refined.convergence.converged)
-    return T_cw, success, converged
+        ends = of_submaps[frames]  # where that of the submap did not end at a minimum, this is why
+        own = [
+            torch.where(ends, found, given[frames])
+            for found, given in zip(refined.convergence.tensors, convergence.tensors, strict=True)
+        ]
+        copied = (x.index_copy(0, frames, y) for x, y in zip(convergence.tensors, own, strict=True))
+        convergence = Convergence(*copied, limit=options.iterations)
+    return T_cw, success, convergence
 
 
 def concatenate_graphs(graphs: Sequence[Graph]) -> Graph:
@@ -546,6 +636,8 @@ def solve_graphs(
     solved together. Converged problems leave the batch, and a failure does not affect the others.
     """
     strict, options = options.strict, options.replace(strict=False)
+    one_precision = in_widest_precision(lambda graph: graph)
+    graphs = [one_precision(graph) for graph in graphs]
 
     alike: dict[tuple[object, ...], list[int]] = {}
     for row, graph in enumerate(graphs):
@@ -560,7 +652,11 @@ def solve_graphs(
         if len(rows) == 1:
             found = (solve_graph(graphs[rows[0]], options=options),)
         else:
-            found = _solve([graphs[row] for row in rows], partial(_adjust_together, options=options), options)
+            with part_of_a_solver():
+                found = _solve(
+                    [graphs[row] for row in rows], partial(_adjust_together, options=options), options
+                )
+            found = [_warning(each) for each in found]
         solved.update(zip(rows, found, strict=True))
     solutions = tuple(solved[row] for row in range(len(graphs)))
     if strict and solutions:
@@ -589,11 +685,9 @@ def _solve(
     frames = torch.cat([submap.keyframes + frame_starts[submap.graph] for submap in submaps])
     points = torch.cat([submap.points + point_starts[submap.graph] for submap in submaps])
 
-    def of_frames(values: Sequence[Tensor], start: Tensor) -> Tensor:
-        return start.index_copy(0, frames, torch.cat([*values]))
-
-    T_cw = of_frames([bundle.T_cw for bundle in bundles], joined.T_cw.detach())
-    success = of_frames([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles], joined.is_keyframe)
+    T_cw = joined.T_cw.detach().index_copy(0, frames, torch.cat([bundle.T_cw for bundle in bundles]))
+    success = torch.cat([bundle.success.expand(len(bundle.T_cw)) for bundle in bundles])
+    success = joined.is_keyframe.index_copy(0, frames, success)
     success = success & joined.T_cw.isfinite().flatten(1).all(-1)
     points_w = torch.cat([bundle.points_w for bundle in bundles])
     points_w = joined.points_w.detach().index_copy(0, points, points_w)
@@ -603,18 +697,25 @@ def _solve(
     camera = cameras[0]
     if len(cameras) > 1:
         camera = camera.with_params(torch.stack([each.params for each in cameras])[joined.submap])
-    T_cw, success, converged = _pose_other_frames(joined, T_cw, points_w, camera, moved, success, options)
+    of_bundles = []
+    for number, graph in enumerate(graphs):
+        place = torch.unique(graph.submap, return_inverse=True)[1]
+        of_graph = [b for b, submap in zip(bundles, submaps, strict=True) if submap.graph == number]
+        columns = zip(*(bundle.convergence.tensors for bundle in of_graph), strict=True)
+        of_bundles.append([torch.cat(column)[place] for column in columns])
+    every = (torch.cat(column) for column in zip(*of_bundles, strict=True))
+    convergence = Convergence(*every, limit=options.iterations)
+    T_cw, success, convergence = _pose_other_frames(
+        joined, T_cw, points_w, camera, moved, success, convergence, options
+    )
     solutions = []
     for number, graph in enumerate(graphs):
         rows = slice(frame_starts[number], frame_starts[number] + len(graph.T_cw))
         places = slice(point_starts[number], point_starts[number] + len(graph.points_w))
         own = tuple(bundle for bundle, submap in zip(bundles, submaps, strict=True) if submap.graph == number)
-        of_bundles = torch.cat([bundle.convergence.converged for bundle in own])
-        of_bundles = of_bundles[torch.unique(graph.submap, return_inverse=True)[1]]
+        of_frames = Convergence(*(column[rows] for column in convergence.tensors), limit=options.iterations)
         found = T_cw[rows], points_w[places], cameras[number], success[rows], moved[places]
-        solutions.append(
-            GraphSolution(graph.timestamps, *found, converged[rows] & of_bundles, graph.submap, own)
-        )
+        solutions.append(GraphSolution(graph.timestamps, *found, of_frames, graph.submap, own))
     return tuple(solutions)
 
 

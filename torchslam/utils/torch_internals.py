@@ -10,6 +10,7 @@ from torch import Tensor
 from torch._C import _are_functorch_transforms_active as in_transform
 from torch._C import _is_any_autocast_enabled as is_any_autocast_enabled
 from torch._C._functorch import TransformType, get_interpreter_stack
+from torch._C._functorch import is_functorch_wrapped_tensor as is_transformed
 from torch.autograd import forward_ad
 from torch.utils import _pytree
 from torch.utils.data._utils.collate import default_collate_fn_map
@@ -17,10 +18,12 @@ from torch.utils.data._utils.collate import default_collate_fn_map
 __all__ = [
     "default_collate_fn_map",
     "forward_mode_depth",
+    "has_tangent",
     "in_forward_mode",
     "in_transform",
     "int8_matmul",
     "is_any_autocast_enabled",
+    "is_transformed",
     "register_pytree",
 ]
 
@@ -33,6 +36,11 @@ int8_matmul: Callable[[Tensor, Tensor], Tensor] | None = getattr(torch, "_int_mm
 def in_forward_mode() -> bool:
     """Test whether a level of `torch.autograd.forward_ad` is open."""
     return forward_ad._current_level >= 0
+
+
+def has_tangent(tensor: Tensor) -> bool:
+    """Test whether a tensor has a tangent of `torch.autograd.forward_ad`."""
+    return in_forward_mode() and forward_ad.unpack_dual(tensor).tangent is not None
 
 
 def forward_mode_depth() -> int:

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import pytest
 import torch
-from torch.autograd import gradcheck
+from torch.autograd import gradcheck, gradgradcheck
 
 from tests.optim.conftest import adjusted, minimized
 from torchslam.geometry import se3_exp, se3_inverse, se3_log, transform
 from torchslam.optim import (
     BUNDLE_OPTIONS,
     DepthPrior,
-    FrameFactors,
+    Factors,
     displacement_error,
     relative_pose_error,
     solve_bundle,
@@ -61,17 +61,13 @@ def test_each_determines_the_scale(bundle_scene, kind, fixed):
         "depths": {
             "depth_prior": DepthPrior(1.3 * depths_of(scene), torch.ones(len(scene.problem.pixels)).double())
         },
-        "distances": {
-            "frame_factors": (FrameFactors.distances(frames, 1.3 * long, torch.full((2,), 1e4).double()),)
-        },
+        "distances": {"factors": (Factors.distances(frames, 1.3 * long, torch.full((2,), 1e4).double()),)},
         "motions": {
-            "frame_factors": (
-                FrameFactors.relative_poses(frames, T_21, 1e4 * torch.eye(6).double().expand(2, 6, 6)),
-            )
+            "factors": (Factors.relative_poses(frames, T_21, 1e4 * torch.eye(6).double().expand(2, 6, 6)),)
         },
         "displacements": {
-            "frame_factors": (
-                FrameFactors.displacements(
+            "factors": (
+                Factors.displacements(
                     frames,
                     antennas[:, 1] - antennas[:, 0],
                     1e4 * torch.eye(3).double().expand(2, 3, 3),
@@ -103,9 +99,9 @@ def mixed(scene, frames):
 
     def with_all(tensors, **options):
         factors = (
-            FrameFactors.relative_poses(frames, tensors["T_21"], tensors["T_information"]),
-            FrameFactors.distances(frames, tensors["distances"], tensors["distance_information"]),
-            FrameFactors(
+            Factors.relative_poses(frames, tensors["T_21"], tensors["T_information"]),
+            Factors.distances(frames, tensors["distances"], tensors["distance_information"]),
+            Factors(
                 frames,
                 tensors["heights"],
                 torch.full((len(frames), 1, 1), 1e3).double(),
@@ -113,7 +109,7 @@ def mixed(scene, frames):
             ),
         )
         depths = DepthPrior(tensors["depths"], tensors["depth_information"])
-        return replace(problem, frame_factors=factors, depth_prior=depths, **options)
+        return replace(problem, factors=factors, depth_prior=depths, **options)
 
     return with_all, tensors
 
@@ -203,16 +199,43 @@ def test_the_gradient_agrees_with_differences_with_free_camera_and_kernel(bundle
         torch.testing.assert_close((gradient * step).sum(), 0.5 * (up - down), rtol=1e-3, atol=1e-12)
 
 
+def test_what_an_error_closes_over_has_its_gradient(bundle_scene):
+    """Parameters of a network and a tensor with a history, to second order and by every transform."""
+    scene = bundle_scene(noise=1.0, frames=3, points=10, fixed_frames=(0,))
+    frames = torch.tensor([(0, 2), (1, 2)])
+    T_21, information = motions_of(scene.T_cw, frames), spd(2, 6)
+
+    def position(weight, offset):
+        def learned(T_1w, T_2w, T_21):
+            error = relative_pose_error(T_1w, T_2w, T_21)
+            shown = torch.tanh(error[..., :1] + 0.1 * offset.square())
+            return error + torch.nn.functional.linear(shown, weight)
+
+        factors = (Factors(frames, T_21, information, learned),)
+        solution = adjusted(replace(scene.problem, factors=factors), kernel="none", **CONVERGED)
+        return solution.T_cw[2, :3, 3]
+
+    given = (0.1 * draw(6, 1)).requires_grad_(), draw(1, seed=1).requires_grad_()
+    assert gradcheck(position, given, eps=1e-4, atol=1e-8, rtol=1e-6)
+    assert gradgradcheck(lambda *x: position(*x)[0], given, eps=1e-4, atol=1e-7, rtol=1e-4, fast_mode=True)
+    wanted = torch.autograd.functional.jacobian(position, given)
+    for mode in (torch.func.jacrev, torch.func.jacfwd):
+        for found, expected in zip(mode(position, (0, 1))(*given), wanted, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-6, atol=1e-10)
+    with pytest.raises(RuntimeError, match="vmap over a tensor that an error closes over"):
+        torch.vmap(position, (0, None))(torch.stack([given[0]] * 2), given[1])
+
+
 def test_a_frame_that_sees_nothing_follows_its_factors(bundle_scene):
     scene = bundle_scene(noise=0.0, frames=5, points=40)
     problem = scene.problem
     frames = torch.tensor([(1, 4)])
     T_21 = motions_of(scene.T_cw, frames)
-    factors = (FrameFactors.relative_poses(frames, T_21, torch.eye(6).double()[None]),)
-    blind = replace(problem, mask=problem.frame_index != 4, frame_factors=factors)
+    factors = (Factors.relative_poses(frames, T_21, torch.eye(6).double()[None]),)
+    blind = replace(problem, mask=problem.frame_index != 4, factors=factors)
     solution = adjusted(blind, kernel="none", **CONVERGED)
     torch.testing.assert_close(solution.T_cw, scene.T_cw, atol=1e-7, rtol=0)
-    unheld = adjusted(replace(blind, frame_factors=()), kernel="none")
+    unheld = adjusted(replace(blind, factors=()), kernel="none")
     assert torch.equal(unheld.T_cw[4], problem.T_cw[4])
 
 
@@ -235,8 +258,8 @@ def test_a_batch_gives_what_its_problems_alone_give(bundle_scene):
         alone = adjusted(with_all(tensors, pixels=noisy[row]), **CONVERGED)
         torch.testing.assert_close(together.T_cw[row], alone.T_cw, rtol=0, atol=1e-10)
     T_21 = torch.stack([tensors["T_21"], se3_exp(0.01 * draw(2, 6)) @ tensors["T_21"]])
-    own = (FrameFactors.relative_poses(frames, T_21, tensors["T_information"].expand(2, -1, -1, -1)),)
-    apart = adjusted(replace(both, frame_factors=own), **CONVERGED)
+    own = (Factors.relative_poses(frames, T_21, tensors["T_information"].expand(2, -1, -1, -1)),)
+    apart = adjusted(replace(both, factors=own), **CONVERGED)
     assert se3_log(apart.T_cw[1] @ se3_inverse(together.T_cw[1])).norm() > 1e-4
 
 
@@ -246,9 +269,9 @@ def test_what_does_not_fit_is_refused(bundle_scene):
     one, eye = torch.eye(4).double()[None], torch.eye(6).double()[None]
 
     def refused(match, frames, measured=one, information=eye):
-        factors = (FrameFactors.relative_poses(torch.tensor(frames), measured, information),)
+        factors = (Factors.relative_poses(torch.tensor(frames), measured, information),)
         with pytest.raises(ValueError, match=match):
-            solve_bundle(replace(problem, frame_factors=factors))
+            solve_bundle(replace(problem, factors=factors))
 
     refused("lie in 0", [(0, 5)])
     refused("with itself", [(1, 1)])
@@ -256,9 +279,9 @@ def test_what_does_not_fit_is_refused(bundle_scene):
     refused("F = 2", [(0, 1), (1, 2)])
     with pytest.raises(ValueError, match="depths must be"):
         solve_bundle(replace(problem, depth_prior=DepthPrior(torch.ones(3).double(), torch.ones(3).double())))
-    one_factor = (FrameFactors.relative_poses(torch.tensor([(0, 1)]), one, eye),)
+    one_factor = (Factors.relative_poses(torch.tensor([(0, 1)]), one, eye),)
     with pytest.raises(ValueError, match="use solve_bundle"):
-        solve_bundle_numpy(replace(problem, frame_factors=one_factor), 1.0, 5, 1e-8)
+        solve_bundle_numpy(replace(problem, factors=one_factor), 1.0, 5, 1e-8)
 
 
 def test_second_derivatives_and_transforms(bundle_scene):
@@ -268,8 +291,8 @@ def test_second_derivatives_and_transforms(bundle_scene):
     long = (centers(scene.T_cw)[frames[:, 1]] - centers(scene.T_cw)[frames[:, 0]]).norm(dim=-1)
 
     def last(distances):
-        factors = (FrameFactors.distances(frames, distances, torch.full((2,), 1e3).double()),)
-        return adjusted(replace(scene.problem, frame_factors=factors), kernel="none").T_cw[3, :3, 3]
+        factors = (Factors.distances(frames, distances, torch.full((2,), 1e3).double()),)
+        return adjusted(replace(scene.problem, factors=factors), kernel="none").T_cw[3, :3, 3]
 
     reverse, forward = torch.func.jacrev(last)(long), torch.func.jacfwd(last)(long)
     torch.testing.assert_close(forward, reverse, rtol=1e-6, atol=1e-10)
@@ -277,3 +300,87 @@ def test_second_derivatives_and_transforms(bundle_scene):
     step = 1e-4 * torch.tensor([1.0, -0.5]).double()
     difference = torch.func.jacrev(last)(long + step)[0] - torch.func.jacrev(last)(long - step)[0]
     torch.testing.assert_close(hessian @ step, 0.5 * difference, rtol=1e-3, atol=1e-10)
+
+
+def of_all_kinds(scene):
+    """Factors of frames, points and the camera with noise, and the tensors that they have gradients to."""
+    T_cw, points_w = scene.T_cw, scene.points_w
+    up, wall = torch.tensor((0.0, -1, 0)).double(), torch.tensor((0.0, 0.6, 0.8)).double()
+    frames, points = torch.tensor([0, 3, 4]), torch.tensor([2, 5, 7, 11])
+    pairs = torch.tensor([(0, 9), (5, 8)])
+    down_c = T_cw[frames, :3, :3] @ -up
+    tensors = {
+        "T_cw": se3_exp(0.02 * draw(3, 6)) @ T_cw[frames],
+        "T_information": spd(3, 6, 1e2),
+        "heights": centers(T_cw)[frames] @ up + 0.02 * draw(3),
+        "down_c": torch.nn.functional.normalize(down_c + 0.01 * draw(3, 3), dim=-1),
+        "planes": torch.cat((wall.expand(4, 3), (points_w[points] @ wall + 0.02 * draw(4))[:, None]), dim=-1),
+        "lengths": (points_w[pairs[:, 1]] - points_w[pairs[:, 0]]).norm(dim=-1) * 1.02,
+        "bends": 0.1 * draw(1, 3),
+        "depths": transform(T_cw[[2, 3]], points_w[[4, 6]][:, None])[:, 0, 2] + 0.01,
+        "limit": torch.full((4,), 499.0).double(),
+    }
+
+    def bend(T_1w, T_2w, T_3w, measured):  # of three frames
+        return centers(T_1w) - 2 * centers(T_2w) + centers(T_3w) - measured
+
+    def depth(T_cw, point_w, measured):  # of a frame and a point
+        return ((T_cw[..., :3, :3] @ point_w[..., None])[..., 2, :] + T_cw[..., 2, 3:]) - measured[..., None]
+
+    def factors(tensors, points_too=True):
+        ones, none = torch.full((4,), 400.0).double(), torch.full((4,), -torch.inf).double()
+        high = torch.cat((tensors["limit"][:1], -none[1:]))
+        of_points = (
+            Factors.planes(points, tensors["planes"], ones),
+            Factors.lengths(pairs, tensors["lengths"], ones[:2]),
+            Factors(
+                torch.tensor([[2], [3]]),
+                tensors["depths"],
+                ones[:2, None, None],
+                depth,
+                torch.tensor([[4], [6]]),
+            ),
+        )
+        return (
+            Factors.poses(frames, tensors["T_cw"], tensors["T_information"]),
+            Factors.heights(frames, tensors["heights"], ones[:3], up),
+            Factors.directions(frames, tensors["down_c"], -up, ones[:3]),
+            Factors(torch.tensor([(1, 2, 4)]), tensors["bends"], 1e3 * torch.eye(3).double()[None], bend),
+            Factors.camera_bounds(none, high, 10 * ones),
+            *of_points * points_too,
+        )
+
+    return factors, tensors
+
+
+@pytest.mark.parametrize("frames", [5, 40])
+def test_factors_of_all_kinds_have_their_minimum_and_gradient(bundle_scene, frames):
+    """The gradient of the written-out cost vanishes, and agrees with differences; nothing is fixed."""
+    scene = bundle_scene(noise=1.0, frames=frames, points=30, fixed_frames=())
+    factors, tensors = of_all_kinds(scene)
+    focal = torch.tensor([[1.0], [1.0], [0.0], [0.0]]).double()
+
+    def solved(tensors):
+        problem = replace(scene.problem, factors=factors(tensors))
+        return adjusted(problem, free_camera=focal, kernel="cauchy", scale=3.0, **CONVERGED)
+
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in tensors.items()}
+    solution = solved(leaves)
+    weights = draw(frames, 4, 4, seed=6), draw(30, 3, seed=7)
+    loss = (
+        (weights[0] * solution.T_cw).sum()
+        + (weights[1] * solution.points_w).sum()
+        + solution.camera.params[0]
+    )
+    gradients = torch.autograd.grad(loss, list(leaves.values()))
+    for name, gradient in zip(tensors, gradients, strict=True):
+        step = 1e-4 * draw(*gradient.shape, seed=11)
+        step = step + step.mT if name == "T_information" else step
+        with torch.no_grad():
+            up, down = (solved(tensors | {name: tensors[name] + sign * step}) for sign in (1, -1))
+        moved = weights[0] * (up.T_cw - down.T_cw), weights[1] * (up.points_w - down.points_w)
+        difference = moved[0].sum() + moved[1].sum() + up.camera.params[0] - down.camera.params[0]
+        torch.testing.assert_close((gradient * step).sum(), 0.5 * difference, rtol=1e-5, atol=1e-10)
+    covariance = solution.covariance()
+    assert (covariance.frames.diagonal(dim1=1, dim2=2) > 0).all()
+    assert (torch.linalg.eigvalsh(covariance.points) > 0).all()

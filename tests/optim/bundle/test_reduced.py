@@ -10,7 +10,7 @@ from torchslam.optim import (
     BUNDLE_OPTIONS,
     BundleProblem,
     CameraPrior,
-    FrameFactors,
+    Factors,
     PosePrior,
     relative_pose_error,
     solve_bundle,
@@ -99,7 +99,7 @@ def with_factors(problem):
     T_cw = problem.T_cw
     T_21 = T_cw[frames[:, 1]] @ se3_inverse(T_cw[frames[:, 0]])
     information = 1e4 * torch.eye(6, dtype=torch.float64).repeat(4, 1, 1)
-    return replace(problem, frame_factors=(FrameFactors(frames, T_21, information, relative_pose_error),))
+    return replace(problem, factors=(Factors(frames, T_21, information, relative_pose_error),))
 
 
 def with_priors(problem):

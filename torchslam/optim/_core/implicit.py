@@ -11,15 +11,17 @@ networks", 2021.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from functools import wraps
 from typing import Any, Literal, ParamSpec, Protocol, TypeVar
 
 import torch
 from torch import Tensor
 from torch.func import grad, vjp, vmap
+from torch.overrides import TorchFunctionMode
 
 from torchslam.geometry.precision import full_precision
-from torchslam.utils.torch_internals import forward_mode_depth, in_transform
+from torchslam.utils.torch_internals import forward_mode_depth, has_tangent, in_transform, is_transformed
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -92,11 +94,14 @@ class Minimization(Protocol):
         ...
 
 
-def find_minimum(problem: Minimization, inputs: Sequence[Tensor], backward: Backward) -> Tensors:
+def find_minimum(
+    problem: Minimization, inputs: Sequence[Tensor], backward: Backward, closed_over: Sequence[Tensor] = ()
+) -> Tensors:
     """What `problem.minimize` finds, with the gradients of `backward`; "truncated" here means detached.
 
-    With "implicit", theta has its implicit derivatives to the inputs, and the rest is detached. Raises RuntimeError for
-    forward mode within forward mode, where PyTorch would silently drop a part.
+    With "implicit", theta has its implicit derivatives to the inputs and to the tensors that functions of the problem
+    close over, and the rest is detached. Raises RuntimeError for forward mode within forward mode, where PyTorch would
+    silently drop a part.
     """
     if not torch.is_inference_mode_enabled():  # what was made under it can be no part of a graph
         inputs = [tensor.clone() if tensor.is_inference() else tensor for tensor in inputs]
@@ -104,11 +109,118 @@ def find_minimum(problem: Minimization, inputs: Sequence[Tensor], backward: Back
         return problem.minimize(tuple(inputs))
     if backward != "implicit":
         inputs = [tensor.detach() for tensor in inputs]
+    elif closed_over:
+        problem, inputs = _Closed(problem, tuple(closed_over)), [*inputs, *closed_over]
     if forward_mode_depth() > 1:
         raise RuntimeError(
             "forward mode within forward mode is not supported: take torch.func.jacfwd of torch.func.jacrev"
         )
     return _Minimum.apply(problem, *inputs)
+
+
+class _Exchange(TorchFunctionMode):
+    """Calls of PyTorch take other tensors in the place of some, as they are or in lists."""
+
+    def __init__(self, exchanged: Callable[[Tensor], Tensor]) -> None:
+        super().__init__()
+        self.exchanged = exchanged
+
+    def __torch_function__(
+        self, func: Callable[..., Any], types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        kwargs = {name: self._of(value) for name, value in (kwargs or {}).items()}
+        return self.returned(func(*map(self._of, args), **kwargs))
+
+    def returned(self, value: Any) -> Any:
+        """What a call returned."""
+        return value
+
+    def _of(self, value: Any) -> Any:
+        if isinstance(value, Tensor):
+            return self.exchanged(value)
+        return type(value)(map(self._of, value)) if type(value) in (list, tuple) else value
+
+
+class _Listing(_Exchange):
+    """Calls of PyTorch take detached tensors; lists those from outside that have derivatives."""
+
+    def __init__(self) -> None:
+        super().__init__(self._listed)
+        self.inside: dict[int, Any] = {}  # kept, so that no number is used twice
+        self.outside: dict[int, tuple[Tensor, Tensor]] = {}
+
+    def returned(self, value: Any) -> Any:
+        for each in value if isinstance(value, (list, tuple)) else (value,):
+            self.inside[id(each)] = each
+        return value
+
+    def _listed(self, tensor: Tensor) -> Tensor:
+        number = id(tensor)
+        if number in self.inside or not tensor.is_floating_point():
+            return tensor
+        if number not in self.outside:
+            if not (tensor.requires_grad or is_transformed(tensor) or has_tangent(tensor)):
+                return tensor
+            self.outside[number] = tensor, tensor.detach()
+        return self.outside[number][1]
+
+
+def tensors_closed_over(function: Callable[..., Tensor], *arguments: Tensor) -> tuple[Tensor, list[Tensor]]:
+    """The value, and the tensors with derivatives that a function uses beside its arguments, as of one call.
+
+    Raises ValueError where the value has a gradient to another tensor, which is none of those that PyTorch was called
+    with: one within `torch.jit.script` or an `autograd.Function`.
+    """
+    arguments = tuple(tensor.detach() for tensor in arguments)
+    listing = _Listing()
+    listing.inside = {id(tensor): tensor for tensor in arguments}
+    with torch.enable_grad(), listing:
+        value = function(*arguments)
+    if value.requires_grad and not in_transform():
+        raise ValueError(
+            "the error depends on a tensor with gradient that cannot be found, as within torch.jit.script or an "
+            "autograd.Function: make it an input"
+        )
+    return value, [tensor for tensor, _ in listing.outside.values()]
+
+
+class _Closed:
+    """A minimization whose last inputs are the tensors that its functions close over."""
+
+    def __init__(self, problem: Minimization, tensors: Tensors) -> None:
+        self.problem, self.tensors = problem, tensors
+        self.num_unknowns, self.num_vectors = problem.num_unknowns, problem.num_vectors
+        self.dims = tuple(tensor.ndim for tensor in tensors)
+        self.ndims = *problem.ndims[:2], (*problem.ndims[2], *self.dims)
+        self.retracted, self.push, self.pull_back = problem.retracted, problem.push, problem.pull_back
+
+    def minimize(self, inputs: Tensors) -> Tensors:
+        inputs, exchange = self._split(inputs)
+        with exchange:
+            return self.problem.minimize(inputs)
+
+    def factorized(self, found: Tensors, inputs: Tensors) -> Callable[[Tensors], Tensors]:
+        inputs, exchange = self._split(inputs)
+        with exchange:
+            return self.problem.factorized(found, inputs)
+
+    def slope(self, found: Tensors, inputs: Tensors, direction: Tensors) -> Tensor:
+        inputs, exchange = self._split(inputs)
+        with exchange:
+            return self.problem.slope(found, inputs, direction)
+
+    def _split(self, inputs: Tensors) -> tuple[Tensors, AbstractContextManager[Any]]:
+        """The inputs of the problem itself, and the context in which the others stand in for what is closed over."""
+        inputs, others = _split(inputs, len(inputs) - len(self.tensors))
+        if any(tensor.ndim != dims for tensor, dims in zip(others, self.dims, strict=True)):
+            raise RuntimeError(
+                "vmap over a tensor that an error closes over is not supported: make it an input"
+            )
+        pairs = zip(self.tensors, others, strict=True)
+        places = {id(own): (own, other) for own, other in pairs if own is not other}
+        if not places:
+            return inputs, nullcontext()
+        return inputs, _Exchange(lambda tensor: places.get(id(tensor), (tensor, tensor))[1])
 
 
 class _Minimum(torch.autograd.Function):

@@ -10,7 +10,11 @@ can be differentiated through ("unroll"). Sources: Levenberg, 1944; Marquardt, 1
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from typing import Any, Protocol, Self, TypeVar, get_args, runtime_checkable
@@ -20,10 +24,11 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.utils._pytree import tree_map
 
-from torchslam.errors import ConvergenceError
+from torchslam.errors import ConvergenceError, ConvergenceWarning
 from torchslam.geometry.robust import TAIL_SCALE, Kernel
 from torchslam.optim._core.implicit import Backward
 from torchslam.utils.by_value import ByValue
+from torchslam.utils.torch_internals import in_transform
 
 INITIAL_DAMPING = 1e-4
 """Relative to the diagonal of the Hessian: nearly a step of Gauss and Newton at first. Tried at this value only."""
@@ -89,6 +94,15 @@ class Rounded(Protocol):
         ...
 
 
+@runtime_checkable
+class Drifting(Protocol):
+    """A problem that may have no minimum because its unknowns drift to a limit where it is degenerate."""
+
+    def drifts(self, old: Any, new: Any, relative_reduction: Float[Tensor, " B"]) -> Bool[Tensor, " B"]:
+        """Which elements to give up, called once for each step that was accepted."""
+        ...
+
+
 class SolverReason(Enum):
     """How a search ended."""
 
@@ -96,7 +110,8 @@ class SolverReason(Enum):
     ITERATION_LIMIT = "not converged: allow more iterations"
     GAVE_UP = "not converged: no shorter step lowers the cost"
     UNDETERMINED = (
-        "not determined: too few observations, a degenerate configuration, or a start that is not finite"
+        "not determined: too few observations, a degenerate configuration, a start that is not finite, or factors "
+        "that shrink the map without limit"
     )
 
     def __str__(self) -> str:
@@ -146,10 +161,13 @@ class Convergence:
 
 
 class Outcome:
-    """How the search for a solution ended."""
+    """How the search for a solution ended. It can be pickled, without gradients."""
 
     success: Bool[Tensor, "*batch"]
     convergence: Convergence
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: tree_map(_detached, value) for name, value in vars(self).items()}
 
     @property
     def converged(self) -> Bool[Tensor, "*batch"]:
@@ -160,6 +178,58 @@ class Outcome:
     def reasons(self) -> list[SolverReason]:
         """How the search ended, for each element."""
         return self.convergence.reasons(self.success)
+
+
+_quiet = ContextVar("_quiet", default=False)
+"""Whether a solver is part of another one, which warns for both."""
+
+
+@contextmanager
+def part_of_a_solver() -> Iterator[None]:
+    """Solvers inside do not warn of gradients of their own."""
+    token = _quiet.set(True)
+    try:
+        yield
+    finally:
+        _quiet.reset(token)
+
+
+def warned(tensor: Tensor, success: Tensor, convergence: Convergence, what: str) -> Tensor:
+    """A solution (..., n, m), whose first dimension is that of the elements, that warns once when a gradient passes an
+    element that is not at a minimum. Under `torch.func` it does not."""
+    if _quiet.get() or in_transform() or not tensor.requires_grad:
+        return tensor
+    unfinished = success.flatten() & ~convergence.converged.expand(success.numel())
+    if not bool(unfinished.any()):
+        return tensor
+    tensor = tensor.view_as(tensor)
+    has_warned: list[bool] = []
+
+    def warn(gradient: Tensor | None) -> None:
+        if gradient is None or has_warned:
+            return
+        rows = unfinished & (gradient != 0).reshape(len(unfinished), -1).any(-1)
+        if not bool(rows.any()):
+            return
+        has_warned.append(True)
+        reasons = Counter(
+            str(reason)
+            for reason, row in zip(convergence.reasons(success), rows.tolist(), strict=True)
+            if row
+        )
+        warnings.warn(
+            f"gradient of {int(rows.sum())} of {len(rows)} {what} that are not at a minimum, which may be wrong by any "
+            f"factor ({'; '.join(f'{count} {reason}' for reason, count in reasons.items())})",
+            ConvergenceWarning,
+            stacklevel=2,
+        )
+
+    tensor.register_hook(warn)
+    return tensor
+
+
+def _detached(value: Any) -> Any:
+    return value.detach() if isinstance(value, Tensor) else value
 
 
 def check_minimum(success: Bool[Tensor, "*batch"], converged: Bool[Tensor, "*batch"], what: str) -> None:
@@ -231,8 +301,12 @@ def minimize_batch(
         accept = active & (relative_reduction < torch.inf) & (trial.cost <= slack * model.cost)
         steps = steps.index_add(0, rows, active.long())
         active = active & (relative_reduction > tolerance) & (model.cost.detach() > vanished)
+        drifts = torch.zeros_like(active)
+        if isinstance(problem, Drifting) and bool(accept.all()):
+            drifts = active & problem.drifts(model, trial, relative_reduction)
         model = problem.select(accept, trial, model)
         stuck = active & ~accept & (damping >= _DAMPING_RANGE[1])  # no shorter step is to be had
+        stuck = stuck | drifts
         given_up = given_up.index_copy(0, rows, stuck)
         active = active & ~stuck
         damping = torch.where(accept, damping * DAMPING_DOWN, damping * DAMPING_UP).clamp(*_DAMPING_RANGE)

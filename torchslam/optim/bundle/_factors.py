@@ -1,8 +1,9 @@
-"""Additional factors: priors of the depth of observed points, and user-defined errors between two frames.
+"""Additional factors: priors of the depth of observed points, and any errors of frames, points or the camera.
 
 They cost half of e^T information e, as priors do, without a robust kernel. A depth adds one row to its observation. An
-error between frames adds blocks to the reduced system, which the elimination of the points leaves as it is: neither
-makes a bundle adjustment less sparse. Derivatives of errors between frames are those of autograd, of all at once.
+error of frames adds blocks to the reduced system, one of a point to its block: neither makes a bundle adjustment less
+sparse. What joins a point with other points or with frames is a correction of low rank (`_schur`). Derivatives are
+those of autograd, of all at once.
 """
 
 from __future__ import annotations
@@ -11,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from math import prod
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Float, Int
@@ -20,11 +21,14 @@ from torch.func import grad, jvp
 
 from torchslam.geometry.lie import se3_inverse, so3_log
 from torchslam.geometry.precision import full_precision
+from torchslam.optim._core.implicit import tensors_closed_over
 from torchslam.optim._core.residuals import Expansion
-from torchslam.optim._core.tangent import retract, row_jacobian
+from torchslam.optim._core.tangent import retract, rotated, row_jacobian
+from torchslam.utils.torch_internals import in_transform
 
-FrameError = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""error(T_1w, T_2w, measured) -> (..., F, D), of poses (..., F, 4, 4), each row from its own rows alone."""
+Error = Callable[..., Tensor]
+"""error(*T_kw, *points_w, measured) -> (..., F, D), of poses (..., F, 4, 4) and points (..., F, 3), or of the camera's
+parameters (..., F, P) in the place of both; each row from its own rows alone."""
 
 
 @full_precision
@@ -65,23 +69,160 @@ def displacement_error(
     return second - first - displacement_w
 
 
+@full_precision
+def pose_error(
+    T_cw: Float[Tensor, "*#batch 4 4"], prior: Float[Tensor, "*#batch 4 4"]
+) -> Float[Tensor, "*#batch 6"]:
+    """Translation and rotation vector of T_cw @ prior^-1, as of `PosePrior`."""
+    E = T_cw @ se3_inverse(prior)
+    return torch.cat((E[..., :3, 3], so3_log(E[..., :3, :3])), dim=-1)
+
+
+@full_precision
+def direction_error(
+    T_cw: Float[Tensor, "*#batch 4 4"], measured: Float[Tensor, "*#batch 2 3"]
+) -> Float[Tensor, "*#batch 3"]:
+    """Difference between a direction of the world in the camera and the measured one, radians where it is small.
+
+    `measured` is the direction in the world, as that of gravity, then in the camera, both of unit length.
+    """
+    direction_w, direction_c = measured.unbind(-2)
+    return (T_cw[..., :3, :3] @ direction_w[..., None]).squeeze(-1) - direction_c
+
+
+@full_precision
+def plane_error(
+    points_w: Float[Tensor, "*#batch 3"], plane: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*#batch 1"]:
+    """Distance of a point from a plane: normal of unit length, then n . x on the plane."""
+    return ((points_w * plane[..., :3]).sum(-1) - plane[..., 3])[..., None]
+
+
+@full_precision
+def center_error(
+    T_cw: Float[Tensor, "*#batch 4 4"], plane: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*#batch 1"]:
+    """Distance of the camera center from a plane, as of `plane_error`: the difference of a height, for instance."""
+    return plane_error(se3_inverse(T_cw)[..., :3, 3], plane)
+
+
+@full_precision
+def log_length_error(
+    first_w: Float[Tensor, "*#batch 3"],
+    second_w: Float[Tensor, "*#batch 3"],
+    lengths: Float[Tensor, "*#batch"],
+) -> Float[Tensor, "*#batch 1"]:
+    """Logarithm of the distance between two points over the measured one; the points must differ."""
+    return (torch.linalg.vector_norm(second_w - first_w, dim=-1) / lengths).log()[..., None]
+
+
+@full_precision
+def bounds_error(
+    values: Float[Tensor, "*#batch D"], bounds: Float[Tensor, "*#batch 2 D"]
+) -> Float[Tensor, "*#batch D"]:
+    """How far values lie below the lower bounds (negative) or above the upper ones; zero within."""
+    low, high = bounds.unbind(-2)
+    return (values - high).clamp_min(0) + (values - low).clamp_max(0)
+
+
 @dataclass(frozen=True)
-class FrameFactors:
-    """F errors of one kind between pairs of frames; differentiable with respect to what is measured and information.
+class Factors:
+    """F errors of one kind of some frames, some points, or the camera; differentiable with respect to what is measured,
+    information, and what `error` closes over, such as the parameters of a network.
 
     Attributes:
-        frames: rows of T_cw, first and second frame of each pair; a batch shares them.
-        measured: what `error` takes as its third argument, leading with F.
-        information: inverse covariances of the errors, symmetric; a pair with zero does not count. It leads with B
+        frames: rows of T_cw: one, two or more frames of each error, in any order; none where it is of points or the
+            camera. A batch shares them.
+        measured: what `error` takes as its last argument, leading with F.
+        information: inverse covariances of the errors, symmetric; one of zero does not count. It leads with B
             where `measured` does.
-        error: function of poses, world to camera, and measured, to (..., F, D). PyTorch must be able to differentiate
-            it in forward mode and twice.
+        error: function of poses, world to camera, points and measured, to (..., F, D): error(T_1w, T_2w, measured) of
+            two frames. PyTorch must be able to differentiate it in forward mode and twice.
+        points: rows of points_w. Errors that join a point with anything else are meant for some tens of them: they
+            are eliminated together.
+        of_camera: the error is error(params, measured), with F = 1, of the one camera.
     """
 
-    frames: Int[Tensor, "F 2"]
+    frames: Int[Tensor, "F n"]
     measured: Float[Tensor, "..."]
     information: Float[Tensor, "*#batch F D D"]
-    error: FrameError
+    error: Error
+    points: Int[Tensor, "F m"] | None = None
+    of_camera: bool = False
+
+    @property
+    def is_of_world(self) -> bool:
+        """Whether the errors are of one frame or one point, and so relative to the world."""
+        return self.frames.shape[1] + (0 if self.points is None else self.points.shape[1]) == 1
+
+    @classmethod
+    def poses(
+        cls,
+        frames: Int[Tensor, " F"],
+        T_cw: Float[Tensor, "*batch F 4 4"],
+        information: Float[Tensor, "*batch F 6 6"],
+    ) -> Factors:
+        """Priors of poses; see `pose_error`."""
+        return cls(frames[:, None], T_cw, information, pose_error)
+
+    @classmethod
+    def heights(
+        cls,
+        frames: Int[Tensor, " F"],
+        heights: Float[Tensor, "*batch F"],
+        information: Float[Tensor, "*batch F"],
+        up_w: Float[Tensor, " 3"],
+    ) -> Factors:
+        """Measured heights of camera centers along a direction of the world, in the unit of the points, which
+        determine the scale unless all are the same; information: inverse variances."""
+        measured = torch.cat((up_w.expand(*heights.shape, 3), heights[..., None]), dim=-1)
+        return cls(frames[:, None], measured, information[..., None, None], center_error)
+
+    @classmethod
+    def directions(
+        cls,
+        frames: Int[Tensor, " F"],
+        directions_c: Float[Tensor, "*batch F 3"],
+        direction_w: Float[Tensor, " 3"],
+        information: Float[Tensor, "*batch F"],
+    ) -> Factors:
+        """A direction of the world, such as that of gravity, as measured in the camera; both are of unit length.
+        information: inverse variances, rad^-2."""
+        measured = torch.stack((direction_w.expand_as(directions_c), directions_c), dim=-2)
+        eye = torch.eye(3, dtype=measured.dtype, device=measured.device)
+        return cls(frames[:, None], measured, information[..., None, None] * eye, direction_error)
+
+    @classmethod
+    def planes(
+        cls,
+        points: Int[Tensor, " F"],
+        planes_w: Float[Tensor, "*batch F 4"],
+        information: Float[Tensor, "*batch F"],
+    ) -> Factors:
+        """Points that lie on planes of the world, as `plane_error` has them; information: inverse variances of their
+        distances."""
+        return cls(_no_frames(points), planes_w, information[..., None, None], plane_error, points[:, None])
+
+    @classmethod
+    def lengths(
+        cls,
+        points: Int[Tensor, "F 2"],
+        lengths: Float[Tensor, "*batch F"],
+        information: Float[Tensor, "*batch F"],
+    ) -> Factors:
+        """Known distances between two points, which determine the scale; information: inverse variances of the
+        logarithm, that is of the relative error."""
+        return cls(_no_frames(points), lengths, information[..., None, None], log_length_error, points)
+
+    @classmethod
+    def camera_bounds(
+        cls, low: Float[Tensor, " P"], high: Float[Tensor, " P"], information: Float[Tensor, " P"]
+    ) -> Factors:
+        """Soft bounds on the parameters of a free camera, infinite where there are none; see `bounds_error`.
+        information: inverse variances of what is allowed beyond the bounds."""
+        measured = torch.stack((low, high))[None]
+        none = torch.zeros(1, 0, dtype=torch.int64, device=low.device)
+        return cls(none, measured, information.diag()[None], bounds_error, of_camera=True)
 
     @classmethod
     def relative_poses(
@@ -89,7 +230,7 @@ class FrameFactors:
         frames: Int[Tensor, "F 2"],
         T_21: Float[Tensor, "*batch F 4 4"],
         information: Float[Tensor, "*batch F 6 6"],
-    ) -> FrameFactors:
+    ) -> Factors:
         """Measured motions from the first to the second frame, as of odometry; see `relative_pose_error`."""
         return cls(frames, T_21, information, relative_pose_error)
 
@@ -99,7 +240,7 @@ class FrameFactors:
         frames: Int[Tensor, "F 2"],
         distances: Float[Tensor, "*batch F"],
         information: Float[Tensor, "*batch F"],
-    ) -> FrameFactors:
+    ) -> Factors:
         """Measured distances between camera centers, in the unit of the points, which determine the scale; information:
         inverse variances of the logarithm, that is of the relative error."""
         return cls(frames, distances, information[..., None, None], log_distance_error)
@@ -111,7 +252,7 @@ class FrameFactors:
         displacements_w: Float[Tensor, "*batch F 3"],
         information: Float[Tensor, "*batch F 3 3"],
         lever_c: Float[Tensor, " 3"] | None = None,
-    ) -> FrameFactors:
+    ) -> Factors:
         """Measured displacements of an antenna, as between positions of a receiver, whose constant offset they are
         free of; see `displacement_error`.
 
@@ -138,13 +279,27 @@ class DepthPrior:
     information: Float[Tensor, "*#batch O"]
 
 
+def _no_frames(points: Tensor) -> Tensor:
+    """(F, 0) rows."""
+    return points.new_zeros(len(points), 0)
+
+
 class FactorKind(NamedTuple):
-    """The discrete part of `FrameFactors`: rows (F, 2), the shape of one measurement, D, and the error."""
+    """The discrete part of `Factors`: rows of frames (F, n) and of points (F, m), whether they are of the camera, the
+    shape of one measurement, D, and the error."""
 
     frames: Tensor
+    points: Tensor
+    of_camera: bool
     shape: tuple[int, ...]
     size: int
-    error: FrameError
+    error: Error
+
+    @property
+    def pairs(self) -> Tensor:
+        """The pairs (M, 2) of frames that errors join."""
+        number = torch.combinations(torch.arange(self.frames.shape[1], device=self.frames.device))
+        return self.frames[:, number].flatten(0, 1)
 
 
 class FrameBlocks(NamedTuple):
@@ -155,11 +310,26 @@ class FrameBlocks(NamedTuple):
     blocks: Tensor
 
 
-def factor_kinds(factors: Sequence[FrameFactors]) -> list[FactorKind]:
+class PointBlocks(NamedTuple):
+    """What factors of points add to a Hessian: over points (N, 3) and (N, 3, 3), and beside the diagonal, where they
+    join points with points or frames, a symmetric matrix (r, r).
+
+    joined: of each of its rows the place among all numbers of frames, 6 K, and then of points, 3 N
+    """
+
+    gradient: Tensor
+    diagonal: Tensor
+    joined: Tensor
+    matrix: Tensor
+
+
+def factor_kinds(factors: Sequence[Factors]) -> list[FactorKind]:
     """The discrete parts of factors that `packed_factors` has accepted."""
     return [
         FactorKind(
             each.frames,
+            _no_frames(each.frames) if each.points is None else each.points,
+            each.of_camera,
             tuple(each.measured.shape[each.information.ndim - 2 :]),
             each.information.shape[-1],
             each.error,
@@ -169,7 +339,7 @@ def factor_kinds(factors: Sequence[FrameFactors]) -> list[FactorKind]:
 
 
 def packed_factors(
-    factors: Sequence[FrameFactors], T_cw: Float[Tensor, "B K 4 4"]
+    factors: Sequence[Factors], T_cw: Float[Tensor, "B K 4 4"], num_points: int
 ) -> tuple[Float[Tensor, "B M"], Float[Tensor, "B L"]]:
     """All that is measured and all information, flat, one kind after the other.
 
@@ -179,13 +349,18 @@ def packed_factors(
     measured, information = [T_cw.new_zeros(batch, 0)], [T_cw.new_zeros(batch, 0)]
     for each in factors:
         frames, matrices, own = each.frames, each.information, each.measured
-        if frames.ndim != 2 or frames.shape[1] != 2:
-            raise ValueError(f"frames of factors must be (F, 2), not {tuple(frames.shape)}")
-        if len(frames) and not 0 <= int(frames.min()) <= int(frames.max()) < num_frames:
-            raise ValueError(f"frames of factors must lie in 0 ... {num_frames - 1}")
-        if (frames[:, 0] == frames[:, 1]).any():
-            raise ValueError("a factor must join two frames, not one with itself")
+        points = _no_frames(frames) if each.points is None else each.points
+        for name, rows, most in (("frames", frames, num_frames), ("points", points, num_points)):
+            if rows.ndim != 2 or len(rows) != len(frames):
+                raise ValueError(f"{name} of factors must be (F, n), not {tuple(rows.shape)}")
+            if rows.numel() and not 0 <= int(rows.min()) <= int(rows.max()) < most:
+                raise ValueError(f"{name} of factors must lie in 0 ... {most - 1}")
+            ordered = rows.sort(dim=1).values
+            if (ordered[:, 1:] == ordered[:, :-1]).any():
+                raise ValueError(f"a factor must join different {name}, not one with itself")
         count, size = len(frames), matrices.shape[-1]
+        if each.of_camera == bool(frames.shape[1] + points.shape[1]) or (each.of_camera and count != 1):
+            raise ValueError("a factor must be of frames and points, or one of the camera alone")
         lead = (batch,) if matrices.ndim == 4 else ()
         if matrices.shape != (*lead, count, size, size) or own.shape[: len(lead) + 1] != (*lead, count):
             raise ValueError(
@@ -196,6 +371,24 @@ def packed_factors(
         measured.append(own.expand(batch, count, *shape).reshape(batch, -1))
         information.append(matrices.expand(batch, count, size, size).reshape(batch, -1))
     return torch.cat(measured, dim=1), torch.cat(information, dim=1)
+
+
+def tensors_of_errors(
+    factors: Sequence[Factors],
+    T_cw: Float[Tensor, "B K 4 4"],
+    points_w: Float[Tensor, "B N 3"],
+    params: Float[Tensor, "B C P"],
+) -> list[Tensor]:
+    """The tensors with derivatives that the errors close over, such as the parameters of a network."""
+    found: dict[int, Tensor] = {}
+    for each, kind in zip(factors, factor_kinds(factors), strict=True):
+        if len(each.frames):
+            own = each.measured if each.information.ndim == 3 else each.measured[0]
+            _, tensors = tensors_closed_over(
+                each.error, *_seen_by(kind, T_cw[0], points_w[0], params[0]), own
+            )
+            found |= {id(tensor): tensor for tensor in tensors}
+    return list(found.values())
 
 
 def _unpacked(
@@ -227,67 +420,182 @@ def frames_with_factors(
     return touched > 0
 
 
+class FactorTerms(NamedTuple):
+    """Cost (), and gradients and Hessians of factors over K frames, which move along the axes of the world, over the n
+    free directions of the camera, (n,) and (n, n), and over points; `points` is None where no factor has any."""
+
+    cost: Tensor
+    frames_gradient: Tensor
+    frames: Tensor
+    between: FrameBlocks
+    camera_gradient: Tensor
+    camera: Tensor
+    points: PointBlocks | None
+
+
 def factor_terms(
     kinds: Sequence[FactorKind],
-    T_cw: Float[Tensor, "K 4 4"],
+    at: tuple[Float[Tensor, "K 4 4"], Float[Tensor, "N 3"], Float[Tensor, "C P"]],
     measured: Float[Tensor, " M"],
     information: Float[Tensor, " L"],
-    exact: bool,
-) -> tuple[Tensor, Tensor, Tensor, FrameBlocks]:
-    """Cost (), and gradient (K, 6) and Hessian over frames: blocks on the diagonal (K, 6, 6), and between pairs.
+    directions: Float[Tensor, "P n"],
+    curvature: Literal["none", "definite", "exact"],
+) -> FactorTerms:
+    """The terms at poses, points and camera parameters, which move along directions.
 
-    exact: the exact Hessian, not that of Gauss and Newton.
+    curvature: that of the errors themselves: of "none" (Gauss and Newton), of those parts that leave the Hessian of an
+    error positive semi-definite, or of all
     """
-    cost, gradient = T_cw.new_zeros(()), T_cw.new_zeros(len(T_cw), 6)
-    diagonal, pairs, blocks = T_cw.new_zeros(len(T_cw), 6, 6), [], []
+    T_cw, points_w, _ = at
+    count, num_points, most = len(T_cw), len(points_w), directions.shape[1]
+    cost, gradient = T_cw.new_zeros(()), T_cw.new_zeros(6 * count + 3 * num_points)
+    camera_gradient, camera = T_cw.new_zeros(most), T_cw.new_zeros(most, most)
+    frames, points = T_cw.new_zeros(count, 6, 6), T_cw.new_zeros(num_points, 3, 3)
+    pairs, blocks, joined = [torch.zeros_like(kinds[0].pairs[:0])], [T_cw.new_zeros(0, 6, 6)], []
     for kind, own, matrix in _unpacked(kinds, measured, information):
-        first, second = kind.frames.unbind(1)
-        T_1w, T_2w = T_cw[first], T_cw[second]
-        moved = _moved(kind, T_1w, T_2w, own)
-        zero = T_cw.new_zeros(len(first), 12)
-        error, J = moved(zero), row_jacobian(moved, zero)
+        moved = moved_errors(kind, at, own, directions, in_world=True)
+        n, m = kind.frames.shape[1], kind.points.shape[1]
+        zero = T_cw.new_zeros(len(kind.frames), most if kind.of_camera else 6 * n + 3 * m)
+        error, J = _with_jacobian(moved, zero)
         pulled = J.mT @ matrix
-        slope = (pulled @ error[..., None]).squeeze(-1)
-        hessian = row_jacobian(grad(partial(_cost_at, moved, matrix)), zero) if exact else pulled @ J
+        slope, hessian = (pulled @ error[..., None]).squeeze(-1), pulled @ J
+        if curvature != "none":
+            hessian = _with_jacobian(partial(_slope_at, moved, matrix), zero)[1]
+        if curvature == "definite":
+            values, vectors = torch.linalg.eigh(hessian)
+            hessian = (vectors * values.clamp_min(0)[..., None, :]) @ vectors.mT
         cost = cost + _cost(error, matrix)
-        gradient = gradient.index_add(0, first, slope[:, :6]).index_add(0, second, slope[:, 6:])
-        diagonal = diagonal.index_add(0, first, hessian[:, :6, :6])
-        diagonal = diagonal.index_add(0, second, hessian[:, 6:, 6:])
-        pairs.append(kind.frames)
-        blocks.append(hessian[:, :6, 6:])
+        if kind.of_camera:
+            camera_gradient, camera = camera_gradient + slope[0], camera + hessian[0]
+            continue
+        numbers = 6 * kind.frames[..., None] + torch.arange(6, device=zero.device)
+        of_points = 6 * count + 3 * kind.points[..., None] + torch.arange(3, device=zero.device)
+        numbers = torch.cat((numbers.flatten(1), of_points.flatten(1)), dim=1)
+        gradient = gradient.index_add(0, numbers.flatten(), slope.flatten())
+        for i in range(n):
+            rows = slice(6 * i, 6 * i + 6)
+            frames = frames.index_add(0, kind.frames[:, i], hessian[:, rows, rows])
+            for j in range(i + 1, n):
+                pairs.append(kind.frames[:, [i, j]])
+                blocks.append(hessian[:, rows, 6 * j : 6 * j + 6])
+        for i in range(m):
+            rows = slice(6 * n + 3 * i, 6 * n + 3 * i + 3)
+            points = points.index_add(0, kind.points[:, i], hessian[:, rows, rows])
+        if m and n + m > 1:
+            beside = torch.ones_like(hessian[0])
+            beside[: 6 * n, : 6 * n] = 0
+            for i in range(m):
+                rows = slice(6 * n + 3 * i, 6 * n + 3 * i + 3)
+                beside[rows, rows] = 0
+            joined.append((numbers, beside * hessian))
     ends = torch.cat(pairs)
-    return cost, gradient, diagonal, FrameBlocks(ends[:, 0], ends[:, 1], torch.cat(blocks))
+    between = FrameBlocks(ends[:, 0], ends[:, 1], torch.cat(blocks))
+    split = 6 * count
+    joining: PointBlocks | None = None
+    if any(kind.points.shape[1] for kind in kinds):
+        joining = PointBlocks(gradient[split:].view(-1, 3), points, *_beside(joined, gradient))
+    of_frames = gradient[:split].view(-1, 6), frames, between
+    return FactorTerms(cost, *of_frames, camera_gradient, camera, joining)
+
+
+def _beside(joined: list[tuple[Tensor, Tensor]], like: Tensor) -> tuple[Tensor, Tensor]:
+    """The distinct numbers (r,) of joined frames and points, and the sum (r, r) of their blocks."""
+    every = [numbers.flatten() for numbers, _ in joined]
+    distinct = torch.unique(torch.cat([torch.zeros(0, dtype=torch.int64, device=like.device), *every]))
+    matrix = like.new_zeros(len(distinct), len(distinct))
+    for numbers, blocks in joined:
+        rows = torch.searchsorted(distinct, numbers)
+        matrix = matrix.index_put((rows[:, :, None], rows[:, None, :]), blocks, accumulate=True)
+    return distinct, matrix
 
 
 def factor_slope(
     kinds: Sequence[FactorKind],
-    T_cw: Float[Tensor, "B K 4 4"],
+    at: tuple[Float[Tensor, "B K 4 4"], Float[Tensor, "B N 3"], Float[Tensor, "B C P"]],
     measured: Float[Tensor, "B M"],
     information: Float[Tensor, "B L"],
-    xi: Float[Tensor, "B K 6"],
+    step: tuple[Float[Tensor, "B K 6"], Float[Tensor, "B N 3"], Float[Tensor, "B C P"]],
 ) -> Float[Tensor, ""]:
-    """The derivative of the cost of all factors along steps of the frames."""
-    slope = T_cw.new_zeros(())
+    """The derivative of the cost of all factors along steps of the frames, the points and the camera's parameters."""
+    slope = at[0].new_zeros(())
     for kind, own, matrix in _unpacked(kinds, measured, information):
-        first, second = kind.frames.unbind(1)
-        step = torch.cat((xi[:, first], xi[:, second]), dim=-1)
-        moved = _moved(kind, T_cw[:, first], T_cw[:, second], own)
-        error, velocity = jvp(moved, (torch.zeros_like(step),), (step,))[:2]
+        along = torch.cat([part.flatten(-2) for part in _rows_of(kind, *step[:2])], dim=-1)
+        along = step[2] if kind.of_camera else along
+        moved = moved_errors(kind, at, own)
+        error, velocity = jvp(moved, (torch.zeros_like(along),), (along,))[:2]
         slope = slope + torch.einsum("...i,...ij,...j->...", error, matrix, velocity).sum()
     return slope
 
 
-def _moved(kind: FactorKind, T_1w: Tensor, T_2w: Tensor, measured: Tensor) -> Callable[[Tensor], Tensor]:
-    """The errors as a function of steps (..., F, 12) of both poses."""
-
-    def at(step: Tensor) -> Tensor:
-        return kind.error(retract(T_1w, step[..., :6]), retract(T_2w, step[..., 6:]), measured)
-
-    return at
+def _rows_of(kind: FactorKind, of_frames: Tensor, of_points: Tensor) -> tuple[Tensor, Tensor]:
+    """(..., F, n, 6) and (..., F, m, 3) of the frames and points of the errors."""
+    return of_frames[..., kind.frames, :], of_points[..., kind.points, :]
 
 
-def _cost_at(moved: Callable[[Tensor], Tensor], information: Tensor, step: Tensor) -> Tensor:
-    return _cost(moved(step), information)
+def _seen_by(kind: FactorKind, T_cw: Tensor, points_w: Tensor, params: Tensor) -> tuple[Tensor, ...]:
+    """The poses (..., F, 4, 4) and points (..., F, 3) that an error takes, or the camera (..., 1, P)."""
+    if kind.of_camera:
+        return (params,)
+    frames, points = kind.frames.unbind(1), kind.points.unbind(1)
+    return *(T_cw[..., rows, :, :] for rows in frames), *(points_w[..., rows, :] for rows in points)
+
+
+def moved_errors(
+    kind: FactorKind,
+    at: tuple[Tensor, Tensor, Tensor],
+    measured: Tensor,
+    directions: Tensor | None = None,
+    in_world: bool = False,
+) -> Callable[[Tensor], Tensor]:
+    """The errors as a function of steps of what they are of, one after the other; directions: in which the camera
+    moves, of all its parameters if None; in_world: whether steps of frames are along the axes of the world."""
+    n, seen = kind.frames.shape[1], _seen_by(kind, *at)
+
+    def at_step(step: Tensor) -> Tensor:
+        if kind.of_camera:
+            return kind.error(seen[0] + (step if directions is None else step @ directions.mT), measured)
+        frames, points = step[..., : 6 * n].unflatten(-1, (n, 6)), step[..., 6 * n :]
+        values = []
+        for number, value in enumerate(seen):
+            if number >= n:
+                values.append(value + points[..., 3 * (number - n) : 3 * (number - n) + 3])
+                continue
+            xi = frames[..., number, :]
+            values.append(
+                retract(value, rotated(value[..., :3, :3], xi[..., None])[..., 0] if in_world else xi)
+            )
+        return kind.error(*values, measured)
+
+    return at_step
+
+
+def _with_jacobian(function: Callable[[Tensor], Tensor], zero: Tensor) -> tuple[Tensor, Tensor]:
+    """The value (F, D) at zero (F, n), and the derivatives (F, D, n) of its rows: by reverse mode, which outside of
+    transforms takes a tenth of the time of `row_jacobian`."""
+    if in_transform():
+        return function(zero), row_jacobian(function, zero)
+    keep = torch.is_grad_enabled()
+    with torch.enable_grad():
+        at = zero.detach().requires_grad_()
+        value = function(at)
+        value = value if value.requires_grad else value + 0 * at.sum()
+        rows = [
+            torch.autograd.grad(
+                column.sum(), at, retain_graph=True, create_graph=keep, materialize_grads=True
+            )[0]
+            for column in value.unbind(-1)
+        ]
+    J = torch.stack(rows, dim=-2) if rows else value.new_zeros(*value.shape, zero.shape[-1])
+    return (value, J) if keep else (value.detach(), J)
+
+
+def _slope_at(moved: Callable[[Tensor], Tensor], information: Tensor, step: Tensor) -> Tensor:
+    """The gradient (F, n) of the cost in a step."""
+    if in_transform():
+        return grad(lambda step: _cost(moved(step), information))(step)
+    return torch.autograd.grad(
+        _cost(moved(step), information), step, create_graph=True, materialize_grads=True
+    )[0]
 
 
 def _cost(error: Tensor, information: Tensor) -> Tensor:

@@ -18,8 +18,9 @@ from torchslam.optim._core.tangent import CameraPrior, PosePrior, prior_expansio
 from torchslam.optim.bundle._factors import (
     DepthPrior,
     FactorKind,
+    Factors,
     FrameBlocks,
-    FrameFactors,
+    PointBlocks,
     frames_with_factors,
     packed_factors,
 )
@@ -50,8 +51,8 @@ class BundleProblem(ByValue):
         pose_prior: T_cw (K, 4, 4) and information (K, 6, 6), zero for frames without a prior.
         camera_prior: prior on the parameters of free cameras.
         depth_prior: measured depths of the observed points.
-        frame_factors: measured motions or distances between frames, or custom residuals. A batch with factors or
-            depths is solved one problem after the other.
+        factors: measured motions, heights, planes, lengths and the like, or custom residuals. A batch with factors
+            or depths is solved one problem after the other.
     """
 
     T_cw: Float[Tensor, "*#batch K 4 4"]
@@ -68,7 +69,7 @@ class BundleProblem(ByValue):
     pose_prior: PosePrior | None = None
     camera_prior: CameraPrior | None = None
     depth_prior: DepthPrior | None = None
-    frame_factors: Sequence[FrameFactors] = ()
+    factors: Sequence[Factors] = ()
 
     @property
     def is_batch(self) -> bool:
@@ -219,7 +220,7 @@ def sanitized(problem: BundleProblem, scale: Tensor | float) -> BundleData:
     if (depth := problem.depth_prior) is not None:
         depths = _over("depth_prior.depths", "(O,)", depth.depths, tuple(mask.shape))
         depth_information = _over("depth_prior.information", "(O,)", depth.information, tuple(mask.shape))
-    measured, factor_information = packed_factors(problem.frame_factors, T_cw)
+    measured, factor_information = packed_factors(problem.factors, T_cw, points_w.shape[1])
     (batch, num_frames), num_points = T_cw.shape[:2], points_w.shape[1]
     rows = mask.shape
     frame_index = checked_rows("frame_index", problem.frame_index, rows, num_frames)
@@ -331,17 +332,14 @@ class PriorTerms(NamedTuple):
     cameras_gradient: Tensor
     cameras: Tensor
     between: FrameBlocks | None = None
+    points: PointBlocks | None = None
 
     def in_world(self, R_cw: Tensor) -> PriorTerms:
         """The same for frames (..., K, 3, 3) that move along the axes of the world."""
-        R_wc, between = R_cw.mT, self.between
-        if between is not None:
-            first, second, blocks = between
-            between = FrameBlocks(first, second, rotated(R_wc[second], rotated(R_wc[first], blocks).mT).mT)
+        R_wc = R_cw.mT
         return self._replace(
             frames_gradient=rotated(R_wc, self.frames_gradient[..., None])[..., 0],
             frames=rotated(R_wc, rotated(R_wc, self.frames).mT),
-            between=between,
         )
 
 
@@ -386,13 +384,22 @@ def gauge_motions(T_cw: Float[Tensor, "*batch K 4 4"], origin_w: Tensor) -> Floa
     return rotated(T_cw[..., :3, :3].mT, torch.cat((scaling, -se3_adjoint(T_cw)), dim=-1))
 
 
-def open_motions(motions: Float[Tensor, "*batch K 6 g"], terms: PriorTerms) -> Float[Tensor, "*batch K 6 g"]:
-    """Of orthonormal motions (..., K, 6, g) of all frames those that priors and factors do not hinder; else zero."""
+def open_motions(
+    motions: Float[Tensor, "*batch K 6 g"], terms: PriorTerms, of_points: Float[Tensor, "N 3 g"] | None = None
+) -> Float[Tensor, "*batch K 6 g"]:
+    """Of orthonormal motions (..., K, 6, g) of all frames those that priors and factors do not hinder; else zero.
+
+    of_points: how points move with the frames, where there are factors of points
+    """
     held = torch.einsum("...fag,...fab,...fbh->...gh", motions, terms.frames, motions)
     if terms.between is not None:
         first, second, blocks = terms.between
         across = torch.einsum("fag,fab,fbh->gh", motions[first], blocks, motions[second])
         held = held + across + across.mT
+    if terms.points is not None and of_points is not None:
+        held = held + torch.einsum("nag,nab,nbh->gh", of_points, terms.points.diagonal, of_points)
+        joined = torch.cat((motions.flatten(0, 1), of_points.flatten(0, 1)))[terms.points.joined]
+        held = held + joined.mT @ terms.points.matrix @ joined
     stiffness, mixtures = torch.linalg.eigh(held)
     is_open = stiffness <= torch.finfo(held.dtype).eps ** 0.5 * stiffness[..., -1:]
     return motions @ (mixtures * is_open[..., None, :])[..., None, :, :]

@@ -21,8 +21,8 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from torchslam.optim._core.linear import Groups, diagonal_floor, factorize
-from torchslam.optim.bundle._factors import FrameBlocks
+from torchslam.optim._core.linear import Groups, diagonal_floor, factorize, smallest_pivot
+from torchslam.optim.bundle._factors import FrameBlocks, PointBlocks
 from torchslam.optim.bundle._reduced import (
     FRAME_DIMS,
     MOST_CAMERAS,
@@ -250,6 +250,7 @@ class NormalEquations:
         coupling: the blocks of points against frames, as `Structure.coupling` stores them
         camera_coupling: those against cameras
         between: blocks between two free frames, by slots, where there are factors
+        joined: of factors that join points with points or free frames; its diagonal is part of `points` already
     """
 
     structure: Structure
@@ -262,6 +263,7 @@ class NormalEquations:
     camera_coupling: Float[Tensor, "S n"]
     free_points: Bool[Tensor, " N"]
     between: FrameBlocks | None = None
+    joined: PointBlocks | None = None
 
     def factorized(
         self, damping: Float[Tensor, "*#scale"] | None = None, gauge: Float[Tensor, "K D g"] | None = None
@@ -390,8 +392,52 @@ class FactorizedEquations:
     tiles: list[WhitenedTile]
     reduced: Reduced
 
+    @property
+    def definite(self) -> Bool[Tensor, ""]:
+        """Whether the whole matrix is positive definite."""
+        if self._correction is None:
+            return self.reduced.definite
+        return self.reduced.definite & self._correction.definite
+
     def solve(self, right: BundleTangent) -> BundleTangent:
-        """H^-1 right; all zero where the reduced system is not definite."""
+        """H^-1 right; all zero where the system is not definite."""
+        solution, correction = self._solve_apart(right), self._correction
+        if correction is None:
+            return solution
+        pulled = correction.middle @ _flat(solution)[correction.numbers]
+        return BundleTangent(
+            *(
+                torch.where(correction.definite, x - column @ pulled, 0.0)
+                for x, column in zip(solution, correction.columns, strict=True)
+            )
+        )
+
+    @cached_property
+    def _correction(self) -> _Correction | None:
+        """What factors that join points change; Sylvester's identity needs one solution for each of their numbers."""
+        joined = self.equations.joined
+        if joined is None or not len(joined.joined):
+            return None
+        like = self.equations.gradient
+        shapes, sizes = [x.shape for x in like], [x.numel() for x in like]
+        units = (
+            torch.nn.functional.one_hot(joined.joined, sum(sizes)).to(self.points_root).split(sizes, dim=1)
+        )
+        columns = torch.vmap(self._solve_apart, out_dims=-1)(
+            BundleTangent(*(x.unflatten(1, shape) for x, shape in zip(units, shapes, strict=True)))
+        )
+        inverse = torch.cat([x.flatten(0, 1) for x in columns])[joined.joined]
+        lower, failed = torch.linalg.cholesky_ex(0.5 * (inverse + inverse.mT))
+        eye = torch.eye(len(lower), dtype=lower.dtype, device=lower.device)
+        lower = torch.where(failed > 0, eye, lower)
+        values = torch.linalg.eigvalsh(lower.mT @ joined.matrix @ lower)
+        definite = (failed == 0) & (values > smallest_pivot(lower.dtype) - 1).all()
+        system = torch.where(definite, eye + joined.matrix @ inverse, eye)
+        middle = torch.linalg.solve(system, joined.matrix)
+        return _Correction(joined.joined, columns, middle, definite)
+
+    def _solve_apart(self, right: BundleTangent) -> BundleTangent:
+        """As `solve`, without the factors that join points."""
         reduced_right = torch.cat((right.frames.flatten(), right.cameras.flatten()))
         halves = (self.points_root @ right.points[..., None]).squeeze(-1)
         for points, rows, A in self.tiles:
@@ -413,7 +459,28 @@ class FactorizedEquations:
             root = self.points_root[points]
             blocks.append(root.mT @ (eye + moved @ A.unflatten(0, (-1, 3)).mT) @ root)
         points_w = torch.cat(blocks) if blocks else self.points_root
-        return Marginals(self.reduced.inverse_frames, points_w, self.reduced.inverse_cameras)
+        inverse = self.reduced.inverse_frames, points_w, self.reduced.inverse_cameras
+        correction = self._correction
+        if correction is not None:
+            columns = *correction.columns[:2], correction.columns.cameras.flatten(0, 1)
+            inverse = tuple(  # type: ignore[assignment]
+                torch.where(correction.definite, x - Y @ correction.middle @ Y.mT, 0.0)
+                for x, Y in zip(inverse, columns, strict=True)
+            )
+        return Marginals(*inverse)
+
+
+class _Correction(NamedTuple):
+    """H^-1 = A^-1 - columns middle columns^T of H = A + U S U^T: U picks `numbers` (r,), columns are A^-1 U."""
+
+    numbers: Int[Tensor, " r"]
+    columns: BundleTangent
+    middle: Float[Tensor, "r r"]
+    definite: Bool[Tensor, ""]
+
+
+def _flat(vector: BundleTangent) -> Tensor:
+    return torch.cat([part.flatten() for part in vector])
 
 
 class Marginals(NamedTuple):

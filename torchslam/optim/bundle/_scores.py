@@ -181,7 +181,7 @@ def observations_alone(
 ) -> tuple[SparseBundle, BundleEstimate]:
     """One bundle adjustment without what it has of priors and factors, and its start, both in the order of the layout;
     directions: in which the parameters of its one camera may move."""
-    problem = replace(problem, camera_prior=None, pose_prior=None, depth_prior=None, frame_factors=())
+    problem = replace(problem, camera_prior=None, pose_prior=None, depth_prior=None, factors=())
     given = sanitized(problem, options.scale)
     free = False if directions is None else directions
     minimization = BundleMinimization(problem.camera, free, options, matrices=given.weights.ndim > 3)

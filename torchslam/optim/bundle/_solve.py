@@ -22,6 +22,7 @@ from torchslam.optim._core.levenberg_marquardt import (
     SolverOptions,
     check_minimum,
     minimize_batch,
+    warned,
 )
 from torchslam.optim._core.residuals import ReprojectionData, linearize, only
 from torchslam.optim._core.tangent import move, pull_back, push, retract
@@ -32,7 +33,13 @@ from torchslam.optim.bundle._dense import (
     dense_data,
     suits_dense,
 )
-from torchslam.optim.bundle._factors import FactorKind, depth_terms, factor_kinds, factor_slope
+from torchslam.optim.bundle._factors import (
+    FactorKind,
+    depth_terms,
+    factor_kinds,
+    factor_slope,
+    tensors_of_errors,
+)
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
@@ -111,6 +118,10 @@ class BundleSolution(Outcome):
         of_frames, of_points, camera = self._covariance
         return Marginals(some("frames", frames, of_frames), some("points", points, of_points), camera)
 
+    def __getstate__(self) -> dict[str, Any]:
+        # The covariances themselves travel, not the problem that they follow from.
+        return {**super().__getstate__(), "_covariance": self._covariance, "_marginals": None}
+
     def element(self, row: int, num_frames: int, num_points: int) -> BundleSolution:
         """One problem of a batch, without the frames and points that came after its own to fill it up."""
         frames, points = slice(num_frames), slice(num_points)
@@ -157,8 +168,8 @@ def solve_bundle(
         free_camera: True frees all P parameters of every camera. A tensor (P, n) frees steps along its n columns, of
             which the covariances then are. Every problem of a batch finds its own parameters.
         options: how to minimize; gradients reach pixels, weights, camera.params (unless free), scale, priors, fixed
-            poses and fixed points, and depths and what factors measure, with their information. Nothing flows to the
-            start of free unknowns.
+            poses and fixed points, depths and what factors measure, with their information, and the tensors that
+            errors of factors close over. Nothing flows to the start of free unknowns.
         progress: called before each iteration with its number and the maximum; its exceptions end the minimization.
         check: test whether all that moves is determined. Without, `success` is that of the start; saves a tenth.
 
@@ -170,9 +181,10 @@ def solve_bundle(
         ConvergenceError: with `options.strict`.
     """
     given = sanitized(problem, options.scale)
-    matrices, kinds = given.weights.ndim > 2, factor_kinds(problem.frame_factors)
+    matrices, kinds = given.weights.ndim > 2, factor_kinds(problem.factors)
     minimization = BundleMinimization(problem.camera, free_camera, options, progress, check, matrices, kinds)
-    found = BundleMinimum(*find_minimum(minimization, given, options.backward))
+    closed_over = tensors_of_errors(problem.factors, given.T_cw, given.points_w, given.params)
+    found = BundleMinimum(*find_minimum(minimization, given, options.backward, closed_over))
     if options.strict:
         check_minimum(found.success, found.converged, "bundle adjustments")
     detached = [x.detach() for x in given]
@@ -188,16 +200,23 @@ def solve_bundle(
         of_all = minimization.marginals(found, detached)
         return of_all if problem.is_batch else Marginals(*(blocks[0] for blocks in of_all))
 
-    row = slice(None) if problem.is_batch else 0
+    row, convergence = (
+        slice(None) if problem.is_batch else 0,
+        Convergence(*found[-4:], limit=options.iterations),
+    )
+    T_cw, points_w, params = (
+        warned(x, found.success, convergence, "bundle adjustments")
+        for x in (solution.T_cw, solution.points_w, params)
+    )
     return BundleSolution(
-        solution.T_cw[row],
-        solution.points_w[row],
+        T_cw[row],
+        points_w[row],
         problem.camera.with_params(params[row]),
         found.cost[row],
         found.success[row],
         found.moved_frames[row],
         found.moved_points[row],
-        Convergence(*found[-4:], limit=options.iterations),
+        convergence,
         marginals,
     )
 
@@ -341,8 +360,12 @@ class BundleMinimization:
             terms = depth_terms(given.depths.flatten(), counted, points_c[:, 2], exact=False)
             slope = slope + (terms.slope * velocity[:, 2]).sum()
         if self.kinds:
-            moved = torch.where(found.moved_frames[..., None], frames, 0.0)
-            slope = slope + factor_slope(self.kinds, at.T_cw, given.measured, given.factor_information, moved)
+            moved = found.moved_frames[..., None], found.moved_points[..., None]
+            of_frames, of_points = (
+                torch.where(mask, part, 0.0) for mask, part in zip(moved, (frames, points), strict=True)
+            )
+            step = of_frames, of_points, self._along(camera, at.params)
+            slope = slope + factor_slope(self.kinds, at, given.measured, given.factor_information, step)
         if not given.has_priors:
             return slope
         directions = self._directions(at.params)
@@ -436,7 +459,7 @@ def _parts(given: BundleData, moving: MovingParts, kinds: Sequence[FactorKind] =
     if use_dense:
         cells = _MAX_CELLS_CPU if given.T_cw.device.type == "cpu" else _MAX_CELLS_GPU
         size = max(1, cells // (moving.frames.shape[1] * moving.points.shape[1]))
-    joined = torch.cat([kind.frames for kind in kinds]) if kinds else None
+    joined = torch.cat([kind.pairs for kind in kinds]) if kinds else None
     parts = []
     for start in range(0, batch, size):
         rows = slice(start, min(start + size, batch))

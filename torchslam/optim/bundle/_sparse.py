@@ -11,14 +11,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry.camera import Camera
-from torchslam.geometry.lie import se3_inverse
+from torchslam.geometry.lie import se3_inverse, skew
 from torchslam.geometry.robust import Kernel
 from torchslam.optim._core.implicit import Tensors
 from torchslam.optim._core.levenberg_marquardt import select_models
@@ -34,7 +34,14 @@ from torchslam.optim._core.residuals import (
     variance_factor,
 )
 from torchslam.optim._core.tangent import cross_entries, retract, rotated
-from torchslam.optim.bundle._factors import FactorKind, FrameBlocks, depth_terms, factor_terms, with_depths
+from torchslam.optim.bundle._factors import (
+    FactorKind,
+    FrameBlocks,
+    PointBlocks,
+    depth_terms,
+    factor_terms,
+    with_depths,
+)
 from torchslam.optim.bundle._problem import (
     BundleData,
     BundleEstimate,
@@ -53,6 +60,12 @@ from torchslam.optim.bundle._schur import (
     build_structure,
 )
 
+Curvature = Literal["none", "definite", "exact"]
+"""As of `factor_terms`."""
+_DRIFT, _DRIFT_GAIN, _DRIFT_STEPS = 0.01, 0.01, 10
+"""A minimization with factors is given up after this many steps that each change the distances of points from cameras
+by this share, but lower the cost by less than this one. Healthy ones reach another scale in a few steps. Tried at these
+values only."""
 _INNER_FRAMES = 32
 """Free frames from which on points take steps of their own: parts of a window of few frames do not move against each
 other, and it converges in a few steps."""
@@ -206,7 +219,8 @@ class SparseBundle:
     ) -> None:
         """given: of one problem; directions: (P, n) in which the parameters move, None where they stay; kinds: of
         factors"""
-        self.kinds = kinds
+        self.kinds = [kind._replace(points=layout.point_rank[kind.points]) for kind in kinds]
+        self.drift_steps, self.has_drifted = 0, False
         self.layout, self.given, self.directions = layout, given, directions
         self.camera, self.kernel = camera, kernel
         rows = layout.observations
@@ -222,6 +236,9 @@ class SparseBundle:
         if len(given.depths):
             information = given.depth_information.index_select(0, rows)
             self.depths = given.depths.index_select(0, rows), information
+        self.inner_points = layout.free_points  # that may take steps of their own
+        for kind in self.kinds:
+            self.inner_points = self.inner_points.index_fill(0, kind.points.flatten(), False)
         has_prior = (given.pose_prior is not None or len(kinds) > 0) and len(layout.free_frames) > 0
         self.solvable = torch.tensor([len(rows) > 0 or has_prior], device=given.pixels.device)
 
@@ -232,7 +249,8 @@ class SparseBundle:
         return rounding_cost(weights[None], self.given.params[None])
 
     def evaluate(self, estimate: BundleEstimate, use_curvature: Tensor) -> SparseModel:
-        seen, terms = self._seen(estimate), self._priors(estimate)
+        curvature: Curvature = "definite" if bool(use_curvature.any()) else "none"
+        seen, terms = self._seen(estimate), self._priors(estimate, curvature)
         lin = self._linearize(estimate, seen)
         cost = lin.cost.sum() if terms is None else lin.cost.sum() + terms.cost
         if self.depths is not None:
@@ -245,9 +263,7 @@ class SparseBundle:
         equations, estimate = model.equations, model.estimate
         factorized = equations.factorized(damping, self._gauge(estimate))
         step = factorized.solve(equations.gradient)
-        predicted_reduction = torch.where(
-            factorized.reduced.definite, 0.5 * step.dot(equations.gradient), torch.inf
-        )
+        predicted_reduction = torch.where(factorized.definite, 0.5 * step.dot(equations.gradient), torch.inf)
         frames = self.layout.free_frames
         T_free = estimate.T_cw.index_select(0, frames)
         T_free = retract(T_free, -rotated(T_free[:, :3, :3], step.frames[..., None])[..., 0])
@@ -268,7 +284,7 @@ class SparseBundle:
         a single point that steps too far does not stop all others.
         Source: Jeong et al., "Pushing the envelope of modern methods for bundle adjustment", 2012, section 4.
         """
-        if len(self.layout.free_frames) < _INNER_FRAMES or not self.layout.free_points.any():
+        if len(self.layout.free_frames) < _INNER_FRAMES or not self.inner_points.any():
             return estimate
         damping = torch.full_like(estimate.points_w[:, 0], 1e-4)
         now, steps = self._of_points(estimate), _INNER_STEPS
@@ -313,14 +329,31 @@ class SparseBundle:
     ) -> Float[Tensor, "N 3"]:
         """What to subtract from the points, zero where they are fixed or not determined."""
         grown = [hessian[row, column] * (1 + damping * (row == column)) for row, column in LOWER_3X3]
-        root = inverse_root_3x3(grown, self.layout.free_points)
+        root = inverse_root_3x3(grown, self.inner_points)
         return torch.stack(upper_times(root, lower_times(root, gradient)), dim=-1)
+
+    def drifts(self, old: SparseModel, new: SparseModel, relative_reduction: Tensor) -> Tensor:
+        """Whether factors shrink or grow the map without end: a plane that the camera does not keep is kept best by a
+        map without extent."""
+        if not self.kinds:
+            return torch.zeros_like(self.solvable)
+        rows = self.layout.observations
+        before, after = (
+            float(self._seen(model.estimate).points_c.norm(dim=-1).log().mean()) if len(rows) else 0.0
+            for model in (old, new)
+        )
+        is_drift = abs(after - before) > _DRIFT and float(relative_reduction) < _DRIFT_GAIN
+        self.drift_steps = self.drift_steps + 1 if is_drift else 0
+        self.has_drifted = self.drift_steps >= _DRIFT_STEPS
+        return torch.full_like(self.solvable, self.has_drifted)
 
     select = staticmethod(select_models)
 
     def definite(self, model: SparseModel) -> Tensor:
         """Whether (1,) all that moves is determined, up to the gauge."""
-        return model.equations.factorized(gauge=self._gauge(model.estimate)).reduced.definite[None]
+        if self.has_drifted:
+            return torch.zeros_like(self.solvable)
+        return model.equations.factorized(gauge=self._gauge(model.estimate)).definite[None]
 
     def ordered(self, estimate: BundleEstimate) -> BundleEstimate:
         """The estimate of a batch of one in the layout's order."""
@@ -354,12 +387,19 @@ class SparseBundle:
             if len(anchors):
                 return None
             motions = motions[..., 1:]
-        motions = torch.linalg.qr(motions.flatten(0, 1)).Q.unflatten(0, (-1, 6))
+        every, motions = motions, torch.linalg.qr(motions.flatten(0, 1)).Q.unflatten(0, (-1, 6))
         with torch.no_grad():
             priors = self._priors(estimate)
-            return motions if priors is None else open_motions(motions, priors)
+            if priors is None:
+                return motions
+            of_points = None
+            if priors.points is not None:
+                moved = _moved_with_gauge(estimate.points_w, origin)
+                moved = moved[..., :1] if len(anchors) else moved[..., 7 - every.shape[-1] :]
+                of_points = moved @ torch.linalg.lstsq(every.flatten(0, 1), motions.flatten(0, 1)).solution
+            return open_motions(motions, priors, of_points)
 
-    def _priors(self, estimate: BundleEstimate, exact: bool = False) -> PriorTerms | None:
+    def _priors(self, estimate: BundleEstimate, curvature: Curvature = "none") -> PriorTerms | None:
         """What priors on free frames (K') and cameras, and factors, add, in the axes of the world."""
         frames, given = self.layout.free_frames, self.given
         if not given.has_priors and not self.kinds:
@@ -371,21 +411,39 @@ class SparseBundle:
             given = given._replace(prior_T_cw=T_cw, prior_information=information)
         T_cw = estimate.T_cw.index_select(0, frames)
         moving = torch.ones_like(frames).bool()
-        terms = prior_terms(given, T_cw, estimate.params, moving, self.directions, exact)
-        if self.kinds:  # what belongs to frames that stay is left out
-            cost, gradient, diagonal, (first, second, blocks) = factor_terms(
-                self.kinds, estimate.T_cw, given.measured, given.factor_information, exact
-            )
-            slots = torch.full((len(estimate.T_cw),), -1, device=frames.device)
-            slots[frames] = torch.arange(len(frames), device=frames.device)
-            joined = (slots[first] >= 0) & (slots[second] >= 0)
-            terms = terms._replace(
-                cost=terms.cost + cost,
-                frames_gradient=terms.frames_gradient + gradient[frames],
-                frames=terms.frames + diagonal[frames],
-                between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
-            )
-        return terms.in_world(T_cw[:, :3, :3])
+        terms = prior_terms(given, T_cw, estimate.params, moving, self.directions, curvature == "exact")
+        terms = terms.in_world(T_cw[:, :3, :3])
+        return self._with_factors(terms, estimate, curvature) if self.kinds else terms
+
+    def _with_factors(self, terms: PriorTerms, estimate: BundleEstimate, curvature: Curvature) -> PriorTerms:
+        """The terms with those of the factors; what belongs to frames and points that stay is left out."""
+        frames, given, directions = self.layout.free_frames, self.given, self.directions
+        if directions is None:
+            directions = given.params.new_zeros(given.params.shape[1], 0)
+        found = factor_terms(
+            self.kinds, estimate, given.measured, given.factor_information, directions, curvature
+        )
+        slots = torch.full((len(estimate.T_cw),), -1, device=frames.device)
+        slots[frames] = torch.arange(len(frames), device=frames.device)
+        first, second, blocks = found.between
+        joined = (slots[first] >= 0) & (slots[second] >= 0)
+        points = found.points
+        if points is not None:
+            numbers, split, width = points.joined, 6 * len(slots), 6 * len(frames)
+            of_frames = 6 * slots[torch.where(numbers < split, numbers, 0) // 6] + numbers % 6
+            points_free = self.layout.free_points[(numbers - split).clamp_min(0) // 3]
+            stays = torch.where(numbers < split, of_frames < 0, ~points_free)
+            numbers = torch.where(numbers < split, of_frames, numbers - split + width)[~stays]
+            points = PointBlocks(*points[:2], numbers, points.matrix[~stays][:, ~stays])
+        return terms._replace(
+            cost=terms.cost + found.cost,
+            frames_gradient=terms.frames_gradient + found.frames_gradient[frames],
+            frames=terms.frames + found.frames[frames],
+            cameras_gradient=terms.cameras_gradient + found.camera_gradient,
+            cameras=terms.cameras + found.camera,
+            between=FrameBlocks(slots[first[joined]], slots[second[joined]], blocks[joined]),
+            points=points,
+        )
 
     def marginals(self, estimate: BundleEstimate) -> Marginals:
         """Covariances (1, K, 6, 6), (1, N, 3, 3), (1, C n, C n) in the order of the problem, zero for what stays."""
@@ -493,7 +551,15 @@ class SparseBundle:
         expansion = self._with_depths(expansion, seen, exact=True)
         layout = self.layout
         equations = assemble_sparse(layout.structure, expansion, rays_w, layout.free_points, exact=True)
-        return _with_priors(equations, self._priors(estimate, exact=True))
+        return _with_priors(equations, self._priors(estimate, "exact"))
+
+
+def _moved_with_gauge(
+    points_w: Float[Tensor, "N 3"], origin_w: Float[Tensor, " 3"]
+) -> Float[Tensor, "N 3 7"]:
+    """How points move with the frames of `gauge_motions`."""
+    eye = torch.eye(3, dtype=points_w.dtype, device=points_w.device).expand(len(points_w), 3, 3)
+    return torch.cat(((points_w - origin_w)[..., None], eye, -skew(points_w)), dim=-1)
 
 
 def _with_priors(
@@ -506,10 +572,16 @@ def _with_priors(
     between = terms.between
     if between is not None:
         between = between._replace(blocks=share * between.blocks)
+    joined, blocks = terms.points, equations.points
+    if joined is not None:
+        points, blocks = points + joined.gradient, blocks + share * joined.diagonal
+        joined = joined._replace(matrix=share * joined.matrix)
     return replace(
         equations,
         gradient=BundleTangent(frames + terms.frames_gradient, points, cameras + terms.cameras_gradient),
         between=between,
+        joined=joined,
+        points=blocks,
         frames=equations.frames + share * terms.frames,
         cameras=equations.cameras + share * terms.cameras,
     )

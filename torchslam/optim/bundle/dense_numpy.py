@@ -161,7 +161,7 @@ class _Bundle:
 def _rows_of(problem: BundleProblem) -> tuple[Array, Array, Array]:
     """Frame and point of each observation, (O,) twice, and the mask (K,) of the fixed frames."""
     names = ("fixed_points", "mask", "camera_index", "pose_prior", "camera_prior", "depth_prior")
-    if problem.is_batch or problem.frame_factors or any(getattr(problem, name) is not None for name in names):
+    if problem.is_batch or problem.factors or any(getattr(problem, name) is not None for name in names):
         raise ValueError(
             f"the NumPy backend takes one problem without {', '.join(names)} and factors: use solve_bundle"
         )
