@@ -26,7 +26,7 @@ from torchslam import SLAM, GraphSolution, open_sequence, solve_graph
 from torchslam.evaluation import ate
 from torchslam.geometry import se3_inverse
 from torchslam.learning import Training
-from torchslam.optim import GRAPH_OPTIONS, FrameFactors
+from torchslam.optim import GRAPH_OPTIONS, Factors
 from torchslam.optim.run_graph import RunGraph
 
 TRAIN, TEST = (1, 2, 3), (101, 102)  # seeds of the rooms
@@ -85,9 +85,9 @@ class Corrections(nn.Module):
         """All poses of a room."""
         count = len(example.pairs)
         information = torch.full((count, 1, 1), 1 / WHEEL_STD**2, dtype=torch.float64)
-        factor = FrameFactors(example.pairs, example.distances, information, self.wheels)
+        factor = Factors(example.pairs, example.distances, information, self.wheels)
         options = PRECISE if precise else GRAPH_OPTIONS
-        return solve_graph(self(example), frame_factors=[factor], options=options)
+        return solve_graph(self(example), factors=[factor], options=options)
 
 
 def error(module: Corrections, example: Example, precise: bool = False) -> Tensor:
