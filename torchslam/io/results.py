@@ -32,6 +32,29 @@ from torchslam.io.export.scene import (
     open_images,
     scene_of,
 )
+from torchslam.io.file_names import (  # noqa: F401 -- the other modules find them here
+    CHECKPOINT,
+    CONFIG,
+    DENSE_CLOUD,
+    DEPTHS,
+    EXAMPLE_IMAGE,
+    FRAMES,
+    GROUND_TRUTH,
+    KEYFRAMES,
+    LIVE,
+    MAP,
+    MESH,
+    METRICS,
+    ONLINE,
+    OTHER_TRAJECTORY,
+    PICTURE_NAMES,
+    PICTURES,
+    PLOTS,
+    POINT_CLOUD,
+    STAGE_SUFFIX,
+    STAGES,
+    TRAJECTORY,
+)
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
 from torchslam.map.map import Map
@@ -39,26 +62,6 @@ from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.console import is_unicode
 from torchslam.utils.files import write_whole
 
-TRAJECTORY = "trajectory.txt"
-OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number
-ONLINE = "online.txt"
-KEYFRAMES = "keyframes.txt"
-GROUND_TRUTH = "groundtruth.txt"
-MAP = "map.safetensors"
-CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
-STAGES = "global_mapping"  # folder of the saved stages of global mapping, during a run
-POINT_CLOUD = "map.ply"
-DENSE_CLOUD = "dense.ply"  # of the main submap, z up as in POINT_CLOUD
-MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
-DEPTHS = Path("dense") / "depths.safetensors"  # of keyframes of the main submap
-PICTURES = Path("dense") / "pictures"
-PICTURE_NAMES = "[0-9]" * 6 + ".png"  # pattern of depth pictures: the digits of the frame
-CONFIG = "config.toml"
-METRICS = "metrics.json"
-FRAMES = "frames.csv"
-EXAMPLE_IMAGE = "example.png"
-PLOTS = "plots"
-STAGE_SUFFIX = "_ms"  # of the columns of frames.csv that have times
 MAX_COUNT = 1 << 31  # of indices, counts and numbers of submaps in files
 
 
