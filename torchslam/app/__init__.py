@@ -21,39 +21,20 @@ UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # of sizes on the com
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `torchslam app`."""
+    folder = "folder of results, created if needed (default: %(default)s)"
     parser.add_argument(
-        "folder",
-        type=Path,
-        nargs="?",
-        default=Path("results"),
-        metavar="FOLDER",
-        help="folder of results, created if needed (default: %(default)s)",
+        "folder", type=Path, nargs="?", default=Path("results"), metavar="FOLDER", help=folder
     )
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen at (default: this computer alone)"
     )
-    parser.add_argument(
-        "--port",
-        type=at_least(0),
-        default=PORT,
-        metavar="N",
-        help="port; 0: any free one (default: %(default)s)",
-    )
+    port = "port; 0: any free one (default: %(default)s)"
+    parser.add_argument("--port", type=at_least(0), default=PORT, metavar="N", help=port)
     parser.add_argument("--no-browser", action="store_true", help="do not open the browser")
-    parser.add_argument(
-        "--max-upload",
-        type=size,
-        default=size("4G"),
-        metavar="SIZE",
-        help="largest upload, for example 500M or 4G (default: 4G)",
-    )
-    parser.add_argument(
-        "--max-runs",
-        type=at_least(1),
-        default=100,
-        metavar="N",
-        help="largest number of results in the folder for which new runs are accepted (default: %(default)s)",
-    )
+    upload = "largest upload, for example 500M (default: 4G)"
+    parser.add_argument("--max-upload", type=size, default=size("4G"), metavar="SIZE", help=upload)
+    most = "number of runs in the folder from which on no more are accepted (default: %(default)s)"
+    parser.add_argument("--max-runs", type=at_least(1), default=100, metavar="N", help=most)
 
 
 def size(text: str) -> int:

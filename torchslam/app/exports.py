@@ -7,139 +7,106 @@ import shlex
 import shutil
 import threading
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple
 
-from torchslam.app.jobs import INPUT, LOCK, LOG, RECORD, Record, message_of, tool
+from torchslam.app.jobs import INPUT, LOCK, LOG, RECORD, tool
 from torchslam.errors import ResultsError
 from torchslam.io.file_names import DENSE_CLOUD, MESH, METRICS, POINT_CLOUD, TRAJECTORY
 
 FOLDER = "taken"  # in the results folder: written on demand, and again when the results have changed
-VIEW = "view.html"  # as `page.VIEW`, whose module imports torch
-FREE = 1 << 30  # bytes of the disk that exports leave free
-
-
-class Export(NamedTuple):
-    """Something to take away.
-
-    Attributes:
-        label: on the page.
-        file: of the results folder; empty for an export.
-        words: of `torchslam export`, and the name of what it writes.
-    """
-
-    label: str
-    file: str = ""
-    words: tuple[str, ...] = ()
-
-
-EXPORTS = {
-    "colmap": Export("COLMAP (zip)", words=("--to", "colmap")),
-    "nerfstudio": Export("nerfstudio (zip)", words=("--to", "nerfstudio")),
-    "splat": Export("3D Gaussian splatting (zip)", words=("--to", "colmap", "--undistort")),
-    "ply": Export("sparse cloud (PLY)", POINT_CLOUD),
-    "dense": Export("dense cloud (PLY)", DENSE_CLOUD),
-    "mesh": Export("mesh (PLY)", MESH),
-    "tum": Export("path, TUM", TRAJECTORY),
-    "kitti": Export("path, KITTI (zip)", words=("--to", "kitti")),
-    "view": Export("view.html, to share", VIEW),
-    "all": Export("all results (zip)"),
+VIEW = "view.html"  # as `page.VIEW`, whose module needs torch
+FREE = 1 << 30  # bytes of the disk that uploads and exports leave free
+FILES = {
+    "ply": ("sparse cloud (PLY)", POINT_CLOUD),
+    "dense": ("dense cloud (PLY)", DENSE_CLOUD),
+    "mesh": ("mesh (PLY)", MESH),
+    "tum": ("path, TUM", TRAJECTORY),
+    "view": ("view.html, to share", VIEW),
 }
+"""Files of the results folder: label and name."""
+ZIPS: dict[str, tuple[str, Sequence[str]]] = {
+    "colmap": ("COLMAP (zip)", ("--to", "colmap")),
+    "nerfstudio": ("nerfstudio (zip)", ("--to", "nerfstudio")),
+    "splat": ("3D Gaussian splatting (zip)", ("--to", "colmap", "--undistort")),
+    "kitti": ("path, KITTI (zip)", ("--to", "kitti")),
+    "all": ("all results (zip)", ()),
+}
+"""Zips: label and arguments of `torchslam export`; without any, of the results folder itself."""
 _writing = threading.Lock()
 
 
-def write_export(path: Path, kind: str, name: str) -> tuple[Path, str]:
-    """Write an export of a results folder unless it is there; return the file, and the name to save it under.
+def check_disk(folder: Path, size: int = 0) -> None:
+    """Check that the disk has room for some bytes more. Raises ResultsError."""
+    if shutil.disk_usage(folder).free < FREE + size:
+        raise ResultsError("the disk of the server has not enough space")
 
-    Raises ResultsError if it is none, or cannot be written.
-    """
-    if kind not in EXPORTS:
-        raise ResultsError("no such export")
-    export = EXPORTS[kind]
-    if not (path / METRICS).is_file():
-        raise ResultsError("the run has no results yet")
-    if export.file:
-        if not (path / export.file).is_file():
-            hint = {"dense": "run it with Dense", "mesh": "run it with Dense"}.get(kind, "the run wrote none")
-            if kind == "mesh" and (path / DENSE_CLOUD).is_file():
-                return _made_mesh(path), f"{name}-{MESH}"
-            raise ResultsError(f"no {export.file}: {hint}")
-        return path / export.file, f"{name}-{export.file}"
+
+def write_export(path: Path, kind: str) -> Path:
+    """Return the file of an export of a results folder, which is written unless it is there. Raises ResultsError."""
+    if kind not in FILES | ZIPS or not (path / METRICS).is_file():
+        raise ResultsError("there is no such export, or the run has no results yet")
     with _writing:
-        target = path / FOLDER / f"{kind}.zip"
+        if kind in FILES:
+            file = path / FILES[kind][1]
+            if kind == "mesh" and not file.is_file():
+                check_disk(path)
+                tool(["export", str(path), "--to", "mesh", "--output", str(file), "--overwrite"], path.parent)
+            if not file.is_file():
+                raise ResultsError(
+                    f"the run wrote no {file.name}" + (": run it with Dense" if kind == "dense" else "")
+                )
+            return file
+        target, (_, words) = path / FOLDER / f"{kind}.zip", ZIPS[kind]
         if not target.exists() or target.stat().st_mtime < (path / METRICS).stat().st_mtime:
-            _check_disk(path)
-            source = path
-            if export.words:
-                source = path / FOLDER / kind
-                _export(path, [*export.words, "--output", str(source), "--overwrite"])
+            check_disk(path)
+            source = path / FOLDER / kind if words else path
+            if words:
+                tool(["export", str(path), *words, "--output", str(source), "--overwrite"], path.parent)
             zip_folder(source, target)
-        return target, f"{name}-{kind}.zip"
-
-
-def links(name: str, address: str) -> str:
-    """HTML of the buttons for all exports, see page.js; `address` is that of the run, quoted."""
-    style = "display:block;margin:4px 12px;cursor:pointer;color:#1864ab;font-size:0.875em"
-    return "".join(
-        f'<a role="button" style="{style}" data-take="{label}" data-address="{address}/{kind}">{label}</a>'
-        for kind, (label, *_) in EXPORTS.items()
-    )
-
-
-def command_and_python(record: Record, words: list[str], folder: Path) -> str:
-    """The command line that does the same, and lines of Python; paths are below `folder`, which is left out."""
-    plain = [word.replace(f"{folder}/", "") for word in words]
-    source, arguments = plain[1], dict(zip(plain, [*plain[1:], ""], strict=True))
-    opened = [repr(source)]
-    opened += [f"camera={arguments['--camera']!r}"] if "--camera" in arguments else []
-    opened += [f"stride={arguments['--stride']}"] if "--stride" in arguments else []
-    settings = [after for word, after in itertools.pairwise(plain) if word == "--set"]
-    settings += [
-        f"metric.{flag[2:].replace('-', '_')}={arguments[flag]}"
-        for flag in ("--marker", "--camera-height", "--gps")
-        if flag in arguments
-    ]
-    lines = [
-        "import torchslam",
-        "",
-        f"sequence = torchslam.open_sequence({', '.join(opened)})",
-        f"config = torchslam.load_config(None, {settings!r})",
-        f"run = torchslam.run(sequence, config, mapping={arguments.get('--mapping', 'auto')!r})",
-        "if run.check is not None:",
-        "    print(run.check.sentence())",
-        "print(run.camera.params, run.trajectory.positions_w.shape)",
-        "points = run.map.positions_w[run.map.valid_points()]",
-    ]
-    return shlex.join(["torchslam", *plain]) + "\n\n" + "\n".join(lines)
+        return target
 
 
 def zip_folder(source: Path, target: Path) -> None:
     """Write the files of a folder into a zip, whole or not at all; not what was uploaded, nor links."""
     target.parent.mkdir(exist_ok=True)
     part = target.with_suffix(".part")
-    left_out = {RECORD, LOG, LOCK, FOLDER}
     with zipfile.ZipFile(part, "w", zipfile.ZIP_DEFLATED, compresslevel=1) as archive:
         for file in sorted(source.rglob("*")):
             inside = file.relative_to(source)
-            is_kept = inside.parts[0] not in left_out and not inside.parts[0].startswith(f"{INPUT}.")
-            if file.is_file() and not file.is_symlink() and is_kept and inside.parts[0] != INPUT:
+            is_own = (
+                inside.parts[0] in (RECORD, LOG, LOCK, FOLDER) or inside.parts[0].partition(".")[0] == INPUT
+            )
+            if file.is_file() and not file.is_symlink() and not is_own:
                 archive.write(file, inside)
     part.replace(target)
 
 
-def _made_mesh(path: Path) -> Path:
-    with _writing:
-        _check_disk(path)
-        _export(path, ["--to", "mesh", "--output", str(path / MESH), "--overwrite"])
-    return path / MESH
+def links(address: str) -> str:
+    """HTML of the buttons for all exports, see page.js; `address` is that of the run, quoted."""
+    style = "display:block;margin:4px 12px;cursor:pointer;color:#1864ab;font-size:0.875em"
+    return "".join(
+        f'<a role="button" style="{style}" data-take="{label}" data-address="{address}/{kind}">{label}</a>'
+        for kind, (label, _) in (ZIPS | FILES).items()
+    )
 
 
-def _export(path: Path, words: list[str]) -> None:
-    done = tool(["export", str(path), *words])
-    if done.returncode:
-        raise ResultsError(message_of(done, path.parent))
-
-
-def _check_disk(path: Path) -> None:
-    if shutil.disk_usage(path).free < FREE:
-        raise ResultsError("the disk of the server has not enough space")
+def command_and_python(words: list[str], folder: Path) -> str:
+    """The command line of a run, and lines of Python that do the same; paths are relative to `folder`."""
+    plain = [word.replace(f"{folder}/", "") for word in words]
+    given = dict(itertools.pairwise(plain))
+    stride = given.get("--stride", 1)
+    settings = [after for word, after in itertools.pairwise(plain) if word == "--set"]
+    for flag, name in (("--marker", "marker"), ("--camera-height", "camera_height"), ("--gps", "gps")):
+        settings += [f"metric.{name}={given[flag]}"] if flag in given else []
+    lines = [
+        "import torchslam",
+        f"sequence = torchslam.open_sequence({plain[1]!r}, {given.get('--camera')!r}, stride={stride})",
+        f"config = torchslam.load_config(None, {settings!r})",
+        f"run = torchslam.run(sequence, config, mapping={given.get('--mapping', 'auto')!r})",
+        "if run.check is not None:",
+        "    print(run.check.sentence())",
+        "print(run.camera.params, run.trajectory.positions_w.shape)",
+        "points = run.map.positions_w[run.map.valid_points()]",
+    ]
+    return shlex.join(["torchslam", *plain]) + "\n\n" + "\n".join(lines)

@@ -10,9 +10,12 @@ import secrets
 import socket
 import webbrowser
 
+from torchslam.app.jobs import Runs
+from torchslam.app.reading import ReadingProcess
 from torchslam.errors import ConfigError, ResultsError
 
 LOCK = ".torchslam-app"  # in the folder: one server at a time
+ANY = ("0.0.0.0", "::", "")  # addresses of all networks
 
 
 def serve(options: argparse.Namespace) -> int:
@@ -22,14 +25,11 @@ def serve(options: argparse.Namespace) -> int:
         import viser
 
         from torchslam.app.panel import Panel
-        from torchslam.app.web import LOCAL, Handlers, Uploads, application
+        from torchslam.app.web import LOCAL, Uploads, application
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("torchslam"):
             raise
         raise ConfigError(f"the page needs {error.name}: pip install 'torchslam[app]'") from None
-    from torchslam.app.jobs import Runs
-    from torchslam.app.reading import ReadingProcess
-
     is_local = options.host in ("localhost", "127.0.0.1", "::1")
     token = "" if is_local else secrets.token_urlsafe(24)
     runs = Runs(options.folder, options.max_runs)
@@ -49,18 +49,13 @@ def serve(options: argparse.Namespace) -> int:
         at_end.callback(viewer.stop)
         panel = Panel(viewer, runs, reader)
         at_end.callback(panel.close)
-        handlers = Handlers(panel.received, panel.taken, panel.picture)
-        page = application(viewer, Uploads(runs.folder, options.max_upload), handlers, token)
-        name = (
-            LOCAL[0]
-            if is_local
-            else (socket.gethostname() if options.host in ("0.0.0.0", "::") else options.host)
-        )
+        page = application(viewer, Uploads(runs.folder, options.max_upload), panel, token)
+        name = LOCAL[0] if is_local else socket.gethostname() if options.host in ANY else options.host
         address = f"http://{name}:{listening.getsockname()[1]}/" + (f"?token={token}" if token else "")
         print(f"torchslam app: {address}\nresults: {runs.folder}\nend: Ctrl-C (runs go on)", flush=True)
         if not options.no_browser:
             webbrowser.open(address)
-        # Files of the viewer are large messages; compressing them takes longer than sending them.
+        # What the viewer sends is large; to compress it takes longer than to send it.
         config = uvicorn.Config(
             page, log_level="warning", ws="websockets-sansio", ws_per_message_deflate=False
         )
@@ -75,5 +70,5 @@ def _listen(host: str, port: int) -> socket.socket:
         return socket.create_server((host, port), family=family)
     except OSError as error:
         raise ConfigError(
-            f"--host {host} --port {port}: {error.strerror or error}; --port 0 takes any free port"
+            f"--host {host} --port {port}: {error.strerror}; --port 0 takes a free port"
         ) from None
