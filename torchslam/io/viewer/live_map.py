@@ -108,7 +108,11 @@ def read_live_map(folder: Path) -> dict[str, Any] | None:
     """Read the file of a results folder; None if there is none. Raises ResultsError if it is damaged."""
     path = folder / LIVE
     try:
-        with np.load(io.BytesIO(read_bytes(path, MAX_BYTES, "a live map")), allow_pickle=False) as content:
+        file = io.BytesIO(read_bytes(path, MAX_BYTES, "a live map"))
+        with zipfile.ZipFile(file) as archive:
+            if sum(entry.file_size for entry in archive.infolist()) > MAX_BYTES:
+                raise ValueError("it is packed")  # a run writes it unpacked
+        with np.load(file, allow_pickle=False) as content:
             return {name: content[name] for name in content.files}
     except FileNotFoundError:
         return None
