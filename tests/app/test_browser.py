@@ -39,7 +39,12 @@ def page(browser: Any, server: Server) -> Iterator[Any]:
     """A tab; it fails if anything of a file name was executed, or the page asked another computer."""
     opened = browser.new_page(viewport={"width": 1280, "height": 800})
     dialogs, asked = list[str](), list[str]()
-    opened.on("dialog", lambda dialog: (dialogs.append(dialog.message), dialog.dismiss()))
+
+    def dismiss(dialog: Any) -> None:
+        dialogs.append(dialog.message)
+        dialog.dismiss()
+
+    opened.on("dialog", dismiss)
     opened.on("request", lambda request: asked.append(request.url))
     opened.goto(server.address)
     opened.get_by_text("Demo: a rendered room").wait_for(timeout=SLOW_MS)

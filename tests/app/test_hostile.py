@@ -12,6 +12,7 @@ import stat
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 from urllib.parse import quote
 
 import pytest
@@ -334,7 +335,8 @@ def test_the_viewer_itself_accepts_no_connection_but_that_of_the_page(tmp_path: 
     from torchslam.app.web import SECRET, Uploads, application
 
     viewer = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    application(viewer, Uploads(tmp_path, 1), None)
+    nobody: Any = None
+    application(viewer, Uploads(tmp_path, 1), nobody)
 
     async def received(**headers: str) -> int:
         address = f"ws://127.0.0.1:{viewer.get_port()}/"

@@ -10,10 +10,12 @@ By default the page is for this computer alone, also through a tunnel: ssh -L 80
 from __future__ import annotations
 
 import argparse
+import os
 import re
 from pathlib import Path
 
 from torchslam.cli.arguments import at_least
+from torchslam.errors import ConfigError
 
 PORT = 8090  # of the page; neither 8080 of other viewers nor 8888 of notebooks
 UNITS = {"": 1, "K": 1 << 10, "M": 1 << 20, "G": 1 << 30}  # of sizes on the command line, bytes
@@ -47,6 +49,8 @@ def size(text: str) -> int:
 
 def execute(options: argparse.Namespace) -> int:
     """Execute `torchslam app`; returns the exit status."""
+    if os.name == "nt":
+        raise ConfigError("torchslam app needs Linux or macOS: its runs are known by their locks")
     from torchslam.app.server import serve
 
     return serve(options)

@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from http.cookies import CookieError, SimpleCookie
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import viser
@@ -29,6 +29,9 @@ from websockets.typing import Subprotocol
 from torchslam.app.exports import check_disk
 from torchslam.app.jobs import INPUT, shown, stored_name
 from torchslam.errors import ResultsError, TorchslamError
+
+if TYPE_CHECKING:
+    from torchslam.app.panel import Panel
 
 UPLOADS = ".uploads"  # folder of what is being uploaded, and of what waits for its start
 COOKIE, SECRET = (
@@ -188,20 +191,7 @@ class Uploads:
             shutil.rmtree(upload.folder, ignore_errors=True)
 
 
-class Page(Protocol):
-    """What the page does; each may take long and raise TorchslamError, whose words are shown."""
-
-    def received(self, kind: str, path: Path, called: str) -> None:
-        """Take an upload of a kind: the file or folder, and how it is called."""
-
-    def taken(self, name: str, kind: str) -> Path:
-        """Write an export of a run, by their names."""
-
-    def picture(self, name: str) -> Path:
-        """The file of the picture of a run."""
-
-
-def application(viewer: viser.ViserServer, uploads: Uploads, page: Page, token: str = "") -> Guard:
+def application(viewer: viser.ViserServer, uploads: Uploads, page: Panel, token: str = "") -> Guard:
     """The page, its uploads and downloads."""
     secret, tabs = secrets.token_hex(32), set[int]()
     _accept_only(viewer, secret)
