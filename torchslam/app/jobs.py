@@ -95,9 +95,10 @@ class Runs:
 
     def path(self, name: str) -> Path:
         """The folder of a run. Raises ResultsError for a name that is none of a run."""
-        if name not in self.names():
+        path = self.folder / name
+        if name in ("", ".", "..") or path.parent != self.folder or not is_run(path):
             raise ResultsError(f"no run {printable(name)[:MAX_TITLE]!r}")
-        return self.folder / name
+        return path
 
     def recordings(self) -> list[str]:
         """The names of other files and folders in the folder, which may be recordings; no hidden ones and no links."""

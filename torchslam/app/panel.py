@@ -27,6 +27,7 @@ TICK_S = 1.0
 CHECK_S = 120.0  # seconds in which a reader is to open an upload; tried at this value only
 PLAY_FPS, PLAY_STEPS = 15, 600  # poses a second while the path is played, and in all
 SHOWN_MESSAGES = 6  # last messages of a run
+ERROR = 2  # exit status of an error that the log explains, as of `cli.main`, which is a command
 NONE = "—"  # of the lists
 IMAGE, RULER, UP = "show image", "measure", "set up"
 WORDS = {
@@ -294,19 +295,22 @@ class Panel:
     # --- what goes on
 
     def _watch(self) -> None:
-        tick = self._guarded(lambda _: self._follow())
+        refresh, follow = self._guarded(lambda _: None), self._guarded(lambda _: self._follow())
         while not self._ended.wait(TICK_S):
-            tick(None)
+            (follow if self._is_live else refresh)(None)
 
     def _follow(self) -> None:
         """Show the map so far of the run that is shown; its result once it has ended."""
-        if not self._is_live:
-            return
+        self._runs.advance()  # also if the images cannot be read
         if self._runs.state(self._shown) not in (State.RUNNING, State.QUEUED):
             self._open(self._shown)
             return
         path, words = self._runs.path(self._shown), tuple(self._runs.command(self._shown)[1:])
-        found = self._reader.call(reading.live, path, words, self._frame)
+        try:
+            found = self._reader.call(reading.live, path, words, self._frame)
+        except (TorchslamError, OSError) as error:  # the run goes on
+            self._image.label, self._image.visible = f"not shown: {error}", True
+            return
         if found is not None:
             self._frame = int(found["frame"])
             self._scene.show_live(found)
@@ -339,8 +343,10 @@ class Panel:
             content = f"<b>{html.escape(self._runs.record(self._shown).title)}</b>: {state.value}"
         words, share = progress_of(log) if state is State.RUNNING else ("", 0.0)
         messages = [line.removeprefix("torchslam: ") for line in log if line.startswith("torchslam: ")]
-        if state is State.FAILED and not messages:
-            messages = [f"the run ended unexpectedly: {log[-1] if log else 'without a message'}"]
+        if state is State.FAILED and (status := self._runs.record(self._shown).status) != ERROR:
+            messages.append(
+                f"the run ended unexpectedly, with status {status}: {log[-1] if log else 'no message'}"
+            )
         lines = [words, *(messages[-SHOWN_MESSAGES:] if state is not State.DONE else [])]
         content += "".join(f"<br>{html.escape(each)}" for each in lines if each)
         change(self._status, "content", f'<div style="{LINE}">{content}</div>')

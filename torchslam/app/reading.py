@@ -73,6 +73,14 @@ def _begin() -> None:
     import cv2
     import torch
 
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_server() -> None:
+        parent.join()
+        os._exit(0)
+
+    threading.Thread(target=end_with_server, daemon=True).start()  # however the server ends
     os.nice(NICENESS)
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
