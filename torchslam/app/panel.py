@@ -39,7 +39,7 @@ LINE = "margin:4px 12px;font-size:0.875em;overflow-wrap:anywhere"
 PRE = "margin:8px 12px;padding:8px;background:#f4f4f4;font-size:0.75em;white-space:pre-wrap;overflow-wrap:anywhere"
 ROW = "display:flex;gap:8px;margin:4px 12px;font-size:0.8em;overflow-wrap:anywhere"
 PICTURE = "width:64px;height:48px;object-fit:cover;background:#ddd"
-EMPTY = np.zeros((1, 1, 3), np.uint8)
+EMPTY = np.zeros((1, 1, 3), np.uint8)  # an image before there is one
 
 
 class Panel:
@@ -314,7 +314,7 @@ class Panel:
         if found is not None:
             self._frame = int(found["frame"])
             self._scene.show_live(found)
-            self._image.image, self._image.visible = found["image"], True
+            self._image.image, self._image.label, self._image.visible = found["image"], None, True
 
     def _refresh(self) -> None:
         """Start what waits, and update the status and the lists."""

@@ -23,9 +23,9 @@ import numpy as np
 from torchslam.errors import FrameError, ResultsError
 
 Answer = TypeVar("Answer")
-NICENESS = 10
-"""Of the process, relative to the server: a run that is watched comes first. Tried at 10 only."""
-PATIENCE_S = 120.0
+NICENESS = 5
+"""Of the process, relative to the server: a run that is watched comes first. With 10 it starved on a busy machine."""
+PATIENCE_S = 300.0
 """Seconds after which reading is given up. Tried at this value only."""
 LIVE_SIDE, THUMBNAIL_SIDE = (
     480,
