@@ -19,7 +19,7 @@ BROWSER = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "
 ARGUMENTS = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 PICTURES = os.environ.get("TORCHSLAM_PICTURES")
 """Folder into which the pictures of README and tutorial are drawn."""
-SLOW_MS = 300_000.0  # a run on a busy machine, milliseconds
+SLOW_MS = 600_000.0  # a run on a busy machine, milliseconds
 
 sync_api = pytest.importorskip(
     "playwright.sync_api", reason="the page is tested through playwright: pip install playwright"

@@ -19,7 +19,7 @@ PATH, UNCERTAIN, TRUTH, OTHER = (
 FRUSTUM, MARK = (70, 110, 190), (230, 60, 50)  # red, green, blue
 UNCERTAIN_STATE = 2  # number of `types.State.UNCERTAIN`, whose module needs torch
 MAX_FRUSTA, MAX_THUMBNAILS = 400, 48
-"""Keyframes that are drawn as frusta, and those of them with an image; see the measurement in docs/tutorials/app.md."""
+"""Keyframes that are drawn as frusta, and those of them with an image. Tried at these values only."""
 REACH_PX, BESIDE_PX = 14.0, 3.0
 """Pixels from a click to what it means, and by which what is nearer to the eye may be farther away, as in view.html."""
 PLANE_POINTS = 40
