@@ -114,6 +114,7 @@ class TestMeasures:
         unknown = submap | {"error_step": np.zeros_like(submap["error_step"])}
         assert np.isnan(self.code.length_between(unknown, rows)[1])
         click = self.code.click_of(submap, (640, 480), rows[0])
+        assert click is not None
         frame, _, pixel = click.partition(":")
         assert int(frame) in range(16)
         x, y = map(float, pixel.split(","))
