@@ -47,7 +47,11 @@ SMALL = (
     "download",
 )  # in the module `commands`; others have their own
 
-WITHOUT_THREADS = ("app", "config", "info")  # compute nothing and import torch only where a sequence is opened
+WITHOUT_THREADS = (
+    "app",
+    "config",
+    "info",
+)  # compute nothing and import torch only where a sequence is opened
 
 
 def console() -> NoReturn:

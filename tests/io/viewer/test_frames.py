@@ -268,6 +268,7 @@ def test_frames_that_are_no_keyframes_are_shown_after_a_while(
 ) -> None:
     now = [100.0]
     monkeypatch.setattr(live_map.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(live_map, "SHARE", 1e9)
     walk = Pictured()
     live = LiveMap(slam_of(walk), tmp_path)
     lost = StepResult(0, 0.0, State.LOST, None)

@@ -24,7 +24,7 @@ from torchslam.utils.files import PART, read_bytes
 EVERY_S = 0.5
 """Shortest time between two files, seconds. Tried at 0.5 only: a person sees the map grow."""
 SHARE = 0.02
-"""Largest share of the run's time that writing takes. Tried at 0.02 only: a run is to be slowed down by 5 % at most."""
+"""Largest share of the run's processor time that writing takes. Tried at 0.02 only: 5 % are to be the most."""
 PATIENCE_S = 2.0
 """Seconds after which a frame that is no keyframe is shown as well. Tried at 2 only."""
 MAX_PATH = 5_000  # poses of the path in the file: 100 bytes each
@@ -36,15 +36,16 @@ class LiveMap:
 
     def __init__(self, slam: SLAM, folder: Path) -> None:
         self._slam, self._path = slam, folder / LIVE
-        self._next, self._shown = 0.0, list[int]()
+        self._next, self._next_cpu, self._shown = 0.0, 0.0, list[int]()  # seconds of both clocks
         self._uncertain = list[float]()
 
     def offer(self, result: StepResult) -> None:
         """Write the file after a frame if it is due."""
         if result.state is State.UNCERTAIN:
             self._uncertain.append(result.timestamp)
-        start = time.monotonic()
-        if start < self._next + (0.0 if result.is_keyframe else PATIENCE_S):
+        start = time.process_time()
+        patience = 0.0 if result.is_keyframe else PATIENCE_S
+        if time.monotonic() < self._next + patience or start < self._next_cpu:
             return
         if result.is_keyframe:
             self._shown.append(result.index)
@@ -53,8 +54,8 @@ class LiveMap:
         part = self._path.with_name(self._path.name + PART)
         part.write_bytes(content.getbuffer())
         part.replace(self._path)
-        end = time.monotonic()
-        self._next = end + max(EVERY_S, (end - start) / SHARE)
+        end = time.process_time()
+        self._next, self._next_cpu = time.monotonic() + EVERY_S, end + (end - start) / SHARE
 
     def _arrays(self, result: StepResult) -> dict[str, Any]:
         """The content of the file.
