@@ -32,6 +32,7 @@ LIVE_SIDE, THUMBNAIL_SIDE = (
     96,
 )  # longer sides of the image during a run, and of those in the frusta, pixels
 MAX_KEPT = 600  # images that are kept to color the points of a run: up to 0.7 MB each
+MAX_PASSED = 4  # keyframes since the last look whose images are read as well
 UNSEEN = (150, 155, 165)  # red, green, blue of points without an image
 STATE_COLORS = ((201, 180, 88), (87, 190, 65), (190, 130, 225), (200, 85, 61))
 """Red, green, blue of the states in the timeline, in the order of `types.State`: about those of view.html."""
@@ -141,6 +142,11 @@ def live(folder: Path, words: tuple[str, ...], shown: int) -> dict[str, Any] | N
     if found is None or int(found["frame"]) == shown:
         return None
     watched, width = _watched(words), found["camera"][4]
+    passed = [
+        each for each in sorted(set(found["seen_frame"].tolist())) if shown < each < int(found["frame"])
+    ]
+    for frame in passed[:MAX_PASSED]:  # a decoder comes by them on its way
+        watched.image(frame)
     drawn = watched.image(int(found["frame"])).copy()
     found["colors"] = watched.colors(found["seen_frame"], found["seen_pixel"], width)
     own = COLORS[State(str(found["state"]))][::-1]
