@@ -2,4 +2,5 @@
 
 from torchslam.cli.main import console
 
-console()
+if __name__ == "__main__":  # not where another process imports this module
+    console()

@@ -228,7 +228,7 @@ def test_plot_of_an_incomplete_folder_names_what_is_missing(
 
 
 @pytest.mark.parametrize(
-    "command", ["run", "batch", "demo", "eval", "plot", "export", "info", "config", "download"]
+    "command", ["run", "app", "batch", "demo", "eval", "plot", "export", "info", "config", "download"]
 )
 def test_help_of_every_command(command: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):

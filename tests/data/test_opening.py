@@ -219,6 +219,19 @@ def test_zip_of_a_mac(tmp_path: Path, tum_folder: Callable[..., Path]) -> None:
     assert len(open_sequence(pack(tmp_path / "a.zip", files))) == 5
 
 
+@pytest.mark.parametrize("listed", ["../outside.png", "{}/outside.png", "rgb/../../../outside.png"])
+def test_a_list_in_a_zip_that_names_an_image_outside_is_refused(
+    tmp_path: Path, tum_folder: Callable[..., Path], listed: str
+) -> None:
+    folder = tum_folder()
+    image = next((folder / "rgb").glob("*.png"))
+    shutil.copy(image, tmp_path / "outside.png")
+    lines = [f"1.0 rgb/{image.name}", f"2.0 {listed.format(tmp_path)}"]
+    files = {"rgb.txt": "\n".join(lines).encode(), f"rgb/{image.name}": image.read_bytes()}
+    with pytest.raises(SequenceError, match=r"a\.zip: image 1 is outside of the archive$"):
+        open_sequence(pack(tmp_path / "a.zip", files), CAMERA)
+
+
 def test_zips_without_one_sequence(tmp_path: Path) -> None:
     (tmp_path / "wrong.zip").write_bytes(b"PK\x03\x04 not a zip")
     with pytest.raises(SequenceError, match=r"wrong\.zip: not a zip archive"):

@@ -28,6 +28,7 @@ ERROR = 2
 # The first line of the description of each command.
 COMMANDS = {
     "run": "run SLAM on a sequence and write trajectory, map, metrics and plots",
+    "app": "open a page in the browser: drop a video, watch the map grow, measure, and take the result away",
     "batch": "run many sequences and write one table: in one process, as shards of a job array, or on Ray",
     "refine": "refine the poses of another program from the images and write them in their original format",
     "align": "scale a finished run to meters by markers, clicked lengths, the camera height, or other measurements",
@@ -49,7 +50,11 @@ SMALL = (
     "download",
 )  # in the module `commands`; others have their own
 
-WITHOUT_THREADS = ("config", "info")  # compute nothing and import torch only where a sequence is opened
+WITHOUT_THREADS = (
+    "app",
+    "config",
+    "info",
+)  # compute nothing and import torch only where a sequence is opened
 
 
 def console() -> NoReturn:
@@ -166,7 +171,8 @@ def load_command(name: str) -> tuple[str, Callable[..., None], Callable[..., int
     from inspect import getdoc
 
     home, suffix = ("commands", f"_{name}") if name in SMALL else (name, "")
-    module = import_module(f"torchslam.cli.{home}")  # that of the requested command alone
+    home = "torchslam.app" if name == "app" else f"torchslam.cli.{home}"
+    module = import_module(home)  # that of the requested command alone
     execute = getattr(module, f"execute{suffix}")
     about = getdoc(execute if suffix else module) or ""
     return about, getattr(module, f"add_arguments{suffix}"), execute

@@ -45,8 +45,9 @@ from torchslam.global_mapping.recording import Mapping, run_recording
 from torchslam.io.export.mesh import import_open3d
 from torchslam.io.export.recording import import_rerun
 from torchslam.io.report import compute_metrics, result_warnings, summary
-from torchslam.io.results import CHECKPOINT, CONFIG, MAP, STAGES, delete_unfinished, prepare
+from torchslam.io.results import CHECKPOINT, CONFIG, LIVE, MAP, STAGES, delete_unfinished, prepare
 from torchslam.io.viewer.frames import VIDEO, FrameViewer, FrameViewers, LiveView, film_of
+from torchslam.io.viewer.live_map import LiveMap
 from torchslam.io.viewer.page import VIEW
 from torchslam.io.write_run import source_of, write_run
 from torchslam.system.checkpoint import read_checkpoint, write_checkpoint
@@ -138,6 +139,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     execution.add_argument(
         "--video", action="store_true", help=f"write {VIDEO}: the frames with their tracked keypoints"
     )
+    execution.add_argument(
+        "--live",
+        action="store_true",
+        help=f"write {LIVE} during the run: the map so far, as `torchslam app` shows it",
+    )
     arguments.add_named_settings(parser).add_argument(
         "--refine-camera",
         action="store_true",
@@ -214,6 +220,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         screens: list[FrameViewer] = [LiveView.spawn(slam)] if options.view else []
         screens += [film_of(sequence, options.output)] if options.video else []
         watching = viewers.enter_context(FrameViewers(slam, sequence, screens))
+        live = LiveMap(slam, options.output) if options.live else None
         checkpoints = Checkpoints(options.output, options.checkpoint, slam, so_far, sequence)
 
         def after_frame(result: StepResult, is_last: bool) -> None:
@@ -222,6 +229,8 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
             # Global mapping may follow the last frame, which is worth a checkpoint.
             checkpoints.offer(at_once=stop_signals.is_wanted or (may_map and is_last))
             watching.show(result)
+            if live is not None:
+                live.offer(result)
 
         bars = ProgressBars(stop_signals, sequence.known_length, lambda: slam.map.num_points, after_frame)
         processes = 1 if screens else options.processes  # with viewers this process needs the images
@@ -237,6 +246,7 @@ def run(sequence: Sequence, config: Config, options: argparse.Namespace) -> int:
         metrics |= _latency(latencies) | _usage(before_s) | source_of(options.path, options.fps, sequence)
         write_run(finished, sequence, metrics, options.output)
         watching.end(finished)
+        (options.output / LIVE).unlink(missing_ok=True)
     rows = summary(metrics) | {"results": str(options.output), "view": str(options.output / VIEW)}
     rows |= {"video": str(options.output / VIDEO)} if options.video else {}
     print(f"\n{sequence.name}\n{table(rows)}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import itertools
 import math
+import os
 import re
 import tempfile
 from collections import Counter
@@ -120,6 +121,7 @@ def _open_archive(path: str, open_folder: Callable[[str], Sequence]) -> Sequence
     try:
         unpack(archive, folder)
         sequence = open_folder(_only_sequence(archive, folder))
+        _check_inside(sequence, folder)
     except BaseException as error:
         holder.cleanup()
         if isinstance(error, DownloadError):
@@ -131,6 +133,14 @@ def _open_archive(path: str, open_folder: Callable[[str], Sequence]) -> Sequence
         raise
     sequence.holder = holder  # the files are deleted with the sequence
     return sequence
+
+
+def _check_inside(sequence: Sequence, folder: Path) -> None:
+    """Raise SequenceError for an image outside of the unpacked archive, which a list in it can name."""
+    start = os.path.join(os.path.abspath(folder), "")
+    for index in range(len(sequence)):
+        if not os.path.abspath(sequence.image_name(index)).startswith(start):
+            raise SequenceError(f"{folder}: image {index} is outside of the archive")
 
 
 def _only_sequence(archive: Path, folder: Path) -> str:

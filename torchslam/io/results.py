@@ -33,6 +33,31 @@ from torchslam.io.export.scene import (
     open_images,
     scene_of,
 )
+from torchslam.io.file_names import (  # noqa: F401 -- the other modules find them here
+    CHECKPOINT,
+    CONFIG,
+    DENSE_CLOUD,
+    DEPTHS,
+    EXAMPLE_IMAGE,
+    FRAMES,
+    GRAPH,
+    GROUND_TRUTH,
+    KEYFRAMES,
+    LIVE,
+    LOOPS,
+    MAP,
+    MESH,
+    METRICS,
+    ONLINE,
+    OTHER_TRAJECTORY,
+    PICTURE_NAMES,
+    PICTURES,
+    PLOTS,
+    POINT_CLOUD,
+    STAGE_SUFFIX,
+    STAGES,
+    TRAJECTORY,
+)
 from torchslam.loop_closing.records import LoopClosureRecord, read_closures
 from torchslam.map.atlas import Submap
 from torchslam.map.file import read_atlas
@@ -42,28 +67,6 @@ from torchslam.types import Explanation, State, StepResult, Trajectory
 from torchslam.utils.console import is_unicode
 from torchslam.utils.files import write_whole
 
-TRAJECTORY = "trajectory.txt"
-OTHER_TRAJECTORY = "trajectory_{}.txt"  # of the submap of that number
-ONLINE = "online.txt"
-KEYFRAMES = "keyframes.txt"
-GROUND_TRUTH = "groundtruth.txt"
-MAP = "map.safetensors"
-GRAPH = "graph.safetensors"  # all observations
-LOOPS = "loops.safetensors"  # the loops that were closed, and their pose graphs
-CHECKPOINT = "checkpoint.safetensors"  # while a run is going on
-STAGES = "global_mapping"  # folder of the saved stages of global mapping, during a run
-POINT_CLOUD = "map.ply"
-DENSE_CLOUD = "dense.ply"  # of the main submap, z up as in POINT_CLOUD
-MESH = "mesh.ply"  # of the main submap, z up as in POINT_CLOUD
-DEPTHS = Path("dense") / "depths.safetensors"  # of keyframes of the main submap
-PICTURES = Path("dense") / "pictures"
-PICTURE_NAMES = "[0-9]" * 6 + ".png"  # pattern of depth pictures: the digits of the frame
-CONFIG = "config.toml"
-METRICS = "metrics.json"
-FRAMES = "frames.csv"
-EXAMPLE_IMAGE = "example.png"
-PLOTS = "plots"
-STAGE_SUFFIX = "_ms"  # of the columns of frames.csv that have times
 MAX_COUNT = 1 << 31  # of indices, counts and numbers of submaps in files
 
 

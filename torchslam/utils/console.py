@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Mapping
 from typing import Any, TextIO
 
-INTERVAL = 5.0
-"""Seconds between two progress lines in a log."""
+INTERVAL = float(os.environ.get("TORCHSLAM_LOG_INTERVAL", "5"))
+"""Seconds between two progress lines in a log: 5, or those of the environment variable."""
 OPENCV = (
     "OpenCV is not installed (module cv2): pip install opencv-python-headless, or opencv-python if another package "
     "needs its windows; install only one of them, since each overwrites the files of the other"

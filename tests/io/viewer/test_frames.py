@@ -17,6 +17,7 @@ from torchslam.cli.main import main
 from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, se3_inverse, transform
 from torchslam.io.export.scene import pinhole_within
+from torchslam.io.viewer import live_map
 from torchslam.io.viewer.frames import (
     BAR,
     FrameSnapshot,
@@ -26,6 +27,7 @@ from torchslam.io.viewer.frames import (
     film_of,
     tracked_pixels,
 )
+from torchslam.io.viewer.live_map import LiveMap, read_live_map
 from torchslam.types import State, StepResult
 
 SIMULATED = ["features.kind=simulated", "features.num_keypoints=300", "simulated.points_per_view=200"]
@@ -225,3 +227,65 @@ def test_a_video_in_a_folder_whose_name_has_a_colon(tmp_path: Path, monkeypatch:
 def test_a_video_that_cannot_be_written_is_an_error(tmp_path: Path) -> None:
     with pytest.raises(ResultsError, match="cannot write it"):
         VideoRecorder(tmp_path / "nowhere" / "it.mp4", (64, 48), 10.0)
+
+
+def test_a_live_map_is_the_map_so_far_and_does_not_change_the_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(live_map, "EVERY_S", 0.0)
+    monkeypatch.setattr(live_map, "SHARE", 1e9)
+    assert read_live_map(tmp_path) is None
+    walk = Pictured()
+    slam = SLAM(walk.camera, load_config(None, SIMULATED))
+    live, found = LiveMap(slam, tmp_path), dict[int, dict[str, np.ndarray]]()
+
+    def show(result: StepResult) -> None:
+        live.offer(result)
+        content = read_live_map(tmp_path)
+        if result.is_keyframe and content is not None:
+            found[result.index] = content
+            assert int(content["frame"]) == result.index
+            assert len(content["points"]) == len(slam.map.valid_points())
+            last = slam.posed_frames.trajectory(slam.map).T_wc[-1, :3]
+            np.testing.assert_allclose(content["poses"][-1], last, rtol=1e-5, atol=1e-6)
+
+    run = slam.run(walk, show)
+    first, last = (found[index] for index in (min(found), max(found)))
+    assert len(first["poses"]) < len(last["poses"])
+    # Image points are only in frames that were shown, and those of the map's points.
+    assert set(np.unique(last["seen_frame"])) - {-1} <= found.keys()
+    assert (last["seen_frame"] >= 0).mean() > 0.5
+    again = slam_of(walk).run(walk, lambda result: None)
+    assert torch.equal(run.trajectory.T_wc, again.trajectory.T_wc)
+
+
+def slam_of(walk: Walk) -> SLAM:
+    return SLAM(walk.camera, load_config(None, SIMULATED))
+
+
+def test_frames_that_are_no_keyframes_are_shown_after_a_while(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = [100.0]
+    monkeypatch.setattr(live_map.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(live_map, "SHARE", 1e9)
+    walk = Pictured()
+    live = LiveMap(slam_of(walk), tmp_path)
+    lost = StepResult(0, 0.0, State.LOST, None)
+    live.offer(lost)
+    shown = read_live_map(tmp_path)
+    assert shown is not None
+    assert len(shown["points"]) == len(shown["poses"]) == 0
+    for seconds, frame in ((1.0, 0), (live_map.EVERY_S + live_map.PATIENCE_S, 2)):
+        now[0] = 100.0 + seconds
+        live.offer(StepResult(2, 0.1, State.LOST, None))
+        content = read_live_map(tmp_path)
+        assert content is not None
+        assert int(content["frame"]) == frame
+
+
+@pytest.mark.parametrize("content", [b"", b"PK", b"x" * 1000])
+def test_a_damaged_live_map_is_refused(tmp_path: Path, content: bytes) -> None:
+    (tmp_path / "live.npz").write_bytes(content)
+    with pytest.raises(ResultsError, match=r"live\.npz"):
+        read_live_map(tmp_path)

@@ -70,17 +70,17 @@ def test_points_are_seen_at_a_fine_scale_far_from_the_border(slam_map: Map) -> N
     twice = twice[twice != 3]
     slam_map.keyframes["keypoints"][:2] = torch.tensor([79.5, 59.5], dtype=torch.float64)
     slam_map.keyframes["scales"][0, :20] = 2.0
-    assert clearest_observations(slam_map, twice, 0, SIZE)[0].tolist() == [5] * 9
+    assert clearest_observations(slam_map, twice, slam_map.keyframe_rows(0), SIZE)[0].tolist() == [5] * 9
     slam_map.keyframes["scales"][0, :20] = 1.0
     slam_map.keyframes["keypoints"][1] = torch.tensor([158.0, 2.0], dtype=torch.float64)
-    frames, pixels = clearest_observations(slam_map, twice, 0, SIZE)
+    frames, pixels = clearest_observations(slam_map, twice, slam_map.keyframe_rows(0), SIZE)
     assert frames.tolist() == [0] * 9
     assert pixels.tolist() == [[79.5, 59.5]] * 9
 
 
 def test_points_that_only_another_session_observed_have_no_image_point(slam_map: Map) -> None:
     slam_map.keyframes["session"][1:] = 1
-    frames, _ = clearest_observations(slam_map, slam_map.valid_points(), 1, SIZE)
+    frames, _ = clearest_observations(slam_map, slam_map.valid_points(), slam_map.keyframe_rows(1), SIZE)
     alone = slam_map.valid_points() < 20
     assert (frames[alone] == torch.where(slam_map.valid_points()[alone] < 10, 5, -1)).all()
     assert (frames[~alone] >= 5).all()

@@ -253,7 +253,8 @@ def of_points(
     """
     values: list[Any] = [[], [], [], []]
     if len(point_ids):  # else the table may have no columns yet
-        frames, pixels = clearest_observations(slam_map, point_ids, session, size)
+        rows = slam_map.keyframe_rows(session)
+        frames, pixels = clearest_observations(slam_map, point_ids, rows, size)
         steps = STEPS / (torch.tensor(size, dtype=torch.float64, device="cpu") - 1).clamp(min=1)
         sR = S_shown_map[:3, :3]
         step, factor = error_factors(sR @ slam_map.points["covariances_w"][point_ids].double() @ sR.mT)
@@ -264,14 +265,14 @@ def of_points(
 
 
 def clearest_observations(
-    slam_map: Map, point_ids: Int[Tensor, " N"], session: int, size: tuple[int, int]
+    slam_map: Map, point_ids: Int[Tensor, " N"], keyframes: Int[Tensor, " K"], size: tuple[int, int]
 ) -> tuple[Int[Tensor, " N"], Float[Tensor, "N 2"]]:
-    """Return one observation of each point by a keyframe of a session: of a fine scale, and far from the border.
+    """Return one observation of each point by one of the keyframes: of a fine scale, and far from the border.
 
     Returns:
-        Index of the frame in the sequence, -1 for points that the session does not observe; and pixels.
+        Index of the frame in the sequence, -1 for points that none of them observes; and pixels.
     """
-    seen = slam_map.observations(slam_map.keyframe_rows(session).to(slam_map.T_cw.device))
+    seen = slam_map.observations(keyframes.to(slam_map.T_cw.device))
     half = torch.tensor(size, dtype=seen.pixels.dtype, device=seen.pixels.device) / 2
     off_center = ((seen.pixels + 0.5) / half - 1).square().sum(dim=-1) / 2  # 1 in the corners
     order = torch.argsort(seen.scales * (1 + off_center), stable=True)
@@ -311,3 +312,9 @@ def encoded(values: Num[Tensor, "*shape"] | np.ndarray | list[Any], kind: str) -
     if sys.byteorder == "big":
         array = array.byteswap()
     return {"type": kind, "data": base64.b64encode(array.tobytes()).decode("ascii")}
+
+
+def decoded(entry: dict[str, str]) -> np.ndarray:
+    """Decode the numbers of `encoded`, in one row."""
+    kind = np.dtype(entry["type"]).newbyteorder("<")
+    return np.frombuffer(base64.b64decode(entry["data"]), kind)

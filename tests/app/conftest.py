@@ -1,0 +1,84 @@
+"""A server of the page with a folder of its own, and a video of the rendered room."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import pytest
+
+from torchslam.data import open_sequence
+
+VIDEO_FRAMES = 40
+
+
+@dataclass
+class Server:
+    """A server that runs."""
+
+    process: subprocess.Popen[str]
+    folder: Path
+    address: str
+    token: str
+
+    @property
+    def port(self) -> int:
+        return int(self.address.rstrip("/").rpartition(":")[2])
+
+
+def start_server(folder: Path, *options: str) -> Server:
+    command = [sys.executable, "-m", "torchslam", "app", str(folder), "--no-browser", "--port", "0", *options]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if found := re.match(r"torchslam app: (http://\S+:\d+/)(?:\?token=(\S+))?", line):
+            return Server(process, folder, found[1], found[2] or "")
+    raise AssertionError(f"the server ended with {process.wait()}")
+
+
+def stop_server(server: Server) -> None:
+    server.process.send_signal(signal.SIGINT)
+    server.process.wait(30)
+
+
+@pytest.fixture(scope="session")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Server]:
+    for module in ("viser", "starlette", "uvicorn"):
+        pytest.importorskip(module, reason=f"the page needs {module}: pip install 'torchslam[app]'")
+    running = start_server(tmp_path_factory.mktemp("app") / "results")
+    yield running
+    stop_server(running)
+
+
+@pytest.fixture(scope="session")
+def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The first frames of the demo as a video, with a name that a careless page would execute; not in pictures."""
+    name = "room.mp4" if "TORCHSLAM_PICTURES" in os.environ else "<img src=x onerror=alert(1)> {alert(2)}.mp4"
+    path = tmp_path_factory.mktemp("video") / name
+    sequence = open_sequence("synthetic:room", resize_to="320x240", limit=VIDEO_FRAMES)
+    plain = path.with_name("plain.mp4")
+    film = cv2.VideoWriter(str(plain), cv2.VideoWriter.fourcc(*"mp4v"), 15.0, (320, 240))
+    for index in range(len(sequence)):
+        film.write(cv2.cvtColor(sequence.color(index).numpy(), cv2.COLOR_RGB2BGR))
+    film.release()
+    return plain.rename(path)
+
+
+def wait_until(is_so: object, seconds: float = 120.0) -> None:
+    """Wait until a function returns a true value."""
+    assert callable(is_so)
+    end = time.monotonic() + seconds
+    while not is_so():
+        assert time.monotonic() < end, "it took too long"
+        time.sleep(0.2)
+
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of the servers and of their runs

@@ -1,0 +1,150 @@
+"""What the page shows of results: the data of view.html, images, errors; and what is measured in it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tests.cli.conftest import finished
+from torchslam.app import reading
+from torchslam.errors import ResultsError
+from torchslam.io.results import TRAJECTORY, read_metrics, read_results
+from torchslam.io.viewer.page import decoded, encoded
+
+__all__ = ["finished"]
+
+
+@pytest.mark.parametrize("kind", ["float32", "float64", "uint8", "int8", "uint16", "int32"])
+def test_arrays_round_trip(kind: str) -> None:
+    values = np.arange(12).astype(kind).reshape(3, 4)
+    np.testing.assert_array_equal(decoded(encoded(values, kind)).reshape(3, 4), values)
+    assert decoded(encoded(values, kind)).dtype == values.dtype
+
+
+def test_a_result_has_the_data_of_the_page(finished: Path) -> None:
+    data, metrics = reading.result(finished), read_metrics(finished)
+    submap = data["submaps"][0]
+    assert len(submap["poses"]) == 12 * metrics["posed"]
+    assert len(submap["keyframe_poses"]) == 12 * metrics["keyframes"]
+    assert submap["points"].dtype == np.float32
+    assert data["summary"]["check"].endswith(metrics["check"]["sentence"])
+    assert data["timeline"].shape == (60, 600, 3)
+    frames = [int(data["frames"]["index"][row]) for row in submap["keyframe"]]
+    images = reading.thumbnails(finished, frames)
+    assert images.keys() == set(frames)
+    assert all(max(image.shape) == reading.THUMBNAIL_SIDE for image in images.values())
+    drawn, words = reading.residuals(finished, frames[0])
+    assert drawn.shape[2] == 3
+    assert words.startswith(f"frame {frames[0]}: ")
+    assert float(words.split("residual ")[1].split(" px")[0]) < 1.0
+
+
+def test_a_path_is_the_same_as_itself_and_close_to_the_truth(finished: Path) -> None:
+    positions, words = reading.compared(finished, finished / TRAJECTORY, False)
+    submap = reading.result(finished)["submaps"][0]
+    np.testing.assert_allclose(positions, submap["poses"].reshape(-1, 3, 4)[:, :, 3], atol=1e-4)
+    assert float(words.split()[1]) < 1e-6
+    _, words = reading.compared(finished, finished / "groundtruth.txt", True)
+    assert words.startswith(f"ATE {read_metrics(finished)['ate_m']:.4g} m RMSE")
+
+
+def test_the_timeline_has_states_and_breaks() -> None:
+    states = np.array([0, 1, 1, 2, 3, 1])
+    image = reading.timeline(states, np.array([0, 50, 100, 100, 0, 100]), np.arange(6) * 10, [30])
+    row = image[-1, 50::100]
+    np.testing.assert_array_equal(row, np.array(reading.STATE_COLORS)[states])
+    assert (image[0, 300] == reading.BREAK_COLOR).all()
+    assert (image[0, 150] == 245).all()  # half as high
+    assert reading.timeline(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), []).shape == (60, 600, 3)
+
+
+def crash(folder: Path) -> None:
+    os._exit(139)
+
+
+def echo(folder: Path, value: int) -> int:
+    return value
+
+
+def test_a_file_that_ends_the_reading_process_is_an_error_and_the_next_one_is_read(tmp_path: Path) -> None:
+    reader = reading.ReadingProcess()
+    try:
+        assert reader.call(echo, tmp_path, 3) == 3
+        with pytest.raises(ResultsError, match="ended its process"):
+            reader.call(crash, tmp_path)
+        assert reader.call(echo, tmp_path, 4) == 4
+        with pytest.raises(ResultsError, match=r"metrics\.json"):
+            reader.call(reading.result, tmp_path)
+    finally:
+        reader.close()
+
+
+class TestMeasures:
+    """The ruler and the plane of scene.py."""
+
+    @pytest.fixture(autouse=True)
+    def scene(self) -> Any:
+        pytest.importorskip("viser", reason="the page needs viser: pip install 'torchslam[app]'")
+        from torchslam.app import scene
+
+        self.code = scene
+        return scene
+
+    def test_the_length_of_two_points_has_their_errors(self, finished: Path) -> None:
+        submap = reading.result(finished)["submaps"][0]
+        results = read_results(finished)
+        slam_map = results.map
+        ids = slam_map.valid_points()
+        S = np.array(submap["S_shown_map"])
+        scale = np.cbrt(np.linalg.det(S[:3, :3]))
+        covariances = slam_map.points["covariances_w"][ids].double().numpy()
+        known = [row for row in range(len(ids)) if np.linalg.eigvalsh(covariances[row])[0] > 0]
+        rows = [known[0], known[-1]]
+        positions = slam_map.positions_w[ids].double().numpy()[rows]
+        between = positions[1] - positions[0]
+        along = between / np.linalg.norm(between)
+        expected_std = scale * np.sqrt(sum(along @ covariances[row] @ along for row in rows))
+        length, std = self.code.length_between(submap, rows)
+        assert length == pytest.approx(scale * np.linalg.norm(between), rel=1e-4)
+        assert std == pytest.approx(expected_std, rel=0.02)
+        unknown = submap | {"error_step": np.zeros_like(submap["error_step"])}
+        assert np.isnan(self.code.length_between(unknown, rows)[1])
+        click = self.code.click_of(submap, (640, 480), rows[0])
+        assert click is not None
+        frame, _, pixel = click.partition(":")
+        assert int(frame) in range(16)
+        x, y = map(float, pixel.split(","))
+        assert 0 <= x < 640
+        assert 0 <= y < 480
+
+    def test_a_length_is_written_to_two_digits_of_its_error(self) -> None:
+        assert self.code.length_words(1.23456, 0.0123, "m") == "1.235 ± 0.012 m"
+        assert self.code.length_words(1.23456, float("nan"), "") == "1.235 map units"
+
+    def test_a_click_means_the_nearest_point_along_its_ray(self) -> None:
+        points = np.array([[0.0, 0, 5], [0.02, 0, 2], [0, 0, -1], [3, 0, 5]])
+        eye, ahead = np.zeros(3), np.array([0.0, 0, 1])
+        assert self.code.nearest_to_ray(points, eye, ahead, 1e-2) == 1  # in front of the other
+        assert self.code.nearest_to_ray(points, eye, ahead, 1e-4) == 0  # the near one is 100 pixels away
+        assert self.code.nearest_to_ray(points, eye, np.array([0.0, 1, 0]), 1e-3) == -1
+        assert self.code.nearest_to_ray(points[:0], eye, ahead, 1e-3) == -1
+
+    def test_the_plane_of_a_floor_faces_the_eye(self) -> None:
+        rng = np.random.default_rng(0)
+        floor = np.c_[rng.uniform(-1, 1, (200, 2)), rng.normal(0, 1e-3, 200)]
+        normal = self.code.plane_normal(floor, 0, np.array([0.0, 0, 3]))
+        assert normal @ [0, 0, 1] > np.cos(np.radians(1))
+        assert self.code.plane_normal(floor, 0, np.array([0.0, 0, -3])) @ [0, 0, 1] < 0
+
+    def test_frusta_are_eight_edges_each(self) -> None:
+        pose = np.eye(3, 4)[None] + np.array([0, 0, 0, 1.0])
+        edges = self.code.outlines(pose, np.array([[-1.0, -1, 1], [1, -1, 1], [1, 1, 1], [-1, 1, 1]]))
+        assert edges.shape == (8, 2, 3)
+        assert (edges[:4, 0] == 1).all()
+        np.testing.assert_array_equal(edges[4:, 0], edges[:4, 1])
+        assert self.code.strip(np.zeros((0, 3))).shape == (0, 2, 3)
+        assert self.code.spread(10, 4).tolist() == [0, 3, 6, 9]

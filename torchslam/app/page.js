@@ -1,0 +1,79 @@
+/* Added to the page of the viewer: files are dropped or chosen, and uploaded one after the other, with their progress. */
+(() => {
+  const bar = document.createElement("div");
+  bar.id = "upload-progress";
+  bar.style.cssText =
+    "position:fixed;left:50%;top:16px;transform:translateX(-50%);z-index:9999;padding:10px 16px;border-radius:8px;" +
+    "color:#fff;font:14px system-ui,sans-serif;max-width:80vw;display:none;white-space:pre-wrap";
+  bar.addEventListener("click", () => say(""));
+  document.addEventListener("DOMContentLoaded", () => document.body.append(bar));
+  document.title = "torchslam";
+
+  function say(words, isError) {
+    bar.textContent = isError ? `${words}\n(click to close)` : words;
+    bar.style.background = isError ? "#991b1b" : "#1f2937";
+    bar.style.display = words ? "block" : "none";
+  }
+
+  /** Ask the server; XMLHttpRequest reports the progress of an upload, fetch does not. */
+  function ask(method, address, body = null, progress = () => {}) {
+    return new Promise((resolve, reject) => {
+      const request = new XMLHttpRequest();
+      request.open(method, address);
+      request.responseType = "json";
+      request.upload.onprogress = (event) => progress(event.loaded);
+      request.onload = () => {
+        if (request.status < 300) resolve(request.response);
+        else reject(new Error(request.response?.error ?? `the server answers ${request.status}`));
+      };
+      request.onerror = () => reject(new Error("the connection was lost"));
+      request.send(body);
+    });
+  }
+
+  async function upload(files, kind) {
+    const all = [...files].sort((a, b) => a.name.localeCompare(b.name, undefined, { numeric: true }));
+    const total = all.reduce((sum, file) => sum + file.size, 0);
+    const what = all.length === 1 ? all[0].name : `${all.length} files`;
+    try {
+      const { id } = await ask("POST", `/uploads?size=${total}&count=${all.length}`);
+      let before = 0;
+      for (const [position, file] of all.entries()) {
+        const progress = (sent) => say(`${what}: ${Math.floor((100 * (before + sent)) / Math.max(1, total))} % uploaded`);
+        await ask("PUT", `/uploads/${id}/${position}?name=${encodeURIComponent(file.name)}`, file, progress);
+        before += file.size;
+      }
+      say(`${what}: reading it ...`);
+      await ask("POST", `/uploads/${id}/end?kind=${kind}`);
+      say("");
+    } catch (error) {
+      say(`${what}: ${error.message}`, true);
+    }
+  }
+
+  document.addEventListener("change", ({ target }) => {
+    if (!target.matches?.("input[type=file][data-kind]") || !target.files.length) return;
+    upload(target.files, target.dataset.kind);
+    target.value = "";
+  });
+  for (const name of ["dragover", "drop"])
+    document.addEventListener(name, (event) => {
+      if (!event.dataTransfer?.types.includes("Files")) return;
+      event.preventDefault();
+      if (event.dataTransfer.files.length) upload(event.dataTransfer.files, "recording");
+    });
+  document.addEventListener("click", async ({ target }) => {
+    const { take, address } = target.closest?.("a[data-take]")?.dataset ?? {};
+    if (!take) return;
+    say(`writing ${take} ...`); // it is written on demand
+    try {
+      const link = document.createElement("a");
+      link.href = (await ask("POST", address)).address;
+      link.download = "";
+      link.click();
+      say("");
+    } catch (error) {
+      say(`${take}: ${error.message}`, true);
+    }
+  });
+})();

@@ -1,0 +1,268 @@
+"""Reads images and results in a process of its own: a damaged file can end that process, but not the server.
+
+The functions below run in that process, which alone imports torch; they return NumPy arrays.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import re
+import threading
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import TimeoutError as TooLate
+from concurrent.futures.process import BrokenProcessPool
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+
+from torchslam.errors import FrameError, ResultsError
+
+Answer = TypeVar("Answer")
+NICENESS = 5
+"""Of the process, relative to the server: a run that is watched comes first. With 10 it starved on a busy machine."""
+PATIENCE_S = 300.0
+"""Seconds after which reading is given up. Tried at this value only."""
+LIVE_SIDE, THUMBNAIL_SIDE = (
+    480,
+    96,
+)  # longer sides of the image during a run, and of those in the frusta, pixels
+MAX_KEPT = 600  # images that are kept to color the points of a run: up to 0.7 MB each
+MAX_PASSED = 4  # keyframes since the last look whose images are read as well
+UNSEEN = (150, 155, 165)  # red, green, blue of points without an image
+STATE_COLORS = ((201, 180, 88), (87, 190, 65), (190, 130, 225), (200, 85, 61))
+"""Red, green, blue of the states in the timeline, in the order of `types.State`: about those of view.html."""
+TIMELINE_SIZE, BREAK_COLOR = (600, 60), (220, 30, 30)  # width and height, pixels; red, green, blue
+
+
+class ReadingProcess:
+    """Calls functions in the other process, one after the other; it is started again after it has ended."""
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._pool = self._start()
+
+    def call(self, function: Callable[..., Answer], folder: Path, *arguments: Any) -> Answer:
+        """Return what a function of this module returns. Raises TorchslamError, also if its process ended."""
+        with self._lock:
+            try:
+                return self._pool.submit(function, folder, *arguments).result(PATIENCE_S)
+            except (BrokenProcessPool, TooLate):
+                self.close()
+                self._pool = self._start()
+        raise ResultsError(
+            f"{folder.name}: reading it ended its process, or took {PATIENCE_S:g} s: damaged files?"
+        )
+
+    def close(self) -> None:
+        """End the process, whatever it does."""
+        for each in multiprocessing.active_children():
+            each.kill()
+        self._pool.shutdown(wait=False, cancel_futures=True)
+
+    def _start(self) -> ProcessPoolExecutor:
+        pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _begin)
+        pool.submit(_import)  # now rather than with the first image
+        return pool
+
+
+def _begin() -> None:
+    import cv2
+    import torch
+
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def end_with_server() -> None:
+        parent.join()
+        os._exit(0)
+
+    threading.Thread(target=end_with_server, daemon=True).start()  # however the server ends
+    os.nice(NICENESS)
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+
+
+def _import() -> None:
+    import torchslam.cli.run
+    import torchslam.io.viewer.page  # noqa: F401
+
+
+class _Watched:
+    """The images of a run that goes on, as they are shown, from its arguments after `run`."""
+
+    def __init__(self, words: tuple[str, ...]) -> None:
+        from torchslam.cli import arguments, run
+
+        parser = argparse.ArgumentParser()
+        run.add_arguments(parser)
+        self._sequence = arguments.sequence(parser.parse_args(words))
+        self._images = dict[int, np.ndarray]()
+
+    def image(self, frame: int) -> np.ndarray:
+        """The (H, W, 3) image of a frame, red, green, blue: not larger than it is shown."""
+        if frame not in self._images:
+            if len(self._images) >= MAX_KEPT:
+                del self._images[next(iter(self._images))]
+            self._images[frame] = small(self._sequence.color(frame).numpy(), LIVE_SIDE)
+        return self._images[frame]
+
+    def colors(self, frames: np.ndarray, pixels: np.ndarray, width: float) -> np.ndarray:
+        """The (N, 3) colors of image points in frames that were shown; `UNSEEN` for the others."""
+        colors = np.full((len(frames), 3), UNSEEN, np.uint8)
+        for frame in self._images.keys() & set(np.unique(frames).tolist()):
+            image, rows = self._images[frame], frames == frame
+            at = np.round(pixels[rows] * (image.shape[1] / width)).astype(int)
+            x, y = np.clip(at, 0, np.array(image.shape[1::-1]) - 1).T
+            colors[rows] = image[y, x]
+        return colors
+
+
+@lru_cache(maxsize=1)
+def _watched(words: tuple[str, ...]) -> _Watched:
+    return _Watched(words)
+
+
+def live(folder: Path, words: tuple[str, ...], shown: int) -> dict[str, Any] | None:
+    """The content of live.npz with the colors of the points and the image of the frame, its keypoints drawn.
+
+    None if its frame is that which is shown already, or there is no file.
+    """
+    import cv2
+
+    from torchslam.io.viewer.frames import COLORS
+    from torchslam.io.viewer.live_map import read_live_map
+    from torchslam.types import State
+
+    found = read_live_map(folder)
+    if found is None or int(found["frame"]) == shown:
+        return None
+    watched, width = _watched(words), found["camera"][4]
+    passed = [
+        each for each in sorted(set(found["seen_frame"].tolist())) if shown < each < int(found["frame"])
+    ]
+    for frame in passed[:MAX_PASSED]:  # a decoder comes by them on its way
+        watched.image(frame)
+    drawn = watched.image(int(found["frame"])).copy()
+    found["colors"] = watched.colors(found["seen_frame"], found["seen_pixel"], width)
+    own = COLORS[State(str(found["state"]))][::-1]
+    for pixels, color, radius in ((found["keypoints"], UNSEEN, 1), (found["tracked"], own, 2)):
+        for x, y in np.round(pixels * (drawn.shape[1] / width)).astype(int).tolist():
+            cv2.circle(drawn, (x, y), radius, color, 1, cv2.LINE_AA)
+    return found | {"image": drawn}
+
+
+def result(folder: Path) -> dict[str, Any]:
+    """The data of view.html with arrays instead of text, the summary of the run, its camera and the timeline."""
+    from torchslam.io.report import summary
+    from torchslam.io.results import read_results
+    from torchslam.io.viewer.page import decoded, page_data
+
+    def arrays(value: Any) -> Any:
+        if isinstance(value, dict):
+            is_array = value.keys() == {"type", "data"}
+            return decoded(value) if is_array else {key: arrays(each) for key, each in value.items()}
+        return [arrays(each) for each in value] if isinstance(value, list) else value
+
+    results = read_results(folder)
+    data, breaks = arrays(page_data(results)), (results.metrics.get("check") or {}).get("breaks", [])
+    rows = summary(results.metrics) | ({"breaks": "; ".join(breaks)} if breaks else {})
+    at = [int(found[1]) for each in breaks if (found := re.search(r"between frames (\d+)", each))]
+    picture = timeline(data["frames"]["state"], data["frames"]["inliers"], data["frames"]["index"], at)
+    return data | {"camera": results.camera.params[:4].tolist(), "summary": rows, "timeline": picture}
+
+
+def timeline(states: np.ndarray, inliers: np.ndarray, indices: np.ndarray, breaks: list[int]) -> np.ndarray:
+    """A picture of all frames from left to right: inliers as height, the state as color, breaks of the check in red."""
+    (width, height), count = TIMELINE_SIZE, max(1, len(states))
+    image = np.full((height, width, 3), 245, np.uint8)
+    for x, row in enumerate(np.arange(width) * len(states) // width if len(states) else ()):
+        share = 0.15 + 0.85 * max(0, inliers[row]) / max(1, inliers.max())
+        image[height - round(share * height) :, x] = STATE_COLORS[states[row]]
+    for place in breaks:
+        x = int(np.searchsorted(indices, place)) * width // count
+        image[:, min(x, width - 2) : x + 2] = BREAK_COLOR
+    return image
+
+
+def thumbnails(folder: Path, frames: list[int]) -> dict[int, np.ndarray]:
+    """Small images of keyframes: red, green, blue; those that cannot be read are missing."""
+    from torchslam.io.results import open_run
+
+    run, found = open_run(folder), dict[int, np.ndarray]()
+    if run.main is not None:
+        images = run.images(run.scene(run.main, keyframes_alone=True))
+        for frame in frames:
+            try:
+                found[frame] = small(images.bgr(frame)[..., ::-1], THUMBNAIL_SIDE)
+            except FrameError:
+                continue
+    return found
+
+
+def residuals(folder: Path, frame: int) -> tuple[np.ndarray, str]:
+    """The image of a keyframe with its observations and ten times their residuals; and these in words."""
+    import cv2
+
+    from torchslam.geometry import transform
+    from torchslam.io.results import open_run
+
+    run = open_run(folder)
+    if run.main is None:
+        raise ResultsError("there is no map")
+    scene = run.scene(run.main, keyframes_alone=True)
+    row = int((scene.frame_ids == frame).nonzero()[0, 0])
+    seen = scene.frame_index == row
+    points_c = transform(scene.T_cw[row], scene.points_w[scene.point_index[seen]])
+    observed = scene.pixels[seen].numpy()
+    residual = scene.camera.project(points_c)[0].numpy() - observed
+    image = run.images(scene).bgr(frame)[..., ::-1]
+    drawn = small(image, 2 * LIVE_SIDE)
+    scale = drawn.shape[1] / image.shape[1]
+    starts, ends = (
+        np.round(scale * each).astype(int).tolist() for each in (observed, observed + 10 * residual)
+    )
+    for start, end in zip(starts, ends, strict=True):
+        cv2.line(drawn, start, end, (230, 70, 60), 1, cv2.LINE_AA)
+        cv2.circle(drawn, start, 2, (87, 190, 65), 1, cv2.LINE_AA)
+    middle = np.median(np.linalg.norm(residual, axis=1)) if len(observed) else np.nan
+    return (
+        drawn,
+        f"frame {frame}: {len(observed)} points, median residual {middle:.2f} px (drawn ten times as long)",
+    )
+
+
+def compared(folder: Path, other: Path, is_truth: bool) -> tuple[np.ndarray, str]:
+    """Another path, aligned by a similarity with that of a results folder in the axes in which it is shown.
+
+    Returns:
+        The (N, 3) positions, and the error in words: in meters of the other path if it is true, else in map units.
+    """
+    import torch
+
+    from torchslam.data.trajectories import read_trajectory
+    from torchslam.evaluation import evaluate
+    from torchslam.geometry import transform
+    from torchslam.io.results import TRAJECTORY, read_results
+    from torchslam.io.viewer.page import page_data
+
+    own, theirs = read_trajectory(folder / TRAJECTORY), read_trajectory(other)
+    found = evaluate(own, theirs) if is_truth else evaluate(theirs, own)
+    S = torch.linalg.inv(found.S_groundtruth_estimate) if is_truth else found.S_groundtruth_estimate
+    shown = torch.tensor(page_data(read_results(folder))["submaps"][0]["S_shown_map"], dtype=torch.float64)
+    what, unit = ("ATE", "m") if is_truth else ("difference", "units of this result")
+    words = f"{what} {found.ate_m:.4g} {unit} RMSE after Sim(3) alignment, over {len(found.errors_m)} frames"
+    return transform(shown @ S, theirs.positions_w).float().numpy(), words
+
+
+def small(image: np.ndarray, side: int) -> np.ndarray:
+    """An image that is reduced to a longer side; a smaller one as it is."""
+    import cv2
+
+    scale = min(1.0, side / max(image.shape[:2]))
+    size = [max(1, round(scale * each)) for each in image.shape[1::-1]]
+    return np.ascontiguousarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA))
