@@ -9,6 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
+import torchslam
 from tests.accelerator import SimulatedTensor
 from tests.walks import T_cw as true_T_cw
 from tests.walks import Walk, arc
@@ -54,6 +55,16 @@ def test_a_run_its_gradient_and_its_covariances(device: torch.device) -> None:
     expected = gradients(walk, CPU)
     for name, found in gradients(walk, device).items():
         torch.testing.assert_close(found, expected[name], **TOLERANCE)
+
+
+def test_a_recording_that_is_mapped_as_a_whole(device: torch.device) -> None:
+    """With a camera that is not exact, which its measurement moves."""
+    walk, config = Walk(arc(8)), load_config(None, [*NOISY, "camera.std=0.01"])
+    expected, found = (torchslam.run(walk, config, mapping="global", device=d) for d in (CPU, device))
+    assert found.by_frame is not None or found.kept is expected.kept
+    assert found.camera.params.device.type == device.type
+    assert found.check is not None
+    torch.testing.assert_close(found.trajectory.T_wc.cpu(), expected.trajectory.T_wc, rtol=1e-3, atol=1e-4)
 
 
 @pytest.mark.slow

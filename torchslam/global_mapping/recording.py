@@ -173,7 +173,7 @@ def map_recording(
             It is called only where the map of the whole is not right: no run that was lost is better than a right one.
         features: those that were extracted before, by `features_to_keep`; None: there are none.
     """
-    check = None
+    check, camera = None, camera.to(device)
     why = _loss(online) if go_on is None else f"tracking was lost at frame {online.results[-1].index}"
     if not why or mapping is Mapping.ONLINE:
         progress("check", 0, 1)
