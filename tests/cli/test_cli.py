@@ -35,7 +35,16 @@ def test_run_writes_all_results(finished: Path) -> None:
     names = {path.relative_to(finished).as_posix() for path in finished.rglob("*") if path.is_file()}
     pictures = {f"plots/{name}.png" for name in ("scene", "top_view", "errors", "features", "tracking")}
     files = {f"{name}.txt" for name in ("trajectory", "online", "keyframes", "groundtruth", "calibration")}
-    files |= {"map.safetensors", "map.ply", "config.toml", "view.html", "metrics.json", "frames.csv"}
+    files |= {
+        "map.safetensors",
+        "graph.safetensors",
+        "loops.safetensors",
+        "map.ply",
+        "config.toml",
+        "view.html",
+        "metrics.json",
+        "frames.csv",
+    }
     assert names == files | {"example.png"} | pictures
     figures = json.loads((finished / "metrics.json").read_text())
     assert figures["frames"] == 16

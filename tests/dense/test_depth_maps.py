@@ -93,7 +93,7 @@ def test_parts_of_another_camera_are_not_joined(tmp_path: Path) -> None:
         ("confidence", 1.5, "confidence: not between 0 and 1"),
         ("frame_index", 9, "frame_index: not ascending"),
         ("T_cw", torch.inf, "T_cw: not finite"),
-        ("camera.params", -1.0, "no focal lengths"),
+        ("camera.params", -1.0, "focal lengths above zero"),
     ],
 )
 def test_wrong_numbers_are_refused_with_the_name_of_the_file(

@@ -286,6 +286,16 @@ def calls() -> dict[str, Call]:
         "relative_pose_error": of(o.relative_pose_error, T_1w=T, T_2w=T_2, T_21=T),
         "log_distance_error": of(o.log_distance_error, T_1w=T, T_2w=T_2, distances=1 + rand(B)),
         "displacement_error": of(o.displacement_error, T_1w=T, T_2w=T_2, measured=rand(B, 2, 3)),
+        "pose_error": of(o.pose_error, T_cw=T, prior=T_2),
+        "direction_error": of(o.direction_error, T_cw=T, measured=rand(B, 2, 3)),
+        "plane_error": of(o.plane_error, points_w=rand(B, 3), plane=rand(B, 4)),
+        "center_error": of(o.center_error, T_cw=T, plane=rand(B, 4)),
+        "log_length_error": of(
+            o.log_length_error, first_w=rand(B, 3), second_w=2 + rand(B, 3), lengths=1 + rand(B)
+        ),
+        "bounds_error": of(
+            o.bounds_error, values=rand(B, 3), bounds=torch.stack((0.1 + rand(B, 3), 0.2 + rand(B, 3)), 1)
+        ),
         "evaluate": decision(evaluation.evaluate, estimate=estimate, groundtruth=truth),
         "ate_apart": decision(evaluation.ate_apart, parts=[estimate], groundtruth=truth),
         "ate": of(

@@ -253,7 +253,8 @@ def compared(folder: Path, other: Path, is_truth: bool) -> tuple[np.ndarray, str
     own, theirs = read_trajectory(folder / TRAJECTORY), read_trajectory(other)
     found = evaluate(own, theirs) if is_truth else evaluate(theirs, own)
     S = torch.linalg.inv(found.S_groundtruth_estimate) if is_truth else found.S_groundtruth_estimate
-    shown = torch.tensor(page_data(read_results(folder))["submaps"][0]["S_shown_map"], dtype=torch.float64)
+    S_shown_map = page_data(read_results(folder))["submaps"][0]["S_shown_map"]
+    shown = torch.tensor(S_shown_map, dtype=torch.float64, device="cpu")
     what, unit = ("ATE", "m") if is_truth else ("difference", "units of this result")
     words = f"{what} {found.ate_m:.4g} {unit} RMSE after Sim(3) alignment, over {len(found.errors_m)} frames"
     return transform(shown @ S, theirs.positions_w).float().numpy(), words

@@ -90,7 +90,7 @@ class Camera(ByValue):
     @property
     def _is_traced(self) -> bool:
         """Whether no decision may depend on values."""
-        return torch.compiler.is_compiling() or in_transform()
+        return torch.compiler.is_compiling() or in_transform() or self.params.is_meta
 
     @property
     def is_proper(self) -> Bool[Tensor, "*batch"]:

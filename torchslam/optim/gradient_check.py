@@ -127,7 +127,7 @@ def check_gradient(
         size_of = {"weights": values[name].abs(), "camera": _CAMERA_UNIT * values[name].abs()}
         unit = size_of.get(name, torch.ones_like(gradient))
         for _ in range(directions):
-            noise = torch.randn(gradient.shape, generator=generator, dtype=torch.float64)
+            noise = torch.randn(gradient.shape, generator=generator, dtype=torch.float64, device="cpu")
             along = unit * noise.to(gradient)
             wide, narrow = (
                 (moved(name, size * along) - moved(name, -size * along)) / (2 * size)

@@ -46,7 +46,10 @@ class Reading(NamedTuple):
 
     def changes(self) -> int:
         """How rare the reading is: inverted or OpenGL's axes count one, other axes or centers two, mirrored three."""
-        eye, opengl = torch.eye(3, dtype=self.axes.dtype), torch.diag(self.axes.new_tensor((1.0, -1.0, -1.0)))
+        eye, opengl = (
+            torch.eye(3, dtype=self.axes.dtype, device=self.axes.device),
+            torch.diag(self.axes.new_tensor((1.0, -1.0, -1.0))),
+        )
         known = [torch.equal(self.axes.cpu(), each.cpu()) for each in (eye, opengl)]
         of_axes = known.index(True) if any(known) else 2 + int(torch.linalg.det(self.axes) < 0)
         return self.inverted + 2 * self.swapped + of_axes

@@ -229,7 +229,7 @@ class _Refinement:
         poses = self.T_cw if given.is_world_to_camera else se3_inverse(self.T_cw)
         pairs = self.pairs[:: 1 + len(self.pairs) // MAX_PAIRS]
 
-        def pixels(view: int, rows: Int[Tensor, " M"]) -> Float[Tensor, "M 2"]:
+        def pixels(view: int, rows: Int[Tensor, " M"]) -> Float[Tensor, "N 2"]:
             return self.views[view].keypoints[rows[:: len(rows) // MATCHES][:MATCHES]]
 
         pixels_1 = torch.stack([pixels(pair.first, pair.keypoints_1) for pair in pairs])

@@ -370,7 +370,10 @@ def from_colmap(path: Path, lines: list[str], used: Collection[str] | None = Non
     kind = "fisheye" if model.endswith("FISHEYE") else ""
     coefficients = [values.get(key, 0.0) for key in MODELS[kind or "rational"].coefficients]
     intrinsics = [fx, fy, values["cx"] - HALF_PIXEL, values["cy"] - HALF_PIXEL]
-    found = checked(intrinsics, coefficients, str(path), kind, (int(width), int(height)))
+    sides = [int(side) for side in (width, height) if side.isascii() and side.isdigit()]
+    if len(sides) != 2:
+        raise CalibrationError(f"{path}: width and height must be whole numbers, got {width} and {height}")
+    found = checked(intrinsics, coefficients, str(path), kind, (sides[0], sides[1]))
     return replace(found, as_stored=True)
 
 

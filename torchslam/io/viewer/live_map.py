@@ -89,7 +89,11 @@ class LiveMap:
             "uncertain": np.isin(times.numpy(), self._uncertain),
             "breaks": np.array(gaps(times), dtype=np.int64),
         }
-        points, frames, pixels = torch.zeros(0, 3, device="cpu"), torch.zeros(0, device="cpu").long(), empty
+        points, frames, pixels = (
+            torch.zeros(0, 3, dtype=torch.float32, device="cpu"),
+            rows.new_zeros(0),
+            empty,
+        )
         if slam_map.num_points:
             ids = slam_map.valid_points()
             ids = ids[thin(len(ids), MAX_POINTS)]
