@@ -89,11 +89,8 @@ class LiveMap:
             "uncertain": np.isin(times.numpy(), self._uncertain),
             "breaks": np.array(gaps(times), dtype=np.int64),
         }
-        points, frames, pixels = (
-            torch.zeros(0, 3, dtype=torch.float32, device="cpu"),
-            rows.new_zeros(0),
-            empty,
-        )
+        points = torch.zeros(0, 3, dtype=torch.float32, device="cpu")
+        frames, pixels = torch.zeros(0, dtype=torch.int64, device="cpu"), empty
         if slam_map.num_points:
             ids = slam_map.valid_points()
             ids = ids[thin(len(ids), MAX_POINTS)]
