@@ -505,3 +505,14 @@ def test_cameras_are_values(camera: Camera) -> None:
     assert not any(camera == each for each in [*others, camera.params, Camera.stack([camera])])
     assert len({camera, *same, *others}) == 3
     assert Camera.stack([camera, others[0]]) == Camera.stack([*same[:1], others[0]])
+
+
+def test_a_step_that_leaves_a_camera_degenerate_is_noticed() -> None:
+    """What is kept of the parameters is kept until they change in place."""
+    camera = Camera.pinhole(500.0, 500.0, 320.0, 240.0, size=(640, 480))
+    ahead = torch.tensor([[0.0, 0.0, 2.0]], dtype=torch.float64)
+    assert camera.project(ahead)[1].all()
+    camera.params[0] = torch.nan
+    assert not camera.project(ahead)[1].any()
+    camera.params[0] = 500.0
+    assert camera.project(ahead)[1].all()

@@ -83,8 +83,8 @@ class Camera(ByValue):
         if self.params.shape[-1:] != (expected,):
             shape = tuple(self.params.shape)
             raise ValueError(f"a {self.model} camera has {expected} parameters, but params has shape {shape}")
-        if check_values and not (self._is_traced or bool((proper := self.is_proper).all())):
-            wrong = self.params.detach()[~proper][0].tolist()
+        if check_values and not (self._is_traced or self._are_all_proper()):
+            wrong = self.params.detach()[~self.is_proper][0].tolist()
             raise ValueError(f"a camera needs finite parameters and focal lengths above zero, got {wrong}")
 
     @property
@@ -98,13 +98,20 @@ class Camera(ByValue):
         params = self.params.detach()
         return torch.isfinite(params).all(-1) & (params[..., :2] > 0).all(-1)
 
+    def _are_all_proper(self) -> bool:
+        """`is_proper` of all cameras, kept until the parameters change in place: it takes a fifth of a projection."""
+        version = None if self.params.is_inference() else self.params._version
+        known = self.__dict__.get("_proper")
+        if version is None or known is None or known[0] != version:
+            known = self.__dict__["_proper"] = version, bool(self.is_proper.all())
+        are_proper: bool = known[1]
+        return are_proper
+
     def _without_degenerate(self) -> Camera:
         """The camera, with harmless parameters and a mark where it is not proper, in which nothing is valid."""
-        if "_usable" in self.__dict__:
+        if "_usable" in self.__dict__ or (not self._is_traced and self._are_all_proper()):
             return self
         proper = self.is_proper
-        if not self._is_traced and bool(proper.all()):
-            return self
         harmless = self.params.new_tensor((1.0, 1.0, *(0.0,) * (self.params.shape[-1] - 2)))
         camera = self.with_params(torch.where(proper[..., None], self.params, harmless))
         camera.__dict__["_usable"] = proper
