@@ -36,14 +36,8 @@ MAX_QUEUED = 20  # runs that wait; more are a mistake
 MAX_TITLE = 120  # characters of a file name that are shown
 LOG_TAIL = 1 << 14  # bytes of the log that are shown: about 100 lines
 TOOL_S = 1800.0  # seconds after which a command on a finished run is ended; tried at this value only
-STOPPED_STATUS = (
-    None,
-    130,
-    143,
-    -signal.SIGINT,
-    -signal.SIGTERM,
-    -signal.SIGKILL,
-)  # None: of another server's run
+# None: of another server's run.
+STOPPED_STATUS = (None, 130, 143, -signal.SIGINT, -signal.SIGTERM, -signal.SIGKILL)
 
 
 class State(StrEnum):

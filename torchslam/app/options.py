@@ -21,11 +21,8 @@ MARKER, HEIGHT, GPS = "marker", "camera height", "GPS file"  # sources of meters
 NO_METERS, CLICKS = "none", "clicked length, after the run"
 MAPPINGS = ("auto", "online", "global")  # as of `global_mapping.recording.Mapping`, which needs torch
 FILE_KINDS = {"camera": FILE, "gps": GPS}  # kinds of uploads, and the option that they belong to
-HIDDEN = (
-    "metric",
-    "paper",
-    "simulated",
-)  # sections: the options above have the first, the others are for studies
+# Sections: the options above have the first, the others are for studies.
+HIDDEN = ("metric", "paper", "simulated")
 MAX_SHOWN = 10**9  # limits of numbers that are shown: a browser has no larger ones in steps of 1
 
 # The arguments that a run of the page may have, and their values. None names a folder or a plugin, so that a record in

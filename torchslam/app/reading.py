@@ -27,10 +27,8 @@ NICENESS = 5
 """Of the process, relative to the server: a run that is watched comes first. With 10 it starved on a busy machine."""
 PATIENCE_S = 300.0
 """Seconds after which reading is given up. Tried at this value only."""
-LIVE_SIDE, THUMBNAIL_SIDE = (
-    480,
-    96,
-)  # longer sides of the image during a run, and of those in the frusta, pixels
+LIVE_SIDE, THUMBNAIL_SIDE = 480, 96
+"""Longer sides of the image during a run, and of those in the frusta, pixels."""
 MAX_KEPT = 600  # images that are kept to color the points of a run: up to 0.7 MB each
 MAX_PASSED = 4  # keyframes since the last look whose images are read as well
 UNSEEN = (150, 155, 165)  # red, green, blue of points without an image

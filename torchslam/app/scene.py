@@ -10,12 +10,8 @@ import viser
 from jaxtyping import Float, Int
 from viser.transforms import SO3
 
-PATH, UNCERTAIN, TRUTH, OTHER = (
-    (87, 150, 65),
-    (190, 130, 225),
-    (60, 60, 60),
-    (230, 140, 40),
-)  # red, green, blue
+# Red, green, blue.
+PATH, UNCERTAIN, TRUTH, OTHER = (87, 150, 65), (190, 130, 225), (60, 60, 60), (230, 140, 40)
 FRUSTUM, MARK = (70, 110, 190), (230, 60, 50)  # red, green, blue
 UNCERTAIN_STATE = 2  # number of `types.State.UNCERTAIN`, whose module needs torch
 MAX_FRUSTA, MAX_THUMBNAILS = 400, 48

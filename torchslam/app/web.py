@@ -34,10 +34,8 @@ if TYPE_CHECKING:
     from torchslam.app.panel import Panel
 
 UPLOADS = ".uploads"  # folder of what is being uploaded, and of what waits for its start
-COOKIE, SECRET = (
-    "torchslam-token",
-    "x-torchslam-secret",
-)  # of users, and of the connection from here to the viewer
+# Of users, and of the connection from here to the viewer.
+COOKIE, SECRET = "torchslam-token", "x-torchslam-secret"
 LOCAL = ("localhost", "127.0.0.1", "[::1]")  # names of this computer
 MAX_FILES = 10_000  # of one upload: photos of a walk
 MAX_TABS = 100  # connections to the viewer at the same time

@@ -50,11 +50,8 @@ SMALL = (
     "download",
 )  # in the module `commands`; others have their own
 
-WITHOUT_THREADS = (
-    "app",
-    "config",
-    "info",
-)  # compute nothing and import torch only where a sequence is opened
+# These compute nothing, and import torch only where a sequence is opened.
+WITHOUT_THREADS = ("app", "config", "info")
 
 
 def console() -> NoReturn:

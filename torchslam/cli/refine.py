@@ -33,9 +33,8 @@ from torchslam.refine.files import write_refined
 from torchslam.system.metric_run import run_in_meters
 from torchslam.utils.console import say, table, warn
 
-MAX_CONTRADICTED = (
-    0.5  # share of image pairs that contradict the given poses, beyond which a warning names it
-)
+MAX_CONTRADICTED = 0.5
+"""Share of image pairs that contradict the given poses, beyond which a remark says so. Tried at this value only."""
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

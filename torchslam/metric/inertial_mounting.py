@@ -89,11 +89,7 @@ def other_readings(
 def _simplest(errors: list[tuple[float, int, Tensor]]) -> tuple[float, int, Tensor]:
     """The first, which is as given, unless the least error is clearly less; the first of equals."""
     least = min(error for error, _, _ in errors)
-    return (
-        errors[0]
-        if errors[0][0] * BETTER <= least
-        else next(each for each in errors if each[0] <= least / BETTER)
-    )
+    return next(each for each in errors if each[0] <= least / BETTER)
 
 
 def _names(A: Float[Tensor, "3 3"]) -> str:

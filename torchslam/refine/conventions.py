@@ -46,11 +46,8 @@ class Reading(NamedTuple):
 
     def changes(self) -> int:
         """How rare the reading is: inverted or OpenGL's axes count one, other axes or centers two, mirrored three."""
-        eye, opengl = (
-            torch.eye(3, dtype=self.axes.dtype, device=self.axes.device),
-            torch.diag(self.axes.new_tensor((1.0, -1.0, -1.0))),
-        )
-        known = [torch.equal(self.axes.cpu(), each.cpu()) for each in (eye, opengl)]
+        simple = self.axes.new_tensor(((1.0, 1.0, 1.0), (1.0, -1.0, -1.0)))  # as they are, and OpenGL's
+        known = [torch.equal(self.axes, torch.diag(each)) for each in simple]
         of_axes = known.index(True) if any(known) else 2 + int(torch.linalg.det(self.axes) < 0)
         return self.inverted + 2 * self.swapped + of_axes
 

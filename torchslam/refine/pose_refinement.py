@@ -266,10 +266,8 @@ class _Refinement:
         self.after = self._check(reconstruction.T_cw, known, reconstruction.camera)
         self.run = self.mapper.finish(self.views, *made, self.frames, self.given)
         submap = self.run.submaps[0]
-        T_cw, given = (
-            submap.posed_frames.T_cw(submap.map),
-            self.given_cw[submap.posed_frames.frames["frame_index"]],
-        )
+        T_cw = submap.posed_frames.T_cw(submap.map)
+        given = self.given_cw[submap.posed_frames.frames["frame_index"]]
         S = align_to_input(T_cw, given)
         submap.transform(S)
         R_S = S[:3, :3] / sim3_scale(S)

@@ -200,10 +200,8 @@ def solve_bundle(
         of_all = minimization.marginals(found, detached)
         return of_all if problem.is_batch else Marginals(*(blocks[0] for blocks in of_all))
 
-    row, convergence = (
-        slice(None) if problem.is_batch else 0,
-        Convergence(*found[-4:], limit=options.iterations),
-    )
+    row = slice(None) if problem.is_batch else 0
+    convergence = Convergence(*found[-4:], limit=options.iterations)
     T_cw, points_w, params = (
         warned(x, found.success, convergence, "bundle adjustments")
         for x in (solution.T_cw, solution.points_w, params)

@@ -74,7 +74,7 @@ _INNER_STEPS, _INNER_GAIN = 3, 1e-4
 another. Three adjustments of office_loop need 147 joint steps without any, 55 with at most one, 29 with three."""
 _INNER_STEPS_BACK = 6
 """The same after a joint step that raises the cost, until each point that went back has found a better place: a joint
-step takes as long as ten of them. With the two, the rounds of courthouse need 69 joint steps in place of 93."""
+step takes as long as ten of them. So the rounds and the final adjustment of courthouse need 66 steps in place of 93."""
 _RAISED = 1e-8
 """Share of the cost by which it must rise for that: far above rounding, far below what a single point does."""
 
@@ -220,7 +220,7 @@ class SparseBundle:
         """given: of one problem; directions: (P, n) in which the parameters move, None where they stay; kinds: of
         factors"""
         self.kinds = [kind._replace(points=layout.point_rank[kind.points]) for kind in kinds]
-        self.drift_steps, self.has_drifted = 0, False
+        self.drift_steps = 0  # in a row
         self.layout, self.given, self.directions = layout, given, directions
         self.camera, self.kernel = camera, kernel
         rows = layout.observations
@@ -292,7 +292,7 @@ class SparseBundle:
         if bool(now[0].sum() > (1 + _RAISED) * model.cost):
             before = estimate._replace(points_w=model.estimate.points_w)
             then, steps = self._of_points(before), _INNER_STEPS_BACK
-            returned = then[0] < now[0]
+            returned = (then[0] < now[0]) & self.inner_points
             now = tuple(torch.where(returned, one, other) for one, other in zip(then, now, strict=True))
             points_w = torch.where(returned[:, None], before.points_w, estimate.points_w)
             estimate = estimate._replace(points_w=points_w)
@@ -344,14 +344,17 @@ class SparseBundle:
         )
         is_drift = abs(after - before) > _DRIFT and float(relative_reduction) < _DRIFT_GAIN
         self.drift_steps = self.drift_steps + 1 if is_drift else 0
-        self.has_drifted = self.drift_steps >= _DRIFT_STEPS
-        return torch.full_like(self.solvable, self.has_drifted)
+        return torch.full_like(self.solvable, self._has_drifted)
+
+    @property
+    def _has_drifted(self) -> bool:
+        return self.drift_steps >= _DRIFT_STEPS
 
     select = staticmethod(select_models)
 
     def definite(self, model: SparseModel) -> Tensor:
         """Whether (1,) all that moves is determined, up to the gauge."""
-        if self.has_drifted:
+        if self._has_drifted:
             return torch.zeros_like(self.solvable)
         return model.equations.factorized(gauge=self._gauge(model.estimate)).definite[None]
 
