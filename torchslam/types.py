@@ -448,6 +448,7 @@ class Reason(StrEnum):
     LOW_COVERAGE_RATIO = "only {ratio:.0%} of the image looks as the map predicts"
     MOVING_MAJORITY = "most of the image moves independently"
     WEAK_LINK = "weakly connected to the main map, or the check contradicts the connection"
+    ZOOM = "the focal length changes, by {ratio:.0%} from the first frame to this one"
     MOVING_REMAINDER = "{count} matches in the rest of the image move against the map"
 
     # without an online map

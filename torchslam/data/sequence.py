@@ -9,8 +9,10 @@ from enum import Enum
 from fractions import Fraction
 from typing import Any, NamedTuple, Protocol
 
+import cv2
+import numpy as np
 import torch
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, Shaped, UInt8
 from torch import Tensor
 
 from torchslam.data.calibration import UNKNOWN, Calibration, GivenCamera, size_text
@@ -18,6 +20,7 @@ from torchslam.data.trajectories import interpolate_poses
 from torchslam.errors import CalibrationError, FrameError, SequenceError
 from torchslam.geometry.camera import Camera
 from torchslam.geometry.lie import se3_inverse
+from torchslam.geometry.zoom import Zoom
 from torchslam.types import Features, Frame, Trajectory
 from torchslam.utils.console import printable, without_credentials
 
@@ -65,6 +68,7 @@ class Sequence(ABC):
         counted_until: where images have no times and are counted at some rate, half an interval after the last one.
         measurements: settings of the section `metric` that the dataset brings along, by name: files of its own sensors.
         as_stored: whether the orientation in the EXIF block of images is ignored, as the program did that calibrated.
+        zoom: that is undone in the images; None: they are as they were taken.
     """
 
     def __init__(
@@ -103,6 +107,7 @@ class Sequence(ABC):
         self.groundtruth = groundtruth
         self.notes = tuple(map(printable, notes))
         self.as_stored = False
+        self.zoom: Zoom | None = None
         self.measurements: Mapping[str, str] = {}
         self.counted_until: float | None = None
         self.holder: object = None  # of what must not go before the sequence does: unpacked files
@@ -269,6 +274,10 @@ class Sequence(ABC):
             return self
         return self.with_camera(UNKNOWN.camera(self.size, self.pixel_aspect), Calibrated.GUESSED)
 
+    def unzoomed(self, zoom: Zoom | None) -> Sequence:
+        """Return the sequence with a zoom undone in its images; None: as they were taken."""
+        return self if zoom is None else Unzoomed(self, zoom)
+
     @property
     def frame_rate(self) -> float:
         """Frames per second by the median interval; 0 for a single frame."""
@@ -345,6 +354,7 @@ class Transformed(Sequence):
         )
         self.camera_std, self.as_stored = whole.camera_std, whole.as_stored
         self.counted_until, self.measurements = whole.counted_until, whole.measurements
+        self.zoom = whole.zoom
         self._whole = whole
         self._indices = indices
         self._same_pixels = camera is None and size in (None, whole.size)
@@ -421,3 +431,56 @@ class Reader(NamedTuple):
     matches: Callable[[str], bool]
     open: Callable[..., Sequence]
     takes_need: bool = False
+
+
+class Unzoomed(Transformed):
+    """Sequence whose images are those of a camera with one focal length, see `geometry.zoom`.
+
+    Images of a longer focal length become smaller, with a margin that is masked; of those of a shorter one the margin
+    is lost.
+    """
+
+    def __init__(self, whole: Sequence, zoom: Zoom) -> None:
+        super().__init__(whole)
+        self.zoom, self._same_pixels = zoom, False
+
+    def unzoomed(self, zoom: Zoom | None) -> Sequence:
+        return self._whole.unzoomed(zoom)
+
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
+        image = super().image(index)
+        return self._undone(image[0, 0], index)[None, None]
+
+    def color(self, index: int) -> UInt8[Tensor, "H W 3"]:
+        return self._undone(super().color(index), index)
+
+    def mask(self, index: int) -> Bool[Tensor, "1 1 H W"] | None:
+        mask, (width, height) = super().mask(index), self.size
+        whole = (
+            torch.ones(height, width, dtype=torch.uint8, device="cpu") if mask is None else mask[0, 0].byte()
+        )
+        return self._undone(whole, index, is_mask=True)[None, None] > 0
+
+    def _undone(self, image: Tensor, index: int, is_mask: bool = False) -> Tensor:
+        assert self.zoom is not None
+        ratio = float(self.zoom.at(torch.tensor([index], device="cpu"))[0])
+        return unzoomed_image(image, ratio, self.camera, is_mask)
+
+
+def unzoomed_image(
+    image: Shaped[Tensor, "H W *c"], ratio: float, camera: Camera, is_mask: bool = False
+) -> Tensor:
+    """An image as the camera would have taken it with its own focal length, `ratio` times shorter.
+
+    A margin has the colors of its edge; in a mask it is 0.
+    """
+    if ratio == 1.0:
+        return image
+    cx, cy = (float(number) for number in camera.params[2:4])
+    to_image = np.array([[ratio, 0, cx * (1 - ratio)], [0, ratio, cy * (1 - ratio)]])
+    interpolation = cv2.INTER_NEAREST if is_mask else cv2.INTER_CUBIC if ratio < 1 else cv2.INTER_LINEAR
+    border = cv2.BORDER_CONSTANT if is_mask else cv2.BORDER_REPLICATE
+    flags = interpolation | cv2.WARP_INVERSE_MAP
+    warped = cv2.warpAffine(image.contiguous().numpy(), to_image, camera.size, flags=flags, borderMode=border)
+    found = torch.from_numpy(warped)
+    return found.clamp(0.0, 1.0) if found.is_floating_point() else found

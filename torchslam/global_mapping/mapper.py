@@ -75,7 +75,7 @@ from torchslam.system.front_end import (
     image_extractor,
     source,
 )
-from torchslam.system.run import Run
+from torchslam.system.run import Run, joined_zoom
 from torchslam.tracking.matcher import DescriptorMatcher, make_matcher, prepare_view
 from torchslam.types import Explanation, Frame, FrameFeatures, Reason, State, StepResult
 
@@ -466,7 +466,7 @@ class GlobalMapper:
         every = self._all_views(range(len(self.sequence)) if frames is None else frames, views, followed)
         again = None if followed is None else followed.again
         results = pose_frames(submap, every, sensor, self.config, given_cw, again)
-        final = FinalAdjustment(sensor, self.config, self.given)
+        final = FinalAdjustment(sensor, self.config, self.given, self.sequence.zoom)
         if not keep:
             final.adjust(atlas, 0, partial(self.progress, "final adjustment"), settled=True)
         return Run(
@@ -480,6 +480,8 @@ class GlobalMapper:
             given=final.given,
             calibration=final.calibration,
             shutter=final.shutter,
+            zoom=joined_zoom(self.sequence.zoom, final.zoom),
+            read_zoom=self.sequence.zoom,
         )
 
     def _overlapping(self, views: list[FrameFeatures]) -> list[FrameFeatures]:

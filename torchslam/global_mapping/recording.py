@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, fields, replace
 from enum import StrEnum
@@ -35,6 +36,9 @@ LOOP_MATCHES = 40
 """Verified matches of a pair of similar places that counts. On kitti07, which visits no place twice, three have 22 to
 30; where places are visited again, most have more than 40 (machine_hall, office_loop)."""
 
+LARGE_ZOOM = 0.03
+"""Change of the logarithm of the focal length from which on a recording is processed again without it, or its frames
+are doubtful: by less, the map is the same, and is adjusted to corrected keypoints. Tried at this value only."""
 UNMEASURED = "interrupted; `torchslam align` measures later"
 """Why an interrupted run has an arbitrary unit."""
 KeyframePairs = tuple[list[FrameFeatures], list[ViewPair]]
@@ -122,27 +126,68 @@ def run_recording(
         stages, features: as in `map_recording`.
         all_frames: whether all frames are processed online, even after tracking was lost.
     """
-    config, observer, sources = online.slam.config, online.observer, list(sources)
+    sources, original = list(sources), sequence
+    sequence = original.unzoomed(online.slam.zoom)
+    run = _mapped(online, sequence, mapping, device, stages, features, all_frames)
+    if mapping is not None and online.slam.zoom is None and _is_zoomed(run):
+        assert run.zoom is not None
+        # Maps that were made with one focal length are wrong; features of zoomed images are elsewhere.
+        online, sequence = online.anew(run.zoom), original.unzoomed(run.zoom)
+        run = _mapped(online, sequence, mapping, device, stages, None, all_frames)
+    if run.interrupted:
+        return replace(run, unmeasured=(UNMEASURED,) if sources else ())
+    if _is_zoomed(run):
+        run = replace(run, results=with_doubtful_zoom(run))
+    try:
+        return run_in_meters(run, original.unzoomed(run.zoom), sources)
+    except KeyboardInterrupt:
+        return replace(run, interrupted=True, unmeasured=(UNMEASURED,) if sources else ())
+
+
+def _mapped(
+    online: OnlineRun,
+    sequence: Sequence,
+    mapping: Mapping | None,
+    device: torch.device | str,
+    stages: Path | None,
+    features: KeptFeatures | None,
+    all_frames: bool,
+) -> MappedRun:
+    """Process the frames, check their map, and map the recording as a whole where needed; see `run_recording`."""
+    config, observer = online.slam.config, online.observer
     length = sequence.known_length
     are_all_mapped = length is not None and length <= config.global_mapping.window_images
     may_map = mapping in (Mapping.AUTO, Mapping.GLOBAL)
     run = MappedRun.of(online.run(until_lost=may_map and are_all_mapped and not all_frames))
-    if mapping is not None and not run.interrupted:
-        go_on = None if online.is_finished else online.run
-        try:
-            with observer.whole():
-                camera = sequence.camera
-                run = map_recording(
-                    sequence, run, config, camera, mapping, device, observer.stage, stages, go_on, features
-                )
-        except KeyboardInterrupt:
-            run = replace(MappedRun.of(online.end()), interrupted=True)
-    if not run.interrupted:
-        try:
-            return run_in_meters(run, sequence, sources)
-        except KeyboardInterrupt:
-            run = replace(run, interrupted=True)
-    return replace(run, unmeasured=(UNMEASURED,) if sources else ())
+    if mapping is None or run.interrupted or (_is_zoomed(run) and run.read_zoom is None):
+        return run
+    go_on = None if online.is_finished else online.run
+    try:
+        with observer.whole():
+            camera = sequence.camera
+            return map_recording(
+                sequence, run, config, camera, mapping, device, observer.stage, stages, go_on, features
+            )
+    except KeyboardInterrupt:
+        return replace(MappedRun.of(online.end()), interrupted=True)
+
+
+def _is_zoomed(run: Run) -> bool:
+    """Whether the focal length changed so much in the images of a run that its map is doubtful."""
+    return run.found_zoom is not None and run.found_zoom.extent > LARGE_ZOOM
+
+
+def with_doubtful_zoom(run: Run) -> list[StepResult]:
+    """The results with frames whose focal length is another one than the map was made with called uncertain."""
+    assert run.found_zoom is not None
+    frames = torch.tensor([result.index for result in run.results], device="cpu")
+    results = list[StepResult]()
+    for result, ratio in zip(run.results, run.found_zoom.at(frames).tolist(), strict=True):
+        if abs(math.log(ratio)) > LARGE_ZOOM and result.state is State.TRACKING:
+            reasons = (Explanation(Reason.ZOOM, {"ratio": ratio - 1}),)
+            result = replace(result, state=State.UNCERTAIN, reasons=reasons)
+        results.append(result)
+    return results
 
 
 def map_recording(

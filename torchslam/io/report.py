@@ -13,6 +13,7 @@ from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import Evaluation, ate_apart, evaluate
 from torchslam.geometry import transform
+from torchslam.geometry.zoom import Zoom
 from torchslam.global_mapping.recording import MappedRun
 from torchslam.metric.options import KINDS
 from torchslam.system.run import Run
@@ -54,6 +55,7 @@ def compute_metrics(
         "camera": camera,
         "rolling_shutter": shake_remark(finished),
         "readout": readout_metrics(finished),
+        "zoom": None if finished.zoom is None else finished.zoom.plain,
     }
     changes = [
         {"frame": change.frame, "focal_px": float(change.camera.focal)}
@@ -275,6 +277,7 @@ def summary(metrics: Mapping[str, Any]) -> dict[str, str]:
     rows |= _describe_submaps(metrics)
     rows |= {"camera": metrics["camera"]} if metrics.get("camera") else {}
     rows |= {"readout": readout_words(readout)} if (readout := metrics.get("readout")) else {}
+    rows |= {"zoom": zoom_words(Zoom.from_plain(zoom))} if (zoom := metrics.get("zoom")) else {}
     if metrics["fps"]:  # frames were processed one by one
         rows["speed"] = (
             f"{metrics['fps']:.1f} frames/s; {metrics['ms_median']:.0f} ms a frame (median), "
@@ -299,6 +302,16 @@ def readout_words(readout: Mapping[str, Any]) -> str:
         f"{readout['ms']:.1f} ± {readout['std_ms']:.1f} ms from the first row to the last ({source}): "
         "rolling shutter, corrected in the final poses"
     )
+
+
+def zoom_words(zoom: Zoom) -> str:
+    """Describe a zoom by its extremes."""
+    low, high = int(zoom.ratios.argmin()), int(zoom.ratios.argmax())
+    places = ", ".join(
+        f"{float(zoom.ratios[row]):.3f} times that of the first frame at frame {int(zoom.frames[row])}"
+        for row in sorted((low, high))
+    )
+    return f"the focal length changes: {places}; undone in keypoints and poses"
 
 
 def _describe_submaps(metrics: Mapping[str, Any]) -> dict[str, str]:

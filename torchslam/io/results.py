@@ -22,6 +22,7 @@ from torchslam.errors import ResultsError, TrajectoryError
 from torchslam.evaluation import Evaluation, evaluate
 from torchslam.geometry import Camera, rigid, transform
 from torchslam.geometry.rolling_shutter import MAX_READOUT, Readout
+from torchslam.geometry.zoom import Zoom
 from torchslam.global_mapping.saved_stages import delete_stages
 from torchslam.io.export.ply import read_cloud, upright_from_map
 from torchslam.io.export.scene import (
@@ -104,6 +105,12 @@ class SavedRun:
         return readout_of(self.metrics)
 
     @property
+    def zoom(self) -> Zoom | None:
+        """The zoom of the images, which is undone in all keypoints; None: one focal length."""
+        plain = self.metrics.get("zoom")
+        return None if plain is None else Zoom.from_plain(plain)
+
+    @property
     def graph(self) -> RunGraph:
         """All observations as one differentiable problem, as `Run.graph`. Raises ResultsError if it is missing."""
         path = self.directory / GRAPH
@@ -145,7 +152,7 @@ class SavedRun:
             example = ExampleFrame(frame, time, read_gray(image, str(image)))
         files = {result.index: file for result, file in _read_rows(self.directory / FRAMES) if file}
         as_stored = self.metrics.get("source_as_stored") is True
-        source = ImageSource(path, self.metrics.get("source_fps"), files, example, as_stored)
+        source = ImageSource(path, self.metrics.get("source_fps"), files, example, as_stored, self.zoom)
         return open_images(source, scene, pinhole, otherwise)
 
 
@@ -331,6 +338,13 @@ def _is_readout(value: Any) -> bool:
     return value is None or all(_is_number(each) and abs(each) <= 1e3 * MAX_READOUT for each in numbers)
 
 
+def _is_zoom(value: object) -> bool:
+    try:
+        return value is None or bool(Zoom.from_plain(value))
+    except ValueError:
+        return False
+
+
 def _are_submaps(value: object) -> bool:
     submaps = value if isinstance(value, list) else [None]
     return all(isinstance(submap, dict) and _is_count(submap.get("submap")) for submap in submaps)
@@ -342,6 +356,7 @@ _METRIC_CHECKS: dict[str, Callable[[Any], bool]] = {
     "submaps": _are_submaps,
     "ate_m": _is_number,
     "readout": _is_readout,
+    "zoom": _is_zoom,
     **dict.fromkeys(("session", "posed", "keyframes"), _is_count),
     "failure": lambda value: isinstance(value, str),
     "source": lambda value: value is None or isinstance(value, str),

@@ -57,6 +57,7 @@ def write_run(
         folder: the results folder.
         plots, viewer: whether to draw the plots and to write the viewer page.
     """
+    sequence = sequence.unzoomed(run.zoom)
     colorize_points([submap.map for submap in run.submaps], sequence, run.session)
     write_results(run, sequence, metrics, folder)
     redraw(folder, plots, viewer)

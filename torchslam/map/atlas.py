@@ -14,8 +14,9 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from torchslam.geometry import SensorModel, sim3_inverse, sim3_scale
+from torchslam.geometry import Camera, SensorModel, sim3_inverse, sim3_scale
 from torchslam.geometry.transforms import carry_points, covariances_with_unit, with_unit, without_scale
+from torchslam.geometry.zoom import Zoom
 from torchslam.map.map import Map
 from torchslam.map.posed_frames import PosedFrames
 from torchslam.map.unit import MetricUnit
@@ -135,6 +136,10 @@ class Submap:
         """Set the keypoints of keyframes to those of a global shutter; `newest`: how many of them, None: all."""
         rows = None if newest is None else torch.argsort(self.map.keys, descending=True)[:newest]
         self.posed_frames.correct_keyframes(self.map, sensor, rows)
+
+    def undo_zoom(self, zoom: Zoom, camera: Camera) -> None:
+        """Undo a zoom in the keypoints of all frames, which are of one session."""
+        self.posed_frames.undo_zoom(self.map, zoom, camera)
 
     def apply_sim3_correction(self, S_cw: Float[Tensor, "K 4 4"]) -> None:
         """Move every keyframe to the pose of its Sim(3) S_cw, world to camera.

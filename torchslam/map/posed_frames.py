@@ -10,8 +10,10 @@ from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
 from torchslam.geometry import CHI_SQUARE_95, KeypointNoise, SensorModel, passes_gate, se3_inverse, transform
+from torchslam.geometry.camera import Camera
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import frame_velocities, global_shutter_pixels
+from torchslam.geometry.zoom import Zoom
 from torchslam.map.map import Map, key_of
 from torchslam.map.table import FRAMES, OBSERVATIONS, Table
 from torchslam.optim.run_graph import GraphSolution, RunGraph
@@ -244,6 +246,14 @@ class PosedFrames:
         depths = torch.where(depths.isnan(), depths.nanmedian(dim=1, keepdim=True).values, depths)
         corrected = sensor.at_middle_row(detected, velocities, depths)
         table["keypoints"][rows] = torch.where(corrected.isfinite(), corrected, detected)
+
+    def undo_zoom(self, slam_map: Map, zoom: Zoom, camera: Camera) -> None:
+        """Undo a zoom in the keypoints of keyframes and frames, which are of one session."""
+        table, seen = slam_map.keyframes, self.observations
+        for name in ("detected", "keypoints"):
+            table[name][:] = zoom.undone(table[name], table["frame_index"], camera)
+        frames = self.frames["frame_index"][seen["frame_row"]]
+        seen["pixels"][:] = zoom.undone(seen["pixels"], frames, camera)
 
     def at_middle_row(
         self, views: Sequence[FrameFeatures], slam_map: Map, sensor: SensorModel

@@ -21,6 +21,7 @@ from torchslam.errors import ResultsError
 from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import with_radial_terms
 from torchslam.geometry.rolling_shutter import Readout
+from torchslam.geometry.zoom import Zoom
 from torchslam.loop_closing.records import pack_closures, unpack_closures
 from torchslam.map.atlas import TrackingState
 from torchslam.map.file import SavedAtlas, pack_submaps, read_tensors, unpack_submaps, write_tensors
@@ -77,6 +78,7 @@ def write_checkpoint(path: str | Path, slam: SLAM, so_far: RunProgress, sequence
         "pending_estimate": _plain_estimate(slam.online_camera.pending),
         "readout": _plain_readout(slam.shared_camera.model.readout),
         "loop_closures": closures,
+        "zoom": None if slam.zoom is None else slam.zoom.plain,
     }
     write_tensors(
         path,
@@ -115,6 +117,7 @@ def read_checkpoint(
     slam = SLAM(saved.camera, config, extractor)
     try:
         so_far = RunProgress(run["next"], _results(own, run, device), run["skipped"])
+        slam.zoom = None if run["zoom"] is None else Zoom.from_plain(run["zoom"])
         _restore(slam, saved, own, run, device)
     except (
         KeyError,
@@ -135,7 +138,8 @@ def input_hash(of: Sequence | Config) -> str:
         return fingerprint([to_toml(of)])
     files = [of.file_name(index) for index in range(len(of.timestamps))]
     camera = of.camera
-    about = [of.name, camera.model, camera.size, camera.params.tolist(), of.known_length, files]
+    about: list[object] = [of.name, camera.model, camera.size, camera.params.tolist(), of.known_length, files]
+    about += [] if of.zoom is None else [of.zoom.plain]
     return fingerprint([about, of.timestamps.cpu().numpy().tobytes()])
 
 

@@ -13,12 +13,14 @@ from torchslam.config import Config
 from torchslam.geometry import Camera, SensorModel
 from torchslam.geometry.camera_measurement import CameraMeasurement, with_radial_terms
 from torchslam.geometry.gating import passes_gate
+from torchslam.geometry.zoom import Zoom
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.mapping.local_bundle import adjust_all, noise_variance, squared_errors
 from torchslam.optim import GRAPH_OPTIONS, Progress, SolverOptions, pose_covariance
 from torchslam.optim.rolling_shutter import RollingShutter, ShakingTest
 from torchslam.optim.run_graph import GraphSolution, RunGraph, keyframe_problem, solve_graph
 from torchslam.optim.sensor_estimate import SensorPrior, estimate_sensor, graph_evidence
+from torchslam.optim.zoom import find_zoom, with_jumps
 from torchslam.system.online_camera import given_readout
 
 FINAL_CHI_SQUARE = 1.5**2
@@ -53,21 +55,31 @@ class FinalAdjustment:
             solution. None until then, and where the camera is exact.
         calibration: the camera of `sensor` with its error; None as `given`.
         shutter: the residuals as functions of the readout; None where that was not tested.
+        zoom: that was found and undone in the keypoints of the maps; None: one focal length.
     """
 
-    def __init__(self, sensor: SensorModel, config: Config, measured: CameraMeasurement | None) -> None:
+    def __init__(
+        self,
+        sensor: SensorModel,
+        config: Config,
+        measured: CameraMeasurement | None,
+        undone: Zoom | None = None,
+    ) -> None:
         """Create the adjustment.
 
         Args:
             sensor: of the maps as they are.
             config: the configuration.
             measured: the given camera with its error; None if it is exact.
+            undone: the zoom that is undone in the images.
         """
+        self.has_zoom = undone is not None
         self.sensor, self.is_wanted = sensor, not config.paper.unrefined
         self.prior = SensorPrior(measured, given_readout(config.camera))
         self.given: CameraMeasurement | None = None
         self.calibration: CameraMeasurement | None = None
         self.shutter: RollingShutter | None = None
+        self.zoom: Zoom | None = None
         self._progress: Progress | None = None
         self._free: CameraMeasurement | None = (
             None  # prior of the camera in the next solution; None: it is held
@@ -93,15 +105,17 @@ class FinalAdjustment:
         if main is None or not self.is_wanted:
             return
         self._progress, self._free = progress, self.prior.camera
-        for step in self._steps(settled, is_main=True):
+        for step in self._steps(settled, is_main=True, may_zoom=session == 0):
             step(main)
         self._free = None
         for submap in atlas:
             if submap is not main:
+                if self.zoom is not None:
+                    submap.undo_zoom(self.zoom, self.sensor.camera)
                 for step in self._steps(settled, is_main=False):
                     step(submap)
 
-    def _steps(self, settled: bool, is_main: bool) -> list[_Step]:
+    def _steps(self, settled: bool, is_main: bool, may_zoom: bool = False) -> list[_Step]:
         """The steps of a submap. The rounds of a settled map have adjusted and rejected already."""
         roughly, exactly = partial(self._solve, options=ROUGH), partial(self._solve, options=FINAL)
         # Where a readout is found, it is estimated once more by better poses.
@@ -109,15 +123,17 @@ class FinalAdjustment:
         shutter: list[_Step] = [partial(self._estimate_readout, shaking=test)] if is_main else []
         noise: list[_Step] = [self._estimate_noise] if is_main else []
         camera: list[_Step] = [self._choose_camera] if is_main else []
+        zoom: list[_Step] = [self._undo_zoom] if may_zoom and self._free is not None else []
         end: list[_Step] = [self._correct, self._state_camera, self._store_covariances]
         if settled:
             exactly = partial(self._solve, options=SETTLED)
-            return [self._remove_outliers, *shutter, self._correct, *noise, *camera, exactly, *end]
+            return [self._remove_outliers, *shutter, self._correct, *zoom, *noise, *camera, exactly, *end]
         first: list[_Step] = [self._adjust_keyframes, self._remove_outliers, roughly]
         # The readout before outliers leave, since many of them are what a rolling shutter shifts in fast turns.
         first += [*shutter, partial(self._solve_by_other_readout, options=ROUGH)] if is_main else []
         again: list[_Step] = [self._refine_readout] if is_main else []
-        return [*first, self._correct, self._reject, *noise, roughly, *again, *camera, exactly, *end]
+        # A zoom as well: many of the outliers are what it moves.
+        return [*first, self._correct, *zoom, self._reject, *noise, roughly, *again, *camera, exactly, *end]
 
     def _adjust_keyframes(self, submap: Submap) -> None:
         """Adjust keyframes and points alone: the frames in between follow them."""
@@ -144,6 +160,23 @@ class FinalAdjustment:
     def _refine_readout(self, submap: Submap) -> None:
         if self.sensor.readout is not None:
             self._estimate_readout(submap, ShakingTest.ALWAYS)
+
+    def _undo_zoom(self, submap: Submap) -> None:
+        """Undo a zoom in the keypoints of all frames, if there is one, and adjust the map to them."""
+        assert self._free is not None
+        graph = submap.posed_frames.graph(submap.map, self.sensor)
+        found = find_zoom(graph, self._free, ROUGH, self.has_zoom)
+        if found is None or not (found.is_found or (self.has_zoom and found.gain.total > 0)):
+            return
+        self.zoom = found.zoom
+        submap.undo_zoom(self.zoom, self.sensor.camera)
+        self._use(found.camera)
+        self._solve(submap, ROUGH)
+        with_jumps_too = with_jumps(self._graph(submap), self.zoom, ROUGH)
+        submap.undo_zoom(with_jumps_too.beyond(self.zoom), self.sensor.camera)
+        self.zoom = with_jumps_too
+        self._solve(submap, ROUGH)
+        self._correct(submap)
 
     def _reject(self, submap: Submap) -> None:
         """Remove observations that are far from their points.

@@ -14,13 +14,14 @@ import torch
 from torchslam.data.sequence import EndOfSequence, Frames, Sequence
 from torchslam.errors import FrameError, TorchslamError
 from torchslam.geometry import Camera, SharedCamera
+from torchslam.geometry.zoom import Zoom
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.optim import Progress
 from torchslam.parallel.workers import RunningSystem, with_workers
 from torchslam.system.final_adjustment import FinalAdjustment
 from torchslam.system.front_end import source
 from torchslam.system.online_camera import OnlineCamera
-from torchslam.system.run import Run
+from torchslam.system.run import Run, joined_zoom
 from torchslam.system.session import Session
 from torchslam.types import Frame, Reason, State, StepResult
 
@@ -33,6 +34,10 @@ class _System(RunningSystem, Protocol):
     session: Session
     loop_closer: LoopCloser
     last_frame: tuple[int, float] | None
+    zoom: Zoom | None
+
+    def reset(self) -> None:
+        """Forget all maps."""
 
     def step(self, frame: Frame) -> StepResult:
         """Process one frame."""
@@ -114,7 +119,8 @@ class OnlineRun:
         processes: int | None = 1,
         observer: Observer | None = None,
     ) -> None:
-        self.slam, self.sequence, self.processes = slam, source(sequence, slam.config, slam.camera), processes
+        self.slam, self.processes = slam, processes
+        self.sequence = source(sequence.unzoomed(slam.zoom), slam.config, slam.camera)
         self.so_far = RunProgress() if so_far is None else so_far
         self.observer = Observer() if observer is None else observer
         self._finished: Run | None = None
@@ -128,6 +134,14 @@ class OnlineRun:
     def is_finished(self) -> bool:
         """Whether all frames were processed, or the run was ended."""
         return self._finished is not None
+
+    def anew(self, zoom: Zoom) -> OnlineRun:
+        """Return a run of the same frames from the beginning, with a zoom undone in their images."""
+        self.slam.reset()
+        self.slam.zoom, self.so_far.next = zoom, 0
+        self.so_far.results.clear()
+        self.so_far.skipped.clear()
+        return OnlineRun(self.slam, self.sequence, self.so_far, self.processes, self.observer)
 
     def run(self, until_lost: bool = False) -> Run:
         """Process the frames that are left; with `until_lost` the run may stop before its end, unadjusted."""
@@ -143,7 +157,8 @@ class OnlineRun:
             if are_all_processed:
                 return self.end(interrupted=False)
         sensor, maps = slam.shared_camera.model, tuple(slam.session.atlas)
-        return Run(maps, sensor, slam.config, so_far.results, so_far.skipped, False, failure="")
+        results, skipped = list(so_far.results), list(so_far.skipped)
+        return Run(maps, sensor, slam.config, results, skipped, False, failure="", read_zoom=slam.zoom)
 
     def _process(self, frames: Frames, until_lost: bool) -> bool:
         """Process the frames that are left, with `until_lost` up to one in which tracking was lost; were these all?"""
@@ -170,7 +185,7 @@ class OnlineRun:
     def end(self, interrupted: bool = True) -> Run:
         """Adjust the map of the frames so far, once; the others are not processed."""
         if self._finished is None:
-            results, skipped = self.so_far.results, self.so_far.skipped
+            results, skipped = list(self.so_far.results), list(self.so_far.skipped)
             self._finished = finish(self.slam, results, skipped, interrupted, self.observer.adjusting)
         return self._finished
 
@@ -185,7 +200,7 @@ def finish(
     """Adjust all maps if so configured, and return the run; `adjusting` is called before each iteration."""
     with torch.inference_mode():
         slam.finalize()
-    final = FinalAdjustment(slam.shared_camera.model, slam.config, slam.online_camera.given)
+    final = FinalAdjustment(slam.shared_camera.model, slam.config, slam.online_camera.given, slam.zoom)
     try:
         if slam.session.mapping:
             final.adjust(slam.session.atlas, slam.session.number, adjusting)
@@ -207,6 +222,8 @@ def finish(
         final.calibration,
         tuple(slam.online_camera.changes),
         final.shutter,
+        zoom=joined_zoom(slam.zoom, final.zoom),
+        read_zoom=slam.zoom,
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
@@ -11,6 +11,7 @@ from torchslam.errors import InitializationError
 from torchslam.geometry import Camera, SensorModel, se3_inverse
 from torchslam.geometry.camera_measurement import CameraMeasurement
 from torchslam.geometry.rolling_shutter import Readout
+from torchslam.geometry.zoom import Zoom
 from torchslam.loop_closing.loop_detector import LoopClosureRecord
 from torchslam.map.atlas import Submap, main_submap
 from torchslam.map.map import Map
@@ -43,6 +44,8 @@ class Run:
         camera_changes: cameras that the map took over while the run went on.
         shutter: what the residuals say of it; None where that was not tested.
         unmeasured: one line for each source of meters that said nothing of the main submap.
+        zoom: of the recording, undone in all keypoints; None: one focal length.
+        read_zoom: the part of it that was undone in the images that the run read.
     """
 
     submaps: tuple[Submap, ...]
@@ -60,6 +63,8 @@ class Run:
     camera_changes: tuple[CameraChange, ...] = ()
     shutter: RollingShutter | None = None
     unmeasured: tuple[str, ...] = ()
+    zoom: Zoom | None = None
+    read_zoom: Zoom | None = None
 
     @property
     def metric(self) -> MetricUnit | None:
@@ -120,10 +125,18 @@ class Run:
         """The readout of a rolling shutter, given or found; None: a global shutter."""
         return self.sensor.readout
 
+    @property
+    def found_zoom(self) -> Zoom | None:
+        """The zoom of the images that the run read; None: one focal length."""
+        return None if self.zoom is None else self.zoom.beyond(self.read_zoom)
+
     def at_middle_row(self, views: list[FrameFeatures]) -> list[FrameFeatures]:
-        """Views of frames of the main submap with the keypoints of a global shutter; others as they are."""
+        """Views without a zoom that was found, those of frames of the main submap with the keypoints of a global
+        shutter."""
         if self.main is None:
             return views
+        if (zoom := self.found_zoom) is not None:
+            views = [_unzoomed(view, zoom, self.camera) for view in views]
         return self.posed_frames.at_middle_row(views, self.map, self.sensor)
 
     def _given_in(self, number: int) -> Trajectory:
@@ -151,3 +164,19 @@ class Run:
 
     def _graph_of(self, submap: Submap) -> RunGraph:
         return submap.posed_frames.graph(submap.map, self.sensor, submap.number, self.given)
+
+
+def _unzoomed(view: FrameFeatures, zoom: Zoom, camera: Camera) -> FrameFeatures:
+    """A view with a zoom undone in its keypoints."""
+    frame = torch.tensor([view.index], device=view.keypoints.device)
+    keypoints, detected = (
+        zoom.undone(pixels[None], frame, camera)[0] for pixels in (view.keypoints, view.detected)
+    )
+    return replace(view, keypoints=keypoints, detected=detected)
+
+
+def joined_zoom(undone: Zoom | None, found: Zoom | None) -> Zoom | None:
+    """The zoom of a recording: what was undone in its images, then what was found in those."""
+    if undone is None or found is None:
+        return undone or found
+    return undone.then(found)

@@ -22,6 +22,7 @@ from torchslam.data.formats.image_file import image_tensor
 from torchslam.data.sequence import Sequence
 from torchslam.errors import ConfigError
 from torchslam.geometry import Camera, SensorModel, SharedCamera
+from torchslam.geometry.zoom import Zoom
 from torchslam.loop_closing.loop_closer import LoopCloser
 from torchslam.map.atlas import Atlas, Submap
 from torchslam.map.map import Map, feature_mismatch, key_of
@@ -92,6 +93,7 @@ class SLAM:
 
     def reset(self) -> None:
         """Forget all submaps, and wait for a new initialization."""
+        self.zoom: Zoom | None = None  # that is undone in the images of its frames
         self.shared_camera.use(SensorModel(self.camera))
         self.start_session(Session(self.camera, Atlas(self.camera.params)))
 

@@ -26,6 +26,7 @@ from torchslam.data.transforms import resize, scale_camera
 from torchslam.errors import FrameError, ResultsError, SequenceError
 from torchslam.geometry import Camera, SensorModel, se3_inverse, squared_reprojection_errors, transform
 from torchslam.geometry.rolling_shutter import Readout
+from torchslam.geometry.zoom import Zoom
 from torchslam.map.atlas import Submap
 
 MAX_GROWTH = 2.0  # of width and height; a pinhole image diverges at 90 degrees from the axis
@@ -287,6 +288,7 @@ class ImageSource:
         files: file of each frame, if frames are files; a file is a frame's own, a time that was counted is not.
         example: frame by whose image the sequence is recognized; None if there is none.
         as_stored: whether the run ignored the EXIF orientation of images.
+        zoom: of the run, which is undone in the images; None: one focal length.
     """
 
     path: str
@@ -294,6 +296,7 @@ class ImageSource:
     files: Mapping[int, str] = field(default_factory=dict)
     example: ExampleFrame | None = None
     as_stored: bool = False
+    zoom: Zoom | None = None
 
 
 def open_images(
@@ -326,6 +329,8 @@ def open_images(
     except SequenceError as error:
         raise ResultsError(f"the sequence of this run cannot be read: {error}; {otherwise}") from None
     rows, example = _image_rows(sequence, source, times, otherwise), source.example
+    if source.zoom is not None:
+        sequence = sequence.with_camera(scene.camera).unzoomed(_of_rows(source.zoom, rows))
     if example is not None and example.frame_id in rows:
         try:
             found = sequence.image(rows[example.frame_id])
@@ -337,6 +342,13 @@ def open_images(
                 f"did; {otherwise}"
             )
     return Images(sequence, rows, scene.camera, pinhole)
+
+
+def _of_rows(zoom: Zoom, rows: Mapping[int, int]) -> Zoom:
+    """The zoom of a run by the rows of the sequence that its frames are; rows: index in the sequence of each frame."""
+    ids = sorted(rows, key=rows.__getitem__)
+    frames = torch.tensor(ids, dtype=torch.int64, device="cpu")
+    return Zoom(torch.tensor([rows[each] for each in ids], dtype=torch.int64, device="cpu"), zoom.at(frames))
 
 
 def _image_rows(

@@ -19,7 +19,7 @@ from torchslam.optim._core.residuals import Linearization, flatness, variance_fa
 from torchslam.optim.bundle._problem import BundleData, BundleEstimate, BundleProblem, sanitized
 from torchslam.optim.bundle._schur import BundleTangent, FactorizedEquations
 from torchslam.optim.bundle._solve import BundleMinimization
-from torchslam.optim.bundle._sparse import SparseBundle
+from torchslam.optim.bundle._sparse import SparseBundle, SparseLayout
 
 
 class CameraScores(NamedTuple):
@@ -71,12 +71,8 @@ def camera_scores(
     frames, points = (
         torch.stack([column[part] for column in columns], dim=-1) @ block for part in range(2)
     )  # (K', 6, n), (N, 3, n)
-    moved = frames.new_zeros(len(estimate.T_cw), 6, n).index_copy(0, layout.free_frames, frames)
-    moved = moved[layout.frame_index]
-    rays_w = rays_w.mT[..., None].expand(-1, -1, n)
-    velocity = moved[:, :3] + torch.linalg.cross(moved[:, 3:], rays_w, dim=1) + points[layout.point_index]
     J = J.permute(2, 0, 1)
-    M = J[..., :3] @ velocity + J[..., 3:]
+    M = J[..., :3] @ _velocities(layout, estimate, rays_w, frames, points) + J[..., 3:]
     scores = -(M.mT @ lin.gradient_wrt_residual[..., None])[..., 0]
     unknowns = 6 * len(layout.free_frames) + 3 * int(layout.free_points.sum()) + n
     return CameraScores(
@@ -86,6 +82,84 @@ def camera_scores(
         layout.point_order[layout.point_index],
         variance_factor(bundle.observations, lin, unknowns),
     )
+
+
+class FocalScores(NamedTuple):
+    """The efficient scores of the focal lengths of frames, by observation that counts.
+
+    Attributes:
+        slopes: what an observation sees of a step of the logarithm of each focal length, in whitened pixels, where
+            frames, points and the common camera follow it to their minimum.
+        residuals: whitened, times `weight`; weight: of each residual by the kernel.
+        frame_index, point_index, variance: as of `CameraScores`.
+    """
+
+    slopes: Float[Tensor, "O 2 F"]
+    residuals: Float[Tensor, "O 2"]
+    weight: Float[Tensor, " O"]
+    frame_index: Int[Tensor, " O"]
+    point_index: Int[Tensor, " O"]
+    variance: Float[Tensor, ""]
+
+
+@full_precision
+@torch.no_grad()
+def focal_scores(
+    problem: BundleProblem,
+    shares: Float[Tensor, "K F"],
+    directions: Float[Tensor, "P n"],
+    options: SolverOptions,
+) -> FocalScores | None:
+    """The scores of focal lengths of which each frame has its shares, beside those of the common camera. Detached.
+
+    As `camera_scores`, at a minimum of a single camera, whose parameters may move along `directions`, the first of
+    which is that of the focal length. None where the observations do not determine them.
+    """
+    bundle, estimate = observations_alone(problem, directions, options)
+    lin, J, rays_w, factorized = bundle.linear_system(estimate)
+    layout, structure = bundle.layout, bundle.layout.structure
+    if not bool(factorized.reduced.definite):
+        return None
+    share = shares[layout.frame_index]
+    slope = (J * (lin.weight * J[:, 3])[:, None]).sum(0)
+    pulls = torch.cat((slope[:3], torch.linalg.cross(rays_w, slope[:3], dim=0)))[:, : structure.num_linked]
+    steps = [
+        factorized.solve(
+            BundleTangent(
+                structure.sum_by_frame(pulls * part[: structure.num_linked]),
+                structure.sum_by_point((slope[:3] * part).mT),
+                structure.sum_by_camera(slope[3:] * part),
+            )
+        )
+        for part in share.mT
+    ]
+    frames, points = (torch.stack([step[part] for step in steps], dim=-1) for part in range(2))
+    camera = torch.stack([step.cameras[0] for step in steps], dim=-1)
+    J = J.permute(2, 0, 1)
+    followed = J[..., :3] @ _velocities(layout, estimate, rays_w, frames, points) + J[..., 3:] @ camera
+    unknowns = 6 * len(layout.free_frames) + 3 * int(layout.free_points.sum()) + shares.shape[1]
+    return FocalScores(
+        J[..., 3, None] * share[:, None] - followed,
+        lin.gradient_wrt_residual,
+        lin.weight,
+        layout.frame_index,
+        layout.point_order[layout.point_index],
+        variance_factor(bundle.observations, lin, unknowns),
+    )
+
+
+def _velocities(
+    layout: SparseLayout,
+    estimate: BundleEstimate,
+    rays_w: Float[Tensor, "3 O"],
+    frames: Float[Tensor, "k 6 n"],
+    points: Float[Tensor, "N 3 n"],
+) -> Float[Tensor, "O 3 n"]:
+    """How each of n steps of free frames and points moves the points of observations, seen from their frames."""
+    moved = frames.new_zeros(len(estimate.T_cw), *frames.shape[1:])
+    moved = moved.index_copy(0, layout.free_frames, frames)[layout.frame_index]
+    rays_w = rays_w.mT[..., None].expand(-1, -1, frames.shape[-1])
+    return moved[:, :3] + torch.linalg.cross(moved[:, 3:], rays_w, dim=1) + points[layout.point_index]
 
 
 @full_precision
