@@ -1,6 +1,6 @@
 """The cases: random rendered sequences, and parts of all recordings. As a program, it lists them.
 
-python -m experiments.decisions.cases [--cases rendered|parts|all] [--first N] [--half tuning|held-out]
+python -m experiments.decisions.cases [--cases rendered|parts|zoomed|all] [--first N] [--half tuning|held-out]
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from experiments.common import DATA_DIR, DRONE_CAMERA, DRONE_TRUTH, Backward, parser_of
-from experiments.decisions.rendered import MOTIONS, Path, RenderedSequence
+from experiments.decisions.rendered import MOTIONS, Path, RenderedSequence, Zoomed
 from torchslam.batch import Columns
 from torchslam.data import Sequence, open_sequence
 from torchslam.data.trajectories import read_trajectory
@@ -60,7 +60,7 @@ class Case(Protocol):
 
     @property
     def kind(self) -> str:
-        """`rendered` or `parts`."""
+        """`rendered`, `parts` or `zoomed`."""
 
     @property
     def group(self) -> str:
@@ -169,6 +169,49 @@ class RenderedCase:
             self.blur,
             self.number,
         )
+
+    def description(self) -> Columns:
+        return asdict(self)
+
+
+ZOOMS = {
+    "jump by 1.1": lambda time: 1.1 if time >= 0.5 else 1.0,
+    "jump by 1.4": lambda time: 1.4 if time >= 0.5 else 1.0,
+    "gradual to 1.4": lambda time: 1.0 + 0.4 * min(max((time - 0.3) / 0.4, 0.0), 1.0),
+    "breathing of 2 %": lambda time: 1.0 + 0.02 * min(max((time - 0.3) / 0.4, 0.0), 1.0),
+}
+"""Ratio of the focal length to that of the first frame, by time from 0 to 1."""
+
+
+@dataclass(frozen=True)
+class ZoomedCase:
+    """A rendered case with a zoom in its images.
+
+    Attributes:
+        rendered: the case without it, of the same number.
+        zoom: of `ZOOMS`.
+    """
+
+    rendered: RenderedCase
+    zoom: str
+    kind: str = "zoomed"
+
+    @property
+    def number(self) -> int:
+        return self.rendered.number
+
+    @property
+    def group(self) -> str:
+        return self.rendered.group
+
+    @property
+    def truth(self) -> Truth:
+        return self.rendered.truth
+
+    def open(self) -> Sequence:
+        sequence = self.rendered.open()
+        last = len(sequence) - 1
+        return Zoomed(sequence, [ZOOMS[self.zoom](frame / last) for frame in range(last + 1)])
 
     def description(self) -> Columns:
         return asdict(self)
@@ -323,7 +366,14 @@ def part_cases() -> list[Case]:
     return sorted(cases, key=lambda case: case.number)
 
 
-KINDS = {"rendered": rendered_cases, "parts": part_cases}
+def zoomed_cases() -> list[Case]:
+    """All rendered cases with a zoom: each kind of zoom in turns in both halves."""
+    names = list(ZOOMS)
+    cases = [RenderedCase.random(number) for number in range(RENDERED)]
+    return [ZoomedCase(case, names[case.number // 2 % len(names)]) for case in cases]
+
+
+KINDS = {"rendered": rendered_cases, "parts": part_cases, "zoomed": zoomed_cases}
 
 
 def add_choice(parser: argparse.ArgumentParser) -> None:

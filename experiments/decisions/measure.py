@@ -13,21 +13,21 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+import torchslam
 from experiments.common import scaled
 from experiments.decisions.cases import Case, half_of, name_of
 from experiments.trials.judging import extent, wrong
 from torchslam.batch import Columns
-from torchslam.config import Config
 from torchslam.data import Sequence
 from torchslam.errors import TrajectoryError
 from torchslam.evaluation import evaluate
 from torchslam.geometry import Camera, se3_inverse, umeyama
 from torchslam.geometry.rolling_shutter import Readout
 from torchslam.global_mapping.check import MapCheck
-from torchslam.global_mapping.recording import KeyframePairs, check_run, keyframe_pairs, with_doubts
+from torchslam.global_mapping.recording import KeyframePairs, Mapping, check_run, keyframe_pairs, with_doubts
 from torchslam.system.online_camera import CameraChange
+from torchslam.system.online_run import Observer
 from torchslam.system.run import Run
-from torchslam.system.slam import SLAM
 from torchslam.types import State, StepResult, Trajectory
 
 BENDS = {"1.15": 1.15, "1.2": 1.2, "1/1.2": 1 / 1.2}
@@ -65,7 +65,7 @@ def measured(case: Case) -> Columns:
         nonlocal tracked
         tracked = time.process_time()
 
-    run = SLAM(sequence.camera, Config()).run(sequence, after_frame)
+    run = torchslam.run(sequence, mapping=Mapping.ONLINE, processes=1, observer=Observer(after_frame))
     seconds["final"] = time.process_time() - tracked
     seconds["online"] = clock.lap() - seconds["final"]
     pairs = None if run.failure else keyframe_pairs(run)
@@ -134,6 +134,7 @@ def final_columns(run: Run) -> Columns:
         "k2_std": k2_std,
         "readout_ms": _ms(run.readout),
         "readout_std_ms": None if run.readout is None else 1e3 * run.readout.std,
+        "zoom_extent": None if run.zoom is None else run.zoom.extent,
     }
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchslam.data import Sequence
 from torchslam.data.formats.image_file import gray_to_tensor
+from torchslam.data.sequence import Transformed, unzoomed_image
 from torchslam.data.synthetic.renderer import Renderer
 from torchslam.data.synthetic.scene import Painter, Rectangle, room, wall
 from torchslam.data.synthetic.sequence import poses
@@ -232,6 +233,17 @@ class RenderedSequence(Sequence):
 
     def image_name(self, index: int) -> str:
         return f"{self.name}#{index}"
+
+
+class Zoomed(Transformed):
+    """Sequence with a zoom: the images enlarged about the principal point, by a ratio for each."""
+
+    def __init__(self, whole: Sequence, ratios: list[float]) -> None:
+        super().__init__(whole)
+        self._ratios, self._same_pixels = ratios, False
+
+    def image(self, index: int) -> Float[Tensor, "1 1 H W"]:
+        return unzoomed_image(super().image(index)[0, 0], 1 / self._ratios[index], self.camera)[None, None]
 
 
 @lru_cache(maxsize=2)

@@ -236,6 +236,27 @@ def ended_worse_not_right(case: Columns) -> Outcome:
     return ended_worse(case) if _is_judged(case) and not is_right(case) else None
 
 
+def _has_zoom(case: Columns) -> bool:
+    return case["final"]["zoom_extent"] is not None
+
+
+def zoom_found_without(case: Columns) -> Outcome:
+    """A zoom found where there is none."""
+    return None if case["kind"] == "zoomed" or case["failure"] else _has_zoom(case)
+
+
+def zoom_found(case: Columns) -> Outcome:
+    """A zoom that is found."""
+    return _has_zoom(case) if case["kind"] == "zoomed" and not case["failure"] else None
+
+
+def zoom_overlooked(case: Columns) -> Outcome:
+    """A zoomed recording whose path is off by more than 5 %, without a frame that is uncertain."""
+    if case["kind"] != "zoomed" or not case["errors"]:
+        return None
+    return case["errors"]["ate"] > 0.05 * case["errors"]["extent"] and not case["states"].get("uncertain")
+
+
 def of_cases(outcome: Callable[[Columns], Outcome], is_error: bool) -> Callable[[Sequence[Columns]], Counted]:
     """Count the cases in which something happened; `is_error`: that it did, otherwise that it did not."""
 
@@ -310,6 +331,9 @@ ROWS: dict[str, Callable[[Sequence[Columns]], Counted]] = {
     "true focal length within two": of_cases(focal_within(2.0), False),
     "true readout within one stated error": of_cases(readout_within(1.0), False),
     "true readout within two": of_cases(readout_within(2.0), False),
+    "zoom found where there is none": of_cases(zoom_found_without, True),
+    "zoom found": of_cases(zoom_found, False),
+    "zoom: path off by more than 5 %, and no frame uncertain": of_cases(zoom_overlooked, True),
     "map wrong": of_cases(map_wrong, True),
     "right map: called not right by the check": of_cases(right_called_wrong, True),
     "right map: some frames called uncertain by the check": of_cases(right_doubted, True),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import replace
 from enum import Enum
 from fractions import Fraction
 from typing import Any, NamedTuple, Protocol
@@ -442,7 +443,7 @@ class Unzoomed(Transformed):
 
     def __init__(self, whole: Sequence, zoom: Zoom) -> None:
         super().__init__(whole)
-        self.zoom, self._same_pixels = zoom, False
+        self.zoom = zoom
 
     def unzoomed(self, zoom: Zoom | None) -> Sequence:
         return self._whole.unzoomed(zoom)
@@ -460,6 +461,14 @@ class Unzoomed(Transformed):
             torch.ones(height, width, dtype=torch.uint8, device="cpu") if mask is None else mask[0, 0].byte()
         )
         return self._undone(whole, index, is_mask=True)[None, None] > 0
+
+    def features(self, index: int) -> Features | None:
+        features = super().features(index)
+        if features is None:
+            return None
+        assert self.zoom is not None
+        frame = torch.tensor([index], device=features.keypoints.device)
+        return replace(features, keypoints=self.zoom.undone(features.keypoints, frame, self.camera))
 
     def _undone(self, image: Tensor, index: int, is_mask: bool = False) -> Tensor:
         assert self.zoom is not None
