@@ -39,6 +39,8 @@ LOOP_MATCHES = 40
 LARGE_ZOOM = 0.03
 """Change of the logarithm of the focal length from which on a recording is processed again without it, or its frames
 are doubtful: by less, the map is the same, and is adjusted to corrected keypoints. Tried at this value only."""
+MOST_AGAIN = 2
+"""How often it is processed again. Of rendered zooms by 1.4, a third is still off by more than that after once."""
 UNMEASURED = "interrupted; `torchslam align` measures later"
 """Why an interrupted run has an arbitrary unit."""
 KeyframePairs = tuple[list[FrameFeatures], list[ViewPair]]
@@ -128,12 +130,12 @@ def run_recording(
     """
     sources, original = list(sources), sequence
     sequence = original.unzoomed(online.slam.zoom)
-    run = _mapped(online, sequence, mapping, device, stages, features, all_frames)
-    if mapping is not None and online.slam.zoom is None and _is_zoomed(run):
-        assert run.zoom is not None
+    for again in range(MOST_AGAIN, -1, -1):
+        run = _mapped(online, sequence, mapping, device, stages, features, all_frames, may_end=again > 0)
+        if mapping is None or run.interrupted or run.zoom is None or not _is_zoomed(run) or not again:
+            break
         # Maps that were made with one focal length are wrong; features of zoomed images are elsewhere.
-        online, sequence = online.anew(run.zoom), original.unzoomed(run.zoom)
-        run = _mapped(online, sequence, mapping, device, stages, None, all_frames)
+        online, sequence, features = online.anew(run.zoom), original.unzoomed(run.zoom), None
     if run.interrupted:
         return replace(run, unmeasured=(UNMEASURED,) if sources else ())
     if _is_zoomed(run):
@@ -152,14 +154,18 @@ def _mapped(
     stages: Path | None,
     features: KeptFeatures | None,
     all_frames: bool,
+    may_end: bool,
 ) -> MappedRun:
-    """Process the frames, check their map, and map the recording as a whole where needed; see `run_recording`."""
+    """Process the frames, check their map, and map the recording as a whole where needed; see `run_recording`.
+
+    may_end: whether a zoom that is found in the frames ends it
+    """
     config, observer = online.slam.config, online.observer
     length = sequence.known_length
     are_all_mapped = length is not None and length <= config.global_mapping.window_images
     may_map = mapping in (Mapping.AUTO, Mapping.GLOBAL)
     run = MappedRun.of(online.run(until_lost=may_map and are_all_mapped and not all_frames))
-    if mapping is None or run.interrupted or (_is_zoomed(run) and run.read_zoom is None):
+    if mapping is None or run.interrupted or (may_end and _is_zoomed(run)):
         return run
     go_on = None if online.is_finished else online.run
     try:
