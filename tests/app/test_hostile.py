@@ -247,6 +247,7 @@ def test_uploads_that_lie_about_themselves_are_refused_and_deleted(server: Serve
         b'[["x", -1]]',
         b'[["x", "1e9"]]',
         b'[["x", null]]',
+        b'[["x", 1e999]]',
     ]
     lists += [
         b"\xff",
@@ -341,7 +342,7 @@ def test_the_viewer_itself_accepts_no_connection_but_that_of_the_page(tmp_path: 
 
     viewer = viser.ViserServer("127.0.0.1", 0, verbose=False)
     nobody: Any = None
-    application(viewer, Uploads(tmp_path, 1), nobody)
+    application(viewer, nobody, Uploads(tmp_path, 1), nobody)
 
     async def received(**headers: str) -> int:
         address = f"ws://127.0.0.1:{viewer.get_port()}/"

@@ -24,10 +24,10 @@ def test_a_result_has_the_data_of_the_page(finished: Path) -> None:
     assert submap["keyframe_poses"].shape == (metrics["keyframes"], 3, 4)
     assert submap["points"].dtype == np.float32
     assert data["summary"]["check"].endswith(metrics["check"]["sentence"])
-    assert data["timeline"].shape == (60, 600, 3)
+    assert data["timeline"].shape == (260, 500, 3)
     frames = submap["frames"].tolist()
-    images = reading.thumbnails(finished)
-    assert images.keys() == set(frames)
+    images = submap["images"]
+    assert images.keys() == set(range(len(frames)))
     assert all(max(image.shape) == reading.THUMBNAIL_SIDE for image in images.values())
     drawn, words = reading.residuals(finished, frames[0])
     assert drawn.shape[2] == 3
@@ -42,16 +42,6 @@ def test_a_path_is_the_same_as_itself_and_close_to_the_truth(finished: Path) -> 
     assert float(words.split()[1]) < 1e-6
     _, words = reading.compared(finished, finished / "groundtruth.txt", True, submap["S_shown_map"])
     assert words.startswith(f"ATE {read_metrics(finished)['ate_m']:.4g} m RMSE")
-
-
-def test_the_timeline_has_states_and_breaks() -> None:
-    states = np.array([0, 1, 1, 2, 3, 1])
-    image = reading.timeline(states, np.array([0, 50, 100, 100, 0, 100]), np.arange(6) * 10, [30])
-    row = image[-1, 50::100]
-    np.testing.assert_array_equal(row, np.array(reading.STATE_COLORS)[states])
-    assert (image[0, 300] == reading.BREAK_COLOR).all()
-    assert (image[0, 150] == 245).all()  # half as high
-    assert reading.timeline(np.zeros(0, int), np.zeros(0, int), np.zeros(0, int), []).shape == (60, 600, 3)
 
 
 def crash(folder: Path) -> None:

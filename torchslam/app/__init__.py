@@ -87,7 +87,7 @@ def execute(options: argparse.Namespace) -> int:
         at_end.callback(viewer.stop)
         panel = Panel(viewer, runs, reader)
         at_end.callback(panel.close)
-        page = application(viewer, Uploads(runs.folder, options.max_upload), panel, token)
+        page = application(viewer, runs, Uploads(runs.folder, options.max_upload), panel, token)
         name = LOCAL[0] if is_local else socket.gethostname() if host in ("0.0.0.0", "::", "") else host
         address = f"http://{name}:{listening.getsockname()[1]}/" + (f"?token={token}" if token else "")
         print(f"torchslam app: {address}\nresults: {runs.folder}\nend: Ctrl-C (runs go on)", flush=True)

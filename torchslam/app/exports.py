@@ -13,7 +13,7 @@ from pathlib import Path
 
 from torchslam.app.jobs import INPUT, LOCK, LOG, RECORD, tool
 from torchslam.errors import ResultsError
-from torchslam.io.file_names import DENSE_CLOUD, MESH, METRICS, POINT_CLOUD, TRAJECTORY
+from torchslam.io.file_names import DENSE_CLOUD, EXAMPLE_IMAGE, MESH, METRICS, POINT_CLOUD, TRAJECTORY
 
 TAKEN = "taken"  # folder of the zips, in the results folder: written again when the results have changed
 FREE = 1 << 30  # bytes of the disk that uploads and exports leave free
@@ -28,8 +28,10 @@ EXPORTS: dict[str, tuple[str, str, Sequence[str]]] = {
     "mesh": ("mesh (PLY)", MESH, ("--to", "mesh")),
     "tum": ("path, TUM", TRAJECTORY, ()),
     "view": ("view.html, to share", "view.html", ()),
+    "picture": ("", EXAMPLE_IMAGE, ()),
 }
-"""Label; file of the results folder, none for a zip; and arguments of `torchslam export` that write it."""
+"""Label, none for the picture of a run in the list; file of the results folder, none for a zip; and arguments of
+`torchslam export` that write it."""
 _writing = threading.Lock()
 
 
@@ -81,6 +83,7 @@ def links(address: str) -> str:
     return "".join(
         f'<a role="button" style="{style}" data-take="{label}" data-address="{address}/{kind}">{label}</a>'
         for kind, (label, _, _) in EXPORTS.items()
+        if label
     )
 
 

@@ -18,7 +18,7 @@ from torchslam.app.jobs import DEMO, Runs, State, log_tail, progress_of, tool
 from torchslam.app.options import FILE_KINDS, Options, file_button
 from torchslam.app.scene import Scene, click_of, length_between, length_words
 from torchslam.errors import ResultsError, TorchslamError
-from torchslam.io.file_names import EXAMPLE_IMAGE, METRICS, TRAJECTORY
+from torchslam.io.file_names import METRICS, TRAJECTORY
 from torchslam.utils.console import printable
 
 TICK_S = 1.0
@@ -86,16 +86,6 @@ class Panel:
         else:
             raise ResultsError("no such kind of upload")
 
-    def taken(self, name: str, kind: str) -> Path:
-        """Write an export of a run, see `exports.write_export`."""
-        return exports.write_export(self._runs.path(name), kind)
-
-    def picture(self, name: str) -> Path:
-        """The picture of a run in the list. Raises ResultsError if there is none yet."""
-        if not (path := self._runs.path(name) / EXAMPLE_IMAGE).is_file():
-            raise ResultsError("the run has no picture yet")
-        return path
-
     # --- tabs
 
     def _add_new(self) -> None:
@@ -109,7 +99,7 @@ class Panel:
 
     def _add_result(self) -> None:
         self._summary = self._gui.add_html("")
-        self._timeline = self._gui.add_image(EMPTY, label="inliers of each frame", visible=False)
+        self._timeline = self._gui.add_image(EMPTY, visible=False)
         self._row = self._gui.add_slider("Path", 0, 1, 1, 0, hint="fly along the path")
         self._row.on_update(self._guarded(lambda _: self._scene.fly(int(self._row.value))))
         self._button("Play the path", lambda _: self._toggle_play(), color="gray")
@@ -168,7 +158,7 @@ class Panel:
             self._show_result(name)
 
     def _show_result(self, name: str) -> None:
-        path, data = self._runs.path(name), self._reader.call(reading.result, self._runs.path(name))
+        data = self._reader.call(reading.result, self._runs.path(name))
         self._scene.show_result(data["submap"])
         self._summary.content = line_of(data["failure"], "#c92a2a") + table(data["summary"])
         self._timeline.image, self._timeline.visible = data["timeline"], True
@@ -177,19 +167,7 @@ class Panel:
         if self._runs.record(name).source:
             words = exports.command_and_python(self._runs.command(name), self._runs.folder)
             self._commands.content = f'<pre style="{PRE}">{html.escape(words)}</pre>'
-        if submap := data["submap"]:
-            self._row.max = max(1, len(submap["poses"]) - 1)
-            threading.Thread(target=self._add_thumbnails, args=(path, submap), daemon=True).start()
-
-    def _add_thumbnails(self, path: Path, submap: dict[str, Any]) -> None:
-        try:
-            images = self._reader.call(reading.thumbnails, path)
-        except (TorchslamError, OSError) as error:
-            self._comparison.content = line_of(f"without images: {error}")
-            return
-        with self._lock:
-            if self._scene.submap is submap:
-                self._scene.show_thumbnails(images)
+        self._row.max = max(1, len(data["submap"].get("poses", ())) - 1)
 
     def _toggle_play(self) -> None:
         def play() -> None:

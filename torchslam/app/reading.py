@@ -6,10 +6,8 @@ The functions below run in that process, which alone imports torch; they return 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import multiprocessing
 import os
-import re
 import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -22,7 +20,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from torchslam.errors import FrameError, ResultsError
+from torchslam.errors import ResultsError, TorchslamError
 
 Answer = TypeVar("Answer")
 NICENESS = 5
@@ -35,9 +33,7 @@ its image takes .15 ms of a frame where there is no GPU."""
 MAX_KEPT = 600  # images that are kept to color the points of a run: up to 0.7 MB each
 MAX_PASSED = 4  # keyframes since the last look whose images are read as well
 UNSEEN = (150, 155, 165)  # red, green, blue of points without an image
-STATE_COLORS = ((201, 180, 88), (87, 190, 65), (190, 130, 225), (200, 85, 61))
-"""Red, green, blue of the states in the timeline, in the order of `types.State`: about those of view.html."""
-TIMELINE_SIZE, BREAK_COLOR = (600, 60), (220, 30, 30)  # width and height, pixels; red, green, blue
+TIMELINE_INCHES = 5.0, 2.6  # width and height, of 100 pixels: about the width of the panel
 
 
 class ReadingProcess:
@@ -118,9 +114,7 @@ class _Watched:
         return colors
 
 
-@lru_cache(maxsize=1)
-def _watched(words: tuple[str, ...]) -> _Watched:
-    return _Watched(words)
+_watched = lru_cache(maxsize=1)(_Watched)
 
 
 def live(folder: Path, words: tuple[str, ...], shown: int) -> dict[str, Any] | None:
@@ -154,60 +148,44 @@ def result(folder: Path) -> dict[str, Any]:
 
     Returns:
         summary, failure: of the run; words by name, and words
-        timeline: a picture of all frames
+        timeline: (H, W, 3) picture of all frames
         submap: of the main submap, the data of view.html, with what is drawn beside: `uncertain` (F,) poses, `frames`
-            (K,) of the keyframes, `size` of the images, `corners` (4, 3) of the frusta in their cameras; empty without
-            a map
+            (K,) of the keyframes, `size` of the images, `corners` (4, 3) of the frusta in their cameras, small `images`
+            of keyframes by row; empty without a map
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from torchslam.io.plots import plot_tracking
+    from torchslam.io.plots.charts import thin
     from torchslam.io.report import summary
     from torchslam.io.results import read_results
     from torchslam.io.viewer.page import page_data
     from torchslam.types import State
 
     results = read_results(folder)
-    data, breaks = page_data(results), (results.metrics.get("check") or {}).get("breaks", [])
-    rows, frames = (
-        summary(results.metrics) | ({"breaks": "; ".join(breaks)} if breaks else {}),
-        data["frames"],
-    )
-    at = [int(found[1]) for each in breaks if (found := re.search(r"between frames (\d+)", each))]
-    submap = data["submaps"][0] if data["submaps"] else {}
-    if submap:
+    data, rows = page_data(results), summary(results.metrics)
+    frames, submap = data["frames"], dict[str, Any]()
+    if results.main is not None and len(results.trajectory):
+        submap = data["submaps"][0]
         submap["uncertain"] = frames["state"][submap["frame"]] == list(State).index(State.UNCERTAIN)
         submap["frames"], submap["size"] = frames["index"][submap["keyframe"]], data["size"]
         submap["corners"] = submap["frustum"] * np.array(data["corners"])
+        images = submap["images"] = dict[int, np.ndarray]()
+        try:
+            opened = results.images(results.scene(results.main, keyframes_alone=True))
+            for row in thin(len(submap["frames"]), MAX_THUMBNAILS).tolist():
+                images[row] = small(opened.bgr(int(submap["frames"][row]))[..., ::-1], THUMBNAIL_SIDE)
+        except (TorchslamError, OSError) as error:  # moved, or damaged
+            rows["images"] = f"not shown: {error}"
         if not len(submap["colors"]):
             submap["colors"] = np.full(submap["points"].shape, UNSEEN, np.uint8)
-    picture = timeline(frames["state"], frames["inliers"], frames["index"], at)
+    figure = plot_tracking(results.frames, breaks=results.breaks)
+    figure.set_size_inches(TIMELINE_INCHES)
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    rows |= {"breaks": "; ".join(results.breaks)} if results.breaks else {}
+    picture = np.array(canvas.buffer_rgba())[..., :3]
     return {"summary": rows, "failure": data["failure"], "timeline": picture, "submap": submap}
-
-
-def timeline(states: np.ndarray, inliers: np.ndarray, indices: np.ndarray, breaks: list[int]) -> np.ndarray:
-    """A picture of all frames from left to right: inliers as height, the state as color, breaks of the check in red."""
-    (width, height), count = TIMELINE_SIZE, max(1, len(states))
-    image = np.full((height, width, 3), 245, np.uint8)
-    for x, row in enumerate(np.arange(width) * len(states) // width if len(states) else ()):
-        share = 0.15 + 0.85 * max(0, inliers[row]) / max(1, inliers.max())
-        image[height - round(share * height) :, x] = STATE_COLORS[states[row]]
-    for place in breaks:
-        x = int(np.searchsorted(indices, place)) * width // count
-        image[:, min(x, width - 2) : x + 2] = BREAK_COLOR
-    return image
-
-
-def thumbnails(folder: Path) -> dict[int, np.ndarray]:
-    """Small images of keyframes by frame: red, green, blue; those that cannot be read are missing."""
-    from torchslam.io.plots.charts import thin
-    from torchslam.io.results import open_run
-
-    run, found = open_run(folder), dict[int, np.ndarray]()
-    if run.main is not None:
-        scene = run.scene(run.main, keyframes_alone=True)
-        images = run.images(scene)
-        for frame in scene.frame_ids[thin(len(scene.frame_ids), MAX_THUMBNAILS)].tolist():
-            with contextlib.suppress(FrameError):
-                found[frame] = small(images.bgr(frame)[..., ::-1], THUMBNAIL_SIDE)
-    return found
 
 
 def residuals(folder: Path, frame: int) -> tuple[np.ndarray, str]:

@@ -68,13 +68,8 @@ class Scene:
                 self._path("path", submap["poses"][:, :, 3], submap["uncertain"], submap["breaks"])
                 self._path("truth", submap["truth"], color=TRUTH)
                 self._frusta(submap["keyframe_poses"], submap["corners"])
+                self._images(submap["images"], submap["keyframe_poses"], submap["corners"])
             self._aim(np.zeros(3), (0.6, -1.0, 0.7), 1.5 * submap["radius"])
-
-    def show_thumbnails(self, images: dict[int, np.ndarray]) -> None:
-        """Add the images of keyframes to their frusta, as of `reading.thumbnails`."""
-        row_of = {frame: row for row, frame in enumerate(self.submap["frames"].tolist())}
-        found = {row_of[frame]: image for frame, image in images.items() if frame in row_of}
-        self._images(found, self.submap["keyframe_poses"], self.submap["corners"])
 
     def crop(self, limits: Float[np.ndarray, "2 3"] | None, is_dense: bool = True) -> None:
         """Draw the points within two corners, the dense ones if there are any and they are wanted."""
@@ -149,7 +144,7 @@ class Scene:
         points, ends = beads(positions.astype(float), is_kept)
         is_uncertain = np.isin(ends, np.flatnonzero(uncertain))[:, None]
         colors = np.where(is_uncertain, np.array(UNCERTAIN, np.uint8), np.array(color, np.uint8))
-        self._cloud(name, points.astype(np.float32), colors, 0.004)
+        self._cloud(name, points.astype(np.float32), colors, 0.0025)
 
     def _frusta(self, poses: np.ndarray, corners: Float[np.ndarray, "4 3"]) -> None:
         """Draw the edges of frusta, all at once, and in random order like points."""

@@ -25,8 +25,8 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import WebSocketException
 from websockets.typing import Subprotocol
 
-from torchslam.app.exports import check_disk
-from torchslam.app.jobs import INPUT, shown, stored_name
+from torchslam.app.exports import check_disk, write_export
+from torchslam.app.jobs import INPUT, Runs, shown, stored_name
 from torchslam.errors import ResultsError, TorchslamError
 from torchslam.utils.files import parse_json
 
@@ -117,7 +117,7 @@ class Uploads:
         """Announce files by JSON, a name and a size in bytes of each; return the name of their upload."""
         try:
             listed = [(str(name), int(size)) for name, size in parse_json(content.decode())]
-        except (ValueError, TypeError):
+        except (ValueError, TypeError, OverflowError):
             raise ResultsError("the names and sizes of the files are missing") from None
         if not 0 < len(listed) <= MAX_FILES or min(size for _, size in listed) < 0:
             raise ResultsError(f"{len(listed)} files: from 1 to {MAX_FILES} can be uploaded together")
@@ -173,13 +173,16 @@ async def _written(
     return path, f"{called} and {len(listed) - 1} more" if is_several else called
 
 
-def application(viewer: viser.ViserServer, uploads: Uploads, page: Panel, token: str = "") -> Guard:
+def application(
+    viewer: viser.ViserServer, runs: Runs, uploads: Uploads, page: Panel, token: str = ""
+) -> Guard:
     """The page, its uploads and downloads."""
     secret, tabs = secrets.token_hex(32), asyncio.Semaphore(MAX_TABS)
     _accept_only(viewer, secret)
     home = (files("viser") / "client" / "build" / "index.html").read_text(encoding="utf-8")
     home = home.replace("<head>", '<head><script src="/page.js"></script>', 1)
-    script = (files("torchslam.app") / "page.js").read_text(encoding="utf-8")
+    scripts = (files("torchslam.io") / "viewer" / "detail.js", files("torchslam.app") / "page.js")
+    script = "".join(each.read_text(encoding="utf-8") for each in scripts)
 
     async def announce(request: Request) -> Response:
         content = b""
@@ -196,10 +199,10 @@ def application(viewer: viser.ViserServer, uploads: Uploads, page: Panel, token:
 
     async def take(request: Request) -> Response:
         run, kind = request.path_params["run"], request.path_params["kind"]
-        path = await run_in_threadpool(page.taken, run, kind)
+        path = await run_in_threadpool(write_export, runs.path(run), kind)
         if request.method == "POST":  # written, to be fetched
             return JSONResponse({"address": request.url.path})
-        return FileResponse(path, filename=f"{run}-{path.name}", media_type="application/octet-stream")
+        return FileResponse(path, filename=f"{run}-{path.name}")  # to be stored, not shown
 
     async def relay(browser: WebSocket) -> None:
         """Connect a browser to the viewer, which accepts connections from here alone."""
@@ -235,7 +238,6 @@ def application(viewer: viser.ViserServer, uploads: Uploads, page: Panel, token:
         Route("/page.js", lambda _: Response(script, media_type="text/javascript")),
         Route("/uploads", announce, methods=["POST"]),
         Route("/uploads/{id}", receive, methods=["PUT"]),
-        Route("/runs/{run}/picture", lambda asked: FileResponse(page.picture(asked.path_params["run"]))),
         Route("/runs/{run}/{kind}", take, methods=["GET", "POST"]),
         WebSocketRoute("/", relay),
     ]

@@ -31,7 +31,14 @@ from torchslam.types import State, Trajectory
 from torchslam.utils.console import printable
 
 VIEW = "view.html"
-SCRIPTS = ("draw.js", "orbit.js", "scene.js", "ruler.js", "view.js")  # in this order, all in one script
+SCRIPTS = (
+    "detail.js",
+    "draw.js",
+    "orbit.js",
+    "scene.js",
+    "ruler.js",
+    "view.js",
+)  # in this order, all in one script
 MAX_POINTS = 150_000  # of all submaps together: 42 bytes each in the page
 MAX_DENSE_POINTS = 500_000  # of the dense cloud: 12 bytes each in the page
 STEPS = 65535  # of 16 bits: of the dense cloud over its extent, of pixels over the image
